@@ -1,0 +1,38 @@
+# `make demo` and `make test` need Python >= 3.10, git and make, nothing else: the environment is built on first use.
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+STEPS ?= 24
+
+.PHONY: demo test lint types doctest imports smoke bench clean
+
+demo: $(VENV)/.ready  ## evaluate a built-in rig in the built-in courtyard; writes to out/demo
+	$(BIN)/torchcover evaluate front_roof_128 --scenario courtyard --steps $(STEPS) --out out/demo
+
+test: $(VENV)/.ready  ## every test
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/.ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.ready
+	$(BIN)/mypy
+
+doctest: $(VENV)/.ready  ## the examples in the docstrings and in the documentation
+	$(BIN)/python -m pytest --doctest-modules torchcover --doctest-glob='*.md' README.md docs
+
+smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the repository
+	PYTHON="$(PYTHON)" bash benchmarks/../.ci/smoke $(BIN)/python
+
+bench: $(VENV)/.ready  ## the speed and memory figures of docs/performance.md
+	$(BIN)/python -m benchmarks
+
+clean:
+	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+
+# The marker file is written last, so that an interrupted installation is made again.
+$(VENV)/.ready: pyproject.toml constraints.txt
+	$(PYTHON) .ci/make_venv.py $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@

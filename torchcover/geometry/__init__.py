@@ -1,0 +1,13 @@
+"""Rigid transforms and boxes. Knows no other part of the house."""
+
+from torchcover.geometry.boxes import Box
+from torchcover.geometry.rigid import (
+    check_rigid,
+    invert,
+    rigid,
+    rotation_from_euler,
+    rotation_from_quaternion,
+    transform,
+)
+
+__all__ = ["Box", "check_rigid", "invert", "rigid", "rotation_from_euler", "rotation_from_quaternion", "transform"]

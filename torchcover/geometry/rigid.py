@@ -1,0 +1,149 @@
+"""Rigid transforms: 4x4 float64 matrices named `destination_T_source` that act on column vectors."""
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Matrix = NDArray[np.float64]
+
+# A calibration printed with four decimals passes; a scaled, sheared or mirrored matrix does not.
+RIGID_TOLERANCE = 1e-3
+
+
+def rigid(rotation: ArrayLike, translation_m: ArrayLike) -> Matrix:
+    """Assemble a transform from a rotation and a translation.
+
+    Args:
+        rotation: (3, 3) rotation matrix.
+        translation_m: (3,) position of the source frame's origin in the destination frame, in metres.
+
+    Returns:
+        (4, 4) float64 matrix.
+
+    Example:
+        >>> rigid(np.eye(3), [1.0, 2.0, 3.0])[:3, 3]
+        array([1., 2., 3.])
+    """
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation
+    matrix[:3, 3] = translation_m
+    return matrix
+
+
+def invert(destination_T_source: Matrix) -> Matrix:
+    """Invert a rigid transform: `source_T_destination`, by transposing the rotation.
+
+    Example:
+        >>> world_T_vehicle = rigid(rotation_from_euler(90.0, 0.0, 0.0), [5.0, 0.0, 0.0])
+        >>> bool(np.allclose(invert(world_T_vehicle) @ world_T_vehicle, np.eye(4)))
+        True
+    """
+    rotation = destination_T_source[:3, :3]
+    return rigid(rotation.T, -rotation.T @ destination_T_source[:3, 3])
+
+
+def rotation_from_euler(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix:
+    """Rotation by roll about x, then pitch about y, then yaw about z (all axes fixed): R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    In a frame with x forward, y left, z up a positive yaw turns left, a positive pitch turns the nose DOWN
+    (right-handed about y) and a positive roll lowers the right side.
+
+    Example:
+        >>> rotation_from_euler(90.0, 0.0, 0.0).round(6) @ [1.0, 0.0, 0.0]
+        array([0., 1., 0.])
+    """
+    yaw, pitch, roll = np.deg2rad([yaw_deg, pitch_deg, roll_deg])
+    (cy, cp, cr), (sy, sp, sr) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
+    return np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+
+
+def rotation_from_quaternion(wxyz: ArrayLike) -> Matrix:
+    """Rotation matrix of a quaternion (w, x, y, z), which is normalised first.
+
+    Raises:
+        ValueError: The quaternion is not four finite numbers, or its norm is 0.
+
+    Example:
+        >>> rotation_from_quaternion([1.0, 0.0, 0.0, 0.0]).tolist()
+        [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    quaternion = np.asarray(wxyz, dtype=np.float64)
+    if quaternion.shape != (4,) or not np.isfinite(quaternion).all():
+        raise ValueError(f"a quaternion needs four finite numbers w, x, y, z; got {wxyz}")
+    norm = float(np.linalg.norm(quaternion))
+    if norm == 0.0:
+        raise ValueError("a quaternion of norm 0 is no rotation; the identity is [1, 0, 0, 0] (w, x, y, z)")
+    w, x, y, z = quaternion / norm
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def check_rigid(matrix: ArrayLike, name: str) -> Matrix:
+    """Return `matrix` as float64 if it is a rigid transform, else say by how much it is not.
+
+    Args:
+        matrix: (4, 4) transform as it came from outside.
+        name: What the user calls it, for the message.
+
+    Returns:
+        (4, 4) float64 copy whose rotation is orthonormal to the last bits (the nearest rotation to a matrix that
+        was printed with a few decimals).
+
+    Raises:
+        ValueError: Not 4x4, not finite, last row not 0 0 0 1, or the 3x3 part deviates from a rotation by more
+            than 1e-3 (scaled, sheared or mirrored).
+    """
+    try:
+        array = np.array(matrix, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name}: a 4x4 matrix of numbers is needed; got {matrix!r}") from error
+    if array.shape != (4, 4):
+        raise ValueError(f"{name}: a 4x4 matrix is needed; got shape {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name}: {int((~np.isfinite(array)).sum())} of its 16 entries are NaN or infinite")
+    if not np.array_equal(array[3], [0.0, 0.0, 0.0, 1.0]):
+        raise ValueError(f"{name}: the last row of a rigid transform is 0 0 0 1; got {array[3].tolist()}")
+    rotation = array[:3, :3]
+    deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+    determinant = float(np.linalg.det(rotation))
+    if deviation > RIGID_TOLERANCE:
+        raise ValueError(
+            f"{name}: not a rigid transform: R R^T deviates from the identity by {deviation:.3g} "
+            f"(allowed {RIGID_TOLERANCE:g}), determinant {determinant:.6g}; remove scale and shear"
+        )
+    if determinant < 0:
+        raise ValueError(
+            f"{name}: a mirror, not a rotation (determinant {determinant:.6g}); flip one axis of the source frame"
+        )
+    u, _, vt = np.linalg.svd(rotation)
+    return rigid(u @ vt, array[:3, 3])
+
+
+def transform(destination_T_source: Matrix, points_m: NDArray[np.floating]) -> Matrix:
+    """Transform points, in float64 whatever their type, so that UTM-sized coordinates keep their millimetres.
+
+    Args:
+        destination_T_source: (4, 4) rigid transform.
+        points_m: (N, 3) points in the source frame.
+
+    Returns:
+        (N, 3) float64 points in the destination frame.
+
+    Example:
+        >>> transform(rigid(np.eye(3), [0.0, 0.0, 1.7]), np.zeros((1, 3)))
+        array([[0. , 0. , 1.7]])
+    """
+    rotation, translation = destination_T_source[:3, :3], destination_T_source[:3, 3]
+    points = points_m.astype(np.float64, copy=False)
+    # R (p - R^T (-t)): the large numbers of a world frame cancel in the subtraction, before anything is multiplied.
+    return (points + rotation.T @ translation) @ rotation.T
