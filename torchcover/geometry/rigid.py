@@ -74,7 +74,7 @@ def rotation_from_quaternion(wxyz: ArrayLike) -> Matrix:
     """
     quaternion = np.asarray(wxyz, dtype=np.float64)
     if quaternion.shape != (4,) or not np.isfinite(quaternion).all():
-        raise ValueError(f"a quaternion needs four finite numbers w, x, y, z; got {wxyz}")
+        raise ValueError(f"a quaternion needs four finite numbers w, x, y, z; got {wxyz!r}")
     norm = float(np.linalg.norm(quaternion))
     if norm == 0.0:
         raise ValueError("a quaternion of norm 0 is no rotation; the identity is [1, 0, 0, 0] (w, x, y, z)")

@@ -1,1 +1,9 @@
-"""To be."""
+"""Exact nearest neighbours. Knows no other part of the house.
+
+One entry, `nearest`; a backend is a file with one function `search(query, points, max_distance, memory_mb)`
+that returns the index of a nearest point. What a distance is, and its gradient, is decided once, in `nearest`.
+"""
+
+from torchcover.neighbors.nearest import BACKENDS, Nearest, blind_spot_radius, check_cloud, nearest
+
+__all__ = ["BACKENDS", "Nearest", "blind_spot_radius", "check_cloud", "nearest"]

@@ -1,0 +1,184 @@
+"""The bird's-eye-view grid: which cell a point belongs to. Bins are half-open, [lo, hi), on every axis."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import pairwise
+from types import MappingProxyType
+
+import torch
+from torch import Tensor
+
+# Height bands of Uecker & Zöllner 2024.
+PAPER_HEIGHTS: Mapping[str, tuple[float, float]] = MappingProxyType({"ground": (-0.5, 0.5), "obstacle": (0.5, 2.0)})
+
+# The extents of a grid are written in decimals; a multiple of the cell is one up to their rounding.
+MULTIPLE_TOLERANCE = 1e-6
+# An int64 count and three float64 sums for every cell: 3 GB.
+MOST_CELLS = 100_000_000
+
+
+@dataclass(frozen=True)
+class BevGrid:
+    """Square cells over x and y in the vehicle frame, in height bands over z.
+
+    A cell's number is `(h * Y + y) * X + x`; arrays over the grid have the shape (H, Y, X).
+
+    Args:
+        x: Lower and upper bound forward, in metres.
+        y: Lower and upper bound to the left, in metres.
+        cell: Side of a cell in metres. The extents must be multiples of it.
+        heights: Name of each height band -> lower and upper bound of z in metres. Bands may not overlap; gaps are
+            allowed. The default is the paper's: ground [-0.5, 0.5) and obstacle [0.5, 2.0).
+
+    Raises:
+        ValueError: Inverted or infinite bounds, a cell that is not positive, an extent that is not a multiple of the
+            cell, no band, overlapping bands, or more than 1e8 cells.
+
+    Example:
+        >>> grid = BevGrid(x=(0.0, 20.0), y=(-5.0, 5.0), cell=0.5)
+        >>> grid.shape
+        (2, 20, 40)
+        >>> grid.cell_of(torch.tensor([[0.0, -5.0, 0.0], [0.0, -5.0, 0.5], [20.0, 0.0, 0.0]]))
+        tensor([  0, 800,  -1])
+    """
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    cell: float = 0.25
+    heights: Mapping[str, tuple[float, float]] = field(default_factory=lambda: dict(PAPER_HEIGHTS))
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.cell) and self.cell > 0):
+            raise ValueError(f"cell: a positive length in metres is needed; got {self.cell}")
+        for axis, bounds in (("x", self.x), ("y", self.y)):
+            _check_bounds(axis, bounds)
+            _check_multiple(axis, bounds, self.cell)
+        _check_heights(self.heights)
+        if math.prod(self.shape) > MOST_CELLS:
+            raise ValueError(f"the grid has {math.prod(self.shape):,} cells, over {MOST_CELLS:,}: use larger cells")
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of bands, cells along y, cells along x: (H, Y, X)."""
+        return len(self.heights), _count(self.y, self.cell), _count(self.x, self.cell)
+
+    @property
+    def cells(self) -> int:
+        """Number of cells in all bands."""
+        return math.prod(self.shape)
+
+    @property
+    def diagonal_m(self) -> float:
+        """Longest distance between two points of the grid, heights included, in metres."""
+        lowest = min(low for low, _ in self.heights.values())
+        highest = max(high for _, high in self.heights.values())
+        return math.hypot(self.x[1] - self.x[0], self.y[1] - self.y[0], highest - lowest)
+
+    @property
+    def x_edges_m(self) -> Tensor:
+        """(X + 1,) float64 cell borders along x."""
+        return _edges(self.x, self.cell)
+
+    @property
+    def y_edges_m(self) -> Tensor:
+        """(Y + 1,) float64 cell borders along y."""
+        return _edges(self.y, self.cell)
+
+    @property
+    def x_centres_m(self) -> Tensor:
+        """(X,) float64 cell centres along x."""
+        return _centres(self.x_edges_m)
+
+    @property
+    def y_centres_m(self) -> Tensor:
+        """(Y,) float64 cell centres along y."""
+        return _centres(self.y_edges_m)
+
+    def cell_of(self, points: Tensor) -> Tensor:
+        """Number of the cell of each point.
+
+        Args:
+            points: (N, 3) coordinates in metres, any floating-point type.
+
+        Returns:
+            (N,) int64 cell numbers; -1 for a point outside every cell or band.
+        """
+        x, y, z = points.detach().double().T.contiguous()
+        _, rows, columns = self.shape
+        column = bin_of(x, self.x_edges_m)
+        row = bin_of(y, self.y_edges_m)
+        band = self._band_of(z)
+        inside = (column >= 0) & (row >= 0) & (band >= 0)
+        return ((band * rows + row) * columns + column).where(inside, -1)
+
+    def _band_of(self, z: Tensor) -> Tensor:
+        order = sorted(range(len(self.heights)), key=lambda band: list(self.heights.values())[band])
+        borders = [border for band in order for border in list(self.heights.values())[band]]
+        # Between the borders of sorted bands lie, in turn, a band and a gap (which may be empty).
+        interval = bin_of(z, torch.tensor(borders, dtype=torch.float64))
+        band_of_interval = torch.full((len(borders),), -1)
+        band_of_interval[torch.arange(0, len(borders), 2)] = torch.tensor(order)
+        # bin_of gives -1 for outside, which picks the last entry: the one after the highest band.
+        return band_of_interval.to(z.device)[interval]
+
+
+def bin_of(values: Tensor, edges: Tensor) -> Tensor:
+    """Index of the half-open bin [edges[i], edges[i + 1]) of each value: the one place where this is decided.
+
+    The edges are compared with, not divided by, so that no rounding moves a point over a border.
+
+    Args:
+        values: (N,) float64.
+        edges: (B + 1,) float64, ascending; a bin between equal edges is empty.
+
+    Returns:
+        (N,) int64 bin indices in [0, B), -1 outside.
+
+    Example:
+        >>> bin_of(torch.tensor([-0.1, 0.0, 0.9, 2.0]).double(), torch.tensor([0.0, 1.0, 2.0]).double())
+        tensor([-1,  0,  0, -1])
+    """
+    index = torch.bucketize(values, edges.to(values.device), right=True) - 1
+    return index.where(index < len(edges) - 1, -1)
+
+
+def _check_bounds(name: str, bounds: tuple[float, float]) -> None:
+    if len(bounds) != 2 or not all(math.isfinite(bound) for bound in bounds):
+        raise ValueError(f"{name}: two finite bounds in metres are needed; got {bounds}")
+    if not bounds[0] < bounds[1]:
+        raise ValueError(f"{name}: the lower bound must be below the upper one; got {bounds}")
+
+
+def _check_multiple(name: str, bounds: tuple[float, float], cell: float) -> None:
+    extent = bounds[1] - bounds[0]
+    cells = extent / cell
+    if cells < 0.5 or abs(cells - round(cells)) > MULTIPLE_TOLERANCE * max(1.0, cells):
+        fits = extent / max(1, round(cells))
+        raise ValueError(
+            f"{name}: its extent of {extent:g} m is not a multiple of the cell of {cell:g} m "
+            f"({cells:g} cells); a cell of {fits:g} m would fit"
+        )
+
+
+def _check_heights(heights: Mapping[str, tuple[float, float]]) -> None:
+    if not heights:
+        raise ValueError("heights: at least one height band is needed, for example {'ground': (-0.5, 0.5)}")
+    for name, band in heights.items():
+        _check_bounds(f"heights[{name!r}]", band)
+    ordered = sorted(heights.items(), key=lambda item: item[1])
+    for (below, (_, top)), (above, (bottom, _)) in pairwise(ordered):
+        if bottom < top:
+            raise ValueError(f"heights: bands {below!r} and {above!r} overlap between z = {bottom:g} and {top:g} m")
+
+
+def _count(bounds: tuple[float, float], cell: float) -> int:
+    return round((bounds[1] - bounds[0]) / cell)
+
+
+def _edges(bounds: tuple[float, float], cell: float) -> Tensor:
+    return torch.linspace(bounds[0], bounds[1], _count(bounds, cell) + 1, dtype=torch.float64)
+
+
+def _centres(edges: Tensor) -> Tensor:
+    return (edges[:-1] + edges[1:]) / 2

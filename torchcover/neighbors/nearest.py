@@ -1,0 +1,194 @@
+"""The blind spot radius, and the exact nearest-neighbour search beneath it."""
+
+import math
+from collections.abc import Callable
+from importlib import import_module
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+# backend -> its module; imported when first used, so that an unused library costs nothing.
+BACKENDS = {
+    "cdist": "torchcover.neighbors.cdist",
+    "kdtree": "torchcover.neighbors.kdtree",
+}
+
+# Below this many query-point pairs the brute-force search beats building a tree (docs/performance.md, crossover).
+CROSSOVER_PAIRS = 2_000_000
+
+Search = Callable[[Tensor, Tensor, float, float], Tensor]
+
+
+class Nearest(NamedTuple):
+    """Result of `nearest`: `distance` (N,) and `index` (N,) int64; inf and -1 where no point is within reach."""
+
+    distance: Tensor
+    index: Tensor  # type: ignore[assignment]  # hides tuple.index, as torch.return_types do
+
+
+def blind_spot_radius(
+    reference: Tensor,
+    sensor: Tensor,
+    *,
+    max_radius: float = math.inf,
+    backend: str = "auto",
+    memory_mb: float = 256.0,
+) -> Tensor:
+    """Radius of the largest ball around each reference point that holds no sensor point.
+
+    r(q) = min over p in sensor of ||q - p||  (Uecker & Zöllner 2024, section III).
+
+    Args:
+        reference: (N, 3) points of the reference sensor in metres.
+        sensor: (M, 3) points of the rig in metres, in the same frame. Never crop it to the region of interest: the
+            nearest point may lie outside.
+        max_radius: Saturation in metres. A search that ends there is faster. An empty `sensor` gives `max_radius`
+            everywhere: a rig that saw nothing is blind.
+        backend: As in `nearest`.
+        memory_mb: As in `nearest`.
+
+    Returns:
+        (N,) radius in metres, differentiable in both clouds where it is below `max_radius`.
+
+    Raises:
+        ValueError: As `nearest`.
+        TypeError: As `nearest`.
+
+    Example:
+        >>> reference = torch.tensor([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0]])
+        >>> blind_spot_radius(reference, torch.zeros(1, 3))
+        tensor([0., 5.])
+    """
+    found = nearest(reference, sensor, max_distance=max_radius, backend=backend, memory_mb=memory_mb)
+    return found.distance.clamp(max=max_radius)
+
+
+def nearest(
+    query: Tensor,
+    points: Tensor,
+    *,
+    max_distance: float = math.inf,
+    backend: str = "auto",
+    memory_mb: float = 256.0,
+) -> Nearest:
+    """Distance from each query to its nearest point, and the index of that point. Exact.
+
+    The backend finds the index; the distance is then computed from the coordinate differences in float64 and rounded
+    once. So backends agree to the last bits, and gradients flow to both inputs whichever backend was used.
+
+    * Ties: any one of the points at the same distance; which one depends on the backend, the distance does not.
+    * `max_distance` is inclusive, and compared after rounding it to the type of the distance.
+    * float16 and bfloat16 coordinates are widened to float32 (exactly), mixed types to the wider one.
+    * At distance 0 the gradient is taken as 0.
+
+    Args:
+        query: (N, 3) floating-point coordinates, any strides, any device.
+        points: (M, 3) floating-point coordinates on the same device. M = 0 is allowed.
+        max_distance: Only points within this distance count. A finite value makes the search faster.
+        backend: "cdist" (any device), "kdtree" (CPU) or "auto" (by device and number of pairs).
+        memory_mb: Most memory in megabytes that "cdist" may use beside its inputs and outputs.
+
+    Returns:
+        `Nearest(distance, index)`: (N,) distances (float32 or float64) and (N,) int64 indices; inf and -1 where no
+        point is within `max_distance`.
+
+    Raises:
+        ValueError: A shape other than (N, 3); NaN or infinite coordinates; two devices; a negative or NaN
+            `max_distance`; an unknown backend, or "kdtree" for tensors that are not on the CPU.
+        TypeError: An input is not a tensor of a floating-point type.
+
+    Example:
+        >>> points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+        >>> nearest(torch.tensor([[0.9, 0.0, 0.0], [9.0, 0.0, 0.0]]), points, max_distance=1.0)
+        Nearest(distance=tensor([0.1000,    inf]), index=tensor([ 1, -1]))
+    """
+    query, points = _check_inputs(query, points, max_distance, memory_mb)
+    search = _choose_search(query, points, backend)
+    if len(query) == 0 or len(points) == 0:
+        index = torch.full((len(query),), -1, dtype=torch.int64, device=query.device)
+    else:
+        with torch.no_grad():
+            index = search(*_rescale(query, points, max_distance), memory_mb)
+    return _distance_to(query, points, index, max_distance)
+
+
+def check_cloud(cloud: Tensor, name: str) -> None:
+    """Raise unless `cloud` is a floating-point tensor of shape (N, 3) with finite coordinates.
+
+    Args:
+        cloud: What arrived.
+        name: What the caller calls it, for the message.
+
+    Raises:
+        TypeError: Not a tensor of a floating-point type.
+        ValueError: Another shape, or NaN or infinite coordinates (the message says how many points have them).
+    """
+    if not isinstance(cloud, Tensor) or not cloud.is_floating_point():
+        arrived = cloud.dtype if isinstance(cloud, Tensor) else type(cloud).__name__
+        raise TypeError(f"{name}: a floating-point torch tensor is needed; got {arrived}")
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        raise ValueError(f"{name}: shape (N, 3) is needed; got {tuple(cloud.shape)}")
+    if not cloud.isfinite().all():
+        bad = int((~cloud.detach().isfinite()).any(dim=1).sum())
+        raise ValueError(f"{name}: {bad} of {len(cloud)} points have NaN or infinite coordinates; drop them first")
+
+
+def _check_inputs(query: Tensor, points: Tensor, max_distance: float, memory_mb: float) -> tuple[Tensor, Tensor]:
+    check_cloud(query, "query")
+    check_cloud(points, "points")
+    if query.device != points.device:
+        raise ValueError(f"query is on {query.device}, points on {points.device}; move them to one device")
+    if not max_distance >= 0:
+        raise ValueError(f"max_distance: a distance >= 0 is needed; got {max_distance}")
+    if not memory_mb > 0:
+        raise ValueError(f"memory_mb: a positive number of megabytes is needed; got {memory_mb}")
+    common = torch.promote_types(torch.promote_types(query.dtype, points.dtype), torch.float32)
+    return query.to(common), points.to(common)
+
+
+def _choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
+    on_cpu = query.device.type == "cpu"
+    if backend == "auto":
+        backend = "kdtree" if on_cpu and len(query) * len(points) > CROSSOVER_PAIRS else "cdist"
+    if backend not in BACKENDS:
+        raise ValueError(f"backend: one of {', '.join(['auto', *BACKENDS])} is needed; got {backend!r}")
+    if backend == "kdtree" and not on_cpu:
+        raise ValueError(f"backend 'kdtree' runs on the CPU; the clouds are on {query.device}: use 'cdist' or 'auto'")
+    search: Search = import_module(BACKENDS[backend]).search
+    return search
+
+
+def _rescale(query: Tensor, points: Tensor, max_distance: float) -> tuple[Tensor, Tensor, float]:
+    """Scale by a power of two (exactly) where squares of coordinates would overflow or vanish in the search."""
+    largest = float(max(query.detach().abs().amax(), points.detach().abs().amax()))
+    limit = float(torch.finfo(query.dtype).max) ** 0.25
+    if largest == 0.0 or 1 / limit < largest < limit:
+        return query.detach(), points.detach(), max_distance
+    scale = -math.frexp(largest)[1]
+    # Two steps: 2^scale itself may lie outside the type's range when the coordinates are subnormal.
+    half = 2.0 ** (scale // 2)
+    rest = 2.0 ** (scale - scale // 2)
+    return query.detach() * half * rest, points.detach() * half * rest, max_distance * half * rest
+
+
+def _distance_to(query: Tensor, points: Tensor, index: Tensor, max_distance: float) -> Nearest:
+    """Measure from the differences, in float64; mask what is out of reach."""
+    found = index >= 0
+    if len(points) == 0:
+        distance = query.new_full((len(query),), math.inf)
+        return Nearest(distance, index)
+    difference = query.double() - points.index_select(0, index.clamp(min=0)).double()
+    distance = _norm(difference).to(query.dtype)
+    within = found & (distance.detach() <= max_distance)
+    return Nearest(distance.where(within, math.inf), index.where(within, -1))
+
+
+def _norm(difference: Tensor) -> Tensor:
+    """Euclidean norm of (N, 3) float64 rows, without overflow, with gradient 0 at 0."""
+    largest = difference.detach().abs().amax() if difference.numel() else difference.new_zeros(())
+    # Squares of float32 differences always fit float64; only float64 input can need the scaling.
+    scale = largest if not 1e-140 < largest < 1e140 and largest > 0 else torch.ones_like(largest)
+    squared = (difference / scale).square().sum(dim=1)
+    positive = squared > 0
+    return torch.where(positive, squared.where(positive, 1.0).sqrt(), 0.0) * scale
