@@ -1,1 +1,1 @@
-"""To be."""
+"""The command line. Imports late, so that `--help` answers at once."""

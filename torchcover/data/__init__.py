@@ -1,1 +1,16 @@
-"""To be."""
+"""Datasets of frames: simulated worlds, recordings, and the readers of cloud files."""
+
+from torchcover.data.clouds import read_cloud
+from torchcover.data.frame import Frame, FrameBatch, collate_frames
+from torchcover.data.recorded import BadFrameError, RecordedFrames
+from torchcover.data.simulated import SimulatedFrames
+
+__all__ = [
+    "BadFrameError",
+    "Frame",
+    "FrameBatch",
+    "RecordedFrames",
+    "SimulatedFrames",
+    "collate_frames",
+    "read_cloud",
+]

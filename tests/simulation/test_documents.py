@@ -1,0 +1,137 @@
+"""YAML documents: what is wrong is said in one line that names the file and the key."""
+
+import numpy as np
+import pytest
+
+from torchcover import Rig, Scenario
+from torchcover.simulation import Pose, builtin_names
+
+RIG = """
+name: r
+sensors:
+  - type: lidar
+    name: top
+    mount: {x_m: 1.0, z_m: 2.0}
+    channels: 4
+    vertical_fov_deg: [-10, 10]
+    horizontal_fov_deg: 360
+    columns: 8
+    max_range_m: 50
+"""
+SCENARIO = """
+name: s
+ego: {shape: {type: box, size_m: [4, 2, 1.5]}}
+bodies:
+  - {name: ground, shape: {type: plane, size_m: [100, 100]}}
+"""
+
+
+def write(folder, content, name="doc.yaml"):
+    path = folder / name
+    path.write_text(content)
+    return path
+
+
+def test_a_rig_is_read(tmp_path):
+    rig = Rig.load(write(tmp_path, RIG))
+    assert rig.sensors[0].mount.matrix()[:3, 3].tolist() == [1.0, 0.0, 2.0]
+
+
+def test_a_scenario_is_read_and_mesh_paths_are_relative_to_it(tmp_path):
+    content = SCENARIO + "  - {name: m, shape: {type: mesh, path: parts/m.stl}}\n"
+    scenario = Scenario.load(str(write(tmp_path, content)))
+    assert scenario.bodies[1].shape.path == tmp_path / "parts" / "m.stl"
+
+
+@pytest.mark.parametrize("kind", ["rigs", "scenarios", "vehicles"])
+def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
+    from torchcover.simulation.bodies import Vehicle
+    from torchcover.simulation.documents import load_document
+
+    model = {"rigs": Rig, "scenarios": Scenario, "vehicles": Vehicle}[kind]
+    names = builtin_names(kind)
+    assert names
+    for name in names:
+        document = load_document(model, kind, name)
+        assert document.name == name
+        assert document.description
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("columns: 8", "colums: 8", r"sensors\.0\.columns: Field required; sensors\.0\.colums: Extra inputs"),
+        ("columns: 8", "columns: 0", r"sensors\.0\.columns: .*greater than 0 \(got 0\)"),
+        ("columns: 8", "columns: many", r"sensors\.0\.columns: .*integer.*got 'many'"),
+        ("x_m: 1.0", "x: 1.0", r"sensors\.0\.mount\.x: Extra inputs"),
+        ("x_m: 1.0", "x_m: .nan", r"sensors\.0\.mount\.x_m: .*finite"),
+        ("x_m: 1.0", "x_m: .inf", r"sensors\.0\.mount\.x_m: .*finite"),
+        ("x_m: 1.0", "quaternion_wxyz: [0, 0, 0, 0]", r"sensors\.0\.mount: a quaternion of norm 0"),
+        ("x_m: 1.0", "yaw_deg: 3, quaternion_wxyz: [1, 0, 0, 0]", "quaternion or as yaw, pitch and roll, not both"),
+        ("channels: 4", "channels: 4\n    elevations_deg: [1, 2]", "not both"),
+        ("    channels: 4\n", "", "rows are missing"),
+        ("[-10, 10]", "[10, -10]", "lower elevation comes first"),
+        ("[-10, 10]", "[-100, 10]", r"vertical_fov_deg\.0: .*-90"),
+        ("horizontal_fov_deg: 360", "horizontal_fov_deg: 361", "less than or equal to 360"),
+        ("max_range_m: 50", "max_range_m: 50\n    min_range_m: 60", r"min_range_m \(60\.0\) must be below"),
+        ("columns: 8", "columns: 8\n    azimuth_offsets_deg: [1, 2]", "one for each of the 4 rows is needed; got 2"),
+        ("  - type: lidar", "  - type: radar", r"sensors\.0\.type"),
+        ("name: r\n", "", "name: Field required"),
+    ],
+)
+def test_a_wrong_rig_names_file_and_key(tmp_path, old, new, message):
+    assert old in RIG
+    path = write(tmp_path, RIG.replace(old, new))
+    with pytest.raises(ValueError, match=message) as caught:
+        Rig.load(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_sensors_need_different_names(tmp_path):
+    twice = RIG + RIG.split("sensors:\n")[1]
+    with pytest.raises(ValueError, match="sensors need different names; got top, top"):
+        Rig.load(write(tmp_path, twice))
+
+
+def test_a_rig_needs_a_sensor(tmp_path):
+    with pytest.raises(ValueError, match="sensors: .*at least 1"):
+        Rig.load(write(tmp_path, "name: r\nsensors: []"))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("- a\n- b", "mapping of keys is needed; got list"), ("", "got NoneType"), ("a: [1", "not a YAML file")],
+)
+def test_what_is_not_a_document_is_refused(tmp_path, content, message):
+    with pytest.raises(ValueError, match=rf"doc\.yaml: .*{message}"):
+        Rig.load(write(tmp_path, content))
+
+
+def test_a_binary_file_is_refused(tmp_path):
+    path = tmp_path / "doc.yaml"
+    path.write_bytes(bytes(range(256)))
+    with pytest.raises(ValueError, match="not a YAML file"):
+        Scenario.load(path)
+
+
+def test_an_unknown_shape_lists_the_known_ones(tmp_path):
+    with pytest.raises(ValueError, match=r"bodies\.0\.shape: .*'plane', 'box', 'frustum', 'cylinder', 'mesh'"):
+        Scenario.load(write(tmp_path, SCENARIO.replace("type: plane", "type: torus")))
+
+
+@pytest.mark.parametrize("name", ["no_such_rig", "../rigs/front_roof_128", ""])
+def test_an_unknown_name_lists_the_built_in_ones(name):
+    with pytest.raises(FileNotFoundError, match="neither a .yaml file nor one of the built-in rigs: .*front_roof_128"):
+        Rig.load(name)
+
+
+def test_a_missing_file_is_named():
+    with pytest.raises(FileNotFoundError, match=r"none\.yaml: no such file"):
+        Rig.load("none.yaml")
+
+
+def test_a_quaternion_and_angles_describe_the_same_pose():
+    half = np.deg2rad(30.0) / 2
+    by_quaternion = Pose(quaternion_wxyz=(2 * np.cos(half), 0.0, 0.0, 2 * np.sin(half)))
+    np.testing.assert_allclose(by_quaternion.matrix(), Pose(yaw_deg=30.0).matrix(), atol=1e-15)

@@ -1,0 +1,116 @@
+"""Where the rays of the LiDAR and of the reference sensor point."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchcover.geometry import Box
+from torchcover.simulation import Lidar, ReferenceSensor
+
+EGO = Box((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
+
+
+def lidar(**changes):
+    content = {
+        "name": "l",
+        "channels": 5,
+        "vertical_fov_deg": (-20, 10),
+        "horizontal_fov_deg": 90,
+        "columns": 6,
+        "max_range_m": 9,
+    }
+    return Lidar(**{**content, **changes})
+
+
+def angles(directions):
+    x, y, z = directions.astype(np.float64)
+    return np.rad2deg(np.arcsin(z)), np.rad2deg(np.arctan2(y, x))
+
+
+def test_rows_span_the_vertical_field_of_view_and_columns_the_middles_of_equal_sectors():
+    elevation, azimuth = angles(lidar().directions())
+    np.testing.assert_allclose(elevation.reshape(5, 6)[:, 0], [-20, -12.5, -5, 2.5, 10], atol=1e-5)
+    np.testing.assert_allclose(azimuth.reshape(5, 6)[2], [-37.5, -22.5, -7.5, 7.5, 22.5, 37.5], atol=1e-5)
+
+
+def test_a_full_turn_has_no_ray_twice():
+    _, azimuth = angles(lidar(horizontal_fov_deg=360, columns=8, channels=1, vertical_fov_deg=(0, 0)).directions())
+    np.testing.assert_allclose(np.diff(np.sort(azimuth)), 45.0, atol=1e-4)
+
+
+def test_a_table_of_rows_with_offsets_is_taken_as_it_is():
+    table = lidar(
+        channels=None, vertical_fov_deg=None, elevations_deg=(5, -3, 1), azimuth_offsets_deg=(0, 2, -4), columns=1
+    )
+    elevation, azimuth = angles(table.directions())
+    np.testing.assert_allclose(elevation, [5, -3, 1], atol=1e-5)
+    np.testing.assert_allclose(azimuth, [0, 2, -4], atol=1e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(1, 40), st.integers(1, 40), st.floats(0.1, 360))
+def test_directions_have_length_one(channels, columns, fov):
+    directions = lidar(channels=channels, columns=columns, horizontal_fov_deg=fov).directions()
+    assert directions.shape == (3, channels * columns)
+    assert directions.dtype == np.float32
+    np.testing.assert_allclose(np.linalg.norm(directions.astype(np.float64), axis=0), 1.0, atol=2e-7)
+
+
+def test_the_reference_sensor_covers_the_lower_hemisphere_evenly_in_angle():
+    elevation, azimuth = angles(ReferenceSensor(rows=91, columns=36).directions)
+    np.testing.assert_allclose(elevation.reshape(91, 36)[:, 3], np.arange(0, -91, -1), atol=0.03)
+    np.testing.assert_allclose(np.sort(azimuth.reshape(91, 36)[0] % 360), np.arange(0, 360, 10), atol=1e-4)
+
+
+def test_the_default_is_the_papers():
+    sensor = ReferenceSensor()
+    assert (sensor.rows, sensor.columns, sensor.shell_m, sensor.max_tilt_deg) == (1024, 1024, 0.5, 45.0)
+
+
+def poses(count, sensor=ReferenceSensor(rows=1, columns=1)):
+    generator = np.random.default_rng(7)
+    return np.stack([sensor.vehicle_T_reference(EGO, generator) for _ in range(count)])
+
+
+def test_positions_are_uniform_in_the_shell_beside_and_above_the_ego():
+    position = poses(4000)[:, :3, 3]
+    lower, upper = np.array(EGO.lower_m), np.array(EGO.upper_m)
+    assert (position >= lower - [0.5, 0.5, 0]).all()
+    assert (position <= upper + 0.5).all()
+    inside = ((position > lower) & (position < upper)).all(axis=1)
+    assert not inside.any()
+    shell = np.prod(upper - lower + [1, 1, 0.5]) - np.prod(upper - lower)
+    above = np.prod((upper - lower)[:2] + 1) * 0.5 / shell
+    share = (position[:, 2] > upper[2]).mean()
+    assert abs(share - above) < 4 * np.sqrt(above * (1 - above) / 4000)
+    in_front = (upper - lower + [0, 1, 0.5])[1:].prod() * 0.5 / shell
+    share = (position[:, 0] > upper[0]).mean()
+    assert abs(share - in_front) < 4 * np.sqrt(in_front * (1 - in_front) / 4000)
+
+
+def test_yaw_pitch_and_roll_are_uniform_in_their_ranges():
+    rotation = poses(4000)[:, :3, :3]
+    yaw = np.rad2deg(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
+    pitch = np.rad2deg(np.arcsin(-rotation[:, 2, 0]))
+    roll = np.rad2deg(np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2]))
+    for angle, bound in ((yaw, 180), (pitch, 45), (roll, 45)):
+        assert np.abs(angle).max() <= bound + 1e-9
+        # Mean 0 and standard deviation bound / sqrt(3), to four standard errors.
+        assert abs(angle.mean()) < 4 * bound / np.sqrt(3 * 4000)
+        assert angle.std() == pytest.approx(bound / np.sqrt(3), rel=0.04)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"rows": 0}, "needs rows and columns; got 0 x 1024"),
+        ({"columns": -1}, "got 1024 x -1"),
+        ({"shell_m": 0.0}, "shell_m: a positive thickness"),
+        ({"shell_m": float("nan")}, "shell_m: a positive thickness"),
+        ({"max_tilt_deg": 91.0}, "angle from 0 to 90"),
+    ],
+)
+def test_an_impossible_reference_sensor_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        ReferenceSensor(**changes)

@@ -1,0 +1,115 @@
+"""Shapes are closed, face outwards, and have the volume of their formula."""
+
+import numpy as np
+import pytest
+
+from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, in_vehicle_frame
+from torchcover.simulation.documents import Pose, load_document
+from torchcover.simulation.shapes import Box, Cylinder, Frustum, MeshFile, Plane
+
+TETRAHEDRON = """ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+element face 4
+property list uchar int vertex_indices
+end_header
+0 0 0
+1000 0 0
+0 1000 0
+0 0 1000
+3 0 2 1
+3 0 1 3
+3 0 3 2
+3 1 2 3
+"""
+
+
+def signed_volume(mesh):
+    a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+def edge_counts(mesh):
+    """How often each directed edge occurs; in a closed, consistently turned mesh each has exactly one opposite."""
+    directed = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
+    forward = {tuple(edge) for edge in directed.tolist()}
+    return len(directed), len(forward), forward == {(b, a) for a, b in forward}
+
+
+@pytest.mark.parametrize(
+    ("shape", "volume"),
+    [
+        (Box(type="box", size_m=(2, 3, 4)), 24.0),
+        (Frustum(type="frustum", bottom_m=(2, 3), top_m=(2, 3), height_m=4, top_shift_m=1), 24.0),
+        # Integral of (4 - 2t)(2 - t) over the height of 3.
+        (Frustum(type="frustum", bottom_m=(4, 2), top_m=(2, 1), height_m=3), 3 * 2 * (4 - 4 / 2 + 1 / 3)),
+        (Cylinder(type="cylinder", radius_m=2, height_m=5), 5 * 0.5 * 24 * 4 * np.sin(2 * np.pi / 24)),
+    ],
+)
+def test_solids_are_closed_face_outwards_and_have_their_volume(shape, volume):
+    mesh = shape.mesh()
+    edges, distinct, paired = edge_counts(mesh)
+    assert edges == distinct
+    assert paired
+    assert signed_volume(mesh) == pytest.approx(volume, rel=1e-12)
+    assert mesh.vertices_m[:, 2].min() == 0.0
+
+
+def test_a_plane_is_flat_and_centred():
+    mesh = Plane(type="plane", size_m=(4, 2)).mesh()
+    np.testing.assert_array_equal(mesh.vertices_m.min(0), [-2, -1, 0])
+    np.testing.assert_array_equal(mesh.vertices_m.max(0), [2, 1, 0])
+
+
+def test_a_body_has_one_copy_for_each_pose():
+    body = Body(name="b", shape=Box(type="box", size_m=(1, 1, 1)), poses=(Pose(x_m=5), Pose(y_m=-3, z_m=2)))
+    first, second = body.meshes()
+    np.testing.assert_allclose(first.vertices_m.mean(0), [5, 0, 0.5])
+    np.testing.assert_allclose(second.vertices_m.mean(0), [0, -3, 2.5])
+
+
+def test_mesh_files_are_scaled_to_metres(tmp_path):
+    path = tmp_path / "t.ply"
+    path.write_text(TETRAHEDRON)
+    mesh = MeshFile(type="mesh", path=path, metres_per_unit=0.001).mesh()
+    assert signed_volume(mesh) == pytest.approx(1 / 6)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (TETRAHEDRON.replace("1000 0 0", "nan 0 0"), r"1 of 4 vertices are NaN"),
+        (TETRAHEDRON.split("3 0 2 1")[0].replace("face 4", "face 0"), "no face"),
+        ("not a mesh at all", "cannot read it"),
+        ("", "cannot read it"),
+    ],
+)
+def test_unusable_mesh_files_are_named(tmp_path, content, message):
+    path = tmp_path / "bad.ply"
+    path.write_text(content)
+    with pytest.raises(ValueError, match=rf"bad\.ply: .*{message}"):
+        MeshFile(type="mesh", path=path).mesh()
+
+
+def test_a_missing_mesh_file_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.stl: no such mesh file"):
+        MeshFile(type="mesh", path=tmp_path / "none.stl").mesh()
+
+
+def test_a_vehicle_frame_lies_on_the_ground_under_the_centre():
+    moved = Box(type="box", size_m=(4, 2, 1)).mesh().moved(Pose(x_m=7, y_m=-2, z_m=3).matrix())
+    mesh = in_vehicle_frame(moved)
+    np.testing.assert_allclose(mesh.vertices_m.min(0), [-2, -1, 0], atol=1e-12)
+    np.testing.assert_allclose(mesh.vertices_m.max(0), [2, 1, 1], atol=1e-12)
+
+
+def test_the_built_in_vehicle_has_the_size_of_the_papers_ego_and_closed_parts():
+    mesh = VehicleShape(type="vehicle", vehicle="suv").mesh()
+    np.testing.assert_allclose(np.ptp(mesh.vertices_m, axis=0), [4.90, 1.94, 1.63], atol=1e-9)
+    for part in load_document(Vehicle, "vehicles", "suv").parts:
+        for copy in part.meshes():
+            assert signed_volume(copy) > 0
+            assert edge_counts(copy)[2]

@@ -1,0 +1,98 @@
+"""LiDAR: a table of rows, turned through its columns."""
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from torchcover.simulation.documents import Document, Pose
+
+Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
+
+
+class Lidar(Document):
+    """A scanning LiDAR. Its frame is x forward, y left, z up.
+
+    The ray of row i in column j points to elevation `E[i]` and azimuth `A[j] + D[i]`, where the rows' elevations E are
+    a table or evenly spaced over the field of view, both ends included; the columns' azimuths A are evenly spaced over
+    the field of view, in the middle of `columns` equal sectors; and D are offsets of the rows.
+
+    Args:
+        name: What maps and messages call it.
+        mount: `vehicle_T_lidar`.
+        channels: Number of rows, when they are evenly spaced.
+        vertical_fov_deg: Lowest and highest elevation of evenly spaced rows.
+        elevations_deg: Elevation of each row instead, in any order.
+        azimuth_offsets_deg: Offset of each row; positive is left. None if not given.
+        horizontal_fov_deg: Field of view about the x axis, 360 for a full turn.
+        columns: Number of columns.
+        min_range_m: Closer hits give no point.
+        max_range_m: Farther hits give no point.
+
+    Example:
+        >>> lidar = Lidar(
+        ...     name="front", channels=3, vertical_fov_deg=(-10, 10), columns=360, horizontal_fov_deg=360, max_range_m=100
+        ... )
+        >>> lidar.directions().shape
+        (3, 1080)
+    """
+
+    type: Literal["lidar"] = "lidar"
+    name: str
+    mount: Pose = Pose()
+    channels: PositiveInt | None = None
+    vertical_fov_deg: tuple[Elevation, Elevation] | None = None
+    elevations_deg: tuple[Elevation, ...] | None = Field(default=None, min_length=1)
+    azimuth_offsets_deg: tuple[float, ...] | None = None
+    horizontal_fov_deg: Annotated[float, Field(gt=0.0, le=360.0)]
+    columns: PositiveInt
+    min_range_m: NonNegativeFloat = 0.0
+    max_range_m: PositiveFloat
+
+    @model_validator(mode="after")
+    def _check_rows(self) -> Self:
+        spaced = (self.channels is not None, self.vertical_fov_deg is not None)
+        if self.elevations_deg is not None and any(spaced):
+            raise ValueError("give the rows as elevations_deg, or as channels and vertical_fov_deg, not both")
+        if self.elevations_deg is None and not all(spaced):
+            raise ValueError("the rows are missing: give channels and vertical_fov_deg, or elevations_deg")
+        if self.vertical_fov_deg is not None and self.vertical_fov_deg[0] > self.vertical_fov_deg[1]:
+            raise ValueError(f"vertical_fov_deg: the lower elevation comes first; got {self.vertical_fov_deg}")
+        rows, offsets = len(self.rows_deg()), self.azimuth_offsets_deg
+        if offsets is not None and len(offsets) != rows:
+            raise ValueError(f"azimuth_offsets_deg: one for each of the {rows} rows is needed; got {len(offsets)}")
+        if self.min_range_m >= self.max_range_m:
+            raise ValueError(f"min_range_m ({self.min_range_m}) must be below max_range_m ({self.max_range_m})")
+        return self
+
+    def rows_deg(self) -> NDArray[np.float64]:
+        """(rows,) elevation of each row."""
+        if self.elevations_deg is not None:
+            return np.array(self.elevations_deg)
+        assert self.channels is not None  # checked in _check_rows
+        assert self.vertical_fov_deg is not None
+        return np.linspace(*self.vertical_fov_deg, self.channels)
+
+    def directions(self) -> NDArray[np.float32]:
+        """(3, rows * columns) unit directions in the LiDAR's frame, row by row."""
+        middle = (np.arange(self.columns) + 0.5) / self.columns - 0.5
+        offsets = np.zeros(len(self.rows_deg())) if self.azimuth_offsets_deg is None else self.azimuth_offsets_deg
+        azimuths_deg = np.add.outer(offsets, self.horizontal_fov_deg * middle)
+        return unit_directions(self.rows_deg()[:, None], azimuths_deg)
+
+
+def unit_directions(elevation_deg: NDArray[np.float64], azimuth_deg: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Directions from angles that broadcast to (rows, columns).
+
+    Args:
+        elevation_deg: Angle above the x-y plane.
+        azimuth_deg: Angle from x towards y.
+
+    Returns:
+        (3, rows * columns) float32 unit vectors.
+    """
+    elevation, azimuth = np.deg2rad(elevation_deg), np.deg2rad(azimuth_deg)
+    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+    z = np.broadcast_to(np.sin(elevation), x.shape)
+    return np.stack([x.ravel(), y.ravel(), z.ravel()]).astype(np.float32)

@@ -1,0 +1,78 @@
+"""The random reference sensor: a best case to compare a rig with."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import Box, rigid, rotation_from_euler
+from torchcover.simulation.lidar import unit_directions
+
+
+@dataclass(frozen=True)
+class ReferenceSensor:
+    """The paper's reference sensor: rays over the lower hemisphere, from a new pose at every step.
+
+    The position is uniform in the shell between the ego's bounding box and that box grown sideways and upwards, yaw
+    is uniform in +-180 degrees, pitch and roll in +-`max_tilt_deg`. Rows are evenly spaced over elevations 0 to -90
+    degrees, both ends included (Uecker & Zöllner 2024, section III).
+
+    Args:
+        rows: Number of elevations.
+        columns: Number of azimuths over 360 degrees.
+        shell_m: Thickness of the shell.
+        max_tilt_deg: Bound of pitch and roll.
+
+    Raises:
+        ValueError: A number of rows or columns below 1, a shell without thickness, a tilt outside 0 to 90 degrees.
+
+    Example:
+        >>> sensor = ReferenceSensor(rows=4, columns=8)
+        >>> ego = Box((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6))
+        >>> sensor.vehicle_T_reference(ego, np.random.default_rng(0)).shape
+        (4, 4)
+    """
+
+    rows: int = 1024
+    columns: int = 1024
+    shell_m: float = 0.5
+    max_tilt_deg: float = 45.0
+
+    def __post_init__(self) -> None:
+        if self.rows < 1 or self.columns < 1:
+            raise ValueError(f"the reference sensor needs rows and columns; got {self.rows} x {self.columns}")
+        if not self.shell_m > 0:
+            raise ValueError(f"shell_m: a positive thickness in metres is needed; got {self.shell_m}")
+        if not 0 <= self.max_tilt_deg <= 90:
+            raise ValueError(f"max_tilt_deg: an angle from 0 to 90 is needed; got {self.max_tilt_deg}")
+
+    @cached_property
+    def directions(self) -> NDArray[np.float32]:
+        """(3, rows * columns) unit directions in the sensor's frame."""
+        elevation = np.linspace(0.0, -90.0, self.rows)
+        azimuth = 360.0 * np.arange(self.columns) / self.columns
+        return unit_directions(elevation[:, None], azimuth[None, :])
+
+    def vehicle_T_reference(self, ego: Box, generator: np.random.Generator) -> NDArray[np.float64]:
+        """Draw the pose of one step.
+
+        Args:
+            ego: Bounding box of the ego in the vehicle frame.
+            generator: Source of the random numbers.
+
+        Returns:
+            (4, 4) transform.
+        """
+        yaw = generator.uniform(-180.0, 180.0)
+        pitch, roll = generator.uniform(-self.max_tilt_deg, self.max_tilt_deg, size=2)
+        return rigid(rotation_from_euler(yaw, pitch, roll), self._position_in_shell(ego, generator))
+
+    def _position_in_shell(self, ego: Box, generator: np.random.Generator) -> NDArray[np.float64]:
+        lower, upper = np.array(ego.lower_m), np.array(ego.upper_m)
+        outer_lower = lower - [self.shell_m, self.shell_m, 0.0]
+        outer_upper = upper + self.shell_m
+        while True:
+            position = generator.uniform(outer_lower, outer_upper)
+            if ((position < lower) | (position > upper)).any():
+                return position

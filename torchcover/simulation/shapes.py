@@ -1,0 +1,157 @@
+"""Shapes: primitives, and meshes from files."""
+
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import PositiveFloat, field_validator
+
+from torchcover.geometry import transform
+from torchcover.simulation.documents import Document, beside
+
+CYLINDER_SIDES = 24
+
+Length = PositiveFloat
+
+
+class Mesh(NamedTuple):
+    """A triangle mesh: `vertices_m` (V, 3) float64 in metres and `faces` (F, 3) int64 indices into them."""
+
+    vertices_m: NDArray[np.float64]
+    faces: NDArray[np.int64]
+
+    def moved(self, destination_T_source: NDArray[np.float64]) -> "Mesh":
+        """The mesh in another frame."""
+        return Mesh(transform(destination_T_source, self.vertices_m), self.faces)
+
+
+class Plane(Document):
+    """A flat rectangle at z = 0, seen from both sides.
+
+    Args:
+        size_m: Extent along x and y.
+    """
+
+    type: Literal["plane"]
+    size_m: tuple[Length, Length]
+
+    def mesh(self) -> Mesh:
+        """Two triangles, centred."""
+        return Mesh(_rectangle(self.size_m, 0.0), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+class Box(Document):
+    """A box that stands on z = 0.
+
+    Args:
+        size_m: Extent along x, y, z.
+    """
+
+    type: Literal["box"]
+    size_m: tuple[Length, Length, Length]
+
+    def mesh(self) -> Mesh:
+        """Twelve triangles; x and y centred, z from 0."""
+        length, width, height = self.size_m
+        return _prism(_rectangle((length, width), 0.0), _rectangle((length, width), height))
+
+
+class Frustum(Document):
+    """A body between two rectangles, such as a tapered cabin; stands on z = 0.
+
+    Args:
+        bottom_m: Extent along x and y at the bottom.
+        top_m: Extent along x and y at the top.
+        height_m: Extent along z.
+        top_shift_m: How far the top's centre lies forward of the bottom's.
+    """
+
+    type: Literal["frustum"]
+    bottom_m: tuple[Length, Length]
+    top_m: tuple[Length, Length]
+    height_m: Length
+    top_shift_m: float = 0.0
+
+    def mesh(self) -> Mesh:
+        """Twelve triangles."""
+        top = _rectangle(self.top_m, self.height_m) + [self.top_shift_m, 0.0, 0.0]
+        return _prism(_rectangle(self.bottom_m, 0.0), top)
+
+
+class Cylinder(Document):
+    """An upright cylinder that stands on z = 0, as a prism with 24 sides whose edges lie on the circle.
+
+    Args:
+        radius_m: Radius.
+        height_m: Extent along z.
+    """
+
+    type: Literal["cylinder"]
+    radius_m: Length
+    height_m: Length
+
+    def mesh(self) -> Mesh:
+        """A closed prism."""
+        angle = 2 * np.pi * np.arange(CYLINDER_SIDES) / CYLINDER_SIDES
+        bottom = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1) * self.radius_m
+        return _prism(bottom, bottom + [0.0, 0.0, self.height_m])
+
+
+class MeshFile(Document):
+    """A mesh from any file that trimesh loads (PLY, OBJ, STL, GLB, OFF, ...).
+
+    Args:
+        path: The file; relative to the document that names it.
+        metres_per_unit: Scale of the file: 1 for metres, 0.001 for millimetres.
+    """
+
+    type: Literal["mesh"]
+    path: Path
+    metres_per_unit: PositiveFloat = 1.0
+
+    _path_beside = field_validator("path")(beside)
+
+    def mesh(self) -> Mesh:
+        """All geometry of the file in one mesh.
+
+        Raises:
+            FileNotFoundError: No such file.
+            ValueError: trimesh cannot read it, it has no faces, or a vertex is NaN or infinite.
+        """
+        import trimesh
+
+        if not self.path.is_file():
+            raise FileNotFoundError(f"{self.path}: no such mesh file")
+        try:
+            loaded = trimesh.load_mesh(self.path, process=False)
+        except Exception as error:  # trimesh raises whatever the reader of the format raises
+            raise ValueError(f"{self.path}: trimesh cannot read it as a mesh ({error})") from error
+        vertices = np.asarray(getattr(loaded, "vertices", ()), dtype=np.float64)
+        faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64)
+        if len(faces) == 0:
+            raise ValueError(f"{self.path}: a mesh with faces is needed; it has {len(vertices)} vertices and no face")
+        if not np.isfinite(vertices).all():
+            bad = int((~np.isfinite(vertices)).any(axis=1).sum())
+            raise ValueError(f"{self.path}: {bad} of {len(vertices)} vertices are NaN or infinite")
+        return Mesh(vertices * self.metres_per_unit, faces)
+
+
+def _rectangle(size_m: tuple[float, float], z_m: float) -> NDArray[np.float64]:
+    x, y = size_m[0] / 2, size_m[1] / 2
+    return np.array([[-x, -y, z_m], [x, -y, z_m], [x, y, z_m], [-x, y, z_m]])
+
+
+def _prism(bottom: NDArray[np.float64], top: NDArray[np.float64]) -> Mesh:
+    """Close the space between two convex polygons with K corners each, given counter-clockwise from above."""
+    corners = len(bottom)
+    here = np.arange(corners)
+    following = (here + 1) % corners
+    sides = np.concatenate(
+        [
+            np.stack([here, following, following + corners], axis=1),
+            np.stack([here, following + corners, here + corners], axis=1),
+        ]
+    )
+    fan = np.stack([np.zeros(corners - 2, dtype=int), here[1:-1], here[2:]], axis=1)
+    return Mesh(np.concatenate([bottom, top]), np.concatenate([sides, fan[:, ::-1], fan + corners]))
