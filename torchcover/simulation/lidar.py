@@ -32,7 +32,7 @@ class Lidar(Document):
 
     Example:
         >>> lidar = Lidar(
-        ...     name="front", channels=3, vertical_fov_deg=(-10, 10), columns=360, horizontal_fov_deg=360, max_range_m=100
+        ...     name="a", channels=3, vertical_fov_deg=(-10, 10), columns=360, horizontal_fov_deg=360, max_range_m=99
         ... )
         >>> lidar.directions().shape
         (3, 1080)

@@ -105,10 +105,10 @@ def _rotate(rotation: Float32, directions: Float32) -> Float32:
     # Written out: the rounding of a matrix product depends on how a BLAS splits it.
     x, y, z = directions
     rotated = np.empty((3, len(x)), dtype=np.float32)
-    for out, (rx, ry, rz) in zip(rotated, rotation, strict=True):
-        np.multiply(x, rx, out=out)
-        out += ry * y
-        out += rz * z
+    for axis, (rx, ry, rz) in enumerate(rotation):
+        np.multiply(x, rx, out=rotated[axis])
+        rotated[axis] += ry * y
+        rotated[axis] += rz * z
     return rotated
 
 

@@ -75,7 +75,7 @@ class Frustum(Document):
 
     def mesh(self) -> Mesh:
         """Twelve triangles."""
-        top = _rectangle(self.top_m, self.height_m) + [self.top_shift_m, 0.0, 0.0]
+        top = _rectangle(self.top_m, self.height_m) + np.array([self.top_shift_m, 0.0, 0.0])
         return _prism(_rectangle(self.bottom_m, 0.0), top)
 
 
@@ -95,7 +95,7 @@ class Cylinder(Document):
         """A closed prism."""
         angle = 2 * np.pi * np.arange(CYLINDER_SIDES) / CYLINDER_SIDES
         bottom = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1) * self.radius_m
-        return _prism(bottom, bottom + [0.0, 0.0, self.height_m])
+        return _prism(bottom, bottom + np.array([0.0, 0.0, self.height_m]))
 
 
 class MeshFile(Document):

@@ -1,0 +1,84 @@
+"""Where a body is at a time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from torchcover.geometry import rigid, rotation_from_euler
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses at times, with straight lines and the shorter turn in between; the body rests before and after.
+
+    Args:
+        times_s: (K,) ascending times in seconds.
+        positions_m: (K, 3) positions in the world frame in metres, float64: they may be of UTM size.
+        angles_deg: (K, 3) yaw, pitch and roll; see `torchcover.geometry.rotation_from_euler`.
+
+    Raises:
+        ValueError: No pose, shapes that do not fit, NaN or infinite numbers, times that do not ascend.
+
+    Example:
+        >>> drive = Trajectory.of(times_s=[0.0, 2.0], positions_m=[[0, 0, 0], [20, 0, 0]], angles_deg=[[0, 0, 0]] * 2)
+        >>> drive.at(0.5)[:3, 3]
+        array([5., 0., 0.])
+    """
+
+    times_s: Matrix
+    positions_m: Matrix
+    angles_deg: Matrix
+
+    def __post_init__(self) -> None:
+        count = len(self.times_s)
+        if count == 0 or self.positions_m.shape != (count, 3) or self.angles_deg.shape != (count, 3):
+            raise ValueError(
+                "a trajectory needs K >= 1 times, (K, 3) positions and (K, 3) angles; got "
+                f"{self.times_s.shape}, {self.positions_m.shape} and {self.angles_deg.shape}"
+            )
+        numbers = np.column_stack([self.times_s, self.positions_m, self.angles_deg])
+        if not np.isfinite(numbers).all():
+            bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
+            raise ValueError(f"a trajectory has NaN or infinite numbers in {len(bad)} of {count} poses, first {bad[0]}")
+        steps = np.diff(self.times_s)
+        if (steps <= 0).any():
+            at = int(np.argmax(steps <= 0))
+            raise ValueError(
+                f"the times of a trajectory must ascend; pose {at + 1} is at {self.times_s[at + 1]:g} s, "
+                f"after {self.times_s[at]:g} s"
+            )
+
+    @classmethod
+    def of(cls, times_s: ArrayLike, positions_m: ArrayLike, angles_deg: ArrayLike) -> "Trajectory":
+        """From anything that NumPy takes."""
+        times, positions, angles = (np.array(a, dtype=np.float64) for a in (times_s, positions_m, angles_deg))
+        return cls(times, positions, angles)
+
+    @classmethod
+    def resting(cls, position_m: ArrayLike, angles_deg: ArrayLike = (0.0, 0.0, 0.0)) -> "Trajectory":
+        """A body that stays where it is."""
+        return cls.of([0.0], [position_m], [angles_deg])
+
+    @property
+    def moves(self) -> bool:
+        """Whether the pose ever changes."""
+        return bool(np.ptp(self.positions_m, axis=0).any() or np.ptp(self.angles_deg, axis=0).any())
+
+    def at(self, time_s: float) -> Matrix:
+        """The (4, 4) pose `world_T_body` at a time."""
+        position, angles = self._interpolate(time_s)
+        return rigid(rotation_from_euler(*angles), position)
+
+    def _interpolate(self, time_s: float) -> tuple[Matrix, Matrix]:
+        after = int(np.searchsorted(self.times_s, time_s, side="right"))
+        if after == 0 or after == len(self.times_s):
+            at = max(after - 1, 0)
+            return self.positions_m[at], self.angles_deg[at]
+        before = after - 1
+        share = (time_s - self.times_s[before]) / (self.times_s[after] - self.times_s[before])
+        turn = (self.angles_deg[after] - self.angles_deg[before] + 180.0) % 360.0 - 180.0
+        way = self.positions_m[after] - self.positions_m[before]
+        return self.positions_m[before] + share * way, self.angles_deg[before] + share * turn

@@ -1,0 +1,43 @@
+"""What a scenario builds: bodies that rest, bodies that move, and the ego."""
+
+from dataclasses import dataclass
+
+from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.trajectory import Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Actor:
+    """A body with a place for every time.
+
+    Args:
+        name: Different for each actor of a world.
+        category: What it is: "car", "truck", "bus", "cyclist", "pedestrian", ...
+        mesh: Its form in its own frame: origin on the ground under the centre of the bounding box, x forward, z up.
+            Actors of one kind share one mesh object.
+        trajectory: `world_T_actor` over time.
+    """
+
+    name: str
+    category: str
+    mesh: Mesh
+    trajectory: Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """Everything there is, over time.
+
+    Args:
+        static: Meshes in the world frame that never move.
+        ego: The vehicle that carries the rig.
+        actors: The others.
+        time_step_s: Time between two frames.
+        duration_s: Time after which the trajectories end.
+    """
+
+    static: tuple[Mesh, ...]
+    ego: Actor
+    actors: tuple[Actor, ...] = ()
+    time_step_s: float = 0.1
+    duration_s: float = 0.0
