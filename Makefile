@@ -23,7 +23,7 @@ doctest: $(VENV)/.ready  ## the examples in the docstrings and in the documentat
 	$(BIN)/python -m pytest --doctest-modules torchcover --doctest-glob='*.md' README.md docs
 
 smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the repository
-	PYTHON="$(PYTHON)" bash benchmarks/../.ci/smoke $(BIN)/python
+	PYTHON="$(PYTHON)" bash .ci/smoke $(BIN)/python
 
 bench: $(VENV)/.ready  ## the speed and memory figures of docs/performance.md
 	$(BIN)/python -m benchmarks

@@ -95,7 +95,7 @@ def test_sensors_need_different_names(tmp_path):
 
 
 def test_a_rig_needs_a_sensor(tmp_path):
-    with pytest.raises(ValueError, match="sensors: .*at least 1"):
+    with pytest.raises(ValueError, match=r"sensors: .*at least 1"):
         Rig.load(write(tmp_path, "name: r\nsensors: []"))
 
 
@@ -122,7 +122,9 @@ def test_an_unknown_shape_lists_the_known_ones(tmp_path):
 
 @pytest.mark.parametrize("name", ["no_such_rig", "../rigs/front_roof_128", ""])
 def test_an_unknown_name_lists_the_built_in_ones(name):
-    with pytest.raises(FileNotFoundError, match="neither a .yaml file nor one of the built-in rigs: .*front_roof_128"):
+    with pytest.raises(
+        FileNotFoundError, match=r"neither a \.yaml file nor one of the built-in rigs: .*front_roof_128"
+    ):
         Rig.load(name)
 
 

@@ -68,7 +68,8 @@ def test_the_default_is_the_papers():
     assert (sensor.rows, sensor.columns, sensor.shell_m, sensor.max_tilt_deg) == (1024, 1024, 0.5, 45.0)
 
 
-def poses(count, sensor=ReferenceSensor(rows=1, columns=1)):
+def poses(count):
+    sensor = ReferenceSensor(rows=1, columns=1)
     generator = np.random.default_rng(7)
     return np.stack([sensor.vehicle_T_reference(EGO, generator) for _ in range(count)])
 

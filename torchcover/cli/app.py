@@ -4,7 +4,6 @@ import sys
 from pathlib import Path
 from typing import Annotated
 
-import click
 import typer
 
 app = typer.Typer(
@@ -15,16 +14,19 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+# What is raised for any mistake in options and arguments. Typer names only descendants of it.
+USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
+
 
 def main() -> None:
     """Run the command line; a user's mistake ends in one line on stderr and exit code 2."""
     try:
         code = typer.main.get_command(app).main(standalone_mode=False)
-    except click.ClickException as error:
-        _fail(error.format_message())
+    except USAGE_ERROR as error:
+        _fail(error.format_message())  # type: ignore[attr-defined]  # the typed name is private
     except (ValueError, TypeError, OSError) as error:
         _fail(str(error))
-    except (KeyboardInterrupt, click.exceptions.Abort):
+    except (KeyboardInterrupt, typer.Abort):
         sys.exit(130)
     sys.exit(code if isinstance(code, int) else 0)
 

@@ -54,13 +54,12 @@ class Trajectory:
     @classmethod
     def of(cls, times_s: ArrayLike, positions_m: ArrayLike, angles_deg: ArrayLike) -> "Trajectory":
         """From anything that NumPy takes."""
-        times, positions, angles = (np.array(a, dtype=np.float64) for a in (times_s, positions_m, angles_deg))
-        return cls(times, positions, angles)
+        return cls(*(np.array(numbers, dtype=np.float64) for numbers in (times_s, positions_m, angles_deg)))
 
     @classmethod
     def resting(cls, position_m: ArrayLike, angles_deg: ArrayLike = (0.0, 0.0, 0.0)) -> "Trajectory":
         """A body that stays where it is."""
-        return cls.of([0.0], [position_m], [angles_deg])
+        return cls.of([0.0], np.array([position_m]), np.array([angles_deg]))
 
     @property
     def moves(self) -> bool:

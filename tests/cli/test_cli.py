@@ -1,0 +1,188 @@
+"""The command line as a user meets it: files that agree with each other, and one line for each mistake."""
+
+import csv
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from torchcover import Coverage
+from torchcover.cli import app
+
+
+@pytest.fixture
+def torchcover(monkeypatch, capsys):
+    """Run the command in this process; returns exit code, stdout, stderr."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["torchcover", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            app.main()
+        captured = capsys.readouterr()
+        return stop.value.code, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Four frames of a line of reference points beside one sensor point."""
+    folder = tmp_path / "recording"
+    for source in ("sensor", "reference"):
+        (folder / source).mkdir(parents=True)
+    line = np.stack([np.arange(0.125, 10.0, 0.25), np.full(40, 0.125), np.zeros(40)], axis=1)
+    for frame in (1, 2, 10, 11):
+        np.save(folder / "sensor" / f"f{frame}.npy", np.array([[0.125, 0.125, 0.0]], dtype=np.float32))
+        np.save(folder / "reference" / f"f{frame}.npy", line.astype(np.float32))
+    return folder
+
+
+def test_a_recording_is_evaluated_and_the_files_agree(torchcover, recording, tmp_path):
+    out = tmp_path / "out"
+    code, printed, _ = torchcover("evaluate", "--frames", recording, "--out", out, "--threshold", 0.4, "--threshold", 1)
+    assert code == 0
+    assert str(out) in printed.replace("\n", "")
+    coverage = Coverage.load(out / "coverage.npz")
+    # Cell k along the line is k cells from the only sensor point.
+    row = coverage.radius[0, 160, 160:200]
+    np.testing.assert_allclose(row, 0.25 * np.arange(40), atol=1e-6)
+    assert coverage.thresholds == (0.4, 1.0)
+    assert coverage.counts["steps"] == 4
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["complete"] is True
+    assert summary["counts"]["steps"] == 4
+    first = coverage.summary()[0]
+    assert summary["rows"][0]["radius_m"] == pytest.approx(first.radius_m)
+    assert summary["rows"][0]["known_cells"] == 40
+    with (out / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 6
+    assert sorted(path.name for path in (out / "maps").iterdir()) == [
+        "detection_0.4m_ground.png",
+        "detection_0.4m_obstacle.png",
+        "detection_1m_ground.png",
+        "detection_1m_obstacle.png",
+        "radius_ground.png",
+        "radius_obstacle.png",
+    ]
+
+
+def test_steps_limits_a_recording(torchcover, recording, tmp_path):
+    assert torchcover("evaluate", "--frames", recording, "--out", tmp_path / "o", "--steps", 3)[0] == 0
+    assert Coverage.load(tmp_path / "o" / "coverage.npz").counts["steps"] == 3
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_a_bad_frame_stops_the_run_by_name_and_what_was_done_is_written(torchcover, recording, tmp_path, workers):
+    (recording / "reference" / "f10.npy").write_bytes(b"rubbish")
+    out = tmp_path / "out"
+    code, _, error = torchcover("evaluate", "--frames", recording, "--out", out, "--workers", workers)
+    assert code == 2
+    assert "torchcover: f10 (frame 2): " in error
+    assert "Traceback" not in error
+    assert Coverage.load(out / "coverage.npz").counts["steps"] == 2
+    assert json.loads((out / "summary.json").read_text())["complete"] is False
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_bad_frames_can_be_skipped_and_are_counted(torchcover, recording, tmp_path, workers):
+    (recording / "reference" / "f10.npy").write_bytes(b"rubbish")
+    out = tmp_path / "out"
+    code, printed, _ = torchcover(
+        "evaluate", "--frames", recording, "--out", out, "--skip-bad-frames", "--workers", workers
+    )
+    assert code == 0
+    assert "skipped: f10" in printed
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["counts"]["steps"] == 3
+    assert len(summary["skipped_frames"]) == 1
+    assert "f10" in summary["skipped_frames"][0]
+
+
+def test_a_recording_of_bad_frames_only_writes_nothing(torchcover, recording, tmp_path):
+    for path in (recording / "sensor").iterdir():
+        path.write_bytes(b"rubbish")
+    code, _, error = torchcover("evaluate", "--frames", recording, "--out", tmp_path / "o", "--skip-bad-frames")
+    assert code == 2
+    assert "no frame could be used" in error
+    assert not (tmp_path / "o").exists()
+
+
+def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
+    (tmp_path / "rig.yaml").write_text(
+        "name: tiny\nsensors:\n  - {name: top, mount: {z_m: 2.0}, channels: 8, vertical_fov_deg: [-30, 0],"
+        " horizontal_fov_deg: 360, columns: 90, max_range_m: 60}\n"
+    )
+    for out in ("a", "b"):
+        assert torchcover("evaluate", tmp_path / "rig.yaml", "--steps", 1, "--cell", 1, "--out", tmp_path / out)[0] == 0
+    a, b = (Coverage.load(tmp_path / out / "coverage.npz") for out in "ab")
+    np.testing.assert_array_equal(a.radius, b.radius)
+    assert a.grid.cell == 1.0
+    assert a.max_radius == pytest.approx(a.grid.diagonal_m)
+    assert 0 < a.summary()[0].known_share <= 1
+    summary = json.loads((tmp_path / "a" / "summary.json").read_text())
+    assert summary["frame_counts"]["reference_rays"] == 1024 * 1024
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["evaluate"], "which rig?"),
+        (["evaluate", "no_such_rig"], "neither a .yaml file nor one of the built-in rigs: front_grille_128"),
+        (["evaluate", "front_roof_128", "--scenario", "moon"], "one of the built-in scenarios: courtyard"),
+        (["evaluate", "none.yaml"], "none.yaml: no such file"),
+        (["evaluate", "--frames", "no_such_folder"], "no_such_folder"),
+        (["evaluate", "front_roof_128", "--scenario", "courtyard", "--frames", "x"], "exclude each other"),
+        (["evaluate", "front_roof_128", "--cell", "0.3"], "not a multiple of the cell of 0.3 m"),
+        (["evaluate", "front_roof_128", "--cell", "-1"], "cell: a positive length"),
+        (["evaluate", "front_roof_128", "--threshold", "-1"], "thresholds: distances >= 0"),
+        (["evaluate", "front_roof_128", "--steps", "0"], "--steps"),
+        (["evaluate", "front_roof_128", "--steps", "many"], "--steps"),
+        (["evaluate", "front_roof_128", "--seed", "-1"], "--seed"),
+        (["evaluate", "front_roof_128", "--device", "abacus"], "--device abacus: cannot be used here"),
+        (["evaluate", "front_roof_128", "--colour"], "No such option: --colour"),
+        (["measure"], "No such command 'measure'"),
+    ],
+)
+def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, arguments, message):
+    code, _, error = torchcover(*arguments)
+    assert code == 2
+    assert message in error
+    assert error.startswith("torchcover: ")
+    assert error.count("\n") == 1
+
+
+def test_an_output_folder_that_cannot_be_made_is_a_mistake_too(torchcover, recording, tmp_path):
+    (tmp_path / "file").write_text("")
+    code, _, error = torchcover("evaluate", "--frames", recording, "--out", tmp_path / "file")
+    assert code == 2
+    assert "file" in error
+
+
+def test_list_names_everything_built_in(torchcover):
+    code, printed, _ = torchcover("list")
+    assert code == 0
+    for name in ("front_roof_128", "front_grille_128", "courtyard"):
+        assert name in printed
+
+
+def test_version_and_help(torchcover):
+    code, printed, _ = torchcover("--version")
+    assert (code, printed.strip()) == (0, "0.1.0")
+    code, printed, _ = torchcover("evaluate", "--help")
+    assert code == 0
+    assert "--skip-bad-frames" in printed
+
+
+def test_help_loads_none_of_the_heavy_libraries():
+    program = (
+        "import sys; sys.argv = ['torchcover', '--help']\n"
+        "from torchcover.cli.app import main\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "print(sorted({'torch', 'numpy', 'matplotlib', 'trimesh', 'embreex', 'pydantic'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip().splitlines()[-1] == "[]"

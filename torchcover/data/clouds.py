@@ -1,0 +1,88 @@
+"""Read one point cloud from one file, whatever its format."""
+
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from torchcover.data.formats.arrays import Points, read_npy, read_npz, read_records
+from torchcover.data.formats.pcd import read_pcd
+from torchcover.data.formats.ply import read_ply
+from torchcover.data.formats.text import read_text
+
+# zipfile and NumPy quote what they choke on, which may be the whole file.
+MAX_REASON_CHARS = 500
+
+# Suffix -> reader. A reader returns (N, 3) float32 or float64 and raises ValueError without naming the file.
+READERS: dict[str, Callable[[Path], Points]] = {
+    ".npy": read_npy,
+    ".npz": read_npz,
+    ".bin": partial(read_records, columns=4),  # KITTI: x y z intensity
+    ".pcd.bin": partial(read_records, columns=5),  # nuScenes: x y z intensity ring; no PCD despite its name
+    ".pcd": read_pcd,
+    ".ply": read_ply,
+    ".csv": read_text,
+    ".xyz": read_text,
+}
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """Split a file name into stem and registered suffix; the suffix is empty where no reader is registered.
+
+    Example:
+        >>> split_name("LIDAR_TOP__15.pcd.bin"), split_name("000007.BIN"), split_name("notes.txt")
+        (('LIDAR_TOP__15', '.pcd.bin'), ('000007', '.bin'), ('notes.txt', ''))
+    """
+    suffix = max((known for known in READERS if name.lower().endswith(known)), key=len, default="")
+    return name[: len(name) - len(suffix)], suffix
+
+
+def read_cloud(path: str | os.PathLike[str]) -> Points:
+    """Read a point cloud; the suffix says how.
+
+    `.npy`; `.npz` (the array `points`, or the only one); `.bin` (KITTI: x y z intensity, float32); `.pcd.bin`
+    (nuScenes: x y z intensity ring, float32); `.pcd` (ascii, binary, binary_compressed); `.ply` (ascii, binary);
+    `.csv` and `.xyz` (commas or white space; a line above the points may name the columns). In a file without names
+    the first three columns are x y z.
+
+    Args:
+        path: The file.
+
+    Returns:
+        (N, 3) points in metres in the file's own frame, non-finite ones included: float64 where the file stores
+        float64 or text, so that UTM-sized coordinates keep their digits, else float32. N may be 0.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        IsADirectoryError: A folder.
+        ValueError: Not a cloud: an unknown suffix, an empty or truncated file, other content than the suffix says, a
+            header that claims more than the file holds, another shape or type, or points of which none is finite.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "frame.xyz")
+        ...     _ = path.write_text("513248.125 5403655.25 12.5")
+        ...     read_cloud(path).tolist()
+        [[513248.125, 5403655.25, 12.5]]
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise IsADirectoryError(f"{path}: a folder; a cloud is one file ({', '.join(READERS)})")
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file")
+    _, suffix = split_name(path.name)
+    if not suffix:
+        raise ValueError(f"{path}: no reader for this suffix; allowed are {', '.join(READERS)}")
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path}: an empty file (0 bytes); a cloud without points needs at least a header")
+    try:
+        points = READERS[suffix](path)
+    except ValueError as error:
+        raise ValueError(f"{path}: {' '.join(str(error).split())[:MAX_REASON_CHARS]}") from error
+    if len(points) and not np.isfinite(points).all(axis=1).any():
+        raise ValueError(f"{path}: none of the {len(points)} points is finite; at least one has to be")
+    # Native byte order, contiguous and the caller's own: readers hand out views of buffers.
+    return np.array(points, dtype=points.dtype.newbyteorder("="), order="C")
