@@ -4,12 +4,15 @@ import numpy as np
 import pytest
 
 from torchcover.geometry import rigid
-from torchcover.simulation.lidar import unit_directions
-from torchcover.simulation.raycaster import CHUNK, RayCaster
+from torchcover.simulation.raycaster import RayCaster
+from torchcover.simulation.rays import unit_directions
 from torchcover.simulation.shapes import Box, Mesh, Plane
 
 HERE = np.zeros(3)
-IDENTITY = np.eye(3)
+
+
+def endless(directions):
+    return np.full(directions.shape[1], np.inf, dtype=np.float32)
 
 
 def random_directions(count, seed=0):
@@ -21,6 +24,10 @@ def random_mesh(faces, seed=0):
     generator = np.random.default_rng(seed)
     places = np.repeat(generator.uniform(-10, 10, size=(faces, 3)), 3, axis=0)
     return Mesh(places + generator.uniform(-2, 2, size=(3 * faces, 3)), np.arange(3 * faces).reshape(-1, 3))
+
+
+def box_at(x, y=0.0, size=1.0):
+    return Box(type="box", size_m=(size, size, size)).mesh().moved(rigid(np.eye(3), [x, y, -size / 2]))
 
 
 def slow_hits(mesh, origin, directions):
@@ -43,102 +50,65 @@ def slow_hits(mesh, origin, directions):
 
 def test_rays_onto_a_plane_end_where_geometry_says():
     elevation = np.linspace(-89.0, -1.0, 45)
-    directions = unit_directions(elevation[:, None], np.linspace(0, 350, 36)[None])
-    hits = RayCaster([Plane(type="plane", size_m=(1000, 1000)).mesh()]).cast(
-        np.array([1.0, 2.0, 1.7]), IDENTITY, directions
-    )
-    assert len(hits.ray) == directions.shape[1]
-    assert np.abs(hits.points[2]).max() < 1e-5
-    ground_range = np.hypot(hits.points[0] - 1.0, hits.points[1] - 2.0)
-    expected = np.repeat(1.7 / np.tan(np.deg2rad(-elevation)), 36)
-    np.testing.assert_allclose(ground_range, expected, rtol=2e-5)
+    directions = unit_directions(elevation[:, None], np.linspace(0, 350, 36)[None]).reshape(3, -1).astype(np.float32)
+    caster = RayCaster([Plane(type="plane", size_m=(1000, 1000)).mesh()])
+    hits = caster.cast(np.array([1.0, 2.0, 1.7]), directions, endless(directions))
+    assert (hits.body == 0).all()
+    np.testing.assert_allclose(hits.range_m, np.repeat(1.7 / np.sin(np.deg2rad(-elevation)), 36), rtol=2e-5)
 
 
 def test_agrees_with_a_slow_intersection_in_float64():
     mesh, directions = random_mesh(200), random_directions(600)
-    hits = RayCaster([mesh]).cast(HERE, IDENTITY, directions)
+    hits = RayCaster([mesh]).cast(HERE, directions, endless(directions))
     expected = slow_hits(mesh, HERE, directions)
-    found = np.full(directions.shape[1], np.inf)
-    found[hits.ray] = np.linalg.norm(hits.points, axis=0)
     # A ray through the very border of a face may go either way in float32.
-    same_verdict = np.isfinite(found) == np.isfinite(expected)
-    assert same_verdict.mean() > 0.995
-    both = np.isfinite(found) & np.isfinite(expected)
-    close = np.abs(found[both] - expected[both]) < 1e-4
-    assert close.mean() > 0.995
+    assert (np.isfinite(hits.range_m) == np.isfinite(expected)).mean() > 0.995
+    assert ((hits.body >= 0) == np.isfinite(hits.range_m)).all()
+    both = np.isfinite(hits.range_m) & np.isfinite(expected)
+    assert (np.abs(hits.range_m[both] - expected[both]) < 1e-4).mean() > 0.995
     assert 0.2 < both.mean() < 1.0
 
 
 def test_no_ray_slips_out_of_a_closed_box_through_its_edges():
     box = Box(type="box", size_m=(4.0, 6.0, 3.0)).mesh()
-    targets = box.vertices_m[box.faces]
+    corners = box.vertices_m[box.faces]
     weights = np.linspace(0, 1, 101)[:, None, None, None]
-    on_edges = (weights * targets[None] + (1 - weights) * targets[None][:, :, [1, 2, 0]]).reshape(-1, 3)
+    on_edges = (weights * corners + (1 - weights) * corners[:, [1, 2, 0]]).reshape(-1, 3)
     origin = np.array([0.3, -0.2, 1.1])
-    directions = (on_edges - origin).T
-    directions = (directions / np.linalg.norm(directions, axis=0)).astype(np.float32)
-    hits = RayCaster([box]).cast(origin, IDENTITY, directions)
-    assert len(hits.ray) == directions.shape[1]
-    np.testing.assert_allclose(hits.points.T, on_edges, atol=1e-5)
+    range_m = np.linalg.norm(on_edges - origin, axis=1)
+    directions = ((on_edges - origin).T / range_m).astype(np.float32)
+    hits = RayCaster([box]).cast(origin, directions, endless(directions))
+    assert (hits.body == 0).all()
+    np.testing.assert_allclose(hits.range_m, range_m, atol=1e-5)
 
 
 def test_hits_name_their_body():
-    bodies = [
-        Box(type="box", size_m=(1, 1, 1)).mesh().moved(rigid(IDENTITY, place))
-        for place in ([5.0, 0.0, -0.5], [0.0, 7.0, -0.5])
-    ]
     directions = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0]], dtype=np.float32).T
-    hits = RayCaster(bodies).cast(HERE, IDENTITY, directions)
-    assert hits.body.tolist() == [0, 1]
-    assert hits.ray.tolist() == [0, 1]
-    np.testing.assert_allclose(hits.points.T, [[4.5, 0, 0], [0, 6.5, 0]], atol=1e-6)
+    hits = RayCaster([box_at(5.0), box_at(0.0, 7.0)]).cast(HERE, directions, endless(directions))
+    assert hits.body.tolist() == [0, 1, -1]
+    np.testing.assert_allclose(hits.range_m, [4.5, 6.5, np.inf])
 
 
-def test_the_rotation_takes_directions_into_the_frame_of_the_bodies():
-    plane = Plane(type="plane", size_m=(100, 100)).mesh()
-    quarter_turn_down = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # x -> -z
-    hits = RayCaster([plane]).cast(
-        np.array([0.0, 0.0, 2.0]), quarter_turn_down, np.array([[1.0], [0.0], [0.0]], dtype=np.float32)
-    )
-    np.testing.assert_allclose(hits.points[:, 0], [0, 0, 0], atol=1e-6)
-
-
-@pytest.mark.parametrize(("near", "far", "expected"), [(0, 10, 1), (0, 4.9, 0), (5.1, 10, 0), (0, 5.0, 1), (5, 10, 1)])
-def test_range_limits(near, far, expected):
-    wall = Box(type="box", size_m=(2, 2, 2)).mesh().moved(rigid(IDENTITY, [6.0, 0.0, -1.0]))
+@pytest.mark.parametrize(("limit", "body", "range_m"), [(4.4, -1, 4.4), (4.6, 0, 4.5), (np.inf, 0, 4.5)])
+def test_a_ray_ends_at_its_limit(limit, body, range_m):
     ray = np.array([[1.0], [0.0], [0.0]], dtype=np.float32)
-    assert len(RayCaster([wall]).cast(HERE, IDENTITY, ray, min_range_m=near, max_range_m=far).ray) == expected
-
-
-def test_a_hit_that_is_too_close_hides_what_lies_behind():
-    walls = [Box(type="box", size_m=(1, 2, 2)).mesh().moved(rigid(IDENTITY, [x, 0.0, -1.0])) for x in (1.0, 9.0)]
-    ray = np.array([[1.0], [0.0], [0.0]], dtype=np.float32)
-    assert len(RayCaster(walls).cast(HERE, IDENTITY, ray, min_range_m=2.0).ray) == 0
-
-
-def test_the_result_does_not_depend_on_threads():
-    caster, directions = RayCaster([random_mesh(500)]), random_directions(3 * CHUNK + 17)
-    one = caster.cast(HERE, IDENTITY, directions, threads=1)
-    many = caster.cast(HERE, IDENTITY, directions, threads=5)
-    for a, b in zip(one, many, strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert one.ray[-1] > 3 * CHUNK  # the last, short chunk took part
-    assert (np.diff(one.ray) > 0).all()
+    hits = RayCaster([box_at(5.0)]).cast(HERE, ray, np.array([limit], dtype=np.float32))
+    assert hits.body.tolist() == [body]
+    np.testing.assert_allclose(hits.range_m, [range_m], rtol=1e-6)
 
 
 def test_the_arguments_are_left_alone():
     caster, directions, origin = RayCaster([random_mesh(50)]), random_directions(100), np.ones(3)
-    before = directions.copy()
-    caster.cast(origin, IDENTITY, directions, max_range_m=5.0)
+    before, limit = directions.copy(), endless(directions)
+    caster.cast(origin, directions, limit)
     np.testing.assert_array_equal(directions, before)
     np.testing.assert_array_equal(origin, np.ones(3))
+    assert np.isinf(limit).all()
 
 
-def test_no_rays_and_no_hits_are_empty_results():
-    caster = RayCaster([random_mesh(5)])
-    assert caster.cast(HERE, IDENTITY, np.empty((3, 0), np.float32)).points.shape == (3, 0)
-    up = np.array([[0.0], [0.0], [1.0]], dtype=np.float32)
-    assert caster.cast(np.array([0.0, 0.0, 99.0]), IDENTITY, up).points.shape == (3, 0)
+def test_no_rays_are_an_empty_result():
+    none = np.empty((3, 0), np.float32)
+    assert RayCaster([random_mesh(5)]).cast(HERE, none, endless(none)).range_m.shape == (0,)
 
 
 def test_a_scene_without_bodies_is_refused():

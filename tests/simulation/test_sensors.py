@@ -24,19 +24,19 @@ def lidar(**changes):
 
 
 def angles(directions):
-    x, y, z = directions.astype(np.float64)
+    x, y, z = directions.reshape(3, -1)
     return np.rad2deg(np.arcsin(z)), np.rad2deg(np.arctan2(y, x))
 
 
 def test_rows_span_the_vertical_field_of_view_and_columns_the_middles_of_equal_sectors():
     elevation, azimuth = angles(lidar().directions())
-    np.testing.assert_allclose(elevation.reshape(5, 6)[:, 0], [-20, -12.5, -5, 2.5, 10], atol=1e-5)
-    np.testing.assert_allclose(azimuth.reshape(5, 6)[2], [-37.5, -22.5, -7.5, 7.5, 22.5, 37.5], atol=1e-5)
+    np.testing.assert_allclose(elevation.reshape(5, 6)[:, 0], [-20, -12.5, -5, 2.5, 10], atol=1e-12)
+    np.testing.assert_allclose(azimuth.reshape(5, 6)[2], [-37.5, -22.5, -7.5, 7.5, 22.5, 37.5], atol=1e-12)
 
 
 def test_a_full_turn_has_no_ray_twice():
     _, azimuth = angles(lidar(horizontal_fov_deg=360, columns=8, channels=1, vertical_fov_deg=(0, 0)).directions())
-    np.testing.assert_allclose(np.diff(np.sort(azimuth)), 45.0, atol=1e-4)
+    np.testing.assert_allclose(np.diff(np.sort(azimuth)), 45.0, atol=1e-12)
 
 
 def test_a_table_of_rows_with_offsets_is_taken_as_it_is():
@@ -44,23 +44,22 @@ def test_a_table_of_rows_with_offsets_is_taken_as_it_is():
         channels=None, vertical_fov_deg=None, elevations_deg=(5, -3, 1), azimuth_offsets_deg=(0, 2, -4), columns=1
     )
     elevation, azimuth = angles(table.directions())
-    np.testing.assert_allclose(elevation, [5, -3, 1], atol=1e-5)
-    np.testing.assert_allclose(azimuth, [0, 2, -4], atol=1e-5)
+    np.testing.assert_allclose(elevation, [5, -3, 1], atol=1e-12)
+    np.testing.assert_allclose(azimuth, [0, 2, -4], atol=1e-12)
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(1, 40), st.integers(1, 40), st.floats(0.1, 360))
 def test_directions_have_length_one(channels, columns, fov):
     directions = lidar(channels=channels, columns=columns, horizontal_fov_deg=fov).directions()
-    assert directions.shape == (3, channels * columns)
-    assert directions.dtype == np.float32
-    np.testing.assert_allclose(np.linalg.norm(directions.astype(np.float64), axis=0), 1.0, atol=2e-7)
+    assert directions.shape == (3, channels, columns)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=0), 1.0, atol=1e-15)
 
 
 def test_the_reference_sensor_covers_the_lower_hemisphere_evenly_in_angle():
-    elevation, azimuth = angles(ReferenceSensor(rows=91, columns=36).directions)
-    np.testing.assert_allclose(elevation.reshape(91, 36)[:, 3], np.arange(0, -91, -1), atol=0.03)
-    np.testing.assert_allclose(np.sort(azimuth.reshape(91, 36)[0] % 360), np.arange(0, 360, 10), atol=1e-4)
+    elevation, azimuth = angles(ReferenceSensor(rows=91, columns=36).directions())
+    np.testing.assert_allclose(elevation.reshape(91, 36)[:, 3], np.arange(0, -91, -1), atol=1e-6)
+    np.testing.assert_allclose(np.sort(azimuth.reshape(91, 36)[0] % 360), np.arange(0, 360, 10), atol=1e-12)
 
 
 def test_the_default_is_the_papers():
@@ -110,6 +109,7 @@ def test_yaw_pitch_and_roll_are_uniform_in_their_ranges():
         ({"shell_m": 0.0}, "shell_m: a positive thickness"),
         ({"shell_m": float("nan")}, "shell_m: a positive thickness"),
         ({"max_tilt_deg": 91.0}, "angle from 0 to 90"),
+        ({"max_range_m": 0.0}, "max_range_m: a positive distance"),
     ],
 )
 def test_an_impossible_reference_sensor_is_refused(changes, message):

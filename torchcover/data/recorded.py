@@ -50,7 +50,7 @@ class BadFrameError(ValueError):
 class _Source(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
-    vehicle_T_sensor: list[list[float]]  # noqa: N815  (the key in the file)
+    vehicle_T_sensor: list[list[float]]
 
 
 class _Poses(BaseModel):

@@ -9,7 +9,8 @@ from torch.utils.data import Dataset
 
 from torchcover.data.frame import Frame
 from torchcover.simulation import ReferenceSensor, Rig, Scenario
-from torchcover.simulation.scene import Scan, Scene
+from torchcover.simulation.rays import Tile, into_tiles
+from torchcover.simulation.scene import Instant, Scan, Scene
 
 
 class SimulatedFrames(Dataset[Frame]):
@@ -57,14 +58,16 @@ class SimulatedFrames(Dataset[Frame]):
         self.seed = seed
         self.reference = reference or ReferenceSensor()
         self._scene: Scene | None = None
-        self._directions: list[np.ndarray[Any, np.dtype[np.float32]]] = []
+        self._reference_tiles: tuple[Tile, ...] = ()
+        self._sensor_tiles: list[tuple[Tile, ...]] = []
 
     @property
     def scene(self) -> Scene:
         """The scenario as geometry; built when first needed, once in each process."""
         if self._scene is None:
-            self._scene = Scene(self.scenario)
-            self._directions = [sensor.directions() for sensor in self.rig.sensors]
+            self._scene = Scene(self.scenario.world())
+            self._reference_tiles = into_tiles(self.reference.directions())
+            self._sensor_tiles = [into_tiles(sensor.directions()) for sensor in self.rig.sensors]
         return self._scene
 
     def __len__(self) -> int:
@@ -73,8 +76,9 @@ class SimulatedFrames(Dataset[Frame]):
     def __getitem__(self, index: int) -> Frame:
         if not 0 <= index < self.steps:
             raise IndexError(f"frame {index} of {self.steps}")
-        sensor_scans = self._scan_sensors()
-        reference_scan = self._scan_reference(index)
+        instant = self.scene.at(0)
+        sensor_scans = self._scan_sensors(instant)
+        reference_scan = self._scan_reference(instant, index)
         points = np.concatenate([scan.points for scan in sensor_scans])
         return Frame(
             sensor=torch.from_numpy(points),
@@ -84,27 +88,31 @@ class SimulatedFrames(Dataset[Frame]):
             counts=_count("sensor", sensor_scans) | _count("reference", [reference_scan]),
         )
 
-    def _scan_sensors(self) -> list[Scan]:
-        scene = self.scene
+    def _scan_sensors(self, instant: Instant) -> list[Scan]:
         return [
-            scene.scan(
+            instant.scan(
                 sensor.mount.matrix(),
-                directions,
+                tiles,
                 min_range_m=sensor.min_range_m,
                 max_range_m=sensor.max_range_m,
                 threads=torch.get_num_threads(),
             )
-            for sensor, directions in zip(self.rig.sensors, self._directions, strict=True)
+            for sensor, tiles in zip(self.rig.sensors, self._sensor_tiles, strict=True)
         ]
 
-    def _scan_reference(self, index: int) -> Scan:
+    def _scan_reference(self, instant: Instant, index: int) -> Scan:
         generator = np.random.default_rng([self.seed, index])
         vehicle_T_reference = self.reference.vehicle_T_reference(self.scene.ego_box, generator)
-        return self.scene.scan(vehicle_T_reference, self.reference.directions, threads=torch.get_num_threads())
+        return instant.scan(
+            vehicle_T_reference,
+            self._reference_tiles,
+            max_range_m=self.reference.max_range_m,
+            threads=torch.get_num_threads(),
+        )
 
     def __getstate__(self) -> dict[str, Any]:
         # Embree's scene cannot be pickled; a worker builds its own.
-        return {**self.__dict__, "_scene": None, "_directions": []}
+        return {**self.__dict__, "_scene": None, "_reference_tiles": (), "_sensor_tiles": []}
 
 
 def _count(source: str, scans: list[Scan]) -> dict[str, int]:

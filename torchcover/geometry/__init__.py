@@ -3,6 +3,7 @@
 from torchcover.geometry.boxes import Box
 from torchcover.geometry.rigid import (
     check_rigid,
+    euler_from_rotation,
     invert,
     rigid,
     rotation_from_euler,
@@ -10,4 +11,4 @@ from torchcover.geometry.rigid import (
     transform,
 )
 
-__all__ = ["Box", "check_rigid", "invert", "rigid", "rotation_from_euler", "rotation_from_quaternion", "transform"]
+__all__ = ["Box", "check_rigid", "euler_from_rotation", "invert", "rigid", "rotation_from_euler", "rotation_from_quaternion", "transform"]

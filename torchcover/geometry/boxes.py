@@ -23,6 +23,8 @@ class Box:
     upper_m: tuple[float, float, float]
 
     def __post_init__(self) -> None:
+        if not len(self.lower_m) == len(self.upper_m) == 3:
+            raise ValueError(f"a box needs three numbers for each corner; got {self.lower_m} and {self.upper_m}")
         if not all(low < high for low, high in zip(self.lower_m, self.upper_m, strict=True)):
             raise ValueError(f"a box needs lower < upper on every axis; got {self.lower_m} and {self.upper_m}")
 

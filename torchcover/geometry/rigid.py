@@ -62,6 +62,29 @@ def rotation_from_euler(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Ma
     )
 
 
+def euler_from_rotation(rotation: Matrix) -> Matrix:
+    """Yaw, pitch and roll in degrees: the inverse of `rotation_from_euler`. Straight up or down, the roll is 0.
+
+    Args:
+        rotation: (..., 3, 3) rotation matrices.
+
+    Returns:
+        (..., 3) yaw, pitch, roll.
+
+    Example:
+        >>> euler_from_rotation(rotation_from_euler(30.0, -20.0, 10.0)).round(9)
+        array([ 30., -20.,  10.])
+    """
+    r = rotation
+    horizontal = np.hypot(r[..., 0, 0], r[..., 1, 0])
+    upright = horizontal < 1e-9
+    yaw = np.where(upright, np.arctan2(-r[..., 0, 1], r[..., 1, 1]), np.arctan2(r[..., 1, 0], r[..., 0, 0]))
+    roll = np.where(upright, 0.0, np.arctan2(r[..., 2, 1], r[..., 2, 2]))
+    pitch = np.arctan2(-r[..., 2, 0], horizontal)
+    angles: Matrix = np.rad2deg(np.stack([yaw, pitch, roll], axis=-1))
+    return angles
+
+
 def rotation_from_quaternion(wxyz: ArrayLike) -> Matrix:
     """Rotation matrix of a quaternion (w, x, y, z), which is normalised first.
 

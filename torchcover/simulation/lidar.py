@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from torchcover.simulation.documents import Document, Pose
+from torchcover.simulation.rays import unit_directions
 
 Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
 
@@ -35,7 +36,7 @@ class Lidar(Document):
         ...     name="a", channels=3, vertical_fov_deg=(-10, 10), columns=360, horizontal_fov_deg=360, max_range_m=99
         ... )
         >>> lidar.directions().shape
-        (3, 1080)
+        (3, 3, 360)
     """
 
     type: Literal["lidar"] = "lidar"
@@ -74,25 +75,9 @@ class Lidar(Document):
         assert self.vertical_fov_deg is not None
         return np.linspace(*self.vertical_fov_deg, self.channels)
 
-    def directions(self) -> NDArray[np.float32]:
-        """(3, rows * columns) unit directions in the LiDAR's frame, row by row."""
+    def directions(self) -> NDArray[np.float64]:
+        """(3, rows, columns) unit directions in the LiDAR's frame."""
         middle = (np.arange(self.columns) + 0.5) / self.columns - 0.5
         offsets = np.zeros(len(self.rows_deg())) if self.azimuth_offsets_deg is None else self.azimuth_offsets_deg
         azimuths_deg = np.add.outer(offsets, self.horizontal_fov_deg * middle)
         return unit_directions(self.rows_deg()[:, None], azimuths_deg)
-
-
-def unit_directions(elevation_deg: NDArray[np.float64], azimuth_deg: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Directions from angles that broadcast to (rows, columns).
-
-    Args:
-        elevation_deg: Angle above the x-y plane.
-        azimuth_deg: Angle from x towards y.
-
-    Returns:
-        (3, rows * columns) float32 unit vectors.
-    """
-    elevation, azimuth = np.deg2rad(elevation_deg), np.deg2rad(azimuth_deg)
-    x, y = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
-    z = np.broadcast_to(np.sin(elevation), x.shape)
-    return np.stack([x.ravel(), y.ravel(), z.ravel()]).astype(np.float32)

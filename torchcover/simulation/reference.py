@@ -1,13 +1,12 @@
 """The random reference sensor: a best case to compare a rig with."""
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import Box, rigid, rotation_from_euler
-from torchcover.simulation.lidar import unit_directions
+from torchcover.simulation.rays import unit_directions
 
 
 @dataclass(frozen=True)
@@ -23,9 +22,11 @@ class ReferenceSensor:
         columns: Number of azimuths over 360 degrees.
         shell_m: Thickness of the shell.
         max_tilt_deg: Bound of pitch and roll.
+        max_range_m: Farther hits give no point. The default reaches every corner of the paper's regions.
 
     Raises:
-        ValueError: A number of rows or columns below 1, a shell without thickness, a tilt outside 0 to 90 degrees.
+        ValueError: A number of rows or columns below 1, a shell without thickness, a tilt outside 0 to 90 degrees,
+            a range that is not positive.
 
     Example:
         >>> sensor = ReferenceSensor(rows=4, columns=8)
@@ -38,6 +39,7 @@ class ReferenceSensor:
     columns: int = 1024
     shell_m: float = 0.5
     max_tilt_deg: float = 45.0
+    max_range_m: float = 250.0
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
@@ -46,10 +48,11 @@ class ReferenceSensor:
             raise ValueError(f"shell_m: a positive thickness in metres is needed; got {self.shell_m}")
         if not 0 <= self.max_tilt_deg <= 90:
             raise ValueError(f"max_tilt_deg: an angle from 0 to 90 is needed; got {self.max_tilt_deg}")
+        if not self.max_range_m > 0:
+            raise ValueError(f"max_range_m: a positive distance in metres is needed; got {self.max_range_m}")
 
-    @cached_property
-    def directions(self) -> NDArray[np.float32]:
-        """(3, rows * columns) unit directions in the sensor's frame."""
+    def directions(self) -> NDArray[np.float64]:
+        """(3, rows, columns) unit directions in the sensor's frame."""
         elevation = np.linspace(0.0, -90.0, self.rows)
         azimuth = 360.0 * np.arange(self.columns) / self.columns
         return unit_directions(elevation[:, None], azimuth[None, :])

@@ -5,8 +5,10 @@ from typing import Self
 
 from pydantic import Field
 
-from torchcover.simulation.bodies import Body, Shape
+from torchcover.simulation.bodies import Body, Shape, in_vehicle_frame
 from torchcover.simulation.documents import Document, Pose, load_document
+from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.world import Actor, World
 
 
 class Ego(Document):
@@ -50,3 +52,18 @@ class Scenario(Document):
             ValueError: The file is not a scenario; the message names the file and the key.
         """
         return load_document(cls, "scenarios", path_or_name)
+
+    def world(self) -> World:
+        """Build it.
+
+        Raises:
+            FileNotFoundError: A mesh or vehicle file is missing.
+            ValueError: A mesh cannot be used.
+        """
+        ego = Actor(
+            "ego",
+            "ego",
+            in_vehicle_frame(self.ego.shape.mesh()),
+            Trajectory.from_poses([0.0], self.ego.pose.matrix()[None]),
+        )
+        return World(static=tuple(mesh for body in self.bodies for mesh in body.meshes()), ego=ego)

@@ -5,14 +5,17 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry import euler_from_rotation, rigid, rotation_from_euler
 
 Matrix = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses at times, with straight lines and the shorter turn in between; the body rests before and after.
+    """Poses at times; the body rests before and after.
+
+    In between it moves on a straight line, and yaw, pitch and roll each turn the shorter way: sample finely where a
+    body pitches to beyond 80 degrees.
 
     Args:
         times_s: (K,) ascending times in seconds.
@@ -61,6 +64,11 @@ class Trajectory:
         """A body that stays where it is."""
         return cls.of([0.0], np.array([position_m]), np.array([angles_deg]))
 
+    @classmethod
+    def from_poses(cls, times_s: ArrayLike, world_T_body: Matrix) -> "Trajectory":
+        """From (K, 4, 4) rigid transforms."""
+        return cls.of(times_s, world_T_body[:, :3, 3], euler_from_rotation(world_T_body[:, :3, :3]))
+
     @property
     def moves(self) -> bool:
         """Whether the pose ever changes."""
@@ -70,6 +78,10 @@ class Trajectory:
         """The (4, 4) pose `world_T_body` at a time."""
         position, angles = self._interpolate(time_s)
         return rigid(rotation_from_euler(*angles), position)
+
+    def positions_at(self, times_s: Matrix) -> Matrix:
+        """(T, 3) positions at (T,) times."""
+        return np.stack([np.interp(times_s, self.times_s, axis) for axis in self.positions_m.T], axis=1)
 
     def _interpolate(self, time_s: float) -> tuple[Matrix, Matrix]:
         after = int(np.searchsorted(self.times_s, time_s, side="right"))

@@ -41,3 +41,8 @@ class World:
     actors: tuple[Actor, ...] = ()
     time_step_s: float = 0.1
     duration_s: float = 0.0
+
+    @property
+    def steps(self) -> int:
+        """Number of instants: at 0, one time step, two time steps, ... up to the duration."""
+        return int(self.duration_s / self.time_step_s + 1e-9) + 1
