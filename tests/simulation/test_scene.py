@@ -124,8 +124,8 @@ def test_bodies_that_are_out_of_reach_change_nothing():
     made = world()
     scene = Scene(made)
     near, far = scene.at(0, within_m=50.0), scene.at(0, within_m=3.0)
-    assert len(near.parts) == 2
-    assert len(far.parts) == 1
+    assert len(near.moving) == 1
+    assert len(far.moving) == 0
     seen = near.scan(ABOVE, SPHERE, max_range_m=3.0)
     np.testing.assert_array_equal(seen.points, far.scan(ABOVE, SPHERE, max_range_m=3.0).points)
 

@@ -57,6 +57,9 @@ class RayCaster:
         Returns:
             `Hits(range_m, body)`: the nearest hit within the limit; else the limit, and -1.
         """
-        origins = np.broadcast_to(origin_m.astype(np.float32), (directions.shape[1], 3))
+        # One origin for all rays: an array that steps over no memory from row to row.
+        origins = np.ndarray(
+            (directions.shape[1], 3), np.float32, origin_m.astype(np.float32).tobytes(), strides=(0, 4)
+        )
         answer = self._scene.run(origins, directions.T, dists=limit_m.copy(), output=True)
         return Hits(answer["tfar"], answer["geomID"])

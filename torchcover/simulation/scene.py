@@ -9,21 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import Box, invert, transform
-from torchcover.simulation.raycaster import RayCaster
+from torchcover.simulation.raycaster import Hits, RayCaster
 from torchcover.simulation.rays import Tile
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.world import Actor, World
-
-# Bodies are numbered: the ego, then the actors in their order, then everything else.
-EGO = 0
-MISS = -1
 
 # Angles between float32 directions are off by less than this, in radians.
 ROUNDING = 1e-5
 
 Matrix = NDArray[np.float64]
 Float32 = NDArray[np.float32]
-Int32 = NDArray[np.int32]
 
 
 class Scan(NamedTuple):
@@ -48,14 +43,11 @@ class Solid(NamedTuple):
 
 
 class Part(NamedTuple):
-    """A caster placed at one instant, with a ball around it in the vehicle frame.
-
-    `numbers` names the bodies of the caster, and ends with MISS, which the index -1 of a miss picks.
-    """
+    """A solid placed at one instant, with a ball around it in the vehicle frame; `body` is its number."""
 
     caster: RayCaster
     vehicle_T_part: Matrix
-    numbers: Int32
+    body: int
     centre_m: Matrix
     radius_m: float
 
@@ -74,24 +66,22 @@ class Scene:
     def __init__(self, world: World) -> None:
         self._world = world
         self.ego_box = Box.around(world.ego.mesh.vertices_m)
-        bodies = list(enumerate((world.ego, *world.actors)))
-        self._moving = [(number, actor) for number, actor in bodies if actor.trajectory.moves]
-        self._solids = {id(actor.mesh): _solid(actor.mesh) for _, actor in self._moving}
+        bodies = (world.ego, *world.actors)
+        self._moving = [actor for actor in bodies if actor.trajectory.moves]
+        self._resting = [actor for actor in bodies if not actor.trajectory.moves]
+        self._solids = {id(actor.mesh): _solid(actor.mesh) for actor in self._moving}
         # (steps, moving bodies, 3): where they are, to find out at once which are near.
         times_s = world.time_step_s * np.arange(world.steps, dtype=np.float64)
-        tracks = [actor.trajectory.positions_at(times_s) for _, actor in self._moving]
+        tracks = [actor.trajectory.positions_at(times_s) for actor in self._moving]
         self._positions_m = np.stack(tracks, axis=1) if tracks else np.empty((world.steps, 0, 3))
         # Subtracted in float64: world coordinates may be of UTM size. Where the ego rests, this frame is its own.
         self._world_T_local = world.ego.trajectory.at(0.0)
-        self._static = self._build_static([body for body in bodies if not body[1].trajectory.moves])
+        self._static = RayCaster(self._static_meshes())
 
-    def _build_static(self, resting: list[tuple[int, Actor]]) -> Part:
+    def _static_meshes(self) -> list[Mesh]:
         local_T_world = invert(self._world_T_local)
-        meshes = [actor.mesh.moved(local_T_world @ actor.trajectory.at(0.0)) for _, actor in resting]
-        meshes += [mesh.moved(local_T_world) for mesh in self._world.static]
-        something_else = len(self._world.actors) + 1
-        numbers = [number for number, _ in resting] + [something_else] * len(self._world.static)
-        return Part(RayCaster(meshes), np.eye(4), np.array([*numbers, MISS], np.int32), np.zeros(3), np.inf)
+        meshes = [actor.mesh.moved(local_T_world @ actor.trajectory.at(0.0)) for actor in self._resting]
+        return meshes + [mesh.moved(local_T_world) for mesh in self._world.static]
 
     def at(self, step: int, within_m: float = np.inf) -> "Instant":
         """Place everything for one step.
@@ -107,29 +97,38 @@ class Scene:
         world_T_vehicle = self._world.ego.trajectory.at(time_s)
         vehicle_T_world = invert(world_T_vehicle)
         distance_m = np.linalg.norm(self._positions_m[step] - world_T_vehicle[:3, 3], axis=1)
-        parts = [
-            self._place(number, actor, vehicle_T_world @ actor.trajectory.at(time_s))
-            for (number, actor), distance in zip(self._moving, distance_m, strict=True)
+        first = len(self._resting) + len(self._world.static)
+        moving = tuple(
+            self._place(first + k, actor, vehicle_T_world @ actor.trajectory.at(time_s))
+            for k, (actor, distance) in enumerate(zip(self._moving, distance_m, strict=True))
             if distance < within_m + self._solids[id(actor.mesh)].reach_m
-        ]
-        parts.append(self._static._replace(vehicle_T_part=vehicle_T_world @ self._world_T_local))
-        return Instant(tuple(parts))
+        )
+        # Either list of bodies begins with the ego.
+        if self._world.ego.trajectory.moves:
+            return Instant(self._static, vehicle_T_world @ self._world_T_local, moving, ego=first)
+        return Instant(self._static, np.eye(4), moving, ego=0)
 
-    def _place(self, number: int, actor: Actor, vehicle_T_actor: Matrix) -> Part:
+    def _place(self, body: int, actor: Actor, vehicle_T_actor: Matrix) -> Part:
         solid = self._solids[id(actor.mesh)]
         centre_m = transform(vehicle_T_actor, solid.centre_m[None])[0]
-        return Part(solid.caster, vehicle_T_actor, np.array([number, MISS], np.int32), centre_m, solid.radius_m)
+        return Part(solid.caster, vehicle_T_actor, body, centre_m, solid.radius_m)
 
 
 @dataclass(frozen=True, eq=False)
 class Instant:
-    """A scene at one time.
+    """A scene at one time. Its bodies are numbered: what never moves, then what moves.
 
     Args:
-        parts: What moves, placed in the vehicle frame; then what never moves.
+        static: What never moves.
+        vehicle_T_static: Where its frame lies.
+        moving: The bodies that move and are near.
+        ego: Number of the ego.
     """
 
-    parts: tuple[Part, ...]
+    static: RayCaster
+    vehicle_T_static: Matrix
+    moving: tuple[Part, ...]
+    ego: int
 
     def scan(
         self,
@@ -164,7 +163,7 @@ class Instant:
                 scans = list(pool.map(scan_tile, tiles))
         points, self_hits = zip(*scans, strict=True)
         rays = sum(tile.directions.shape[1] for tile in tiles)
-        return Scan(np.concatenate(points, axis=1).T.copy(), rays, sum(self_hits))
+        return Scan(np.concatenate(points), rays, sum(self_hits))
 
     def _scan_tile(
         self, vehicle_T_sensor: Matrix, tile: Tile, min_range_m: float, max_range_m: float
@@ -172,51 +171,53 @@ class Instant:
         origin_m = vehicle_T_sensor[:3, 3]
         directions = _rotate(vehicle_T_sensor[:3, :3], tile.directions)
         axis = vehicle_T_sensor[:3, :3] @ tile.axis
-        range_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
-        body = np.full(directions.shape[1], MISS, dtype=np.int32)
-        for part in self.parts:
+        limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
+        hits = _cast(self.static, self.vehicle_T_static, origin_m, directions, limit_m)
+        for part in self.moving:
             rays = _rays_towards(part, origin_m, directions, axis, tile.half_angle, max_range_m)
-            if rays is not None:
-                _cast(part, origin_m, directions, rays, range_m, body)
-        seen = np.flatnonzero((body > EGO) & (range_m >= min_range_m))
-        points = origin_m.astype(np.float32)[:, None] + range_m[seen] * directions[:, seen]
-        return points, int(np.count_nonzero(body == EGO))
+            if len(rays):
+                nearer = _cast(part.caster, part.vehicle_T_part, origin_m, directions[:, rays], hits.range_m[rays])
+                hits.range_m[rays] = nearer.range_m
+                hits.body[rays[nearer.body >= 0]] = part.body
+        seen = (hits.body >= 0) & (hits.body != self.ego)
+        if min_range_m > 0:
+            seen &= hits.range_m >= min_range_m
+        return _points(origin_m, directions, hits.range_m, seen), int(np.count_nonzero(hits.body == self.ego))
+
+
+def _points(origin_m: Matrix, directions: Float32, range_m: Float32, seen: NDArray[np.bool_]) -> Float32:
+    """(K, 3) where the rays that saw something ended."""
+    points = np.empty((np.count_nonzero(seen), 3), dtype=np.float32)
+    for axis in range(3):
+        coordinate = directions[axis] * range_m
+        coordinate += np.float32(origin_m[axis])
+        points[:, axis] = coordinate[seen]
+    return points
 
 
 def _rays_towards(
     part: Part, origin_m: Matrix, directions: Float32, axis: Matrix, half_angle: float, max_range_m: float
-) -> slice | NDArray[np.int64] | None:
-    """Which rays of a cone may hit a part: all (a slice), some, or none."""
+) -> NDArray[np.int64]:
+    """Which rays of a cone may hit the ball around a part."""
     way_m = part.centre_m - origin_m
     distance_m = float(np.linalg.norm(way_m))
     if distance_m <= part.radius_m:
-        return slice(None)
+        return np.arange(directions.shape[1])
     towards = way_m / distance_m
     opening = float(np.arcsin(part.radius_m / distance_m))
     angle = float(np.arccos(np.clip(towards @ axis, -1.0, 1.0)))
     if distance_m - part.radius_m > max_range_m or angle > half_angle + opening + ROUNDING:
-        return None
+        return np.empty(0, dtype=np.int64)
     x, y, z = directions
     cosine = towards[0] * x + towards[1] * y + towards[2] * z
-    rays = np.flatnonzero(cosine > np.cos(opening + ROUNDING))
-    return rays if len(rays) else None
+    return np.flatnonzero(cosine > np.cos(opening + ROUNDING))
 
 
-def _cast(
-    part: Part,
-    origin_m: Matrix,
-    directions: Float32,
-    rays: slice | NDArray[np.int64],
-    range_m: Float32,
-    body: Int32,
-) -> None:
-    """Cast some rays at one part; shorten `range_m` and set `body` in place where they hit."""
-    part_T_vehicle = invert(part.vehicle_T_part)
-    towards = _rotate(part_T_vehicle[:3, :3], directions[:, rays])
-    hits = part.caster.cast(transform(part_T_vehicle, origin_m[None])[0], towards, range_m[rays])
-    numbers = part.numbers[hits.body]
-    range_m[rays] = hits.range_m
-    body[rays] = np.where(numbers == MISS, body[rays], numbers)
+def _cast(caster: RayCaster, vehicle_T_part: Matrix, origin_m: Matrix, directions: Float32, limit_m: Float32) -> Hits:
+    """Cast rays of the vehicle frame at a caster in its own frame."""
+    part_T_vehicle = invert(vehicle_T_part)
+    towards = _rotate(part_T_vehicle[:3, :3], directions)
+    return caster.cast(transform(part_T_vehicle, origin_m[None])[0], towards, limit_m)
 
 
 def _rotate(rotation: Matrix, directions: Float32) -> Float32:
