@@ -39,11 +39,11 @@ def install_debian_venv() -> None:
     print(f"This Python has no ensurepip; installing {package} with apt-get.", flush=True)
     if can:
         environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
-        subprocess.run([*as_root, "apt-get", "update", "-qq"], env=environment)
-        done = subprocess.run([*as_root, "apt-get", "install", "-y", "-qq", package], env=environment)
+        subprocess.run([*as_root, "apt-get", "update", "-qq"], env=environment, check=False)
+        done = subprocess.run([*as_root, "apt-get", "install", "-y", "-qq", package], env=environment, check=False)
         if done.returncode == 0:
             return
-    sys.exit(f"Could not install {package} from here. Run this once, then make again:\n  sudo apt-get install {package}")
+    sys.exit(f"Could not install {package} here. Run this once, then make again:\n  sudo apt-get install {package}")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,21 @@
+"""Run every benchmark and print its table: `python -m benchmarks [name ...]`."""
+
+import importlib
+import sys
+
+BENCHMARKS = ("nearest", "crossover", "raycasting", "paper_step", "memory", "imports")
+
+
+def main(names):
+    unknown = set(names) - set(BENCHMARKS)
+    if unknown:
+        sys.exit(f"no benchmark {', '.join(sorted(unknown))}; there are {', '.join(BENCHMARKS)}")
+    for name in names or BENCHMARKS:
+        module = importlib.import_module(f"benchmarks.{name}")
+        print(f"## {name}: {module.__doc__.splitlines()[0]}\n", flush=True)
+        module.main()
+        print(flush=True)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,13 @@
+"""Ray-cast clouds of the courtyard: what a search really gets, unlike random numbers."""
+
+import torch
+
+from torchcover.data import SimulatedFrames
+
+
+def courtyard_clouds(queries, points):
+    """A reference cloud and a sensor cloud of these sizes, float32, cut from the courtyard's first frames."""
+    frames = SimulatedFrames("courtyard", "front_roof_128", steps=8, seed=0)
+    reference = torch.cat([frames[index].reference for index in range(8)])
+    sensor = torch.cat([frames[0].sensor, frames[0].sensor + 0.01])
+    return reference[: queries * (len(reference) // queries) : len(reference) // queries][:queries], sensor[:points]
