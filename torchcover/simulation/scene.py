@@ -70,7 +70,7 @@ class Scene:
         self._moving = [actor for actor in bodies if actor.trajectory.moves]
         self._resting = [actor for actor in bodies if not actor.trajectory.moves]
         self._solids = {id(actor.mesh): _solid(actor.mesh) for actor in self._moving}
-        # (steps, moving bodies, 3): where they are, to find out at once which are near.
+        # (steps, moving bodies, 3): where they are, to find out at once which are near; NaN, so never near, if absent.
         times_s = world.time_step_s * np.arange(world.steps, dtype=np.float64)
         tracks = [actor.trajectory.positions_at(times_s) for actor in self._moving]
         self._positions_m = np.stack(tracks, axis=1) if tracks else np.empty((world.steps, 0, 3))

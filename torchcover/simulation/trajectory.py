@@ -12,7 +12,7 @@ Matrix = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Poses at times; the body rests before and after.
+    """Poses at times.
 
     In between it moves on a straight line, and yaw, pitch and roll each turn the shorter way: sample finely where a
     body pitches to beyond 80 degrees.
@@ -21,6 +21,8 @@ class Trajectory:
         times_s: (K,) ascending times in seconds.
         positions_m: (K, 3) positions in the world frame in metres, float64: they may be of UTM size.
         angles_deg: (K, 3) yaw, pitch and roll; see `torchcover.geometry.rotation_from_euler`.
+        transient: Whether the body is there only between the first and the last time, as in a recording that it enters
+            and leaves; else it rests before and after.
 
     Raises:
         ValueError: No pose, shapes that do not fit, NaN or infinite numbers, times that do not ascend.
@@ -34,6 +36,7 @@ class Trajectory:
     times_s: Matrix
     positions_m: Matrix
     angles_deg: Matrix
+    transient: bool = False
 
     def __post_init__(self) -> None:
         count = len(self.times_s)
@@ -57,7 +60,8 @@ class Trajectory:
     @classmethod
     def of(cls, times_s: ArrayLike, positions_m: ArrayLike, angles_deg: ArrayLike) -> "Trajectory":
         """From anything that NumPy takes."""
-        return cls(*(np.array(numbers, dtype=np.float64) for numbers in (times_s, positions_m, angles_deg)))
+        times, positions, angles = (np.array(a, dtype=np.float64) for a in (times_s, positions_m, angles_deg))
+        return cls(times, positions, angles)
 
     @classmethod
     def resting(cls, position_m: ArrayLike, angles_deg: ArrayLike = (0.0, 0.0, 0.0)) -> "Trajectory":
@@ -71,8 +75,8 @@ class Trajectory:
 
     @property
     def moves(self) -> bool:
-        """Whether the pose ever changes."""
-        return bool(np.ptp(self.positions_m, axis=0).any() or np.ptp(self.angles_deg, axis=0).any())
+        """Whether the body ever changes its pose, enters or leaves."""
+        return self.transient or bool(np.ptp(self.positions_m, axis=0).any() or np.ptp(self.angles_deg, axis=0).any())
 
     def at(self, time_s: float) -> Matrix:
         """The (4, 4) pose `world_T_body` at a time."""
@@ -80,8 +84,10 @@ class Trajectory:
         return rigid(rotation_from_euler(*angles), position)
 
     def positions_at(self, times_s: Matrix) -> Matrix:
-        """(T, 3) positions at (T,) times."""
-        return np.stack([np.interp(times_s, self.times_s, axis) for axis in self.positions_m.T], axis=1)
+        """(T, 3) positions at (T,) times; NaN where the body is not there."""
+        outside = np.nan if self.transient else None
+        tracks = [np.interp(times_s, self.times_s, axis, outside, outside) for axis in self.positions_m.T]
+        return np.stack(tracks, axis=1)
 
     def _interpolate(self, time_s: float) -> tuple[Matrix, Matrix]:
         after = int(np.searchsorted(self.times_s, time_s, side="right"))

@@ -1,0 +1,168 @@
+"""Trajectories and recorded actors from files, good and bad."""
+
+import numpy as np
+import pytest
+
+from torchcover import Scenario
+from torchcover.geometry import euler_from_rotation, rotation_from_euler
+from torchcover.simulation import Pose
+from torchcover.simulation.rays import into_tiles, unit_directions
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.tracks import read_boxes, read_trajectory
+from torchcover.simulation.trajectory import Trajectory
+
+HEADER = "t,x,y,z,roll,pitch,yaw\n"
+BOXES = "t,id,category,x,y,z,length,width,height,yaw\n"
+
+
+def write(folder, content, name="track.csv"):
+    path = folder / name
+    path.write_text(content)
+    return path
+
+
+def test_between_poses_a_body_moves_straight_and_turns_the_shorter_way():
+    turn = Trajectory.of(
+        [0.0, 2.0, 3.0], [[0, 0, 0], [4, 0, 0], [4, 2, 0]], [[170, 0, 0], [-170, 10, 0], [-170, 10, -6]]
+    )
+    np.testing.assert_allclose(turn.at(1.0)[:3, 3], [2, 0, 0])
+    np.testing.assert_allclose(turn.at(1.0)[:3, :3], rotation_from_euler(180, 5, 0), atol=1e-12)
+    np.testing.assert_allclose(turn.at(2.5)[:3, :3], rotation_from_euler(-170, 10, -3), atol=1e-12)
+    np.testing.assert_allclose(turn.at(2.0)[:3, 3], [4, 0, 0])
+
+
+def test_outside_its_times_a_body_rests_or_is_not_there():
+    resting = Trajectory.of([1.0, 2.0], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0]] * 2)
+    np.testing.assert_array_equal(resting.at(-5.0), resting.at(1.0))
+    np.testing.assert_array_equal(resting.at(9.0), resting.at(2.0))
+    transient = Trajectory(resting.times_s, resting.positions_m, resting.angles_deg, transient=True)
+    times = np.array([0.9, 1.0, 1.5, 2.0, 2.1])
+    np.testing.assert_allclose(transient.positions_at(times)[:, 0], [np.nan, 0, 0.5, 1, np.nan])
+    np.testing.assert_allclose(resting.positions_at(times)[:, 0], [0, 0, 0.5, 1, 1])
+
+
+def test_positions_at_many_times_are_those_of_the_poses():
+    generator = np.random.default_rng(0)
+    track = Trajectory.of(np.sort(generator.uniform(0, 9, 20)), generator.normal(size=(20, 3)), np.zeros((20, 3)))
+    times = generator.uniform(-1, 10, 50)
+    np.testing.assert_allclose(track.positions_at(times), [track.at(time)[:3, 3] for time in times], atol=1e-12)
+
+
+@pytest.mark.parametrize("pitch", [-90.0, -89.999, 0.0, 45.0, 90.0])
+def test_euler_angles_describe_the_rotation_they_came_from(pitch):
+    for yaw, roll in ((0, 0), (30, 20), (-170, 100)):
+        rotation = rotation_from_euler(yaw, pitch, roll)
+        np.testing.assert_allclose(rotation_from_euler(*euler_from_rotation(rotation)), rotation, atol=1e-8)
+
+
+def test_a_csv_is_read_in_any_order_of_columns(tmp_path):
+    path = write(tmp_path, "yaw, t, x, y, z, roll, pitch\n90, 0, 1, 2, 3, 10, 20\n90, 1, 1, 2, 3, 10, 20\n")
+    pose = read_trajectory(path).at(0.5)
+    np.testing.assert_allclose(pose[:3, 3], [1, 2, 3])
+    np.testing.assert_allclose(pose[:3, :3], rotation_from_euler(90, 20, 10), atol=1e-12)
+
+
+def test_poses_are_read(tmp_path):
+    poses = np.stack([Pose(x_m=k, yaw_deg=10 * k, roll_deg=3).matrix() for k in range(4)])
+    np.savez(tmp_path / "p.npz", times_s=np.arange(4.0), world_T_body=poses)
+    track = read_trajectory(tmp_path / "p.npz")
+    for k in range(4):
+        np.testing.assert_allclose(track.at(k), poses[k], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (HEADER, "holds no row"),
+        ("", "needs the columns t, x, y, z, roll, pitch, yaw; t, x, y, z, roll, pitch, yaw missing"),
+        ("t,x,y,z,yaw\n0,0,0,0,0\n", "roll, pitch missing"),
+        (HEADER + "0,0,0,0,0,0,0\n1,0,zero,0,0,0,0\n", "line 3: y is 'zero', not a number"),
+        (HEADER + "0,0,0,0,0,0,0\n1,0,0\n", "line 3: z is None, not a number"),
+        (HEADER + "0,0,0,0,0,0,0\n1,nan,0,0,0,0,0\n", r"NaN or infinite numbers in 1 of 2 poses, first 1"),
+        (HEADER + "0,0,0,0,0,0,0\n0,1,0,0,0,0,0\n", r"must ascend; pose 1 is at 0 s, after 0 s"),
+        (HEADER + "0,0,0,0,0,0,0\n2,1,0,0,0,0,0\n1,1,0,0,0,0,0\n", r"must ascend; pose 2 is at 1 s, after 2 s"),
+        (HEADER + "".join(f"{t},0,0,0,0,0,0\n" for t in (0, 1, 2, 9, 10)), "a gap of 7 s after t = 2 s"),
+    ],
+)
+def test_a_bad_trajectory_names_the_file(tmp_path, content, message):
+    path = write(tmp_path, content)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_trajectory(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_poses_that_are_not_rigid_are_refused(tmp_path):
+    np.savez(tmp_path / "p.npz", times_s=[0.0], world_T_body=[np.diag([2.0, 1, 1, 1])])
+    with pytest.raises(ValueError, match=r"p\.npz: pose 0: not a rigid transform"):
+        read_trajectory(tmp_path / "p.npz")
+    np.savez(tmp_path / "q.npz", times=[0.0])
+    with pytest.raises(ValueError, match=r"q\.npz: needs the arrays times_s and world_T_body; got times"):
+        read_trajectory(tmp_path / "q.npz")
+
+
+def test_missing_files_and_other_formats_are_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"none\.csv: no such trajectory"):
+        read_trajectory(tmp_path / "none.csv")
+    with pytest.raises(ValueError, match=r"a trajectory is a \.csv or \.npz file; got \.txt"):
+        read_trajectory(tmp_path / "t.txt")
+    with pytest.raises(FileNotFoundError, match="no such file of boxes"):
+        read_boxes(tmp_path / "none.csv")
+
+
+def test_recorded_boxes_become_actors_that_come_and_go(tmp_path):
+    rows = [f"{t},a,car,{5 + t},0,0,4,2,1.5,0" for t in (1, 2, 3)] + ["1,b,truck,0,9,0,8,2.5,3,90"]
+    a, b = read_boxes(write(tmp_path, BOXES + "\n".join(rows)))
+    assert (a.name, a.category, b.name, b.category) == ("a", "car", "b", "truck")
+    np.testing.assert_allclose(np.ptp(a.mesh.vertices_m, axis=0), [4, 2, 1.5])
+    np.testing.assert_allclose(a.trajectory.at(1.5)[:3, 3], [6.5, 0, 0])
+    np.testing.assert_allclose(b.trajectory.at(1.0)[:3, 0], [0, 1, 0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("1,a,car,0,0,0,0,2,1,0", "id a: a box needs a positive length"),
+        ("1,a,car,0,0,0,nan,2,1,0", "id a: a box needs a positive length"),
+        ("1,a,car,nan,0,0,4,2,1,0", "id a: .*NaN"),
+        ("1,a,car,0,0,0,4,2,1,0\n1,a,car,0,0,0,4,2,1,0", "id a: .*must ascend"),
+    ],
+)
+def test_bad_boxes_name_their_id(tmp_path, row, message):
+    with pytest.raises(ValueError, match=message):
+        read_boxes(write(tmp_path, BOXES + row))
+
+
+SCENARIO = """
+name: s
+time_step_s: 1.0
+duration_s: 4.0
+ego: {shape: {type: box, size_m: [4, 2, 1.5]}, trajectory: ego.csv}
+bodies:
+  - {name: ground, shape: {type: plane, size_m: [400, 400]}}
+actors:
+  - {name: bus, category: bus, shape: {type: box, size_m: [12, 2.5, 3]}, trajectory: bus.csv}
+boxes: boxes.csv
+"""
+
+
+def test_a_scenario_of_files_plays(tmp_path):
+    write(tmp_path, HEADER + "0,0,0,0,0,0,0\n4,40,0,0,0,0,0\n", "ego.csv")
+    write(tmp_path, HEADER + "0,30,4,0,0,0,0\n4,30,4.004,0,0,0,0\n", "bus.csv")
+    write(tmp_path, BOXES + "1,a,car,20,-5,0,4,2,1.5,0\n2,a,car,20,-5,0,4,2,1.5,0\n", "boxes.csv")
+    world = Scenario.load(write(tmp_path, SCENARIO, "s.yaml")).world()
+    assert world.steps == 5
+    scene = Scene(world)
+    sphere = into_tiles(unit_directions(np.linspace(-60, 30, 90)[:, None], np.linspace(-180, 179, 360)[None]))
+    rear_of_bus, box_seen = [], []
+    for step in range(5):
+        x, y, z = scene.at(step).scan(Pose(z_m=2.0).matrix(), sphere).points.T
+        rear_of_bus.append(x[(y > 2.7) & (z > 0.1)].min())
+        box_seen.append(bool(((y < -3) & (z > 0.5)).any()))
+    np.testing.assert_allclose(rear_of_bus, [24 - 10 * step for step in range(5)], atol=0.2)
+    assert box_seen == [False, True, True, False, False]
+
+
+def test_a_mover_has_a_pose_or_a_trajectory_not_both(tmp_path):
+    both = SCENARIO.replace("trajectory: ego.csv", "trajectory: ego.csv, pose: {x_m: 1}")
+    with pytest.raises(ValueError, match="ego: give a pose or a trajectory, not both"):
+        Scenario.load(write(tmp_path, both, "s.yaml"))

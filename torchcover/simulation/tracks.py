@@ -1,0 +1,140 @@
+"""Trajectories and actors from files."""
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import check_rigid
+from torchcover.simulation.shapes import Box, Mesh
+from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.world import Actor
+
+TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")
+BOX_COLUMNS = ("t", "id", "category", "x", "y", "z", "length", "width", "height", "yaw")
+# A step this many times longer than the usual one means that poses are missing.
+LONGEST_STEP = 5.0
+
+
+def read_trajectory(path: Path) -> Trajectory:
+    """Read a trajectory.
+
+    Args:
+        path: `.csv` with the columns t, x, y, z, roll, pitch, yaw (seconds, metres, degrees); or `.npz` with `times_s`
+            (K,) and `world_T_body` (K, 4, 4).
+
+    Returns:
+        The trajectory in the world frame.
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: Another suffix, missing columns, what is no number, NaN, times that do not ascend, a gap in time,
+            or a pose that is not a rigid transform; the message names the file.
+    """
+    readers = {".csv": _read_csv, ".npz": _read_npz}
+    if path.suffix not in readers:
+        raise ValueError(f"{path}: a trajectory is a .csv or .npz file; got {path.suffix or 'no suffix'}")
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such trajectory file")
+    try:
+        trajectory = readers[path.suffix](path)
+        _check_gaps(trajectory.times_s)
+    except (ValueError, KeyError, OSError) as error:
+        raise ValueError(f"{path}: {error}") from error
+    return trajectory
+
+
+def read_boxes(path: Path) -> tuple[Actor, ...]:
+    """Read recorded boxes as actors, one for each id: the box of its first size, there between its first and last time.
+
+    Args:
+        path: `.csv` with the columns t, id, category, x, y, z, length, width, height, yaw (seconds, metres, degrees; x,
+            y, z of the centre of the bottom).
+
+    Returns:
+        One actor an id, in the order of their first appearance.
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: As `read_trajectory`, or a box without volume; the message names the file and the id.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file of boxes")
+    rows: dict[str, list[dict[str, str]]] = {}
+    try:
+        for row in _rows(path, BOX_COLUMNS):
+            rows.setdefault(row["id"], []).append(row)
+        return tuple(_box_actor(name, track) for name, track in rows.items())
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _read_csv(path: Path) -> Trajectory:
+    numbers = _numbers(_rows(path, TRAJECTORY_COLUMNS), TRAJECTORY_COLUMNS)
+    time_s, position_m, (roll, pitch, yaw) = numbers[:, 0], numbers[:, 1:4], numbers[:, 4:].T
+    return Trajectory.of(time_s, position_m, np.stack([yaw, pitch, roll], axis=1))
+
+
+def _read_npz(path: Path) -> Trajectory:
+    with np.load(path, allow_pickle=False) as file:
+        missing = {"times_s", "world_T_body"} - set(file.files)
+        if missing:
+            raise ValueError(f"needs the arrays times_s and world_T_body; got {', '.join(file.files) or 'none'}")
+        times_s, poses = file["times_s"], file["world_T_body"]
+    return Trajectory.from_poses(times_s, np.stack([check_rigid(pose, f"pose {k}") for k, pose in enumerate(poses)]))
+
+
+def _rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.DictReader(file, skipinitialspace=True)
+        names = [name.strip() for name in reader.fieldnames or ()]
+        missing = [column for column in columns if column not in names]
+        if missing:
+            raise ValueError(f"needs the columns {', '.join(columns)}; {', '.join(missing)} missing")
+        reader.fieldnames = names
+        rows = list(reader)
+    if not rows:
+        raise ValueError("holds no row")
+    return rows
+
+
+def _numbers(rows: Sequence[dict[str, str]], columns: Sequence[str]) -> NDArray[np.float64]:
+    numbers = np.empty((len(rows), len(columns)))
+    for line, row in enumerate(rows, 2):
+        for k, column in enumerate(columns):
+            try:
+                numbers[line - 2, k] = float(row[column])
+            except (TypeError, ValueError):
+                raise ValueError(f"line {line}: {column} is {row[column]!r}, not a number") from None
+    return numbers
+
+
+def _check_gaps(times_s: NDArray[np.float64]) -> None:
+    steps = np.diff(times_s)
+    if len(steps) and steps.max() > LONGEST_STEP * np.median(steps):
+        at = int(steps.argmax())
+        raise ValueError(
+            f"a gap of {steps[at]:g} s after t = {times_s[at]:g} s, where the usual step is {np.median(steps):g} s; "
+            "fill it, or split the file"
+        )
+
+
+def _box_actor(name: str, track: list[dict[str, str]]) -> Actor:
+    numbers = _numbers(track, [column for column in BOX_COLUMNS if column not in ("id", "category")])
+    size_m = numbers[0, 4:7]
+    if not (np.isfinite(size_m).all() and (size_m > 0).all()):
+        raise ValueError(f"id {name}: a box needs a positive length, width and height; got {size_m.tolist()}")
+    angles_deg = np.column_stack([numbers[:, 7], np.zeros((len(track), 2))])
+    try:
+        trajectory = Trajectory(numbers[:, 0], numbers[:, 1:4], angles_deg, transient=True)
+        _check_gaps(trajectory.times_s)
+    except ValueError as error:
+        raise ValueError(f"id {name}: {error}") from error
+    return Actor(name, track[0]["category"], _box(size_m), trajectory)
+
+
+def _box(size_m: NDArray[np.float64]) -> Mesh:
+    length, width, height = size_m.tolist()
+    return Box(type="box", size_m=(length, width, height)).mesh()
