@@ -158,7 +158,7 @@ def test_a_scenario_of_files_plays(tmp_path):
         x, y, z = scene.at(step).scan(Pose(z_m=2.0).matrix(), sphere).points.T
         rear_of_bus.append(x[(y > 2.7) & (z > 0.1)].min())
         box_seen.append(bool(((y < -3) & (z > 0.5)).any()))
-    np.testing.assert_allclose(rear_of_bus, [24 - 10 * step for step in range(5)], atol=0.2)
+    np.testing.assert_allclose(rear_of_bus, [24 - 10 * step for step in range(5)], atol=0.5)
     assert box_seen == [False, True, True, False, False]
 
 
