@@ -130,7 +130,7 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
     ("arguments", "message"),
     [
         (["evaluate"], "which rig?"),
-        (["evaluate", "no_such_rig"], "neither a .yaml file nor one of the built-in rigs: front_grille_128"),
+        (["evaluate", "no_such_rig"], "neither a .yaml file nor one of the built-in rigs: argoverse2,"),
         (["evaluate", "front_roof_128", "--scenario", "moon"], "one of the built-in scenarios: courtyard"),
         (["evaluate", "none.yaml"], "none.yaml: no such file"),
         (["evaluate", "--frames", "no_such_folder"], "no_such_folder"),

@@ -5,7 +5,7 @@ import pytest
 
 from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, in_vehicle_frame
 from torchcover.simulation.documents import Pose, load_document
-from torchcover.simulation.shapes import Box, Cylinder, Frustum, MeshFile, Plane
+from torchcover.simulation.shapes import Box, Cylinder, Ellipsoid, Frustum, MeshFile, Plane
 
 TETRAHEDRON = """ply
 format ascii 1.0
@@ -25,6 +25,11 @@ end_header
 3 0 3 2
 3 1 2 3
 """
+
+
+# Bands between rings of radius cos(30 k degrees): frusta over a polygon of twelve sides, whose area is 3 r^2.
+RADII, HEIGHTS = np.cos(np.deg2rad(np.arange(-90, 91, 30))), np.sin(np.deg2rad(np.arange(-90, 91, 30)))
+BANDED_SPHERE = float((np.diff(HEIGHTS) * (RADII[:-1] ** 2 + RADII[:-1] * RADII[1:] + RADII[1:] ** 2)).sum())
 
 
 def signed_volume(mesh):
@@ -47,6 +52,8 @@ def edge_counts(mesh):
         # Integral of (4 - 2t)(2 - t) over the height of 3.
         (Frustum(type="frustum", bottom_m=(4, 2), top_m=(2, 1), height_m=3), 3 * 2 * (4 - 4 / 2 + 1 / 3)),
         (Cylinder(type="cylinder", radius_m=2, height_m=5), 5 * 0.5 * 24 * 4 * np.sin(2 * np.pi / 24)),
+        (Cylinder(type="cylinder", radius_m=2, height_m=5, sides=4), 5 * 2 * 4),
+        (Ellipsoid(type="ellipsoid", size_m=(2, 4, 6)), 6 * BANDED_SPHERE),
     ],
 )
 def test_solids_are_closed_face_outwards_and_have_their_volume(shape, volume):
@@ -56,6 +63,19 @@ def test_solids_are_closed_face_outwards_and_have_their_volume(shape, volume):
     assert paired
     assert signed_volume(mesh) == pytest.approx(volume, rel=1e-12)
     assert mesh.vertices_m[:, 2].min() == 0.0
+
+
+def test_an_ellipsoid_has_its_size_and_its_corners_lie_on_the_surface():
+    mesh = Ellipsoid(type="ellipsoid", size_m=(0.2, 0.3, 0.5)).mesh()
+    np.testing.assert_allclose(mesh.vertices_m.min(0), [-0.1, -0.15, 0.0], atol=1e-15)
+    np.testing.assert_allclose(mesh.vertices_m.max(0), [0.1, 0.15, 0.5], atol=1e-15)
+    on_sphere = (mesh.vertices_m - [0, 0, 0.25]) / [0.1, 0.15, 0.25]
+    np.testing.assert_allclose(np.linalg.norm(on_sphere, axis=1), 1.0, rtol=1e-12)
+
+
+def test_a_cylinder_needs_three_sides():
+    with pytest.raises(ValueError, match="greater than or equal to 3"):
+        Cylinder(type="cylinder", radius_m=1, height_m=1, sides=2)
 
 
 def test_a_plane_is_flat_and_centred():

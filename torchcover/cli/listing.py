@@ -1,17 +1,25 @@
 """`torchcover list`."""
 
+import re
+
 from rich.console import Console
 from rich.table import Table
 
-from torchcover.simulation import Rig, Scenario, builtin_names
+from torchcover.simulation import LidarModel, Rig, Scenario, builtin_names
+from torchcover.simulation.documents import load_document
 
 
 def run() -> None:
-    """Print the built-in rigs and scenarios with their descriptions."""
+    """Print the built-in rigs, scenarios and LiDAR models, with the first sentence of their descriptions."""
     console = Console()
-    for kind, model in (("rigs", Rig), ("scenarios", Scenario)):
+    for kind, model in (("rigs", Rig), ("scenarios", Scenario), ("lidars", LidarModel)):
         table = Table("name", "description", title=kind, title_justify="left", box=None, padding=(0, 2, 0, 0))
         for name in builtin_names(kind):
-            table.add_row(name, model.load(name).description)
+            table.add_row(name, _first_sentence(load_document(model, kind, name).description))
         console.print(table)
         console.print()
+
+
+def _first_sentence(text: str) -> str:
+    # A full stop inside a number or an abbreviation is not followed by a blank and a capital.
+    return re.split(r"(?<=[.:;]) (?=[A-Z])", text, maxsplit=1)[0]

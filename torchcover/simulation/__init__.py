@@ -1,9 +1,9 @@
 """Simulated worlds: what a rig and a reference sensor see of a scenario."""
 
 from torchcover.simulation.documents import Pose, builtin_names
-from torchcover.simulation.lidar import Lidar
+from torchcover.simulation.lidar import Lidar, LidarModel
 from torchcover.simulation.reference import ReferenceSensor
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 
-__all__ = ["Lidar", "Pose", "ReferenceSensor", "Rig", "Scenario", "builtin_names"]
+__all__ = ["Lidar", "LidarModel", "Pose", "ReferenceSensor", "Rig", "Scenario", "builtin_names"]

@@ -27,7 +27,7 @@ class VehicleShape(Document):
 
 
 Shape = Annotated[
-    shapes.Plane | shapes.Box | shapes.Frustum | shapes.Cylinder | shapes.MeshFile | VehicleShape,
+    shapes.Plane | shapes.Box | shapes.Frustum | shapes.Cylinder | shapes.MeshFile | shapes.Ellipsoid | VehicleShape,
     Field(discriminator="type"),
 ]
 

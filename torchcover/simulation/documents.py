@@ -68,7 +68,7 @@ def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -
 
     Args:
         model: What it must hold.
-        kind: Folder of the built-in ones: "rigs", "scenarios" or "vehicles".
+        kind: Folder of the built-in ones: "rigs", "scenarios", "vehicles" or "lidars".
         path_or_name: A path that ends in .yaml or .yml, or the name of a built-in document.
 
     Returns:

@@ -1,35 +1,67 @@
-"""LiDAR: a table of rows, turned through its columns."""
+"""LiDAR: a sensor at its place on the vehicle, and the models on the market that it may start from."""
 
-from typing import Annotated, Literal, Self
+from pathlib import Path
+from typing import Any, Literal, Self
 
-import numpy as np
-from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import ValidationInfo, model_validator
 
-from torchcover.simulation.documents import Document, Pose
-from torchcover.simulation.rays import unit_directions
+from torchcover.simulation.documents import Pose, beside, load_document
+from torchcover.simulation.scan_pattern import ScanPattern
 
-Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
+# Two ways to write rows: a sensor that chooses one of them takes nothing of the other from its model.
+SPACED_ROWS = ("channels", "vertical_fov_deg")
+ROW_TABLE = ("elevations_deg", "azimuth_offsets_deg")
 
 
-class Lidar(Document):
-    """A scanning LiDAR. Its frame is x forward, y left, z up.
+class LidarModel(ScanPattern):
+    """What is known of a LiDAR on the market: the scan pattern that a sensor starts from.
 
-    The ray of row i in column j points to elevation `E[i]` and azimuth `A[j] + D[i]`, where the rows' elevations E are
-    a table or evenly spaced over the field of view, both ends included; the columns' azimuths A are evenly spaced over
-    the field of view, in the middle of `columns` equal sectors; and D are offsets of the rows.
+    Args:
+        name: What a sensor's `model` calls it.
+        description: What it is, and where its numbers come from.
+    """
+
+    name: str
+    description: str = ""
+
+    @classmethod
+    def load(cls, path_or_name: str | Path) -> Self:
+        """Read a model from a YAML file, or a built-in one by its name.
+
+        Raises:
+            FileNotFoundError: No such file or name; the message lists the names.
+            ValueError: The file is not a model; the message names the file and the key.
+
+        Example:
+            >>> len(LidarModel.load("velodyne_vlp16").rows_deg())
+            16
+        """
+        return load_document(cls, "lidars", path_or_name)
+
+    def completing(self, given: dict[str, Any]) -> dict[str, Any]:
+        """The keys of a sensor, and those of the model that it does not give.
+
+        Args:
+            given: The sensor's keys. One with evenly spaced rows takes no table from the model; one with a table of its
+                own takes neither spacing nor offsets.
+        """
+        pattern = self.model_dump(exclude={"name", "description"}, exclude_unset=True)
+        left_out: tuple[str, ...] = ()
+        if any(given.get(key) is not None for key in SPACED_ROWS):
+            left_out = ROW_TABLE
+        elif given.get("elevations_deg") is not None:
+            left_out = SPACED_ROWS + ROW_TABLE
+        return {key: value for key, value in pattern.items() if key not in left_out} | given
+
+
+class Lidar(ScanPattern):
+    """A scanning LiDAR at its place on the vehicle. Its frame is x forward, y left, z up.
 
     Args:
         name: What maps and messages call it.
         mount: `vehicle_T_lidar`.
-        channels: Number of rows, when they are evenly spaced.
-        vertical_fov_deg: Lowest and highest elevation of evenly spaced rows.
-        elevations_deg: Elevation of each row instead, in any order.
-        azimuth_offsets_deg: Offset of each row; positive is left. None if not given.
-        horizontal_fov_deg: Field of view about the x axis, 360 for a full turn.
-        columns: Number of columns.
-        min_range_m: Closer hits give no point.
-        max_range_m: Farther hits give no point.
+        model: Name of a built-in `LidarModel`, or path of a YAML file. It stands for every key of the scan pattern that
+            is not given here.
 
     Example:
         >>> lidar = Lidar(
@@ -37,47 +69,24 @@ class Lidar(Document):
         ... )
         >>> lidar.directions().shape
         (3, 3, 360)
+        >>> Lidar.model_validate({"name": "b", "model": "velodyne_vlp16", "max_range_m": 50}).columns
+        1800
     """
 
     type: Literal["lidar"] = "lidar"
     name: str
     mount: Pose = Pose()
-    channels: PositiveInt | None = None
-    vertical_fov_deg: tuple[Elevation, Elevation] | None = None
-    elevations_deg: tuple[Elevation, ...] | None = Field(default=None, min_length=1)
-    azimuth_offsets_deg: tuple[float, ...] | None = None
-    horizontal_fov_deg: Annotated[float, Field(gt=0.0, le=360.0)]
-    columns: PositiveInt
-    min_range_m: NonNegativeFloat = 0.0
-    max_range_m: PositiveFloat
+    model: str | None = None
 
-    @model_validator(mode="after")
-    def _check_rows(self) -> Self:
-        spaced = (self.channels is not None, self.vertical_fov_deg is not None)
-        if self.elevations_deg is not None and any(spaced):
-            raise ValueError("give the rows as elevations_deg, or as channels and vertical_fov_deg, not both")
-        if self.elevations_deg is None and not all(spaced):
-            raise ValueError("the rows are missing: give channels and vertical_fov_deg, or elevations_deg")
-        if self.vertical_fov_deg is not None and self.vertical_fov_deg[0] > self.vertical_fov_deg[1]:
-            raise ValueError(f"vertical_fov_deg: the lower elevation comes first; got {self.vertical_fov_deg}")
-        rows, offsets = len(self.rows_deg()), self.azimuth_offsets_deg
-        if offsets is not None and len(offsets) != rows:
-            raise ValueError(f"azimuth_offsets_deg: one for each of the {rows} rows is needed; got {len(offsets)}")
-        if self.min_range_m >= self.max_range_m:
-            raise ValueError(f"min_range_m ({self.min_range_m}) must be below max_range_m ({self.max_range_m})")
-        return self
-
-    def rows_deg(self) -> NDArray[np.float64]:
-        """(rows,) elevation of each row."""
-        if self.elevations_deg is not None:
-            return np.array(self.elevations_deg)
-        assert self.channels is not None  # checked in _check_rows
-        assert self.vertical_fov_deg is not None
-        return np.linspace(*self.vertical_fov_deg, self.channels)
-
-    def directions(self) -> NDArray[np.float64]:
-        """(3, rows, columns) unit directions in the LiDAR's frame."""
-        middle = (np.arange(self.columns) + 0.5) / self.columns - 0.5
-        offsets = np.zeros(len(self.rows_deg())) if self.azimuth_offsets_deg is None else self.azimuth_offsets_deg
-        azimuths_deg = np.add.outer(offsets, self.horizontal_fov_deg * middle)
-        return unit_directions(self.rows_deg()[:, None], azimuths_deg)
+    @model_validator(mode="before")
+    @classmethod
+    def _complete_from_model(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (what stood in the file)
+        if not isinstance(content, dict) or not isinstance(content.get("model"), str):
+            return content
+        name: str | Path = content["model"]
+        if Path(name).suffix in (".yaml", ".yml"):
+            name = beside(Path(name), info)
+        try:
+            return LidarModel.load(name).completing(content)
+        except FileNotFoundError as error:
+            raise ValueError(f"model: {error}") from error

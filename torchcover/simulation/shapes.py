@@ -1,16 +1,17 @@
 """Shapes: primitives, and meshes from files."""
 
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PositiveFloat, field_validator
+from pydantic import Field, PositiveFloat, field_validator
 
 from torchcover.geometry import transform
 from torchcover.simulation.documents import Document, beside
 
 CYLINDER_SIDES = 24
+ELLIPSOID_SIDES = 12  # around the z axis; half as many bands from pole to pole
 
 Length = PositiveFloat
 
@@ -80,22 +81,46 @@ class Frustum(Document):
 
 
 class Cylinder(Document):
-    """An upright cylinder that stands on z = 0, as a prism with 24 sides whose edges lie on the circle.
+    """An upright cylinder that stands on z = 0, as a prism whose edges lie on the circle.
 
     Args:
         radius_m: Radius.
         height_m: Extent along z.
+        sides: Number of sides. A multiple of four has the full diameter along x and y.
     """
 
     type: Literal["cylinder"]
     radius_m: Length
     height_m: Length
+    sides: Annotated[int, Field(ge=3)] = CYLINDER_SIDES
 
     def mesh(self) -> Mesh:
         """A closed prism."""
-        angle = 2 * np.pi * np.arange(CYLINDER_SIDES) / CYLINDER_SIDES
-        bottom = np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1) * self.radius_m
+        bottom = np.insert(_circle(self.sides) * self.radius_m, 2, 0.0, axis=1)
         return _prism(bottom, bottom + np.array([0.0, 0.0, self.height_m]))
+
+
+class Ellipsoid(Document):
+    """An ellipsoid that stands on z = 0, such as a head or a tree's crown; 120 triangles with corners on its surface.
+
+    Args:
+        size_m: Extent along x, y, z.
+    """
+
+    type: Literal["ellipsoid"]
+    size_m: tuple[Length, Length, Length]
+
+    def mesh(self) -> Mesh:
+        """Two poles and the rings between them, lowest first."""
+        bands = ELLIPSOID_SIDES // 2
+        elevation = np.pi * np.arange(1, bands) / bands - np.pi / 2
+        # The unit sphere: axes are bands, sides, coordinates.
+        across = np.cos(elevation)[:, None, None] * _circle(ELLIPSOID_SIDES)
+        upwards = np.broadcast_to(np.sin(elevation)[:, None, None], (*across.shape[:2], 1))
+        rings = np.concatenate([across, upwards], axis=2).reshape(-1, 3)
+        sphere = np.concatenate([[[0.0, 0.0, -1.0]], rings, [[0.0, 0.0, 1.0]]])
+        vertices = (sphere + np.array([0.0, 0.0, 1.0])) * np.array(self.size_m) / 2
+        return Mesh(vertices, _ball_faces(bands - 1, ELLIPSOID_SIDES))
 
 
 class MeshFile(Document):
@@ -142,16 +167,39 @@ def _rectangle(size_m: tuple[float, float], z_m: float) -> NDArray[np.float64]:
     return np.array([[-x, -y, z_m], [x, -y, z_m], [x, y, z_m], [-x, y, z_m]])
 
 
+def _circle(corners: int) -> NDArray[np.float64]:
+    """(corners, 2) points of the unit circle, counter-clockwise from (1, 0)."""
+    angle = 2 * np.pi * np.arange(corners) / corners
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def _ball_faces(rings: int, corners: int) -> NDArray[np.int64]:
+    """Triangles over vertices in the order lower pole, rings from below, upper pole."""
+    here = np.arange(corners)
+    following = (here + 1) % corners
+    lower, upper = np.zeros(corners, dtype=int), np.full(corners, rings * corners + 1)
+    top = (rings - 1) * corners + 1
+    faces = [np.stack([lower, following + 1, here + 1], axis=1), np.stack([upper, here + top, following + top], axis=1)]
+    for first in range(1, top, corners):
+        faces.append(_band(here + first, following + first, corners))
+    return np.concatenate(faces)
+
+
+def _band(here: NDArray[np.int64], following: NDArray[np.int64], upwards: int) -> NDArray[np.int64]:
+    """Two triangles for each side between a ring and the one above it, whose indices are larger by `upwards`."""
+    return np.concatenate(
+        [
+            np.stack([here, following, following + upwards], axis=1),
+            np.stack([here, following + upwards, here + upwards], axis=1),
+        ]
+    )
+
+
 def _prism(bottom: NDArray[np.float64], top: NDArray[np.float64]) -> Mesh:
     """Close the space between two convex polygons with K corners each, given counter-clockwise from above."""
     corners = len(bottom)
     here = np.arange(corners)
     following = (here + 1) % corners
-    sides = np.concatenate(
-        [
-            np.stack([here, following, following + corners], axis=1),
-            np.stack([here, following + corners, here + corners], axis=1),
-        ]
-    )
+    sides = _band(here, following, corners)
     fan = np.stack([np.zeros(corners - 2, dtype=int), here[1:-1], here[2:]], axis=1)
     return Mesh(np.concatenate([bottom, top]), np.concatenate([sides, fan[:, ::-1], fan + corners]))

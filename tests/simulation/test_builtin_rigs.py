@@ -1,0 +1,181 @@
+"""The published rigs carry the numbers of their sources, in the vehicle frame."""
+
+import numpy as np
+import pytest
+
+from torchcover import Rig
+from torchcover.geometry import transform
+from torchcover.simulation import builtin_names
+from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.documents import load_document
+
+RIGS = builtin_names("rigs")
+
+# Centre of the box in the frame of the source: metres before the rear axle, height of the source's origin.
+NUSCENES, KITTI, WAYMO, ARGOVERSE, EDGAR = (1.385, 0.0), (1.337, 0.0), (1.461, 0.0), (1.339, 0.30), (1.5915, 0.338)
+
+# Rig, sensor, frame, position as published (rear axle; x forward, y left, z up).
+REAR_AXLE = [
+    ("nuscenes", "top", NUSCENES, (0.944, 0.0, 1.840)),
+    ("kitti", "velodyne", KITTI, (0.76, 0.0, 1.73)),
+    ("waymo", "top", WAYMO, (1.430, 0.0, 2.184)),
+    ("waymo", "front", WAYMO, (4.070, 0.0, 0.689)),
+    ("waymo", "side_left", WAYMO, (3.245, 1.025, 0.979)),
+    ("waymo", "side_right", WAYMO, (3.245, -1.025, 0.979)),
+    ("waymo", "rear", WAYMO, (-1.155, 0.0, 0.464)),
+    ("argoverse2", "up_lidar", ARGOVERSE, (1.350, 0.0, 1.640)),
+    ("argoverse2", "down_lidar", ARGOVERSE, (1.347, 0.005, 1.526)),
+    ("edgar", "ouster_left", EDGAR, (2.312, 0.582, 1.610)),
+    ("edgar", "ouster_right", EDGAR, (2.312, -0.665, 1.613)),
+    ("edgar", "innovusion_front", EDGAR, (2.259, 0.0, 1.600)),
+    ("edgar", "innovusion_rear", EDGAR, (-0.399, 0.003, 1.760)),
+]
+
+# Rig, x, y, z as published in CARLA's frame (y right).
+CARLA = {
+    "hu2022_center": ((0, 0, 0, 0), (0, 0, 0, 0), (2.4, 2.6, 2.8, 3.0)),
+    "hu2022_line": ((0, 0, 0, 0), (-0.6, -0.4, 0.4, 0.6), (2.2,) * 4),
+    "hu2022_line_roll": ((0, 0, 0, 0), (-0.6, -0.4, 0.4, 0.6), (2.2,) * 4),
+    "hu2022_square": ((-0.5, -0.5, 0.5, 0.5), (0.5, -0.5, 0.5, -0.5), (2.2,) * 4),
+    "hu2022_pyramid": ((-0.2, 0.4, -0.2, -0.2), (-0.6, 0, 0, 0.6), (2.2, 2.4, 2.6, 2.2)),
+    "hu2022_pyramid_roll": ((-0.2, 0.4, -0.2, -0.2), (-0.6, 0, 0, 0.6), (2.2, 2.4, 2.6, 2.2)),
+    "hu2022_pyramid_pitch": ((-0.2, 0.4, -0.2, -0.2), (-0.6, 0, 0, 0.6), (2.2, 2.4, 2.6, 2.2)),
+    "hu2022_trapezoid": ((-0.4, -0.4, 0.2, 0.2), (0.2, -0.2, 0.5, -0.5), (2.2,) * 4),
+    "place3d_1x64": ((0, 0), (0, 0), (2.0, 2.0)),
+    "place3d_center": ((0, 0, 0, 0), (0, 0, 0, 0), (1.8, 2.0, 2.2, 2.4)),
+    "place3d_line": ((0, 0, 0, 0), (-0.6, -0.4, 0.4, 0.6), (1.8, 2.2, 2.2, 1.8)),
+    "place3d_pyramid": ((-0.8, 0.2, -0.6, -0.8), (-0.6, 0, 0, 0.6), (1.8, 2.0, 2.4, 1.8)),
+    "place3d_square": ((-1, -1, 0.2, 0.2), (0.5, -0.5, 0.5, -0.5), (2.0, 2.0, 2.2, 2.2)),
+    "place3d_trapezoid": ((-0.6, -0.6, 0.2, 0.2), (0.6, -0.6, 0.4, -0.4), (2.0, 2.0, 1.8, 1.8)),
+    "place3d_optimised_detection": ((0.5, -0.4, 0, -0.1), (0.5, 0.1, 0, -0.5), (2.5, 2.6, 2.8, 2.7)),
+}
+# Roll in radians in CARLA, where a positive one lowers the right side, as here.
+ROLLS = {
+    "hu2022_line_roll": (-0.28, 0, 0, 0.28),
+    "hu2022_pyramid_roll": (-0.28, 0, 0, 0.28),
+    "place3d_optimised_detection": (-0.3, -0.2, 0, 0),
+}
+
+
+def mounted(rig, sensor):
+    (found,) = [each for each in Rig.load(rig).sensors if each.name == sensor]
+    return found.mount.matrix()
+
+
+def looks(matrix, direction=(1.0, 0.0, 0.0)):
+    """Azimuth and elevation in degrees of a direction in the sensor's frame, in the vehicle frame."""
+    x, y, z = matrix[:3, :3] @ direction
+    return np.rad2deg(np.arctan2(y, x)), np.rad2deg(np.arcsin(z))
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_a_rig_says_where_its_numbers_come_from_and_names_its_sensors(name):
+    rig = Rig.load(name)
+    assert rig.name == name
+    assert any(word in rig.description for word in ("/", "assumption"))
+    names = [sensor.name for sensor in rig.sensors]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_no_sensor_lies_inside_the_suv_or_below_the_ground(name):
+    positions = np.array([sensor.mount.matrix()[:3, 3] for sensor in Rig.load(name).sensors])
+    assert (positions[:, 2] > 0.3).all()
+    for part in load_document(Vehicle, "vehicles", "suv").parts:
+        for mesh in part.meshes():
+            # Parts are convex: a point inside lies behind every face.
+            a, b, c = (mesh.vertices_m[mesh.faces[:, corner]] for corner in range(3))
+            normals = np.cross(b - a, c - a)
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+            distance = ((positions[:, None] - a) * normals).sum(2).max(1)
+            assert (distance > 0.03).all()
+
+
+@pytest.mark.parametrize(("rig", "sensor", "frame", "published"), REAR_AXLE)
+def test_positions_are_those_of_the_source(rig, sensor, frame, published):
+    before_axle, axle_height = frame
+    np.testing.assert_allclose(mounted(rig, sensor)[:3, 3] + [before_axle, 0.0, -axle_height], published, atol=6e-4)
+
+
+@pytest.mark.parametrize("rig", CARLA)
+def test_positions_are_those_of_carla_with_left_and_right_exchanged(rig):
+    positions = np.array([sensor.mount.matrix()[:3, 3] for sensor in Rig.load(rig).sensors])
+    np.testing.assert_allclose((positions * [1, -1, 1]).T, CARLA[rig], atol=1e-9)
+
+
+@pytest.mark.parametrize("rig", CARLA)
+def test_the_right_axis_drops_by_the_sine_of_carlas_roll(rig):
+    rolls = ROLLS.get(rig, (0,) * len(CARLA[rig][0]))
+    for sensor, roll in zip(Rig.load(rig).sensors, rolls, strict=True):
+        right = sensor.mount.matrix()[:3, :3] @ [0, -1, 0]
+        assert right[2] == pytest.approx(-np.sin(roll), abs=1e-5)
+
+
+def test_tilted_placements_look_down_on_their_own_side():
+    for rig in ("hu2022_line_roll", "hu2022_pyramid_roll"):
+        for sensor in Rig.load(rig).sensors:
+            matrix = sensor.mount.matrix()
+            outwards = np.array([0.0, np.sign(matrix[1, 3]), 0.0])
+            if sensor.mount.roll_deg:
+                assert (matrix[:3, :3] @ outwards)[2] < -0.25
+    front = Rig.load("hu2022_pyramid_pitch").sensors[1].mount.matrix()
+    assert looks(front)[1] == pytest.approx(np.rad2deg(-0.09), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("rig", "sensor", "azimuth", "elevation"),
+    [
+        ("nuscenes", "top", 0.1, 0.0),
+        ("waymo", "side_left", 88.8, 0.0),
+        ("waymo", "side_right", -92.2, 0.0),
+        ("waymo", "rear", 178.4, 0.0),
+        # The source turns the sensor's z axis out: 90 degrees less 1.369065 rad, and 1.7552732 rad less 90 degrees.
+        ("edgar", "innovusion_front", 0.0, -11.558),
+        ("edgar", "innovusion_rear", 180.0, -10.570),
+    ],
+)
+def test_sensors_look_where_the_source_says(rig, sensor, azimuth, elevation):
+    found = looks(mounted(rig, sensor))
+    assert (found[0] - azimuth + 180) % 360 - 180 == pytest.approx(0.0, abs=1e-3)
+    assert found[1] == pytest.approx(elevation, abs=1e-3)
+
+
+def test_edgars_ousters_are_turned_as_in_its_urdf():
+    for sensor, (roll, pitch, yaw) in {
+        "ouster_left": (-0.3461248, 0.0165291, -0.0162606),
+        "ouster_right": (0.3551248, 0.0165291, 0.0061281),
+    }.items():
+        (cr, sr), (cp, sp), (cy, sy) = ((np.cos(angle), np.sin(angle)) for angle in (roll, pitch, yaw))
+        about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+        about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+        about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+        np.testing.assert_allclose(mounted("edgar", sensor)[:3, :3], about_z @ about_y @ about_x, atol=2e-5)
+
+
+def test_argoverses_lower_lidar_hangs_upside_down():
+    matrix = mounted("argoverse2", "down_lidar")
+    np.testing.assert_allclose(matrix[:3, :3] @ [0, 0, 1], [0, 0, -1], atol=1e-12)
+    assert looks(matrix)[0] == pytest.approx(-11.6)
+
+
+def test_roof_rigs_differ_in_their_rows_alone():
+    roofs = {rows: Rig.load(f"front_roof_{rows}").sensors[0] for rows in (32, 64, 128)}
+    for rows, sensor in roofs.items():
+        assert len(sensor.rows_deg()) == rows
+        assert sensor.model_copy(update={"channels": 128}) == roofs[128]
+
+
+@pytest.mark.parametrize("rig", sorted(set(RIGS) - {"front_grille_128"}))
+def test_rays_reach_the_ground_in_front(rig):
+    """A gross error of a mount, such as a roll of 180 degrees, leaves no ray for the road ahead."""
+    reached = 0
+    for sensor in Rig.load(rig).sensors:
+        matrix, directions = sensor.mount.matrix(), sensor.directions().reshape(3, -1)
+        ends = transform(matrix, directions.T)
+        origin = matrix[:3, 3]
+        fall = origin[2] - ends[:, 2]
+        distance = np.divide(origin[2], fall, out=np.full_like(fall, np.inf), where=fall > 1e-3)
+        road = origin + np.minimum(distance, 1e6)[:, None] * (ends - origin)
+        ahead = (distance < sensor.max_range_m) & (road[:, 0] > 4) & (road[:, 0] < 40) & (np.abs(road[:, 1]) < 2)
+        reached += int(ahead.sum())
+    assert reached > 100

@@ -1,0 +1,171 @@
+"""A LiDAR starts from a model; what it says itself wins."""
+
+import numpy as np
+import pytest
+
+from torchcover import Rig
+from torchcover.simulation import Lidar, builtin_names
+from torchcover.simulation.lidar import LidarModel
+
+# Rows, lowest and highest elevation (degrees), columns, range (m): published figures, not read from our files.
+PUBLISHED = {
+    "hesai_at128": (128, -12.47, 12.93, 1200, 200),
+    "hesai_pandar128": (128, -24.96, 14.45, 3600, 200),
+    "hesai_pandar64": (64, -24.91, 14.87, 1800, 200),
+    "innovusion_falcon": (60, -12.5, 12.5, 1500, 250),
+    "ouster_os0_128": (128, -46.16, 44.3, 1024, 55),
+    "ouster_os1_128": (128, -21.95, 20.47, 1024, 120),
+    "ouster_os1_64": (64, -16.68, 16.73, 1024, 120),
+    "valeo_scala1": (3, -0.4, 1.2, 580, 80),
+    "valeo_scala2": (16, -4.75, 4.75, 532, 100),
+    "velodyne_hdl32e": (32, -30.67, 10.67, 2168, 100),
+    "velodyne_hdl64e": (64, -24.56, 1.96, 2083, 120),
+    "velodyne_vlp16": (16, -15.0, 15.0, 1800, 100),
+    "velodyne_vlp32c": (32, -25.0, 15.0, 1800, 200),
+    "velodyne_vls128": (128, -25.0, 15.0, 1800, 300),
+    "waymo_short_range": (200, -89.7, 29.7, 600, 20),
+    "waymo_top": (64, -17.72, 2.21, 2650, 75),
+}
+RIG = """
+name: r
+sensors:
+  - {{type: lidar, name: top, {keys}}}
+"""
+
+
+def sensor(**keys):
+    return Lidar.model_validate({"name": "s", **keys})
+
+
+def read(folder, keys):
+    path = folder / "rig.yaml"
+    path.write_text(RIG.format(keys=keys))
+    return Rig.load(path).sensors[0]
+
+
+def test_these_are_all():
+    assert builtin_names("lidars") == sorted(PUBLISHED)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_a_model_has_its_published_figures_and_says_where_they_come_from(name):
+    model = LidarModel.load(name)
+    rows, lowest, highest, columns, range_m = PUBLISHED[name]
+    elevations = model.rows_deg()
+    assert model.name == name
+    assert len(elevations) == rows
+    assert elevations.min() == pytest.approx(lowest, abs=0.006)
+    assert elevations.max() == pytest.approx(highest, abs=0.006)
+    assert (model.columns, model.max_range_m) == (columns, range_m)
+    assert any(word in model.description for word in ("/", "data sheets"))
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_rows_are_sorted_and_different(name):
+    steps = np.diff(LidarModel.load(name).rows_deg())
+    assert (steps < 0).all() or (steps > 0).all()
+
+
+def test_hesai_rows_turn_left_where_its_table_says_right():
+    # Channel 8 of a Pandar64: elevation 1.676, offset 3.125 degrees clockwise.
+    model = LidarModel.load("hesai_pandar64")
+    row = int(np.argmin(np.abs(model.rows_deg() - 1.676)))
+    assert model.azimuth_offsets_deg[row] == -3.125
+    x, y, _ = model.directions()[:, row, 900]
+    assert np.rad2deg(np.arctan2(y, x)) == pytest.approx(-3.125 + 0.1, abs=1e-6)
+
+
+def test_velodyne_rows_turn_as_in_the_manual():
+    # VLP-32C, laser 0: elevation -25, azimuth offset +1.4 degrees clockwise.
+    model = LidarModel.load("velodyne_vlp32c")
+    assert model.azimuth_offsets_deg[int(np.argmin(model.rows_deg()))] == -1.4
+
+
+def test_a_sensor_has_the_pattern_of_its_model():
+    model = LidarModel.load("ouster_os1_64")
+    lidar = sensor(model="ouster_os1_64", mount={"z_m": 2.0})
+    np.testing.assert_array_equal(lidar.directions(), model.directions())
+    assert (lidar.name, lidar.mount.z_m, lidar.min_range_m, lidar.max_range_m) == ("s", 2.0, 0.3, 120.0)
+
+
+def test_what_a_sensor_says_itself_wins():
+    lidar = sensor(model="velodyne_vlp16", columns=900, max_range_m=30, range_noise_m=0.03, dropout=0.1)
+    assert (lidar.columns, lidar.max_range_m, lidar.range_noise_m, lidar.dropout) == (900, 30.0, 0.03, 0.1)
+    assert len(lidar.rows_deg()) == 16
+
+
+def test_evenly_spaced_rows_replace_a_models_table_and_its_offsets():
+    lidar = sensor(model="hesai_pandar64", channels=3, vertical_fov_deg=(-10, 10))
+    assert lidar.rows_deg().tolist() == [-10, 0, 10]
+    assert lidar.azimuth_offsets_deg is None
+
+
+def test_a_table_replaces_a_models_rows_and_its_offsets():
+    for model in ("hesai_pandar64", "innovusion_falcon"):
+        lidar = sensor(model=model, elevations_deg=(1, -1))
+        assert lidar.rows_deg().tolist() == [1, -1]
+        assert lidar.azimuth_offsets_deg is None
+
+
+def test_the_number_of_evenly_spaced_rows_can_change_alone():
+    lidar = sensor(model="innovusion_falcon", channels=3)
+    assert lidar.rows_deg().tolist() == [-12.5, 0, 12.5]
+
+
+def test_offsets_can_be_left_out():
+    lidar = sensor(model="hesai_pandar64", azimuth_offsets_deg=None)
+    assert lidar.azimuth_offsets_deg is None
+    assert len(lidar.rows_deg()) == 64
+
+
+def test_a_sensor_written_out_is_the_same_sensor_again():
+    for model in ("ouster_os1_64", "innovusion_falcon"):
+        lidar = sensor(model=model, columns=7)
+        assert Lidar.model_validate(lidar.model_dump()) == lidar
+
+
+def test_the_keys_that_arrive_stay_as_they_were():
+    keys = {"name": "s", "model": "velodyne_vlp16"}
+    Lidar.model_validate(keys)
+    assert keys == {"name": "s", "model": "velodyne_vlp16"}
+
+
+def test_a_model_can_be_a_file_beside_the_rig(tmp_path):
+    (tmp_path / "own.yaml").write_text(
+        "{name: own, elevations_deg: [0, -5], horizontal_fov_deg: 90, columns: 4, max_range_m: 9}"
+    )
+    assert read(tmp_path, "model: own.yaml").rows_deg().tolist() == [0, -5]
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ("model: vlp16", r"sensors\.0: model: 'vlp16' is neither .* built-in lidars: .*velodyne_vlp16"),
+        ("model: none.yaml", r"sensors\.0: model: .*none\.yaml: no such file"),
+        ("model: 16", r"sensors\.0\.model: .*string \(got 16\)"),
+        ("model: hesai_pandar64, channels: 8", r"sensors\.0: the rows are missing"),
+        ("model: hesai_pandar64, azimuth_offsets_deg: [1]", "one for each of the 64 rows is needed; got 1"),
+        ("model: velodyne_vlp16, max_range_m: 0.2", r"min_range_m \(0\.4\) must be below"),
+        ("model: velodyne_vlp16, colums: 9", r"sensors\.0\.colums: Extra inputs"),
+        ("model: velodyne_vlp16, dropout: 1.1", r"dropout: .*less than or equal to 1 \(got 1\.1\)"),
+        ("model: velodyne_vlp16, dropout: -0.1", r"dropout: .*greater than or equal to 0"),
+        ("model: velodyne_vlp16, range_noise_m: -1", r"range_noise_m: .*greater than or equal to 0"),
+        ("model: velodyne_vlp16, range_noise_m: .nan", r"range_noise_m: .*finite"),
+    ],
+)
+def test_a_wrong_sensor_is_named(tmp_path, keys, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        read(tmp_path, keys)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_wrong_model_file_is_named(tmp_path):
+    (tmp_path / "own.yaml").write_text("{name: own, elevations_deg: [95], horizontal_fov_deg: 90, columns: 4}")
+    with pytest.raises(ValueError, match=r"sensors\.0: .*own\.yaml: elevations_deg\.0: .*90.*; max_range_m: Field req"):
+        read(tmp_path, "model: own.yaml")
+
+
+def test_noise_and_dropout_are_off_unless_asked_for():
+    for name in PUBLISHED:
+        model = LidarModel.load(name)
+        assert (model.range_noise_m, model.dropout) == (0.0, 0.0)

@@ -1,0 +1,140 @@
+"""The built-in vehicles are closed, stand on the ground, and have the size and the silhouette of the real ones."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from torchcover.simulation import builtin_names
+from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.documents import load_document
+
+SIZES_M = {
+    "adult": (0.305, 0.52, 1.75),
+    "bus": (12.0, 2.55, 3.10),
+    "child": (0.209, 0.36, 1.20),
+    "cyclist": (1.80, 0.60, 1.75),
+    "hatchback": (4.28, 1.79, 1.46),
+    "motorcycle": (2.10, 0.80, 1.50),
+    "sedan": (4.77, 1.83, 1.46),
+    "suv": (4.90, 1.94, 1.63),
+    "truck": (16.50, 2.55, 4.00),
+    "van": (5.93, 2.02, 2.64),
+}
+CARS = ("hatchback", "sedan", "suv", "van")
+WITH_WHEELS = tuple(sorted(set(SIZES_M) - {"adult", "child"}))
+
+
+def load(name):
+    return load_document(Vehicle, "vehicles", name)
+
+
+def height_at(mesh, x_m, y_m):
+    """Height of the highest surface over a point of the ground; -inf where there is none."""
+    a, b, c = (mesh.vertices_m[mesh.faces[:, corner]] for corner in range(3))
+
+    def area(p, q, r):
+        return (q[:, 0] - p[:, 0]) * (r[:, 1] - p[:, 1]) - (q[:, 1] - p[:, 1]) * (r[:, 0] - p[:, 0])
+
+    point = np.broadcast_to([x_m, y_m, 0.0], a.shape)
+    weights = np.stack([area(b, c, point), area(c, a, point), area(a, b, point)])
+    total = area(a, b, c)
+    over = (np.abs(total) > 1e-12) & ((weights * np.sign(total)) >= 0).all(axis=0)
+    heights = (weights[:, over] * np.stack([a, b, c])[:, over, 2]).sum(0) / total[over]
+    return max(heights, default=-np.inf)
+
+
+def profile(mesh, x_m):
+    """The outline of a vehicle along its middle."""
+    return np.array([height_at(mesh, x, 0.013) for x in x_m])
+
+
+def test_these_are_all():
+    assert builtin_names("vehicles") == sorted(SIZES_M)
+
+
+@pytest.mark.parametrize("name", SIZES_M)
+def test_a_vehicle_stands_on_the_ground_in_the_middle_of_its_box(name):
+    vertices = load(name).mesh().vertices_m
+    length, width, height = SIZES_M[name]
+    np.testing.assert_allclose(vertices.min(0), [-length / 2, -width / 2, 0], atol=1e-3)
+    np.testing.assert_allclose(vertices.max(0), [length / 2, width / 2, height], atol=1e-3)
+
+
+@pytest.mark.parametrize("name", SIZES_M)
+def test_the_description_states_the_height(name):
+    assert f"{SIZES_M[name][2]:.2f} m" in load(name).description
+
+
+@pytest.mark.parametrize("name", SIZES_M)
+def test_every_part_is_closed_and_faces_outwards(name):
+    for part in load(name).parts:
+        for mesh in part.meshes():
+            solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
+            assert solid.is_watertight
+            assert solid.is_winding_consistent
+            assert solid.volume > 1e-5
+
+
+@pytest.mark.parametrize("name", SIZES_M)
+def test_left_and_right_are_mirror_images(name):
+    # Part by part: the corners of all copies of a part, and of their mirror image, are the same points.
+    for part in load(name).parts:
+        corners = np.concatenate([mesh.vertices_m for mesh in part.meshes()])
+        rounded = {tuple(corner) for corner in (np.round(corners, 6) + 0.0).tolist()}
+        mirrored = {tuple(corner) for corner in (np.round(corners * [1, -1, 1], 6) + 0.0).tolist()}
+        assert rounded == mirrored, part.name
+
+
+@pytest.mark.parametrize("name", SIZES_M)
+def test_few_faces_are_enough(name):
+    assert len(load(name).mesh().faces) < (400 if name in CARS else 600)
+
+
+@pytest.mark.parametrize("name", WITH_WHEELS)
+def test_wheels_stand_on_the_ground_and_nothing_else_does(name):
+    for part in load(name).parts:
+        lowest = min(mesh.vertices_m[:, 2].min() for mesh in part.meshes())
+        if "wheels" in part.name:
+            assert lowest == pytest.approx(0.0, abs=1e-12)
+        else:
+            assert lowest > 0.1
+
+
+@pytest.mark.parametrize("name", CARS)
+def test_a_car_has_a_hood_below_a_raked_windscreen_below_a_roof(name):
+    mesh = load(name).mesh()
+    x = np.linspace(-0.98, 0.98, 197) * SIZES_M[name][0] / 2
+    outline = profile(mesh, x)
+    roof = SIZES_M[name][2]
+    hood = outline[x > 0.6 * x.max()].max()
+    assert 0.4 * roof < hood < 0.72 * roof
+    front_of_roof = x[outline > 0.95 * roof].max()
+    foot = x[outline > hood + 0.05].max()
+    # The windscreen: between foot and roof the outline falls all the way, at a rake of 25 to 65 degrees.
+    windscreen = outline[(x > front_of_roof) & (x < foot)]
+    assert (np.diff(windscreen) < 0).all()
+    rake = np.rad2deg(np.arctan2(0.95 * roof - hood - 0.05, foot - front_of_roof))
+    assert 25 < rake < 65
+
+
+@pytest.mark.parametrize("name", CARS)
+def test_a_cars_cabin_is_narrower_than_its_body(name):
+    vertices = load(name).mesh().vertices_m
+    height = SIZES_M[name][2]
+    roof = vertices[vertices[:, 2] > 0.99 * height]
+    assert np.ptp(roof[:, 1]) < 0.8 * SIZES_M[name][1]
+
+
+@pytest.mark.parametrize("name", [*CARS, "truck", "bus"])
+def test_mirrors_end_within_the_width(name):
+    (mirrors,) = [part for part in load(name).parts if part.name == "mirrors"]
+    outermost = max(mesh.vertices_m[:, 1].max() for mesh in mirrors.meshes())
+    assert outermost <= SIZES_M[name][1] / 2 + 1e-9
+    assert len(mirrors.meshes()) == 2
+
+
+def test_riders_and_walkers_have_a_head_on_top():
+    for name in ("adult", "child", "cyclist", "motorcycle"):
+        mesh = load(name).mesh()
+        top = mesh.vertices_m[mesh.vertices_m[:, 2] > SIZES_M[name][2] - 0.05]
+        assert np.ptp(top[:, 1]) < 0.2
