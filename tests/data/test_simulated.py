@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from torchcover import Rig
+from torchcover import Rig, Scenario
 from torchcover.data import SimulatedFrames, collate_frames
 from torchcover.simulation import ReferenceSensor
 
@@ -96,3 +96,99 @@ def test_an_index_outside_is_an_index_error(index):
 def test_impossible_requests_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
         frames(**changes)
+
+
+def scenario(ego_z=0.0, wall_x=50.0):
+    return Scenario.model_validate(
+        {
+            "name": "s",
+            "ego": {"shape": {"type": "box", "size_m": [4, 2, 1.5]}, "pose": {"z_m": ego_z}},
+            "bodies": [
+                {"name": "ground", "shape": {"type": "plane", "size_m": [200, 200]}},
+                {"name": "wall", "shape": {"type": "box", "size_m": [4, 4, 4]}, "poses": [{"x_m": wall_x}]},
+            ],
+        }
+    )
+
+
+def lidar(**changes):
+    content = {
+        "name": "top",
+        "mount": {"z_m": 1.8},
+        "channels": 16,
+        "vertical_fov_deg": (-30, 0),
+        "horizontal_fov_deg": 360,
+        "columns": 180,
+        "max_range_m": 80,
+    }
+    return Rig.model_validate({"name": "r", "sensors": [{**content, **changes}]})
+
+
+def test_several_rigs_see_the_same_instant_and_share_the_reference():
+    names = ("front_grille_128", "front_roof_128")
+    both = SimulatedFrames("courtyard", rigs={name: name for name in names}, steps=2, seed=3, reference=SMALL)[1]
+    for name in names:
+        alone = frames(rig=name)[1]
+        assert torch.equal(both.sensors[name], alone.sensor)
+        assert torch.equal(both.reference, alone.reference)
+    with pytest.raises(ValueError, match=r"clouds of 2 rigs \(front_grille_128, front_roof_128\): say which"):
+        _ = both.sensor
+
+
+@pytest.mark.parametrize("given", [{}, {"rig": "front_roof_128", "rigs": {"a": "front_roof_128"}}, {"rigs": {}}])
+def test_one_rig_or_several_are_needed(given):
+    with pytest.raises(ValueError, match="give one rig, or several"):
+        SimulatedFrames("courtyard", steps=1, **given)
+
+
+def test_range_noise_is_along_the_ray_and_has_its_standard_deviation():
+    exact = SimulatedFrames(scenario(), lidar(), steps=1, reference=SMALL)[0].sensor.double()
+    noisy = SimulatedFrames(scenario(), lidar(range_noise_m=0.05), steps=1, reference=SMALL)[0].sensor.double()
+    origin = torch.tensor([0.0, 0.0, 1.8]).double()
+    ray = (exact - origin) / (exact - origin).norm(dim=1, keepdim=True)
+    along = ((noisy - exact) * ray).sum(dim=1)
+    assert ((noisy - exact) - along[:, None] * ray).abs().max() < 1e-5
+    assert along.std() == pytest.approx(0.05, rel=0.06)
+    assert abs(along.mean()) < 4 * 0.05 / len(along) ** 0.5
+
+
+def test_dropout_takes_its_share_of_the_points():
+    exact = SimulatedFrames(scenario(), lidar(), steps=2, reference=SMALL)
+    thinned = SimulatedFrames(scenario(), lidar(dropout=0.3), steps=2, reference=SMALL)
+    count, kept = len(exact[0].sensor), len(thinned[0].sensor)
+    assert abs(kept / count - 0.7) < 4 * (0.21 / count) ** 0.5
+    assert set(map(tuple, thinned[0].sensor.tolist())) <= set(map(tuple, exact[0].sensor.tolist()))
+    assert not torch.equal(thinned[0].sensor[:50], thinned[1].sensor[:50])
+
+
+def test_a_sensor_inside_the_ego_is_named():
+    with pytest.raises(ValueError, match=r"rig 'r': sensor 'top' at \[0.0, 0.0, 0.7\] m lies inside the ego"):
+        SimulatedFrames(scenario(), lidar(mount={"z_m": 0.7}), steps=1)[0]
+
+
+def test_a_reference_pose_inside_a_wall_is_drawn_again_and_counted():
+    close = SimulatedFrames(scenario(wall_x=4.05), lidar(), steps=40, reference=SMALL)
+    wide = SimulatedFrames(scenario(wall_x=50.0), lidar(), steps=40, reference=SMALL)
+    assert sum(close[index].counts["reference_poses_redrawn"] for index in range(40)) > 0
+    assert sum(wide[index].counts["reference_poses_redrawn"] for index in range(40)) == 0
+    for index in range(40):
+        points = close[index].reference
+        inside = ((points - torch.tensor([4.05, 0.0, 2.0])).abs() < 1.99).all(dim=1)
+        assert not inside.any()
+
+
+def test_an_ego_below_the_ground_is_an_error():
+    with pytest.raises(ValueError, match="100 places beside and above the ego lie inside other bodies"):
+        SimulatedFrames(scenario(ego_z=-9.0), lidar(), steps=1, reference=SMALL)[0]
+
+
+@pytest.mark.parametrize("name", ["urban", "highway", "parking"])
+def test_traffic_plays_the_same_in_any_order_and_starts_anew_at_its_end(name):
+    short = Scenario.model_validate({"name": name, "traffic": {"type": name, "duration_s": 1.0, "time_step_s": 0.5}})
+    made = SimulatedFrames(short, lidar(), steps=7, seed=1, reference=SMALL)
+    in_order = [made[index] for index in range(7)]
+    again = SimulatedFrames(short, lidar(), steps=7, seed=1, reference=SMALL)
+    assert all(same(in_order[index], again[index]) for index in (6, 2, 5, 0))
+    assert not torch.equal(in_order[0].sensor, in_order[3].sensor)
+    other = SimulatedFrames(short, lidar(), steps=1, seed=2, reference=SMALL)[0]
+    assert not torch.equal(in_order[0].sensor, other.sensor)

@@ -137,3 +137,18 @@ def test_a_quaternion_and_angles_describe_the_same_pose():
     half = np.deg2rad(30.0) / 2
     by_quaternion = Pose(quaternion_wxyz=(2 * np.cos(half), 0.0, 0.0, 2 * np.sin(half)))
     np.testing.assert_allclose(by_quaternion.matrix(), Pose(yaw_deg=30.0).matrix(), atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("name: s\n", "ego and bodies missing"),
+        (SCENARIO.replace("bodies:", "actors: []\nbodies_:"), "bodies_: Extra inputs"),
+        ("name: s\ntraffic: {type: urban}\nduration_s: 5\n", "traffic makes duration_s itself"),
+        ("name: s\ntraffic: {type: urban}\nego: {shape: {type: box, size_m: [4, 2, 1]}, pose: {}}", "shape only"),
+        ("name: s\ntraffic: {type: rural}\n", "traffic: .*'urban', 'highway', 'parking'"),
+    ],
+)
+def test_a_scenario_is_given_or_procedural(tmp_path, content, message):
+    with pytest.raises(ValueError, match=message):
+        Scenario.load(write(tmp_path, content))

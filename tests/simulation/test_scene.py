@@ -149,3 +149,37 @@ def test_a_scenario_places_its_ego_and_bodies():
     assert scene.ego_box.lower_m == (-2.0, -1.0, 0.0)
     points = scene.at(0).scan(Pose(x_m=-8.0, z_m=1.5).matrix(), SPHERE).points
     assert points[points[:, 2] > 1.6][:, 0].min() == pytest.approx(-0.5, abs=1e-4)
+
+
+def test_an_actor_in_the_ego_is_an_error_that_names_actor_and_time():
+    made = world(ego_moves=True)
+    crossing = Trajectory.of([0.0, 10.0], [[5, -25, 0], [5, 25, 0]], [[90, 0, 0]] * 2)
+    scene = Scene(World(made.static, made.ego, (Actor("truck", "truck", box(8, 2, 3), crossing),), 1.0, 10.0))
+    scene.at(3)
+    with pytest.raises(ValueError, match=r"actor 'truck' overlaps the ego at t = 5 s"):
+        scene.at(5)
+
+
+def test_a_place_inside_the_ego_is_found():
+    scene = Scene(world())
+    assert scene.encloses(np.array([1.0, 0.5, 0.5]))
+    assert not scene.encloses(np.array([0.0, 0.0, 1.1]))
+    assert not scene.encloses(np.array([2.1, 0.0, 0.5]))
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_place_in_the_ground_a_wall_or_a_car_is_buried(moving):
+    instant = Scene(world(moving=moving)).at(0)
+    for buried in ([3, 3, -0.2], [10, 0, 1], [0, 6, 0.5]):
+        assert instant.buried(np.array(buried, dtype=float))
+    for free in ([3, 3, 0.2], [9.3, 0, 1], [0, 5.3, 0.5], [0, 0, 1.2]):
+        assert not instant.buried(np.array(free, dtype=float))
+
+
+def test_bodies_with_faces_turned_inside_out_are_seen_alike():
+    """Rays stop at a face from either side."""
+    made = world()
+    turned = World(
+        tuple(mesh._replace(faces=mesh.faces[:, ::-1]) for mesh in made.static), made.ego, made.actors, 1, 10
+    )
+    np.testing.assert_array_equal(as_set(scan(made).points), as_set(scan(turned).points))

@@ -12,26 +12,40 @@ class Frame:
     """The clouds of one time step, in the vehicle frame (x forward, y left, z up, metres).
 
     Args:
-        sensor: (N, 3) float32 points of all sensors of the rig.
+        sensors: Name of each rig -> (N, 3) float32 points of all its sensors; one rig, unless several were simulated
+            side by side.
         reference: (M, 3) float32 points of the reference sensor.
         index: Position in its dataset.
         name: What a user calls it: a file stem, or scenario and step.
         counts: What was left out on the way here, by name (`sensor_self_hits`, `reference_nonfinite`, ...).
     """
 
-    sensor: Tensor
+    sensors: Mapping[str, Tensor]
     reference: Tensor
     index: int
     name: str
     counts: Mapping[str, int] = field(default_factory=dict)
 
+    @property
+    def sensor(self) -> Tensor:
+        """(N, 3) points of the only rig.
+
+        Raises:
+            ValueError: There are several rigs: say which, `frame.sensors[name]`.
+        """
+        if len(self.sensors) != 1:
+            raise ValueError(f"the frame has clouds of {len(self.sensors)} rigs ({', '.join(self.sensors)}): say which")
+        return next(iter(self.sensors.values()))
+
     def pin_memory(self) -> "Frame":
         """A copy in page-locked memory; DataLoader calls it when `pin_memory=True`."""
-        return replace(self, sensor=self.sensor.pin_memory(), reference=self.reference.pin_memory())
+        sensors = {name: cloud.pin_memory() for name, cloud in self.sensors.items()}
+        return replace(self, sensors=sensors, reference=self.reference.pin_memory())
 
     def to(self, device: torch.device | str) -> "Frame":
         """A copy on another device."""
-        return replace(self, sensor=self.sensor.to(device), reference=self.reference.to(device))
+        sensors = {name: cloud.to(device) for name, cloud in self.sensors.items()}
+        return replace(self, sensors=sensors, reference=self.reference.to(device))
 
 
 @dataclass(frozen=True)
@@ -46,8 +60,12 @@ class FrameBatch:
 
     @property
     def sensor(self) -> list[Tensor]:
-        """One (N, 3) cloud a frame; N differs."""
+        """One (N, 3) cloud a frame, of the only rig; N differs."""
         return [frame.sensor for frame in self.frames]
+
+    def sensors(self, rig: str) -> list[Tensor]:
+        """One (N, 3) cloud a frame, of one of several rigs."""
+        return [frame.sensors[rig] for frame in self.frames]
 
     @property
     def reference(self) -> list[Tensor]:
@@ -76,7 +94,7 @@ def collate_frames(frames: Sequence[Frame]) -> FrameBatch:
         A `FrameBatch` of all of them.
 
     Example:
-        >>> frame = Frame(torch.zeros(5, 3), torch.zeros(9, 3), index=0, name="a")
+        >>> frame = Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=0, name="a")
         >>> [len(cloud) for cloud in collate_frames([frame, frame]).reference]
         [9, 9]
     """

@@ -122,7 +122,7 @@ class RecordedFrames(Dataset[Frame]):
             (sensor, reference), counts = self._read(position)
         except (OSError, ValueError) as error:
             raise BadFrameError(f"{self.names[position]} (frame {position}): {error}") from error
-        return Frame(sensor, reference, index=position, name=self.names[position], counts=counts)
+        return Frame({"recording": sensor}, reference, index=position, name=self.names[position], counts=counts)
 
     def _read(self, position: int) -> tuple[list[torch.Tensor], dict[str, int]]:
         clouds, counts = [], {}

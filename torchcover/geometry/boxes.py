@@ -1,6 +1,7 @@
 """Axis-aligned boxes in the vehicle frame."""
 
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +38,37 @@ class Box:
         )
 
     @property
+    def corners_m(self) -> NDArray[np.float64]:
+        """(8, 3) corners."""
+        return np.array(list(product(*zip(self.lower_m, self.upper_m, strict=True))))
+
+    @property
     def size_m(self) -> tuple[float, float, float]:
         """Extent along x, y, z in metres."""
         (x0, y0, z0), (x1, y1, z1) = self.lower_m, self.upper_m
         return (x1 - x0, y1 - y0, z1 - z0)
+
+
+def overlap(a: Box, a_T_b: NDArray[np.float64], b: Box) -> bool:
+    """Whether two boxes that stand on about the same ground share space; touching is not sharing.
+
+    Args:
+        a: A box in its frame.
+        a_T_b: (4, 4) pose of the other box's frame in that of `a`, turned mainly about z.
+        b: The other box, in its own frame.
+
+    Returns:
+        True if their heights overlap, and so do their outlines seen from above (separating axes).
+
+    Example:
+        >>> car, away = Box((-2, -1, 0), (2, 1, 1.5)), np.eye(4)
+        >>> away[:3, 3] = [3.0, 2.1, 0.0]
+        >>> overlap(car, np.eye(4), car), overlap(car, away, car)
+        (True, False)
+    """
+    ours = a.corners_m
+    theirs = b.corners_m @ a_T_b[:3, :3].T + a_T_b[:3, 3]
+    axes = [np.eye(3)[0], np.eye(3)[1], np.eye(3)[2], a_T_b[:3, 0], a_T_b[:3, 1]]
+    return all(
+        (theirs @ axis).min() < (ours @ axis).max() and (ours @ axis).min() < (theirs @ axis).max() for axis in axes
+    )

@@ -63,3 +63,20 @@ class RayCaster:
         )
         answer = self._scene.run(origins, directions.T, dists=limit_m.copy(), output=True)
         return Hits(answer["tfar"], answer["geomID"])
+
+    def back_faces(self, origin_m: NDArray[np.floating], directions: Float32) -> NDArray[np.bool_]:
+        """Which rays first meet a face from behind, as rays that start inside a closed body do.
+
+        Args:
+            origin_m: (3,) common origin of the rays.
+            directions: (3, N) unit directions.
+
+        Returns:
+            (N,) whether the ray's first hit is the back of a face.
+        """
+        origins = np.ascontiguousarray(np.broadcast_to(origin_m.astype(np.float32), (directions.shape[1], 3)))
+        answer = self._scene.run(origins, directions.T, output=True)
+        # Embree's Ng points to where the corners of the face turn counter-clockwise.
+        behind: NDArray[np.bool_] = (answer["Ng"] * directions.T).sum(axis=1) > 0
+        behind &= answer["geomID"] >= 0
+        return behind

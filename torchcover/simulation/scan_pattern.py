@@ -28,8 +28,8 @@ class ScanPattern(Document):
         columns: Number of columns.
         min_range_m: Closer hits give no point.
         max_range_m: Farther hits give no point.
-        range_noise_m: Standard deviation of the measured range along the ray. Not applied yet.
-        dropout: Probability that a ray gives no point, from 0 to 1. Not applied yet.
+        range_noise_m: Standard deviation of the measured range, along the ray.
+        dropout: Probability that a ray gives no point, from 0 to 1.
     """
 
     channels: PositiveInt | None = None
@@ -73,3 +73,25 @@ class ScanPattern(Document):
         offsets = np.zeros(len(self.rows_deg())) if self.azimuth_offsets_deg is None else self.azimuth_offsets_deg
         azimuths_deg = np.add.outer(offsets, self.horizontal_fov_deg * middle)
         return unit_directions(self.rows_deg()[:, None], azimuths_deg)
+
+    def disturb(
+        self, points_m: NDArray[np.float32], origin_m: NDArray[np.float64], generator: np.random.Generator
+    ) -> NDArray[np.float32]:
+        """Apply the noise of the range and the drop-out.
+
+        Args:
+            points_m: (N, 3) exact points.
+            origin_m: (3,) where their rays start.
+            generator: Source of the random numbers; not touched if there is neither noise nor drop-out.
+
+        Returns:
+            (K, 3) points; the very array if there is neither.
+        """
+        if self.range_noise_m > 0:
+            rays = points_m.astype(np.float64) - origin_m
+            range_m = np.linalg.norm(rays, axis=1, keepdims=True)
+            noise_m = generator.normal(0.0, self.range_noise_m, size=range_m.shape)
+            points_m = (points_m + rays * (noise_m / range_m)).astype(np.float32)
+        if self.dropout > 0:
+            points_m = points_m[generator.random(len(points_m)) >= self.dropout]
+        return points_m

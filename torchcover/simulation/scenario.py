@@ -1,15 +1,19 @@
 """A scenario: the world around the ego, what moves in it, and the ego's own body."""
 
 from pathlib import Path
-from typing import Self
+from typing import Annotated, Self
 
+import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, model_validator
 
-from torchcover.simulation.bodies import Body, Shape, in_vehicle_frame
+from torchcover.simulation.bodies import Body, Shape, VehicleShape, in_vehicle_frame
 from torchcover.simulation.documents import Document, Pose, beside, load_document
 from torchcover.simulation.tracks import read_boxes, read_trajectory
+from torchcover.simulation.traffic import Highway, Parking, Urban
 from torchcover.simulation.trajectory import Trajectory
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import Actor, World, steps_of
+
+Traffic = Annotated[Urban | Highway | Parking, Field(discriminator="type")]
 
 
 class Mover(Document):
@@ -56,17 +60,18 @@ class NamedMover(Mover):
 
 
 class Scenario(Document):
-    """A world with an ego in it.
+    """A world with an ego in it: given body by body, or made by a procedure.
 
     Args:
         name: What tables and maps call it.
         description: What it is.
-        ego: The vehicle that carries the rig.
+        ego: The vehicle that carries the rig; in procedural traffic its shape only, an SUV if not given.
         bodies: What never moves, in the world frame.
         actors: What moves, or may be recognised.
         boxes: File of recorded boxes that are actors too; relative to the document.
         time_step_s: Time between two frames.
         duration_s: Time of the last frame; frames beyond it start again at 0.
+        traffic: A procedure that makes bodies, actors, the ego's drive, and the times.
 
     Example:
         >>> Scenario.load("courtyard").ego.shape.type
@@ -75,14 +80,29 @@ class Scenario(Document):
 
     name: str
     description: str = ""
-    ego: Mover
-    bodies: tuple[Body, ...] = Field(min_length=1)
+    ego: Mover | None = None
+    bodies: tuple[Body, ...] = ()
     actors: tuple[NamedMover, ...] = ()
     boxes: Path | None = None
     time_step_s: PositiveFloat = 0.1
     duration_s: NonNegativeFloat = 0.0
+    traffic: Traffic | None = None
 
     _path_beside = field_validator("boxes")(beside)
+
+    @model_validator(mode="after")
+    def _check_given_or_procedural(self) -> Self:
+        if self.traffic is None:
+            missing = [key for key in ("ego", "bodies") if not getattr(self, key)]
+            if missing:
+                raise ValueError(f"{' and '.join(missing)} missing: give them, or traffic that makes them")
+            return self
+        made = {"bodies", "actors", "boxes", "time_step_s", "duration_s"} & self.model_fields_set
+        if made:
+            raise ValueError(f"traffic makes {', '.join(sorted(made))} itself: leave them out")
+        if self.ego is not None and (self.ego.pose is not None or self.ego.trajectory is not None):
+            raise ValueError("ego: traffic drives it; give its shape only")
+        return self
 
     @classmethod
     def load(cls, path_or_name: str | Path) -> Self:
@@ -94,13 +114,31 @@ class Scenario(Document):
         """
         return load_document(cls, "scenarios", path_or_name)
 
-    def world(self) -> World:
+    def locate(self, index: int) -> tuple[int, int]:
+        """Which run through the scenario a frame belongs to, and its time step in it.
+
+        A given world plays again and again; procedural traffic starts anew with other random numbers.
+        """
+        times = self.traffic or self
+        episode, step = divmod(index, steps_of(times.duration_s, times.time_step_s))
+        return (episode if self.traffic else 0), step
+
+    def world(self, seed: int = 0, episode: int = 0) -> World:
         """Build it.
+
+        Args:
+            seed: Seed of procedural traffic.
+            episode: Which run; see `locate`.
 
         Raises:
             FileNotFoundError: A mesh, vehicle or trajectory file is missing.
             ValueError: A mesh or a trajectory cannot be used.
         """
+        if self.traffic is not None:
+            shape = self.ego.shape if self.ego else VehicleShape(type="vehicle", vehicle="suv")
+            own_seed = int(np.random.SeedSequence([seed, episode]).generate_state(1, np.uint64)[0])
+            return self.traffic.world(own_seed, in_vehicle_frame(shape.mesh()))
+        assert self.ego is not None  # checked in _check_given_or_procedural
         actors = tuple(actor.actor(actor.name, actor.category) for actor in self.actors)
         return World(
             static=tuple(mesh for body in self.bodies for mesh in body.meshes()),

@@ -8,14 +8,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import Box, invert, transform
+from torchcover.geometry import Box, invert, overlap, transform
 from torchcover.simulation.raycaster import Hits, RayCaster
-from torchcover.simulation.rays import Tile
+from torchcover.simulation.rays import Tile, unit_directions
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.world import Actor, World
 
 # Angles between float32 directions are off by less than this, in radians.
 ROUNDING = 1e-5
+
+# Directions all around, to find out whether a place lies inside a body.
+ALL_AROUND = unit_directions(np.linspace(-85.0, 85.0, 12)[:, None], np.arange(0.0, 360.0, 30.0)[None])
+ALL_AROUND_RAYS = ALL_AROUND.reshape(3, -1).astype(np.float32)
+# Above the ground no ray meets the back of a face; below it, those that go up do.
+BURIED_SHARE = 0.25
 
 Matrix = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -33,6 +39,7 @@ class Solid(NamedTuple):
     """The geometry of one kind of body in its own frame, and a ball around it."""
 
     caster: RayCaster
+    box: Box
     centre_m: Matrix
     radius_m: float
 
@@ -67,13 +74,15 @@ class Scene:
         self._world = world
         self.ego_box = Box.around(world.ego.mesh.vertices_m)
         bodies = (world.ego, *world.actors)
-        self._moving = [actor for actor in bodies if actor.trajectory.moves]
         self._resting = [actor for actor in bodies if not actor.trajectory.moves]
-        self._solids = {id(actor.mesh): _solid(actor.mesh) for actor in self._moving}
-        # (steps, moving bodies, 3): where they are, to find out at once which are near; NaN, so never near, if absent.
+        self._moving = [actor for actor in bodies if actor.trajectory.moves]
+        # One solid for each mesh object, however many actors share it.
+        self._solids = {id(mesh): _solid(mesh) for mesh in {id(actor.mesh): actor.mesh for actor in bodies}.values()}
+        # (steps, bodies, 3): where they are, to find out at once which are near; NaN, so never near, if absent.
         times_s = world.time_step_s * np.arange(world.steps, dtype=np.float64)
-        tracks = [actor.trajectory.positions_at(times_s) for actor in self._moving]
-        self._positions_m = np.stack(tracks, axis=1) if tracks else np.empty((world.steps, 0, 3))
+        tracks = [actor.trajectory.positions_at(times_s) for actor in self._resting + self._moving]
+        self._positions_m = np.stack(tracks, axis=1)
+        self._reach_m = np.array([self._solids[id(actor.mesh)].reach_m for actor in self._resting + self._moving])
         # Subtracted in float64: world coordinates may be of UTM size. Where the ego rests, this frame is its own.
         self._world_T_local = world.ego.trajectory.at(0.0)
         self._static = RayCaster(self._static_meshes())
@@ -92,21 +101,43 @@ class Scene:
 
         Returns:
             The `Instant`, which sensors can scan.
+
+        Raises:
+            ValueError: The bounding box of an actor overlaps that of the ego.
         """
         time_s = step * self._world.time_step_s
         world_T_vehicle = self._world.ego.trajectory.at(time_s)
         vehicle_T_world = invert(world_T_vehicle)
-        distance_m = np.linalg.norm(self._positions_m[step] - world_T_vehicle[:3, 3], axis=1)
-        first = len(self._resting) + len(self._world.static)
+        distance_m = np.linalg.norm(self._positions_m[step] - world_T_vehicle[:3, 3], axis=1) - self._reach_m
+        self._check_overlap(time_s, vehicle_T_world, distance_m)
+        resting, first = len(self._resting), len(self._resting) + len(self._world.static)
         moving = tuple(
-            self._place(first + k, actor, vehicle_T_world @ actor.trajectory.at(time_s))
-            for k, (actor, distance) in enumerate(zip(self._moving, distance_m, strict=True))
-            if distance < within_m + self._solids[id(actor.mesh)].reach_m
+            self._place(first + k, self._moving[k], vehicle_T_world @ self._moving[k].trajectory.at(time_s))
+            for k in np.flatnonzero(distance_m[resting:] < within_m).tolist()
         )
         # Either list of bodies begins with the ego.
         if self._world.ego.trajectory.moves:
             return Instant(self._static, vehicle_T_world @ self._world_T_local, moving, ego=first)
         return Instant(self._static, np.eye(4), moving, ego=0)
+
+    def encloses(self, position_m: Matrix) -> bool:
+        """Whether a place in the vehicle frame lies inside the ego's body, so that no ray gets out."""
+        ego = self._solids[id(self._world.ego.mesh)].caster
+        hits = ego.cast(position_m, ALL_AROUND_RAYS, np.full(ALL_AROUND_RAYS.shape[1], np.inf, dtype=np.float32))
+        return bool((hits.body >= 0).all())
+
+    def _check_overlap(self, time_s: float, vehicle_T_world: Matrix, distance_m: Matrix) -> None:
+        bodies = self._resting + self._moving
+        ego_reach_m = self._solids[id(self._world.ego.mesh)].reach_m
+        for k in np.flatnonzero(distance_m < ego_reach_m).tolist():
+            if bodies[k] is self._world.ego:
+                continue
+            vehicle_T_actor = vehicle_T_world @ bodies[k].trajectory.at(time_s)
+            if overlap(self.ego_box, vehicle_T_actor, self._solids[id(bodies[k].mesh)].box):
+                raise ValueError(
+                    f"actor {bodies[k].name!r} overlaps the ego at t = {time_s:g} s (their bounding boxes do); "
+                    "change one of the trajectories"
+                )
 
     def _place(self, body: int, actor: Actor, vehicle_T_actor: Matrix) -> Part:
         solid = self._solids[id(actor.mesh)]
@@ -164,6 +195,16 @@ class Instant:
         points, self_hits = zip(*scans, strict=True)
         rays = sum(tile.directions.shape[1] for tile in tiles)
         return Scan(np.concatenate(points), rays, sum(self_hits))
+
+    def buried(self, position_m: Matrix) -> bool:
+        """Whether a place in the vehicle frame lies below the ground or inside a wall or another body."""
+        casters = [(self.static, self.vehicle_T_static)]
+        casters += [(part.caster, part.vehicle_T_part) for part in self.moving]
+        return any(
+            caster.back_faces(transform(invert(vehicle_T_part), position_m[None])[0], ALL_AROUND_RAYS).mean()
+            > BURIED_SHARE
+            for caster, vehicle_T_part in casters
+        )
 
     def _scan_tile(
         self, vehicle_T_sensor: Matrix, tile: Tile, min_range_m: float, max_range_m: float
@@ -237,4 +278,4 @@ def _solid(mesh: Mesh) -> Solid:
     box = Box.around(mesh.vertices_m)
     centre_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
     radius_m = float(np.linalg.norm(mesh.vertices_m - centre_m, axis=1).max())
-    return Solid(RayCaster([mesh]), centre_m, radius_m)
+    return Solid(RayCaster([mesh]), box, centre_m, radius_m)

@@ -45,4 +45,9 @@ class World:
     @property
     def steps(self) -> int:
         """Number of instants: at 0, one time step, two time steps, ... up to the duration."""
-        return int(self.duration_s / self.time_step_s + 1e-9) + 1
+        return steps_of(self.duration_s, self.time_step_s)
+
+
+def steps_of(duration_s: float, time_step_s: float) -> int:
+    """Number of instants from 0 to a duration, both included."""
+    return int(duration_s / time_step_s + 1e-9) + 1

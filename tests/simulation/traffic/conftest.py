@@ -1,0 +1,34 @@
+"""Worlds that several tests look at, with every body a box of the built-in body's size: one convex piece a body."""
+
+from functools import cache
+
+import pytest
+
+from torchcover.geometry import Box
+from torchcover.simulation import shapes
+from torchcover.simulation.traffic import Highway, Parking, Urban
+from torchcover.simulation.traffic.fleet import load_bodies
+
+KINDS = {"urban": Urban(), "narrow": Urban(lanes=2), "highway": Highway(), "parking": Parking()}
+
+
+@cache
+def boxes():
+    sizes = {kind: Box.around(mesh.vertices_m).size_m for kind, mesh in load_bodies().items()}
+    return {kind: shapes.Box(type="box", size_m=size).mesh() for kind, size in sizes.items()}
+
+
+@cache
+def built(kind, seed):
+    return KINDS[kind].world(seed, bodies=boxes())
+
+
+@pytest.fixture(scope="session")
+def bodies():
+    return boxes()
+
+
+@pytest.fixture(scope="session")
+def world():
+    """`world(kind, seed)`, built once."""
+    return built

@@ -1,0 +1,96 @@
+"""The Intelligent Driver Model against its closed forms."""
+
+import numpy as np
+import pytest
+
+from torchcover.simulation.traffic.idm import (
+    HARDEST_BRAKING_MPS2,
+    Driver,
+    acceleration,
+    advance,
+    equilibrium_gap_m,
+)
+
+DRIVER = Driver(desired_speed_mps=30.0, headway_s=1.5, standstill_gap_m=2.0, acceleration_mps2=1.4)
+STEP_S = 0.05
+
+
+def drive(driver, speed, leader_place, leader_speed, duration, step=STEP_S):
+    """Follow a leader of constant speed; (T,) gaps and (T,) speeds. Places are those of touching bumpers."""
+    place, speed, gaps, speeds = np.zeros(1), np.array([float(speed)]), [], []
+    for index in range(round(duration / step)):
+        gap = leader_place + leader_speed * index * step - place
+        way, speed = advance(speed, acceleration(driver, speed, gap, speed - leader_speed), gap, step)
+        place = place + way
+        gaps.append(float(leader_place + leader_speed * (index + 1) * step - place[0]))
+        speeds.append(float(speed[0]))
+    return np.array(gaps), np.array(speeds)
+
+
+@pytest.mark.parametrize("speed", [0.0, 5.0, 15.0, 29.0])
+def test_nobody_accelerates_at_the_equilibrium_gap(speed):
+    gap = equilibrium_gap_m(DRIVER, speed)
+    assert gap == pytest.approx((2.0 + 1.5 * speed) / np.sqrt(1 - (speed / 30.0) ** 4))
+    assert acceleration(DRIVER, np.array([speed]), np.array([gap]), np.zeros(1)) == pytest.approx(0.0, abs=1e-12)
+
+
+@pytest.mark.parametrize("speed", [5.0, 20.0])
+def test_a_follower_settles_at_the_equilibrium_gap(speed):
+    gaps, speeds = drive(DRIVER, 25.0, leader_place=120.0, leader_speed=speed, duration=400.0)
+    assert gaps[-1] == pytest.approx(equilibrium_gap_m(DRIVER, speed), rel=1e-3)
+    assert speeds[-1] == pytest.approx(speed, rel=1e-3)
+
+
+def test_on_an_empty_road_the_speed_follows_the_integral():
+    # dv/dt = a (1 - (v/v0)^4) integrates to t = v0/(2a) (artanh(v/v0) + arctan(v/v0)).
+    _, speeds = drive(DRIVER, 0.0, leader_place=np.inf, leader_speed=0.0, duration=40.0)
+    share = speeds / 30.0
+    expected_time = 30.0 / 1.4 / 2 * (np.arctanh(share) + np.arctan(share))
+    np.testing.assert_allclose(expected_time[:-1], STEP_S * np.arange(1, len(speeds)), rtol=0.01)
+    assert (np.diff(speeds) > 0).all()
+
+
+@pytest.mark.parametrize("step", [0.01, 0.1, 0.5])
+def test_stops_behind_a_standing_leader_at_the_standstill_gap(step):
+    gaps, speeds = drive(DRIVER, 25.0, leader_place=300.0, leader_speed=0.0, duration=120.0, step=step)
+    assert speeds[-1] < 0.05
+    assert 1.5 < gaps[-1] < 2.3
+    assert gaps.min() > 1.5
+    assert (np.diff(gaps) <= 0).all()
+
+
+def test_brakes_at_about_the_comfortable_deceleration():
+    _, speeds = drive(DRIVER, 25.0, leader_place=300.0, leader_speed=0.0, duration=120.0)
+    assert np.diff(speeds).min() / STEP_S == pytest.approx(-2.0, abs=0.35)
+
+
+def test_braking_is_bounded_and_finite_at_contact():
+    wanted = acceleration(DRIVER, np.array([20.0, 20.0]), np.array([0.0, -1.0]), np.array([20.0, 20.0]))
+    np.testing.assert_array_equal(wanted, -HARDEST_BRAKING_MPS2)
+
+
+def test_no_step_leads_backwards_or_through_the_one_ahead():
+    generator = np.random.default_rng(0)
+    speed, room = generator.uniform(0, 40, 10_000), generator.uniform(-1, 60, 10_000)
+    room[::7] = 0.0
+    for step in (0.01, 0.1, 1.0, 10.0):
+        way, after = advance(speed, generator.uniform(-9, 3, 10_000), room, step)
+        assert (way >= 0).all()
+        assert (way <= np.maximum(room, 0)).all()
+        assert (after >= 0).all()
+
+
+def test_a_step_is_uniform_acceleration_with_a_stop():
+    infinite = np.full(3, np.inf)
+    way, after = advance(np.array([10.0, 10.0, 1.0]), np.array([2.0, -2.0, -4.0]), infinite, 0.5)
+    np.testing.assert_allclose(way, [10 * 0.5 + 0.25, 10 * 0.5 - 0.25, 1.0 / 8.0])
+    np.testing.assert_allclose(after, [11.0, 9.0, 0.0])
+
+
+def test_many_drivers_are_that_many_single_drivers():
+    many = Driver(np.array([20.0, 30.0]), np.array([1.0, 2.0]), np.array([1.0, 3.0]), np.array([1.0, 2.0]))
+    speed, gap, closing = np.array([15.0, 25.0]), np.array([20.0, 90.0]), np.array([2.0, -1.0])
+    together = acceleration(many, speed, gap, closing)
+    for index, single in enumerate([Driver(20.0, 1.0, 1.0, 1.0), Driver(30.0, 2.0, 3.0, 2.0)]):
+        alone = acceleration(single, speed[[index]], gap[[index]], closing[[index]])
+        assert together[index] == pytest.approx(alone[0])

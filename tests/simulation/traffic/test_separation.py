@@ -1,0 +1,114 @@
+"""No two bodies ever interpenetrate: separating axes in plan view with overlap in height, for everybody at every time.
+
+Knows nothing of how worlds are made: it takes the boxes around the actors' meshes, and the connected pieces of the static
+meshes, each of which is convex here because the bodies of the fixture are boxes.
+"""
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull
+
+TOUCHING_M = 1e-3
+CASES = [(kind, seed) for kind in ("urban", "highway", "parking") for seed in (0, 1, 2)] + [("narrow", 0)]
+
+
+def pieces(mesh):
+    """Plan outline, lowest and highest z of each connected piece."""
+    edges = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
+    count = len(mesh.vertices_m)
+    graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    order = np.argsort(label, kind="stable")
+    for group in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+        corners = mesh.vertices_m[group]
+        hull = ConvexHull(corners[:, :2])
+        yield corners[hull.vertices, :2], corners[:, 2].min(), corners[:, 2].max()
+
+
+class Solids:
+    """Convex prisms: `outline` (N, K, 2), padded by repeating a corner, and `low`, `high` (N,)."""
+
+    def __init__(self, outline, low, high):
+        self.outline, self.low, self.high = outline, low, high
+        self.centre = (outline.max(axis=1) + outline.min(axis=1)) / 2
+        self.radius = np.linalg.norm(outline - self.centre[:, None], axis=2).max(axis=1)
+
+    @classmethod
+    def of_static(cls, meshes):
+        found = [piece for mesh in meshes for piece in pieces(mesh)]
+        corners = max(len(outline) for outline, _, _ in found)
+        outline = np.stack([o[np.minimum(np.arange(corners), len(o) - 1)] for o, _, _ in found])
+        return cls(outline, np.array([low for _, low, _ in found]), np.array([high for _, _, high in found]))
+
+    @classmethod
+    def of_actors(cls, actors, step):
+        lower = np.stack([actor.mesh.vertices_m.min(axis=0) for actor in actors])
+        upper = np.stack([actor.mesh.vertices_m.max(axis=0) for actor in actors])
+        position = np.stack([actor.trajectory.positions_m[step] for actor in actors])
+        yaw = np.deg2rad(np.array([actor.trajectory.angles_deg[step, 0] for actor in actors]))
+        x = np.stack([lower[:, 0], upper[:, 0], upper[:, 0], lower[:, 0]], axis=1)
+        y = np.stack([lower[:, 1], lower[:, 1], upper[:, 1], upper[:, 1]], axis=1)
+        cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
+        outline = np.stack([cos * x - sin * y, sin * x + cos * y], axis=2) + position[:, None, :2]
+        return cls(outline, position[:, 2] + lower[:, 2], position[:, 2] + upper[:, 2])
+
+
+def overlaps(a, b, pairs):
+    """Of the candidate pairs (P, 2), those that no axis separates."""
+    first, second = pairs.T
+    in_height = np.minimum(a.high[first], b.high[second]) - np.maximum(a.low[first], b.low[second]) > TOUCHING_M
+    first, second = first[in_height], second[in_height]
+    p, q = a.outline[first], b.outline[second]
+    edges = np.concatenate([np.roll(p, -1, axis=1) - p, np.roll(q, -1, axis=1) - q], axis=1)
+    length = np.linalg.norm(edges, axis=2, keepdims=True)
+    normals = np.stack([-edges[..., 1], edges[..., 0]], axis=2) / np.where(length < 1e-9, np.inf, length)
+    on_p, on_q = normals @ p.transpose(0, 2, 1), normals @ q.transpose(0, 2, 1)
+    depth = np.minimum(on_p.max(axis=2), on_q.max(axis=2)) - np.maximum(on_p.min(axis=2), on_q.min(axis=2))
+    depth = np.where(length[..., 0] < 1e-9, np.inf, depth).min(axis=1)
+    return [(i, j, d) for i, j, d in zip(first, second, depth, strict=True) if d > TOUCHING_M]
+
+
+def near_pairs(a, b):
+    """(P, 2) indices of those whose circles in plan view meet: nobody else can overlap."""
+    away = ((a.centre[:, None, :] - b.centre) ** 2).sum(axis=2)
+    return np.argwhere(away < (a.radius[:, None] + b.radius) ** 2)
+
+
+def among(solids):
+    """Overlaps of solids with each other."""
+    pairs = near_pairs(solids, solids)
+    return overlaps(solids, solids, pairs[pairs[:, 0] < pairs[:, 1]])
+
+
+def test_the_checker_finds_what_overlaps_and_only_that():
+    square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    turned = square @ np.array([[1.0, 1.0], [-1.0, 1.0]]) / np.sqrt(2)
+    shift = np.array([2.3, 0.0])
+    outline = np.stack([square, turned + shift, square + [1.9, 1.9], turned + [2.2, 2.2], square])
+    solids = Solids(outline, np.array([0.0, 0.0, 0.0, 0.0, 1.0]), np.array([1.0, 1.0, 1.0, 1.0, 2.0]))
+    found = {(int(i), int(j)) for i, j, _ in among(solids)}
+    assert found == {(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)}
+
+
+@pytest.mark.parametrize(("kind", "seed"), CASES)
+def test_what_rests_does_not_interpenetrate(kind, seed, world):
+    static = Solids.of_static(world(kind, seed).static[1:])
+    found = among(static)
+    assert not found, [(static.centre[i], static.centre[j], d) for i, j, d in found[:3]]
+
+
+@pytest.mark.parametrize(("kind", "seed"), CASES)
+def test_who_moves_does_not_interpenetrate(kind, seed, world):
+    w = world(kind, seed)
+    everybody = [w.ego, *w.actors]
+    static = Solids.of_static(w.static[1:])
+    for step in range(0, len(w.ego.trajectory.times_s), 3):
+        moving = Solids.of_actors(everybody, step)
+        found = among(moving)
+        assert not found, [(step, everybody[i].name, everybody[j].name, d) for i, j, d in found[:3]]
+        if step % 2:
+            continue
+        found = overlaps(moving, static, near_pairs(moving, static))
+        assert not found, [(step, everybody[i].name, static.centre[j], d) for i, j, d in found[:3]]

@@ -1,0 +1,216 @@
+"""Whole worlds: who is where, what is under the wheels, and that nothing is chance."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from torchcover.simulation.raycaster import RayCaster
+from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic import Highway, Parking, Urban
+
+WORLDS = ["urban", "narrow", "highway", "parking"]
+
+
+def leader_distance(world):
+    """(T,) distance to the nearest vehicle on the ego's way, centre to centre; inf without one."""
+    ego = world.ego.trajectory
+    yaw = np.deg2rad(ego.angles_deg[:, 0])
+    nearest = np.full(len(yaw), np.inf)
+    for actor in world.actors:
+        x, y, _ = (actor.trajectory.positions_m - ego.positions_m).T
+        ahead, left = np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x
+        on_way = (ahead > 0) & (np.abs(left) < 1.5) & (actor.category != "pedestrian")
+        nearest = np.where(on_way, np.minimum(nearest, ahead), nearest)
+    return nearest
+
+
+def speeds(actor):
+    steps = np.linalg.norm(np.diff(actor.trajectory.positions_m, axis=0), axis=1)
+    return steps / np.diff(actor.trajectory.times_s)
+
+
+@pytest.mark.parametrize("kind", WORLDS)
+def test_the_same_seed_gives_the_same_world_and_another_seed_another(kind, world, bodies):
+    model = {"urban": Urban, "highway": Highway, "parking": Parking}.get(kind, Urban)
+    options = {"lanes": 2} if kind == "narrow" else {}
+    first, again = (model(duration_s=3.0, **options).world(seed, bodies=bodies) for seed in (5, 5))
+    other = model(duration_s=3.0, **options).world(6, bodies=bodies)
+    for one, two in zip(first.static, again.static, strict=True):
+        np.testing.assert_array_equal(one.vertices_m, two.vertices_m)
+        np.testing.assert_array_equal(one.faces, two.faces)
+    for one, two in zip([first.ego, *first.actors], [again.ego, *again.actors], strict=True):
+        assert (one.name, one.category) == (two.name, two.category)
+        np.testing.assert_array_equal(one.trajectory.positions_m, two.trajectory.positions_m)
+        np.testing.assert_array_equal(one.trajectory.angles_deg, two.trajectory.angles_deg)
+    assert not np.array_equal(first.ego.trajectory.positions_m, other.ego.trajectory.positions_m)
+
+
+@pytest.mark.parametrize("kind", WORLDS)
+def test_a_world_is_complete(kind, world):
+    w = world(kind, 0)
+    names = [actor.name for actor in w.actors] + [w.ego.name]
+    assert len(set(names)) == len(names)
+    assert len({id(actor.mesh) for actor in w.actors}) == len({actor.name.split()[0] for actor in w.actors})
+    for actor in [w.ego, *w.actors]:
+        assert actor.trajectory.times_s[0] == 0.0
+        assert actor.trajectory.times_s[-1] == pytest.approx(w.duration_s)
+        np.testing.assert_allclose(np.diff(actor.trajectory.times_s), w.time_step_s)
+        # Nobody jumps, either.
+        assert speeds(actor).max() < 40.0
+    assert sum(len(mesh.faces) for mesh in w.static) < 50_000
+    assert {actor.category for actor in w.actors} >= {"car"}
+
+
+@pytest.mark.parametrize("kind", WORLDS)
+def test_the_ego_stays_on_the_road_and_tilts_a_little(kind, world):
+    ego = world(kind, 0).ego.trajectory
+    assert (ego.positions_m[:, 2] == 0.0).all()
+    _, pitch, roll = ego.angles_deg.T
+    assert 0.1 < np.abs(pitch).max() < 2.0
+    assert 0.1 < np.abs(roll).max() < 1.5
+    assert abs(pitch.mean()) < 0.1
+    assert np.abs(np.diff(ego.angles_deg[:, 1:], axis=0)).max() < 0.4
+
+
+@pytest.mark.parametrize("kind", WORLDS)
+def test_rays_always_hit_the_ground(kind, world):
+    w = world(kind, 0)
+    generator = np.random.default_rng(0)
+    for time_s in (0.0, w.duration_s / 2, w.duration_s):
+        pose = w.ego.trajectory.at(time_s)
+        yaw = np.arctan2(pose[1, 0], pose[0, 0])
+        ahead, left = generator.uniform(-60.0, 160.0, 100_000), generator.uniform(-40.0, 40.0, 100_000)
+        offset = np.stack([np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left])
+        origin = np.array([0.0, 0.0, 100.0])
+        to_ground = np.concatenate([offset, np.full((1, 100_000), -100.0)])
+        directions = (to_ground / np.linalg.norm(to_ground, axis=0)).astype(np.float32)
+        static = [Mesh(mesh.vertices_m - pose[:3, 3], mesh.faces) for mesh in w.static]
+        limit = np.full(100_000, 1000.0, dtype=np.float32)
+        hits = RayCaster(static).cast(origin, directions, limit)
+        assert (hits.body >= 0).all()
+        assert (100.0 + hits.range_m * directions[2]).min() > -0.01
+        # The ground alone has no holes either, whatever stands on it.
+        on_ground = RayCaster(static[:1]).cast(origin, directions, limit)
+        assert (on_ground.body == 0).all()
+        np.testing.assert_allclose(on_ground.range_m * directions[2], -100.0, atol=0.01)
+
+
+@pytest.mark.parametrize("kind", WORLDS)
+def test_nobody_floats_and_nobody_sinks(kind, world):
+    w = world(kind, 0)
+    on_pavement = np.array([0.0, 0.15])
+    for actor in w.actors:
+        z = actor.trajectory.positions_m[:, 2]
+        if actor.category != "pedestrian":
+            assert (z == 0.0).all()
+        assert z.min() >= 0.0
+        assert z.max() <= 0.15 + 1e-12
+        # Stepping up or down takes a moment; else the feet are on one of the two surfaces.
+        assert (np.abs(z[:, None] - on_pavement).min(axis=1) < 1e-9).mean() > 0.8
+
+
+@pytest.mark.parametrize("kind", ["urban", "narrow"])
+def test_the_city_drives_on_the_right_and_walks_on_pavements(kind, world):
+    w = world(kind, 0)
+    kerb = float(np.abs(w.static[1].vertices_m[:, 1]).min())
+    middles = junction_middles(w)
+    for actor in w.actors:
+        x, y, z = actor.trajectory.positions_m.T
+        side = x[0] - middles[np.abs(middles - x[0]).argmin()]
+        heading = np.round(actor.trajectory.angles_deg[0, 0]) % 360
+        if actor.category == "pedestrian":
+            # On the carriageway of the main street only at the crossings.
+            on_road = np.abs(y) < kerb - 0.5
+            assert (z[on_road] == 0.0).all()
+            assert not on_road.any() or abs(side) < 12.0 or not middles[0] < x[0] < middles[-1]
+        elif heading in (0.0, 180.0):
+            assert (np.abs(y) < kerb).all()
+            assert ((y < 0) if heading == 0.0 else (y > 0)).all()
+        elif middles[0] - 8.0 < x[0] < middles[-1] + 8.0:
+            assert 0.0 < (side if heading == 90.0 else -side) < 8.0
+
+
+def junction_middles(world):
+    """x of the gaps between blocks, from the blocks' own corners."""
+    edges = np.unique(np.round(world.static[1].vertices_m[:, 0], 6))
+    return (edges[1:-1:2] + edges[2::2]) / 2
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("urban", 0), ("urban", 1), ("urban", 2), ("narrow", 0), ("highway", 0)])
+def test_the_ego_usually_follows_somebody(kind, seed, world):
+    distance = leader_distance(world(kind, seed))
+    assert (distance < (80.0 if kind == "highway" else 40.0)).mean() >= 0.6
+    assert distance.min() > 4.0
+
+
+def test_city_traffic_stops_at_lights_and_moves_on(world):
+    share = [np.mean(speeds(actor) < 0.1) for actor in world("urban", 0).actors if actor.category == "car"]
+    assert 0.1 < np.mean(share) < 0.7
+
+
+def test_motorway_speeds_and_lanes(world):
+    w = world("highway", 0)
+    own = {"car": 0, "truck": 0}
+    for actor in [w.ego, *w.actors]:
+        assert speeds(actor).min() > 23.5
+        assert speeds(actor).max() < 36.0
+        if actor.category in own:
+            own[actor.category] += 1
+    assert min(own.values()) > 5
+    forward = np.cos(np.deg2rad(np.array([actor.trajectory.angles_deg[0, 0] for actor in w.actors])))
+    assert (np.abs(forward) > 0.9).all()
+    assert (forward > 0).sum() > 20
+    assert (forward < 0).sum() > 20
+
+
+def test_people_cross_the_aisles_of_the_lot_and_cars_are_slow(world):
+    w = world("parking", 0)
+    people = [actor for actor in w.actors if actor.category == "pedestrian"]
+    assert sum(np.ptp(actor.trajectory.positions_m[:, 1]) > 5.0 for actor in people) > 4
+    assert speeds(w.ego).max() < 4.0
+    assert speeds(w.ego).min() > 1.0
+
+
+@pytest.mark.parametrize(
+    ("model", "options"),
+    [
+        (Urban, {"traffic_per_km": 0, "cyclists_per_km": 0, "people_per_km": 0, "parked_share": 0}),
+        (Urban, {"traffic_per_km": 120, "parked_share": 1}),
+        (Urban, {"time_step_s": 0.5, "duration_s": 0.2}),
+        (Highway, {"traffic_per_km": 0, "ego_lane": 1}),
+        (Parking, {"cars": 0, "crossings": 0, "parked_share": 0}),
+        (Parking, {"cars": 6, "crossings": 8, "parked_share": 1}),
+    ],
+)
+def test_extreme_parameters_still_make_a_world(model, options, bodies):
+    w = model(**{"duration_s": 4.0, **options}).world(0, bodies=bodies)
+    assert w.static
+    assert w.ego.trajectory.moves
+
+
+@pytest.mark.parametrize(
+    ("model", "options"),
+    [
+        (Urban, {"lanes": 3}),
+        (Urban, {"parked_share": 1.5}),
+        (Urban, {"traffic_per_km": -1}),
+        (Urban, {"lane": 4}),
+        (Highway, {"ego_lane": 4}),
+        (Highway, {"duration_s": 0}),
+        (Parking, {"speed_mps": 20}),
+    ],
+)
+def test_impossible_parameters_are_errors(model, options):
+    with pytest.raises(ValidationError):
+        model(**options)
+
+
+def test_a_missing_body_is_an_error_that_names_it(bodies):
+    few = {kind: mesh for kind, mesh in bodies.items() if kind not in ("bus", "adult")}
+    with pytest.raises(ValueError, match="none for adult, bus"):
+        Urban().world(0, bodies=few)
+
+
+def test_the_ego_may_have_a_body_of_its_own(bodies):
+    w = Urban(duration_s=2.0).world(0, ego=bodies["bus"], bodies=bodies)
+    assert w.ego.mesh is bodies["bus"]

@@ -1,0 +1,69 @@
+"""From places on lanes to a world."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic.attitude import attitude
+from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet
+from torchcover.simulation.traffic.flow import Agent, Flow, Lane
+from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.world import Actor
+
+Numbers = NDArray[np.float64]
+
+# Beyond the farthest range of a sensor: who never comes this close to the ego is left out of the world.
+HORIZON_M = 250.0
+
+
+class Paths(NamedTuple):
+    """Where N bodies are at T times: `positions_m` (T, N, 3), `yaw_deg` (T, N), and the N `kinds`."""
+
+    positions_m: Numbers
+    yaw_deg: Numbers
+    kinds: tuple[str, ...]
+
+
+def paths(lanes: Sequence[Lane], agents: Sequence[Agent], flow: Flow) -> Paths:
+    """Follow the lanes, on the ground."""
+    poses = np.empty((*flow.place_m.shape, 3))
+    lane_of = np.array([agent.lane for agent in agents])
+    for lane in np.unique(lane_of):
+        poses[:, lane_of == lane] = lanes[lane].line.poses(flow.place_m[:, lane_of == lane])
+    yaw_deg = poses[..., 2].copy()
+    poses[..., 2] = 0.0
+    return Paths(poses, yaw_deg, tuple(agent.kind for agent in agents))
+
+
+def ego_actor(
+    times_s: Numbers, found: Paths, flow: Flow, index: int, mesh: Mesh, generator: np.random.Generator
+) -> Actor:
+    """The ego, one of those who follow lanes, with a body that tilts."""
+    way, speed = flow.place_m[:, index], flow.speed_mps[:, index]
+    angles = attitude(times_s, way, speed, found.yaw_deg[:, index], generator)
+    return Actor(EGO, "car", mesh, Trajectory(times_s, found.positions_m[:, index].copy(), angles))
+
+
+def actors(times_s: Numbers, found: Sequence[Paths], ego: Actor, fleet: Fleet) -> tuple[Actor, ...]:
+    """All who ever come near the ego; the ego itself is left out.
+
+    Args:
+        times_s: (T,) times.
+        found: Who there is, in groups.
+        ego: The ego.
+        fleet: Their bodies.
+    """
+    near: list[Actor] = []
+    for group in found:
+        distance = np.linalg.norm(group.positions_m - ego.trajectory.positions_m[:, None], axis=2).min(axis=0)
+        for index in np.flatnonzero(distance < HORIZON_M):
+            kind = group.kinds[index]
+            if kind == EGO:
+                continue
+            angles = np.column_stack([group.yaw_deg[:, index], np.zeros((len(times_s), 2))])
+            trajectory = Trajectory(times_s, group.positions_m[:, index].copy(), angles)
+            near.append(Actor(f"{kind} {len(near)}", CATEGORIES[kind], fleet.meshes[kind], trajectory))
+    return tuple(near)

@@ -1,0 +1,117 @@
+"""People who go to and fro across a carriageway, each on a path of their own, when it will stay free."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.simulation.traffic.scenery import PAVEMENT_M
+
+Numbers = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+# Probability to take the first chance after a stay, instead of waiting for another.
+EAGERNESS = 0.8
+LONGEST_STAY_S = 12.0
+
+
+@dataclass(frozen=True, eq=False)
+class Footpath:
+    """A straight way from one waiting place to another.
+
+    Args:
+        start_m: (2,) one waiting place.
+        end_m: (2,) the other.
+        kerb_m: How far behind a waiting place the kerb is, at both ends; without one the path is level.
+    """
+
+    start_m: Numbers
+    end_m: Numbers
+    kerb_m: float | None = None
+
+    @property
+    def length_m(self) -> float:
+        """From one waiting place to the other."""
+        return float(np.linalg.norm(self.end_m - self.start_m))
+
+    def poses(self, share: Numbers, back: Flags, body_radius_m: float) -> tuple[Numbers, Numbers]:
+        """Where somebody is who has gone a share of the way.
+
+        Args:
+            share: (T,) 0 at the start, 1 at the end.
+            back: (T,) whether they face the start.
+            body_radius_m: How far the body reaches from its middle: it steps down when all of it is past the kerb.
+
+        Returns:
+            (T, 3) positions and (T,) headings in degrees.
+        """
+        way = self.end_m - self.start_m
+        yaw = np.rad2deg(np.arctan2(way[1], way[0])) + 180.0 * back
+        position = self.start_m + share[:, None] * way
+        if self.kerb_m is None:
+            height = np.zeros(len(share))
+        else:
+            height = step_height(np.minimum(share, 1 - share) * self.length_m - self.kerb_m, body_radius_m)
+        return np.column_stack([position, height]), yaw
+
+
+def walk(
+    path: Footpath,
+    may_go: Flags,
+    crossing_s: float,
+    times_s: Numbers,
+    body_radius_m: float,
+    generator: np.random.Generator,
+) -> tuple[Numbers, Numbers]:
+    """Go to and fro on a path, setting off only when one may.
+
+    Args:
+        path: The path.
+        may_go: (T,) whether who sets off at this time finds the way free until the end.
+        crossing_s: How long it takes from one end to the other.
+        times_s: (T,) evenly spaced times.
+        body_radius_m: How far the body reaches from its middle.
+        generator: Draws the stays and which side is first.
+
+    Returns:
+        (T, 3) positions and (T,) headings in degrees.
+    """
+    share, back = _stroll(may_go, crossing_s, float(times_s[1] - times_s[0]), generator)
+    return path.poses(share, back, body_radius_m)
+
+
+def step_height(beyond_kerb_m: Numbers, body_radius_m: float) -> Numbers:
+    """Height of the feet of somebody whose middle is so far beyond the kerb, on the carriageway's side."""
+    stepping = (beyond_kerb_m - body_radius_m) / PAVEMENT_M
+    return PAVEMENT_M * (1.0 - np.clip(stepping, 0.0, 1.0))
+
+
+def _stroll(may_go: Flags, crossing_s: float, step_s: float, generator: np.random.Generator) -> tuple[Numbers, Flags]:
+    """(T,) share of the way gone, and (T,) whether the face is towards the start."""
+    count = len(may_go)
+    chances = np.flatnonzero(may_go)
+    steps = int(np.ceil(crossing_s / step_s))
+    back = bool(generator.random() < 0.5)
+    share, faces_start = np.full(count, float(back)), np.full(count, back)
+    now = 0
+    while True:
+        now += round(generator.uniform(0.0, LONGEST_STAY_S) / step_s)
+        ahead = chances[np.searchsorted(chances, now) :]
+        if len(ahead) == 0:
+            return share, faces_start
+        set_off = int(ahead[0])
+        now = set_off + 1
+        if generator.random() < EAGERNESS:
+            gone = np.clip((np.arange(count) - set_off) / steps, 0.0, 1.0)[set_off:]
+            share[set_off:] = 1.0 - gone if back else gone
+            arrived = set_off + steps
+            faces_start[arrived:] = not back
+            back, now = not back, arrived
+
+
+def free_for(blocked: Flags, duration_s: float, step_s: float) -> Flags:
+    """(T,) whether nothing is blocked from each time on for a duration; what is after the last time counts as free."""
+    steps = int(np.ceil(duration_s / step_s))
+    before = np.concatenate([[0], np.cumsum(blocked)])
+    here = np.arange(len(blocked))
+    return np.asarray(before[np.minimum(here + steps + 1, len(blocked))] == before[here])

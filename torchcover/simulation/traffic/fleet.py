@@ -1,0 +1,145 @@
+"""Who is on the road: bodies by kind, how each kind drives, and lanes filled with them."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from torchcover.geometry import Box
+from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.documents import load_document
+from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic.flow import Agent, Lane
+from torchcover.simulation.traffic.idm import Driver
+
+# What each built-in body counts as.
+CATEGORIES = {
+    "suv": "car",
+    "sedan": "car",
+    "hatchback": "car",
+    "van": "car",
+    "truck": "truck",
+    "bus": "bus",
+    "motorcycle": "motorcycle",
+    "cyclist": "cyclist",
+    "adult": "pedestrian",
+    "child": "pedestrian",
+}
+EGO = "ego"
+
+WALKING = Driver(
+    desired_speed_mps=1.4, headway_s=0.4, standstill_gap_m=0.5, acceleration_mps2=1.0, deceleration_mps2=1.5
+)
+CYCLING = Driver(
+    desired_speed_mps=5.0, headway_s=0.8, standstill_gap_m=1.0, acceleration_mps2=0.8, deceleration_mps2=1.8
+)
+
+
+def load_bodies() -> dict[str, Mesh]:
+    """The built-in bodies, by kind."""
+    return {kind: load_document(Vehicle, "vehicles", kind).mesh() for kind in CATEGORIES}
+
+
+class Fleet:
+    """The bodies of a world, and the drivers drawn for them.
+
+    Args:
+        bodies: A mesh for each kind in `CATEGORIES`.
+        ego: Body of the ego; the SUV if not given.
+        generator: Draws kinds, drivers and gaps.
+
+    Raises:
+        ValueError: A kind has no body.
+    """
+
+    def __init__(self, bodies: Mapping[str, Mesh], ego: Mesh | None, generator: np.random.Generator) -> None:
+        missing = sorted(CATEGORIES.keys() - bodies.keys())
+        if missing:
+            raise ValueError(f"traffic needs a body for each kind; there is none for {', '.join(missing)}")
+        self.meshes = {EGO: bodies["suv"] if ego is None else ego, **{kind: bodies[kind] for kind in CATEGORIES}}
+        self._sizes = {kind: Box.around(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
+        self._generator = generator
+
+    def length_m(self, kind: str) -> float:
+        """Extent along x."""
+        return self._sizes[kind][0]
+
+    def width_m(self, kind: str) -> float:
+        """Extent along y."""
+        return self._sizes[kind][1]
+
+    def draw_kind(self, mix: Mapping[str, float]) -> str:
+        """One kind, each with a probability in proportion to its weight."""
+        weights = np.array(list(mix.values()))
+        return str(self._generator.choice(list(mix), p=weights / weights.sum()))
+
+    def draw_driver(self, typical: Driver, spread: float) -> Driver:
+        """A driver whose desired speed differs from the typical one by up to `spread`, a share of it."""
+        return _with_speed(typical, float(typical.desired_speed_mps * self._generator.uniform(1 - spread, 1 + spread)))
+
+    def agent(self, kind: str, lane: int, place_m: float, driver: Driver) -> Agent:
+        """Somebody of a kind on a lane."""
+        return Agent(kind, self.length_m(kind), lane, place_m, driver)
+
+    def fill(
+        self,
+        lanes: Sequence[Lane],
+        lane: int,
+        span_m: tuple[float, float],
+        per_km: float,
+        drivers: Mapping[str, tuple[float, Driver]],
+        *,
+        keep_free: Sequence[Agent] = (),
+        spread: float = 0.12,
+    ) -> list[Agent]:
+        """Fill a lane with agents at random gaps, nobody on a junction.
+
+        Args:
+            lanes: All lanes.
+            lane: Index of the one to fill.
+            span_m: Where on it the fronts and rears of all lie.
+            per_km: How many to a kilometre, about, as far as they fit at full speed.
+            drivers: Weight and typical driver of each kind that uses the lane.
+            keep_free: Agents that are there already.
+            spread: Of the desired speeds.
+        """
+        mix = {kind: weight for kind, (weight, _) in drivers.items()}
+        agents: list[Agent] = []
+        rear = span_m[0]
+        while per_km > 0:
+            kind = self.draw_kind(mix)
+            driver = self.draw_driver(drivers[kind][1], spread)
+            length, gap = self.length_m(kind), _smallest_gap_m(driver)
+            rear += gap + self._generator.exponential(max(1000.0 / per_km - gap - length, 0.1))
+            if rear + length > span_m[1]:
+                break
+            agent = self.agent(kind, lane, rear + length / 2, driver)
+            if not _in_the_way(agent, lanes[lane], gap, keep_free):
+                agents.append(agent)
+            rear += length
+        return agents
+
+
+def _with_speed(driver: Driver, desired_speed_mps: float) -> Driver:
+    return Driver(
+        desired_speed_mps,
+        driver.headway_s,
+        driver.standstill_gap_m,
+        driver.acceleration_mps2,
+        driver.deceleration_mps2,
+    )
+
+
+def _smallest_gap_m(driver: Driver) -> float:
+    """What a driver keeps at full speed, so that nobody has to brake at first."""
+    return float(driver.standstill_gap_m + driver.headway_s * driver.desired_speed_mps)
+
+
+def _in_the_way(agent: Agent, lane: Lane, gap_m: float, others: Sequence[Agent]) -> bool:
+    rear, front = agent.place_m - agent.length_m / 2, agent.place_m + agent.length_m / 2
+    on_junction = any(front > gate.enter_m - gap_m and rear < gate.exit_m for gate in lane.gates)
+    near_others = any(
+        abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m
+        for other in others
+        if other.lane == agent.lane
+    )
+    return on_junction or near_others

@@ -1,0 +1,95 @@
+"""The Intelligent Driver Model: how hard a driver accelerates behind another.
+
+Treiber, Hennecke and Helbing, "Congested traffic states in empirical observations and microscopic simulations",
+Physical Review E 62 (2000). People on foot queue by the same law with other numbers.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Numbers = NDArray[np.float64]
+Quantity = float | Numbers
+
+FREE_ROAD_EXPONENT = 4
+# What tyres give on a dry road; the model itself would ask for more when somebody appears right ahead.
+HARDEST_BRAKING_MPS2 = 9.0
+# Two bodies that touch would ask for infinite braking.
+SMALLEST_GAP_M = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Driver:
+    """How somebody drives; one number for one driver, or arrays (N,) for N of them.
+
+    Args:
+        desired_speed_mps: Speed on an empty road.
+        headway_s: Time to the vehicle ahead that is kept beyond the standstill gap.
+        standstill_gap_m: Gap to the vehicle ahead in a queue, bumper to bumper.
+        acceleration_mps2: When starting on an empty road.
+        deceleration_mps2: Comfortable braking.
+    """
+
+    desired_speed_mps: Quantity
+    headway_s: Quantity = 1.2
+    standstill_gap_m: Quantity = 2.0
+    acceleration_mps2: Quantity = 1.5
+    deceleration_mps2: Quantity = 2.0
+
+
+def acceleration(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: Numbers) -> Numbers:
+    """Acceleration of N drivers.
+
+    Args:
+        driver: The drivers.
+        speed_mps: (N,) their speeds.
+        gap_m: (N,) free road to the one ahead, bumper to bumper; infinite on an empty road.
+        closing_mps: (N,) own speed minus that of the one ahead.
+
+    Returns:
+        (N,) m/s², at least -9.
+    """
+    braking = 2 * np.sqrt(driver.acceleration_mps2 * driver.deceleration_mps2)
+    dynamic_gap = speed_mps * driver.headway_s + speed_mps * closing_mps / braking
+    desired_gap = driver.standstill_gap_m + np.maximum(dynamic_gap, 0.0)
+    free_road = (speed_mps / driver.desired_speed_mps) ** FREE_ROAD_EXPONENT
+    interaction = (desired_gap / np.maximum(gap_m, SMALLEST_GAP_M)) ** 2
+    wanted: Numbers = driver.acceleration_mps2 * (1.0 - free_road - interaction)
+    return np.maximum(wanted, -HARDEST_BRAKING_MPS2)
+
+
+def equilibrium_gap_m(driver: Driver, speed_mps: Quantity) -> Quantity:
+    """Gap at which a driver behind another of constant speed neither brakes nor accelerates.
+
+    Example:
+        >>> round(float(equilibrium_gap_m(Driver(desired_speed_mps=14.0), 10.0)), 2)
+        16.27
+    """
+    slack = 1.0 - (speed_mps / driver.desired_speed_mps) ** FREE_ROAD_EXPONENT
+    return (driver.standstill_gap_m + speed_mps * driver.headway_s) / slack**0.5
+
+
+def advance(speed_mps: Numbers, acceleration_mps2: Numbers, room_m: Numbers, step_s: float) -> tuple[Numbers, Numbers]:
+    """Move N drivers on by one step of constant acceleration (the ballistic update).
+
+    A driver who comes to a stop within the step stays there instead of driving backwards, and nobody goes farther
+    than the room that was free when the step began: those ahead do not drive backwards either, so no step of any
+    length leads through them.
+
+    Args:
+        speed_mps: (N,) speeds.
+        acceleration_mps2: (N,) accelerations.
+        room_m: (N,) how far each may go at most; infinite on an empty road.
+        step_s: Length of the step.
+
+    Returns:
+        (N,) ways in metres and (N,) new speeds.
+    """
+    end_speed = np.maximum(speed_mps + acceleration_mps2 * step_s, 0.0)
+    stops = speed_mps + acceleration_mps2 * step_s < 0.0
+    stopping_way = speed_mps**2 / np.where(stops, -2 * acceleration_mps2, 1.0)
+    way = np.where(stops, stopping_way, (speed_mps + end_speed) / 2 * step_s)
+    room = np.maximum(room_m, 0.0)
+    blocked = way > room
+    return np.minimum(way, room), np.where(blocked, 0.0, end_speed)

@@ -1,0 +1,96 @@
+"""Lines that bodies follow: from a way along the line to a pose."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Numbers = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A polyline on the ground that goes on straight beyond its ends, or a loop.
+
+    Args:
+        points_m: (K, 2) corners, K >= 2. Curves need corners close to each other.
+        closed: Whether the last corner, which then equals the first, leads on to the first. The seam must lie on a
+            straight part.
+
+    Example:
+        >>> Line.straight((0.0, 5.0), yaw_deg=90.0, length_m=100.0).poses(20.0).round(6)
+        array([ 0., 25., 90.])
+    """
+
+    points_m: Numbers
+    closed: bool = False
+
+    @classmethod
+    def straight(cls, start_m: ArrayLike, yaw_deg: float, length_m: float) -> "Line":
+        """A straight line from a point in a direction."""
+        start, yaw = np.asarray(start_m, dtype=np.float64), np.deg2rad(yaw_deg)
+        return cls(np.stack([start, start + length_m * np.array([np.cos(yaw), np.sin(yaw)])]))
+
+    @cached_property
+    def arc_m(self) -> Numbers:
+        """(K,) way along the line at each corner."""
+        return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.points_m, axis=0), axis=1))])
+
+    @property
+    def length_m(self) -> float:
+        """Length, of a loop once around."""
+        return float(self.arc_m[-1])
+
+    def poses(self, place_m: ArrayLike) -> Numbers:
+        """Where one is after a way along the line.
+
+        Args:
+            place_m: (...) ways from the start; on a loop of any size.
+
+        Returns:
+            (..., 3) x and y in metres, and yaw in degrees.
+        """
+        place = np.asarray(place_m, dtype=np.float64)
+        place = np.mod(place, self.length_m) if self.closed else place
+        segment = np.clip(np.searchsorted(self.arc_m, place, side="right") - 1, 0, len(self.arc_m) - 2)
+        along = (place - self.arc_m[segment])[..., None]
+        position = self.points_m[segment] + along * self._directions[segment]
+        yaw = np.rad2deg(np.interp(place, self.arc_m, self._headings))
+        return np.concatenate([position, yaw[..., None]], axis=-1)
+
+    def shifted(self, left_m: float) -> "Line":
+        """The line beside this one, with a way of its own."""
+        normals = np.stack([-np.sin(self._headings), np.cos(self._headings)], axis=1)
+        return Line(self.points_m + left_m * normals, self.closed)
+
+    def reversed(self) -> "Line":
+        """The same line in the other direction."""
+        return Line(self.points_m[::-1], self.closed)
+
+    @cached_property
+    def _directions(self) -> Numbers:
+        steps = np.diff(self.points_m, axis=0)
+        return np.asarray(steps / np.linalg.norm(steps, axis=1, keepdims=True))
+
+    @cached_property
+    def _headings(self) -> Numbers:
+        """(K,) heading at each corner in radians, halfway between the pieces that meet there, without jumps."""
+        pieces = np.unwrap(np.arctan2(self._directions[:, 1], self._directions[:, 0]))
+        return np.concatenate([pieces[:1], (pieces[:-1] + pieces[1:]) / 2, pieces[-1:]])
+
+
+def loop(length_m: float, width_m: float, corner_radius_m: float) -> Line:
+    """A rounded rectangle about the origin, run counter-clockwise from the middle of its lower side.
+
+    Args:
+        length_m: Extent along x.
+        width_m: Extent along y.
+        corner_radius_m: Radius of its corners.
+    """
+    across, up = length_m / 2 - corner_radius_m, width_m / 2 - corner_radius_m
+    points = [np.array([[0.0, -width_m / 2]])]
+    for quarter, (x, y) in enumerate([(across, -up), (across, up), (-across, up), (-across, -up)]):
+        angle = np.linspace(quarter - 1, quarter, 17) * np.pi / 2
+        points.append(np.array([x, y]) + corner_radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    return Line(np.concatenate([*points, points[0]]), closed=True)

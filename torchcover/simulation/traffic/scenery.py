@@ -1,0 +1,131 @@
+"""What stands beside a road, as closed convex pieces that are merged into few meshes."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.simulation.bodies import merge
+from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic.roads import Line
+
+Numbers = NDArray[np.float64]
+
+PAVEMENT_M = 0.15
+POST_SIDES = 8
+CROWN_SIDES = 7
+
+
+def ground(lower_m: ArrayLike, upper_m: ArrayLike) -> Mesh:
+    """The one plane at z = 0 under everything: two triangles, so there is no seam for a ray to slip through."""
+    (x0, y0), (x1, y1) = np.asarray(lower_m, dtype=np.float64), np.asarray(upper_m, dtype=np.float64)
+    corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
+    """A closed body through convex outlines at ascending heights.
+
+    Args:
+        outlines_m: One (K, 2) outline for each height, counter-clockwise from above.
+        heights_m: Their z.
+    """
+    rings = [
+        np.column_stack([outline, np.full(len(np.asarray(outline)), z)])
+        for outline, z in zip(outlines_m, heights_m, strict=True)
+    ]
+    corners = len(rings[0])
+    here = np.arange(corners)
+    following = (here + 1) % corners
+    side = np.concatenate(
+        [
+            np.stack([here, following, following + corners], axis=1),
+            np.stack([here, following + corners, here + corners], axis=1),
+        ]
+    )
+    fan = np.stack([np.zeros(corners - 2, dtype=np.int64), here[1:-1], here[2:]], axis=1)
+    sides = [side + level * corners for level in range(len(rings) - 1)]
+    return Mesh(np.concatenate(rings), np.concatenate([*sides, fan[:, ::-1], fan + (len(rings) - 1) * corners]))
+
+
+def rectangle(x_m: tuple[float, float], y_m: tuple[float, float]) -> Numbers:
+    """(4, 2) outline."""
+    return np.array([[x_m[0], y_m[0]], [x_m[1], y_m[0]], [x_m[1], y_m[1]], [x_m[0], y_m[1]]])
+
+
+def block(x_m: tuple[float, float], y_m: tuple[float, float], z_m: tuple[float, float]) -> Mesh:
+    """A box between bounds."""
+    outline = rectangle(x_m, y_m)
+    return prism([outline, outline], z_m)
+
+
+def box(centre_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: float = 0.0) -> Mesh:
+    """A box about a point (x, y), turned."""
+    length, width, height = np.asarray(size_m, dtype=np.float64)
+    shape = block((-length / 2, length / 2), (-width / 2, width / 2), (bottom_m, bottom_m + height))
+    return placed(shape, [*np.asarray(centre_m), yaw_deg])
+
+
+def post(centre_m: ArrayLike, radius_m: float, bottom_m: float, height_m: float) -> Mesh:
+    """An upright post."""
+    outline = np.asarray(centre_m) + radius_m * _circle(POST_SIDES)
+    return prism([outline, outline], [bottom_m, bottom_m + height_m])
+
+
+def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, crown_radius_m: float) -> list[Mesh]:
+    """A trunk, and on it a crown as wide as given.
+
+    Args:
+        centre_m: (2,) position.
+        bottom_m: Height of the soil.
+        clear_m: Height of the crown's lower end above the soil.
+        height_m: Height of the whole tree.
+        crown_radius_m: Largest radius of the crown.
+    """
+    shape, centre = _circle(CROWN_SIDES), np.asarray(centre_m)
+    outlines = [centre + share * crown_radius_m * shape for share in (0.45, 1.0, 0.9, 0.3)]
+    levels = bottom_m + clear_m + np.array([0.0, 0.3, 0.65, 1.0]) * (height_m - clear_m)
+    return [post(centre, 0.15, bottom_m, clear_m), prism(outlines, levels.tolist())]
+
+
+def rail(line: Line, places_m: Numbers, left_m: float, width_m: float, z_m: tuple[float, float]) -> list[Mesh]:
+    """A rail or wall along a line: one straight piece between each two places.
+
+    Args:
+        line: What it follows.
+        places_m: (K,) ascending places on the line.
+        left_m: How far its middle lies to the left of the line.
+        width_m: Its thickness.
+        z_m: Its lower and upper edge.
+    """
+    sides = [beside(line, places_m, left_m + shift)[:, :2] for shift in (-width_m / 2, width_m / 2)]
+    pieces = []
+    for piece in range(len(places_m) - 1):
+        outline = np.stack([sides[0][piece], sides[0][piece + 1], sides[1][piece + 1], sides[1][piece]])
+        pieces.append(prism([outline, outline], z_m))
+    return pieces
+
+
+def beside(line: Line, places_m: ArrayLike, left_m: float) -> Numbers:
+    """(..., 3) poses x, y, yaw to the left of a line."""
+    poses = line.poses(places_m)
+    yaw = np.deg2rad(poses[..., 2])
+    poses[..., :2] += left_m * np.stack([-np.sin(yaw), np.cos(yaw)], axis=-1)
+    return poses
+
+
+def placed(mesh: Mesh, pose: ArrayLike, height_m: float = 0.0) -> Mesh:
+    """A mesh at a pose x, y in metres and yaw in degrees."""
+    x, y, yaw_deg = np.asarray(pose, dtype=np.float64)
+    return mesh.moved(rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), [x, y, height_m]))
+
+
+def few(*kinds: Sequence[Mesh]) -> tuple[Mesh, ...]:
+    """One mesh for each kind of thing that there is."""
+    return tuple(merge(list(pieces)) for pieces in kinds if pieces)
+
+
+def _circle(sides: int) -> Numbers:
+    angle = 2 * np.pi * np.arange(sides) / sides
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -1,0 +1,164 @@
+"""A city: the ego follows a main street with lights, behind other vehicles and past parked cars and people."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat
+
+from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic.assemble import Paths, actors, ego_actor, paths
+from torchcover.simulation.traffic.city import City
+from torchcover.simulation.traffic.crossing import Footpath, step_height, walk
+from torchcover.simulation.traffic.fleet import CYCLING, EGO, WALKING, Fleet
+from torchcover.simulation.traffic.flow import Agent, Flow, Lane, Simulation
+from torchcover.simulation.traffic.idm import Driver
+from torchcover.simulation.traffic.procedural import Procedural
+from torchcover.simulation.traffic.signals import CROSS, MAIN
+from torchcover.simulation.traffic.streets import (
+    FOOTPATHS_M,
+    WAITING_BEHIND_KERB_M,
+    Streets,
+    plan,
+)
+from torchcover.simulation.world import Actor
+
+Numbers = NDArray[np.float64]
+
+WARM_UP_S = 20.0
+# What is built up or has traffic, behind and ahead of all places the ego gets to.
+BEHIND_M, AHEAD_M = 120.0, 260.0
+# The ego starts this far behind the vehicle it follows, which is a little slower.
+LEADER_AHEAD_M = 20.0
+LEADER_SPEED = 0.82
+# A light may part the two for good; a run in which the ego is alone for most of the time is drawn again, some times.
+FOLLOWS_WITHIN_M = 40.0
+FOLLOWS_SHARE = 0.6
+DRAWS = 5
+# Weight, desired speed as a share of the usual one, headway, acceleration when starting.
+DRIVING = {
+    "sedan": (4.0, 1.0, 1.2, 1.6),
+    "hatchback": (4.0, 1.0, 1.2, 1.6),
+    "suv": (3.0, 1.0, 1.2, 1.6),
+    "van": (1.5, 0.95, 1.3, 1.4),
+    "truck": (0.5, 0.85, 1.6, 0.9),
+    "bus": (0.6, 0.85, 1.5, 1.0),
+    "motorcycle": (0.6, 1.05, 1.2, 2.2),
+}
+
+
+class Urban(Procedural):
+    """Traffic in a city.
+
+    Args:
+        lanes: Of the ego's street, both directions together; the streets that cross it have two or four.
+        speed_mps: What drivers want to drive, about.
+        traffic_per_km: Vehicles to a kilometre of lane.
+        cyclists_per_km: To a kilometre of bicycle lane.
+        people_per_km: On foot, to a kilometre of sidewalk in each direction.
+        parked_share: Share of the parking bays that are taken.
+    """
+
+    type: Literal["urban"] = "urban"
+    lanes: Literal[2, 4] = 4
+    speed_mps: float = Field(default=13.9, ge=5.0, le=20.0)
+    traffic_per_km: NonNegativeFloat = 20.0
+    cyclists_per_km: NonNegativeFloat = 6.0
+    people_per_km: NonNegativeFloat = 25.0
+    parked_share: float = Field(default=0.5, ge=0.0, le=1.0)
+
+    def _build(
+        self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
+    ) -> tuple[tuple[Mesh, ...], Actor, tuple[Actor, ...]]:
+        longest_way = 1.25 * self.speed_mps * (self.duration_s + WARM_UP_S)
+        for _ in range(DRAWS):
+            streets = plan(self.lanes // 2, (-BEHIND_M, longest_way + AHEAD_M), longest_way + 2 * AHEAD_M, generator)
+            lanes, agents = self._traffic(streets, fleet, generator)
+            flow = Simulation(lanes, agents, streets.signals).run(times_s, WARM_UP_S)
+            if _usually_follows(agents, flow):
+                break
+        moving = _on_the_pavement(paths(lanes, agents, flow), streets, fleet)
+        driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator)
+        way = driver.trajectory.positions_m[:, 0]
+        seen = (float(way[0]) - BEHIND_M, float(way[-1]) + AHEAD_M)
+        crossing = _crossers(streets, flow, times_s, seen, fleet, generator)
+        static = City(streets, fleet, self.parked_share, generator).static(seen)
+        others = actors(times_s, [moving, crossing], driver, fleet)
+        return static, driver, others
+
+    def _traffic(
+        self, streets: Streets, fleet: Fleet, generator: np.random.Generator
+    ) -> tuple[list[Lane], list[Agent]]:
+        """Everybody who follows a lane; the ego is the first."""
+        main, bicycles, cross = streets.traffic_lanes(), streets.bicycle_lanes(), streets.cross_lanes()
+        sidewalks = streets.sidewalks()
+        lanes = [*main, *bicycles, *sidewalks, *cross]
+        driving = {
+            kind: (weight, Driver(self.speed_mps * pace, headway_s=headway, acceleration_mps2=starting))
+            for kind, (weight, pace, headway, starting) in DRIVING.items()
+        }
+        agents = self._ego_and_leader(streets, fleet, generator)
+        per_lane = [
+            *[(self.traffic_per_km, driving)] * len(main),
+            *[(self.cyclists_per_km, {"cyclist": (1.0, CYCLING)})] * len(bicycles),
+            *[(self.people_per_km, {"adult": (5.0, WALKING), "child": (1.0, WALKING)})] * len(sidewalks),
+            *[(self.traffic_per_km / 2, driving)] * len(cross),
+        ]
+        for index, (per_km, drivers) in enumerate(per_lane):
+            # Who has left a cross street's junction far behind does not come back.
+            end = 2 * streets.reach_m if index < len(lanes) - len(cross) else streets.reach_m + AHEAD_M
+            agents += fleet.fill(lanes, index, (0.0, end), per_km, drivers, keep_free=agents[:2])
+        return lanes, agents
+
+    def _ego_and_leader(self, streets: Streets, fleet: Fleet, generator: np.random.Generator) -> list[Agent]:
+        lane, middle = int(generator.integers(streets.lanes_each_way)), streets.reach_m
+        kind = fleet.draw_kind({"suv": 1.0, "sedan": 2.0, "hatchback": 2.0, "van": 1.0})
+        return [
+            fleet.agent(EGO, lane, middle - LEADER_AHEAD_M / 2, Driver(self.speed_mps, headway_s=1.1)),
+            fleet.agent(kind, lane, middle + LEADER_AHEAD_M / 2, Driver(LEADER_SPEED * self.speed_mps)),
+        ]
+
+
+def _usually_follows(agents: list[Agent], flow: Flow) -> bool:
+    """Whether in most frames somebody is close ahead of the first agent on its lane."""
+    same_lane = [index for index, agent in enumerate(agents) if agent.lane == agents[0].lane and index > 0]
+    ahead = flow.place_m[:, same_lane] - flow.place_m[:, :1]
+    close = ((ahead > 0) & (ahead < FOLLOWS_WITHIN_M)).any(axis=1)
+    return bool(close.mean() >= FOLLOWS_SHARE)
+
+
+def _on_the_pavement(found: Paths, streets: Streets, fleet: Fleet) -> Paths:
+    """Lift those who walk along the main street onto the pavement, and let them step down at the cross streets."""
+    for index, kind in enumerate(found.kinds):
+        if kind in ("adult", "child"):
+            x = found.positions_m[:, index, 0]
+            beyond_kerb = (streets.cross_kerbs_m - np.abs(x[:, None] - streets.junctions_m)).max(axis=1)
+            found.positions_m[:, index, 2] = step_height(beyond_kerb, fleet.length_m(kind) / 2)
+    return found
+
+
+def _crossers(
+    streets: Streets,
+    flow: Flow,
+    times_s: Numbers,
+    seen_m: tuple[float, float],
+    fleet: Fleet,
+    generator: np.random.Generator,
+) -> Paths:
+    """People who go to and fro across the main street, on both crossings of each junction in sight."""
+    positions, yaws, kinds = [], [], []
+    wait_m = streets.kerb_m + WAITING_BEHIND_KERB_M
+    walks = 2 * wait_m / float(WALKING.desired_speed_mps)
+    green = np.stack([streets.signals.green_left_s(time)[:, CROSS] for time in times_s])
+    may_go = (green + streets.signals.amber_s > walks) & ~flow.occupied[:, :, MAIN]
+    for index in np.flatnonzero((streets.junctions_m > seen_m[0]) & (streets.junctions_m < seen_m[1])):
+        for side in (1, -1):
+            for offset in FOOTPATHS_M:
+                x = streets.junctions_m[index] + side * (streets.cross_kerbs_m[index] + offset)
+                kind = fleet.draw_kind({"adult": 5.0, "child": 1.0})
+                path = Footpath(np.array([x, -wait_m]), np.array([x, wait_m]), WAITING_BEHIND_KERB_M)
+                position, yaw = walk(path, may_go[:, index], walks, times_s, fleet.length_m(kind) / 2, generator)
+                positions.append(position)
+                yaws.append(yaw)
+                kinds.append(kind)
+    return Paths(np.stack(positions, axis=1), np.stack(yaws, axis=1), tuple(kinds))
