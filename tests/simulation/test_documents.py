@@ -60,13 +60,17 @@ def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("columns: 8", "colums: 8", r"sensors\.0\.columns: Field required; sensors\.0\.colums: Extra inputs"),
-        ("columns: 8", "columns: 0", r"sensors\.0\.columns: .*greater than 0 \(got 0\)"),
-        ("columns: 8", "columns: many", r"sensors\.0\.columns: .*integer.*got 'many'"),
-        ("x_m: 1.0", "x: 1.0", r"sensors\.0\.mount\.x: Extra inputs"),
-        ("x_m: 1.0", "x_m: .nan", r"sensors\.0\.mount\.x_m: .*finite"),
-        ("x_m: 1.0", "x_m: .inf", r"sensors\.0\.mount\.x_m: .*finite"),
-        ("x_m: 1.0", "quaternion_wxyz: [0, 0, 0, 0]", r"sensors\.0\.mount: a quaternion of norm 0"),
+        (
+            "columns: 8",
+            "colums: 8",
+            r"sensors\.0\.lidar\.columns: Field required; sensors\.0\.lidar\.colums: Extra inputs",
+        ),
+        ("columns: 8", "columns: 0", r"sensors\.0\.lidar\.columns: .*greater than 0 \(got 0\)"),
+        ("columns: 8", "columns: many", r"sensors\.0\.lidar\.columns: .*integer.*got 'many'"),
+        ("x_m: 1.0", "x: 1.0", r"sensors\.0\.lidar\.mount\.x: Extra inputs"),
+        ("x_m: 1.0", "x_m: .nan", r"sensors\.0\.lidar\.mount\.x_m: .*finite"),
+        ("x_m: 1.0", "x_m: .inf", r"sensors\.0\.lidar\.mount\.x_m: .*finite"),
+        ("x_m: 1.0", "quaternion_wxyz: [0, 0, 0, 0]", r"sensors\.0\.lidar\.mount: a quaternion of norm 0"),
         ("x_m: 1.0", "yaw_deg: 3, quaternion_wxyz: [1, 0, 0, 0]", "quaternion or as yaw, pitch and roll, not both"),
         ("channels: 4", "channels: 4\n    elevations_deg: [1, 2]", "not both"),
         ("    channels: 4\n", "", "rows are missing"),
@@ -75,7 +79,7 @@ def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
         ("horizontal_fov_deg: 360", "horizontal_fov_deg: 361", "less than or equal to 360"),
         ("max_range_m: 50", "max_range_m: 50\n    min_range_m: 60", r"min_range_m \(60\.0\) must be below"),
         ("columns: 8", "columns: 8\n    azimuth_offsets_deg: [1, 2]", "one for each of the 4 rows is needed; got 2"),
-        ("  - type: lidar", "  - type: radar", r"sensors\.0\.type"),
+        ("  - type: lidar", "  - type: radar", r"sensors\.0: type: a sensor is a 'lidar' or a 'camera'"),
         ("name: r\n", "", "name: Field required"),
     ],
 )

@@ -6,16 +6,20 @@ from rich.console import Console
 from rich.table import Table
 
 from torchcover.simulation import LidarModel, Rig, Scenario, builtin_names
-from torchcover.simulation.documents import load_document
 
 
 def run() -> None:
     """Print the built-in rigs, scenarios and LiDAR models, with the first sentence of their descriptions."""
     console = Console()
-    for kind, model in (("rigs", Rig), ("scenarios", Scenario), ("lidars", LidarModel)):
+    models: tuple[tuple[str, type[Rig | Scenario | LidarModel]], ...] = (
+        ("rigs", Rig),
+        ("scenarios", Scenario),
+        ("lidars", LidarModel),
+    )
+    for kind, model in models:
         table = Table("name", "description", title=kind, title_justify="left", box=None, padding=(0, 2, 0, 0))
         for name in builtin_names(kind):
-            table.add_row(name, _first_sentence(load_document(model, kind, name).description))
+            table.add_row(name, _first_sentence(model.load(name).description))
         console.print(table)
         console.print()
 

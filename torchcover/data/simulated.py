@@ -11,6 +11,7 @@ from torch.utils.data import Dataset
 from torchcover.data.frame import Frame
 from torchcover.geometry.rigid import Matrix
 from torchcover.simulation import ReferenceSensor, Rig, Scenario
+from torchcover.simulation.disturbance import disturb
 from torchcover.simulation.rays import Tile, into_tiles
 from torchcover.simulation.scene import Instant, Scan, Scene
 
@@ -150,7 +151,8 @@ class SimulatedFrames(Dataset[Frame]):
                 threads=torch.get_num_threads(),
             )
             generator = np.random.default_rng([self.seed, index, k])
-            scans.append(scan._replace(points=sensor.disturb(scan.points, vehicle_T_sensor[:3, 3], generator)))
+            points = disturb(scan.points, vehicle_T_sensor[:3, 3], sensor.range_noise_m, sensor.dropout, generator)
+            scans.append(scan._replace(points=points))
         return scans
 
     def _scan_reference(self, scene: Scene, instant: Instant, index: int) -> tuple[Scan, int]:

@@ -1,9 +1,10 @@
 """Simulated worlds: what a rig and a reference sensor see of a scenario."""
 
+from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.documents import Pose, builtin_names
 from torchcover.simulation.lidar import Lidar, LidarModel
 from torchcover.simulation.reference import ReferenceSensor
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 
-__all__ = ["Lidar", "LidarModel", "Pose", "ReferenceSensor", "Rig", "Scenario", "builtin_names"]
+__all__ = ["CameraSensor", "Lidar", "LidarModel", "Pose", "ReferenceSensor", "Rig", "Scenario", "builtin_names"]

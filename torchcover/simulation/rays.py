@@ -40,24 +40,31 @@ def unit_directions(elevation_deg: NDArray[np.float64], azimuth_deg: NDArray[np.
     return np.stack([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(elevation)])
 
 
-def into_tiles(directions: NDArray[np.float64]) -> tuple[Tile, ...]:
+def into_tiles(
+    directions: NDArray[np.float64], tile_rows: int = TILE_ROWS, tile_columns: int = TILE_COLUMNS
+) -> tuple[Tile, ...]:
     """Cut a sensor's rows and columns into tiles.
 
     Args:
-        directions: (3, rows, columns) unit vectors.
+        directions: (3, rows, columns) unit vectors; NaN for a pixel that has no ray.
+        tile_rows: Most rows in a tile.
+        tile_columns: Most columns in a tile.
 
     Returns:
-        The tiles, row by row; together they hold every ray once.
+        The tiles, row by row; together they hold every ray once; a pixel without one is left out.
     """
     _, rows, columns = directions.shape
     return tuple(
-        _tile(directions[:, top : top + TILE_ROWS, left : left + TILE_COLUMNS].reshape(3, -1))
-        for top in range(0, rows, TILE_ROWS)
-        for left in range(0, columns, TILE_COLUMNS)
+        _tile(directions[:, top : top + tile_rows, left : left + tile_columns].reshape(3, -1))
+        for top in range(0, rows, tile_rows)
+        for left in range(0, columns, tile_columns)
     )
 
 
 def _tile(directions: NDArray[np.float64]) -> Tile:
+    directions = directions[:, ~np.isnan(directions[0])]
+    if directions.shape[1] == 0:
+        return Tile(directions.astype(np.float32), np.array([1.0, 0.0, 0.0]), 0.0)
     middle = directions.mean(axis=1)
     length = float(np.linalg.norm(middle))
     # Directions that cancel have no middle; any axis will do, for the cone is then the whole sphere.

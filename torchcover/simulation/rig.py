@@ -1,12 +1,26 @@
 """A rig: the sensors of a vehicle and where they are mounted."""
 
 from pathlib import Path
-from typing import Self
+from typing import Annotated, Any, Self
 
-from pydantic import Field, model_validator
+from pydantic import Discriminator, Field, Tag, model_validator
 
+from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.documents import Document, load_document
 from torchcover.simulation.lidar import Lidar
+
+
+def _kind(sensor: Any) -> str | None:  # noqa: ANN401  (whatever stood in the file, or a sensor)
+    kind = sensor.get("type", "lidar") if isinstance(sensor, dict) else getattr(sensor, "type", None)
+    return kind if isinstance(kind, str) else None
+
+
+Sensor = Annotated[
+    Annotated[Lidar, Tag("lidar")] | Annotated[CameraSensor, Tag("camera")],
+    Discriminator(
+        _kind, custom_error_type="sensor_type", custom_error_message="type: a sensor is a 'lidar' or a 'camera'"
+    ),
+]
 
 
 class Rig(Document):
@@ -24,7 +38,7 @@ class Rig(Document):
 
     name: str
     description: str = ""
-    sensors: tuple[Lidar, ...] = Field(min_length=1)
+    sensors: tuple[Sensor, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _check_names(self) -> Self:

@@ -73,25 +73,3 @@ class ScanPattern(Document):
         offsets = np.zeros(len(self.rows_deg())) if self.azimuth_offsets_deg is None else self.azimuth_offsets_deg
         azimuths_deg = np.add.outer(offsets, self.horizontal_fov_deg * middle)
         return unit_directions(self.rows_deg()[:, None], azimuths_deg)
-
-    def disturb(
-        self, points_m: NDArray[np.float32], origin_m: NDArray[np.float64], generator: np.random.Generator
-    ) -> NDArray[np.float32]:
-        """Apply the noise of the range and the drop-out.
-
-        Args:
-            points_m: (N, 3) exact points.
-            origin_m: (3,) where their rays start.
-            generator: Source of the random numbers; not touched if there is neither noise nor drop-out.
-
-        Returns:
-            (K, 3) points; the very array if there is neither.
-        """
-        if self.range_noise_m > 0:
-            rays = points_m.astype(np.float64) - origin_m
-            range_m = np.linalg.norm(rays, axis=1, keepdims=True)
-            noise_m = generator.normal(0.0, self.range_noise_m, size=range_m.shape)
-            points_m = (points_m + rays * (noise_m / range_m)).astype(np.float32)
-        if self.dropout > 0:
-            points_m = points_m[generator.random(len(points_m)) >= self.dropout]
-        return points_m

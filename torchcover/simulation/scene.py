@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import Box, invert, overlap, transform
 from torchcover.simulation.raycaster import Hits, RayCaster
-from torchcover.simulation.rays import Tile, unit_directions
+from torchcover.simulation.rays import Tile, into_tiles, unit_directions
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.world import Actor, World
 
@@ -196,6 +196,25 @@ class Instant:
         rays = sum(tile.directions.shape[1] for tile in tiles)
         return Scan(np.concatenate(points), rays, sum(self_hits))
 
+    def range_image(
+        self, vehicle_T_sensor: Matrix, directions: NDArray[np.float64], *, max_range_m: float = np.inf
+    ) -> Float32:
+        """Distance along the ray of every pixel, the ego's body included.
+
+        Args:
+            vehicle_T_sensor: (4, 4) pose of the frame of the directions.
+            directions: (3, rows, columns) unit directions; NaN for a pixel that has no ray.
+            max_range_m: Hits farther than this are none.
+
+        Returns:
+            (rows, columns) metres; infinite where a ray hits nothing, NaN where there is none.
+        """
+        (tile,) = into_tiles(directions, tile_rows=directions.shape[1], tile_columns=directions.shape[2])
+        _, hits = self._cast_tile(vehicle_T_sensor, tile, max_range_m)
+        image = np.full(directions.shape[1:], np.nan, dtype=np.float32)
+        image[~np.isnan(directions[0])] = np.where(hits.body >= 0, hits.range_m, np.inf)
+        return image
+
     def buried(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies below the ground or inside a wall or another body."""
         casters = [(self.static, self.vehicle_T_static)]
@@ -210,6 +229,15 @@ class Instant:
         self, vehicle_T_sensor: Matrix, tile: Tile, min_range_m: float, max_range_m: float
     ) -> tuple[Float32, int]:
         origin_m = vehicle_T_sensor[:3, 3]
+        directions, hits = self._cast_tile(vehicle_T_sensor, tile, max_range_m)
+        seen = (hits.body >= 0) & (hits.body != self.ego)
+        if min_range_m > 0:
+            seen &= hits.range_m >= min_range_m
+        return _points(origin_m, directions, hits.range_m, seen), int(np.count_nonzero(hits.body == self.ego))
+
+    def _cast_tile(self, vehicle_T_sensor: Matrix, tile: Tile, max_range_m: float) -> tuple[Float32, Hits]:
+        """Directions in the vehicle frame, and their hits."""
+        origin_m = vehicle_T_sensor[:3, 3]
         directions = _rotate(vehicle_T_sensor[:3, :3], tile.directions)
         axis = vehicle_T_sensor[:3, :3] @ tile.axis
         limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
@@ -220,10 +248,7 @@ class Instant:
                 nearer = _cast(part.caster, part.vehicle_T_part, origin_m, directions[:, rays], hits.range_m[rays])
                 hits.range_m[rays] = nearer.range_m
                 hits.body[rays[nearer.body >= 0]] = part.body
-        seen = (hits.body >= 0) & (hits.body != self.ego)
-        if min_range_m > 0:
-            seen &= hits.range_m >= min_range_m
-        return _points(origin_m, directions, hits.range_m, seen), int(np.count_nonzero(hits.body == self.ego))
+        return directions, hits
 
 
 def _points(origin_m: Matrix, directions: Float32, range_m: Float32, seen: NDArray[np.bool_]) -> Float32:

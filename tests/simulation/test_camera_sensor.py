@@ -1,0 +1,118 @@
+"""A camera in a scene: its depth image and its cloud are two views of the same hits."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover import Rig
+from torchcover.data import SimulatedFrames
+from torchcover.simulation import CameraSensor, Pose, ReferenceSensor, Scenario
+from torchcover.simulation.rays import into_tiles
+from torchcover.simulation.scene import Scene
+
+LENSES = {
+    "pinhole": {"fov_deg": 100.0},
+    "brown_conrady": {"lens": "brown_conrady", "coefficients": [-0.25, 0.05, 1e-3, -5e-4]},
+    "kannala_brandt": {"lens": "kannala_brandt", "coefficients": [0.05, -0.01, 0.0, 0.0]},
+    "double_sphere": {"lens": "double_sphere", "coefficients": [-0.2, 0.6]},
+}
+
+
+def camera(kind="pinhole", /, **changes):
+    intrinsics = {} if kind == "pinhole" else {"fx": 60.0, "fy": 62.0, "cx": 79.0, "cy": 61.5}
+    content = {
+        "type": "camera",
+        "name": "front",
+        "mount": {"x_m": 1.0, "y_m": 0.2, "z_m": 1.9, "yaw_deg": 20.0, "pitch_deg": 10.0, "roll_deg": -5.0},
+        "width": 160,
+        "height": 120,
+        "max_range_m": 60.0,
+        **intrinsics,
+        **LENSES[kind],
+    }
+    return CameraSensor.model_validate({**content, **changes})
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_depth_image_that_is_cast_unprojects_to_the_hits(lens):
+    sensor = camera(lens)
+    instant = Scene(Scenario.load("courtyard").world()).at(0)
+    vehicle_T_mount = sensor.mount.matrix()
+    image = instant.range_image(vehicle_T_mount, sensor.directions(), max_range_m=60.0)
+    model = sensor.camera()
+    cloud = model.to_vehicle(model.unproject(torch.from_numpy(image), kind="distance")).numpy()
+    tiles = into_tiles(sensor.directions())
+    scan = instant.scan(vehicle_T_mount, tiles, max_range_m=60.0)
+    # The image shows the ego's hood, the scan leaves it out.
+    assert len(cloud) == len(scan.points) + scan.self_hits
+    in_order = lambda points: points[np.lexsort(points.round(2).T)]  # noqa: E731
+    x, y, z = cloud.T
+    on_ego = (np.abs(x) < 2.46) & (np.abs(y) < 0.98) & (z > 0.2) & (z < 1.64)
+    assert on_ego.sum() == scan.self_hits
+    from_image, from_scan = in_order(cloud[~on_ego]), in_order(scan.points)
+    apart = torch.cdist(torch.from_numpy(from_image[::7]).double(), torch.from_numpy(from_scan).double()).min(dim=1)
+    assert apart.values.max() < 1e-4
+
+
+def test_a_camera_at_rest_looks_forward_upright():
+    directions = camera(mount={}).directions()
+    forward, left, up = directions[:, 60, 80]
+    assert forward > 0.99
+    assert directions[1, 60, 0] > 0.6 > -0.6 > directions[1, 60, -1]  # left of the image is left of the vehicle
+    assert directions[2, 0, 80] > 0.5 > -0.5 > directions[2, -1, 80]  # the top of the image looks up
+    assert (abs(left), abs(up)) < (0.01, 0.01)
+
+
+def test_the_field_of_view_is_that_of_the_outermost_pixels():
+    # 100 degrees to the edges of the outermost pixels; their centres lie half a pixel inside.
+    expected = 2 * np.rad2deg(np.arctan(np.tan(np.deg2rad(50)) * 159 / 160))
+    assert camera(mount={}).horizontal_fov_deg == pytest.approx(expected, abs=0.02)
+
+
+def test_pixels_without_a_ray_give_no_point_and_are_no_rays():
+    # A fold within the image: beyond it there is nothing.
+    folded = camera("brown_conrady", coefficients=[-0.35, 0.0, 0.0, 0.0])
+    missing = int(np.isnan(folded.directions()[0]).sum())
+    assert 0 < missing < 160 * 120
+    frames = SimulatedFrames("courtyard", Rig(name="r", sensors=(folded,)), steps=1, reference=ReferenceSensor(8, 8))
+    assert frames[0].counts["sensor_rays"] == 160 * 120 - missing
+    assert frames[0].sensor.isfinite().all()
+    image = frames.scene.at(0).range_image(np.eye(4) @ folded.mount.matrix(), folded.directions())
+    assert np.isnan(image).sum() == missing
+
+
+def test_cameras_and_lidars_fuse_into_one_cloud():
+    lidar = Rig.load("front_grille_128").sensors[0]
+    both = SimulatedFrames(
+        "courtyard", Rig(name="b", sensors=(camera(), lidar)), steps=1, reference=ReferenceSensor(8, 8)
+    )
+    alone = SimulatedFrames("courtyard", Rig(name="a", sensors=(camera(),)), steps=1, reference=ReferenceSensor(8, 8))
+    assert torch.equal(both[0].sensor[: len(alone[0].sensor)], alone[0].sensor)
+    assert both[0].counts["sensor_rays"] == 160 * 120 + 128 * 1800
+
+
+def test_stride_takes_every_nth_row_and_column():
+    np.testing.assert_array_equal(camera(stride=3).directions(), camera().directions()[:, ::3, ::3])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"fov_deg": None}, "intrinsics are missing"),
+        ({"fx": 50.0}, "give one or the other"),
+        ({"lens": "mei", "coefficients": [0.1]}, "give one or the other"),
+        ({"min_range_m": 70.0}, "must be below max_range_m"),
+        ({"fov_deg": 180.0}, "less than 180"),
+        ({"fov_deg": None, "fx": 50, "fy": 50, "cx": 80, "cy": 60, "lens": "magic"}, "magic"),
+        ({"fov_deg": None, "fx": 50, "fy": 50, "cx": 80, "cy": 60, "lens": "mei", "coefficients": [1]}, "mei"),
+    ],
+)
+def test_an_impossible_camera_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        camera(**changes)
+
+
+def test_range_limits():
+    scene = Scene(Scenario.load("courtyard").world()).at(0)
+    near = scene.scan(camera().mount.matrix(), into_tiles(camera().directions()), max_range_m=8.0).points
+    assert np.linalg.norm(near - Pose(x_m=1.0, y_m=0.2, z_m=1.9).matrix()[:3, 3], axis=1).max() <= 8.001

@@ -1,0 +1,111 @@
+"""A camera that measures depth: the pixels of a lens as rays."""
+
+from typing import Annotated, Literal, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+
+from torchcover.cameras import Camera
+from torchcover.geometry import rigid
+from torchcover.simulation.documents import Document, Pose
+
+# The camera frame is x right, y down, z forward; a mount looks along its x, with y left and z up.
+MOUNT_T_CAMERA = rigid(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+
+
+class CameraSensor(Document):
+    """A camera as a depth sensor: every pixel that has a ray gives the point that it sees.
+
+    Args:
+        name: What maps and messages call it.
+        mount: Its pose in the vehicle frame. At yaw, pitch and roll 0 it looks forward, upright.
+        width: Columns of the image.
+        height: Rows of the image.
+        fov_deg: Horizontal field of view of a pinhole with square pixels and its axis in the middle.
+        fx, fy, cx, cy: Intrinsics in pixels instead; pixel centres lie at integers.
+        lens: Lens model, with the intrinsics; see `torchcover.Camera`.
+        coefficients: Of the lens.
+        stride: Use every stride-th row and column.
+        min_range_m: Closer hits give no point.
+        max_range_m: Farther hits give no point.
+        range_noise_m: Standard deviation of the measured range, along the ray.
+        dropout: Probability that a pixel gives no point, from 0 to 1.
+
+    Example:
+        >>> camera = CameraSensor(name="front", width=64, height=48, fov_deg=90, max_range_m=100)
+        >>> camera.directions().shape
+        (3, 48, 64)
+    """
+
+    type: Literal["camera"] = "camera"
+    name: str
+    mount: Pose = Pose()
+    width: PositiveInt
+    height: PositiveInt
+    fov_deg: Annotated[float, Field(gt=0.0, lt=180.0)] | None = None
+    fx: PositiveFloat | None = None
+    fy: PositiveFloat | None = None
+    cx: float | None = None
+    cy: float | None = None
+    lens: str = "pinhole"
+    coefficients: tuple[float, ...] = ()
+    stride: PositiveInt = 1
+    min_range_m: NonNegativeFloat = 0.0
+    max_range_m: PositiveFloat
+    range_noise_m: NonNegativeFloat = 0.0
+    dropout: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+
+    @model_validator(mode="after")
+    def _check_lens(self) -> Self:
+        given = [value is not None for value in (self.fx, self.fy, self.cx, self.cy)]
+        if self.fov_deg is None and not all(given):
+            raise ValueError("the intrinsics are missing: give fx, fy, cx and cy, or fov_deg")
+        if self.fov_deg is not None and (any(given) or self.lens != "pinhole"):
+            raise ValueError("fov_deg is for a pinhole without fx, fy, cx, cy; give one or the other")
+        if self.min_range_m >= self.max_range_m:
+            raise ValueError(f"min_range_m ({self.min_range_m}) must be below max_range_m ({self.max_range_m})")
+        self.camera()
+        return self
+
+    @property
+    def horizontal_fov_deg(self) -> float:
+        """Angle between the outermost rays of the middle row, seen from above."""
+        forward, left, _ = self.directions()[:, self.height // self.stride // 2]
+        angle = np.rad2deg(np.arctan2(left, forward))
+        return float(np.nanmax(angle) - np.nanmin(angle))
+
+    def camera(self) -> Camera:
+        """The camera with its lens, at its place on the vehicle.
+
+        Raises:
+            ValueError: The lens model is unknown or takes another number of coefficients.
+        """
+        vehicle_T_camera = self.mount.matrix() @ MOUNT_T_CAMERA
+        if self.fov_deg is not None:
+            return Camera.from_fov(
+                self.width, self.height, self.fov_deg, vehicle_T_camera=vehicle_T_camera, name=self.name
+            )
+        assert self.fx is not None  # checked in _check_lens, like the next three
+        assert self.fy is not None
+        assert self.cx is not None
+        assert self.cy is not None
+        return Camera(
+            self.width,
+            self.height,
+            self.fx,
+            self.fy,
+            self.cx,
+            self.cy,
+            self.lens,
+            self.coefficients,
+            vehicle_T_camera=vehicle_T_camera,
+            name=self.name,
+        )
+
+    def directions(self) -> NDArray[np.float64]:
+        """(3, rows, columns) unit directions in the frame of the mount; NaN where a pixel has no ray."""
+        rays, _ = self.camera().rays(dtype=torch.float64)
+        right, down, forward = np.moveaxis(rays.numpy()[:: self.stride, :: self.stride], 2, 0)
+        return np.stack([forward, -right, -down])
