@@ -104,7 +104,7 @@ def test_stride_takes_every_nth_row_and_column():
         ({"min_range_m": 70.0}, "must be below max_range_m"),
         ({"fov_deg": 180.0}, "less than 180"),
         ({"fov_deg": None, "fx": 50, "fy": 50, "cx": 80, "cy": 60, "lens": "magic"}, "magic"),
-        ({"fov_deg": None, "fx": 50, "fy": 50, "cx": 80, "cy": 60, "lens": "mei", "coefficients": [1]}, "mei"),
+        ({"fov_deg": None, "fx": 50, "fy": 50, "cx": 80, "cy": 60, "lens": "mei", "coefficients": [1, 2]}, "mei"),
     ],
 )
 def test_an_impossible_camera_is_refused(changes, message):

@@ -104,6 +104,7 @@ def test_alone_on_a_loop_one_has_a_free_road():
 def test_a_coarse_time_step_gives_the_same_run():
     lanes = [Lane(LONG, (Gate(200.0, 225.0, 0, MAIN),))]
     agents = [car(0, 20.0), car(0, 60.0)]
-    fine = run(lanes, agents, times_s=np.arange(0.0, 40.5, 0.1))
-    coarse = run(lanes, agents, times_s=np.arange(0.0, 40.5, 2.0))
+    # Green ends between two of the coarse times, and would still let the first one pass.
+    fine = run(lanes, agents, times_s=np.arange(0.0, 40.5, 0.1), green_s=(9.05, 18.0))
+    coarse = run(lanes, agents, times_s=np.arange(0.0, 40.5, 2.0), green_s=(9.05, 18.0))
     np.testing.assert_allclose(fine.place_m[::20][: len(coarse.place_m)], coarse.place_m, atol=1e-6)

@@ -1,7 +1,7 @@
-"""No two bodies ever interpenetrate: separating axes in plan view with overlap in height, for everybody at every time.
+"""No two bodies ever interpenetrate: separating axes in plan view with overlap in height, for all, over all times.
 
-Knows nothing of how worlds are made: it takes the boxes around the actors' meshes, and the connected pieces of the static
-meshes, each of which is convex here because the bodies of the fixture are boxes.
+Knows nothing of how worlds are made: it takes the boxes around the actors' meshes, and the connected pieces of the
+static meshes, each of which is convex here because the bodies of the fixture are boxes.
 """
 
 import numpy as np
@@ -85,8 +85,8 @@ def among(solids):
 def test_the_checker_finds_what_overlaps_and_only_that():
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     turned = square @ np.array([[1.0, 1.0], [-1.0, 1.0]]) / np.sqrt(2)
-    shift = np.array([2.3, 0.0])
-    outline = np.stack([square, turned + shift, square + [1.9, 1.9], turned + [2.2, 2.2], square])
+    aside, corner, beyond = np.array([2.3, 0.0]), np.array([1.9, 1.9]), np.array([2.2, 2.2])
+    outline = np.stack([square, turned + aside, square + corner, turned + beyond, square])
     solids = Solids(outline, np.array([0.0, 0.0, 0.0, 0.0, 1.0]), np.array([1.0, 1.0, 1.0, 1.0, 2.0]))
     found = {(int(i), int(j)) for i, j, _ in among(solids)}
     assert found == {(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)}

@@ -30,7 +30,7 @@ def speeds(actor):
 
 
 @pytest.mark.parametrize("kind", WORLDS)
-def test_the_same_seed_gives_the_same_world_and_another_seed_another(kind, world, bodies):
+def test_the_same_seed_gives_the_same_world_and_another_seed_another(kind, bodies):
     model = {"urban": Urban, "highway": Highway, "parking": Parking}.get(kind, Urban)
     options = {"lanes": 2} if kind == "narrow" else {}
     first, again = (model(duration_s=3.0, **options).world(seed, bodies=bodies) for seed in (5, 5))

@@ -131,7 +131,7 @@ class Simulation:
         return np.where(closed, self._gap_to(gate), np.inf)
 
     def _gap_to(self, gate: Gates) -> Numbers:
-        return gate.enter_m - self.place_m - self._length / 2
+        return np.asarray(gate.enter_m - self.place_m - self._length / 2)
 
     def _committed(self, gate: Gates) -> NDArray[np.bool_]:
         """(N,) whether one is on a junction, or will be because it is too late to stop."""

@@ -64,7 +64,7 @@ def equilibrium_gap_m(driver: Driver, speed_mps: Quantity) -> Quantity:
 
     Example:
         >>> round(float(equilibrium_gap_m(Driver(desired_speed_mps=14.0), 10.0)), 2)
-        16.27
+        16.28
     """
     slack = 1.0 - (speed_mps / driver.desired_speed_mps) ** FREE_ROAD_EXPONENT
     return (driver.standstill_gap_m + speed_mps * driver.headway_s) / slack**0.5

@@ -13,8 +13,8 @@ from torchcover.simulation.traffic.roads import Line
 Numbers = NDArray[np.float64]
 
 PAVEMENT_M = 0.15
-POST_SIDES = 8
-CROWN_SIDES = 7
+POST_SIDES = 6
+CROWN_SIDES = 6
 
 
 def ground(lower_m: ArrayLike, upper_m: ArrayLike) -> Mesh:

@@ -65,7 +65,7 @@ class Urban(Procedural):
     traffic_per_km: NonNegativeFloat = 20.0
     cyclists_per_km: NonNegativeFloat = 6.0
     people_per_km: NonNegativeFloat = 25.0
-    parked_share: float = Field(default=0.5, ge=0.0, le=1.0)
+    parked_share: float = Field(default=0.45, ge=0.0, le=1.0)
 
     def _build(
         self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator

@@ -1,0 +1,49 @@
+"""People who go to and fro."""
+
+import numpy as np
+import pytest
+
+from torchcover.simulation.traffic.crossing import Footpath, free_for, step_height, walk
+
+TIMES_S = np.arange(0.0, 120.0, 0.1)
+PATH = Footpath(np.array([3.0, -8.0]), np.array([3.0, 8.0]), kerb_m=0.5)
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_sets_off_only_when_one_may_and_goes_all_the_way(seed):
+    may_go = (TIMES_S % 40.0 > 20.0) & (TIMES_S % 40.0 < 24.0)
+    position, yaw = walk(PATH, may_go, 12.0, TIMES_S, 0.2, np.random.default_rng(seed))
+    y = position[:, 1]
+    moving = np.abs(np.diff(y)) > 1e-9
+    starts = np.flatnonzero(moving & ~np.concatenate([[False], moving[:-1]]))
+    assert may_go[starts].all()
+    for start in starts[TIMES_S[starts] < 100.0]:
+        np.testing.assert_allclose(np.abs(y[[start, start + 120]]), 8.0)
+        assert y[start] * y[start + 120] < 0
+    # Whoever moves looks where they go.
+    np.testing.assert_allclose(np.sin(np.deg2rad(yaw[:-1][moving])), np.sign(np.diff(y))[moving], atol=1e-9)
+    assert (position[:, 0] == 3.0).all()
+
+
+def test_some_do_cross():
+    walks = [walk(PATH, np.ones(1200, bool), 12.0, TIMES_S, 0.2, np.random.default_rng(s))[0] for s in range(10)]
+    assert all(np.ptp(position[:, 1]) == pytest.approx(16.0) for position in walks)
+
+
+def test_who_may_not_go_stays():
+    position, _ = walk(PATH, np.zeros(1200, bool), 12.0, TIMES_S, 0.2, np.random.default_rng(0))
+    assert np.ptp(position, axis=0).max() == 0.0
+    assert position[0, 2] == 0.15
+
+
+def test_feet_are_up_until_the_whole_body_is_past_the_kerb():
+    beyond = np.array([-3.0, 0.0, 0.29, 0.3, 0.375, 0.45, 5.0])
+    np.testing.assert_allclose(step_height(beyond, 0.3), [0.15, 0.15, 0.15, 0.15, 0.075, 0.0, 0.0], atol=1e-12)
+
+
+def test_free_for_looks_ahead():
+    blocked = np.zeros(20, dtype=bool)
+    blocked[10] = True
+    expected = np.ones(20, dtype=bool)
+    expected[7:11] = False
+    np.testing.assert_array_equal(free_for(blocked, 0.3, 0.1), expected)

@@ -1,0 +1,119 @@
+"""The physical effects that the paper names, on a reduced run: a car ahead on a flat road between two walls."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover import BevGrid, CoverageMetric, Region, Rig, Scenario
+from torchcover.data import SimulatedFrames
+from torchcover.simulation import ReferenceSensor
+
+RIGS = ("front_grille_128", "front_roof_128", "front_roof_64", "front_roof_32")
+LEADER_X_M = 13.0
+GRID = BevGrid(x=(0.0, 80.0), y=(-10.0, 10.0), cell=0.5)
+ROAD = Scenario.model_validate(
+    {
+        "name": "road",
+        "ego": {"shape": {"type": "vehicle", "vehicle": "suv"}},
+        "bodies": [
+            {"name": "ground", "shape": {"type": "plane", "size_m": [400, 400]}},
+            {
+                "name": "walls",
+                "shape": {"type": "box", "size_m": [120, 0.4, 4]},
+                "poses": [{"x_m": 50, "y_m": 9}, {"x_m": 50, "y_m": -9}],
+            },
+        ],
+        "actors": [
+            {
+                "name": "leader",
+                "category": "car",
+                "shape": {"type": "vehicle", "vehicle": "sedan"},
+                "pose": {"x_m": LEADER_X_M},
+            }
+        ],
+    }
+)
+
+
+@pytest.fixture(scope="module")
+def coverage():
+    reference = ReferenceSensor(rows=256, columns=256)
+    frames = SimulatedFrames(ROAD, rigs={name: name for name in RIGS}, steps=16, seed=0, reference=reference)
+    metrics = {name: CoverageMetric(GRID, max_radius=GRID.diagonal_m) for name in RIGS}
+    for index in range(len(frames)):
+        frame = frames[index]
+        for name, metric in metrics.items():
+            metric.update(frame.sensors[name], frame.reference)
+    return {name: metric.compute() for name, metric in metrics.items()}
+
+
+def row(coverage, rig, x, y=(-8.0, 8.0), height="ground"):
+    rows = coverage[rig].summary([Region("here", x, y)])
+    (found,) = [row for row in rows if row.height == height]
+    assert found.known_cells > 0
+    return found
+
+
+def test_the_hood_hides_the_ground_in_front_of_the_car_from_the_roof(coverage):
+    lidar = Rig.load("front_roof_128").sensors[0]
+    seen = SimulatedFrames(ROAD, "front_roof_128", steps=1, reference=ReferenceSensor(8, 8))[0]
+    assert seen.counts["sensor_self_hits"] > 0.005 * seen.counts["sensor_rays"]
+    # Without a body the lowest row would reach the ground here; with it, rows end on the hood.
+    first_m = lidar.mount.x_m + lidar.mount.z_m / np.tan(np.deg2rad(25.0))
+    ahead = seen.sensor[(seen.sensor[:, 1].abs() < 0.3) & (seen.sensor[:, 2] < 0.05), 0]
+    assert ahead.min() > first_m + 0.1
+    in_front = row(coverage, "front_roof_128", (2.5, 4.5), (-1.0, 1.0))
+    assert (
+        in_front.detection[0.4] < 0.2 < 0.9 < row(coverage, "front_grille_128", (4.5, 7.0), (-1.0, 1.0)).detection[0.4]
+    )
+
+
+@pytest.mark.parametrize("rig", RIGS)
+def test_blind_spots_are_smaller_higher_up(coverage, rig):
+    ground, obstacle = (row(coverage, rig, (20.0, 80.0), (-10.0, 10.0), height) for height in ("ground", "obstacle"))
+    assert obstacle.radius_m < 0.7 * ground.radius_m
+
+
+@pytest.mark.parametrize("rig", ["front_grille_128", "front_roof_128"])
+def test_the_vehicle_ahead_casts_a_shadow(coverage, rig):
+    behind = (LEADER_X_M + 2.5, LEADER_X_M + 7.0)
+    shadow, beside = row(coverage, rig, behind, (-1.0, 1.0)), row(coverage, rig, behind, (4.0, 7.0))
+    assert shadow.radius_m > 2 * beside.radius_m
+
+
+def test_the_shadow_is_larger_for_the_grille(coverage):
+    behind, across = (LEADER_X_M + 2.5, 60.0), (-1.5, 1.5)
+    grille, roof = (row(coverage, rig, behind, across) for rig in ("front_grille_128", "front_roof_128"))
+    assert grille.radius_m > 1.2 * roof.radius_m
+    assert grille.detection[0.4] < roof.detection[0.4]
+
+
+def test_ground_detection_of_the_grille_fades_near_19_m(coverage):
+    """Rows 0.24 degrees apart from 0.62 m up: at 19 m, rings on the ground are twice the ball of 0.8 m apart."""
+    near, at, far = (
+        row(coverage, "front_grille_128", x, (3.0, 7.0)).detection[0.4] for x in ((8, 12), (18, 21), (26, 30))
+    )
+    assert near > 0.95
+    assert 0.3 < at < 0.75
+    assert far < 0.35
+    assert row(coverage, "front_roof_128", (18, 21), (3.0, 7.0)).detection[0.4] > 0.85
+
+
+def test_resolution_matters_on_the_ground_and_far_away_hardly_for_close_obstacles(coverage):
+    def detection(rig, x, height):
+        return row(coverage, rig, x, (-10.0, 10.0), height).detection[0.4]
+
+    def gain(x, height):
+        return detection("front_roof_128", x, height) - detection("front_roof_32", x, height)
+
+    assert gain((0.0, 20.0), "ground") > 0.1
+    assert gain((40.0, 80.0), "obstacle") > 0.05
+    assert gain((0.0, 20.0), "obstacle") < 0.05
+    for x, height in (((0.0, 20.0), "ground"), ((40.0, 80.0), "obstacle")):
+        order = [detection(rig, x, height) for rig in ("front_roof_32", "front_roof_64", "front_roof_128")]
+        assert order == sorted(order)
+
+
+def test_the_rigs_are_compared_on_the_same_cells(coverage):
+    for name in RIGS[1:]:
+        assert torch.equal(coverage[name].points, coverage[RIGS[0]].points)
