@@ -10,7 +10,7 @@ demo: $(VENV)/.ready  ## evaluate a built-in rig in the built-in courtyard; writ
 	$(BIN)/torchcover evaluate front_roof_128 --scenario courtyard --steps $(STEPS) --out out/demo
 
 test: $(VENV)/.ready  ## every test
-	$(BIN)/python -m pytest
+	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

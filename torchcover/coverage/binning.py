@@ -39,5 +39,5 @@ def mean_per_cell(cell: Tensor, values: Tensor, cells: int) -> CellMeans:
     touched = count.nonzero().squeeze(1)
     count = count[touched]
     sums = [torch.bincount(cell, weights=row.double(), minlength=cells)[touched] for row in values]
-    mean = torch.stack(sums) / count if sums else values.new_empty((0, len(touched)), dtype=torch.float64)
-    return CellMeans(touched, count, mean)
+    mean = torch.stack(sums) / count if sums else values.new_empty((0, len(touched)))
+    return CellMeans(touched, count, mean.double())

@@ -13,7 +13,8 @@ from torch import Tensor
 PAPER_HEIGHTS: Mapping[str, tuple[float, float]] = MappingProxyType({"ground": (-0.5, 0.5), "obstacle": (0.5, 2.0)})
 
 # The extents of a grid are written in decimals; a multiple of the cell is one up to their rounding.
-MULTIPLE_TOLERANCE = 1e-6
+MULTIPLE_TOLERANCE = 1e-6  # of the extent,
+MULTIPLE_TOLERANCE_CELLS = 1e-3  # and never more than this share of a cell
 # An int64 count and three float64 sums for every cell: 3 GB.
 MOST_CELLS = 100_000_000
 
@@ -57,6 +58,25 @@ class BevGrid:
         _check_heights(self.heights)
         if math.prod(self.shape) > MOST_CELLS:
             raise ValueError(f"the grid has {math.prod(self.shape):,} cells, over {MOST_CELLS:,}: use larger cells")
+        self._normalise()
+
+    def _normalise(self) -> None:
+        # Plain floats in copies: lists, whole numbers and a dict that its owner changes later make no difference.
+        heights = {name: (float(low), float(high)) for name, (low, high) in self.heights.items()}
+        own = {"x": tuple(map(float, self.x)), "y": tuple(map(float, self.y)), "cell": float(self.cell)}
+        for name, value in {**own, "heights": heights}.items():
+            object.__setattr__(self, name, value)
+
+    # The order of the bands is part of a cell's number; equal dicts may differ in it.
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, BevGrid) and self._key == other._key
+
+    def __hash__(self) -> int:
+        return hash(self._key)
+
+    @property
+    def _key(self) -> tuple[object, ...]:
+        return self.x, self.y, self.cell, tuple(self.heights.items())
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -153,11 +173,11 @@ def _check_bounds(name: str, bounds: tuple[float, float]) -> None:
 def _check_multiple(name: str, bounds: tuple[float, float], cell: float) -> None:
     extent = bounds[1] - bounds[0]
     cells = extent / cell
-    if cells < 0.5 or abs(cells - round(cells)) > MULTIPLE_TOLERANCE * max(1.0, cells):
+    if cells < 0.5 or abs(cells - round(cells)) > min(MULTIPLE_TOLERANCE * max(1.0, cells), MULTIPLE_TOLERANCE_CELLS):
         fits = extent / max(1, round(cells))
         raise ValueError(
-            f"{name}: its extent of {extent:g} m is not a multiple of the cell of {cell:g} m "
-            f"({cells:g} cells); a cell of {fits:g} m would fit"
+            f"{name}: its extent of {extent:.10g} m is not a multiple of the cell of {cell:.10g} m "
+            f"({cells:.10g} cells); a cell of {fits:.10g} m would fit"
         )
 
 
@@ -177,7 +197,12 @@ def _count(bounds: tuple[float, float], cell: float) -> int:
 
 
 def _edges(bounds: tuple[float, float], cell: float) -> Tensor:
-    return torch.linspace(bounds[0], bounds[1], _count(bounds, cell) + 1, dtype=torch.float64)
+    # (lo (n - i) + hi i) / n rounds once where lo and hi are whole numbers: the border at 0.3 is 0.3, not 3 * 0.1.
+    count = _count(bounds, cell)
+    step = torch.arange(count + 1, dtype=torch.float64)
+    edges = (bounds[0] * (count - step) + bounds[1] * step) / count
+    edges[0], edges[-1] = bounds
+    return edges
 
 
 def _centres(edges: Tensor) -> Tensor:

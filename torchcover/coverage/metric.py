@@ -1,7 +1,8 @@
 """The coverage metric: clouds in, fixed-size sums, coverage out."""
 
+import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -11,7 +12,7 @@ from torchmetrics import Metric
 from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.grid import BevGrid, bin_of
 from torchcover.coverage.result import Coverage, histogram_quantiles
-from torchcover.neighbors import blind_spot_radius, check_cloud
+from torchcover.neighbors import check_cloud, nearest
 
 # Bins of the histogram behind the quantiles: 20 a decade from 1 cm to 100 m, and one beyond each end.
 QUANTILE_EDGES_M = torch.cat([torch.tensor([0.0]), torch.logspace(-2, 2, 81), torch.tensor([math.inf])]).double()
@@ -31,7 +32,8 @@ class CoverageMetric(Metric):
 
     Args:
         grid: Cells and height bands.
-        thresholds: Radii in metres up to which a point counts as detected, each of them >= 0.
+        thresholds: Radii in metres up to which a point counts as detected, each of them >= 0 and at most
+            `max_radius`.
         max_radius: Saturation of r in metres. An empty sensor cloud gives r = `max_radius`: with the default,
             infinity, such a step makes the radius of its cells infinite.
         maximum: Also keep the largest r of each cell.
@@ -44,8 +46,8 @@ class CoverageMetric(Metric):
         kwargs: For `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
 
     Raises:
-        ValueError: A threshold that is negative or NaN, or given twice; a `max_radius` that is not positive; a
-            quantile outside [0, 1].
+        ValueError: A threshold that is negative, NaN, over `max_radius`, or given twice; a `max_radius` that is not
+            positive; a quantile outside [0, 1].
 
     Example:
         >>> metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)}))
@@ -70,6 +72,7 @@ class CoverageMetric(Metric):
     empty_reference_steps: Tensor
     saturated_points: Tensor
     outside_points: Tensor
+    fingerprint: Tensor
 
     def __init__(
         self,
@@ -113,6 +116,14 @@ class CoverageMetric(Metric):
             self.add_state("radius_max", none_yet, dist_reduce_fx="max", persistent=True)
         for name in Coverage.COUNTS:
             add_sum(name, (), torch.int64)
+        # As a state, it keeps a MetricCollection from sharing the sums of metrics that happen to agree after the first
+        # step, and sums made for something else from being merged or loaded.
+        self.add_state("fingerprint", self._fingerprint(), dist_reduce_fx="max", persistent=True)
+
+    def _fingerprint(self) -> Tensor:
+        """(32,) int64 numbers in [0, 256), equal for two metrics exactly if their sums mean the same."""
+        meaning = [self.grid, self.thresholds, self.max_radius, self.maximum, self.pooled, bool(self.quantiles)]
+        return torch.tensor(list(hashlib.sha256(repr(meaning).encode()).digest()))
 
     def update(self, sensor: Tensor | Sequence[Tensor], reference: Tensor | Sequence[Tensor]) -> None:
         """Add one step, or one step for each entry of two lists.
@@ -135,27 +146,30 @@ class CoverageMetric(Metric):
         for sensor_cloud, reference_cloud in zip(sensors, references, strict=True):
             self._add_step(sensor_cloud, reference_cloud)
 
+    @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
     def _add_step(self, sensor: Tensor, reference: Tensor) -> None:
         cell = self.grid.cell_of(reference)
         inside = cell >= 0
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
-        radius = blind_spot_radius(
+        distance = nearest(
             reference[inside],
             sensor.to(reference.device),
-            max_radius=self.max_radius,
+            max_distance=self.max_radius,
             backend=self.backend,
             memory_mb=self.memory_mb,
-        )
-        self._accumulate(cell[inside].to(self.frames.device), radius.to(self.frames.device))
+        ).distance
+        self._accumulate(cell[inside].to(self.frames.device), distance.to(self.frames.device))
         self.steps += 1
         self.empty_sensor_steps += len(sensor) == 0
         self.empty_reference_steps += len(reference) == 0
-        self.outside_points += len(reference) - len(radius)
-        self.saturated_points += (radius >= self.max_radius).sum().to(self.frames.device)
+        self.outside_points += len(reference) - len(distance)
+        self.saturated_points += (distance >= self.max_radius).sum().to(self.frames.device)
 
-    def _accumulate(self, cell: Tensor, radius: Tensor) -> None:
-        detected = torch.stack([radius <= threshold for threshold in self.thresholds]) if self.thresholds else None
-        values = radius[None] if detected is None else torch.cat([radius[None].double(), detected.double()])
+    def _accumulate(self, cell: Tensor, distance: Tensor) -> None:
+        # Before saturation: a point with nothing within `max_radius` is not detected at a threshold of `max_radius`.
+        detected = [distance <= threshold for threshold in self.thresholds]
+        radius = distance.clamp(max=distance.new_tensor(self.max_radius))
+        values = torch.stack([radius.double(), *(row.double() for row in detected)])
         step = mean_per_cell(cell, values, self.grid.cells)
         self.frames[step.cell] += 1
         self.points[step.cell] += step.points
@@ -198,13 +212,16 @@ class CoverageMetric(Metric):
             incoming_state: A `CoverageMetric` with the same parameters, or its `metric_state`.
 
         Raises:
-            ValueError: The other metric has another grid, other thresholds or another `max_radius`.
+            ValueError: The other metric differs in its grid, thresholds, `max_radius`, `maximum`, `pooled` or
+                `quantiles`, or is no coverage metric.
         """
         if isinstance(incoming_state, CoverageMetric):
-            for name in ("grid", "thresholds", "max_radius", "quantiles"):
+            for name in ("grid", "thresholds", "max_radius", "maximum", "pooled", "quantiles"):
                 mine, other = getattr(self, name), getattr(incoming_state, name)
                 if mine != other:
                     raise ValueError(f"cannot merge metrics with different {name}: {mine} and {other}")
+        elif isinstance(incoming_state, dict):
+            self._check_fingerprint(incoming_state.get("fingerprint"))
         super().merge_state(incoming_state)
         # torchmetrics would go on answering from the result it had cached.
         self._computed = None
@@ -220,10 +237,27 @@ class CoverageMetric(Metric):
                         f"state {name!r} has shape {tuple(loaded.shape)}; this metric's grid and thresholds need "
                         f"{tuple(expected)}"
                     )
-                state_dict[prefix + name] = loaded.clone()
+                mine = getattr(self, name)
+                state_dict[prefix + name] = loaded.to(device=mine.device, dtype=mine.dtype, copy=True)
+        if prefix + "fingerprint" in state_dict:
+            self._check_fingerprint(state_dict[prefix + "fingerprint"])
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._computed = None
         self._update_count = int(self.steps)
+
+    def _check_fingerprint(self, other: Tensor | None) -> None:
+        if other is None or not torch.equal(other.to(self.fingerprint), self.fingerprint):
+            raise ValueError("the state was made with another grid, thresholds, max_radius or options than this metric")
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], *args: Any, **kwargs: Any) -> "CoverageMetric":  # noqa: ANN401
+        """Move the state to another device, but leave its type: `.to(torch.float16)` may not round the sums."""
+
+        def moved(state: Tensor) -> Tensor:
+            converted = fn(state)
+            return converted if converted.dtype == state.dtype else state.to(converted.device)
+
+        super()._apply(moved, *args, **kwargs)
+        return self
 
     def _quantiles(self) -> Tensor:
         values = histogram_quantiles(self.histogram, QUANTILE_EDGES_M.to(self.histogram.device), self.quantiles)
@@ -237,6 +271,10 @@ def _check_parameters(thresholds: Sequence[float], max_radius: float, quantiles:
         raise ValueError(f"thresholds: each may be given once; got {tuple(thresholds)}")
     if not max_radius > 0:
         raise ValueError(f"max_radius: a positive distance in metres is needed; got {max_radius}")
+    if any(threshold > max_radius for threshold in thresholds):
+        raise ValueError(
+            f"thresholds: at most max_radius = {max_radius} m, where r saturates, is possible; got {tuple(thresholds)}"
+        )
     if not all(0 <= quantile <= 1 for quantile in quantiles):
         raise ValueError(f"quantiles: numbers in [0, 1] are needed; got {tuple(quantiles)}")
 

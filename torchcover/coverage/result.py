@@ -2,7 +2,6 @@
 
 import json
 import math
-import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -163,14 +162,30 @@ class Coverage:
 
         Raises:
             FileNotFoundError: No such file.
-            ValueError: Not a coverage file, or one of a newer version.
+            ValueError: Not a coverage file, a damaged one, or one of a newer version.
         """
-        header, arrays = _read_npz(Path(path))
-        grid = header["grid"]
-        heights = {name: (band[0], band[1]) for name, band in grid["heights"].items()}
-        header["grid"] = BevGrid(x=tuple(grid["x"]), y=tuple(grid["y"]), cell=grid["cell"], heights=heights)
+        if not Path(path).is_file():
+            raise FileNotFoundError(f"{path}: no such coverage file")
+        try:
+            header, arrays = _read_npz(path)
+            version = header.pop("format")
+            loaded = cls._from_parts(header, arrays) if version == FORMAT_VERSION else None
+        except Exception as error:  # damage shows anywhere: in the zip, zlib, NumPy, JSON, or as a missing part
+            raise ValueError(f"{path}: not a coverage file as Coverage.save writes it ({error})") from error
+        if loaded is None:
+            raise ValueError(f"{path}: coverage format {version}; this torchcover reads format {FORMAT_VERSION}")
+        return loaded
+
+    @classmethod
+    def _from_parts(cls, header: dict[str, Any], arrays: dict[str, Any]) -> "Coverage":
+        stored = header.pop("grid")
+        heights = {name: (band[0], band[1]) for name, band in stored["heights"].items()}
+        grid = BevGrid(x=tuple(stored["x"]), y=tuple(stored["y"]), cell=stored["cell"], heights=heights)
+        for name, array in arrays.items():
+            if array.shape[-3:] != grid.shape:
+                raise ValueError(f"{name} has shape {array.shape}, the grid {grid.shape}")
         tensors: dict[str, Any] = {name: torch.from_numpy(array) for name, array in arrays.items()}
-        return cls(**header, **tensors)
+        return cls(grid=grid, **header, **tensors)
 
     def _regions(self, regions: Sequence[Region] | None) -> Sequence[Region]:
         if regions is not None:
@@ -210,7 +225,8 @@ def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float
     rows = []
     for level in levels:
         target = total * level
-        at = (cumulative < target).sum(dim=0).clamp(max=len(histogram) - 1)
+        # The second condition matters at level 0: the least value lies in the first bin that has any weight.
+        at = ((cumulative < target) | (cumulative == 0)).sum(dim=0).clamp(max=len(histogram) - 1)
         weight = histogram.gather(0, at[None])[0]
         below = cumulative.gather(0, at[None])[0] - weight
         share = ((target - below) / weight).nan_to_num(0.0).clamp(0, 1)
@@ -220,16 +236,8 @@ def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float
     return torch.stack(rows)
 
 
-def _read_npz(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such coverage file")
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = dict(file)
-        header = json.loads(str(arrays.pop("header")))
-        version = header.pop("format")
-    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise ValueError(f"{path}: not a coverage file as Coverage.save writes it ({error})") from error
-    if version != FORMAT_VERSION:
-        raise ValueError(f"{path}: coverage format {version}; this torchcover reads format {FORMAT_VERSION}")
+def _read_npz(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as parts:
+        arrays = dict(parts)
+    header: dict[str, Any] = json.loads(str(arrays.pop("header")))
     return header, arrays

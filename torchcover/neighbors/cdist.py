@@ -22,13 +22,13 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
         query: (N, 3) finite coordinates.
         points: (M, 3) finite coordinates, M > 0, of the same type and device.
         max_distance: Queries without a point in reach may return any index.
-        memory_mb: Most memory in megabytes for intermediate results.
+        memory_mb: Most memory in megabytes for the pairs under comparison, beside a few arrays as long as the clouds.
 
     Returns:
         (N,) int64 indices into `points`.
     """
     budget = int(memory_mb * 1e6) // query.element_size()
-    if _matrix_product_is_exact_enough(query):
+    if _matrix_product_is_exact_enough(query) and budget >= 4 * TILE:
         return _search_by_screening(query, points, budget)
     return _search_by_differences(query, points, budget)
 
@@ -58,12 +58,14 @@ def _nearest_in_chunks(query: Tensor, points: Tensor, columns: int) -> Tensor:
 
 
 def _search_by_screening(query: Tensor, points: Tensor, budget: int) -> Tensor:
-    # Centred clouds have shorter vectors, and the bound grows with their length squared.
+    # Centred clouds have shorter vectors, and the bound grows with their length squared. Centring rounds, so it is
+    # for the screening only: the comparison by differences takes the coordinates as they came.
     centre = points.mean(dim=0)
-    blocks = _to_blocks(points - centre)
+    blocks = _to_blocks(points)
+    centred = blocks - centre
     # Five arrays of (rows, blocks) live at once: the minima, two bounds, their sum, the mask.
     rows = max(1, budget // 2 // (5 * len(blocks)))
-    found = [_search_rows(chunk, blocks, budget // 2) for chunk in torch.split(query - centre, rows)]
+    found = [_search_rows(chunk, chunk - centre, blocks, centred, budget // 2) for chunk in torch.split(query, rows)]
     # The last block is filled up with copies of the last point.
     return torch.cat(found).clamp(max=len(points) - 1)
 
@@ -74,8 +76,8 @@ def _to_blocks(points: Tensor) -> Tensor:
     return torch.cat([points, points[-1:].expand(missing, 3)]).view(-1, BLOCK, 3)
 
 
-def _search_rows(query: Tensor, blocks: Tensor, budget: int) -> Tensor:
-    least, error = _least_squared_distance_per_block(query, blocks)
+def _search_rows(query: Tensor, centred_query: Tensor, blocks: Tensor, centred_blocks: Tensor, budget: int) -> Tensor:
+    least, error = _least_squared_distance_per_block(centred_query, centred_blocks)
     # The nearest point is no farther than any block's minimum could be, and no block is closer than its own could be.
     upper = (least + error).amin(dim=1, keepdim=True)
     row, block = (least - error <= upper).nonzero(as_tuple=True)

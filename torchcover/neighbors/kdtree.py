@@ -21,7 +21,9 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
         (N,) int64 indices into `points`, or -1.
     """
     # The tree compares squares with `<`, in its own type; the caller decides what is within, from the differences.
-    bound = None if math.isinf(max_distance) else max_distance * (1 + 1e-5) + float(torch.finfo(query.dtype).tiny)
+    # The square of the bound may not vanish: `max_distance` 0 still finds a point at distance 0.
+    least = 2 * math.sqrt(torch.finfo(query.dtype).tiny)
+    bound = None if math.isinf(max_distance) else max(max_distance * (1 + 1e-5), least)
     tree = KDTree(np.ascontiguousarray(points.numpy()))
     _, index = tree.query(np.ascontiguousarray(query.numpy()), distance_upper_bound=bound)
     found = torch.from_numpy(index.astype(np.int64))

@@ -60,8 +60,10 @@ def blind_spot_radius(
         >>> blind_spot_radius(reference, torch.zeros(1, 3))
         tensor([0., 5.])
     """
-    found = nearest(reference, sensor, max_distance=max_radius, backend=backend, memory_mb=memory_mb)
-    return found.distance.clamp(max=max_radius)
+    check_cloud(reference, "reference")
+    check_cloud(sensor, "sensor")
+    distance = _nearest(reference, sensor, max_radius, backend, memory_mb).distance
+    return distance.clamp(max=distance.new_tensor(max_radius))
 
 
 def nearest(
@@ -81,13 +83,16 @@ def nearest(
     * `max_distance` is inclusive, and compared after rounding it to the type of the distance.
     * float16 and bfloat16 coordinates are widened to float32 (exactly), mixed types to the wider one.
     * At distance 0 the gradient is taken as 0.
+    * Any finite coordinates are allowed; a distance beyond the type's range is inf. Differences whose squares vanish
+      count as ties: below 1e-19 in float32, 1e-154 in float64 (times the largest coordinate where that is over 1e77).
 
     Args:
         query: (N, 3) floating-point coordinates, any strides, any device.
         points: (M, 3) floating-point coordinates on the same device. M = 0 is allowed.
         max_distance: Only points within this distance count. A finite value makes the search faster.
         backend: "cdist" (any device), "kdtree" (CPU) or "auto" (by device and number of pairs).
-        memory_mb: Most memory in megabytes that "cdist" may use beside its inputs and outputs.
+        memory_mb: Most memory in megabytes that "cdist" may use for the pairs under comparison, beside a few arrays as
+            long as the clouds.
 
     Returns:
         `Nearest(distance, index)`: (N,) distances (float32 or float64) and (N,) int64 indices; inf and -1 where no
@@ -103,12 +108,19 @@ def nearest(
         >>> nearest(torch.tensor([[0.9, 0.0, 0.0], [9.0, 0.0, 0.0]]), points, max_distance=1.0)
         Nearest(distance=tensor([0.1000,    inf]), index=tensor([ 1, -1]))
     """
-    query, points = _check_inputs(query, points, max_distance, memory_mb)
+    check_cloud(query, "query")
+    check_cloud(points, "points")
+    return _nearest(query, points, max_distance, backend, memory_mb)
+
+
+def _nearest(query: Tensor, points: Tensor, max_distance: float, backend: str, memory_mb: float) -> Nearest:
+    query, points = _check_together(query, points, max_distance, memory_mb)
     search = _choose_search(query, points, backend)
     if len(query) == 0 or len(points) == 0:
         index = torch.full((len(query),), -1, dtype=torch.int64, device=query.device)
     else:
-        with torch.no_grad():
+        # Under autocast a matrix product would be rounded to bfloat16.
+        with torch.no_grad(), torch.autocast(query.device.type, enabled=False):
             index = search(*_rescale(query, points, max_distance), memory_mb)
     return _distance_to(query, points, index, max_distance)
 
@@ -134,13 +146,11 @@ def check_cloud(cloud: Tensor, name: str) -> None:
         raise ValueError(f"{name}: {bad} of {len(cloud)} points have NaN or infinite coordinates; drop them first")
 
 
-def _check_inputs(query: Tensor, points: Tensor, max_distance: float, memory_mb: float) -> tuple[Tensor, Tensor]:
-    check_cloud(query, "query")
-    check_cloud(points, "points")
+def _check_together(query: Tensor, points: Tensor, max_distance: float, memory_mb: float) -> tuple[Tensor, Tensor]:
     if query.device != points.device:
-        raise ValueError(f"query is on {query.device}, points on {points.device}; move them to one device")
+        raise ValueError(f"the clouds are on {query.device} and on {points.device}; move them to one device")
     if not max_distance >= 0:
-        raise ValueError(f"max_distance: a distance >= 0 is needed; got {max_distance}")
+        raise ValueError(f"max_distance (max_radius): a distance >= 0 is needed; got {max_distance}")
     if not memory_mb > 0:
         raise ValueError(f"memory_mb: a positive number of megabytes is needed; got {memory_mb}")
     common = torch.promote_types(torch.promote_types(query.dtype, points.dtype), torch.float32)
@@ -160,11 +170,13 @@ def _choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
 
 
 def _rescale(query: Tensor, points: Tensor, max_distance: float) -> tuple[Tensor, Tensor, float]:
-    """Scale by a power of two (exactly) where squares of coordinates would overflow or vanish in the search."""
+    """Keep squares of coordinates from overflowing or vanishing in the search: widen, else scale by a power of two."""
     largest = float(max(query.detach().abs().amax(), points.detach().abs().amax()))
     limit = float(torch.finfo(query.dtype).max) ** 0.25
     if largest == 0.0 or 1 / limit < largest < limit:
         return query.detach(), points.detach(), max_distance
+    if query.dtype == torch.float32:  # any square of it fits float64
+        return query.detach().double(), points.detach().double(), max_distance
     scale = -math.frexp(largest)[1]
     # Two steps: 2^scale itself may lie outside the type's range when the coordinates are subnormal.
     half = 2.0 ** (scale // 2)
@@ -186,9 +198,10 @@ def _distance_to(query: Tensor, points: Tensor, index: Tensor, max_distance: flo
 
 def _norm(difference: Tensor) -> Tensor:
     """Euclidean norm of (N, 3) float64 rows, without overflow, with gradient 0 at 0."""
-    largest = difference.detach().abs().amax() if difference.numel() else difference.new_zeros(())
+    largest = difference.detach().abs().amax(dim=1)
     # Squares of float32 differences always fit float64; only float64 input can need the scaling.
-    scale = largest if not 1e-140 < largest < 1e140 and largest > 0 else torch.ones_like(largest)
-    squared = (difference / scale).square().sum(dim=1)
+    scale = largest.clamp(max=torch.finfo(torch.float64).max)
+    scale = scale.where(((scale < 1e-140) | (scale > 1e140)) & (scale > 0), 1.0)
+    squared = (difference / scale[:, None]).square().sum(dim=1)
     positive = squared > 0
     return torch.where(positive, squared.where(positive, 1.0).sqrt(), 0.0) * scale

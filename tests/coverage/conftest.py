@@ -1,0 +1,44 @@
+import math
+from collections import defaultdict
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+
+@pytest.fixture(scope="session")
+def slow_coverage():
+    """The definitions in plain float64 loops, independent of the package: (grid, steps, thresholds) -> maps."""
+    return _slow_coverage
+
+
+def _slow_coverage(grid, steps, thresholds=(0.4,), max_radius=math.inf):
+    per_cell = defaultdict(list)  # cell -> for each step with points there, the distances of those points
+    for sensor, reference in steps:
+        in_step = defaultdict(list)
+        distance = cdist(reference, sensor).min(axis=1, initial=math.inf)
+        for point, r in zip(reference.tolist(), distance.tolist(), strict=True):
+            in_step[_cell_of(grid, point)].append(r)
+        for cell, distances in in_step.items():
+            per_cell[cell].append(np.array(distances))
+    per_cell.pop(None, None)
+
+    shape = grid.shape
+    maps = {name: np.full(shape, np.nan) for name in ("radius", "maximum", "pooled")}
+    maps |= {name: np.zeros(shape, dtype=int) for name in ("frames", "points")}
+    maps["detection"] = np.full((len(thresholds), *shape), np.nan)
+    for cell, in_steps in per_cell.items():
+        radii = [np.minimum(distances, max_radius) for distances in in_steps]
+        maps["radius"][cell] = np.mean([r.mean() for r in radii])
+        maps["detection"][(slice(None), *cell)] = [np.mean([(d <= t).mean() for d in in_steps]) for t in thresholds]
+        maps["maximum"][cell] = np.concatenate(radii).max()
+        maps["pooled"][cell] = np.concatenate(radii).mean()
+        maps["frames"][cell], maps["points"][cell] = len(radii), sum(map(len, radii))
+    return maps
+
+
+def _cell_of(grid, point):
+    x, y, z = point
+    bands = [h for h, (low, high) in enumerate(grid.heights.values()) if low <= z < high]
+    inside = grid.x[0] <= x < grid.x[1] and grid.y[0] <= y < grid.y[1] and bands
+    return (bands[0], int((y - grid.y[0]) // grid.cell), int((x - grid.x[0]) // grid.cell)) if inside else None

@@ -1,0 +1,216 @@
+"""The grid: half-open cells [lo, hi) on every axis, decided in one place."""
+
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchcover import BevGrid
+from torchcover.coverage.grid import bin_of
+
+ONE_BAND = {"all": (-1.0, 1.0)}
+
+
+def at(x=0.5, y=0.5, z=0.0, dtype=torch.float64):
+    return torch.tensor([[x, y, z]], dtype=dtype)
+
+
+def index_of(grid, point):
+    """(h, y, x) of the one point's cell, or None."""
+    cell = grid.cell_of(point).item()
+    return None if cell < 0 else tuple(int(i) for i in np.unravel_index(cell, grid.shape))
+
+
+# Borders
+
+
+@pytest.mark.parametrize("bounds", [(0.0, 10.0), (-10.0, 0.0), (-3.0, 2.0), (10.0, 20.0), (-7.5, -2.5), (1e6, 1e6 + 5)])
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_cells_are_half_open_wherever_the_range_lies(bounds, axis):
+    other = "y" if axis == "x" else "x"
+    grid = BevGrid(**{axis: bounds, other: (0.0, 1.0)}, cell=0.5, heights=ONE_BAND)
+    count = round((bounds[1] - bounds[0]) / 0.5)
+    place = {"x": 2, "y": 1}[axis]
+    for cell in range(count):
+        low, high = bounds[0] + 0.5 * cell, bounds[0] + 0.5 * (cell + 1)
+        for inside in (low, low + 0.25, math.nextafter(high, -math.inf)):
+            assert index_of(grid, at(**{axis: inside}))[place] == cell
+    for outside in (math.nextafter(bounds[0], -math.inf), bounds[1], bounds[1] + 1e9, -1e300):
+        assert index_of(grid, at(**{axis: outside})) is None
+
+
+def test_bands_are_half_open_and_touch_without_a_gap():
+    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0)
+    for z, band in [(-0.5, 0), (0.0, 0), (0.4999, 0), (0.5, 1), (1.9999, 1), (2.0, None), (-0.5001, None)]:
+        found = index_of(grid, at(z=z))
+        assert (found and found[0]) == band if band is not None else found is None
+
+
+@pytest.mark.parametrize("order", [("low", "middle", "high"), ("high", "low", "middle"), ("middle", "high", "low")])
+def test_bands_come_in_any_order_and_with_gaps(order):
+    bounds = {"low": (-2.0, -1.0), "middle": (-1.0, 0.5), "high": (3.0, 4.0)}
+    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={name: bounds[name] for name in order})
+    expected = {-2.0: "low", -1.5: "low", -1.0: "middle", 0.0: "middle", 0.5: None, 2.0: None, 3.0: "high", 4.0: None}
+    for z, name in {**expected, -2.5: None, 9.0: None}.items():
+        found = index_of(grid, at(z=z))
+        assert (order[found[0]] if found else None) == name
+
+
+def test_cells_are_numbered_band_by_band_then_row_by_row():
+    grid = BevGrid(x=(0.0, 4.0), y=(-1.0, 2.0), cell=1.0, heights={"a": (0.0, 1.0), "b": (1.0, 2.0)})
+    assert grid.shape == (2, 3, 4)
+    assert grid.cells == 24
+    assert grid.cell_of(at(x=3.5, y=0.5, z=1.5)).item() == (1 * 3 + 1) * 4 + 3
+
+
+@pytest.mark.parametrize(
+    ("cell", "bounds"), [(0.1, (0, 20)), (0.1, (-7, 3)), (0.3, (-3, 6)), (0.7, (0, 7)), (0.01, (0, 1))]
+)
+def test_a_border_is_the_decimal_that_one_writes(cell, bounds):
+    """Multiples of 0.1 are not representable: 3 * 0.1 > 0.3, and a point at x = 0.3 belongs to the cell from 0.3 on."""
+    grid = BevGrid(x=bounds, y=(0.0, cell), cell=cell, heights=ONE_BAND)
+    decimal = Fraction(str(cell))
+    borders = [float(bounds[0] + decimal * k) for k in range(grid.shape[2] + 1)]
+    assert grid.x_edges_m.tolist() == borders
+    points = torch.tensor([[border, 0.0, 0.0] for border in borders], dtype=torch.float64)
+    assert grid.cell_of(points).tolist() == [*range(grid.shape[2]), -1]
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    low=st.integers(-1000, 1000),
+    count=st.integers(1, 300),
+    cell=st.sampled_from([0.1, 0.25, 0.3, 0.05, 1.0, 2.5]),
+    share=st.floats(-0.5, 1.5),
+)
+def test_a_point_lies_between_the_borders_of_its_cell(low, count, cell, share):
+    bounds = (low * cell, (low + count) * cell)
+    grid = BevGrid(x=(0.0, cell), y=bounds, cell=cell, heights=ONE_BAND)
+    edges = grid.y_edges_m
+    assert grid.shape == (1, count, 1)
+    assert (edges[0], edges[-1]) == bounds
+    assert (edges.diff() > 0).all()
+    y = bounds[0] + share * (bounds[1] - bounds[0])
+    found = grid.cell_of(at(x=0.0, y=y)).item()
+    if bounds[0] <= y < bounds[1]:
+        assert edges[found] <= y < edges[found + 1]
+    else:
+        assert found == -1
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
+def test_points_of_any_type_are_compared_as_they_are(dtype):
+    grid = BevGrid(x=(0, 1), y=(0, 1), cell=0.1, heights=ONE_BAND)
+    x = torch.arange(10).to(dtype) / 10
+    points = torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], dim=1)
+    # What 0.7 becomes in a short type lies on one side of 0.7.
+    expected = [max(k for k in range(10) if value >= k / 10) for value in x.double().tolist()]
+    assert grid.cell_of(points).tolist() == expected
+    assert grid.cell_of(points.T.contiguous().T.requires_grad_()).tolist() == expected
+
+
+def test_no_points_have_no_cells():
+    cells = BevGrid(x=(0, 1), y=(0, 1), cell=0.1).cell_of(torch.zeros(0, 3))
+    assert (cells.shape, cells.dtype) == ((0,), torch.int64)
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.integers(-5, 5), min_size=2, max_size=6).map(sorted), st.floats(-6, 6))
+def test_bin_of_is_the_definition(edges, value):
+    found = bin_of(torch.tensor([value], dtype=torch.float64), torch.tensor(edges, dtype=torch.float64)).item()
+    bins = [i for i in range(len(edges) - 1) if edges[i] <= value < edges[i + 1]]
+    assert found == (bins[0] if bins else -1)
+
+
+# What a grid says of itself
+
+
+def test_centres_lie_in_the_middle():
+    grid = BevGrid(x=(-1.0, 1.0), y=(2.0, 3.0), cell=0.5)
+    assert grid.x_centres_m.tolist() == [-0.75, -0.25, 0.25, 0.75]
+    assert grid.y_centres_m.tolist() == [2.25, 2.75]
+
+
+def test_the_diagonal_spans_all_bands():
+    grid = BevGrid(x=(-1.0, 2.0), y=(0.0, 4.0), cell=0.5, heights={"b": (5.0, 12.0), "a": (0.0, 1.0)})
+    assert grid.diagonal_m == 13.0
+
+
+def test_the_defaults_are_the_papers():
+    grid = BevGrid(x=(0, 20), y=(-5, 5))
+    assert grid.cell == 0.25
+    assert grid.heights == {"ground": (-0.5, 0.5), "obstacle": (0.5, 2.0)}
+    assert list(grid.heights) == ["ground", "obstacle"]
+
+
+def test_grids_are_equal_when_their_cells_mean_the_same():
+    heights = {"a": (0.0, 1.0), "b": (1.0, 2.0)}
+    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights=heights)
+    same = BevGrid(x=[0, 2], y=(0, 1), cell=1, heights={"a": [0, 1], "b": [1, 2]})
+    assert grid == same
+    assert hash(grid) == hash(same)
+    assert repr(grid) == repr(same)
+    assert grid != BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"b": (1.0, 2.0), "a": (0.0, 1.0)})
+    assert grid != BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=0.5, heights=heights)
+    assert grid != "a grid"
+
+
+def test_a_grid_does_not_change_with_its_arguments():
+    heights = {"a": (0.0, 1.0)}
+    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights=heights)
+    heights["b"] = (1.0, 2.0)
+    assert grid.shape == (1, 1, 2)
+
+
+# What is refused
+
+
+@pytest.mark.parametrize("cell", [0.0, -0.5, math.nan, math.inf])
+def test_a_cell_without_a_length_is_refused(cell):
+    with pytest.raises(ValueError, match=f"cell: a positive length in metres is needed; got {cell}"):
+        BevGrid(x=(0, 1), y=(0, 1), cell=cell)
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        ((1.0, 1.0), "the lower bound must be below the upper one; got .1.0, 1.0"),
+        ((2.0, -2.0), "the lower bound must be below the upper one"),
+        ((0.0, math.inf), "two finite bounds in metres are needed; got .0.0, inf"),
+        ((math.nan, 1.0), "two finite bounds in metres are needed"),
+        ((0.0, 1.0, 2.0), "two finite bounds in metres are needed"),
+        ((0.0, 1.2), "its extent of 1.2 m is not a multiple of the cell of 0.5 m .2.4 cells.; a cell of 0.6 m would"),
+        ((0.0, 0.2), "its extent of 0.2 m is not a multiple of the cell of 0.5 m .0.4 cells.; a cell of 0.2 m would"),
+        ((0.0, 1e-7), "its extent of 1e-07 m is not a multiple of the cell of 0.5 m .2e-07 cells."),
+        ((0.0, 500_000.25), "its extent of 500000.25 m is not a multiple of the cell of 0.5 m"),
+    ],
+)
+def test_bounds_that_do_not_make_cells_are_refused(axis, bounds, message):
+    other = "y" if axis == "x" else "x"
+    with pytest.raises(ValueError, match=f"^{axis}: {message}"):
+        BevGrid(**{axis: bounds, other: (0.0, 1.0)}, cell=0.5)
+
+
+@pytest.mark.parametrize(
+    ("heights", "message"),
+    [
+        ({}, "heights: at least one height band is needed"),
+        ({"a": (1.0, 0.0)}, r"heights\['a'\]: the lower bound must be below"),
+        ({"a": (0.0, math.nan)}, r"heights\['a'\]: two finite bounds"),
+        ({"b": (0.5, 2.0), "a": (0.0, 1.0)}, "heights: bands 'a' and 'b' overlap between z = 0.5 and 1 m"),
+        ({"a": (0.0, 1.0), "b": (0.0, 1.0)}, "heights: bands 'a' and 'b' overlap"),
+    ],
+)
+def test_bands_that_make_no_sense_are_refused(heights, message):
+    with pytest.raises(ValueError, match=message):
+        BevGrid(x=(0, 1), y=(0, 1), cell=0.5, heights=heights)
+
+
+def test_a_grid_too_large_for_the_memory_is_refused_before_it_is_made():
+    with pytest.raises(ValueError, match="the grid has 200,000,000 cells, over 100,000,000: use larger cells"):
+        BevGrid(x=(0, 10_000), y=(0, 10_000), cell=1.0)

@@ -1,0 +1,336 @@
+"""What `CoverageMetric` computes: the definitions, by hand and against plain loops."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchcover import BevGrid, CoverageMetric
+
+GRID = BevGrid(x=(-2.0, 3.0), y=(-1.5, 1.0), cell=0.5, heights={"high": (1.0, 2.0), "low": (-1.0, 0.5)})
+ONE_CELL = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+NOTHING = torch.zeros(0, 3)
+OPTIONS = {"maximum": True, "pooled": True}
+
+
+def cloud(*rows, dtype=torch.float32):
+    return torch.tensor(rows, dtype=dtype).reshape(-1, 3)
+
+
+def points_at(*distances, dtype=torch.float32):
+    """Reference points in the one cell, at these distances from a sensor point in the origin."""
+    return torch.tensor([[0.0, distance, 0.0] for distance in distances], dtype=dtype).reshape(-1, 3)
+
+
+ORIGIN = cloud([0, 0, 0])
+
+
+def coverage(steps, grid=ONE_CELL, *args, **kwargs):
+    metric = CoverageMetric(grid, *args, **kwargs)
+    for sensor, reference in steps:
+        metric.update(sensor, reference)
+    return metric.compute()
+
+
+def random_steps(seed, steps=3, dyadic=True, empty=True):
+    """Clouds that reach beyond the grid; `dyadic` puts points on borders and at exact distances."""
+    random = np.random.default_rng(seed)
+    clouds = []
+    for _ in range(steps):
+        pair = [random.uniform(-4, 4, (random.integers(0 if empty else 1, 40), 3)) / [1, 1, 2] for _ in range(2)]
+        clouds.append([torch.from_numpy(np.round(points * 4) / 4 if dyadic else points) for points in pair])
+    return clouds
+
+
+# Closed forms
+
+
+@pytest.mark.parametrize("backend", ["cdist", "kdtree"])
+def test_one_sensor_point_over_a_plane_of_reference_points(backend):
+    """r is the distance to that point; a grid of four points a cell, two bands of which one is empty."""
+    grid = BevGrid(x=(-4.0, 4.0), y=(-2.0, 2.0), cell=1.0)
+    x, y = torch.meshgrid(torch.arange(-4, 4, 0.5) + 0.25, torch.arange(-2, 2, 0.5) + 0.25, indexing="ij")
+    plane = torch.stack([x.flatten(), y.flatten(), torch.zeros(128)], dim=1)
+    result = coverage([(cloud([1, 0, 1]), plane)], grid, (1.5, 3.0), backend=backend)
+    for row in range(4):
+        for column in range(8):
+            corners = [(column - 4 + dx, row - 2 + dy) for dx in (0.25, 0.75) for dy in (0.25, 0.75)]
+            r = [math.sqrt((px - 1) ** 2 + py**2 + 1) for px, py in corners]
+            assert result.radius[0, row, column].item() == pytest.approx(sum(r) / 4, rel=1e-6)
+            for at, threshold in enumerate((1.5, 3.0)):
+                assert result.detection[at, 0, row, column].item() == sum(d <= threshold for d in r) / 4
+    assert (result.points[0] == 4).all()
+    assert result.radius[1].isnan().all()
+
+
+def test_a_mean_of_means_not_a_pooled_mean():
+    """Trap 4: a step with 1 point in a cell weighs as much as a step with 1000."""
+    result = coverage([(ORIGIN, points_at(*[0.125] * 1000)), (ORIGIN, points_at(0.875))], pooled=True)
+    assert result.radius.item() == 0.5
+    assert result.detection.item() == 0.5
+    assert result.pooled.item() == (1000 * 0.125 + 0.875) / 1001
+    assert (result.frames.item(), result.points.item()) == (2, 1001)
+
+
+def test_a_step_without_a_point_in_the_cell_does_not_count_there():
+    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    result = coverage([(ORIGIN, points_at(0.5)), (ORIGIN, cloud([1, 0, 0])), (ORIGIN, points_at(0.25))], grid)
+    assert result.radius.flatten().tolist() == [0.375, 1.0]
+    assert result.frames.flatten().tolist() == [2, 1]
+
+
+def test_the_nearest_sensor_point_may_lie_outside_the_grid():
+    """Trap 3: the sensor cloud is never cropped."""
+    outside = cloud([-0.25, 0.5, 0], [0.5, 0.5, 5.0])
+    assert coverage([(outside, cloud([0.25, 0.5, 0]))]).radius.item() == 0.5
+
+
+def test_reference_points_outside_the_grid_change_nothing_but_their_count():
+    inside = points_at(0.25, 0.75)
+    outside = cloud([1, 0, 0], [-0.01, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1.01])
+    alone, together = coverage([(ORIGIN, inside)]), coverage([(ORIGIN, torch.cat([outside, inside]))])
+    assert torch.equal(alone.radius, together.radius)
+    assert together.points.item() == 2
+    assert (alone.counts["outside_points"], together.counts["outside_points"]) == (0, 5)
+
+
+def test_unknown_cells_are_nan_with_count_zero():
+    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    result = coverage([(ORIGIN, points_at(0.5))], grid, (0.4, 0.6), quantiles=(0.5,), **OPTIONS)
+    for values in (result.radius, result.detection, result.maximum, result.pooled, result.quantiles):
+        assert values[..., 1].isnan().all()
+        assert not values[..., 0].isnan().any()
+    assert (result.frames[..., 1].item(), result.points[..., 1].item()) == (0, 0)
+
+
+# Thresholds
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("threshold", [0.4, 0.1, 0.7])
+def test_a_point_at_exactly_the_threshold_is_detected(threshold, dtype):
+    beyond = torch.nextafter(torch.tensor(threshold, dtype=dtype), torch.tensor(1.0, dtype=dtype)).item()
+    origin = ORIGIN.to(dtype)
+    assert coverage([(origin, points_at(threshold, dtype=dtype))], ONE_CELL, (threshold,)).detection.item() == 1
+    assert coverage([(origin, points_at(beyond, dtype=dtype))], ONE_CELL, (threshold,)).detection.item() == 0
+
+
+def test_several_thresholds_in_one_pass():
+    result = coverage([(ORIGIN, points_at(0.0, 0.25, 0.5, 0.75))], ONE_CELL, (0.25, 0.0, 10.0, 0.5))
+    assert result.detection.flatten().tolist() == [0.5, 0.25, 1.0, 0.75]
+    assert result.thresholds == (0.25, 0.0, 10.0, 0.5)
+
+
+def test_no_thresholds_give_no_detection():
+    result = coverage([(ORIGIN, points_at(0.5))], ONE_CELL, ())
+    assert result.detection.shape == (0, 1, 1, 1)
+    assert result.radius.item() == 0.5
+
+
+# Empty clouds, saturation, counts
+
+
+def test_a_step_in_which_the_rig_saw_nothing_is_blind_not_missing():
+    result = coverage([(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.5))], ONE_CELL, (0.75,), maximum=True)
+    assert (result.radius.item(), result.maximum.item()) == (math.inf, math.inf)
+    assert (result.detection.item(), result.frames.item()) == (0.5, 2)
+    assert result.counts["empty_sensor_steps"] == 1
+
+
+def test_an_empty_sensor_cloud_gives_max_radius():
+    result = coverage([(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.5))], max_radius=8.0)
+    assert result.radius.item() == 4.25
+    assert result.max_radius == 8.0
+
+
+def test_a_blind_step_detects_nothing_even_at_a_threshold_of_max_radius():
+    result = coverage([(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.4, 0.5))], ONE_CELL, (0.4,), max_radius=0.4)
+    assert result.detection.item() == 0.25
+    assert result.radius.item() == pytest.approx(0.4)
+
+
+def test_an_empty_reference_cloud_says_nothing():
+    result = coverage([(ORIGIN, NOTHING), (ORIGIN, points_at(0.5)), (NOTHING, NOTHING)], quantiles=(0.5,), **OPTIONS)
+    assert (result.radius.item(), result.frames.item()) == (0.5, 1)
+    assert (result.counts["steps"], result.counts["empty_reference_steps"]) == (3, 2)
+    assert result.counts["empty_sensor_steps"] == 1
+
+
+def test_everything_that_happened_is_counted():
+    steps = [
+        (ORIGIN, torch.cat([points_at(0.25, 0.5, 0.75), cloud([7, 7, 7])])),
+        (NOTHING, points_at(0.1, 0.2)),
+        (ORIGIN, NOTHING),
+        (ORIGIN, cloud([7, 7, 7])),
+    ]
+    assert coverage(steps, ONE_CELL, (0.4,), max_radius=0.5).counts == {
+        "steps": 4,
+        "empty_sensor_steps": 1,
+        "empty_reference_steps": 1,
+        "saturated_points": 4,
+        "outside_points": 2,
+    }
+
+
+@pytest.mark.parametrize("max_radius", [0.5, 1e39, 1e300])
+def test_max_radius_saturates_every_number(max_radius):
+    steps = [(ORIGIN, points_at(0.25, 0.75))]
+    result = coverage(steps, ONE_CELL, (0.4,), max_radius=max_radius, quantiles=(1.0,), **OPTIONS)
+    assert result.maximum.item() == min(0.75, max_radius)
+    assert result.radius.item() == result.pooled.item() == (0.25 + min(0.75, max_radius)) / 2
+    assert result.quantiles.item() <= max_radius
+
+
+# Against plain loops
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32), dyadic=st.booleans(), max_radius=st.sampled_from([math.inf, 2.0]))
+def test_random_clouds_give_what_plain_loops_give(slow_coverage, seed, dyadic, max_radius):
+    steps = random_steps(seed, dyadic=dyadic)
+    thresholds = (0.5, 1.25, 2.0)
+    expected = slow_coverage(GRID, steps, thresholds, max_radius)
+    for backend in ("cdist", "kdtree"):
+        result = coverage(steps, GRID, thresholds, max_radius=max_radius, backend=backend, **OPTIONS)
+        for name, values in expected.items():
+            np.testing.assert_allclose(getattr(result, name).numpy(), values, rtol=1e-12, err_msg=name)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
+def test_shorter_types_give_what_their_rounded_coordinates_give(slow_coverage, dtype):
+    steps = [(sensor.to(dtype), reference.to(dtype)) for sensor, reference in random_steps(5, dyadic=False)]
+    expected = slow_coverage(GRID, [[c.double() for c in step] for step in steps])
+    result = coverage(steps, GRID)
+    assert result.radius.dtype == result.detection.dtype == torch.float64
+    np.testing.assert_allclose(result.radius.numpy(), expected["radius"], rtol=1e-6)
+    np.testing.assert_array_equal(result.points.numpy(), expected["points"])
+
+
+# Laws
+
+
+def assert_same(one, other):
+    assert one.counts == other.counts
+    for name in ("frames", "points", "radius", "detection", "maximum", "pooled", "quantiles"):
+        torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-12, atol=0, equal_nan=True)
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 2**32))
+def test_neither_the_order_of_points_nor_of_steps_matters(seed):
+    steps = random_steps(seed)
+    generator = torch.Generator().manual_seed(seed)
+    shuffled = [[c[torch.randperm(len(c), generator=generator)] for c in step] for step in reversed(steps)]
+    options = {"quantiles": (0.25, 0.9), "max_radius": 3.0, **OPTIONS}
+    assert_same(coverage(steps, GRID, **options), coverage(shuffled, GRID, **options))
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 2**32))
+def test_a_list_of_steps_is_the_steps_one_by_one(seed):
+    steps = random_steps(seed, steps=4)
+    options = {"quantiles": (0.5,), **OPTIONS}
+    metric = CoverageMetric(GRID, **options)
+    metric.update([sensor for sensor, _ in steps], tuple(reference for _, reference in steps))
+    assert_same(metric.compute(), coverage(steps, GRID, **options))
+
+
+@settings(max_examples=12, deadline=None)
+@given(seed=st.integers(0, 2**32))
+def test_more_sensor_points_never_make_it_worse(seed):
+    steps = random_steps(seed, empty=False)
+    more = [(torch.cat([sensor, sensor + 0.5]), reference) for sensor, reference in steps]
+    before, after = coverage(steps, GRID, **OPTIONS), coverage(more, GRID, **OPTIONS)
+    known = before.frames > 0
+    assert (after.radius <= before.radius + 1e-12)[known].all()
+    assert (after.detection >= before.detection - 1e-12)[:, known].all()
+    assert (before.maximum >= before.radius - 1e-12)[known].all()
+
+
+def test_a_step_split_in_two_is_another_number():
+    """The unit is the step: twice half of its points is not the step."""
+    whole = coverage([(ORIGIN, points_at(0.125, 0.5, 0.875))])
+    parts = coverage([(ORIGIN, points_at(0.125)), (ORIGIN, points_at(0.5, 0.875))])
+    assert whole.points.item() == parts.points.item()
+    assert whole.radius.item() == 0.5
+    assert parts.radius.item() == (0.125 + 0.6875) / 2
+
+
+# Quantiles
+
+
+@pytest.mark.parametrize("level", [0.0, 0.1, 0.5, 0.9, 1.0])
+def test_quantiles_are_right_within_a_bin(level):
+    """A bin is 12 % wide, or 1 cm."""
+    grid = BevGrid(x=(0.0, 64.0), y=(0.0, 64.0), cell=64.0, heights={"all": (-1.0, 1.0)})
+    random = np.random.default_rng(0)
+    distances = np.concatenate([10 ** random.uniform(-4, 1.7, 801)])
+    result = coverage([(ORIGIN, points_at(*distances))], grid, quantiles=(level,))
+    expected = np.quantile(distances, level, method="inverted_cdf")
+    assert abs(result.quantiles.item() - expected) <= max(0.123 * expected, 0.01)
+
+
+def test_steps_weigh_the_same_in_a_quantile():
+    steps = [(ORIGIN, points_at(*[0.1] * 500)), (ORIGIN, points_at(0.8)), (ORIGIN, points_at(0.8))]
+    assert coverage(steps, quantiles=(0.5,)).quantiles.item() == pytest.approx(0.8, rel=0.13)
+
+
+def test_quantiles_beyond_the_histogram_are_max_radius():
+    grid = BevGrid(x=(0.0, 512.0), y=(0.0, 512.0), cell=512.0, heights={"all": (-1.0, 1.0)})
+    steps = [(ORIGIN, points_at(1.0, 200.0, 300.0))]
+    assert coverage(steps, grid, quantiles=(0.9,), max_radius=250.0).quantiles.item() == 250.0
+    assert coverage(steps, grid, quantiles=(0.9,)).quantiles.item() == math.inf
+    assert coverage([(NOTHING, points_at(0.5))], quantiles=(0.5,)).quantiles.item() == math.inf
+
+
+def test_the_least_value_is_not_zero_unless_a_value_is():
+    least = coverage([(ORIGIN, points_at(0.5, 0.75))], quantiles=(0.0,)).quantiles.item()
+    assert least == pytest.approx(0.5, rel=0.13)
+    assert coverage([(ORIGIN, points_at(0.0, 0.75))], quantiles=(0.0,)).quantiles.item() == 0
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"thresholds": (0.4, -0.1)}, r"thresholds: distances >= 0 in metres are needed; got \(0.4, -0.1\)"),
+        ({"thresholds": (math.nan,)}, "thresholds: distances >= 0"),
+        ({"thresholds": (0.4, 0.5, 0.4)}, r"thresholds: each may be given once; got \(0.4, 0.5, 0.4\)"),
+        ({"thresholds": (0.4, 3.0), "max_radius": 2.0}, "thresholds: at most max_radius = 2.0 m"),
+        ({"max_radius": 0.0}, "max_radius: a positive distance in metres is needed; got 0.0"),
+        ({"max_radius": -1.0}, "max_radius: a positive distance"),
+        ({"max_radius": math.nan}, "max_radius: a positive distance"),
+        ({"quantiles": (0.5, 1.1)}, r"quantiles: numbers in \[0, 1\] are needed; got \(0.5, 1.1\)"),
+        ({"quantiles": (math.nan,)}, "quantiles: numbers in"),
+    ],
+)
+def test_parameters_that_make_no_sense_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        CoverageMetric(ONE_CELL, **options)
+
+
+BAD = torch.tensor([[0.0, 0.0, math.nan], [0.0, 0.0, 0.0], [math.inf, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize(
+    ("sensor", "reference", "error", "message"),
+    [
+        (BAD, ORIGIN, ValueError, r"sensor\[0\]: 2 of 3 points have NaN or infinite coordinates"),
+        ([ORIGIN, ORIGIN], [ORIGIN, BAD], ValueError, r"reference\[1\]: 2 of 3 points have NaN"),
+        ([ORIGIN], [ORIGIN, ORIGIN], ValueError, "1 sensor clouds for 2 reference clouds; one pair a step"),
+        (torch.zeros(4, 2), ORIGIN, ValueError, r"sensor\[0\]: shape \(N, 3\) is needed; got \(4, 2\)"),
+        ([ORIGIN], [torch.zeros(1, 3, dtype=torch.int64)], TypeError, r"reference\[0\]: .*got torch.int64"),
+        ([[0.0, 0.0, 0.0]], [ORIGIN], TypeError, r"sensor\[0\]: a floating-point torch tensor is needed; got list"),
+    ],
+)
+def test_bad_clouds_are_refused_before_anything_is_added(sensor, reference, error, message):
+    metric = CoverageMetric(ONE_CELL)
+    before = metric.state_dict()
+    with pytest.raises(error, match=message):
+        metric.update(sensor, reference)
+    assert all(torch.equal(before[name], value) for name, value in metric.state_dict().items())

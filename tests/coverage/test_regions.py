@@ -1,0 +1,72 @@
+import math
+
+import pytest
+import torch
+
+from torchcover import BevGrid, Region, forward_regions
+
+GRID = BevGrid(x=(-4.0, 4.0), y=(-2.0, 2.0), cell=0.5)
+
+
+def test_the_papers_regions():
+    assert [(r.name, r.x, r.y) for r in forward_regions()] == [
+        ("20m", (0, 20), (-5, 5)),
+        ("80m", (0, 80), (-20, 20)),
+        ("160m", (0, 160), (-40, 40)),
+    ]
+    assert forward_regions((2.5,)) == (Region("2.5m", x=(0.0, 2.5), y=(-0.625, 0.625)),)
+    assert forward_regions(()) == ()
+
+
+def test_a_cell_belongs_to_a_region_if_its_centre_does():
+    # Centres along x: ..., 0.25, 0.75, 1.25, ...; along y: -1.75, ..., 1.75.
+    mask = Region("r", x=(0.25, 1.25), y=(-0.3, 0.25)).mask(GRID)
+    assert mask.shape == (8, 16)
+    inside = [
+        (GRID.y_centres_m[row].item(), GRID.x_centres_m[column].item()) for row, column in mask.nonzero().tolist()
+    ]
+    assert inside == [(-0.25, 0.25), (-0.25, 0.75)]  # half-open: 1.25 and y = 0.25 are out, 0.25 is in
+
+
+def test_a_region_as_large_as_the_grid_is_the_grid():
+    assert Region("all", x=GRID.x, y=GRID.y).mask(GRID).all()
+
+
+def test_a_region_smaller_than_a_cell_may_hold_no_centre():
+    assert not Region("gap", x=(0.3, 0.7), y=(0.0, 1.0)).mask(GRID).any()
+
+
+def test_two_regions_side_by_side_share_no_cell():
+    masks = [Region("r", x=bounds, y=(-2.0, 2.0)).mask(GRID) for bounds in ((-4.0, 0.75), (0.75, 4.0))]
+    assert torch.equal(masks[0], ~masks[1])
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        ({"x": (0.0, 4.5), "y": (-2.0, 2.0)}, "spans x = 0 to 4.5 m, beyond the grid's -4 to 4 m; enlarge the grid"),
+        ({"x": (-5.0, 4.0), "y": (-2.0, 2.0)}, "spans x = -5 to 4 m, beyond"),
+        ({"x": (0.0, 4.0), "y": (-3.0, 2.0)}, "spans y = -3 to 2 m, beyond"),
+        ({"x": (0.0, 4.0), "y": (-2.0, 2.5)}, "spans y = -2 to 2.5 m, beyond"),
+    ],
+)
+def test_a_region_beyond_the_grid_is_refused(bounds, message):
+    with pytest.raises(ValueError, match=f"region 'far' {message}"):
+        Region("far", **bounds).mask(GRID)
+
+
+@pytest.mark.parametrize("bounds", [(1.0, 1.0), (2.0, 1.0), (0.0, math.inf), (-math.inf, 0.0), (math.nan, 1.0)])
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_bounds_without_inside_are_refused(axis, bounds):
+    with pytest.raises(ValueError, match=f"region 'r': {axis} needs finite bounds, lower first; got"):
+        Region("r", **{"x": (0.0, 1.0), "y": (0.0, 1.0), axis: bounds})
+
+
+def test_a_region_needs_a_name():
+    with pytest.raises(ValueError, match="a region needs a name"):
+        Region("", x=(0.0, 1.0), y=(0.0, 1.0))
+
+
+def test_a_forward_region_of_no_range_is_refused():
+    with pytest.raises(ValueError, match="region '-1m': x needs finite bounds"):
+        forward_regions((-1.0,))

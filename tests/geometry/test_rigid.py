@@ -1,0 +1,137 @@
+"""Rigid transforms: `destination_T_source`, 4x4 float64, acting on column vectors."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchcover.geometry import check_rigid, invert, rigid, rotation_from_euler, rotation_from_quaternion, transform
+
+angles = st.tuples(*[st.floats(-360, 360)] * 3)
+positions = st.tuples(*[st.floats(-1e3, 1e3)] * 3)
+
+
+def a_transform():
+    return rigid(rotation_from_euler(30.0, -20.0, 10.0), [1.0, -2.0, 3.0])
+
+
+def test_rigid_puts_the_source_origin_at_the_translation():
+    matrix = a_transform()
+    np.testing.assert_array_equal(matrix[3], [0, 0, 0, 1])
+    np.testing.assert_array_equal(transform(matrix, np.zeros((1, 3)))[0].round(12), [1, -2, 3])
+    assert matrix.dtype == np.float64
+
+
+@pytest.mark.parametrize(
+    ("angles_deg", "point", "expected"),
+    [
+        ((90, 0, 0), [1, 0, 0], [0, 1, 0]),  # a positive yaw turns left
+        ((0, 90, 0), [1, 0, 0], [0, 0, -1]),  # a positive pitch turns the nose down
+        ((0, 0, 90), [0, 1, 0], [0, 0, 1]),  # a positive roll lifts the left side
+        ((90, 90, 0), [0, 0, 1], [0, 1, 0]),  # pitch first: z -> x, then yaw: x -> y
+        ((0, 90, 90), [0, 1, 0], [1, 0, 0]),  # roll first: y -> z, then pitch: z -> x
+    ],
+)
+def test_euler_angles_by_hand(angles_deg, point, expected):
+    np.testing.assert_allclose(rotation_from_euler(*angles_deg) @ point, expected, atol=1e-15)
+
+
+@settings(max_examples=50, deadline=None)
+@given(angles)
+def test_a_rotation_is_orthonormal_and_right_handed(angles_deg):
+    rotation = rotation_from_euler(*angles_deg)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-14)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+
+
+@settings(max_examples=50, deadline=None)
+@given(angles, positions, positions)
+def test_the_inverse_brings_points_back(angles_deg, translation, point):
+    world_T_vehicle = rigid(rotation_from_euler(*angles_deg), translation)
+    there = transform(world_T_vehicle, np.array([point]))
+    np.testing.assert_allclose(transform(invert(world_T_vehicle), there)[0], point, atol=1e-10)
+    np.testing.assert_allclose(invert(world_T_vehicle) @ world_T_vehicle, np.eye(4), atol=1e-10)
+
+
+@settings(max_examples=50, deadline=None)
+@given(angles, positions, positions)
+def test_transforms_act_on_column_vectors(angles_deg, translation, point):
+    matrix = rigid(rotation_from_euler(*angles_deg), translation)
+    np.testing.assert_allclose(transform(matrix, np.array([point]))[0], (matrix @ [*point, 1.0])[:3], atol=1e-9)
+
+
+def test_points_far_from_the_origin_keep_their_millimetres():
+    """Trap 7: world coordinates of 5e6 m, subtracted in float64 before anything else."""
+    world_T_vehicle = rigid(rotation_from_euler(37.0, 2.0, -1.0), [4.5e5, 5.4e6, 300.0])
+    vehicle = np.random.default_rng(0).uniform(-80, 80, (200, 3))
+    world = transform(world_T_vehicle, vehicle)
+    np.testing.assert_allclose(transform(invert(world_T_vehicle), world), vehicle, rtol=0, atol=5e-9)
+
+
+def test_transform_takes_any_type_and_leaves_its_input_alone():
+    points = np.arange(6, dtype=np.float32).reshape(2, 3)
+    before = points.copy()
+    moved = transform(a_transform(), points)
+    assert moved.dtype == np.float64
+    np.testing.assert_array_equal(points, before)
+    assert transform(a_transform(), np.zeros((0, 3))).shape == (0, 3)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.tuples(*[st.floats(-10, 10)] * 3), st.floats(0.1, 10), st.floats(-180, 180))
+def test_a_quaternion_turns_about_its_axis(axis, norm, angle_deg):
+    axis = np.array([0.0, 0.0, 20.0]) + axis
+    axis /= np.linalg.norm(axis)
+    half = np.deg2rad(angle_deg) / 2
+    rotation = rotation_from_quaternion(norm * np.array([np.cos(half), *(np.sin(half) * axis)]))
+    np.testing.assert_allclose(rotation @ axis, axis, atol=1e-12)
+    across = np.cross(axis, [1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across)
+    turned = np.cos(2 * half) * across + np.sin(2 * half) * np.cross(axis, across)
+    np.testing.assert_allclose(rotation @ across, turned, atol=1e-12)
+
+
+@pytest.mark.parametrize("bad", [[1.0, 0.0, 0.0], [1.0, 0.0, 0.0, np.nan], [[1.0, 0.0, 0.0, 0.0]], np.inf])
+def test_a_quaternion_of_the_wrong_kind_is_refused(bad):
+    with pytest.raises(ValueError, match="four finite numbers w, x, y, z"):
+        rotation_from_quaternion(bad)
+
+
+def test_a_quaternion_of_norm_zero_is_refused():
+    with pytest.raises(ValueError, match="norm 0 is no rotation"):
+        rotation_from_quaternion([0.0, 0.0, 0.0, 0.0])
+
+
+def test_check_rigid_repairs_the_rounding_of_a_printed_matrix():
+    printed = a_transform().round(4)
+    before = printed.copy()
+    checked = check_rigid(printed.tolist(), "lidar.vehicle_T_lidar")
+    rotation = checked[:3, :3]
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-15)
+    np.testing.assert_allclose(checked, a_transform(), atol=1e-4)
+    np.testing.assert_array_equal(check_rigid(printed, "a")[:3, 3], printed[:3, 3])
+    np.testing.assert_array_equal(printed, before)
+
+
+def changed(row, column, value):
+    matrix = np.eye(4)
+    matrix[row, column] = value
+    return matrix
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ("front", "T: a 4x4 matrix of numbers is needed; got 'front'"),
+        ([[1, 2], [3]], "T: a 4x4 matrix of numbers is needed"),
+        (np.eye(3), r"T: a 4x4 matrix is needed; got shape \(3, 3\)"),
+        (changed(0, 3, np.nan), "T: 1 of its 16 entries are NaN or infinite"),
+        (changed(3, 0, 1e-9), "T: the last row of a rigid transform is 0 0 0 1; got"),
+        (changed(0, 0, 1.01), "T: not a rigid transform: R R.T deviates from the identity by 0.0201"),
+        (changed(0, 1, 0.01), "T: not a rigid transform"),
+        (changed(1, 1, -1.0), "T: a mirror, not a rotation .determinant -1"),
+    ],
+)
+def test_check_rigid_says_what_is_wrong(bad, message):
+    with pytest.raises(ValueError, match=message):
+        check_rigid(bad, "T")

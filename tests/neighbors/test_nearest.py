@@ -1,0 +1,450 @@
+"""The contract of `nearest` and `blind_spot_radius`, for every backend."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchcover import blind_spot_radius, nearest
+from torchcover.neighbors import BACKENDS, check_cloud
+
+DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
+# Rounding of the search decides between points that are this close to equally near; the distance is rounded once.
+ULPS = {torch.float32: 4 * 2.0**-23, torch.float64: 4 * 2.0**-52}
+
+backends = pytest.mark.parametrize("backend", sorted(BACKENDS))
+
+
+def cloud(*rows, dtype=torch.float32):
+    return torch.tensor(rows, dtype=dtype).reshape(-1, 3)
+
+
+def random_cloud(count, seed, scale=10.0, dtype=torch.float32):
+    return (torch.randn(count, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) * scale).to(dtype)
+
+
+def brute_force(query, points):
+    """(N,) distances in float64, or wider where NumPy has it."""
+    difference = query.double().numpy()[:, None].astype(np.longdouble) - points.double().numpy()[None]
+    return np.sqrt((difference**2).sum(axis=2)).min(axis=1)
+
+
+def assert_exact(query, points, backend):
+    """Right to the last bits, and the distance is the one to the point that the index names."""
+    found = nearest(query, points, backend=backend)
+    expected = brute_force(query, points)
+    np.testing.assert_allclose(found.distance.double().numpy(), expected, rtol=ULPS[found.distance.dtype], atol=0)
+    named = (query.double() - points[found.index].double()).norm(dim=1).to(found.distance.dtype)
+    torch.testing.assert_close(found.distance, named, rtol=ULPS[found.distance.dtype], atol=0)
+
+
+# What is found
+
+
+@backends
+def test_a_case_by_hand(backend):
+    points = cloud([0, 0, 0], [10, 0, 0], [0, 10, 0])
+    distance, index = nearest(cloud([9, 0, 0], [3, 4, 0], [0, 8, 1]), points, backend=backend)
+    torch.testing.assert_close(distance, torch.tensor([1.0, 5.0, math.sqrt(5.0)]))
+    assert index.tolist() == [1, 0, 2]
+    assert index.dtype == torch.int64
+
+
+@backends
+@pytest.mark.parametrize("counts", [(1, 1), (7, 1), (1, 300), (50, 255), (50, 256), (50, 257), (300, 5000)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_any_number_of_points(backend, counts, dtype):
+    assert_exact(random_cloud(counts[0], 1, dtype=dtype), random_cloud(counts[1], 2, dtype=dtype), backend)
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 2**32),
+    counts=st.tuples(st.integers(1, 60), st.integers(1, 700)),
+    offset=st.sampled_from([0.0, 1.0, 1e3, 5e6]),
+    scale=st.sampled_from([1e-6, 1e-2, 1.0, 1e4]),
+    dtype=st.sampled_from([torch.float32, torch.float64]),
+)
+def test_every_backend_agrees_with_brute_force(seed, counts, offset, scale, dtype):
+    query = (random_cloud(counts[0], seed, scale, torch.float64) + offset).to(dtype)
+    points = (random_cloud(counts[1], seed + 1, scale, torch.float64) + offset).to(dtype)
+    for backend in BACKENDS:
+        assert_exact(query, points, backend)
+
+
+@backends
+def test_ties_have_one_distance_and_name_one_of_the_points(backend):
+    points = cloud([1, 0, 0], [-1, 0, 0], [0, 1, 0], [5, 5, 5])
+    distance, index = nearest(cloud([0, 0, 0]), points, backend=backend)
+    assert distance.item() == 1.0
+    assert index.item() in (0, 1, 2)
+
+
+@backends
+@pytest.mark.parametrize("count", [2, 1000])
+def test_all_points_equal(backend, count):
+    distance, index = nearest(cloud([3, 4, 0], [0, 0, 0]), torch.zeros(count, 3), backend=backend)
+    assert distance.tolist() == [5.0, 0.0]
+    assert ((index >= 0) & (index < count)).all()
+
+
+@backends
+def test_duplicates_among_other_points(backend):
+    points = random_cloud(400, 3).repeat(3, 1)
+    distance, index = nearest(points, points, backend=backend)
+    assert (distance == 0).all()
+    assert torch.equal(points[index], points)
+
+
+@backends
+def test_no_query_and_no_point(backend):
+    none = torch.zeros(0, 3)
+    distance, index = nearest(none, random_cloud(5, 0), backend=backend)
+    assert (distance.shape, index.shape, index.dtype) == ((0,), (0,), torch.int64)
+    distance, index = nearest(random_cloud(2, 0), none, backend=backend)
+    assert distance.tolist() == [math.inf, math.inf]
+    assert index.tolist() == [-1, -1]
+    assert nearest(none, none, backend=backend).distance.shape == (0,)
+
+
+# Types, strides, extents
+
+
+@backends
+@pytest.mark.parametrize("query_dtype", DTYPES)
+@pytest.mark.parametrize("points_dtype", DTYPES)
+def test_types_are_widened_exactly(backend, query_dtype, points_dtype):
+    query, points = random_cloud(20, 4).to(query_dtype), random_cloud(500, 5).to(points_dtype)
+    distance, _ = nearest(query, points, backend=backend)
+    wider = torch.float64 if torch.float64 in (query_dtype, points_dtype) else torch.float32
+    assert distance.dtype == wider
+    np.testing.assert_allclose(distance.double().numpy(), brute_force(query, points), rtol=ULPS[wider])
+
+
+@backends
+def test_views_with_any_strides(backend):
+    query, points = random_cloud(40, 6), random_cloud(900, 7)
+    expected = nearest(query, points, backend=backend)
+    strided = nearest(query.T.contiguous().T, torch.cat([points, points], 1)[:, 3:], backend=backend)
+    reverse = nearest(query.flip(0)[:, [2, 1, 0]], points[:, [2, 1, 0]], backend=backend)
+    expanded = nearest(query[:1].expand(5, 3), points[::2], backend=backend)
+    assert torch.equal(strided.distance, expected.distance)
+    torch.testing.assert_close(reverse.distance.flip(0), expected.distance, rtol=ULPS[torch.float32], atol=0)
+    assert torch.equal(expanded.distance, nearest(query[:1], points[::2], backend=backend).distance.expand(5))
+
+
+@backends
+@pytest.mark.parametrize(
+    ("scale", "dtype"),
+    [
+        (1e30, torch.float32),
+        (1e-30, torch.float32),
+        (1e-41, torch.float32),  # subnormal
+        (1e200, torch.float64),
+        (1e-200, torch.float64),
+        (1e-310, torch.float64),  # subnormal
+    ],
+)
+def test_extents_whose_squares_leave_the_range_of_the_type(backend, scale, dtype):
+    query, points = random_cloud(30, 8, dtype=torch.float64), random_cloud(400, 9, dtype=torch.float64)
+    query, points = (query * scale).to(dtype), (points * scale).to(dtype)
+    # Scaled back to 1 by powers of two, without rounding.
+    up = 2.0 ** -(math.frexp(scale)[1] // 2)
+    expected = brute_force(query.double() * up * up, points.double() * up * up) / up / up
+    distance, _ = nearest(query, points, backend=backend)
+    resolution = float(torch.finfo(dtype).smallest_normal * torch.finfo(dtype).eps)
+    np.testing.assert_allclose(distance.double().numpy(), expected, rtol=ULPS[dtype], atol=2 * resolution)
+    assert (distance > 0).all()
+
+
+@backends
+def test_one_point_far_away_does_not_spoil_the_others(backend):
+    points = cloud([2, 0, 0], [1, 0, 0], [1e30, 0, 0])
+    assert nearest(cloud([0, 0, 0]), points, backend=backend).distance.item() == 1.0
+    wide = cloud([0, 0, 0], [1e200, 0, 0], dtype=torch.float64)
+    distance = nearest(wide, cloud([1e-5, 0, 0], dtype=torch.float64), backend=backend).distance
+    assert distance.tolist() == [1e-5, 1e200]
+
+
+@backends
+@pytest.mark.parametrize(("far", "dtype"), [(3e38, torch.float32), (1.7e308, torch.float64)])
+def test_a_distance_beyond_the_type_is_infinite_and_still_found(backend, far, dtype):
+    distance, index = nearest(cloud([far, 0, 0], dtype=dtype), cloud([-far, 0, 0], dtype=dtype), backend=backend)
+    assert (distance.item(), index.item()) == (math.inf, 0)
+
+
+@backends
+def test_fine_detail_near_the_origin_of_a_wide_cloud(backend):
+    """Centring the cloud would round the small coordinates away."""
+    detail = random_cloud(2000, 10, scale=1e-6)
+    points = torch.cat([detail, random_cloud(3000, 11, scale=1.0) + 100.0])
+    assert_exact(random_cloud(300, 12, scale=1e-6), points, backend)
+
+
+@backends
+def test_a_utm_offset_in_float64_costs_no_precision(backend):
+    """Trap 7: the same clouds with and without an offset of 5e6 m, both representable."""
+    query, points = random_cloud(50, 13).round(decimals=3), random_cloud(600, 14).round(decimals=3)
+    query, points = (query.double() * 1024).round() / 1024, (points.double() * 1024).round() / 1024
+    offset = torch.tensor([4.5e5, 5.4e6, 300.0], dtype=torch.float64)
+    here, there = nearest(query, points, backend=backend), nearest(query + offset, points + offset, backend=backend)
+    assert torch.equal(here.distance, there.distance)
+
+
+# Within max_distance
+
+
+@backends
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("limit", [0.0, 1e-25, 0.1, 0.4, 1.0, 3.3e7])
+def test_max_distance_is_inclusive(backend, limit, dtype):
+    points = cloud([limit, 0, 0], [9e7, 0, 0], dtype=dtype)
+    at, index = nearest(cloud([0, 0, 0], dtype=dtype), points, max_distance=limit, backend=backend)
+    assert (at.item(), index.item()) == (torch.tensor(limit, dtype=dtype).item(), 0)
+    beyond = torch.nextafter(points, torch.tensor(math.inf, dtype=dtype))[:1]
+    out, index = nearest(cloud([0, 0, 0], dtype=dtype), beyond, max_distance=limit, backend=backend)
+    assert (out.item(), index.item()) == (math.inf, -1)
+
+
+@backends
+@pytest.mark.parametrize("limit", [0.5, 2.0, 8.0, 1e300])
+def test_max_distance_only_masks_what_the_whole_search_finds(backend, limit):
+    query, points = random_cloud(200, 15), random_cloud(800, 16)
+    everything = nearest(query, points, backend=backend)
+    bounded = nearest(query, points, max_distance=limit, backend=backend)
+    within = everything.distance <= limit
+    assert torch.equal(bounded.distance, everything.distance.where(within, math.inf))
+    assert torch.equal(bounded.index, everything.index.where(within, -1))
+
+
+@backends
+@pytest.mark.parametrize(
+    ("scale", "dtype"), [(2.0**100, torch.float32), (2.0**665, torch.float64), (2.0**-665, torch.float64)]
+)
+def test_max_distance_with_coordinates_of_any_size(backend, scale, dtype):
+    query = cloud([0, 0, 0], [1, 0, 0], dtype=dtype) * scale
+    points = cloud([0.125, 0, 0], [1, 0.25, 0], dtype=dtype) * scale
+    for limit, index in ((0.0625, [-1, -1]), (0.125, [0, -1]), (0.25, [0, 1])):
+        assert nearest(query, points, max_distance=limit * scale, backend=backend).index.tolist() == index
+
+
+# Laws
+
+
+def rotation(seed):
+    q, _ = torch.linalg.qr(random_cloud(3, seed, dtype=torch.float64))
+    return q
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 2**32), backend=st.sampled_from(sorted(BACKENDS)))
+def test_distances_do_not_depend_on_the_frame_or_the_order(seed, backend):
+    query, points = random_cloud(30, seed, dtype=torch.float64), random_cloud(300, seed + 1, dtype=torch.float64)
+    turn, shift = rotation(seed + 2), random_cloud(1, seed + 3, dtype=torch.float64)
+    expected = nearest(query, points, backend=backend).distance
+    moved = nearest(query @ turn + shift, points @ turn + shift, backend=backend).distance
+    torch.testing.assert_close(moved, expected, rtol=1e-11, atol=1e-12)
+    order = torch.randperm(300, generator=torch.Generator().manual_seed(seed))
+    shuffled = nearest(query.flip(0), points[order], backend=backend)
+    torch.testing.assert_close(shuffled.distance.flip(0), expected, rtol=1e-15, atol=0)
+
+
+@backends
+def test_the_inputs_are_bit_equal_afterwards(backend):
+    query, points = random_cloud(300, 17), random_cloud(3000, 18)
+    before = query.clone(), points.clone()
+    nearest(query, points, backend=backend)
+    nearest(query * 1e30, points, backend=backend)
+    blind_spot_radius(query, points, max_radius=1.0, backend=backend)
+    assert torch.equal(query, before[0])
+    assert torch.equal(points, before[1])
+
+
+def test_backends_agree_under_autocast():
+    """A matrix product in bfloat16 would pick wrong neighbours."""
+    query, points = random_cloud(300, 19), random_cloud(3000, 20)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        for backend in BACKENDS:
+            assert_exact(query, points, backend)
+
+
+@pytest.mark.parametrize(("counts", "chosen"), [((10, 100), "cdist"), ((150, 15_000), "kdtree")])
+def test_auto_chooses_by_the_number_of_pairs_and_is_as_exact(counts, chosen, monkeypatch):
+    for name in BACKENDS.keys() - {chosen}:
+        monkeypatch.setitem(BACKENDS, name, f"not.chosen.{name}")
+    assert_exact(random_cloud(counts[0], 21), random_cloud(counts[1], 22), "auto")
+
+
+# Gradients
+
+
+@backends
+def test_gradients_agree_with_finite_differences(backend):
+    query, points = random_cloud(6, 23, dtype=torch.float64), random_cloud(15, 24, dtype=torch.float64)
+    inputs = query.requires_grad_(), points.requires_grad_()
+    assert torch.autograd.gradcheck(lambda q, p: nearest(q, p, backend=backend).distance, inputs)
+    assert torch.autograd.gradcheck(lambda q, p: blind_spot_radius(q, p, max_radius=8.0, backend=backend), inputs)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
+def test_gradients_are_the_same_for_every_backend(dtype):
+    gradients = []
+    for backend in BACKENDS:
+        query = random_cloud(50, 25).to(dtype).requires_grad_()
+        points = random_cloud(700, 26).to(dtype).requires_grad_()
+        nearest(query, points, backend=backend).distance.sum().backward()
+        gradients.append((query.grad, points.grad))
+    assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
+    torch.testing.assert_close(gradients[0][0].double().norm(dim=1), torch.ones(50).double(), rtol=1e-2, atol=0)
+
+
+@backends
+def test_the_gradient_at_distance_zero_is_zero(backend):
+    query = cloud([1, 2, 3], [0, 0, 1]).requires_grad_()
+    points = cloud([1, 2, 3], [0, 0, 3]).requires_grad_()
+    nearest(query, points, backend=backend).distance.sum().backward()
+    assert query.grad.tolist() == [[0, 0, 0], [0, 0, -1]]
+    assert points.grad.tolist() == [[0, 0, 0], [0, 0, 1]]
+
+
+@backends
+def test_what_is_out_of_reach_has_no_gradient(backend):
+    query = cloud([0, 0, 0], [5, 0, 0]).requires_grad_()
+    points = cloud([1, 0, 0]).requires_grad_()
+    radius = blind_spot_radius(query, points, max_radius=2.0, backend=backend)
+    radius.sum().backward()
+    assert radius.tolist() == [1.0, 2.0]
+    assert query.grad.tolist() == [[-1, 0, 0], [0, 0, 0]]
+    assert points.grad.tolist() == [[1, 0, 0]]
+
+
+@backends
+def test_no_points_and_a_gradient(backend):
+    query = cloud([0, 0, 0]).requires_grad_()
+    assert nearest(query, torch.zeros(0, 3), backend=backend).distance.item() == math.inf
+
+
+# The blind spot radius
+
+
+@backends
+def test_one_sensor_point_gives_the_distance_to_it(backend):
+    x, y = torch.meshgrid(torch.arange(-20.0, 20.0), torch.arange(-20.0, 20.0), indexing="ij")
+    plane = torch.stack([x.flatten(), y.flatten(), torch.zeros(1600)], dim=1)
+    radius = blind_spot_radius(plane, cloud([3, -4, 2]), backend=backend)
+    torch.testing.assert_close(radius, ((plane[:, 0] - 3) ** 2 + (plane[:, 1] + 4) ** 2 + 4).sqrt())
+
+
+@backends
+def test_an_empty_sensor_cloud_is_blind(backend):
+    reference = random_cloud(3, 27)
+    assert blind_spot_radius(reference, torch.zeros(0, 3), backend=backend).tolist() == [math.inf] * 3
+    saturated = blind_spot_radius(reference, torch.zeros(0, 3), max_radius=7.0, backend=backend)
+    assert saturated.tolist() == [7.0] * 3
+    assert blind_spot_radius(torch.zeros(0, 3), reference, backend=backend).shape == (0,)
+
+
+@backends
+@pytest.mark.parametrize("max_radius", [0.0, 0.4, 2.0, 1e39, 1e300, math.inf])
+def test_max_radius_saturates(backend, max_radius):
+    query, points = random_cloud(100, 28), random_cloud(200, 29)
+    expected = torch.minimum(nearest(query, points, backend=backend).distance, torch.tensor(max_radius))
+    assert torch.equal(blind_spot_radius(query, points, max_radius=max_radius, backend=backend), expected)
+
+
+# Trap 5
+
+
+@pytest.mark.parametrize("offset", [1e3, 1e5])
+def test_small_distances_survive_where_a_matrix_product_loses_them(offset):
+    """pytorch issues 42479 and 57690: ||q||^2 - 2 q.p + ||p||^2 cancels."""
+    step = 2.0**-6
+    line = torch.zeros(400, 3)
+    line[:, 0] = offset + torch.arange(400) * step
+    query = line + torch.tensor([0, 0.5 * step, 0])
+    truth = brute_force(query, line)
+    by_product = torch.cdist(query, line, compute_mode="use_mm_for_euclid_dist").min(dim=1).values
+    assert np.abs(by_product.double().numpy() - truth).max() > 0.3 * truth.max()
+    for backend in BACKENDS:
+        np.testing.assert_allclose(nearest(query, line, backend=backend).distance.numpy(), truth, rtol=1e-6)
+
+
+# What is refused
+
+
+@backends
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(
+    ("function", "names"), [(nearest, ("query", "points")), (blind_spot_radius, ("reference", "sensor"))]
+)
+def test_coordinates_that_are_not_finite_are_refused(backend, value, function, names):
+    good, bad = random_cloud(5, 30), random_cloud(4, 31)
+    bad[1, 2] = bad[3, 0] = bad[3, 1] = value
+    for clouds, name in (((bad, good), names[0]), ((good, bad), names[1])):
+        with pytest.raises(ValueError, match=f"^{name}: 2 of 4 points have NaN or infinite coordinates"):
+            function(*clouds, backend=backend)
+
+
+@backends
+@pytest.mark.parametrize("shape", [(3,), (4, 2), (4, 4), (1, 4, 3), ()])
+def test_other_shapes_are_refused(backend, shape):
+    message = rf"points: shape \(N, 3\) is needed; got \({', '.join(map(str, shape))}"
+    with pytest.raises(ValueError, match=message):
+        nearest(random_cloud(4, 32), torch.zeros(shape), backend=backend)
+
+
+@pytest.mark.parametrize(
+    ("bad", "arrived"),
+    [
+        (torch.zeros(2, 3, dtype=torch.int32), "torch.int32"),
+        (torch.zeros(2, 3, dtype=torch.complex64), "torch.complex64"),
+        (np.zeros((2, 3)), "ndarray"),
+        ([[0.0, 0.0, 0.0]], "list"),
+    ],
+)
+def test_other_types_are_refused(bad, arrived):
+    with pytest.raises(TypeError, match=f"query: a floating-point torch tensor is needed; got {arrived}"):
+        nearest(bad, random_cloud(2, 33))
+    with pytest.raises(TypeError, match=f"mine: .* got {arrived}"):
+        check_cloud(bad, "mine")
+
+
+@pytest.mark.parametrize("limit", [-1.0, math.nan])
+def test_a_max_distance_that_is_no_distance_is_refused(limit):
+    with pytest.raises(ValueError, match=f"max_distance .*>= 0 is needed; got {limit}"):
+        nearest(random_cloud(2, 34), random_cloud(2, 35), max_distance=limit)
+    with pytest.raises(ValueError, match=r"max_radius.* >= 0 is needed"):
+        blind_spot_radius(random_cloud(2, 34), random_cloud(2, 35), max_radius=limit)
+
+
+@pytest.mark.parametrize("budget", [0.0, -1.0, math.nan])
+def test_a_memory_budget_that_is_none_is_refused(budget):
+    with pytest.raises(ValueError, match=f"memory_mb: a positive number of megabytes is needed; got {budget}"):
+        nearest(random_cloud(2, 36), random_cloud(2, 37), memory_mb=budget)
+
+
+def test_an_unknown_backend_is_refused_with_the_known_ones():
+    with pytest.raises(ValueError, match="backend: one of auto, cdist, kdtree is needed; got 'faiss'"):
+        nearest(random_cloud(2, 38), random_cloud(2, 39), backend="faiss")
+
+
+def on_another_device(count):
+    """A tensor that is not on the CPU, on any machine; its coordinates pass as finite."""
+
+    class Elsewhere(torch.Tensor):
+        device = torch.device("meta")
+
+    return torch.zeros(count, 3).as_subclass(Elsewhere)
+
+
+def test_two_devices_are_refused():
+    with pytest.raises(ValueError, match="the clouds are on cpu and on meta; move them to one device"):
+        nearest(random_cloud(2, 40), on_another_device(2))
+
+
+def test_the_tree_is_for_the_cpu():
+    with pytest.raises(ValueError, match="backend 'kdtree' runs on the CPU; the clouds are on meta"):
+        nearest(on_another_device(2), on_another_device(3), backend="kdtree")

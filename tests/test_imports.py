@@ -1,0 +1,55 @@
+"""What may import what, and what an import costs."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import torchcover
+
+ROOT = Path(__file__).parents[1]
+
+
+def python(code):
+    """Standard output of a fresh interpreter at the root of the repository."""
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def test_arrows_in_the_house_go_one_way():
+    """The contracts of `[tool.importlinter]` in pyproject.toml."""
+    python("from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))")
+
+
+def test_importing_torchcover_imports_nothing_heavy():
+    loaded = set(python("import sys, torchcover; print(*sys.modules)").split())
+    heavy = {"torch", "torchmetrics", "numpy", "matplotlib", "kornia", "embreex", "trimesh", "pykdtree", "pydantic"}
+    assert "torchcover" in loaded
+    assert not loaded & heavy
+
+
+def test_searching_imports_neither_the_metric_nor_the_tree_before_they_are_needed():
+    code = "import sys, torch, torchcover; torchcover.nearest(*torch.zeros(2, 1, 3)); print(*sys.modules)"
+    assert not set(python(code).split()) & {"torchmetrics", "pykdtree", "matplotlib", "embreex", "trimesh"}
+
+
+@pytest.mark.parametrize("name", torchcover.__all__)
+def test_every_public_name_is_there(name):
+    assert getattr(torchcover, name) is not None
+    assert name in dir(torchcover)
+
+
+def test_the_public_names_are_those_of_the_contract():
+    assert set(torchcover.__all__) == {
+        "BevGrid", "Coverage", "CoverageMetric", "Region", "Rig", "Scenario", "blind_spot_radius", "data",
+        "forward_regions", "nearest",
+    }  # fmt: skip
+    assert torchcover.__all__ == sorted(torchcover.__all__)
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'torchcover' has no attribute 'coverage_metric'"):
+        _ = torchcover.coverage_metric
