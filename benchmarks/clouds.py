@@ -10,4 +10,5 @@ def courtyard_clouds(queries, points):
     frames = SimulatedFrames("courtyard", "front_roof_128", steps=8, seed=0)
     reference = torch.cat([frames[index].reference for index in range(8)])
     sensor = torch.cat([frames[0].sensor, frames[0].sensor + 0.01])
-    return reference[: queries * (len(reference) // queries) : len(reference) // queries][:queries], sensor[:points]
+    stride = len(reference) // queries
+    return reference[::stride][:queries].contiguous(), sensor[:points].contiguous()

@@ -141,7 +141,8 @@ def check_cloud(cloud: Tensor, name: str) -> None:
         raise TypeError(f"{name}: a floating-point torch tensor is needed; got {arrived}")
     if cloud.ndim != 2 or cloud.shape[1] != 3:
         raise ValueError(f"{name}: shape (N, 3) is needed; got {tuple(cloud.shape)}")
-    if not cloud.isfinite().all():
+    # A sum is finite only if all its terms are; one that overflows is looked at term by term.
+    if not cloud.detach().sum().isfinite() and not cloud.isfinite().all():
         bad = int((~cloud.detach().isfinite()).any(dim=1).sum())
         raise ValueError(f"{name}: {bad} of {len(cloud)} points have NaN or infinite coordinates; drop them first")
 
@@ -171,7 +172,8 @@ def _choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
 
 def _rescale(query: Tensor, points: Tensor, max_distance: float) -> tuple[Tensor, Tensor, float]:
     """Keep squares of coordinates from overflowing or vanishing in the search: widen, else scale by a power of two."""
-    largest = float(max(query.detach().abs().amax(), points.detach().abs().amax()))
+    bounds = [bound for cloud in (query, points) for bound in cloud.detach().aminmax()]
+    largest = float(torch.stack(bounds).abs().amax())
     limit = float(torch.finfo(query.dtype).max) ** 0.25
     if largest == 0.0 or 1 / limit < largest < limit:
         return query.detach(), points.detach(), max_distance
@@ -186,22 +188,28 @@ def _rescale(query: Tensor, points: Tensor, max_distance: float) -> tuple[Tensor
 
 def _distance_to(query: Tensor, points: Tensor, index: Tensor, max_distance: float) -> Nearest:
     """Measure from the differences, in float64; mask what is out of reach."""
-    found = index >= 0
     if len(points) == 0:
-        distance = query.new_full((len(query),), math.inf)
-        return Nearest(distance, index)
-    difference = query.double() - points.index_select(0, index.clamp(min=0)).double()
-    distance = _norm(difference).to(query.dtype)
+        return Nearest(query.new_full((len(query),), math.inf), index)
+    found = index >= 0
+    everywhere = index if bool(found.all()) else index.clamp(min=0)
+    difference = query.double() - points.index_select(0, everywhere).double()
+    # Squares of float32 differences always fit float64; only float64 input can need scaling.
+    distance = (_scaled_norm if query.dtype == torch.float64 else _norm)(difference).to(query.dtype)
     within = found & (distance.detach() <= max_distance)
+    if bool(within.all()):
+        return Nearest(distance, index)
     return Nearest(distance.where(within, math.inf), index.where(within, -1))
 
 
 def _norm(difference: Tensor) -> Tensor:
-    """Euclidean norm of (N, 3) float64 rows, without overflow, with gradient 0 at 0."""
+    """Euclidean norm of (N, 3) rows, whose gradient torch defines as 0 at 0."""
+    norm: Tensor = torch.linalg.vector_norm(difference, dim=1)
+    return norm
+
+
+def _scaled_norm(difference: Tensor) -> Tensor:
+    """The same, without overflow or underflow of the squares: rows are scaled by their largest entry where needed."""
     largest = difference.detach().abs().amax(dim=1)
-    # Squares of float32 differences always fit float64; only float64 input can need the scaling.
     scale = largest.clamp(max=torch.finfo(torch.float64).max)
     scale = scale.where(((scale < 1e-140) | (scale > 1e140)) & (scale > 0), 1.0)
-    squared = (difference / scale[:, None]).square().sum(dim=1)
-    positive = squared > 0
-    return torch.where(positive, squared.where(positive, 1.0).sqrt(), 0.0) * scale
+    return _norm(difference / scale[:, None]) * scale
