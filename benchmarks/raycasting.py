@@ -1,4 +1,4 @@
-"""Ray casting, rays generated and points made, beside bare embreex with its rays ready in memory; two threads each."""
+"""Ray casting, rays generated, beside bare embreex with its rays ready in memory; two threads each."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -44,13 +44,20 @@ def main():
         for seed in range(4):
             pose = sensor.vehicle_T_reference(scene.ego_box, np.random.default_rng([0, seed]))
             rays = bare_rays(sensor, pose)
-            seconds, ratios = compare(
-                lambda: instant.scan(pose, tiles, threads=THREADS),  # noqa: B023  (called within the iteration)
-                lambda: list(pool.map(lambda part: bare.run(*part, output=True), rays)),  # noqa: B023
-                rounds=15,
-            )
-            rows.append((seed, seconds[1], seconds[0], ratios[1]))
-    table(("pose", "bare embreex (s)", "torchcover (s)", "bare / torchcover"), rows)
+
+            def embreex(rays=rays):
+                list(pool.map(lambda part: bare.run(*part, output=True), rays))
+
+            def generate_and_cast(pose=pose):
+                list(pool.map(lambda tile: instant._cast_tile(pose, tile, np.inf), tiles))
+
+            def scan(pose=pose):
+                instant.scan(pose, tiles, threads=THREADS)
+
+            seconds, ratios = compare(embreex, generate_and_cast, scan, rounds=21)
+            rows.append((seed, *seconds, 1 / ratios[1], 1 / ratios[2]))
+    header = ("pose", "bare embreex (s)", "rays and hits (s)", "and points (s)", "bare / rays and hits", "bare / all")
+    table(header, rows)
 
 
 if __name__ == "__main__":

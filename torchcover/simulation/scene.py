@@ -53,7 +53,7 @@ class Part(NamedTuple):
     """A solid placed at one instant, with a ball around it in the vehicle frame; `body` is its number."""
 
     caster: RayCaster
-    vehicle_T_part: Matrix
+    part_T_vehicle: Matrix
     body: int
     centre_m: Matrix
     radius_m: float
@@ -117,7 +117,7 @@ class Scene:
         )
         # Either list of bodies begins with the ego.
         if self._world.ego.trajectory.moves:
-            return Instant(self._static, vehicle_T_world @ self._world_T_local, moving, ego=first)
+            return Instant(self._static, invert(self._world_T_local) @ world_T_vehicle, moving, ego=first)
         return Instant(self._static, np.eye(4), moving, ego=0)
 
     def encloses(self, position_m: Matrix) -> bool:
@@ -142,7 +142,7 @@ class Scene:
     def _place(self, body: int, actor: Actor, vehicle_T_actor: Matrix) -> Part:
         solid = self._solids[id(actor.mesh)]
         centre_m = transform(vehicle_T_actor, solid.centre_m[None])[0]
-        return Part(solid.caster, vehicle_T_actor, body, centre_m, solid.radius_m)
+        return Part(solid.caster, invert(vehicle_T_actor), body, centre_m, solid.radius_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,13 +151,13 @@ class Instant:
 
     Args:
         static: What never moves.
-        vehicle_T_static: Where its frame lies.
+        static_T_vehicle: From the vehicle frame to that of what never moves.
         moving: The bodies that move and are near.
         ego: Number of the ego.
     """
 
     static: RayCaster
-    vehicle_T_static: Matrix
+    static_T_vehicle: Matrix
     moving: tuple[Part, ...]
     ego: int
 
@@ -217,12 +217,11 @@ class Instant:
 
     def buried(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies below the ground or inside a wall or another body."""
-        casters = [(self.static, self.vehicle_T_static)]
-        casters += [(part.caster, part.vehicle_T_part) for part in self.moving]
+        casters = [(self.static, self.static_T_vehicle)]
+        casters += [(part.caster, part.part_T_vehicle) for part in self.moving]
         return any(
-            caster.back_faces(transform(invert(vehicle_T_part), position_m[None])[0], ALL_AROUND_RAYS).mean()
-            > BURIED_SHARE
-            for caster, vehicle_T_part in casters
+            caster.back_faces(transform(part_T_vehicle, position_m[None])[0], ALL_AROUND_RAYS).mean() > BURIED_SHARE
+            for caster, part_T_vehicle in casters
         )
 
     def _scan_tile(
@@ -241,11 +240,11 @@ class Instant:
         directions = _rotate(vehicle_T_sensor[:3, :3], tile.directions)
         axis = vehicle_T_sensor[:3, :3] @ tile.axis
         limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
-        hits = _cast(self.static, self.vehicle_T_static, origin_m, directions, limit_m)
+        hits = _cast(self.static, self.static_T_vehicle, origin_m, directions, limit_m)
         for part in self.moving:
             rays = _rays_towards(part, origin_m, directions, axis, tile.half_angle, max_range_m)
             if len(rays):
-                nearer = _cast(part.caster, part.vehicle_T_part, origin_m, directions[:, rays], hits.range_m[rays])
+                nearer = _cast(part.caster, part.part_T_vehicle, origin_m, directions[:, rays], hits.range_m[rays])
                 hits.range_m[rays] = nearer.range_m
                 hits.body[rays[nearer.body >= 0]] = part.body
         return directions, hits
@@ -279,9 +278,8 @@ def _rays_towards(
     return np.flatnonzero(cosine > np.cos(opening + ROUNDING))
 
 
-def _cast(caster: RayCaster, vehicle_T_part: Matrix, origin_m: Matrix, directions: Float32, limit_m: Float32) -> Hits:
+def _cast(caster: RayCaster, part_T_vehicle: Matrix, origin_m: Matrix, directions: Float32, limit_m: Float32) -> Hits:
     """Cast rays of the vehicle frame at a caster in its own frame."""
-    part_T_vehicle = invert(vehicle_T_part)
     towards = _rotate(part_T_vehicle[:3, :3], directions)
     return caster.cast(transform(part_T_vehicle, origin_m[None])[0], towards, limit_m)
 
@@ -292,10 +290,11 @@ def _rotate(rotation: Matrix, directions: Float32) -> Float32:
     # Written out: the rounding of a matrix product depends on how a BLAS splits it.
     x, y, z = directions
     rotated = np.empty_like(directions)
+    term = np.empty_like(x)
     for axis, (rx, ry, rz) in enumerate(rotation.astype(np.float32)):
         np.multiply(x, rx, out=rotated[axis])
-        rotated[axis] += ry * y
-        rotated[axis] += rz * z
+        rotated[axis] += np.multiply(y, ry, out=term)
+        rotated[axis] += np.multiply(z, rz, out=term)
     return rotated
 
 
