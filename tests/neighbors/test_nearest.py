@@ -271,8 +271,11 @@ def test_backends_agree_under_autocast():
             assert_exact(query, points, backend)
 
 
-@pytest.mark.parametrize(("counts", "chosen"), [((10, 100), "cdist"), ((150, 15_000), "kdtree")])
-def test_auto_chooses_by_the_number_of_pairs_and_is_as_exact(counts, chosen, monkeypatch):
+@pytest.mark.parametrize(
+    ("counts", "chosen"),
+    [((16, 10_000), "cdist"), ((17, 10_000), "kdtree"), ((16, 9_999), "kdtree"), ((1, 1), "kdtree")],
+)
+def test_auto_chooses_by_size_and_is_as_exact(counts, chosen, monkeypatch):
     for name in BACKENDS.keys() - {chosen}:
         monkeypatch.setitem(BACKENDS, name, f"not.chosen.{name}")
     assert_exact(random_cloud(counts[0], 21), random_cloud(counts[1], 22), "auto")

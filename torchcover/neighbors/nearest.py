@@ -14,8 +14,10 @@ BACKENDS = {
     "kdtree": "torchcover.neighbors.kdtree",
 }
 
-# Below this many query-point pairs the brute-force search beats building a tree (docs/performance.md, crossover).
-CROSSOVER_PAIRS = 2_000_000
+# On the CPU brute force beats the tree only for few queries against many points, where building it does not pay
+# (docs/performance.md, crossover).
+FEW_QUERIES = 16
+MANY_POINTS = 10_000
 
 Search = Callable[[Tensor, Tensor, float, float], Tensor]
 
@@ -90,7 +92,7 @@ def nearest(
         query: (N, 3) floating-point coordinates, any strides, any device.
         points: (M, 3) floating-point coordinates on the same device. M = 0 is allowed.
         max_distance: Only points within this distance count. A finite value makes the search faster.
-        backend: "cdist" (any device), "kdtree" (CPU) or "auto" (by device and number of pairs).
+        backend: "cdist" (any device), "kdtree" (CPU) or "auto" (by device and size).
         memory_mb: Most memory in megabytes that "cdist" may use for the pairs under comparison, beside a few arrays as
             long as the clouds.
 
@@ -161,7 +163,8 @@ def _check_together(query: Tensor, points: Tensor, max_distance: float, memory_m
 def _choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
     on_cpu = query.device.type == "cpu"
     if backend == "auto":
-        backend = "kdtree" if on_cpu and len(query) * len(points) > CROSSOVER_PAIRS else "cdist"
+        tree_pays = len(query) > FEW_QUERIES or len(points) < MANY_POINTS
+        backend = "kdtree" if on_cpu and tree_pays else "cdist"
     if backend not in BACKENDS:
         raise ValueError(f"backend: one of {', '.join(['auto', *BACKENDS])} is needed; got {backend!r}")
     if backend == "kdtree" and not on_cpu:
