@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STEPS ?= 24
+RAYS ?= 512
 
-.PHONY: demo test lint types doctest imports smoke bench clean
+.PHONY: demo test lint types doctest smoke bench paper clean
 
 demo: $(VENV)/.ready  ## evaluate a built-in rig in the built-in courtyard; writes to out/demo
 	$(BIN)/torchcover evaluate front_roof_128 --scenario courtyard --steps $(STEPS) --out out/demo
@@ -27,6 +28,9 @@ smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the r
 
 bench: $(VENV)/.ready  ## the speed and memory figures of docs/performance.md
 	$(BIN)/python -m benchmarks
+
+paper: $(VENV)/.ready  ## the paper's three experiments: make paper STEPS=256 (the paper: STEPS=4096 RAYS=1024)
+	$(BIN)/python -m examples.paper --steps $(STEPS) --rays $(RAYS)
 
 clean:
 	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

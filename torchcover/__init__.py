@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from torchcover import data as data
+    from torchcover.cameras import Camera as Camera
     from torchcover.coverage import BevGrid as BevGrid
     from torchcover.coverage import Coverage as Coverage
     from torchcover.coverage import CoverageMetric as CoverageMetric
@@ -22,6 +23,7 @@ __version__ = "0.1.0"
 
 _HOME = {
     "BevGrid": "torchcover.coverage",
+    "Camera": "torchcover.cameras",
     "Coverage": "torchcover.coverage",
     "CoverageMetric": "torchcover.coverage",
     "Region": "torchcover.coverage",
@@ -35,6 +37,7 @@ _ROOMS = ("data",)
 
 __all__ = [
     "BevGrid",
+    "Camera",
     "Coverage",
     "CoverageMetric",
     "Region",

@@ -85,6 +85,55 @@ def evaluate(
     )
 
 
+@app.command()
+def compare(
+    rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; two or more.")],
+    scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "courtyard",
+    steps: Annotated[int, typer.Option(min=1, help="Steps to simulate.")] = 64,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulation.")] = 0,
+    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out"),
+    cell: Annotated[float, typer.Option(help="Side of a grid cell in metres.")] = 0.25,
+    threshold: Annotated[
+        list[float] | None, typer.Option(help="Detection threshold in metres (0.4); may be repeated.")
+    ] = None,
+    device: Annotated[str, typer.Option(help="Where the search and the sums run: cpu, cuda, cuda:1, ...")] = "cpu",
+    workers: Annotated[int, typer.Option(min=0, help="Processes that make frames; 0 makes them in this one.")] = 0,
+) -> None:
+    """Compare rigs in the same frames: a table with the better values marked, maps side by side, differences."""
+    from torchcover.cli.compare import Request, run
+
+    run(
+        Request(
+            rigs=tuple(rigs),
+            scenario=scenario,
+            steps=steps,
+            seed=seed,
+            out=out,
+            cell=cell,
+            thresholds=tuple(threshold or (0.4,)),
+            device=device,
+            workers=workers,
+        )
+    )
+
+
+@app.command()
+def show(
+    name: Annotated[str, typer.Argument(help="Rig or scenario: a built-in name (see `list`) or a YAML file.")],
+    scenario: Annotated[
+        str | None, typer.Option(help="For a rig: the scenario whose ego carries it (courtyard).")
+    ] = None,
+    rig: Annotated[str | None, typer.Option(help="For a scenario: whose points to draw (front_roof_128).")] = None,
+    step: Annotated[int | None, typer.Option(min=0, help="For a scenario: which time step (0).")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="For a scenario: seed of the simulation (0).")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
+) -> None:
+    """Draw a rig on its vehicle, or a frame of a scenario from above."""
+    from torchcover.cli.show import run
+
+    run(name, scenario=scenario, rig=rig, step=step, seed=seed, out=out)
+
+
 @app.command("list")
 def list_builtin() -> None:
     """List the built-in rigs and scenarios."""

@@ -1,0 +1,113 @@
+"""Depth encodings."""
+
+import builtins
+
+import numpy as np
+import OpenEXR
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from torchcover.cameras import decode_carla, read_depth
+
+
+def encode_carla(metres, order):
+    code = round(metres / 1000.0 * (2**24 - 1))
+    channels = {"R": code % 256, "G": code // 256 % 256, "B": code // 65536, "A": 255}
+    return [channels[name] for name in order]
+
+
+@given(metres=st.floats(0.0, 999.9), order=st.sampled_from(["BGRA", "RGBA", "BGR", "RGB"]))
+def test_carla_depth_is_coded_to_a_sixteenth_of_a_millimetre(metres, order):
+    depth = decode_carla(np.array([[encode_carla(metres, order)]], dtype=np.uint8), order)
+    assert depth.item() == pytest.approx(metres, abs=1000.0 / (2**24 - 1) + metres * 1e-7)
+
+
+def test_carla_sky_is_infinite_and_the_code_below_it_is_not():
+    depth = decode_carla(np.array([[[255, 255, 255], [254, 255, 255]]], dtype=np.uint8), "RGB")
+    assert depth[0, 0] == torch.inf
+    assert depth[0, 1] < 1000.0001
+
+
+@pytest.mark.parametrize("order", ["RGB", "RGBA"])
+def test_a_colour_png_is_carlas(tmp_path, order):
+    metres = np.array([[2.5, 7.0], [400.0, 1000.0]])
+    pixels = np.array([[encode_carla(value, order) for value in row] for row in metres], dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / "depth.png")
+    expected = torch.tensor([[2.5, 7.0], [400.0, torch.inf]])
+    torch.testing.assert_close(read_depth(tmp_path / "depth.png"), expected, rtol=0, atol=1e-4)
+
+
+def test_a_grey_png_is_scaled(tmp_path):
+    Image.fromarray(np.array([[0, 1500, 65535]], dtype=np.uint16)).save(tmp_path / "depth.png")
+    depth = read_depth(tmp_path / "depth.png", metres_per_unit=0.001)
+    assert depth.tolist() == [[0.0, 1.5, torch.inf]]
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_npy_floats_are_metres(tmp_path, dtype):
+    np.save(tmp_path / "depth.npy", np.array([[0.5, np.inf]], dtype=dtype))
+    depth = read_depth(tmp_path / "depth.npy")
+    assert depth.dtype == torch.float32
+    assert depth.tolist() == [[0.5, torch.inf]]
+
+
+def test_exr(tmp_path):
+    values = np.array([[0.5, 2.0], [3.0, np.inf]], dtype=np.float32)
+    OpenEXR.File({}, {"Z": values}).write(str(tmp_path / "depth.exr"))
+    assert read_depth(tmp_path / "depth.exr").tolist() == values.tolist()
+    OpenEXR.File({}, {"Z": values, "A": values}).write(str(tmp_path / "two.exr"))
+    with pytest.raises(ValueError, match=r"one channel; got A, Z"):
+        read_depth(tmp_path / "two.exr")
+
+
+def test_exr_without_its_package(tmp_path, monkeypatch):
+    plain = builtins.__import__
+
+    def without(name, *args, **kwargs):
+        if name == "OpenEXR":
+            raise ImportError(name)
+        return plain(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ImportError, match=r"torchcover\[exr\]"):
+        read_depth(tmp_path / "depth.exr")
+
+
+def save(path, array):
+    np.save(path, array) if path.suffix == ".npy" else Image.fromarray(array).save(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "scale", "message"),
+    [
+        ("d.png", np.zeros((2, 2), np.uint8), None, "8 bits, colour type 0"),
+        ("d.png", np.zeros((2, 2), np.uint16), None, "metres_per_unit > 0 .*got None"),
+        ("d.png", np.zeros((2, 2), np.uint16), -1.0, "got -1.0"),
+        ("d.png", np.zeros((2, 2, 3), np.uint8), 0.001, "takes no metres_per_unit"),
+        ("d.npy", np.zeros((2, 2)), 0.001, "takes no metres_per_unit"),
+        ("d.npy", np.zeros((2, 2), np.int32), None, "int32 depth needs"),
+        ("d.npy", np.zeros((2, 2), bool), 1.0, "integers or floats; got bool"),
+        ("d.npy", np.zeros((2, 2, 2)), None, r"shape \(H, W\); got \(2, 2, 2\)"),
+        ("d.jpg", np.zeros((2, 2, 3), np.uint8), None, r"got '.jpg'"),
+    ],
+)
+def test_what_cannot_be_depth_is_refused(tmp_path, name, array, scale, message):
+    save(tmp_path / name, array)
+    with pytest.raises(ValueError, match=message):
+        read_depth(tmp_path / name, metres_per_unit=scale)
+
+
+@pytest.mark.parametrize(
+    ("image", "order", "message"),
+    [
+        (np.zeros((2, 2, 3), np.uint8), "GBR", "'GBR' is unknown; allowed: BGRA"),
+        (np.zeros((2, 2, 3), np.uint8), "BGRA", r"\(H, W, 4\).*got shape \(2, 2, 3\)"),
+        (np.zeros((2, 2, 3), np.float32), "RGB", "dtype float32"),
+    ],
+)
+def test_what_cannot_be_carlas_is_refused(image, order, message):
+    with pytest.raises(ValueError, match=message):
+        decode_carla(image, order)

@@ -1,0 +1,53 @@
+"""The command in this process, and worlds small enough to be cast at once."""
+
+import sys
+from functools import partial
+
+import pytest
+
+from torchcover.cli import app
+from torchcover.data import simulated
+from torchcover.simulation import ReferenceSensor
+
+
+@pytest.fixture
+def torchcover(monkeypatch, capsys):
+    """Run the command in this process; returns exit code, stdout, stderr."""
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["torchcover", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            app.main()
+        captured = capsys.readouterr()
+        return stop.value.code, captured.out, captured.err
+
+    return run
+
+
+@pytest.fixture
+def few_rays(monkeypatch):
+    """A reference sensor with 4,096 rays instead of a million."""
+    monkeypatch.setattr(simulated, "ReferenceSensor", partial(ReferenceSensor, rows=64, columns=64))
+
+
+@pytest.fixture
+def worlds(tmp_path):
+    """A folder with a rig `low`, one more sensor in `both`, another `low` in `other/`, and a scenario `yard`."""
+    pattern = "channels: 8, vertical_fov_deg: [-30, 0], horizontal_fov_deg: 90, columns: 30, max_range_m: 60"
+    front = f"  - {{name: front, mount: {{x_m: 2.5, z_m: 0.8}}, {pattern}}}\n"
+    rear = f"  - {{name: rear, mount: {{x_m: -2.5, z_m: 0.8, yaw_deg: 180}}, {pattern}}}\n"
+    (tmp_path / "other").mkdir()
+    (tmp_path / "low.yaml").write_text(f"name: low\nsensors:\n{front}")
+    (tmp_path / "both.yaml").write_text(f"name: both\nsensors:\n{front}{rear}")
+    (tmp_path / "other" / "low.yaml").write_text(f"name: low\nsensors:\n{rear}")
+    (tmp_path / "yard.yaml").write_text(
+        "name: yard\n"
+        "ego: {shape: {type: box, size_m: [4, 2, 1]}, pose: {x_m: 1000, y_m: 500, yaw_deg: 90}}\n"
+        "bodies:\n"
+        "  - {name: ground, shape: {type: plane, size_m: [400, 400]}, poses: [{x_m: 1000, y_m: 500}]}\n"
+        "actors:\n"
+        # 20 m ahead of the ego and 5 m to its left.
+        "  - {name: a, category: box, shape: {type: box, size_m: [4, 2, 1]}, pose: {x_m: 995, y_m: 520, yaw_deg: 90}}\n"
+        "  - {name: b, category: far, shape: {type: box, size_m: [4, 2, 1]}, pose: {x_m: 1000, y_m: 100}}\n"
+    )
+    return tmp_path

@@ -1,0 +1,123 @@
+"""`torchcover compare`: paired, complete, and honest about what was cut short."""
+
+import csv
+import json
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from torchcover import Coverage, CoverageMetric
+
+pytestmark = pytest.mark.usefixtures("few_rays")
+
+
+def compare(torchcover, worlds, *rigs, steps=1, out="out"):
+    """Run it on the tiny yard; returns exit code, stdout, stderr, and the folder."""
+    paths = [worlds / f"{rig}.yaml" for rig in rigs]
+    folder = worlds / out
+    arguments = ["--scenario", worlds / "yard.yaml", "--steps", steps, "--cell", 4, "--threshold", 2, "--out", folder]
+    return *torchcover("compare", *paths, *arguments), folder
+
+
+def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
+    code, printed, _, out = compare(torchcover, worlds, "low", "both", steps=2)
+    assert code == 0
+    assert str(out) in printed.replace("\n", "")
+    coverages = {name: Coverage.load(out / "coverage" / f"{name}.npz") for name in ("low", "both")}
+    np.testing.assert_array_equal(coverages["low"].points, coverages["both"].points)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["rigs"] == {"low": str(worlds / "low.yaml"), "both": str(worlds / "both.yaml")}
+    assert summary["complete"] is True
+    assert summary["counts"]["both"]["steps"] == 2
+    with (out / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(summary["rows"]) == 12
+    for row, same in zip(rows, summary["rows"], strict=True):
+        assert row["rig"] == same["rig"]
+        assert row["radius_m"] == ("" if same["radius_m"] is None else str(same["radius_m"]))
+        assert row["radius_m_best"] == str(same["radius_m_best"])
+    alone = worlds / "alone"
+    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell", 4, "--threshold", 2, "--out", alone]
+    assert torchcover("evaluate", worlds / "both.yaml", *options)[0] == 0
+    np.testing.assert_array_equal(Coverage.load(alone / "coverage.npz").radius, coverages["both"].radius)
+
+
+def test_one_more_sensor_never_makes_it_worse(torchcover, worlds):
+    *_, out = compare(torchcover, worlds, "low", "both")
+    rows = [row for row in json.loads((out / "summary.json").read_text())["rows"] if row["rig"] == "both"]
+    known = [row for row in rows if row["known_cells"]]
+    assert known
+    for row in known:
+        assert row["radius_m_difference"] <= 0 <= row["detection_2m_difference"]
+        assert row["radius_m_best"]
+        assert row["detection_2m_best"]
+    low, both = (Coverage.load(out / "coverage" / f"{name}.npz") for name in ("low", "both"))
+    assert (both.radius < low.radius - 1.0).any()
+
+
+def test_rigs_with_one_name_get_columns_and_files_of_their_own(torchcover, worlds):
+    code, printed, _, out = compare(torchcover, worlds, "low", "other/low", "low")
+    assert code == 0
+    assert sorted(path.name for path in (out / "coverage").iterdir()) == ["low.npz", "low_2.npz", "low_3.npz"]
+    assert "low_3" in printed
+    first, other, again = (Coverage.load(out / "coverage" / f"low{n}.npz") for n in ("", "_2", "_3"))
+    np.testing.assert_array_equal(first.radius, again.radius)
+    assert not np.array_equal(first.radius, other.radius, equal_nan=True)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["rigs"]["low_2"] == str(worlds / "other" / "low.yaml")
+    for row in summary["rows"]:
+        if row["rig"] == "low_3" and row["known_cells"]:
+            assert row["radius_m_difference"] == 0.0
+
+
+def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
+    *_, out = compare(torchcover, worlds, "low", "both")
+    assert sorted(path.name for path in (out / "maps").iterdir()) == sorted(
+        f"{prefix}{metric}_{band}{suffix}.png"
+        for metric in ("radius", "detection_2m")
+        for band in ("ground", "obstacle")
+        for prefix, suffix in (("", ""), ("difference_", "_both_minus_low"))
+    )
+
+
+def test_ctrl_c_between_two_rigs_leaves_a_paired_result(torchcover, worlds, monkeypatch):
+    update, calls = CoverageMetric.update, []
+
+    def interrupted(self, *clouds):
+        calls.append(self)
+        if len(calls) == 3:  # the first rig in the second step
+            os.kill(os.getpid(), signal.SIGINT)
+        update(self, *clouds)
+
+    monkeypatch.setattr(CoverageMetric, "update", interrupted)
+    code, _, _, out = compare(torchcover, worlds, "low", "both", steps=4)
+    assert code == 130
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["complete"] is False
+    assert [counts["steps"] for counts in summary["counts"].values()] == [2, 2]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "Missing argument"),
+        (["front_roof_128"], "at least two rigs; got 'front_roof_128' only"),
+        (["front_roof_128", "no_such_rig"], "neither a .yaml file nor one of the built-in rigs: argoverse2,"),
+        (["front_roof_128", "none.yaml"], "none.yaml: no such file"),
+        (["kitti", "nuscenes", "--scenario", "moon"], "one of the built-in scenarios: courtyard"),
+        (["kitti", "nuscenes", "--cell", "0.3"], "not a multiple of the cell"),
+        (["kitti", "nuscenes", "--threshold", "-1"], "thresholds: distances >= 0"),
+        (["kitti", "nuscenes", "--device", "abacus"], "--device abacus: cannot be used here"),
+        (["kitti", "nuscenes", "--steps", "0"], "--steps"),
+    ],
+)
+def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, arguments, message, tmp_path):
+    code, _, error = torchcover("compare", *arguments, "--out", tmp_path / "out")
+    assert code == 2
+    assert message in error
+    assert error.startswith("torchcover: ")
+    assert error.count("\n") == 1
+    assert not (tmp_path / "out").exists()

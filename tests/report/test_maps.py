@@ -1,0 +1,315 @@
+import math
+from itertools import product
+
+import matplotlib
+import numpy as np
+import pytest
+import torch
+from matplotlib import pyplot
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from torchcover.coverage import BevGrid, Coverage, CoverageMetric
+from torchcover.report import ColourScale, SensorMark, detection_scale, draw_map, draw_maps, radius_scale
+from torchcover.report.cells import INFINITE
+
+SCALE = ColourScale("blind spot radius", "m", "viridis_r", 0.0, 1.0)
+SQUARE = BevGrid(x=(-20.0, 20.0), y=(-10.0, 10.0), cell=1.0)
+EGO = np.array([[2.0, 1.0], [-2.0, 1.0], [-2.0, -1.0], [2.0, -1.0]])
+
+
+class Picture:
+    """A drawn figure: its pixels, (height, width, 3) in [0, 1] with row 0 at the top, and its words."""
+
+    def __init__(self, figure: Figure) -> None:
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        self.axes, self.bar = figure.axes
+        self.pixels = np.asarray(canvas.buffer_rgba())[..., :3] / 255.0
+        (left, bottom), (right, top) = self.axes.get_window_extent().get_points().round().astype(int)
+        self.map = self.pixels[len(self.pixels) - top : len(self.pixels) - bottom, left:right]
+        self.legend = [text.get_text() for text in self.axes.get_legend().get_texts()]
+        self.metres_per_point = 40 / (self.map.shape[1] / figure.dpi * 72)
+
+    def at(self, x_m: float, y_m: float) -> np.ndarray:
+        """The colour of a place in the vehicle frame, found without asking matplotlib where it drew it."""
+        (west, east), (south, north) = self.axes.get_xlim(), self.axes.get_ylim()
+        row = (north - y_m) / (north - south) * len(self.map)
+        column = (x_m - west) / (east - west) * self.map.shape[1]
+        return self.map[int(row), int(column)]
+
+
+def flat(value: float = 0.0, grid: BevGrid = SQUARE) -> torch.Tensor:
+    return torch.full(grid.shape[1:], value)
+
+
+def draw(values: torch.Tensor, grid: BevGrid = SQUARE, **options) -> Picture:
+    return Picture(draw_map(values, grid, options.pop("scale", SCALE), title=options.pop("title", "A map"), **options))
+
+
+def coverage_of(grid: BevGrid, **options) -> Coverage:
+    metric = CoverageMetric(grid, **options)
+    metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5]]))
+    return metric.compute()
+
+
+def test_a_blind_spot_at_the_front_left_is_dark_at_the_upper_right():
+    values = flat()
+    values[17:19, 35:38] = 1.0  # y = 7 to 9 m, x = 15 to 18 m
+    dark = draw(values).map.sum(axis=2) < 0.8
+    rows, columns = np.nonzero(dark[5:-5, 5:-5])  # without the frame
+    assert (rows.mean() / len(dark), columns.mean() / dark.shape[1]) == pytest.approx((0.1, 36.5 / 40), abs=0.01)
+
+
+def test_both_axes_are_in_metres_of_equal_length():
+    axes = draw(flat()).axes
+    extent = axes.get_window_extent()
+    assert extent.width / extent.height == pytest.approx(40 / 20)
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("x forward (m)", "y left (m)")
+
+
+@pytest.mark.parametrize("extent", [(40, 40), (1000, 400), (160, 9), (3, 50)])
+def test_every_cell_is_drawn_as_a_whole_number_of_equal_pixels(extent):
+    columns, rows = extent
+    grid = BevGrid(x=(0.0, columns / 4), y=(0.0, rows / 4), cell=0.25)
+    values = torch.rand(rows, columns, generator=torch.Generator().manual_seed(0))
+    pixels = draw(values, grid).map[::-1]
+    across, up = pixels.shape[1] // columns, len(pixels) // rows
+    assert across == up >= 1
+    assert pixels.shape[:2] == (rows * up, columns * across)
+    blocks = pixels.reshape(rows, up, columns, across, 3)[1:-1, :, 1:-1]  # the frame lies over the outer cells
+    assert (blocks == blocks[:, :1, :, :1]).all()
+    # Colours of viridis_r fall strictly in green as values rise.
+    green = blocks[:, 0, :, 0, 1].ravel()
+    order = values[1:-1, 1:-1].ravel().argsort()
+    assert (np.diff(green[order]) <= 0).all()
+
+
+def test_cells_smaller_than_a_pixel_are_averaged_not_dropped():
+    grid = BevGrid(x=(0.0, 600.0), y=(0.0, 6.0), cell=0.1)
+    stripes = flat(0.0, grid)
+    stripes[:, ::2] = 1.0
+    inside = draw(stripes, grid).map[8:-8, 20:-20]
+    assert inside.std(axis=(0, 1)).max() < 0.05
+
+
+def test_unknown_cells_are_grey_and_named_with_their_share():
+    values = flat()
+    values[:, :10] = math.nan
+    picture = draw(values)
+    red, green, blue = picture.at(-15.3, 3.3)
+    assert red == green == blue
+    assert 0.65 < red < 0.8
+    assert np.ptp(picture.at(5.0, 3.0)) > 0.3
+    assert picture.legend[0] == "unknown: never probed (25.0 % of the cells)"
+
+
+def test_infinite_cells_have_a_colour_of_their_own_and_leave_the_scale_alone():
+    values = flat(0.5)
+    values[:, 20:] = math.inf
+    picture = draw(values, scale=radius_scale("blind spot radius", values))
+    assert picture.at(10.5, 3.5) == pytest.approx(to_rgb(INFINITE), abs=0.01)
+    assert "infinite: a step saw nothing (50.0 % of the cells)" in picture.legend
+    assert picture.bar.get_ylim() == (0.0, 0.5)
+    assert not any("infinite" in entry for entry in draw(flat()).legend)
+
+
+def test_the_colour_bar_has_quantity_and_unit():
+    assert draw(flat()).bar.get_ylabel() == "blind spot radius (m)"
+
+
+def test_values_beyond_the_colours_are_admitted():
+    values = flat(0.5)
+    values[:2] = 9.0
+    bar = draw(values).bar
+    assert "10.0 % of the known cells lie beyond" in bar.get_ylabel()
+    # The arrow takes a piece of the place of the bar.
+    assert bar.get_window_extent().height < draw(flat(0.5)).bar.get_window_extent().height
+
+
+def test_rounding_is_not_taken_for_values_beyond_the_colours():
+    values = flat(1.0).double() * (0.1 + 0.2)
+    assert "beyond" not in draw(values, scale=radius_scale("radius", values)).bar.get_ylabel()
+
+
+@pytest.mark.parametrize(("yaw", "ahead"), [(0, (1, 0)), (90, (0, 1)), (180, (-1, 0)), (-90, (0, -1))])
+def test_a_positive_yaw_turns_the_arrow_to_the_left(yaw, ahead):
+    picture = draw(flat(), sensors=[SensorMark("lidar", 3.0, 2.0, yaw, 90.0, math.inf)])
+    reach = 10 * picture.metres_per_point  # half an arrow, in metres
+    for other in ((1, 0), (0, 1), (-1, 0), (0, -1)):
+        dark = picture.at(3.0 + reach * other[0], 2.0 + reach * other[1]).sum() < 0.5
+        assert dark == (other == ahead)
+
+
+def test_the_field_of_view_is_drawn_around_the_yaw_up_to_the_range():
+    picture = draw(flat(), sensors=[SensorMark("camera", 0.0, 0.0, 90.0, 60.0, 8.0)])
+
+    def is_crossed(angle_deg: float, reaches: np.ndarray) -> bool:
+        along = [math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))]
+        return any(picture.at(*(reach * np.array(along))).sum() < 1.0 for reach in reaches)
+
+    edge = np.linspace(4.0, 7.5, 60)
+    assert is_crossed(60.0, edge)
+    assert is_crossed(120.0, edge)
+    assert not is_crossed(75.0, edge)
+    assert not is_crossed(-60.0, edge)
+    assert any(is_crossed(angle, np.linspace(7.9, 8.1, 9)) for angle in np.linspace(80, 100, 30))
+    assert not is_crossed(60.0, np.linspace(8.4, 10.0, 30))
+
+
+def test_a_field_of_view_without_range_reaches_across_the_map_without_an_arc():
+    picture = draw(flat(), sensors=[SensorMark("camera", -20.0, 0.0, 0.0, 20.0, math.inf)])
+    end = range(math.ceil(0.9 * picture.map.shape[1]), picture.map.shape[1] - 5)
+    rows, columns = np.nonzero(picture.map[5:-5, end].sum(axis=2) < 0.5)
+    y_m = 10.0 - (rows + 5) / len(picture.map) * 20.0
+    assert np.abs(y_m) == pytest.approx(
+        (columns + end[0]) / picture.map.shape[1] * 40.0 * math.tan(math.radians(10.0)), abs=0.1
+    )
+    assert y_m.min() < 0.0 < y_m.max()
+
+
+def test_several_sensors_are_numbered_and_those_close_together_share_a_label():
+    at = (("a", 0.0, 0.0), ("b", 0.2, 0.0), ("c", 0.0, 180.0))
+    sensors = [SensorMark(name, x_m, 0.0, yaw, 90.0, 10.0) for name, x_m, yaw in at]
+    picture = draw(flat(), sensors=[*sensors, SensorMark("$away$", 99.0, 0.0, 0.0, 90.0, 10.0)])
+    labels = [text.get_text() for text in picture.axes.texts]
+    assert "1, 2" in labels
+    assert "3" in labels
+    assert picture.legend[1:5] == ["1  a", "2  b", "3  c", "4  $away$ (beyond the map)"]
+    assert picture.pixels.size < draw(flat()).pixels.size * 1.3  # the paper does not follow it
+
+
+def test_the_ego_is_filled_and_named():
+    picture = draw(flat(1.0), ego_outline_m=EGO)
+    assert picture.at(0.0, 0.0) == pytest.approx((1.0, 1.0, 1.0))
+    assert picture.at(3.0, 0.0).sum() < 1.0
+    assert "ego" in picture.legend
+
+
+def test_nothing_is_clipped_and_the_legend_hides_no_data():
+    sensors = [SensorMark(f"a sensor with a long name, number {n}", 0.0, 0.0, 45.0 * n, 90.0, 10.0) for n in range(8)]
+    title = "A title that is much longer than this narrow map is wide, and that nobody would ever write"
+    narrow = BevGrid(x=(-1.0, 1.0), y=(-20.0, 20.0), cell=1.0)
+    for grid in (narrow, SQUARE, BevGrid(x=(-40.0, 40.0), y=(-1.0, 1.0), cell=1.0)):
+        picture = draw(flat(2.0, grid), grid, title=title, subtitle=title, sensors=sensors, ego_outline_m=EGO)
+        pixels = picture.pixels
+        for border in (pixels[:5], pixels[-5:], pixels[:, :5], pixels[:, -5:]):
+            assert (border == 1.0).all()
+        assert picture.axes.get_legend().get_window_extent().y1 < picture.axes.get_window_extent().y0
+
+
+def test_dollars_are_no_formula():
+    broken = r"$\frac{$"
+    draw(flat(), title=broken)
+    draw(flat(), subtitle=broken)
+    draw(flat(), sensors=[SensorMark(broken, 0.0, 0.0, 0.0, 90.0, 10.0)])
+
+
+def test_values_are_left_as_they_were():
+    values = flat(math.nan)
+    values[3] = 7.0
+    before = values.clone()
+    draw(values)
+    assert torch.equal(values.nan_to_num(-1.0), before.nan_to_num(-1.0))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, 0.0, 1e-9, 1e9])
+def test_a_map_of_one_cell_or_one_value_can_be_drawn(value):
+    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0)
+    values = flat(value, grid)
+    draw(values, grid, scale=radius_scale("radius", values))
+
+
+def test_the_radius_scale_ends_at_the_98th_percentile_of_the_known_cells():
+    radius = torch.cat([torch.linspace(0.0, 1.0, 1000), torch.full((5,), 500.0), torch.tensor([math.nan, math.inf])])
+    assert radius_scale("radius", radius).high == pytest.approx(0.99, abs=0.01)
+
+
+def test_dark_means_blind_in_every_scale():
+    halves = flat(0.0)
+    halves[:, 20:] = 100.0
+    for scale, blind in ((radius_scale("radius", halves), 10.0), (detection_scale("detected"), -10.0)):
+        picture = draw(halves, scale=scale)
+        assert picture.at(blind, 5.0).sum() < 1.0 < picture.at(-blind, 5.0).sum()
+
+
+def test_a_few_blind_cells_among_perfect_ones_still_set_the_scale():
+    assert radius_scale("radius", torch.tensor([0.0] * 999 + [3.14])).high == 3.2
+
+
+def test_draw_maps_writes_a_file_for_each_metric_and_band(tmp_path):
+    coverage = coverage_of(SQUARE, thresholds=(0.4, 1.0))
+    paths = draw_maps(coverage, tmp_path / "new" / "maps", ego_outline_m=EGO)
+    stems = ("radius", "detection_0.4m", "detection_1m")
+    assert [path.name for path in paths] == [f"{s}_{band}.png" for s, band in product(stems, SQUARE.heights)]
+    for path in paths:
+        height, width, _ = imread(path).shape
+        assert 600 < height < 1500
+        assert 1350 < width < 2500
+
+
+def test_draw_maps_adds_what_was_asked_of_the_metric(tmp_path):
+    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    coverage = coverage_of(grid, thresholds=(), maximum=True, pooled=True, quantiles=(0.95,))
+    names = [path.name for path in draw_maps(coverage, tmp_path)]
+    assert names == ["radius_all.png", "radius_maximum_all.png", "radius_pooled_all.png", "radius_q0.95_all.png"]
+
+
+def test_the_bands_of_a_metric_share_their_colours(tmp_path):
+    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"low": (0.0, 1.0), "high": (9.0, 11.0)})
+    metric = CoverageMetric(grid, thresholds=())
+    metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.5], [0.5, 0.5, 10.0]]))
+    low, high = (imread(path)[400, 400, :3] for path in draw_maps(metric.compute(), tmp_path))
+    assert np.abs(low - high).max() > 0.5
+
+
+def test_any_band_name_becomes_a_file_in_the_folder_and_no_two_share_one(tmp_path):
+    names = ["../up", "a/b", "a\\b", "A b", "a_b_3", "$x$", "long" * 99, "Höhe", "\n"]
+    heights = {name: (float(at), at + 1.0) for at, name in enumerate(names)}
+    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights=heights)
+    paths = draw_maps(coverage_of(grid, thresholds=()), tmp_path / "maps")
+    assert len({path.name.lower() for path in paths}) == len(names)
+    assert sorted(tmp_path.rglob("*.png")) == sorted(paths)
+    assert all(path.parent == tmp_path / "maps" for path in paths)
+
+
+def test_the_title_names_metric_band_cell_and_steps(tmp_path, monkeypatch):
+    titles = []
+    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: titles.append(self.axes[0].texts))
+    draw_maps(coverage_of(SQUARE, thresholds=()), tmp_path)
+    title, subtitle = (text.get_text() for text in titles[1][:2])
+    assert title == "Mean blind spot radius, obstacle"
+    assert subtitle == "z 0.5 to 2 m; 1 step, cells of 1 m"
+
+
+def test_drawing_leaves_the_global_state_of_matplotlib_alone():
+    before = dict(matplotlib.rcParams)
+    draw(flat())
+    assert dict(matplotlib.rcParams) == before
+    assert pyplot.get_fignums() == []
+
+
+def test_wrong_shapes_are_refused_with_what_arrived():
+    with pytest.raises(ValueError, match=r"shape \(20, 40\) is needed.*got \(40, 20\)"):
+        draw(flat().T)
+    for outline, shape in ((EGO[:2], r"\(2, 2\)"), (EGO[0], r"\(2,\)"), (np.zeros((4, 3)), r"\(4, 3\)")):
+        with pytest.raises(ValueError, match=f"ego_outline_m: .* got shape {shape}"):
+            draw(flat(), ego_outline_m=outline)
+
+
+@pytest.mark.parametrize("bounds", [(1.0, 1.0), (2.0, 1.0), (0.0, math.inf), (math.nan, 1.0)])
+def test_a_scale_without_extent_is_refused(bounds):
+    with pytest.raises(ValueError, match="finite low < high"):
+        ColourScale("radius", "m", "viridis", *bounds)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("yaw_deg", math.nan), ("x_m", math.inf), ("horizontal_fov_deg", 361.0), ("range_m", 0.0)],
+)
+def test_an_impossible_sensor_is_refused_by_name(field, value):
+    good = {"name": "lidar", "x_m": 0.0, "y_m": 0.0, "yaw_deg": 0.0, "horizontal_fov_deg": 90.0, "range_m": 10.0}
+    with pytest.raises(ValueError, match=f"'lidar': .*{field}"):
+        SensorMark(**{**good, field: value})

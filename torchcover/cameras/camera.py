@@ -1,0 +1,358 @@
+"""The camera: pixels to rays, depth images to points and points to pixels, through a real lens."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from torchcover.cameras import calibration
+from torchcover.cameras.calibration import Calibration
+from torchcover.cameras.depth import count_unusable, usable
+from torchcover.cameras.inverse import ANSWERED, OUTSIDE, UNCONVERGED
+from torchcover.cameras.lens import Scalar
+from torchcover.cameras.models import check_model
+from torchcover.cameras.optics import Optics
+from torchcover.cameras.unprojection import DepthKind, Selection, check_depth, scale_rays, select
+from torchcover.geometry import check_rigid, invert
+from torchcover.geometry.rigid import Matrix
+
+# Pixels whose float64 rays exist at the same time while the table of an image is made.
+_BAND = 1 << 20
+_STATUS_NAMES = {"pixels_valid": ANSWERED, "pixels_outside": OUTSIDE, "pixels_unconverged": UNCONVERGED}
+
+
+class Camera:
+    """A camera with its lens and its place on the vehicle.
+
+    Camera frame: x right, y down, z forward, metres. Pixel centres lie at integers, so the image covers
+    [-0.5, width - 0.5) x [-0.5, height - 0.5). A camera does not change once it is made.
+
+    Args:
+        width: Columns of the image.
+        height: Rows of the image.
+        fx: Focal length in pixels along x. Like the next four it may be a tensor with gradients.
+        fy: Focal length in pixels along y.
+        cx: Column of the optical axis; it may lie outside the image.
+        cy: Row of the optical axis.
+        model: "pinhole", "brown_conrady", "kannala_brandt", "theta_polynomial", "mei", "eucm" or "double_sphere".
+        coefficients: Of the model: numbers or a 1-d tensor. Brown-Conrady takes 4, 5, 8, 12 or 14 in OpenCV's order.
+        vehicle_T_camera: (4, 4) rigid transform; None is the identity.
+        name: What messages call it.
+
+    Raises:
+        ValueError: A size or focal length that is not positive, a value that is not finite, an unknown model, a
+            number of coefficients that the model does not take, or a transform that is not rigid.
+
+    Example:
+        >>> camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, "brown_conrady", [-0.3, 0.1, 0.0, 0.0])
+        >>> rays, valid = camera.rays()
+        >>> rays.shape, bool(valid.all())
+        (torch.Size([480, 640, 3]), True)
+        >>> pixels, visible = camera.project(10.0 * rays[:2, 0].double())
+        >>> pixels.round(decimals=3).abs().tolist()
+        [[0.0, 0.0], [0.0, 1.0]]
+    """
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        fx: Scalar,
+        fy: Scalar,
+        cx: Scalar,
+        cy: Scalar,
+        model: str = "pinhole",
+        coefficients: Sequence[Scalar] | Tensor = (),
+        vehicle_T_camera: ArrayLike | None = None,
+        name: str = "camera",
+    ) -> None:
+        self.width, self.height, self.model, self.name = width, height, model, name
+        self.intrinsics = _vector([fx, fy, cx, cy])
+        self.coefficients = _vector(list(coefficients))
+        self._check()
+        pose = np.eye(4) if vehicle_T_camera is None else vehicle_T_camera
+        self.vehicle_T_camera: Matrix = check_rigid(pose, f"{name}: vehicle_T_camera")
+        self._optics = Optics(self.intrinsics, model, self.coefficients)
+        self._tables: dict[tuple[str, torch.dtype, str], tuple[Tensor, Tensor]] = {}
+        self._pixel_counts: dict[str, int] | None = None
+
+    def _check(self) -> None:
+        for name, size in (("width", self.width), ("height", self.height)):
+            if isinstance(size, bool) or not isinstance(size, int) or size <= 0:
+                raise ValueError(f"{self.name}: {name} must be a positive integer; got {size!r}")
+        if not torch.isfinite(self.intrinsics).all():
+            raise ValueError(f"{self.name}: fx, fy, cx, cy must be finite; got {self.intrinsics.tolist()}")
+        if not (self.intrinsics[:2] > 0).all():
+            raise ValueError(f"{self.name}: fx and fy must be positive; got {self.intrinsics[:2].tolist()}")
+        check_model(self.model, self.coefficients.tolist())
+
+    @classmethod
+    def from_calibration(cls, source: Calibration) -> "Camera":
+        """A camera from a `Calibration`, whose fields are the arguments of the constructor."""
+        return cls(**vars(source))
+
+    @classmethod
+    def from_matrix(cls, matrix: ArrayLike, width: int, height: int, **rest: Any) -> "Camera":  # noqa: ANN401
+        """A camera from its 3x3 matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+
+        Args:
+            matrix: Camera matrix for pixel centres at integers (OpenCV's, ROS's).
+            width: Columns of the image.
+            height: Rows of the image.
+            **rest: `model`, `coefficients`, `vehicle_T_camera`, `name`.
+
+        Returns:
+            The camera.
+
+        Raises:
+            ValueError: The matrix has another shape, a skew, or another last row.
+        """
+        fx, fy, cx, cy = calibration.split_matrix(matrix, str(rest.get("name", "camera")))
+        return cls(width, height, fx, fy, cx, cy, **rest)
+
+    @classmethod
+    def from_fov(cls, width: int, height: int, fov_deg: float, **rest: Any) -> "Camera":  # noqa: ANN401
+        """A pinhole with square pixels and its axis in the middle of the image, as CARLA's cameras are.
+
+        Args:
+            width: Columns of the image.
+            height: Rows of the image.
+            fov_deg: Horizontal field of view from the left edge of the first pixel to the right edge of the last.
+            **rest: `vehicle_T_camera` (`carla_pose` makes one), `name`.
+
+        Returns:
+            The camera, with its axis at (width - 1) / 2: CARLA's own matrix says width / 2, because it counts from
+            the corner of the first pixel, not from its centre.
+
+        Raises:
+            ValueError: The field of view is not between 0 and 180 degrees.
+
+        Example:
+            >>> Camera.from_fov(500, 420, 90.0)
+            Camera('camera', 500x420, pinhole, fx=250, fy=250, cx=249.5, cy=209.5)
+        """
+        focal = calibration.focal_from_fov(width, fov_deg)
+        return cls(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0, **rest)
+
+    @classmethod
+    def from_ros(cls, path: str | Path) -> "Camera":
+        """A camera from a ROS `camera_info` YAML file; see `calibration.read_ros`."""
+        return cls.from_calibration(calibration.read_ros(path))
+
+    @classmethod
+    def from_opencv(cls, path: str | Path, **options: Any) -> "Camera":  # noqa: ANN401
+        """A camera from an OpenCV FileStorage YAML file; see `calibration.read_opencv` for the options."""
+        return cls.from_calibration(calibration.read_opencv(path, **options))
+
+    @classmethod
+    def from_kitti(cls, path: str | Path, camera: int, **options: Any) -> "Camera":  # noqa: ANN401
+        """A camera from a KITTI calibration file; see `calibration.read_kitti` for the options."""
+        return cls.from_calibration(calibration.read_kitti(path, camera, **options))
+
+    @classmethod
+    def from_nuscenes(cls, folder: str | Path, channel: str, **options: Any) -> "Camera":  # noqa: ANN401
+        """A camera from nuScenes' tables; see `calibration.read_nuscenes` for the options."""
+        return cls.from_calibration(calibration.read_nuscenes(folder, channel, **options))
+
+    def __repr__(self) -> str:
+        fx, fy, cx, cy = self.intrinsics.tolist()
+        size = f"{self.width}x{self.height}"
+        return f"Camera({self.name!r}, {size}, {self.model}, fx={fx:g}, fy={fy:g}, cx={cx:g}, cy={cy:g})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without the tables: a worker process makes its own, which is faster than receiving them."""
+        return {**self.__dict__, "_tables": {}}
+
+    def rays(
+        self, pixels: Tensor | None = None, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
+    ) -> tuple[Tensor, Tensor]:
+        """Directions in which pixels look.
+
+        Args:
+            pixels: (..., 2) columns and rows, not only integers; None is the whole image.
+            device: Where the table of the whole image is made and kept; pixels decide for themselves.
+            dtype: float32 or float64 of that table. The lens is solved in float64 either way.
+
+        Returns:
+            Unit directions (H, W, 3), or (..., 3), and a mask (H, W), or (...), of the pixels that have one. The
+            others are NaN: outside the valid region of the lens, or not converged (`pixel_counts` tells which).
+        """
+        if pixels is None:
+            return self._table(str(torch.device(device)), dtype, "distance")
+        if not pixels.is_floating_point() or pixels.shape[-1:] != (2,):
+            raise ValueError(f"{self.name}: pixels are floats (..., 2); got {pixels.dtype} {tuple(pixels.shape)}")
+        directions, status = self._optics.directions(pixels.reshape(-1, 2).double())
+        shape = pixels.shape[:-1]
+        return directions.to(pixels.dtype).reshape(*shape, 3), (status == ANSWERED).reshape(shape)
+
+    def pixel_counts(self) -> dict[str, int]:
+        """How many pixels of the image have a ray, and why the others have none.
+
+        Returns:
+            `pixels_valid`, `pixels_outside` (no direction of the valid region has this image) and
+            `pixels_unconverged` (the solver gave up); they add up to width * height.
+        """
+        if self._pixel_counts is None:
+            self._table("cpu", torch.float32, "distance")
+        return dict(self._pixel_counts or {})
+
+    def _table(self, device: str, dtype: torch.dtype, kind: DepthKind) -> tuple[Tensor, Tensor]:
+        """Per pixel the point at depth 1, and whether there is one; made once unless gradients flow through it."""
+        trace = self._trace_image if kind == "distance" else self._plane
+        if self._optics.differentiable and torch.is_grad_enabled():
+            return trace(device, dtype)
+        key = (device, dtype, kind)
+        if key not in self._tables:
+            self._tables[key] = trace(device, dtype)
+        return self._tables[key]
+
+    def _plane(self, device: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """Rays scaled to z = 1; at and beyond 90 degrees there is no z-depth."""
+        rays, valid = self._table(device, dtype, "distance")
+        valid = valid & (rays[..., 2] > 0)
+        return rays / torch.where(valid, rays[..., 2], torch.nan)[..., None], valid
+
+    def _trace_image(self, device: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        rows = torch.arange(self.height, dtype=torch.float64, device=device)
+        columns = torch.arange(self.width, dtype=torch.float64, device=device)
+        parts = torch.split(rows, max(1, _BAND // self.width))
+        bands = [self._trace_rows(part, columns, dtype) for part in parts]
+        status = torch.cat([band[1] for band in bands])
+        self._pixel_counts = {name: int((status == code).sum()) for name, code in _STATUS_NAMES.items()}
+        return torch.cat([band[0] for band in bands]), status == ANSWERED
+
+    def _trace_rows(self, rows: Tensor, columns: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        y, x = torch.meshgrid(rows, columns, indexing="ij")
+        directions, status = self._optics.directions(torch.stack((x, y), dim=-1).reshape(-1, 2))
+        return directions.to(dtype).reshape(*y.shape, 3), status.reshape(y.shape)
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels at which points are seen.
+
+        Args:
+            points: (N, 3) float points in the camera frame, metres.
+
+        Returns:
+            (N, 2) columns and rows, NaN for points that the lens cannot show (behind it, beyond its fold, not
+            finite), and (N,) bool: visible, that is, shown and inside the image. Occlusion is not considered.
+
+        Raises:
+            ValueError: The points are not (N, 3) floats.
+        """
+        if not points.is_floating_point() or points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"{self.name}: points are floats (N, 3); got {points.dtype} {tuple(points.shape)}")
+        pixels, shown = self._optics.pixels(points.double())
+        size = pixels.new_tensor([self.width, self.height])
+        inside = ((pixels >= -0.5) & (pixels < size - 0.5)).all(dim=1)
+        return pixels.to(points.dtype), shown & inside
+
+    def unproject(
+        self,
+        depth: Tensor,
+        kind: DepthKind = "z",
+        *,
+        stride: int = 1,
+        valid: Tensor | None = None,
+        max_depth: float = float("inf"),
+    ) -> Tensor | list[Tensor]:
+        """Points of a depth image.
+
+        Args:
+            depth: (H, W) metres, float; or (B, H, W). Values that are zero, negative, NaN, infinite or beyond
+                `max_depth` never become points; `count_dropped` counts them.
+            kind: "z", along the optical axis (CARLA, most renderers), or "distance", along the ray. At 90 degrees and
+                more off the axis only distance exists.
+            stride: Take every stride-th row and column, beginning with the first.
+            valid: (H, W) or (B, H, W) bool; pixels to leave out are False.
+            max_depth: Largest depth that is a measurement, metres, of the same kind as the depth.
+
+        Returns:
+            (N, 3) points in the camera frame, row by row, of the depth's dtype (half precision becomes float32); for
+            (B, H, W) a list of B such clouds.
+
+        Raises:
+            TypeError: Integer depth: its unit is unknown.
+            ValueError: Depth or mask of another size than the camera, an unknown kind, a stride below 1.
+
+        Example:
+            >>> Camera.from_fov(3, 1, 90.0).unproject(torch.tensor([[2.0, 0.0, 2.0]]))
+            tensor([[-1.3333,  0.0000,  2.0000],
+                    [ 1.3333,  0.0000,  2.0000]])
+        """
+        pixels = self._select(depth, kind, stride, valid)
+        keep = pixels.allowed & usable(pixels.depth, max_depth)
+        if pixels.depth.ndim == 2:
+            return scale_rays(pixels.rays, pixels.depth, keep)
+        return [scale_rays(pixels.rays, *image) for image in zip(pixels.depth, keep, strict=True)]
+
+    def count_dropped(
+        self,
+        depth: Tensor,
+        kind: DepthKind = "z",
+        *,
+        stride: int = 1,
+        valid: Tensor | None = None,
+        max_depth: float = float("inf"),
+    ) -> dict[str, int]:
+        """Why pixels of a depth image do not become points; the arguments are those of `unproject`.
+
+        Returns:
+            `no_ray` (the lens has no answer, or no z-depth in that direction), `masked` (by `valid`), then
+            `depth_zero`, `depth_negative`, `depth_nan`, `depth_infinite`, `depth_beyond_range`. Every pixel is
+            counted once, under the first reason that fits.
+        """
+        pixels = self._select(depth, kind, stride, valid)
+        has_ray = pixels.has_ray.expand(pixels.depth.shape)
+        allowed = pixels.allowed.expand(pixels.depth.shape)
+        counts = {"no_ray": int((~has_ray).sum()), "masked": int((has_ray & ~allowed).sum())}
+        return counts | count_unusable(pixels.depth[allowed], max_depth)
+
+    def _select(self, depth: Tensor, kind: DepthKind, stride: int, valid: Tensor | None) -> Selection:
+        depth = check_depth(depth, kind, stride, valid, (self.height, self.width), self.name)
+        rays, has_ray = self._table(str(depth.device), depth.dtype, kind)
+        return select(rays, has_ray, depth, stride, valid)
+
+    def z_to_distance(self, depth: Tensor) -> Tensor:
+        """Distance along the ray for depth along the axis: (H, W) or (B, H, W), NaN where a pixel has no z-depth."""
+        depth = check_depth(depth, "z", 1, None, (self.height, self.width), self.name)
+        forward = self._forward(depth.device)
+        return (depth.double() / torch.where(forward > 0, forward, torch.nan)).to(depth.dtype)
+
+    def distance_to_z(self, depth: Tensor) -> Tensor:
+        """Depth along the axis for distance along the ray: (H, W) or (B, H, W), NaN where a pixel has no ray.
+
+        Example:
+            >>> camera = Camera.from_fov(2, 1, 90.0)
+            >>> camera.distance_to_z(camera.z_to_distance(torch.tensor([[3.0, 5.0]])))
+            tensor([[3., 5.]])
+        """
+        depth = check_depth(depth, "distance", 1, None, (self.height, self.width), self.name)
+        return (depth.double() * self._forward(depth.device)).to(depth.dtype)
+
+    def _forward(self, device: torch.device) -> Tensor:
+        """Cosine of the angle between every pixel's ray and the axis, float64."""
+        rays, _ = self._table(str(device), torch.float64, "distance")
+        return rays[..., 2]
+
+    def to_vehicle(self, points: Tensor) -> Tensor:
+        """Points (N, 3) of the camera frame in the vehicle frame."""
+        return self._moved(points, self.vehicle_T_camera)
+
+    def to_camera(self, points: Tensor) -> Tensor:
+        """Points (N, 3) of the vehicle frame in the camera frame."""
+        return self._moved(points, invert(self.vehicle_T_camera))
+
+    @staticmethod
+    def _moved(points: Tensor, matrix: Matrix) -> Tensor:
+        transform = torch.as_tensor(matrix, dtype=points.dtype, device=points.device)
+        return points @ transform[:3, :3].T + transform[:3, 3]
+
+
+def _vector(values: Sequence[Scalar]) -> Tensor:
+    """Numbers, or tensors with their gradients, as a float64 vector."""
+    parts = [torch.as_tensor(value, dtype=torch.float64) for value in values]
+    return torch.stack(parts) if parts else torch.empty(0, dtype=torch.float64)

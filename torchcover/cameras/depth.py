@@ -1,0 +1,158 @@
+"""Depth images: the encodings they come in, to metres, and which of their pixels say nothing.
+
+Every reader returns metres as float32, with infinity where nothing was hit within the sensor's range.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+CARLA_FAR_M = 1000.0
+_CARLA_FULL_CODE = 2**24 - 1
+_CHANNELS = ("BGRA", "RGBA", "BGR", "RGB")
+_PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+
+
+def decode_carla(image: NDArray[np.uint8], order: str) -> Tensor:
+    """Decode CARLA's 24-bit depth: 1000 m * (R + 256 G + 65536 B) / (2^24 - 1), measured along the optical axis.
+
+    Args:
+        image: (H, W, 3 or 4) uint8 as the simulator's buffer or a PNG of it holds it.
+        order: Meaning of the channels: "BGRA" (carla.Image.raw_data), "RGBA", "BGR" or "RGB" (PNG files).
+
+    Returns:
+        (H, W) float32 z-depth in metres; infinity where the code is full: sky, nothing hit.
+
+    Raises:
+        ValueError: The order is unknown, or the image is not uint8 or has other channels than the order says.
+
+    Example:
+        >>> decode_carla(np.array([[[232, 3, 0], [255, 255, 255]]], dtype=np.uint8), "RGB")
+        tensor([[0.0596,    inf]])
+    """
+    if order not in _CHANNELS:
+        raise ValueError(f"channel order {order!r} is unknown; allowed: {', '.join(_CHANNELS)}")
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != len(order):
+        raise ValueError(
+            f"CARLA depth in order {order!r} is an (H, W, {len(order)}) uint8 image; "
+            f"got shape {image.shape}, dtype {image.dtype}"
+        )
+    red, green, blue = (image[..., order.index(channel)].astype(np.int64) for channel in "RGB")
+    code = red + 256 * green + 65536 * blue
+    metres = np.where(code == _CARLA_FULL_CODE, np.inf, code * (CARLA_FAR_M / _CARLA_FULL_CODE))
+    return torch.from_numpy(metres.astype(np.float32))
+
+
+def read_depth(path: str | Path, *, metres_per_unit: float | None = None) -> Tensor:
+    """Read a depth image.
+
+    Args:
+        path: A PNG (8-bit RGB or RGBA: CARLA's encoding; 16-bit grey: integers), an NPY or an EXR file.
+        metres_per_unit: What one step of an integer image means: 0.001 for millimetres, 1/256 for KITTI. Needed for
+            integers, and only for them.
+
+    Returns:
+        (H, W) float32 depth in metres. The largest code of an integer image means "out of range" and becomes infinity.
+
+    Raises:
+        ValueError: An encoding that is not one of these, a missing or superfluous scale, or not one channel.
+        ImportError: An EXR file without the optional package `OpenEXR`.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _READERS:
+        raise ValueError(f"{path}: a depth image is one of {', '.join(_READERS)}; got {path.suffix!r}")
+    values = _READERS[path.suffix.lower()](path)
+    if values.ndim == 3 and values.dtype == np.uint8:
+        _refuse_scale(path, metres_per_unit, "CARLA's 24-bit encoding")
+        return decode_carla(values, "RGBA" if values.shape[2] == 4 else "RGB")
+    if values.ndim != 2:
+        raise ValueError(f"{path}: a depth image has shape (H, W); got {values.shape}")
+    if np.issubdtype(values.dtype, np.floating):
+        _refuse_scale(path, metres_per_unit, f"{values.dtype} metres")
+        return torch.from_numpy(values.astype(np.float32))
+    return _scaled(path, values, metres_per_unit)
+
+
+def _refuse_scale(path: Path, scale: float | None, encoding: str) -> None:
+    if scale is not None:
+        raise ValueError(f"{path}: holds {encoding}, which takes no metres_per_unit; got {scale}")
+
+
+def _scaled(path: Path, values: NDArray[Any], scale: float | None) -> Tensor:
+    if not np.issubdtype(values.dtype, np.integer):
+        raise ValueError(f"{path}: depths are integers or floats; got {values.dtype}")
+    if scale is None or not 0.0 < scale < np.inf:
+        raise ValueError(f"{path}: {values.dtype} depth needs metres_per_unit > 0 (0.001 for millimetres); got {scale}")
+    metres = values.astype(np.float64) * scale
+    return torch.from_numpy(np.where(values == np.iinfo(values.dtype).max, np.inf, metres).astype(np.float32))
+
+
+def _read_png(path: Path) -> NDArray[Any]:
+    """(H, W, 3 or 4) uint8 or (H, W) uint16; the header decides, because Pillow would narrow 16-bit colour silently."""
+    from PIL import Image
+
+    header = path.read_bytes()[:26]
+    bits, colour = (header[24], header[25]) if len(header) == 26 and header.startswith(_PNG_SIGNATURE) else (0, 0)
+    if (bits, colour) not in ((8, 2), (8, 6), (16, 0)):
+        raise ValueError(
+            f"{path}: a depth PNG is 8-bit RGB or RGBA (CARLA) or 16-bit grey; got {bits} bits, colour type {colour} "
+            "(CARLA's logarithmic 8-bit images are for the eye and hold no depth)"
+        )
+    with Image.open(path) as image:
+        return np.asarray(image).astype(np.uint8 if bits == 8 else np.uint16)
+
+
+def _read_npy(path: Path) -> NDArray[Any]:
+    values: NDArray[Any] = np.load(path, allow_pickle=False)
+    if values.ndim != 2:
+        raise ValueError(f"{path}: a depth image has shape (H, W); got {values.shape}")
+    return values
+
+
+def _read_exr(path: Path) -> NDArray[Any]:
+    try:
+        import OpenEXR  # type: ignore[import-not-found, unused-ignore]
+    except ImportError as error:
+        raise ImportError(f"{path}: reading EXR needs the package OpenEXR: pip install 'torchcover[exr]'") from error
+    with OpenEXR.File(str(path)) as file:
+        channels = file.channels()
+        if len(channels) != 1:
+            raise ValueError(f"{path}: a depth EXR has one channel; got {', '.join(channels)}")
+        return np.array(next(iter(channels.values())).pixels)
+
+
+_READERS: dict[str, Callable[[Path], NDArray[Any]]] = {".png": _read_png, ".npy": _read_npy, ".exr": _read_exr}
+
+
+def usable(depth: Tensor, max_depth: float) -> Tensor:
+    """Which depths can become points: above 0, finite, and at most `max_depth`; NaN fails every comparison."""
+    return (depth > 0) & (depth <= min(max_depth, torch.finfo(depth.dtype).max))
+
+
+def count_unusable(depth: Tensor, max_depth: float) -> dict[str, int]:
+    """How many depths `usable` refuses, by reason.
+
+    Args:
+        depth: Depths of any shape.
+        max_depth: Largest depth that counts as a measurement.
+
+    Returns:
+        `depth_zero`, `depth_negative` (with minus infinity), `depth_nan`, `depth_infinite`, `depth_beyond_range`.
+
+    Example:
+        >>> count_unusable(torch.tensor([0.0, 2.0, 90.0, torch.inf]), 50.0)["depth_beyond_range"]
+        1
+    """
+    reasons = {
+        "depth_zero": depth == 0,
+        "depth_negative": depth < 0,
+        "depth_nan": torch.isnan(depth),
+        "depth_infinite": depth == torch.inf,
+        "depth_beyond_range": (depth > max_depth) & (depth < torch.inf),
+    }
+    return {name: int(mask.sum()) for name, mask in reasons.items()}

@@ -1,0 +1,96 @@
+"""The lens models by name: how many coefficients each takes, in which order, and what it is made of."""
+
+from collections.abc import Callable, Sequence
+
+from torchcover.cameras.brown_conrady import BrownConrady, SensorTilt
+from torchcover.cameras.kannala_brandt import AngleChart, KannalaBrandt, ThetaPolynomial
+from torchcover.cameras.lens import Distortion, Lens, Scalar
+from torchcover.cameras.pinhole import PlaneChart
+from torchcover.cameras.unified import DoubleSphereChart, ExtendedChart, SphereChart
+
+# Model -> (allowed numbers of coefficients, their order).
+COEFFICIENTS = {
+    "pinhole": ((0,), "none"),
+    "brown_conrady": ((4, 5, 8, 12, 14), "k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tau_x tau_y]]]]"),
+    "kannala_brandt": ((4,), "k1 k2 k3 k4"),
+    "theta_polynomial": ((4,), "k1 k2 k3 k4"),
+    "mei": ((1, 5), "xi [k1 k2 p1 p2]"),
+    "eucm": ((2,), "alpha beta"),
+    "double_sphere": ((2,), "xi alpha"),
+}
+
+
+def _brown_conrady(coefficients: Sequence[Scalar], trainable: bool) -> Distortion | None:
+    return BrownConrady(coefficients) if trainable or any(coefficients) else None
+
+
+def _build_brown_conrady(coefficients: Sequence[Scalar], trainable: bool) -> Lens:
+    angles = coefficients[12:]
+    tilt = SensorTilt(angles[0], angles[1]) if angles and (trainable or any(angles)) else None
+    return Lens(PlaneChart(), _brown_conrady(coefficients[:12], trainable), tilt)
+
+
+def _build_kannala_brandt(coefficients: Sequence[Scalar], trainable: bool) -> Lens:
+    return Lens(AngleChart(), KannalaBrandt(coefficients) if trainable or any(coefficients) else None)
+
+
+def _build_mei(coefficients: Sequence[Scalar], trainable: bool) -> Lens:
+    distortion = _brown_conrady(coefficients[1:], trainable) if len(coefficients) > 1 else None
+    return Lens(SphereChart(coefficients[0]), distortion)
+
+
+_BUILD: dict[str, Callable[[Sequence[Scalar], bool], Lens]] = {
+    "pinhole": lambda _, __: Lens(PlaneChart()),
+    "brown_conrady": _build_brown_conrady,
+    "kannala_brandt": _build_kannala_brandt,
+    "theta_polynomial": lambda k, _: Lens(AngleChart(), ThetaPolynomial(k)),
+    "mei": _build_mei,
+    "eucm": lambda k, _: Lens(ExtendedChart(k[0], k[1])),
+    "double_sphere": lambda k, _: Lens(DoubleSphereChart(k[0], k[1])),
+}
+
+# Model -> index of the coefficient, name, smallest and largest value at which the model is defined.
+_RANGES = {
+    "mei": [(0, "xi", 0.0, float("inf"))],
+    "eucm": [(0, "alpha", 0.0, 1.0), (1, "beta", 1e-12, float("inf"))],
+    "double_sphere": [(0, "xi", -1.0, 1.0), (1, "alpha", 0.0, 1.0)],
+}
+
+
+def check_model(model: str, coefficients: Sequence[float]) -> None:
+    """Raise unless the model exists and takes these coefficients.
+
+    Raises:
+        ValueError: The model is unknown, the number of coefficients is not one of its own, or a value is not finite
+            or outside the model's range.
+    """
+    if model not in COEFFICIENTS:
+        raise ValueError(f"camera model {model!r} is unknown; allowed: {', '.join(COEFFICIENTS)}")
+    counts, order = COEFFICIENTS[model]
+    if len(coefficients) not in counts:
+        allowed = " or ".join(str(count) for count in counts)
+        raise ValueError(f"camera model {model!r} takes {allowed} coefficients ({order}); got {len(coefficients)}")
+    if not all(abs(value) < float("inf") for value in coefficients):
+        raise ValueError(f"camera model {model!r}: coefficients must be finite; got {list(coefficients)}")
+    for index, name, low, high in _RANGES.get(model, []):
+        if not low <= coefficients[index] <= high:
+            raise ValueError(
+                f"camera model {model!r}: {name} must lie in [{low:g}, {high:g}]; got {coefficients[index]}"
+            )
+    if model == "theta_polynomial" and coefficients[0] <= 0:
+        raise ValueError(f"camera model {model!r}: k1 must be positive; got {coefficients[0]}")
+
+
+def build_lens(model: str, coefficients: Sequence[Scalar], *, trainable: bool) -> Lens:
+    """The lens of a model.
+
+    Args:
+        model: A name that `check_model` has passed.
+        coefficients: As it has passed them.
+        trainable: Whether gradients are wanted: then a distortion is kept while its coefficients are zero, where the
+            map is the identity but its derivatives by the coefficients are not zero.
+
+    Returns:
+        The lens, without a distortion where that does nothing.
+    """
+    return _BUILD[model](coefficients, trainable)

@@ -1,0 +1,121 @@
+"""The two directions of one lens, in float64: pixels to directions and points to pixels. Knows no image borders."""
+
+from math import frexp
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchcover.cameras import inverse
+from torchcover.cameras.inverse import ANSWERED, OUTSIDE
+from torchcover.cameras.lens import Array, Distortion
+from torchcover.cameras.models import build_lens
+from torchcover.cameras.region import HORIZON, Region, find_region
+from torchcover.cameras.start import StartTable, make_start_table
+
+
+class Optics:
+    """A lens with its intrinsics.
+
+    Args:
+        intrinsics: (4,) float64 fx, fy, cx, cy.
+        model: Name of a model.
+        coefficients: (n,) float64, checked.
+    """
+
+    def __init__(self, intrinsics: Tensor, model: str, coefficients: Tensor) -> None:
+        trainable = coefficients.requires_grad
+        self.intrinsics = intrinsics
+        # One lens carries the gradients, its twin in floats is the solver's: no graph, no waiting for a GPU.
+        self._solver = build_lens(model, coefficients.tolist(), trainable=trainable)
+        self._lens = build_lens(model, coefficients.unbind(), trainable=True) if trainable else self._solver
+        self.differentiable = trainable or intrinsics.requires_grad
+        self._found_region: Region | None = None
+        self._start_tables: dict[int, StartTable] = {}
+
+    def directions(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Directions that the lens maps to pixels.
+
+        Args:
+            pixels: (N, 2) float64 columns and rows.
+
+        Returns:
+            (N, 3) float64 unit directions, NaN where there is none, and (N,) uint8 status of `inverse.solve`.
+        """
+        fx, fy, cx, cy = self.intrinsics.to(pixels.device).unbind()
+        u, v = (pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy
+        front = None
+        if self._lens.tilt is not None:
+            u, v, front = self._lens.tilt.undo(u, v)
+        a, b, status = self._undistort(u, v)
+        if front is not None:
+            status = torch.where(front, status, OUTSIDE)
+        rays = self._lens.chart.lift(a, b)
+        return torch.where((status == ANSWERED)[:, None], rays, torch.nan), status
+
+    def _undistort(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        chart, distortion, solver = self._lens.chart, self._lens.distortion, self._solver.distortion
+        if distortion is None or solver is None:
+            shown = torch.hypot(u, v) <= min(chart.limit, HORIZON)
+            status = torch.where(shown, ANSWERED, OUTSIDE).to(torch.uint8)
+            return torch.where(shown, u, 0.0), torch.where(shown, v, 0.0), status
+        a, b, status = self._solve(solver, u.detach(), v.detach())
+        if u.requires_grad or self.differentiable:
+            a, b = inverse.attach_gradients(solver, distortion, a, b, u, v)
+        return a, b, status
+
+    def _solve(self, solver: Distortion, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Through numpy, on the CPU, wherever the pixels are: a table is made once."""
+        fx, fy = self.intrinsics[:2].tolist()
+        images = u.numpy(force=True), v.numpy(force=True)
+        table = self._start_table(solver, np.hypot(*images))
+        solution = inverse.solve(solver, self._region(solver), table, *images, (fx, fy))
+        a, b, status = (torch.from_numpy(values).to(u.device) for values in solution)
+        return a, b, status
+
+    def _region(self, solver: Distortion) -> Region:
+        if self._found_region is None:
+            self._found_region = find_region(solver, self._solver.chart.limit)
+        return self._found_region
+
+    def _start_table(self, solver: Distortion, distorted: Array) -> StartTable:
+        """A table up to the next power of two: what a pixel gets must not depend on what was asked before."""
+        farthest = float(distorted[np.isfinite(distorted)].max(initial=0.0))
+        exponent = max(frexp(farthest)[1], -60)
+        if exponent not in self._start_tables:
+            self._start_tables[exponent] = make_start_table(solver, self._solver.chart.limit, 2.0**exponent)
+        return self._start_tables[exponent]
+
+    def pixels(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels that points are seen at.
+
+        Args:
+            points: (N, 3) float64 in the camera frame.
+
+        Returns:
+            (N, 2) float64 pixels, NaN for points that the lens cannot show, and (N,) bool: those that it can.
+        """
+        finite = torch.isfinite(points).all(dim=1)
+        safe = torch.where(finite[:, None], points, points.new_tensor([0.0, 0.0, 1.0]))
+        a, b, shown = self._lens.chart.draw(*safe.unbind(dim=1))
+        shown = shown & finite & self._inside(a.detach(), b.detach())
+        # Points that are not shown go along the axis, lest their infinities reach the gradients.
+        u, v = torch.where(shown, a, 0.0), torch.where(shown, b, 0.0)
+        if self._lens.distortion is not None:
+            u, v = self._lens.distortion.distort(u, v)
+        if self._lens.tilt is not None:
+            u, v, front = self._lens.tilt.apply(u, v)
+            shown = shown & front
+        fx, fy, cx, cy = self.intrinsics.to(points.device).unbind()
+        image = torch.stack((fx * u + cx, fy * v + cy), dim=-1)
+        return torch.where(shown[:, None], image, torch.nan), shown
+
+    def _inside(self, a: Tensor, b: Tensor) -> Tensor:
+        """Whether drawn points lie before the fold."""
+        solver = self._solver.distortion
+        if solver is None:
+            return torch.ones_like(a, dtype=torch.bool)
+        drawn = a.numpy(force=True), b.numpy(force=True)
+        with np.errstate(all="ignore"):  # far outside the region the polynomials overflow
+            inside = self._region(solver).contains(*drawn, solver.linearise(*drawn).determinant)
+        return torch.from_numpy(inside).to(a.device)

@@ -1,0 +1,117 @@
+"""`torchcover show`: a rig on its vehicle, or a frame of a scenario from above."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from torchcover.cli.run import DEFAULT_SCENARIO, GRID_X_M, GRID_Y_M, outline_m
+from torchcover.data import SimulatedFrames
+from torchcover.geometry import Box, invert, transform
+from torchcover.geometry.rigid import Matrix
+from torchcover.report import ActorMark, SensorView, draw_rig, draw_scene
+from torchcover.simulation import ReferenceSensor, Rig, Scenario, builtin_names
+from torchcover.simulation.rig import Sensor
+from torchcover.simulation.world import Actor, World
+
+DEFAULT_RIG = "front_roof_128"
+# A picture needs fewer points than a measurement.
+REFERENCE = ReferenceSensor(rows=256, columns=512)
+
+
+def run(name: str, *, scenario: str | None, rig: str | None, step: int | None, seed: int | None, out: Path) -> None:
+    """Draw what has this name into `out/NAME.png`.
+
+    Raises:
+        ValueError: The name of neither or of both, an option for the other kind, or a document that is not valid.
+        FileNotFoundError: No such file.
+    """
+    if _is_rig(name):
+        _refuse("a scenario", {"--rig": rig, "--step": step, "--seed": seed}, f"{name!r} is a rig")
+        figure = _draw_rig(Rig.load(name), Scenario.load(scenario or DEFAULT_SCENARIO))
+    else:
+        _refuse("a rig", {"--scenario": scenario}, f"{name!r} is a scenario")
+        figure = _draw_scenario(Scenario.load(name), Rig.load(rig or DEFAULT_RIG), step or 0, seed or 0)
+    path = out / f"{Path(name).stem}.png"
+    out.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=figure.dpi)
+    Console().print(f"Wrote {path}", soft_wrap=True)
+
+
+def _is_rig(name: str) -> bool:
+    if Path(name).suffix in (".yaml", ".yml"):
+        return _has_sensors(Path(name))
+    rigs, scenarios = builtin_names("rigs"), builtin_names("scenarios")
+    if (name in rigs) == (name in scenarios):
+        which = "both a rig and a scenario: give the YAML file" if name in rigs else "neither a .yaml file nor built in"
+        raise ValueError(f"{name!r} is {which}; rigs: {', '.join(rigs)}; scenarios: {', '.join(scenarios)}")
+    return name in rigs
+
+
+def _has_sensors(path: Path) -> bool:
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError):
+        return False  # whatever loads it says what is wrong
+    return isinstance(content, dict) and "sensors" in content
+
+
+def _refuse(kind: str, options: dict[str, Any], reason: str) -> None:
+    given = [option for option, value in options.items() if value is not None]
+    if given:
+        raise ValueError(f"{', '.join(given)}: for {kind} only, and {reason}")
+
+
+def _draw_rig(rig: Rig, scenario: Scenario) -> Figure:
+    ego = scenario.world().ego.mesh
+    length, width, height = Box.around(ego.vertices_m).size_m
+    subtitle = f"on the ego of {scenario.name}, {length:.2f} x {width:.2f} x {height:.2f} m"
+    sensors = [_sensor_view(sensor) for sensor in rig.sensors]
+    return draw_rig(ego.vertices_m, ego.faces, sensors, title=rig.name, subtitle=subtitle)
+
+
+def _sensor_view(sensor: Sensor) -> SensorView:
+    x, y, z = sensor.directions()
+    middle = x.shape[1] // 2
+    elevation_deg = np.rad2deg(np.arctan2(z, np.hypot(x, y)))[:, middle]
+    return SensorView(
+        name=sensor.name,
+        vehicle_T_sensor=sensor.mount.matrix(),
+        horizontal_fov_deg=sensor.horizontal_fov_deg,
+        vertical_fov_deg=(float(np.nanmin(elevation_deg)), float(np.nanmax(elevation_deg))),
+        range_m=sensor.max_range_m,
+    )
+
+
+def _draw_scenario(scenario: Scenario, rig: Rig, step: int, seed: int) -> Figure:
+    frame = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference=REFERENCE)[step]
+    episode, step_of_world = scenario.locate(step)
+    world = scenario.world(seed, episode)
+    time_s = step_of_world * world.time_step_s
+    return draw_scene(
+        GRID_X_M,
+        GRID_Y_M,
+        ego_outline_m=outline_m(Box.around(world.ego.mesh.vertices_m)),
+        actors=_actor_marks(world, time_s),
+        sensor=frame.sensor.numpy(),
+        reference=frame.reference.numpy(),
+        title=f"{scenario.name}, step {step}",
+        subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name}",
+    )
+
+
+def _actor_marks(world: World, time_s: float) -> list[ActorMark]:
+    vehicle_T_world = invert(world.ego.trajectory.at(time_s))
+    there = [actor for actor in world.actors if np.isfinite(actor.trajectory.positions_at(np.array([time_s]))).all()]
+    return [ActorMark(actor.category, _footprint_m(actor, vehicle_T_world, time_s)) for actor in there]
+
+
+def _footprint_m(actor: Actor, vehicle_T_world: Matrix, time_s: float) -> Matrix:
+    corners = outline_m(Box.around(actor.mesh.vertices_m))
+    on_ground = np.column_stack([corners, np.zeros(len(corners))])
+    return transform(vehicle_T_world @ actor.trajectory.at(time_s), on_ground)[:, :2]

@@ -1,0 +1,141 @@
+"""The sheet that a map is drawn on: every cell a whole number of pixels, the paper as large as what is on it."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox, ScaledTranslation
+
+from torchcover.coverage import BevGrid
+
+LARGEST_MAP_IN = (9.0, 6.0)
+LARGEST_PAPER_IN = (12.0, 9.0)
+# Between maps on one paper; below, there is room for a heading.
+BESIDE_IN = 0.3
+BELOW_IN = 0.4
+DOTS_PER_INCH = 150
+# Beyond this, cells are smaller than pixels and are averaged.
+MOST_DOTS_PER_INCH = 300
+COLOUR_BAR_IN = 0.16
+# The label of the colour bar needs this much.
+SHORTEST_COLOUR_BAR_IN = 2.4
+GAP_IN = 0.15
+X_LABEL_IN = 0.55
+LEGEND_COLUMN_IN = 3.0
+HEADING_POINTS = 18
+ABOVE: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "parse_math": False}
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """An empty map, alone on its paper or beside others.
+
+    Args:
+        figure: The whole paper.
+        axes: The map: x to the right and y upwards, in equal metres.
+        bar: Place of the colour bar, which maps on one paper share.
+        legend_columns: How many entries of a legend fit beside each other.
+        metres_per_inch: Scale of the map.
+    """
+
+    figure: Figure
+    axes: Axes
+    bar: Axes
+    legend_columns: int
+    metres_per_inch: float
+
+
+def lay_out(grid: BevGrid, maps: int = 1) -> list[Sheet]:
+    """Empty maps of the grid on one paper: long ones below each other, others beside each other.
+
+    Args:
+        grid: Bounds and cells.
+        maps: How many.
+
+    Returns:
+        The maps, row by row from the upper left.
+    """
+    _, rows, columns = grid.shape
+    across, inches_per_cell = _arrange(grid, maps)
+    dpi = min(math.ceil(DOTS_PER_INCH * inches_per_cell) / inches_per_cell, MOST_DOTS_PER_INCH)
+    map_in = inches_per_cell * np.array([columns, rows])
+    # Gaps of whole pixels, so that every cell of every map is whole pixels.
+    step_in = map_in + np.round(np.array([BESIDE_IN, BELOW_IN]) * dpi) / dpi
+    paper_in = map_in + step_in * [across - 1, math.ceil(maps / across) - 1]
+    figure = Figure(figsize=tuple(paper_in), dpi=dpi)
+    for at in range(maps):
+        left_in, top_in = step_in * [at % across, at // across]
+        place_in = (left_in, paper_in[1] - top_in - map_in[1])
+        axes = figure.add_axes((*(place_in / paper_in), *(map_in / paper_in)), xlim=grid.x, ylim=grid.y)
+        _label(axes, left=at % across == 0, lowest=at + across >= maps)
+    bar_in = np.array([COLOUR_BAR_IN, max(paper_in[1], SHORTEST_COLOUR_BAR_IN)])
+    bar_place_in = (paper_in[0] + GAP_IN, paper_in[1] - bar_in[1])
+    bar = figure.add_axes((*(bar_place_in / paper_in), *(bar_in / paper_in)))
+    legend_columns = max(1, int(paper_in[0] / LEGEND_COLUMN_IN))
+    return [Sheet(figure, axes, bar, legend_columns, grid.cell / inches_per_cell) for axes in figure.axes[:-1]]
+
+
+def _arrange(grid: BevGrid, maps: int) -> tuple[int, float]:
+    """How many maps beside each other, and inches for each cell: the most that the paper allows."""
+    _, rows, columns = grid.shape
+    width_in, height_in = LARGEST_MAP_IN if maps == 1 else LARGEST_PAPER_IN
+
+    def inches_per_cell(across: int) -> float:
+        return min(width_in / (across * columns), height_in / (math.ceil(maps / across) * rows))
+
+    across = max(range(1, maps + 1), key=inches_per_cell)
+    return across, inches_per_cell(across)
+
+
+def _label(axes: Axes, *, left: bool, lowest: bool) -> None:
+    axes.set_xlabel("x forward (m)" if lowest else "")
+    axes.set_ylabel("y left (m)" if left else "")
+    axes.tick_params(labelbottom=lowest, labelleft=left)
+
+
+def write_title(axes: Axes, title: str, subtitle: str, lift_points: float = 0.0) -> None:
+    """Write two lines above the map, the second smaller, both as they are: `$` is no formula."""
+    axes.annotate(title, (0, 1), (0, 22 + lift_points), fontsize=11, fontweight="bold", **ABOVE)
+    axes.annotate(subtitle, (0, 1), (0, 8 + lift_points), fontsize=9, color="#404040", **ABOVE)
+
+
+def write_heading(axes: Axes, heading: str) -> None:
+    """Write a line above one map of several, which leaves room for a title if that is lifted by `HEADING_POINTS`."""
+    axes.annotate(heading, (0, 1), (0, 5), fontsize=9, fontweight="bold", **ABOVE)
+
+
+def write_legend(axes: Axes, entries: Sequence[Artist], columns: int) -> None:
+    """Write the legend under the map, where it hides nothing."""
+    below = ScaledTranslation(0, -X_LABEL_IN, axes.figure.dpi_scale_trans)
+    legend = axes.legend(
+        handles=entries,
+        loc="upper left",
+        bbox_to_anchor=(0, 0),
+        bbox_transform=axes.transAxes + below,
+        borderaxespad=0,
+        ncols=columns,
+        fontsize=8,
+        frameon=False,
+    )
+    for text in legend.get_texts():
+        text.set_parse_math(False)
+
+
+def fit_paper(figure: Figure) -> None:
+    """Make the paper as large as what is drawn on it, with a margin. Nothing is clipped, nothing changes its size."""
+    FigureCanvasAgg(figure)
+    drawn = figure.get_tightbbox().padded(GAP_IN)
+    dots = figure.dpi
+    left, bottom = (math.floor(edge * dots) / dots for edge in drawn.min)
+    right, top = (math.ceil(edge * dots) / dots for edge in drawn.max)
+    old, new = figure.get_size_inches(), (right - left, top - bottom)
+    figure.set_size_inches(*new)
+    for axes in figure.axes:
+        corners = axes.get_position(original=True).get_points() * old - (left, bottom)
+        axes.set_position(Bbox(corners / new))
