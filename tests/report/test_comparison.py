@@ -13,7 +13,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from rich.console import Console
-from rich.measure import Measurement
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.report import (
@@ -24,6 +23,7 @@ from torchcover.report import (
     difference_scale,
     draw_comparison,
     draw_side_by_side,
+    narrowest_width,
     radius_scale,
     write_comparison,
 )
@@ -140,14 +140,24 @@ def test_numbers_that_print_the_same_are_all_marked():
     assert [rig_rows[0]["radius_m_best"] for rig_rows in marked.values()] == [True, True, False]
 
 
-def test_a_narrow_terminal_folds_names_but_parts_no_number_from_its_mark():
-    named = {f"a_rig_with_a_name_of_{length}": one for length, one in pair().items()}
-    console = Console(width=1000)
-    narrowest = max(Measurement.get(console, console.options, t).minimum for t in comparison_tables(named, REGIONS))
-    assert narrowest < 60
-    marked = re.findall(r"\* \d+\.\d+ ", printed(named))
-    assert len(marked) == 4
-    assert re.findall(r"\* \d+\.\d+ ", printed(named, width=narrowest)) == marked
+@pytest.mark.parametrize("rigs", [2, 5, 9])
+def test_on_a_narrow_terminal_names_fold_but_numbers_stay_whole(rigs):
+    one, other = pair().values()
+    named = {f"rig_number_{at}_with_a_long_name": (one, other)[at % 2] for at in range(rigs)}
+    narrowest = narrowest_width(comparison_tables(named, REGIONS), list(named))
+    assert narrowest == 35 + 13 * rigs
+    narrow, wide = (printed(named, width).split("the best of")[0] for width in (narrowest, 400))
+    assert max(map(len, narrow.splitlines())) == narrowest
+    numbers = re.compile(r"(?:\* )?[\d.]+ │|unknown")
+    assert len(numbers.findall(wide)) > 8 * rigs
+    assert numbers.findall(narrow) == numbers.findall(wide)
+    assert "known cells" in narrow
+
+
+def test_the_parts_of_the_table_have_equal_columns():
+    borders = [line for line in printed(pair()).splitlines() if line.startswith("┏")]
+    assert len(borders) == 2
+    assert borders[0] == borders[1]
 
 
 def test_notes_about_one_rig_name_it():
@@ -285,6 +295,8 @@ def test_every_panel_has_whole_pixels_for_each_cell_and_overlaps_no_other(count,
         assert one.shape == shown[0].shape
         assert (one.shape[0] % rows_, one.shape[1] % columns) == (0, 0)
         np.testing.assert_array_equal(one[3:-3, 3:-3], shown[0][3:-3, 3:-3])
+    corners = [axes.get_window_extent().get_points() for axes in figure.axes[:-1]]
+    np.testing.assert_allclose(corners, np.round(corners), atol=1e-3)
     boxes = [axes.get_tightbbox() for axes in figure.axes]
     for at, one in enumerate(boxes):
         assert not any(one.overlaps(other) for other in boxes[at + 1 :])

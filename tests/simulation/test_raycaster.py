@@ -97,10 +97,11 @@ def test_a_ray_ends_at_its_limit(limit, body, range_m):
     np.testing.assert_allclose(hits.range_m, [range_m], rtol=1e-6)
 
 
-def test_origin_and_directions_are_left_alone():
+def test_the_arguments_are_left_alone():
     caster, directions, origin = RayCaster([random_mesh(50)]), random_directions(100), np.ones(3)
-    before = directions.copy()
-    caster.cast(origin, directions, endless(directions))
+    before, limit = directions.copy(), endless(directions)
+    caster.cast(origin, directions, limit)
+    assert np.isinf(limit).all()
     np.testing.assert_array_equal(directions, before)
     np.testing.assert_array_equal(origin, np.ones(3))
 

@@ -7,18 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.measure import Measurement
 from rich.table import Table
 
 from torchcover import __version__
 from torchcover.cli.run import Progression, accumulate, device_called, new_metric, outline_m, sensor_marks
 from torchcover.coverage import Coverage, forward_regions
 from torchcover.data import SimulatedFrames
-from torchcover.report import comparison_dict, comparison_tables, draw_comparison, write_comparison
+from torchcover.report import comparison_dict, comparison_tables, draw_comparison, narrowest_width, write_comparison
 from torchcover.simulation import Rig
-
-# More characters than any table has in a line.
-WIDEST = 10_000
 
 
 @dataclass(frozen=True)
@@ -78,7 +74,7 @@ def _write(
 ) -> None:
     (request.out / "coverage").mkdir(parents=True, exist_ok=True)
     regions = forward_regions()
-    _print(comparison_tables(coverages, regions))
+    _print(comparison_tables(coverages, regions), list(coverages))
     for name, coverage in coverages.items():
         coverage.save(request.out / "coverage" / f"{name}.npz")
     write_comparison(coverages, regions, request.out / "summary.csv")
@@ -106,11 +102,9 @@ def _write(
     )
 
 
-def _print(tables: Sequence[Table]) -> None:
+def _print(tables: Sequence[Table], rigs: Sequence[str]) -> None:
     console = Console()
-    sizes = [Measurement.get(console, console.options.update(width=WIDEST), table) for table in tables]
-    # Rather lines that are too long than numbers that are cut off; in a file, names are whole too.
-    needed = max(size.minimum if console.is_terminal else size.maximum for size in sizes)
-    console.width = max(console.width, needed)
+    # Rather lines that are too long than numbers that are cut off; in a file the names are whole too.
+    console.width = max(console.width, narrowest_width(tables, rigs if console.is_terminal else ()))
     for table in tables:
         console.print(table)

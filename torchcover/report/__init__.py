@@ -1,7 +1,7 @@
 """What a run shows: tables, summaries and maps of a `Coverage`. Imports matplotlib and rich, so import it late."""
 
 from torchcover.report.comparison import draw_comparison, draw_side_by_side
-from torchcover.report.comparison_table import comparison_dict, comparison_tables, write_comparison
+from torchcover.report.comparison_table import comparison_dict, comparison_tables, narrowest_width, write_comparison
 from torchcover.report.maps import draw_map, draw_maps
 from torchcover.report.overlay import SensorMark
 from torchcover.report.rig_view import SensorView, draw_rig
@@ -25,6 +25,7 @@ __all__ = [
     "draw_rig",
     "draw_scene",
     "draw_side_by_side",
+    "narrowest_width",
     "radius_scale",
     "summary_dict",
     "write_comparison",

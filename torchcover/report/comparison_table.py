@@ -6,6 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rich.cells import cell_len
+from rich.console import Console
+from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
@@ -19,6 +22,8 @@ from torchcover.report.wording import metres, percent
 MARK = "*"
 # A marked number is never broken, however narrow the terminal.
 NARROWEST_COLUMN = len(f"{MARK} infinite")
+# More characters than any table has in a line.
+WIDEST = 10_000
 
 
 def comparison_tables(coverages: Mapping[str, Coverage], regions: Sequence[Region]) -> list[Table]:
@@ -40,6 +45,13 @@ def comparison_tables(coverages: Mapping[str, Coverage], regions: Sequence[Regio
     tables = [_table(coverages, regions, quantity) for quantity in _quantities(coverages)]
     tables[-1].caption = Text("\n".join(_notes(coverages, regions)))
     return tables
+
+
+def narrowest_width(tables: Sequence[Table], rigs: Sequence[str]) -> int:
+    """Characters in a line that the tables need at least, with the names folded and the numbers whole."""
+    console = Console(width=WIDEST)
+    natural = max(Measurement.get(console, console.options, table).maximum for table in tables)
+    return natural - sum(max(0, cell_len(name) - NARROWEST_COLUMN) for name in rigs)
 
 
 def write_comparison(coverages: Mapping[str, Coverage], regions: Sequence[Region], path: str | Path) -> None:
@@ -121,7 +133,7 @@ def _table(coverages: Mapping[str, Coverage], regions: Sequence[Region], quantit
     table.add_column("height", no_wrap=True)
     for name in coverages:
         table.add_column(Text(name), justify="right", overflow="fold", min_width=NARROWEST_COLUMN)
-    table.add_column("known cells\n(%)", justify="right")
+    table.add_column("known cells\n(%)", justify="right", no_wrap=True)
     for region in regions:
         for rows in zip(*(coverage.summary([region]) for coverage in coverages.values()), strict=True):
             values = [quantity.of(row) for row in rows]

@@ -52,7 +52,7 @@ class RayCaster:
         Args:
             origin_m: (3,) common origin of the rays.
             directions: (3, N) unit directions.
-            limit_m: (N,) distance at which each ray ends; may be infinite. Overwritten: it becomes `range_m`.
+            limit_m: (N,) distance at which each ray ends; may be infinite.
 
         Returns:
             `Hits(range_m, body)`: the nearest hit within the limit; else the limit, and -1.
@@ -61,7 +61,7 @@ class RayCaster:
         origins = np.ndarray(
             (directions.shape[1], 3), np.float32, origin_m.astype(np.float32).tobytes(), strides=(0, 4)
         )
-        answer = self._scene.run(origins, directions.T, dists=limit_m, output=True)
+        answer = self._scene.run(origins, directions.T, dists=limit_m.copy(), output=True)
         return Hits(answer["tfar"], answer["geomID"])
 
     def back_faces(self, origin_m: NDArray[np.floating], directions: Float32) -> NDArray[np.bool_]:
