@@ -287,14 +287,7 @@ def _cast(caster: RayCaster, part_T_vehicle: Matrix, origin_m: Matrix, direction
 def _rotate(rotation: Matrix, directions: Float32) -> Float32:
     if np.array_equal(rotation, np.eye(3)):
         return directions
-    # Written out: the rounding of a matrix product depends on how a BLAS splits it.
-    x, y, z = directions
-    rotated = np.empty_like(directions)
-    term = np.empty_like(x)
-    for axis, (rx, ry, rz) in enumerate(rotation.astype(np.float32)):
-        np.multiply(x, rx, out=rotated[axis])
-        rotated[axis] += np.multiply(y, ry, out=term)
-        rotated[axis] += np.multiply(z, rz, out=term)
+    rotated: Float32 = rotation.astype(np.float32) @ directions
     return rotated
 
 
