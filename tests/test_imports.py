@@ -32,7 +32,8 @@ def test_importing_torchcover_imports_nothing_heavy():
 
 
 def test_searching_imports_neither_the_metric_nor_the_tree_before_they_are_needed():
-    code = "import sys, torch, torchcover; torchcover.nearest(*torch.zeros(2, 1, 3), backend='cdist'); print(*sys.modules)"
+    search = "torchcover.nearest(*torch.zeros(2, 1, 3), backend='cdist')"
+    code = f"import sys, torch, torchcover; {search}; print(*sys.modules)"
     assert not set(python(code).split()) & {"torchmetrics", "pykdtree", "matplotlib", "embreex", "trimesh"}
 
 

@@ -82,7 +82,21 @@ def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
     )
 
 
-def test_ctrl_c_between_two_rigs_leaves_a_paired_result(torchcover, worlds, monkeypatch):
+@pytest.fixture
+def handler():
+    """Set what Ctrl-C does."""
+    before = signal.getsignal(signal.SIGINT)
+    yield lambda action: signal.signal(signal.SIGINT, action)
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize(
+    ("action", "expected", "steps"), [(signal.default_int_handler, 130, 2), (signal.SIG_IGN, 0, 3)]
+)
+def test_ctrl_c_between_two_rigs_leaves_a_paired_result(
+    torchcover, worlds, monkeypatch, handler, action, expected, steps
+):
+    handler(action)
     update, calls = CoverageMetric.update, []
 
     def interrupted(self, *clouds):
@@ -92,12 +106,12 @@ def test_ctrl_c_between_two_rigs_leaves_a_paired_result(torchcover, worlds, monk
         update(self, *clouds)
 
     monkeypatch.setattr(CoverageMetric, "update", interrupted)
-    code, _, _, out = compare(torchcover, worlds, "low", "both", steps=4)
-    assert code == 130
+    code, _, _, out = compare(torchcover, worlds, "low", "both", steps=3)
+    assert code == expected
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["complete"] is False
-    assert [counts["steps"] for counts in summary["counts"].values()] == [2, 2]
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    assert summary["complete"] is (expected == 0)
+    assert [counts["steps"] for counts in summary["counts"].values()] == [steps, steps]
+    assert signal.getsignal(signal.SIGINT) is action
 
 
 @pytest.mark.parametrize(
