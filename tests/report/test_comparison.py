@@ -29,6 +29,7 @@ from torchcover.report import (
 )
 
 GRID = BevGrid(x=(-8.0, 12.0), y=(-5.0, 5.0), cell=1.0)
+AROUND = BevGrid(x=(-10.0, 10.0), y=(-10.0, 10.0), cell=0.25)
 SQUARE = BevGrid(x=(0.0, 10.0), y=(-5.0, 5.0), cell=1.0)
 REGIONS = (Region("near", (0.0, 5.0), (-5.0, 5.0)), Region("behind", (-8.0, -6.0), (-5.0, 5.0)))
 EGO = np.array([[1.0, 0.5], [-1.0, 0.5], [-1.0, -0.5], [1.0, -0.5]])
@@ -277,17 +278,18 @@ def test_the_same_value_has_the_same_colour_in_every_panel():
 
 def test_long_maps_lie_below_each_other_and_square_ones_beside_each_other():
     long = BevGrid(x=(0.0, 50.0), y=(-10.0, 10.0), cell=1.0)
-    for grid, across in ((long, 1), (SQUARE, 2)):
-        a, b = (
-            axes.get_position() for axes in side_by_side(grid, {n: torch.zeros(grid.shape[1:]) for n in "ab"}).axes[:2]
-        )
-        assert (a.x0 == pytest.approx(b.x0)) == (across == 1)
-        assert (a.y0 == pytest.approx(b.y0)) == (across == 2)
-        assert a.width == pytest.approx(b.width)
+    for grid, stacked in ((long, True), (SQUARE, False)):
+        for names in ("ab", "abc"):
+            figure = side_by_side(grid, {name: torch.zeros(grid.shape[1:]) for name in names})
+            a, *others = (axes.get_position() for axes in figure.axes[:-1])
+            for other in others:
+                assert bool(a.x0 == pytest.approx(other.x0)) is stacked
+                assert bool(a.y0 == pytest.approx(other.y0)) is not stacked
+                assert a.width == pytest.approx(other.width)
 
 
 @pytest.mark.parametrize("count", [2, 3, 5])
-@pytest.mark.parametrize("grid", [GRID, SQUARE, BevGrid(x=(0.0, 200.0), y=(-40.0, 40.0), cell=0.5)])
+@pytest.mark.parametrize("grid", [GRID, AROUND, BevGrid(x=(0.0, 200.0), y=(-40.0, 40.0), cell=0.5)])
 def test_every_panel_has_whole_pixels_for_each_cell_and_overlaps_no_other(count, grid):
     generator = torch.Generator().manual_seed(0)
     values = torch.rand(grid.shape[1:], generator=generator)

@@ -15,9 +15,9 @@ from matplotlib.transforms import Bbox, ScaledTranslation
 from torchcover.coverage import BevGrid
 
 LARGEST_MAP_IN = (9.0, 6.0)
-LARGEST_PAPER_IN = (12.0, 9.0)
-# Between maps on one paper; below, there is room for a heading.
-BESIDE_IN = 0.3
+LARGEST_PAPER_IN = (14.0, 8.75)
+# Between maps on one paper, with room for the outer labels of two axes; below, for a heading.
+BESIDE_IN = 0.6
 BELOW_IN = 0.4
 DOTS_PER_INCH = 150
 # Beyond this, cells are smaller than pixels and are averaged.
@@ -75,7 +75,8 @@ def lay_out(grid: BevGrid, maps: int = 1) -> list[Sheet]:
         axes = figure.add_axes((*(place_in / paper_in), *(map_in / paper_in)), xlim=grid.x, ylim=grid.y)
         _label(axes, left=at % across == 0, lowest=at + across >= maps)
     bar_in = np.array([COLOUR_BAR_IN, max(paper_in[1], SHORTEST_COLOUR_BAR_IN)])
-    bar_place_in = (paper_in[0] + GAP_IN, paper_in[1] - bar_in[1])
+    gap_in = GAP_IN if maps == 1 else BESIDE_IN  # the axis of a map above the last row has labels beside the bar
+    bar_place_in = (paper_in[0] + gap_in, paper_in[1] - bar_in[1])
     bar = figure.add_axes((*(bar_place_in / paper_in), *(bar_in / paper_in)))
     legend_columns = max(1, int(paper_in[0] / LEGEND_COLUMN_IN))
     return [Sheet(figure, axes, bar, legend_columns, grid.cell / inches_per_cell) for axes in figure.axes[:-1]]
