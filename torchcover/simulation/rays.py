@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 # Rows and columns in a tile. A constant, so that the order of points depends on the sensor alone.
 TILE_ROWS = 128
-TILE_COLUMNS = 128
+TILE_COLUMNS = 256
 
 
 @dataclass(frozen=True, eq=False)
