@@ -9,21 +9,6 @@ import numpy as np
 import pytest
 
 from torchcover import Coverage
-from torchcover.cli import app
-
-
-@pytest.fixture
-def torchcover(monkeypatch, capsys):
-    """Run the command in this process; returns exit code, stdout, stderr."""
-
-    def run(*arguments):
-        monkeypatch.setattr(sys, "argv", ["torchcover", *map(str, arguments)])
-        with pytest.raises(SystemExit) as stop:
-            app.main()
-        captured = capsys.readouterr()
-        return stop.value.code, captured.out, captured.err
-
-    return run
 
 
 @pytest.fixture
@@ -159,6 +144,15 @@ def test_an_output_folder_that_cannot_be_made_is_a_mistake_too(torchcover, recor
     code, _, error = torchcover("evaluate", "--frames", recording, "--out", tmp_path / "file")
     assert code == 2
     assert "file" in error
+
+
+def test_an_impossible_output_folder_is_found_before_the_run(torchcover, recording, tmp_path, monkeypatch):
+    monkeypatch.setattr("torchcover.cli.evaluate.accumulate", lambda *_, **__: pytest.fail("it ran all the same"))
+    (tmp_path / "file").write_text("")
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        code, _, error = torchcover("evaluate", "--frames", recording, "--out", out)
+        assert code == 2
+        assert f"--out {out}: " in error
 
 
 def test_list_names_everything_built_in(torchcover):

@@ -202,9 +202,10 @@ def test_nothing_is_clipped_and_the_legend_hides_no_data():
 
 def test_dollars_are_no_formula():
     broken = r"$\frac{$"
-    draw(flat(), title=broken)
-    draw(flat(), subtitle=broken)
-    draw(flat(), sensors=[SensorMark(broken, 0.0, 0.0, 0.0, 90.0, 10.0)])
+    headings = draw(flat(), title=broken, subtitle=f"{broken} too").axes.texts
+    assert [text.get_text() for text in headings] == [broken, f"{broken} too"]
+    legend = draw(flat(), sensors=[SensorMark(broken, 0.0, 0.0, 0.0, 90.0, 10.0)]).axes.get_legend()
+    assert broken in [text.get_text() for text in legend.get_texts()]
 
 
 def test_values_are_left_as_they_were():
@@ -219,7 +220,9 @@ def test_values_are_left_as_they_were():
 def test_a_map_of_one_cell_or_one_value_can_be_drawn(value):
     grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0)
     values = flat(value, grid)
-    draw(values, grid, scale=radius_scale("radius", values))
+    picture = draw(values, grid, scale=radius_scale("radius", values))
+    unknown = picture.axes.get_legend().get_texts()[0].get_text()
+    assert unknown == f"unknown: never probed ({100 if math.isnan(value) else 0} % of the cells)"
 
 
 def test_the_radius_scale_ends_at_the_98th_percentile_of_the_known_cells():

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from torchcover import __version__
-from torchcover.cli.run import Progression, accumulate, device_called, new_metric, outline_m, sensor_marks
+from torchcover.cli.run import Progression, accumulate, check_out, device_called, new_metric, outline_m, sensor_marks
 from torchcover.coverage import Coverage, forward_regions
 from torchcover.data import SimulatedFrames
 from torchcover.report import comparison_dict, comparison_tables, draw_comparison, narrowest_width, write_comparison
@@ -42,6 +42,7 @@ def run(request: Request) -> None:
     """
     if len(request.rigs) < 2:
         raise ValueError(f"compare needs at least two rigs; got {request.rigs[0]!r} only (for one: `evaluate`)")
+    check_out(request.out)
     device = device_called(request.device)
     rigs = {name: Rig.load(rig) for name, rig in zip(distinct_names(request.rigs), request.rigs, strict=True)}
     metrics = [new_metric(request.cell, request.thresholds, device) for _ in rigs]

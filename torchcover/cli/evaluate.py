@@ -16,6 +16,7 @@ from torchcover.cli.run import (
     DEFAULT_STEPS,
     Progression,
     accumulate,
+    check_out,
     device_called,
     new_metric,
     outline_m,
@@ -52,6 +53,7 @@ def run(request: Request) -> None:
         FileNotFoundError: A name or a file is unknown.
         KeyboardInterrupt: The user stopped the run.
     """
+    check_out(request.out)
     device = device_called(request.device)
     metric = new_metric(request.cell, request.thresholds, device)
     frames = _frames(request)

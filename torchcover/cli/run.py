@@ -1,11 +1,13 @@
 """The run that `evaluate` and `compare` share: frames in, one metric for each rig fed from the same frames."""
 
+import os
 import signal
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -63,6 +65,19 @@ def device_called(name: str) -> torch.device:
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"--device {name}: cannot be used here ({str(error).splitlines()[0]}); try cpu") from error
     return device
+
+
+def check_out(folder: Path) -> None:
+    """Find out before the run, not after it, whether its results can be written.
+
+    Raises:
+        ValueError: The folder, or the first of its parents that exists, is a file or may not be written to.
+    """
+    nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not nearest.is_dir():
+        raise ValueError(f"--out {folder}: {nearest} is a file, not a folder")
+    if not os.access(nearest, os.W_OK):
+        raise ValueError(f"--out {folder}: {nearest} may not be written to; choose another folder")
 
 
 def new_metric(cell: float, thresholds: tuple[float, ...], device: torch.device) -> CoverageMetric:
