@@ -258,7 +258,7 @@ def test_a_state_about_something_else_is_not_loaded_or_merged(other):
 
 def test_a_state_of_another_shape_is_not_loaded():
     metric = CoverageMetric(GRID, (0.4,))
-    with pytest.raises(ValueError, match=r"'detection_sum' has shape \(2, 32\); this metric's .* need \(1, 32\)"):
+    with pytest.raises(ValueError, match=r"'detection_sum' has shape \(1, 2, 32\); this metric's .* need \(1, 1, 32\)"):
         metric.load_state_dict(CoverageMetric(GRID, (0.4, 0.8)).state_dict())
 
 

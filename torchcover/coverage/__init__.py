@@ -3,6 +3,6 @@
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.metric import CoverageMetric
 from torchcover.coverage.regions import Region, forward_regions
-from torchcover.coverage.result import Coverage, RegionSummary
+from torchcover.coverage.result import Coverage, RegionNumbers, RegionSummary
 
-__all__ = ["BevGrid", "Coverage", "CoverageMetric", "Region", "RegionSummary", "forward_regions"]
+__all__ = ["BevGrid", "Coverage", "CoverageMetric", "Region", "RegionNumbers", "RegionSummary", "forward_regions"]

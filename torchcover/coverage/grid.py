@@ -108,12 +108,12 @@ class BevGrid:
     @property
     def x_centres_m(self) -> Tensor:
         """(X,) float64 cell centres along x."""
-        return _centres(self.x_edges_m)
+        return _centres(self.x, self.cell)
 
     @property
     def y_centres_m(self) -> Tensor:
         """(Y,) float64 cell centres along y."""
-        return _centres(self.y_edges_m)
+        return _centres(self.y, self.cell)
 
     def cell_of(self, points: Tensor) -> Tensor:
         """Number of the cell of each point.
@@ -197,13 +197,17 @@ def _count(bounds: tuple[float, float], cell: float) -> int:
 
 
 def _edges(bounds: tuple[float, float], cell: float) -> Tensor:
-    # (lo (n - i) + hi i) / n rounds once where lo and hi are whole numbers: the border at 0.3 is 0.3, not 3 * 0.1.
     count = _count(bounds, cell)
-    step = torch.arange(count + 1, dtype=torch.float64)
-    edges = (bounds[0] * (count - step) + bounds[1] * step) / count
+    edges = _between(bounds, torch.arange(count + 1, dtype=torch.float64), count)
     edges[0], edges[-1] = bounds
     return edges
 
 
-def _centres(edges: Tensor) -> Tensor:
-    return (edges[:-1] + edges[1:]) / 2
+def _centres(bounds: tuple[float, float], cell: float) -> Tensor:
+    count = _count(bounds, cell)
+    return _between(bounds, 2 * torch.arange(count, dtype=torch.float64) + 1, 2 * count)
+
+
+def _between(bounds: tuple[float, float], step: Tensor, steps: int) -> Tensor:
+    # (lo (n - i) + hi i) / n rounds once where lo and hi are whole numbers: the border at 0.3 is 0.3, not 3 * 0.1.
+    return (bounds[0] * (steps - step) + bounds[1] * step) / steps

@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -11,6 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcover.coverage.blocks import Blocks
+from torchcover.coverage.errors import cell_errors
+from torchcover.coverage.estimate import Estimator, RegionEstimate, estimate_region, unseen_cells
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.regions import Region, forward_regions
 
@@ -18,24 +22,42 @@ FORMAT_VERSION = 1
 
 
 @dataclass(frozen=True)
-class RegionSummary:
-    """The numbers of one region in one height band.
+class RegionNumbers:
+    """Means over the cells of one region in one height band, every cell weighing the same.
+
+    Args:
+        radius_m: Mean blind spot radius in metres; NaN if no cell is known.
+        detection: Threshold in metres -> mean detection probability.
+        radius_error_m: Standard error of `radius_m`; NaN if it was not asked for, or if there are not enough steps.
+        detection_error: Threshold -> standard error of `detection`.
+    """
+
+    radius_m: float
+    detection: Mapping[float, float]
+    radius_error_m: float
+    detection_error: Mapping[float, float]
+
+
+@dataclass(frozen=True)
+class RegionSummary(RegionNumbers):
+    """The numbers of one region in one height band, over its known cells.
 
     Args:
         region: Name of the region.
         height: Name of the height band.
         cells: Number of cells in the region.
         known_cells: How many of them a reference point has probed.
-        radius_m: Unweighted mean blind spot radius over the known cells in metres; NaN if none is known.
-        detection: Threshold in metres -> unweighted mean detection probability over the known cells.
+        unseen_cells: About how many more would become known with more steps.
+        completed: The numbers with these cells, as far as can be told; less biased as long as there are many. See
+            `torchcover.coverage.estimate.completed_mean`.
     """
 
     region: str
     height: str
     cells: int
     known_cells: int
-    radius_m: float
-    detection: Mapping[float, float]
+    unseen_cells: float
+    completed: RegionNumbers
 
     @property
     def known_share(self) -> float:
@@ -60,6 +82,10 @@ class Coverage:
         pooled: (H, Y, X) pooled mean radius in metres, if asked for.
         quantile_levels: Levels of `quantiles`.
         quantiles: (Q, H, Y, X) quantiles of the radius in metres, if asked for.
+        blocks: The sums in blocks of contiguous steps, if errors were asked for.
+        radius_error: (H, Y, X) standard error of `radius`, if errors were asked for; made from `blocks` if not given.
+            NaN in cells that too few blocks probed.
+        detection_error: (T, H, Y, X) standard error of `detection`, likewise.
         counts: What happened on the way, one number for each name in `COUNTS`.
     """
 
@@ -70,7 +96,17 @@ class Coverage:
         "saturated_points",
         "outside_points",
     )
-    _ARRAYS: ClassVar[tuple[str, ...]] = ("frames", "points", "radius", "detection", "maximum", "pooled", "quantiles")
+    _ARRAYS: ClassVar[tuple[str, ...]] = (
+        "frames",
+        "points",
+        "radius",
+        "detection",
+        "radius_error",
+        "detection_error",
+        "maximum",
+        "pooled",
+        "quantiles",
+    )
 
     def __init__(
         self,
@@ -83,6 +119,9 @@ class Coverage:
         radius: Tensor,
         detection: Tensor,
         counts: Mapping[str, int],
+        blocks: Blocks | None = None,
+        radius_error: Tensor | None = None,
+        detection_error: Tensor | None = None,
         maximum: Tensor | None = None,
         pooled: Tensor | None = None,
         quantile_levels: Sequence[float] = (),
@@ -96,14 +135,30 @@ class Coverage:
         self.radius = radius
         self.detection = detection
         self.counts = dict(counts)
+        self.blocks = blocks
         self.maximum = maximum
         self.pooled = pooled
         self.quantile_levels = tuple(quantile_levels)
         self.quantiles = quantiles
+        self._given_errors = (radius_error, detection_error)
+        self._estimates: dict[tuple[Region, str, Estimator], RegionEstimate] = {}
 
     def __repr__(self) -> str:
         known = float((self.frames > 0).double().mean())
         return f"Coverage({self.grid.shape} cells, {self.counts['steps']} steps, {known:.1%} of the cells known)"
+
+    @cached_property
+    def radius_error(self) -> Tensor | None:
+        """(H, Y, X) standard error of `radius` in metres; NaN where too few blocks probed, None without blocks."""
+        return self._given_errors[0] if self.blocks is None else cell_errors(self.blocks.radius_sum, self.blocks)
+
+    @cached_property
+    def detection_error(self) -> Tensor | None:
+        """(T, H, Y, X) standard error of `detection`, likewise."""
+        if self.blocks is None:
+            return self._given_errors[1]
+        each = [cell_errors(sums, self.blocks) for sums in self.blocks.detection_sum.unbind(dim=1)]
+        return torch.stack(each) if each else torch.zeros_like(self.detection)
 
     def summary(self, regions: Sequence[Region] | None = None) -> list[RegionSummary]:
         """One row for each region and height band.
@@ -117,13 +172,35 @@ class Coverage:
         Raises:
             ValueError: A region reaches beyond the grid, or holds no cell centre.
         """
-        rows = []
-        for region in self._regions(regions):
-            mask = region.mask(self.grid).to(self.radius.device)
-            if not mask.any():
-                raise ValueError(f"region {region.name!r} holds no cell centre; the cell is {self.grid.cell:g} m")
-            rows += [self._summarise(region, height, band, mask) for band, height in enumerate(self.grid.heights)]
-        return rows
+        return [self._summarise(region, height) for region in self._regions(regions) for height in self.grid.heights]
+
+    def estimate(self, region: Region, height: str, estimator: Estimator = "known") -> RegionEstimate:
+        """The numbers of one region in one band with what they become without each block, for errors of differences.
+
+        Args:
+            region: A region within the grid.
+            height: Name of the band.
+            estimator: "known", the paper's unweighted mean over the known cells, or "completed", which adds those that
+                more steps would make known (`torchcover.coverage.estimate.completed_mean`).
+
+        Raises:
+            ValueError: A region that reaches beyond the grid, or holds no cell centre; no such band.
+        """
+        if (region, height, estimator) not in self._estimates:
+            self._estimates[region, height, estimator] = self._estimate(region, height, estimator)
+        return self._estimates[region, height, estimator]
+
+    def _estimate(self, region: Region, height: str, estimator: Estimator) -> RegionEstimate:
+        cells = region.mask(self.grid).to(self.radius.device)
+        if not cells.any():
+            raise ValueError(f"region {region.name!r} holds no cell centre; the cell is {self.grid.cell:g} m")
+        if height not in self.grid.heights:
+            raise ValueError(f"height {height!r}: the grid has {', '.join(self.grid.heights)}")
+        band = list(self.grid.heights).index(height)
+        frames = self.frames[band][cells]
+        means = torch.cat([self.radius[None, band], self.detection[:, band]])[:, cells]
+        sums = (means * frames).where(frames > 0, 0.0)
+        return estimate_region(frames, sums, self.blocks, band, cells, estimator)
 
     def scalars(self, regions: Sequence[Region] | None = None) -> dict[str, float]:
         """The summary as a flat dict for a logger.
@@ -139,6 +216,10 @@ class Coverage:
             flat[f"radius_m/{row.region}/{row.height}"] = row.radius_m
             for threshold, probability in row.detection.items():
                 flat[f"detection_{threshold:g}m/{row.region}/{row.height}"] = probability
+            if self.blocks is not None:
+                flat[f"radius_error_m/{row.region}/{row.height}"] = row.radius_error_m
+                for threshold, error in row.detection_error.items():
+                    flat[f"detection_{threshold:g}m_error/{row.region}/{row.height}"] = error
             flat[f"known_share/{row.region}/{row.height}"] = row.known_share
         return flat
 
@@ -194,19 +275,27 @@ class Coverage:
         fitting = [r for r in forward_regions() if self.grid.x[0] <= 0 and r.x[1] <= front and right <= r.y[0]]
         return [region for region in fitting if region.y[1] <= left]
 
-    def _summarise(self, region: Region, height: str, band: int, mask: Tensor) -> RegionSummary:
-        known = mask & (self.frames[band] > 0)
+    def _summarise(self, region: Region, height: str) -> RegionSummary:
+        known, completed = self.estimate(region, height), self.estimate(region, height, "completed")
+        frames = self.frames[list(self.grid.heights).index(height)].cpu()[region.mask(self.grid)]
         return RegionSummary(
             region=region.name,
             height=height,
-            cells=int(mask.sum()),
-            known_cells=int(known.sum()),
-            # The mean of no cell is NaN: unknown.
-            radius_m=float(self.radius[band][known].mean()),
-            detection={
-                threshold: float(self.detection[at, band][known].mean()) for at, threshold in enumerate(self.thresholds)
-            },
+            cells=len(frames),
+            known_cells=int((frames > 0).sum()),
+            unseen_cells=unseen_cells(frames),
+            **self._numbers(known),
+            completed=RegionNumbers(**self._numbers(completed)),
         )
+
+    def _numbers(self, estimate: RegionEstimate) -> dict[str, Any]:
+        (radius_m, *detection), (radius_error_m, *detection_error) = estimate.value.tolist(), estimate.error.tolist()
+        return {
+            "radius_m": radius_m,
+            "detection": dict(zip(self.thresholds, detection, strict=True)),
+            "radius_error_m": radius_error_m,
+            "detection_error": dict(zip(self.thresholds, detection_error, strict=True)),
+        }
 
 
 def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float]) -> Tensor:

@@ -1,0 +1,458 @@
+"""Blocks of steps and the errors made from them, against plain loops; weights of reference points."""
+
+import copy
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover import BevGrid, CoverageMetric, Region
+from torchcover.coverage import Coverage
+from torchcover.coverage.blocks import Blocks
+from torchcover.coverage.errors import jackknife_error
+
+# Cells so large that the sensor point below a reference point is always the nearest.
+SHAPE = {"x": (0.0, 400.0), "y": (0.0, 100.0), "cell": 100.0, "heights": {"all": (-1.0, 1.0)}}
+GRID = BevGrid(**SHAPE)
+CELLS = GRID.cells
+THRESHOLD = 0.5
+EVERYWHERE = Region("everywhere", GRID.x, GRID.y)
+
+
+def clouds_of(radii: dict[int, list[float]]) -> tuple[torch.Tensor, torch.Tensor]:
+    """Sensor and reference with these radii in these cells: a sensor point straight below each reference point."""
+    places = [(100 * cell + 10 + 20 * at, 50.0, radius) for cell, own in radii.items() for at, radius in enumerate(own)]
+    x, y, radius = torch.tensor(places, dtype=torch.float32).view(-1, 3).T
+    return torch.stack([x, y, -radius], dim=1), torch.stack([x, y, 0 * radius], dim=1)
+
+
+def random_steps(count: int, seed: int = 0, *, dyadic: bool = False, weighted: bool = False) -> list[dict]:
+    """Steps with one to three points in some cells: their radii, the same as clouds, and what else `update` takes."""
+    random = np.random.default_rng(seed)
+    steps = []
+    for index in range(count):
+        cells = np.flatnonzero(random.random(CELLS) < 0.6)
+        if dyadic:  # two points: means and sums of these are exact
+            radii = {int(cell): (random.integers(0, 64, 2) / 64).tolist() for cell in cells}
+        else:
+            radii = {int(cell): random.random(random.integers(1, 4)).tolist() for cell in cells}
+        weights = {cell: (random.random(len(own)) + 0.1).tolist() for cell, own in radii.items()}
+        more = {"index": index}
+        if weighted:
+            more["weights"] = torch.tensor([weight for own in weights.values() for weight in own], dtype=torch.float64)
+        steps.append({"radii": radii, "weights": weights, "clouds": clouds_of(radii), "more": more})
+    return steps
+
+
+def metric_over(steps, *, blocks=16, **options) -> CoverageMetric:
+    metric = CoverageMetric(GRID, (THRESHOLD,), blocks=blocks, **options)
+    for step in steps:
+        metric.update(*step["clouds"], **step["more"])
+    return metric
+
+
+def slow_blocks(steps, blocks: int, *, weighted: bool = False) -> dict[str, np.ndarray]:
+    """The sums in blocks in plain loops."""
+    last = max(step["more"]["index"] for step in steps)
+    length = 1
+    while last // length >= blocks:
+        length *= 2
+    sums = {name: np.zeros((blocks, CELLS)) for name in ("frames", "radius", "detection")}
+    sums["steps"] = np.zeros(blocks)
+    for step in steps:
+        block = step["more"]["index"] // length
+        sums["steps"][block] += 1
+        for cell, own in step["radii"].items():
+            weights = step["weights"][cell] if weighted else [1.0] * len(own)
+            radii = np.float32(own).astype(float)
+            sums["frames"][block, cell] += 1
+            sums["radius"][block, cell] += np.average(radii, weights=weights)
+            sums["detection"][block, cell] += np.average(radii <= THRESHOLD, weights=weights)
+    return sums
+
+
+def slow_jackknife(left_out: list[float], whole: float, sizes: list[float]) -> float:
+    """The delete-m_j jackknife as Busing, Meijer and van der Leeden write it."""
+    g, n = len(sizes), sum(sizes)
+    estimate = g * whole - sum((1 - m / n) * part for m, part in zip(sizes, left_out, strict=True))
+    variance = 0.0
+    for m, part in zip(sizes, left_out, strict=True):
+        h = n / m
+        variance += (h * whole - (h - 1) * part - estimate) ** 2 / (h - 1) / g
+    return math.sqrt(variance)
+
+
+def slow_region_error(sums: dict[str, np.ndarray], name: str) -> float:
+    def mean(kept) -> float:
+        frames, total = sums["frames"][kept].sum(axis=0), sums[name][kept].sum(axis=0)
+        return float(np.mean([total[cell] / frames[cell] for cell in range(CELLS) if frames[cell]]))
+
+    used = [block for block in range(len(sums["steps"])) if sums["steps"][block]]
+    left_out = [mean([other for other in used if other != block]) for block in used]
+    return slow_jackknife(left_out, mean(used), [sums["steps"][block] for block in used])
+
+
+def assert_same_state(one: CoverageMetric, other: CoverageMetric) -> None:
+    """Bit for bit."""
+    for name, value in one.metric_state.items():
+        assert torch.equal(value, other.metric_state[name]), name
+
+
+# The jackknife
+
+
+@pytest.mark.parametrize("count", [8, 9, 100])
+def test_the_jackknife_of_a_mean_is_the_textbook_standard_error(count):
+    values = torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(count))
+    left_out = (values.sum(dim=0) - values) / (count - 1)
+    error = jackknife_error(left_out, values.mean(dim=0), torch.ones(count))
+    torch.testing.assert_close(error, values.std(dim=0) / math.sqrt(count))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_unequal_blocks_are_weighed_as_in_plain_loops(seed):
+    random = np.random.default_rng(seed)
+    sizes, left_out, whole = random.integers(1, 9, 11), random.random(11), random.random()
+    error = jackknife_error(*map(torch.as_tensor, (left_out, np.array(whole), sizes)))
+    assert float(error) == pytest.approx(slow_jackknife(left_out.tolist(), whole, sizes.tolist()), rel=1e-12)
+
+
+def test_blocks_that_all_say_the_same_have_no_error():
+    coverage = metric_over([{"clouds": clouds_of({0: [0.25]}), "more": {"index": at}} for at in range(40)]).compute()
+    (row,) = coverage.summary([EVERYWHERE])
+    assert row.radius_error_m == pytest.approx(0.0, abs=1e-12)
+    assert row.detection_error[THRESHOLD] == pytest.approx(0.0, abs=1e-12)
+    assert float(coverage.radius_error.flatten()[0]) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_one_step_a_block_gives_the_textbook_error_in_a_cell_and_in_its_region():
+    radii = np.random.default_rng(0).random(16).astype(np.float32)
+    steps = [{"clouds": clouds_of({2: [float(radius)]}), "more": {"index": at}} for at, radius in enumerate(radii)]
+    coverage = metric_over(steps).compute()
+    expected = radii.astype(float).std(ddof=1) / 4
+    assert coverage.summary([EVERYWHERE])[0].radius_error_m == pytest.approx(expected)
+    assert float(coverage.radius_error.flatten()[2]) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("count", [8, 16, 17, 40, 77])
+def test_sums_and_errors_are_those_of_plain_loops(count):
+    steps = random_steps(count, seed=count)
+    coverage, sums = metric_over(steps).compute(), slow_blocks(steps, 16)
+    np.testing.assert_array_equal(coverage.blocks.steps, sums["steps"])
+    np.testing.assert_array_equal(coverage.blocks.frames.flatten(1), sums["frames"])
+    np.testing.assert_allclose(coverage.blocks.radius_sum.flatten(1), sums["radius"], rtol=1e-12)
+    np.testing.assert_allclose(coverage.blocks.detection_sum.flatten(1), sums["detection"], rtol=1e-12)
+    (row,) = coverage.summary([EVERYWHERE])
+    assert row.radius_error_m == pytest.approx(slow_region_error(sums, "radius"), rel=1e-9)
+    assert row.detection_error[THRESHOLD] == pytest.approx(slow_region_error(sums, "detection"), rel=1e-9)
+
+
+def test_the_error_in_a_cell_is_that_of_a_ratio_of_sums():
+    steps = random_steps(64, seed=3)
+    coverage, sums = metric_over(steps).compute(), slow_blocks(steps, 16)
+    for name, found in (("radius", coverage.radius_error), ("detection", coverage.detection_error)):
+        for cell in range(CELLS):
+            n, s = sums["frames"][:, cell], sums[name][:, cell]
+            residual = [s[j] - s.sum() / n.sum() * n[j] for j in range(16) if n[j]]
+            k = len(residual)
+            expected = math.sqrt(k / (k - 1) * sum(r * r for r in residual)) / n.sum()
+            assert float(found.flatten()[cell]) == pytest.approx(expected, rel=1e-9)
+
+
+def test_no_error_is_told_from_fewer_than_8_blocks_nor_in_a_cell_that_fewer_than_4_probed():
+    steps = [{"clouds": clouds_of({0: [at / 32], **({1: [0.1]} if at < 3 else {})}), "more": {"index": at}}
+             for at in range(8)]  # fmt: skip
+    (few,), (enough,) = (metric_over(steps[:count]).compute().summary([EVERYWHERE]) for count in (7, 8))
+    assert math.isnan(few.radius_error_m)
+    assert math.isnan(few.detection_error[THRESHOLD])
+    assert enough.radius_error_m > 0
+    coverage = metric_over(steps).compute()
+    assert coverage.radius_error.isnan().flatten().tolist() == [False, True, True, True]
+    assert coverage.detection_error.isnan().flatten().tolist() == [False, True, True, True]
+
+
+def test_without_blocks_there_are_no_errors():
+    coverage = metric_over(random_steps(20), blocks=1).compute()
+    assert (coverage.blocks, coverage.radius_error, coverage.detection_error) == (None, None, None)
+    assert math.isnan(coverage.summary([EVERYWHERE])[0].radius_error_m)
+
+
+def test_the_error_of_a_difference_is_that_of_the_paired_values():
+    """Half of what both rigs share is noise a hundred times the difference: it cancels out."""
+    random = np.random.default_rng(0)
+    shared, own = 2 * random.random(16), 0.02 * random.random(16)
+    estimates = []
+    for radii in (shared, shared + own):
+        steps = [{"clouds": clouds_of({0: [r]}), "more": {"index": at}} for at, r in enumerate(radii.tolist())]
+        estimates.append(metric_over(steps).compute().estimate(EVERYWHERE, "all"))
+    difference = estimates[1].minus(estimates[0])
+    assert float(difference.value[0]) == pytest.approx(own.mean(), rel=1e-4)
+    assert float(difference.error[0]) == pytest.approx(own.std(ddof=1) / 4, rel=1e-3)
+    assert float(difference.error[0]) < 0.05 * float(estimates[0].error[0])
+
+
+@pytest.mark.parametrize("blocks", [0, 2, 6, 9, -8])
+def test_a_number_of_blocks_that_gives_no_error_to_believe_is_refused(blocks):
+    with pytest.raises(ValueError, match=f"blocks: 1, or an even number from 8 on, is needed; got {blocks}"):
+        CoverageMetric(GRID, blocks=blocks)
+
+
+# Which block a step is in
+
+
+def test_the_order_of_the_steps_does_not_matter():
+    steps = random_steps(50, dyadic=True)
+    shuffled = [steps[at] for at in np.random.default_rng(1).permutation(50)]
+    assert_same_state(metric_over(shuffled), metric_over(steps))
+    assert_same_state(metric_over(steps[::-1]), metric_over(steps))
+
+
+@pytest.mark.parametrize("parts", [2, 3, 7])
+def test_interleaved_parts_merge_into_the_whole(parts):
+    """Parts that end early have shorter blocks; merging brings them to one length, whichever comes first."""
+    steps = random_steps(50, dyadic=True)
+    shares = [steps[at::parts] for at in range(parts)]
+    shares[0] = shares[0][:3]
+    whole = metric_over([step for share in shares for step in share])
+    for order in (shares, shares[::-1]):
+        merged = metric_over(order[0])
+        for share in order[1:]:
+            other = metric_over(share)
+            before = copy.deepcopy(other.metric_state)
+            merged.merge_state(other)
+            assert all(torch.equal(value, before[name]) for name, value in other.metric_state.items())
+        assert_same_state(merged, whole)
+
+
+def test_a_run_goes_on_from_its_state_dict_as_if_it_had_never_stopped():
+    steps = random_steps(70, dyadic=True)
+    resumed = CoverageMetric(GRID, (THRESHOLD,), blocks=16)
+    resumed.load_state_dict(metric_over(steps[:23]).state_dict())
+    for step in steps[23:]:
+        resumed.update(*step["clouds"], **step["more"])
+    assert_same_state(resumed, metric_over(steps))
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_forward_fills_the_same_blocks_as_update(indexed):
+    steps = random_steps(40, dyadic=True)
+    metric = CoverageMetric(GRID, (THRESHOLD,), blocks=16)
+    for step in steps:
+        metric(*step["clouds"], **(step["more"] if indexed else {}))
+    assert_same_state(metric, metric_over(steps))
+
+
+@pytest.mark.parametrize("forward", [True, False])
+def test_steps_without_a_number_are_counted_on(forward):
+    steps = random_steps(40, dyadic=True)
+    metric = CoverageMetric(GRID, (THRESHOLD,), blocks=16)
+    for start in range(0, 40, 8):
+        batch = [step["clouds"] for step in steps[start : start + 8]]
+        (metric if forward else metric.update)([sensor for sensor, _ in batch], [cloud for _, cloud in batch])
+    assert_same_state(metric, metric_over(steps))
+
+
+@pytest.mark.parametrize("count", [17, 33, 100])
+def test_doubling_the_blocks_keeps_every_sum(count):
+    steps = random_steps(count, dyadic=True)
+    blocked, plain = metric_over(steps), metric_over(steps, blocks=1)
+    for name in ("frames", "radius_sum", "detection_sum", "block_steps"):
+        assert torch.equal(blocked.metric_state[name].sum(dim=0), plain.metric_state[name][0]), name
+    assert torch.equal(blocked.points, plain.points)
+    assert int(blocked.block_length) == 2 ** math.ceil(math.log2(count / 16))
+    used = blocked.block_steps[blocked.block_steps > 0]
+    assert 8 <= len(used) <= 16
+    assert (used[:-1] == blocked.block_length).all()
+
+
+@pytest.mark.parametrize("options", [{}, {"maximum": True, "pooled": True, "quantiles": (0.5,)}])
+def test_blocks_change_no_number(options):
+    steps = random_steps(40, weighted=True)
+    blocked, plain = (metric_over(steps, blocks=blocks, **options).compute() for blocks in (16, 1))
+    for name in ("frames", "points", "radius", "detection", *(("maximum", "pooled", "quantiles") if options else ())):
+        torch.testing.assert_close(getattr(blocked, name), getattr(plain, name), rtol=1e-12, atol=0, equal_nan=True)
+
+
+def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
+    steps = random_steps(3, dyadic=True)
+    steps[2]["more"]["index"] = 1_000_000
+    coverage = metric_over(steps).compute()
+    assert coverage.blocks.steps.tolist() == [2] + [0] * 14 + [1]
+    assert math.isnan(coverage.summary([EVERYWHERE])[0].radius_error_m)
+
+
+@pytest.mark.parametrize(
+    ("index", "message"), [(-1, "a number >= 0 is needed; got -1"), ([0, 1], "2 indices for 1 reference clouds")]
+)
+def test_numbers_of_steps_that_make_no_sense_are_refused(index, message):
+    with pytest.raises(ValueError, match=message):
+        CoverageMetric(GRID, blocks=16).update(*clouds_of({0: [0.5]}), index=index)
+
+
+def test_two_ranks_with_different_numbers_of_steps_equal_one_process(tmp_path):
+    steps = random_steps(75, dyadic=True)
+    shares = [steps[:20:2], [step for at, step in enumerate(steps) if at >= 20 or at % 2]]
+    job = {"grid": SHAPE, "options": {"thresholds": (THRESHOLD,), "blocks": 16}}
+    job["shares"] = [[(step["clouds"], step["more"]) for step in share] for share in shares]
+    torch.save(job, tmp_path / "job.pt")
+    environment = {**os.environ, "GLOO_SOCKET_IFNAME": "lo0" if sys.platform == "darwin" else "lo"}
+    environment.update(OMP_NUM_THREADS="1", PYTHONPATH=os.pathsep.join(p for p in sys.path if p))
+    script = str(Path(__file__).with_name("one_rank_in_blocks.py"))
+    ranks = [
+        subprocess.Popen(
+            [sys.executable, script, str(rank), str(tmp_path)], env=environment, stderr=subprocess.PIPE, text=True
+        )
+        for rank in range(2)
+    ]
+    try:
+        errors = [process.communicate(timeout=280)[1] for process in ranks]
+    finally:
+        for process in ranks:
+            process.kill()
+    assert [process.returncode for process in ranks] == [0, 0], errors
+    expected = metric_over(steps).compute().blocks
+    found = [torch.load(tmp_path / f"{rank}.pt") for rank in range(2)]
+    assert [blocks["own_length"] for blocks in found] == [2, 8]
+    for blocks in found:
+        for name, value in vars(expected).items():
+            assert torch.equal(blocks[name], value), name
+
+
+# Weights
+
+
+def test_weighted_means_are_those_of_plain_loops():
+    steps = random_steps(30, seed=5, weighted=True)
+    coverage, sums = metric_over(steps, pooled=True).compute(), slow_blocks(steps, 16, weighted=True)
+    frames = sums["frames"].sum(axis=0)
+    np.testing.assert_allclose(coverage.radius.flatten(), sums["radius"].sum(axis=0) / frames, rtol=1e-12)
+    np.testing.assert_allclose(coverage.detection.flatten(), sums["detection"].sum(axis=0) / frames, rtol=1e-12)
+    for cell in range(CELLS):
+        radii = np.float32([r for step in steps for r in step["radii"].get(cell, [])])
+        weights = [w for step in steps for w in step["weights"].get(cell, [])]
+        pooled = np.average(radii.astype(float), weights=weights)
+        assert float(coverage.pooled.flatten()[cell]) == pytest.approx(pooled, rel=1e-12)
+
+
+def test_equal_weights_change_nothing_and_their_scale_in_a_step_neither():
+    steps = random_steps(20, seed=6, weighted=True)
+    options = {"maximum": True, "quantiles": (0.1, 0.5)}
+    plain = [{**step, "more": {"index": step["more"]["index"]}} for step in steps]
+    factors = [2.0 ** (at % 5) for at in range(20)]
+
+    def with_weights(of) -> Coverage:
+        changed = [{**step, "more": {**step["more"], "weights": of(at, step)}} for at, step in enumerate(steps)]
+        return metric_over(changed, **options).compute()
+
+    equal = with_weights(lambda at, step: torch.full((len(step["clouds"][1]),), 0.3 * factors[at]))
+    scaled = with_weights(lambda at, step: step["more"]["weights"] * factors[at])
+    for one, other in (
+        (equal, metric_over(plain, **options).compute()),
+        (scaled, metric_over(steps, **options).compute()),
+    ):
+        for name in ("radius", "detection", "maximum", "quantiles", "radius_error"):
+            torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-6, atol=1e-9, equal_nan=True)
+
+
+def test_weights_of_points_outside_the_grid_are_left_out_with_them():
+    sensor, reference = clouds_of({0: [0.25, 0.75]})
+    reference = torch.cat([torch.tensor([[-50.0, 50.0, 0.0]]), reference])
+    metric = CoverageMetric(GRID, (THRESHOLD,))
+    metric.update(sensor, reference, weights=torch.tensor([100.0, 3.0, 1.0]))
+    assert float(metric.compute().radius[0, 0, 0]) == 0.375
+    assert float(metric.compute().detection[0, 0, 0, 0]) == 0.75
+
+
+def test_a_quantile_counts_weights_not_points():
+    metric = CoverageMetric(GRID, quantiles=(0.2, 0.3))
+    metric.update(*clouds_of({0: [0.1, 0.9]}), weights=torch.tensor([1.0, 3.0]))
+    low, high = metric.compute().quantiles[:, 0, 0, 0].tolist()
+    assert low == pytest.approx(0.1, rel=0.13)
+    assert high == pytest.approx(0.9, rel=0.13)
+
+
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        ([1.0, 0.0], "positive, finite"),
+        ([1.0, -1.0], "positive, finite"),
+        ([1.0, math.nan], "positive, finite"),
+        ([1.0, math.inf], "positive, finite"),
+        ([1.0], r"shape \(2,\), one for each reference point"),
+        ([[1.0, 1.0]], r"shape \(2,\)"),
+    ],
+)
+def test_bad_weights_are_refused_and_nothing_is_counted(weights, message):
+    metric = CoverageMetric(GRID)
+    with pytest.raises(ValueError, match=rf"weights\[0\]: .*{message}"):
+        metric.update(*clouds_of({0: [0.5, 0.5]}), weights=torch.tensor(weights))
+    with pytest.raises(ValueError, match="2 weights and 1 indices for 1 reference clouds"):
+        metric.update(*clouds_of({0: [0.5]}), weights=[torch.ones(1), torch.ones(1)])
+    assert int(metric.steps) == 0
+
+
+def test_points_of_another_density_with_weights_ask_the_same_question():
+    """r = x from a sensor point at x = 0: the mean over [0, 1) is 1/2, the share within 0.3 m is 0.3."""
+    uniform = torch.rand(200_000, generator=torch.Generator().manual_seed(0))
+    line = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    # Density p(x) = 1/2 + x, by the inverse of its integral; the weights are 1 / p(x).
+    denser = (torch.sqrt(1 + 8 * uniform) - 1) / 2
+
+    def found(x: torch.Tensor, weights: torch.Tensor | None) -> list[float]:
+        metric = CoverageMetric(line, (0.3,))
+        metric.update(torch.zeros(1, 3), torch.stack([x, 0 * x, 0 * x], dim=1), weights=weights)
+        coverage = metric.compute()
+        return [float(coverage.radius), float(coverage.detection)]
+
+    assert found(uniform, None) == pytest.approx([0.5, 0.3], abs=0.005)
+    assert found(denser, 1 / (0.5 + denser)) == pytest.approx([0.5, 0.3], abs=0.005)
+    assert found(denser, None) == pytest.approx([7 / 12, 0.195], abs=0.005)
+
+
+# Are the errors true?
+
+
+def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
+    """A coverage of (steps, cells) radii, in 16 blocks, without the detour over clouds."""
+    radii, probed = (torch.from_numpy(values).double().view(16, -1, *GRID.shape) for values in (radii, probed))
+    values = torch.stack([radii, (radii <= THRESHOLD).double()]) * probed
+    frames, sums = probed.sum(dim=1).long(), values.sum(dim=2)
+    means = sums.sum(dim=1) / frames.sum(dim=0)
+    steps = torch.full((16,), radii.shape[1])
+    counts = dict.fromkeys(Coverage.COUNTS, 0)
+    return Coverage(
+        grid=GRID,
+        thresholds=(THRESHOLD,),
+        max_radius=math.inf,
+        frames=frames.sum(dim=0),
+        points=frames.sum(dim=0),
+        radius=means[0],
+        detection=means[1:],
+        counts=counts,
+        blocks=Blocks(steps=steps, frames=frames, radius_sum=sums[0], detection_sum=sums[1, :, None]),
+    )
+
+
+@pytest.mark.parametrize("alike", [1, 4])
+def test_the_reported_errors_are_the_spread_over_many_runs(alike):
+    """Independent steps, and steps that are alike in fours, as many as a block has."""
+    random = np.random.default_rng(0)
+    numbers, errors, cells, cell_errors = [], [], [], []
+    for _ in range(300):
+        radii = random.gamma(2.0, 0.3, (64 // alike, CELLS)) * [0.5, 1.0, 1.5, 2.0]
+        probed = random.random((64 // alike, CELLS)) < 0.8
+        coverage = coverage_of(*(np.repeat(values, alike, axis=0) for values in (radii, probed)))
+        estimate = coverage.estimate(EVERYWHERE, "all")
+        numbers.append(estimate.value)
+        errors.append(estimate.error)
+        cells.append(coverage.radius.flatten())
+        cell_errors.append(coverage.radius_error.flatten())
+    for values, reported in ((numbers, errors), (cells, cell_errors)):
+        # Each known to 4 %: the spread from 300 runs.
+        mean, spread = torch.stack(reported).mean(dim=0), torch.stack(values).std(dim=0)
+        torch.testing.assert_close(mean, spread, rtol=0.12, atol=0)

@@ -1,0 +1,52 @@
+"""Blocks of contiguous steps: what standard errors are estimated from."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+# With fewer, the error itself is off by more than a quarter: 1 / sqrt(2 (blocks - 1)).
+FEWEST_BLOCKS = 8
+# The states that have a row for each block.
+PER_BLOCK = ("frames", "radius_sum", "detection_sum", "block_steps")
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """The sums of a run in blocks of contiguous steps.
+
+    Args:
+        steps: (B,) int64 steps in each block; 0 in the blocks that are not in use.
+        frames: (B, H, Y, X) int64 steps of the block that had a reference point in the cell.
+        radius_sum: (B, H, Y, X) float64 sums over these steps of the cell's mean radius in metres.
+        detection_sum: (B, T, H, Y, X) float64 sums of the cell's share of points within each threshold.
+    """
+
+    steps: Tensor
+    frames: Tensor
+    radius_sum: Tensor
+    detection_sum: Tensor
+
+
+def check_blocks(blocks: int) -> None:
+    """Refuse a number of blocks that gives no error to believe.
+
+    Raises:
+        ValueError: Neither 1 nor an even number from 8 on.
+    """
+    if blocks != 1 and (blocks < FEWEST_BLOCKS or blocks % 2):
+        raise ValueError(f"blocks: 1, or an even number from {FEWEST_BLOCKS} on, is needed; got {blocks}")
+
+
+def pair_up(state: dict[str, Any]) -> None:
+    """Add up neighbouring blocks in place: half as many of twice the length, and room for as many again.
+
+    Args:
+        state: The states of a `CoverageMetric`, `block_length` and those of `PER_BLOCK`.
+    """
+    for name in PER_BLOCK:
+        sums = state[name]
+        half = len(sums) // 2
+        sums[:half] = sums[0::2] + sums[1::2]
+        sums[half:] = 0
+    state["block_length"] *= 2

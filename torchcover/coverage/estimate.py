@@ -1,0 +1,112 @@
+"""The numbers of one region: a mean over its known cells, or over those that it would know in the end."""
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchcover.coverage.blocks import Blocks
+from torchcover.coverage.errors import jackknife_error
+
+Estimator = Literal["known", "completed"]
+
+
+class RegionEstimate(NamedTuple):
+    """Numbers of one region in one band: the mean radius in metres, then the detection at each threshold.
+
+    Args:
+        value: (Q,) from all steps.
+        left_out: (g, Q) without one of the blocks after the other.
+        steps: (g,) steps in these blocks.
+    """
+
+    value: Tensor
+    left_out: Tensor
+    steps: Tensor
+
+    @property
+    def error(self) -> Tensor:
+        """(Q,) standard errors; NaN if there are not enough blocks."""
+        return jackknife_error(self.left_out, self.value, self.steps)
+
+    def minus(self, other: "RegionEstimate") -> "RegionEstimate":
+        """The difference to another rig over the same steps: what both share cancels out, block by block."""
+        return RegionEstimate(self.value - other.value, self.left_out - other.left_out, self.steps)
+
+
+def estimate_region(
+    frames: Tensor, sums: Tensor, blocks: Blocks | None, band: int, cells: Tensor, estimator: Estimator
+) -> RegionEstimate:
+    """Estimate the numbers of a region, and what they become without each block.
+
+    Args:
+        frames: (K,) steps that had a reference point in each cell of the region.
+        sums: (Q, K) sums over these steps of the radius and of the detection at each threshold.
+        blocks: The same in blocks, over the whole grid, if there are any.
+        band: Number of the height band.
+        cells: (Y, X) bool, the K cells of the region.
+        estimator: "known" for the unweighted mean over the known cells, "completed" for `completed_mean`.
+    """
+    mean = ESTIMATORS[estimator]
+    whole = mean(frames, sums)
+    if blocks is None:
+        return RegionEstimate(whole, whole.new_empty((0, len(whole))), whole.new_empty(0))
+    left_out = []
+    used = blocks.steps.nonzero().flatten().tolist()
+    for block in used:
+        own = torch.cat([blocks.radius_sum[block, None, band], blocks.detection_sum[block, :, band]])[:, cells]
+        left_out.append(mean(frames - blocks.frames[block, band][cells], sums - own))
+    return RegionEstimate(whole, torch.stack(left_out) if left_out else whole[None][:0], blocks.steps[used])
+
+
+def known_mean(frames: Tensor, sums: Tensor) -> Tensor:
+    """(Q,) unweighted means over the known cells; NaN if none is known.
+
+    Args:
+        frames: (K,) steps that had a reference point in each cell.
+        sums: (Q, K) sums over these steps.
+    """
+    known = frames > 0
+    return (sums[:, known] / frames[known]).mean(dim=1)
+
+
+def completed_mean(frames: Tensor, sums: Tensor) -> Tensor:
+    """Means over the known cells and those that more steps would make known, which are thought to be like the rarest.
+
+    As long as cells that can be seen are unknown, the known ones are the easy ones. How many are missing is the
+    question of how many species a sample has missed, and has its answer (Chao 1987, Biometrics 43, 783-791, in the
+    form without bias for few cells): f1 (f1 - 1) / (2 (f2 + 1)), where f1 and f2 cells were seen in one and in two
+    steps. They are given the mean of the cells that were seen in one step only, which are the likest to them.
+
+    Args:
+        frames: (K,) steps that had a reference point in each cell.
+        sums: (Q, K) sums over these steps.
+
+    Returns:
+        (Q,) means; NaN if no cell is known.
+
+    Example:
+        >>> frames = torch.tensor([9, 9, 1, 1, 1, 1, 2, 0, 0, 0])       # 12 / 4 = 3 more cells are like the singles
+        >>> radius = torch.where(frames == 1, 1.0, 0.0)
+        >>> completed_mean(frames, (radius * frames)[None]), known_mean(frames, (radius * frames)[None])
+        (tensor([0.7000]), tensor([0.5714]))
+    """
+    known, single = frames > 0, frames == 1
+    unseen = unseen_cells(frames)
+    if unseen == 0:
+        return known_mean(frames, sums)
+    total = (sums[:, known] / frames[known]).sum(dim=1) + unseen * sums[:, single].mean(dim=1)
+    return total / (known.sum() + unseen)
+
+
+def unseen_cells(frames: Tensor) -> float:
+    """About how many cells would become known with more steps; at most those that are unknown."""
+    once, twice = int((frames == 1).sum()), int((frames == 2).sum())
+    return min(once * (once - 1) / (2 * (twice + 1)), int((frames == 0).sum()))
+
+
+ESTIMATORS: Mapping[str, Callable[[Tensor, Tensor], Tensor]] = MappingProxyType(
+    {"known": known_mean, "completed": completed_mean}
+)
