@@ -5,6 +5,7 @@ import pytest
 
 from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, in_vehicle_frame
 from torchcover.simulation.documents import Pose, load_document
+from torchcover.simulation.scenario import Mover
 from torchcover.simulation.shapes import Box, Cylinder, Ellipsoid, Frustum, MeshFile, Plane
 
 TETRAHEDRON = """ply
@@ -133,3 +134,65 @@ def test_the_built_in_vehicle_has_the_size_of_the_papers_ego_and_closed_parts():
         for copy in part.meshes():
             assert signed_volume(copy) > 0
             assert edge_counts(copy)[2]
+
+
+def ply_of(mesh, faces=slice(None)):
+    """The mesh as an ASCII PLY file with only some of its faces."""
+    corners = [" ".join(f"{value:.9g}" for value in vertex) for vertex in mesh.vertices_m]
+    triangles = [f"3 {a} {b} {c}" for a, b, c in mesh.faces[faces].tolist()]
+    header = ["ply", "format ascii 1.0", f"element vertex {len(corners)}"]
+    header += [f"property float {axis}" for axis in "xyz"]
+    header += [f"element face {len(triangles)}", "property list uchar int vertex_indices", "end_header"]
+    return "\n".join([*header, *corners, *triangles, ""])
+
+
+def mesh_file(folder, text, **options):
+    path = folder / "body.ply"
+    path.write_text(text)
+    return MeshFile(type="mesh", path=path, **options)
+
+
+CAR = Box(type="box", size_m=(4.9, 1.94, 1.63))
+
+
+def test_a_mesh_that_is_not_closed_is_named_with_what_it_means(tmp_path):
+    with pytest.warns(UserWarning, match=r"body\.ply: the mesh is not closed \(3 edges .* holes") as seen:
+        mesh_file(tmp_path, ply_of(CAR.mesh(), slice(1, None))).mesh()
+    assert len(seen) == 1
+
+
+@pytest.mark.parametrize("shape", [CAR, Cylinder(type="cylinder", radius_m=2, height_m=5)])
+def test_closed_meshes_give_no_warning_however_they_are_written(tmp_path, shape):
+    mesh = shape.mesh()
+    mesh_file(tmp_path, ply_of(mesh)).mesh()
+    # Each face with corners of its own, as STL has it; then with half of the faces flipped, which is harmless.
+    apart = mesh._replace(
+        vertices_m=mesh.vertices_m[mesh.faces.ravel()], faces=np.arange(mesh.faces.size).reshape(-1, 3)
+    )
+    mesh_file(tmp_path, ply_of(apart)).mesh()
+    flipped = mesh.faces.copy()
+    flipped[::2] = flipped[::2, ::-1]
+    mesh_file(tmp_path, ply_of(mesh._replace(faces=flipped))).mesh()
+    # A face without area is no hole.
+    mesh_file(tmp_path, ply_of(mesh._replace(faces=np.vstack([mesh.faces, [[0, 0, 1]]])))).mesh()
+
+
+def in_millimetres(size_m):
+    return ply_of(Box(type="box", size_m=tuple(1000 * length for length in size_m)).mesh())
+
+
+@pytest.mark.parametrize("unit", [1000.0, 100.0, 1 / 0.0254])
+def test_an_ego_or_actor_in_another_unit_is_named_with_the_remedy(tmp_path, unit):
+    shape = mesh_file(tmp_path, ply_of(CAR.mesh()), metres_per_unit=unit)
+    with pytest.warns(UserWarning, match=r"ego: its body is .* far too large; .*`metres_per_unit: 0\.001`"):
+        Mover(shape=shape).actor("ego", "ego")
+
+
+def test_a_body_in_millimetres_is_named_though_scenery_may_be_large(tmp_path):
+    shape = mesh_file(tmp_path, in_millimetres((4.9, 1.94, 1.63)))
+    with pytest.warns(UserWarning, match=r"body 'parked car': its body is 4,900 x 1,940 x 1,630 m"):
+        Body(name="parked car", shape=shape).meshes()
+    # With the remedy there is nothing to say; nor of a city of 5 km, nor of a train.
+    Body(name="parked car", shape=shape.model_copy(update={"metres_per_unit": 0.001})).meshes()
+    Body(name="city", shape=Box(type="box", size_m=(5000, 5000, 400))).meshes()
+    Mover(shape=Box(type="box", size_m=(75, 2.6, 3.6))).actor("tram", "tram")

@@ -1,10 +1,12 @@
 """One instant: what the rig saw and what was there to be seen."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
+
+from torchcover.data.boxes import Boxes
 
 
 @dataclass(frozen=True)
@@ -18,6 +20,8 @@ class Frame:
         index: Position in its dataset.
         name: What a user calls it: a file stem, or scenario and step.
         counts: What was left out on the way here, by name (`sensor_self_hits`, `reference_nonfinite`, ...).
+        reference_weights: (M,) float32 weight of each reference point, where they differ; see `EvenReference`.
+        boxes: The objects of that instant; None if nobody looked for them, which is not the same as none being there.
     """
 
     sensors: Mapping[str, Tensor]
@@ -25,6 +29,8 @@ class Frame:
     index: int
     name: str
     counts: Mapping[str, int] = field(default_factory=dict)
+    reference_weights: Tensor | None = None
+    boxes: Boxes | None = None
 
     @property
     def sensor(self) -> Tensor:
@@ -39,18 +45,23 @@ class Frame:
 
     def pin_memory(self) -> "Frame":
         """A copy in page-locked memory; DataLoader calls it when `pin_memory=True`."""
-        sensors = {name: cloud.pin_memory() for name, cloud in self.sensors.items()}
-        return replace(self, sensors=sensors, reference=self.reference.pin_memory())
+        return self._each(Tensor.pin_memory, None if self.boxes is None else self.boxes.pin_memory())
 
     def to(self, device: torch.device | str) -> "Frame":
         """A copy on another device."""
-        sensors = {name: cloud.to(device) for name, cloud in self.sensors.items()}
-        return replace(self, sensors=sensors, reference=self.reference.to(device))
+        return self._each(lambda cloud: cloud.to(device), None if self.boxes is None else self.boxes.to(device))
+
+    def _each(self, change: Callable[[Tensor], Tensor], boxes: Boxes | None) -> "Frame":
+        sensors = {name: change(cloud) for name, cloud in self.sensors.items()}
+        weights = None if self.reference_weights is None else change(self.reference_weights)
+        return replace(self, sensors=sensors, reference=change(self.reference), reference_weights=weights, boxes=boxes)
 
 
 @dataclass(frozen=True)
 class FrameBatch:
-    """Frames side by side, as `CoverageMetric.update(batch.sensor, batch.reference)` takes them.
+    """Frames side by side, as `CoverageMetric.update` takes them.
+
+    `metric.update(batch.sensor, batch.reference, weights=batch.weights, index=batch.index)`.
 
     Args:
         frames: The frames in order.
@@ -71,6 +82,65 @@ class FrameBatch:
     def reference(self) -> list[Tensor]:
         """One (M, 3) cloud a frame; M differs."""
         return [frame.reference for frame in self.frames]
+
+    @property
+    def weights(self) -> list[Tensor] | None:
+        """One (M,) tensor a frame, the weights of its reference points; None if no frame has any."""
+        if all(frame.reference_weights is None for frame in self.frames):
+            return None
+        given = [(frame.reference_weights, frame.reference) for frame in self.frames]
+        return [cloud.new_ones(len(cloud)) if weights is None else weights for weights, cloud in given]
+
+    @property
+    def index(self) -> list[int]:
+        """The number of each frame in its dataset."""
+        return [frame.index for frame in self.frames]
+
+    @property
+    def boxes(self) -> list[Boxes]:
+        """The objects of each frame.
+
+        Raises:
+            ValueError: A frame has no boxes, not even an empty list of them.
+        """
+        found = [frame.boxes for frame in self.frames if frame.boxes is not None]
+        if len(found) < len(self.frames):
+            without = next(frame.name for frame in self.frames if frame.boxes is None)
+            raise ValueError(
+                f"{len(self.frames) - len(found)} of {len(self.frames)} frames have no boxes, such as {without!r}: "
+                "SimulatedFrames(..., boxes=True) makes them; for a recording use dataclasses.replace(frame, boxes=...)"
+            )
+        return found
+
+    def padded_boxes(self, categories: Sequence[str]) -> Tensor:
+        """The objects as one tensor, as OpenPCDet's detectors take them.
+
+        Args:
+            categories: The classes, from number 1; objects of other categories are left out.
+
+        Returns:
+            (B, most boxes of a frame, 8): x, y, z of the centre, length, width, height, yaw, class; zeros where a frame
+            has fewer.
+        """
+        rows = []
+        for boxes in self.boxes:
+            wanted = boxes.of_category(*categories)
+            numbers = [categories.index(category) + 1 for category in wanted.categories]
+            rows.append(torch.cat([wanted.rows, wanted.rows.new_tensor(numbers)[:, None]], dim=1))
+        return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
+
+    def stacked_points(self, rig: str | None = None) -> Tensor:
+        """The clouds of one rig as one tensor, as voxel and pillar encoders take them.
+
+        Args:
+            rig: Which of several rigs; the only one if not given.
+
+        Returns:
+            (points of all frames, 4): number of the frame in the batch, x, y, z.
+        """
+        clouds = self.sensor if rig is None else self.sensors(rig)
+        numbered = [torch.nn.functional.pad(cloud, (1, 0), value=number) for number, cloud in enumerate(clouds)]
+        return torch.cat(numbered)
 
     def __len__(self) -> int:
         return len(self.frames)

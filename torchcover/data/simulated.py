@@ -1,19 +1,26 @@
 """Frames of a simulated world."""
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
+from torchcover.data.boxes import Boxes, points_in_boxes
 from torchcover.data.frame import Frame
 from torchcover.geometry.rigid import Matrix
-from torchcover.simulation import ReferenceSensor, Rig, Scenario
+from torchcover.simulation import EvenReference, ReferenceSensor, Rig, Scenario
 from torchcover.simulation.disturbance import disturb
+from torchcover.simulation.instant import Instant, Scan
+from torchcover.simulation.labels import Label, labels
+from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import Tile, into_tiles
-from torchcover.simulation.scene import Instant, Scan, Scene
+from torchcover.simulation.scene import Scene
 
 # A reference pose inside a body is drawn again, at most this often.
 MOST_DRAWS = 100
@@ -34,12 +41,18 @@ class SimulatedFrames(Dataset[Frame]):
         rigs: Several rigs instead, by the name under which `Frame.sensors` has their clouds.
         steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers.
         seed: Seed of the traffic and of the reference sensor's poses.
-        reference: The reference sensor; the paper's if not given.
+        reference: The reference sensor, the paper's or an even one; the paper's if not given.
+        every_s: Time between one frame and the next, a multiple of the scenario's time step; that step if not given.
+            Steps that follow each other are alike: with the same number of frames, a longer time shows more, and in
+            traffic, which starts anew, the frames are spread over more cities.
+        boxes: Whether frames have `boxes`: one for each object within the reference's range, with how many points each
+            rig has in it. An object's name is its own within a run of the scenario.
 
     Raises:
         FileNotFoundError: An unknown name or file.
         ValueError: A document that is not valid, neither or both of `rig` and `rigs`, a number of steps below 1, a
-            negative seed. From indexing: a sensor inside the ego's body, an actor that overlaps the ego.
+            negative seed, a time that is no multiple of the time step. From indexing: a sensor inside the ego's body,
+            an actor that overlaps the ego.
 
     Example:
         >>> frames = SimulatedFrames(
@@ -57,7 +70,9 @@ class SimulatedFrames(Dataset[Frame]):
         rigs: Mapping[str, Rig | str | Path] | None = None,
         steps: int,
         seed: int = 0,
-        reference: ReferenceSensor | None = None,
+        reference: ReferenceSensor | EvenReference | None = None,
+        every_s: float | None = None,
+        boxes: bool = False,
     ) -> None:
         if (rig is None) == (not rigs):
             raise ValueError("give one rig, or several as rigs={name: rig}")
@@ -74,13 +89,16 @@ class SimulatedFrames(Dataset[Frame]):
         self.steps = steps
         self.seed = seed
         self.reference = reference or ReferenceSensor()
-        self._forget()
-
-    def _forget(self) -> None:
-        self._scene: Scene | None = None
-        self._episode = -1
-        self._reference_tiles: tuple[Tile, ...] = ()
+        self._every_steps = 1 if every_s is None else self.scenario.steps_in(every_s)
+        self.boxes = boxes
+        # The geometry of one episode and the sensors in it, by its number.
+        self._built: dict[int, tuple[Scene, dict[str, list[MountedSensor]]]] = {}
         self._rig_tiles: dict[str, list[tuple[Tile, ...]]] = {}
+
+    @property
+    def every_s(self) -> float:
+        """Time between one frame and the next."""
+        return self._every_steps * self.scenario.step_s
 
     @property
     def scene(self) -> Scene:
@@ -92,16 +110,32 @@ class SimulatedFrames(Dataset[Frame]):
 
         It is built when first needed, once in each process for each run through the scenario.
         """
-        episode, step = self.scenario.locate(index)
-        if self._scene is None or episode != self._episode:
-            self._scene, self._episode = Scene(self.scenario.world(self.seed, episode)), episode
-            self._check_mounts(self._scene)
-        if not self._reference_tiles:
-            self._reference_tiles = into_tiles(self.reference.directions())
+        scene, _, step = self._stage(index)
+        return scene, step
+
+    def with_reference(self, reference: ReferenceSensor | EvenReference) -> "SimulatedFrames":
+        """The same instants as another reference sensor sees them; the geometry is built once for both."""
+        other = copy.copy(self)
+        other.reference = reference
+        return other
+
+    def _stage(self, index: int) -> tuple[Scene, Mapping[str, Sequence[MountedSensor]], int]:
+        """The scene of a frame, the sensors of each rig in it, and the frame's time step."""
+        episode, step = self.scenario.locate(index * self._every_steps)
+        if not self._rig_tiles:
             self._rig_tiles = {
                 name: [into_tiles(sensor.directions()) for sensor in rig.sensors] for name, rig in self.rigs.items()
             }
-        return self._scene, step
+        if episode not in self._built:
+            self._built.clear()
+            scene = Scene(self.scenario.world(self.seed, episode))
+            self._check_mounts(scene)
+            self._built[episode] = scene, {name: self._mount(name, scene) for name in self.rigs}
+        return *self._built[episode], step
+
+    def _mount(self, name: str, scene: Scene) -> list[MountedSensor]:
+        sensors = zip(self.rigs[name].sensors, self._rig_tiles[name], strict=True)
+        return [MountedSensor(sensor, tiles, scene) for sensor, tiles in sensors]
 
     def _check_mounts(self, scene: Scene) -> None:
         for name, rig in self.rigs.items():
@@ -119,54 +153,53 @@ class SimulatedFrames(Dataset[Frame]):
     def __getitem__(self, index: int) -> Frame:
         if not 0 <= index < self.steps:
             raise IndexError(f"frame {index} of {self.steps}")
-        scene, step = self.scene_of(index)
+        scene, mounted, step = self._stage(index)
         instant = scene.at(step, within_m=self._longest_range_m())
-        scans = {name: self._scan_rig(instant, name, index) for name in self.rigs}
-        reference, redrawn = self._scan_reference(scene, instant, index)
+        scans = {name: self._scan_rig(sensors, instant, index) for name, sensors in mounted.items()}
+        reference, weights, redrawn = self._scan_reference(scene, instant, index)
+        sensors = {name: torch.from_numpy(_fuse(rig_scans)) for name, rig_scans in scans.items()}
         return Frame(
-            sensors={name: torch.from_numpy(_fuse(rig_scans)) for name, rig_scans in scans.items()},
+            sensors=sensors,
             reference=torch.from_numpy(reference.points),
+            reference_weights=None if weights is None else torch.from_numpy(weights),
             index=index,
             name=f"{self.scenario.name} step {index}",
             counts={
                 **_count("sensor", [scan for rig_scans in scans.values() for scan in rig_scans]),
                 **_count("reference", [reference]),
                 "reference_poses_redrawn": redrawn,
+                **_left_out(scene, instant, [scan for rig_scans in scans.values() for scan in rig_scans], reference),
             },
+            boxes=_boxes(labels(scene.world, step, self.reference.max_range_m), sensors) if self.boxes else None,
         )
 
     def _longest_range_m(self) -> float:
         ranges = [sensor.max_range_m for rig in self.rigs.values() for sensor in rig.sensors]
         return max(self.reference.max_range_m, *ranges)
 
-    def _scan_rig(self, instant: Instant, name: str, index: int) -> list[Scan]:
+    def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[Scan]:
         scans = []
-        for k, (sensor, tiles) in enumerate(zip(self.rigs[name].sensors, self._rig_tiles[name], strict=True), 1):
-            vehicle_T_sensor = sensor.mount.matrix()
-            scan = instant.scan(
-                vehicle_T_sensor,
-                tiles,
-                min_range_m=sensor.min_range_m,
-                max_range_m=sensor.max_range_m,
-                threads=torch.get_num_threads(),
-            )
+        for k, mounted in enumerate(sensors, 1):
+            scan = mounted.scan(instant, threads=torch.get_num_threads())
             generator = np.random.default_rng([self.seed, index, k])
-            points = disturb(scan.points, vehicle_T_sensor[:3, 3], sensor.range_noise_m, sensor.dropout, generator)
-            scans.append(scan._replace(points=points))
+            origin_m, sensor = mounted.vehicle_T_sensor[:3, 3], mounted.sensor
+            scans.append(disturb(scan, origin_m, sensor.range_noise_m, sensor.dropout, generator))
         return scans
 
-    def _scan_reference(self, scene: Scene, instant: Instant, index: int) -> tuple[Scan, int]:
-        vehicle_T_reference, redrawn = self._draw_reference_pose(scene, instant, index)
-        scan = instant.scan(
-            vehicle_T_reference,
-            self._reference_tiles,
-            max_range_m=self.reference.max_range_m,
-            threads=torch.get_num_threads(),
-        )
-        return scan, redrawn
-
-    def _draw_reference_pose(self, scene: Scene, instant: Instant, index: int) -> tuple[Matrix, int]:
+    def _scan_reference(
+        self, scene: Scene, instant: Instant, index: int
+    ) -> tuple[Scan, NDArray[np.float32] | None, int]:
         generator = np.random.default_rng([self.seed, index])
+        vehicle_T_reference, redrawn = self._draw_reference_pose(scene, instant, index, generator)
+        tiles = self.reference.tiles(vehicle_T_reference, generator)
+        scan = instant.scan(
+            vehicle_T_reference, tiles, max_range_m=self.reference.max_range_m, threads=torch.get_num_threads()
+        )
+        return scan, self.reference.weights(vehicle_T_reference, tiles, scan.ray), redrawn
+
+    def _draw_reference_pose(
+        self, scene: Scene, instant: Instant, index: int, generator: np.random.Generator
+    ) -> tuple[Matrix, int]:
         for redrawn in range(MOST_DRAWS):
             vehicle_T_reference = self.reference.vehicle_T_reference(scene.ego_box, generator)
             if not instant.buried(vehicle_T_reference[:3, 3]):
@@ -178,11 +211,23 @@ class SimulatedFrames(Dataset[Frame]):
 
     def __getstate__(self) -> dict[str, Any]:
         # Embree's scene cannot be pickled; a worker builds its own.
-        return {**self.__dict__, "_scene": None, "_reference_tiles": (), "_rig_tiles": {}}
+        return {**self.__dict__, "_built": {}, "_rig_tiles": {}}
 
 
 def _load(rig: Rig | str | Path) -> Rig:
     return rig if isinstance(rig, Rig) else Rig.load(rig)
+
+
+def _boxes(found: Sequence[Label], sensors: Mapping[str, torch.Tensor]) -> Boxes:
+    rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
+    boxes = Boxes.from_rows(
+        torch.tensor(rows, dtype=torch.float32).view(-1, 7),
+        velocity_mps=torch.tensor(np.array([label.velocity_mps for label in found]), dtype=torch.float32).view(-1, 2),
+        ids=tuple(label.name for label in found),
+        categories=tuple(label.category for label in found),
+    )
+    inside = {name: points_in_boxes(cloud, boxes).box for name, cloud in sensors.items()}
+    return replace(boxes, hits={name: torch.bincount(box, minlength=len(boxes)) for name, box in inside.items()})
 
 
 def _fuse(scans: list[Scan]) -> np.ndarray[Any, np.dtype[np.float32]]:
@@ -193,4 +238,18 @@ def _count(source: str, scans: list[Scan]) -> dict[str, int]:
     return {
         f"{source}_rays": sum(scan.rays for scan in scans),
         f"{source}_self_hits": sum(scan.self_hits for scan in scans),
+    }
+
+
+def _left_out(scene: Scene, instant: Instant, scans: Sequence[Scan], reference: Scan) -> dict[str, int]:
+    """What this frame did not need, beside the number of all that there were of the kind."""
+    rays = sum(scan.rays for scan in scans)
+    pairs = (rays + reference.rays) * len(instant.moving)
+    return {
+        "moving_bodies": len(instant.moving) + instant.out_of_range,
+        "moving_bodies_out_of_range": instant.out_of_range,
+        "ray_body_pairs": pairs,
+        "ray_body_pairs_left_out": pairs - reference.body_casts - sum(scan.body_casts for scan in scans),
+        "sensor_rays_reused": 0 if scene.moves else rays,
+        "sensor_self_hits_reused": sum(scan.self_hits for scan in scans) if scene.knows_self_hits else 0,
     }

@@ -2,9 +2,20 @@
 
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.documents import Pose, builtin_names
+from torchcover.simulation.even_reference import EvenReference
 from torchcover.simulation.lidar import Lidar, LidarModel
 from torchcover.simulation.reference import ReferenceSensor
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 
-__all__ = ["CameraSensor", "Lidar", "LidarModel", "Pose", "ReferenceSensor", "Rig", "Scenario", "builtin_names"]
+__all__ = [
+    "CameraSensor",
+    "EvenReference",
+    "Lidar",
+    "LidarModel",
+    "Pose",
+    "ReferenceSensor",
+    "Rig",
+    "Scenario",
+    "builtin_names",
+]

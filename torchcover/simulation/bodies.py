@@ -48,6 +48,7 @@ class Body(Document):
     def meshes(self) -> list[Mesh]:
         """One mesh for each pose."""
         mesh = self.shape.mesh()
+        shapes.warn_of_units(f"body {self.name!r}", mesh, moves=False)
         return [mesh.moved(pose.matrix()) for pose in self.poses]
 
 
@@ -74,6 +75,18 @@ def in_vehicle_frame(mesh: Mesh) -> Mesh:
     box = Box.around(mesh.vertices_m)
     (x0, y0, z0), (x1, y1, _) = box.lower_m, box.upper_m
     return mesh.moved(rigid(np.eye(3), [-(x0 + x1) / 2, -(y0 + y1) / 2, -z0]))
+
+
+def mover_mesh(name: str, shape: Shape) -> Mesh:
+    """The body of the ego or of an actor in its vehicle frame; a warning if it is too large for one.
+
+    Args:
+        name: What the warning calls it.
+        shape: Its form, in its own frame.
+    """
+    mesh = in_vehicle_frame(shape.mesh())
+    shapes.warn_of_units(name, mesh, moves=True)
+    return mesh
 
 
 def merge(meshes: list[Mesh]) -> Mesh:

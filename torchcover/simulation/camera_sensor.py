@@ -13,6 +13,7 @@ from torchcover.simulation.documents import Document, Pose
 
 # The camera frame is x right, y down, z forward; a mount looks along its x, with y left and z up.
 MOUNT_T_CAMERA = rigid(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+ROWS_AT_ONCE = 64
 
 
 class CameraSensor(Document):
@@ -106,6 +107,10 @@ class CameraSensor(Document):
 
     def directions(self) -> NDArray[np.float64]:
         """(3, rows, columns) unit directions in the frame of the mount; NaN where a pixel has no ray."""
-        rays, _ = self.camera().rays(dtype=torch.float64)
-        right, down, forward = np.moveaxis(rays.numpy()[:: self.stride, :: self.stride], 2, 0)
+        rows, columns = (torch.arange(0, size, self.stride, dtype=torch.float64) for size in (self.height, self.width))
+        pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)
+        camera = self.camera()
+        # Only the pixels that are used, and not all at once: the solver needs many times their memory.
+        rays = torch.cat([camera.rays(band)[0] for band in torch.split(pixels, ROWS_AT_ONCE)])
+        right, down, forward = np.moveaxis(rays.numpy(), 2, 0)
         return np.stack([forward, -right, -down])

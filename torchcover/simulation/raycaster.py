@@ -17,6 +17,13 @@ from torchcover.simulation.shapes import Mesh
 
 Float32 = NDArray[np.float32]
 
+# Farther from the origin float32 resolves no better than 64 m, and at 2e18 Embree drops faces without a word.
+MOST_M = 1e9
+# An origin lies on a face if it is no farther from its plane than this many roundings of the largest coordinate.
+CONTACT_ROUNDINGS = 4
+# Only hits this near are looked at: what a sensor is mounted on.
+TOUCHING_M = 1.0
+
 
 class Hits(NamedTuple):
     """For each of N rays: `range_m` (N,) float32 where it ended, and `body` (N,) int32, -1 if at its limit."""
@@ -33,12 +40,18 @@ class RayCaster:
             near the origin: they become float32.
 
     Raises:
-        ValueError: There is no body.
+        ValueError: There is no body, or one with a vertex that is not a number or farther than 1e9 m.
     """
 
     def __init__(self, bodies: Sequence[Mesh]) -> None:
         if not bodies:
             raise ValueError("a scene needs at least one body")
+        reach_m = float(np.max([np.abs(body.vertices_m).max(initial=0.0) for body in bodies]))  # NaN if one is
+        if not reach_m <= MOST_M:
+            raise ValueError(
+                f"bodies within {MOST_M:g} m of the origin are needed; a vertex has the coordinate {reach_m}"
+            )
+        self._contact_m = CONTACT_ROUNDINGS * float(np.finfo(np.float32).eps) * reach_m
         # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
         self._scene = EmbreeScene(robust=True)
         for body in bodies:
@@ -47,7 +60,7 @@ class RayCaster:
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
 
     def cast(self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32) -> Hits:
-        """Cast rays from one origin.
+        """Cast rays from one origin. A ray that starts on a face does not hit that face.
 
         Args:
             origin_m: (3,) common origin of the rays.
@@ -62,7 +75,27 @@ class RayCaster:
             (directions.shape[1], 3), np.float32, origin_m.astype(np.float32).tobytes(), strides=(0, 4)
         )
         answer = self._scene.run(origins, directions.T, dists=limit_m.copy(), output=True)
-        return Hits(answer["tfar"], answer["geomID"])
+        hits = Hits(answer["tfar"], answer["geomID"])
+        self._leave_faces(origin_m, directions, limit_m, answer["Ng"], hits)
+        return hits
+
+    def _leave_faces(
+        self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32, normals: Float32, hits: Hits
+    ) -> None:
+        """Cast the rays again that hit the face they start on, from a place beside it, on the side they point to."""
+        near = np.flatnonzero((hits.range_m < TOUCHING_M) & (hits.body >= 0))
+        if len(near) == 0:
+            return
+        normals, towards = normals[near], directions.T[near]
+        length, slope = np.linalg.norm(normals, axis=1), (normals * towards).sum(axis=1)
+        # By the distance from the face, not along the ray: a grazing ray meets the rounded face far from its origin.
+        touching = (hits.range_m[near] * np.abs(slope) <= self._contact_m * length) & (length > 0)
+        near = near[touching]
+        if len(near):
+            away = np.sign(slope[touching]) / length[touching]
+            beside = origin_m + 2 * self._contact_m * away[:, None] * normals[touching]
+            answer = self._scene.run(beside.astype(np.float32), towards[touching], dists=limit_m[near], output=True)
+            hits.range_m[near], hits.body[near] = answer["tfar"], answer["geomID"]
 
     def back_faces(self, origin_m: NDArray[np.floating], directions: Float32) -> NDArray[np.bool_]:
         """Which rays first meet a face from behind, as rays that start inside a closed body do.

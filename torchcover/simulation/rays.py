@@ -10,19 +10,29 @@ TILE_ROWS = 128
 TILE_COLUMNS = 256
 
 
+# Rows and columns in a block of a tile: what is cast at a body is first looked for by the block.
+BLOCK = 8
+
+
 @dataclass(frozen=True, eq=False)
 class Tile:
-    """Rays that point to about the same place.
+    """Rays that point to about the same place, cut into blocks that are narrower still.
 
     Args:
         directions: (3, n) float32 unit directions in the sensor's frame.
         axis: (3,) float64 middle of the cone that holds them.
         half_angle: Half the opening of that cone in radians.
+        blocks: (B, m) numbers of the rays in each block; one with fewer rays than others repeats one of them.
+        block_lower: (3, B) float64 smallest x, y, z among the directions of each block.
+        block_upper: (3, B) largest.
     """
 
     directions: NDArray[np.float32]
     axis: NDArray[np.float64]
     half_angle: float
+    blocks: NDArray[np.int64]
+    block_lower: NDArray[np.float64]
+    block_upper: NDArray[np.float64]
 
 
 def unit_directions(elevation_deg: NDArray[np.float64], azimuth_deg: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -55,19 +65,43 @@ def into_tiles(
     """
     _, rows, columns = directions.shape
     return tuple(
-        _tile(directions[:, top : top + tile_rows, left : left + tile_columns].reshape(3, -1))
+        _tile(directions[:, top : top + tile_rows, left : left + tile_columns])
         for top in range(0, rows, tile_rows)
         for left in range(0, columns, tile_columns)
     )
 
 
 def _tile(directions: NDArray[np.float64]) -> Tile:
-    directions = directions[:, ~np.isnan(directions[0])]
-    if directions.shape[1] == 0:
-        return Tile(directions.astype(np.float32), np.array([1.0, 0.0, 0.0]), 0.0)
-    middle = directions.mean(axis=1)
+    has_ray = ~np.isnan(directions[0])
+    rays = directions.reshape(3, -1) if has_ray.all() else directions[:, has_ray]
+    rounded = np.ascontiguousarray(rays, dtype=np.float32)
+    if rays.shape[1] == 0:
+        blocks, none = np.empty((0, 1), dtype=np.int64), np.empty((3, 0))
+        return Tile(rounded, np.array([1.0, 0.0, 0.0]), 0.0, blocks, none, none)
+    middle = rays.mean(axis=1)
     length = float(np.linalg.norm(middle))
     # Directions that cancel have no middle; any axis will do, for the cone is then the whole sphere.
     axis = middle / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
-    half_angle = float(np.arccos(np.clip(axis @ directions, -1.0, 1.0)).max())
-    return Tile(np.ascontiguousarray(directions, dtype=np.float32), axis, half_angle)
+    # From the longest chord: the arc cosine would lose angles below 1e-8.
+    chord = np.linalg.norm(rays - axis[:, None], axis=0).max()
+    half_angle = float(2.0 * np.arcsin(min(chord / 2.0, 1.0)))
+    blocks = _blocks(has_ray)
+    in_blocks = rounded.take(blocks, axis=1)
+    lower, upper = in_blocks.min(axis=2).astype(np.float64), in_blocks.max(axis=2).astype(np.float64)
+    return Tile(rounded, axis, half_angle, blocks, lower, upper)
+
+
+def _blocks(has_ray: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(B, m) numbers of the rays in each block of the pixels of a tile, where (rows, columns) pixels have a ray."""
+    rows, columns = has_ray.shape
+    high, wide = min(BLOCK, rows), min(BLOCK, columns)
+    # Blocks at the lower and right border repeat the last row and column.
+    row = np.minimum(np.arange(-(-rows // high) * high), rows - 1).reshape(-1, 1, high, 1)
+    column = np.minimum(np.arange(-(-columns // wide) * wide), columns - 1).reshape(1, -1, 1, wide)
+    pixels = (row * columns + column).reshape(-1, high * wide)
+    filled = has_ray.ravel()[pixels]
+    # Pixels without a ray repeat the first one of their block that has one.
+    first = np.take_along_axis(pixels, filled.argmax(axis=1)[:, None], axis=1)
+    pixels = np.where(filled, pixels, first)[filled.any(axis=1)]
+    numbers: NDArray[np.int64] = has_ray.cumsum()[pixels] - 1
+    return numbers

@@ -1,12 +1,16 @@
 """The random reference sensor: a best case to compare a rig with."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import Box, rigid, rotation_from_euler
-from torchcover.simulation.rays import unit_directions
+from torchcover.simulation.rays import Tile, into_tiles, unit_directions
+
+# Pitch and roll of the paper's sensor are uniform between minus this and this.
+MAX_TILT_DEG = 45.0
 
 
 @dataclass(frozen=True)
@@ -38,7 +42,7 @@ class ReferenceSensor:
     rows: int = 1024
     columns: int = 1024
     shell_m: float = 0.5
-    max_tilt_deg: float = 45.0
+    max_tilt_deg: float = MAX_TILT_DEG
     max_range_m: float = 250.0
 
     def __post_init__(self) -> None:
@@ -57,6 +61,15 @@ class ReferenceSensor:
         azimuth = 360.0 * np.arange(self.columns) / self.columns
         return unit_directions(elevation[:, None], azimuth[None, :])
 
+    def tiles(self, vehicle_T_reference: NDArray[np.float64], generator: np.random.Generator) -> tuple[Tile, ...]:
+        """The rays of one step in the sensor's frame: the same at every step."""
+        return _tiles_of(self)
+
+    def weights(
+        self, vehicle_T_reference: NDArray[np.float64], tiles: tuple[Tile, ...], ray: NDArray[np.int64]
+    ) -> None:
+        """None: the points of this sensor weigh the same."""
+
     def vehicle_T_reference(self, ego: Box, generator: np.random.Generator) -> NDArray[np.float64]:
         """Draw the pose of one step.
 
@@ -69,13 +82,26 @@ class ReferenceSensor:
         """
         yaw = generator.uniform(-180.0, 180.0)
         pitch, roll = generator.uniform(-self.max_tilt_deg, self.max_tilt_deg, size=2)
-        return rigid(rotation_from_euler(yaw, pitch, roll), self._position_in_shell(ego, generator))
+        return rigid(rotation_from_euler(yaw, pitch, roll), position_in_shell(ego, self.shell_m, generator))
 
-    def _position_in_shell(self, ego: Box, generator: np.random.Generator) -> NDArray[np.float64]:
-        lower, upper = np.array(ego.lower_m), np.array(ego.upper_m)
-        outer_lower = lower - [self.shell_m, self.shell_m, 0.0]
-        outer_upper = upper + self.shell_m
-        while True:
-            position = generator.uniform(outer_lower, outer_upper)
-            if ((position < lower) | (position > upper)).any():
-                return position
+
+def position_in_shell(ego: Box, shell_m: float, generator: np.random.Generator) -> NDArray[np.float64]:
+    """(3,) place in metres, uniform between the ego's bounding box and that box grown sideways and upwards.
+
+    Args:
+        ego: Bounding box of the ego in the vehicle frame.
+        shell_m: How far it is grown.
+        generator: Source of the random numbers.
+    """
+    lower, upper = np.array(ego.lower_m), np.array(ego.upper_m)
+    outer_lower, outer_upper = lower - [shell_m, shell_m, 0.0], upper + shell_m
+    while True:
+        position = generator.uniform(outer_lower, outer_upper)
+        if ((position < lower) | (position > upper)).any():
+            return position
+
+
+# Kept for the process, not with the sensor, which travels to DataLoader workers.
+@lru_cache(maxsize=2)
+def _tiles_of(sensor: ReferenceSensor) -> tuple[Tile, ...]:
+    return into_tiles(sensor.directions())

@@ -1,12 +1,13 @@
 """A scenario: the world around the ego, what moves in it, and the ego's own body."""
 
+import math
 from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, model_validator
 
-from torchcover.simulation.bodies import Body, Shape, VehicleShape, in_vehicle_frame
+from torchcover.simulation.bodies import Body, Shape, VehicleShape, mover_mesh
 from torchcover.simulation.documents import Document, Pose, beside, load_document
 from torchcover.simulation.tracks import read_boxes, read_trajectory
 from torchcover.simulation.traffic import Highway, Parking, Urban
@@ -44,7 +45,7 @@ class Mover(Document):
             trajectory = read_trajectory(self.trajectory)
         else:
             trajectory = Trajectory.from_poses([0.0], (self.pose or Pose()).matrix()[None])
-        return Actor(name, category, in_vehicle_frame(self.shape.mesh()), trajectory)
+        return Actor(name, category, mover_mesh(name, self.shape), trajectory)
 
 
 class NamedMover(Mover):
@@ -123,6 +124,26 @@ class Scenario(Document):
         episode, step = divmod(index, steps_of(times.duration_s, times.time_step_s))
         return (episode if self.traffic else 0), step
 
+    @property
+    def step_s(self) -> float:
+        """Its time step, be it given or that of the traffic."""
+        return (self.traffic or self).time_step_s
+
+    def steps_in(self, time_s: float) -> int:
+        """How many time steps a time has.
+
+        Raises:
+            ValueError: It is not a positive multiple of the time step.
+        """
+        time_step_s = self.step_s
+        steps = round(time_s / time_step_s) if math.isfinite(time_s) else 0
+        if steps < 1 or not math.isclose(steps * time_step_s, time_s, rel_tol=1e-6):
+            raise ValueError(
+                f"every_s: a positive multiple of the time step of {self.name!r}, {time_step_s:g} s, is needed; "
+                f"got {time_s:g}"
+            )
+        return steps
+
     def world(self, seed: int = 0, episode: int = 0) -> World:
         """Build it.
 
@@ -137,7 +158,7 @@ class Scenario(Document):
         if self.traffic is not None:
             shape = self.ego.shape if self.ego else VehicleShape(type="vehicle", vehicle="suv")
             own_seed = int(np.random.SeedSequence([seed, episode]).generate_state(1, np.uint64)[0])
-            return self.traffic.world(own_seed, in_vehicle_frame(shape.mesh()))
+            return self.traffic.world(own_seed, mover_mesh("ego", shape))
         assert self.ego is not None  # checked in _check_given_or_procedural
         actors = tuple(actor.actor(actor.name, actor.category) for actor in self.actors)
         return World(

@@ -1,5 +1,6 @@
 """Shapes: primitives, and meshes from files."""
 
+import warnings
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -12,6 +13,9 @@ from torchcover.simulation.documents import Document, beside
 
 CYLINDER_SIDES = 24
 ELLIPSOID_SIDES = 12  # around the z axis; half as many bands from pole to pole
+# Nothing on a road is longer; no building, and no terrain within a sensor's range, is higher.
+LONGEST_VEHICLE_M = 100.0
+TALLEST_SCENERY_M = 1000.0
 
 Length = PositiveFloat
 
@@ -138,7 +142,7 @@ class MeshFile(Document):
     _path_beside = field_validator("path")(beside)
 
     def mesh(self) -> Mesh:
-        """All geometry of the file in one mesh.
+        """All geometry of the file in one mesh; a warning if it is not closed.
 
         Raises:
             FileNotFoundError: No such file.
@@ -159,7 +163,45 @@ class MeshFile(Document):
         if not np.isfinite(vertices).all():
             bad = int((~np.isfinite(vertices)).any(axis=1).sum())
             raise ValueError(f"{self.path}: {bad} of {len(vertices)} vertices are NaN or infinite")
+        if openings := _open_edges(vertices, faces):
+            warnings.warn(
+                f"{self.path}: the mesh is not closed ({openings} edges have a face on one side only): rays pass "
+                "through the holes, and whether a sensor or the reference lies inside it cannot be told; close it in a "
+                "modelling tool, or go on if it is a sheet on purpose, such as terrain",
+                stacklevel=2,
+            )
         return Mesh(vertices * self.metres_per_unit, faces)
+
+
+def warn_of_units(owner: str, mesh: Mesh, *, moves: bool) -> None:
+    """Warn if a body is so large that its file must be in another unit than metres.
+
+    Args:
+        owner: What the warning calls the body.
+        mesh: Its form.
+        moves: Whether it is the ego or an actor, which are 100 m long at most. What never moves may be a whole city:
+            then all three extents must be above 1,000 m.
+    """
+    size_m = np.ptp(mesh.vertices_m, axis=0).tolist()
+    extent_m, most_m = (max(size_m), LONGEST_VEHICLE_M) if moves else (min(size_m), TALLEST_SCENERY_M)
+    if extent_m > most_m:
+        x, y, z = size_m
+        warnings.warn(
+            f"{owner}: its body is {x:,.0f} x {y:,.0f} x {z:,.0f} m, far too large; a file in millimetres needs "
+            "`metres_per_unit: 0.001` beside its `path`, one in centimetres 0.01, one in inches 0.0254",
+            stacklevel=2,
+        )
+
+
+def _open_edges(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> int:
+    """Number of edges that an odd number of faces share; 0 if the mesh is closed, whichever way its faces turn."""
+    # Files repeat a vertex for each face (STL), or for each texture (OBJ).
+    _, number = np.unique(vertices, axis=0, return_inverse=True)
+    corners = number.reshape(-1)[faces]
+    edges = np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    # A face without area has an edge from a corner to itself, and one twice.
+    _, count = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0, return_counts=True)
+    return int((count % 2).sum())
 
 
 def _rectangle(size_m: tuple[float, float], z_m: float) -> NDArray[np.float64]:

@@ -89,6 +89,17 @@ class Trajectory:
         tracks = [np.interp(times_s, self.times_s, axis, outside, outside) for axis in self.positions_m.T]
         return np.stack(tracks, axis=1)
 
+    def velocity_at(self, time_s: float) -> Matrix:
+        """(3,) velocity in the world frame in m/s; where it changes, the mean of before and after; 0 at rest."""
+        # The segments that touch the time: one, or two if a pose is given for it.
+        first = max(int(np.searchsorted(self.times_s, time_s, side="left")) - 1, 0)
+        end = min(int(np.searchsorted(self.times_s, time_s, side="right")), len(self.times_s) - 1)
+        if first >= end or not self.times_s[0] <= time_s <= self.times_s[-1]:
+            return np.zeros(3)
+        way, taken = np.diff(self.positions_m[first : end + 1], axis=0), np.diff(self.times_s[first : end + 1])
+        velocity: Matrix = (way / taken[:, None]).mean(axis=0)
+        return velocity
+
     def _interpolate(self, time_s: float) -> tuple[Matrix, Matrix]:
         after = int(np.searchsorted(self.times_s, time_s, side="right"))
         if after == 0 or after == len(self.times_s):

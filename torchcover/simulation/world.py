@@ -34,6 +34,7 @@ class World:
         actors: The others.
         time_step_s: Time between two frames.
         duration_s: Time after which the trajectories end.
+        parked: Objects that never move and whose geometry is among `static`: where they are, and what.
     """
 
     static: tuple[Mesh, ...]
@@ -41,6 +42,7 @@ class World:
     actors: tuple[Actor, ...] = ()
     time_step_s: float = 0.1
     duration_s: float = 0.0
+    parked: tuple[Actor, ...] = ()
 
     @property
     def steps(self) -> int:

@@ -6,7 +6,7 @@ import numpy as np
 
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet
-from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, box, few, ground, placed, post, tree
+from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, box, few, ground, post, tree
 from torchcover.simulation.traffic.streets import PARKING_BAY_M, SIDEWALK_M, Streets
 
 BLOCK_DEPTH_M = 95.0
@@ -121,7 +121,7 @@ class City:
                 slack = max((PARKING_BAY_M - self._fleet.width_m(kind)) / 2 - 0.08, 0.0)
                 y = -side * (self._streets.bay_m + self._uniform(0.0, slack))
                 yaw = (0.0 if side == 1 else 180.0) + self._uniform(-0.4, 0.4)
-                cars.append(placed(self._fleet.meshes[kind], (x + length / 2, y, yaw)))
+                cars.append(self._fleet.park(kind, (x + length / 2, y, yaw)))
             x += length
         return cars
 

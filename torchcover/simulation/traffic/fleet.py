@@ -10,6 +10,9 @@ from torchcover.simulation.documents import load_document
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.flow import Agent, Lane
 from torchcover.simulation.traffic.idm import Driver
+from torchcover.simulation.traffic.scenery import placed
+from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.world import Actor
 
 # What each built-in body counts as.
 CATEGORIES = {
@@ -58,6 +61,7 @@ class Fleet:
         self.meshes = {EGO: bodies["suv"] if ego is None else ego, **{kind: bodies[kind] for kind in CATEGORIES}}
         self._sizes = {kind: Box.around(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
         self._generator = generator
+        self.parked: list[Actor] = []
 
     def length_m(self, kind: str) -> float:
         """Extent along x."""
@@ -79,6 +83,13 @@ class Fleet:
     def agent(self, kind: str, lane: int, place_m: float, driver: Driver) -> Agent:
         """Somebody of a kind on a lane."""
         return Agent(kind, self.length_m(kind), lane, place_m, driver)
+
+    def park(self, kind: str, pose: tuple[float, float, float]) -> Mesh:
+        """A body at a pose x, y in metres and yaw in degrees, noted down in `parked`."""
+        x_m, y_m, yaw_deg = pose
+        place = Trajectory.resting((x_m, y_m, 0.0), (yaw_deg, 0.0, 0.0))
+        self.parked.append(Actor(f"parked {kind} {len(self.parked)}", CATEGORIES[kind], self.meshes[kind], place))
+        return placed(self.meshes[kind], pose)
 
     def fill(
         self,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet
-from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, box, few, ground, placed, post, tree
+from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, box, few, ground, post, tree
 
 Numbers = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ class Lot:
             y = head_y + inwards * (NOSE_OFF_HEAD_M + self._fleet.length_m(kind) / 2)
             yaw = self._generator.choice((90.0, -90.0)) + self._generator.uniform(-1.5, 1.5)
             x += self._generator.uniform(-0.1, 0.1)
-            return [placed(self._fleet.meshes[kind], (x, y, yaw))], []
+            return [self._fleet.park(kind, (x, y, yaw))], []
         if self._generator.random() < TROLLEY_SHARE:
             x, y = x + self._generator.uniform(-0.6, 0.6), head_y + inwards * self._generator.uniform(1.0, 4.0)
             return [], [box((x, y), TROLLEY_M, yaw_deg=self._generator.uniform(0.0, 360.0))]

@@ -44,7 +44,7 @@ class Procedural(Document):
         steps = int(np.ceil(self.duration_s / self.time_step_s - 1e-9))
         times_s = self.time_step_s * np.arange(steps + 1, dtype=np.float64)
         static, driver, others = self._build(fleet, times_s, generator)
-        return World(static, driver, others, self.time_step_s, self.duration_s)
+        return World(static, driver, others, self.time_step_s, self.duration_s, tuple(fleet.parked))
 
     @abstractmethod
     def _build(

@@ -1,0 +1,139 @@
+"""Nothing that could be hit is left out: the same bits as with every ray cast at every body."""
+
+import numpy as np
+import pytest
+
+from torchcover.geometry import Box, rigid, rotation_from_euler
+from torchcover.simulation import EvenReference, Lidar, Pose, ReferenceSensor, Scenario
+from torchcover.simulation.culling import blocks_towards, boxes_in_cone, outlines, rays_towards
+from torchcover.simulation.instant import cast_from, rotate
+from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.rays import into_tiles, unit_directions
+from torchcover.simulation.scene import Scene
+
+EGO = Box((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
+SPHERE = into_tiles(unit_directions(np.linspace(-89, 89, 60)[:, None], np.linspace(-180, 179, 120)[None]))
+ROOF = Pose(x_m=0.45, z_m=1.73).matrix()
+
+
+@pytest.fixture(scope="module", params=["urban", "highway", "parking"])
+def scene(request):
+    return Scene(Scenario.load(request.param).world(seed=3))
+
+
+def at_every_body(instant, vehicle_T_sensor, tiles, max_range_m):
+    """The slow twin: range and body of every ray, cast at every body in turn."""
+    origin_m, answers = vehicle_T_sensor[:3, 3], []
+    for tile in tiles:
+        directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
+        limit_m = np.full(directions.shape[1], max_range_m, dtype=np.float32)
+        hits = cast_from(instant.static, instant.static_T_vehicle, origin_m, directions, limit_m)
+        for part in instant.moving:
+            nearer = cast_from(part.caster, part.part_T_vehicle, origin_m, directions, hits.range_m)
+            hits.range_m[:] = nearer.range_m
+            hits.body[nearer.body >= 0] = part.body
+        seen = (hits.body >= 0) & (hits.body != instant.ego)
+        points = (directions * hits.range_m + origin_m.astype(np.float32)[:, None])[:, seen]
+        answers.append((points.T, np.count_nonzero(hits.body == instant.ego)))
+    points, self_hits = zip(*answers, strict=True)
+    return np.concatenate(points), sum(self_hits)
+
+
+def assert_same_bits(scan, expected):
+    points, self_hits = expected
+    np.testing.assert_array_equal(scan.points.view(np.int32), points.view(np.int32))
+    assert scan.self_hits == self_hits
+
+
+@pytest.mark.parametrize("step", [0, 170, 399])
+@pytest.mark.parametrize("sensor", ["roof", "bumper", "paper", "even"])
+def test_a_scan_is_that_of_every_ray_cast_at_every_body(scene, step, sensor):
+    instant, generator = scene.at(step, within_m=150.0), np.random.default_rng(step)
+    if sensor in ("paper", "even"):
+        areas = (((0.0, 20.0), (-5.0, 5.0)), ((0.0, 80.0), (-20.0, 20.0)))
+        reference = ReferenceSensor(rows=60, columns=90) if sensor == "paper" else EvenReference(areas, rays=5000)
+        pose = reference.vehicle_T_reference(EGO, generator)
+        tiles = reference.tiles(pose, generator)
+    else:
+        pose, tiles = ROOF if sensor == "roof" else Pose(x_m=2.6, z_m=0.4, pitch_deg=3).matrix(), SPHERE
+    seen = instant.scan(pose, tiles, max_range_m=150.0)
+    assert_same_bits(seen, at_every_body(instant, pose, tiles, 150.0))
+    assert seen.body_casts < 0.5 * seen.rays * len(instant.moving)
+
+
+@pytest.mark.parametrize("step", [0, 250])
+def test_a_mounted_sensor_sees_the_same_without_casting_at_the_ego_again(scene, step):
+    lidar = Lidar(name="roof", mount=Pose(x_m=0.45, z_m=1.73, yaw_deg=20), channels=40, vertical_fov_deg=(-60, 10),
+                  horizontal_fov_deg=360, columns=150, max_range_m=90, min_range_m=0.5)  # fmt: skip
+    tiles, instant = into_tiles(lidar.directions()), scene.at(step, within_m=90.0)
+    mounted = MountedSensor(lidar, tiles, scene).scan(instant, threads=2)
+    afresh = instant.scan(lidar.mount.matrix(), tiles, min_range_m=0.5, max_range_m=90)
+    assert mounted.self_hits > 100
+    assert_same_bits(mounted, (afresh.points, afresh.self_hits))
+    np.testing.assert_array_equal(mounted.ray, afresh.ray)
+    assert mounted.body_casts < afresh.body_casts
+
+
+def boxes_around(generator, count):
+    """(count, 8, 3) corners of boxes of all forms and orientations, some around the origin, and their poses."""
+    corners = Box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).corners_m
+    sizes = generator.uniform(0.05, 1.0, size=(count, 3)) * 10 ** generator.uniform(-1, 1.3, size=(count, 1))
+    places = generator.normal(size=(count, 3)) * 10 ** generator.uniform(-1, 1.5, size=(count, 1))
+    poses = [rigid(rotation_from_euler(*generator.uniform(-180, 180, 3)), place) for place in places]
+    return np.array([(corners * s) @ p[:3, :3].T + p[:3, 3] for s, p in zip(sizes, poses, strict=True)]), sizes, poses
+
+
+def test_no_ray_that_meets_a_box_is_left_out():
+    """Directions to points inside boxes, the corners included, pass every test for those boxes."""
+    generator = np.random.default_rng(0)
+    corners_m, sizes, poses = boxes_around(generator, 300)
+    origin_m = np.array([0.3, -0.2, 0.1])
+    seen = outlines(corners_m, origin_m)
+    turned = rotation_from_euler(30, 20, 10)
+    close = 0
+    for k, (size, pose) in enumerate(zip(sizes, poses, strict=True)):
+        inside = np.vstack([generator.uniform(-0.5, 0.5, size=(92, 3)), Box((-0.5,) * 3, (0.5,) * 3).corners_m]) * size
+        way_m = inside @ pose[:3, :3].T + pose[:3, 3] - origin_m
+        range_m = np.linalg.norm(way_m, axis=1)
+        directions = (way_m / range_m[:, None]).T
+        (tile,) = into_tiles((turned.T @ directions).reshape(3, 10, 10))
+        ends_m = range_m.astype(np.float32)
+        assert seen.nearest_m[k] < range_m.min()
+        assert k in boxes_in_cone(seen, turned @ tile.axis, tile.half_angle, float(ends_m.max()))
+        blocks = blocks_towards(seen.kept(np.array([k])), tile, turned, ends_m)
+        assert blocks.all()
+        rays = tile.blocks[blocks[0]].ravel()
+        kept = rays_towards(seen, k, rays, directions.astype(np.float32), ends_m)
+        np.testing.assert_array_equal(np.unique(kept), np.arange(100))
+        close += bool((seen.normals[k] == 0).all())
+    assert 3 < close < 150
+
+
+def test_rays_that_miss_a_box_by_far_or_end_before_it_are_left_out():
+    box = Box((10.0, -1.0, 0.0), (14.0, 1.0, 1.5))
+    seen = outlines(box.corners_m[None], np.zeros(3))
+    (tile,) = into_tiles(unit_directions(np.linspace(-40, 40, 81)[:, None], np.linspace(-90, 90, 181)[None]),
+                         tile_columns=181)  # fmt: skip
+    forever, short = (np.full(tile.directions.shape[1], metres, np.float32) for metres in (np.inf, 9.9))
+    every = np.arange(tile.directions.shape[1])
+    x, y, z = tile.directions
+    with np.errstate(divide="ignore"):
+        meets = (np.abs(y / x) < 0.1) & (z / x < 0.15) & (z >= 0)
+    kept = rays_towards(seen, 0, every, tile.directions, forever)
+    assert set(np.flatnonzero(meets)) <= set(kept)
+    assert len(kept) <= 1.5 * meets.sum() + 20
+    assert blocks_towards(seen, tile, np.eye(3), forever).mean() < 0.1
+    assert len(rays_towards(seen, 0, every, tile.directions, short)) == 0
+    assert not blocks_towards(seen, tile, np.eye(3), short).any()
+    assert len(boxes_in_cone(seen, np.array([0.0, 1.0, 0.0]), 0.3, np.inf)) == 0
+    assert len(boxes_in_cone(seen, np.array([1.0, 0.0, 0.0]), 0.3, 9.0)) == 0
+    assert boxes_in_cone(seen, np.array([0.0, 1.0, 0.0]), 2.0, np.inf).tolist() == [0]
+
+
+def test_a_ray_does_not_depend_on_its_company():
+    turn, rays = rotation_from_euler(31, 7, 3), np.concatenate([tile.directions for tile in SPHERE], axis=1)
+    together = rotate(turn, rays)
+    for first in range(0, 2000, 40):
+        for count in (1, 2, 3, 5, 8):
+            some = slice(first, first + count)
+            np.testing.assert_array_equal(rotate(turn, rays[:, some]), together[:, some])

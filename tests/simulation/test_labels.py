@@ -1,0 +1,70 @@
+"""Labels are the boxes of the bodies, seen from the vehicle."""
+
+import numpy as np
+import pytest
+
+from torchcover.simulation.labels import labels
+from torchcover.simulation.shapes import Box
+from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.world import Actor, World
+
+CAR = Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh()
+UTM_M = np.array([5.6e5, 5.9e6, 80.0])
+
+
+def driving(speed_mps, yaw_deg, start_m, seconds=10.0):
+    heading = np.array([np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg)), 0.0])
+    start = np.asarray(start_m, dtype=float)
+    return Trajectory.of([0.0, seconds], [start, start + seconds * speed_mps * heading], [[yaw_deg, 0, 0]] * 2)
+
+
+def world(ego, actors, parked=()):
+    return World((CAR,), Actor("ego", "car", CAR, ego), tuple(actors), 0.5, 10.0, tuple(parked))
+
+
+def test_a_label_is_where_the_body_is_in_the_frame_of_the_ego():
+    """The ego drives north, 10 m/s; the truck drives east, 5 m/s, 20 m ahead of it after a second."""
+    ego = driving(10.0, 90.0, UTM_M)
+    truck = Actor("truck 1", "truck", CAR, driving(5.0, 0.0, UTM_M + np.array([-5.0, 30.0, 0.0])))
+    (label,) = labels(world(ego, [truck]), step=2, within_m=100.0)
+    assert (label.name, label.category, label.size_m) == ("truck 1", "truck", (4.0, 2.0, 1.5))
+    np.testing.assert_allclose(label.centre_m, [20.0, 0.0, 0.75], atol=1e-6)
+    assert label.yaw_rad == pytest.approx(-np.pi / 2)
+    # Over ground along the vehicle's axes: the ego's own speed is not subtracted.
+    np.testing.assert_allclose(label.velocity_mps, [0.0, -5.0], atol=1e-6)
+
+
+def test_the_range_is_measured_over_ground_and_who_is_not_there_has_no_label():
+    ego = Trajectory.resting([0.0, 0.0, 0.0])
+    near = Actor("near", "car", CAR, Trajectory.resting([30.0, 40.0, 9.0]))
+    far = Actor("far", "car", CAR, Trajectory.resting([30.0, 40.1, 0.0]))
+    brief = Trajectory(np.array([0.0, 1.0]), np.array([[9.0, 0, 0], [9.0, 1, 0]]), np.zeros((2, 3)), transient=True)
+    made = world(ego, [near, far, Actor("brief", "car", CAR, brief)])
+    assert [label.name for label in labels(made, 0, 50.0)] == ["near", "brief"]
+    assert [label.name for label in labels(made, 4, 50.0)] == ["near"]
+
+
+def test_parked_objects_have_labels_too():
+    parked = Actor("parked van 0", "car", CAR, Trajectory.resting([7.0, 3.0, 0.0], [180.0, 0.0, 0.0]))
+    (label,) = labels(world(Trajectory.resting([0, 0, 0]), [], [parked]), 3, 50.0)
+    assert label.name == "parked van 0"
+    np.testing.assert_array_equal(label.velocity_mps, 0.0)
+
+
+def test_velocity_is_that_of_the_segment_their_mean_at_a_corner_and_zero_at_rest():
+    track = Trajectory.of([1.0, 2.0, 4.0], [[0, 0, 0], [10, 0, 0], [10, 8, 0]], np.zeros((3, 3)))
+    for time_s, expected in {
+        0.5: [0, 0, 0], 1.0: [10, 0, 0], 1.5: [10, 0, 0], 2.0: [5, 2, 0], 3.0: [0, 4, 0], 4.0: [0, 4, 0], 4.5: [0, 0, 0]
+    }.items():  # fmt: skip
+        np.testing.assert_allclose(track.velocity_at(time_s), expected, err_msg=f"at {time_s} s")
+    np.testing.assert_array_equal(Trajectory.resting([1, 2, 3]).velocity_at(0.0), 0.0)
+
+
+def test_velocity_is_the_slope_of_the_positions():
+    generator = np.random.default_rng(0)
+    times_s = np.cumsum(generator.uniform(0.1, 0.5, 20))
+    track = Trajectory.of(times_s, generator.normal(size=(20, 3)), np.zeros((20, 3)))
+    for time_s in generator.uniform(times_s[0] + 0.01, times_s[-1] - 0.01, 30):
+        if np.abs(times_s - time_s).min() > 1e-4:
+            slope = (track.at(time_s + 1e-5)[:3, 3] - track.at(time_s - 1e-5)[:3, 3]) / 2e-5
+            np.testing.assert_allclose(track.velocity_at(time_s), slope, atol=1e-6)

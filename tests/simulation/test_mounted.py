@@ -1,0 +1,93 @@
+"""What a mounted sensor need not look at again is the same to the last bit, and what comes between is seen."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from torchcover.simulation import Lidar, Pose
+from torchcover.simulation.bodies import in_vehicle_frame
+from torchcover.simulation.instant import Instant
+from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.rays import into_tiles
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.shapes import Box, Plane
+from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.world import Actor, World
+
+UTM = np.array([513_248.37, 5_403_655.81, 312.5])
+LIDAR = Lidar(
+    name="roof", mount=Pose(x_m=-0.3, z_m=1.5, yaw_deg=10), channels=30, vertical_fov_deg=(-80, 20),
+    horizontal_fov_deg=360, columns=120, min_range_m=0.2, max_range_m=40,
+)  # fmt: skip
+TILES = into_tiles(LIDAR.directions())
+
+
+def box(*size_m):
+    return in_vehicle_frame(Box(type="box", size_m=size_m).mesh())
+
+
+def driving(start, way, yaw_deg=0.0):
+    ends_m = np.array([start, np.add(start, way)], dtype=float)
+    return Trajectory.of([0.0, 10.0], ends_m, [[yaw_deg, 0, 0]] * 2)
+
+
+def world(ego_moves=True, actor_moves=True, origin_m=(0.0, 0.0, 0.0)):
+    """An ego at up to 1 m/s under a bar that hangs 0.1 m above its roof, and a car beside it."""
+    origin_m = np.array(origin_m)
+    bar = box(0.4, 6, 0.1).moved(Pose(x_m=4.0, z_m=1.1).matrix())
+    static = [bar, Plane(type="plane", size_m=(200, 200)).mesh()]
+    for k, mesh in enumerate(static):
+        static[k] = mesh._replace(vertices_m=mesh.vertices_m + origin_m)
+    ego = Actor("ego", "ego", box(4, 2, 1), driving(origin_m, (10.0 * ego_moves, 0, 0)))
+    car = Actor("car", "car", box(3, 1, 1), driving(np.add(origin_m, [0, 5, 0]), (20.0 * actor_moves, 0, 0)))
+    return World(tuple(static), ego, (car,), time_step_s=1.0, duration_s=10.0)
+
+
+def afresh(instant):
+    return instant.scan(LIDAR.mount.matrix(), TILES, min_range_m=0.2, max_range_m=40)
+
+
+@pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), UTM])
+@pytest.mark.parametrize("actor_moves", [False, True])
+@pytest.mark.parametrize("ego_moves", [False, True])
+def test_every_step_is_that_of_a_scan_afresh(ego_moves, actor_moves, origin_m):
+    scene = Scene(world(ego_moves, actor_moves, origin_m))
+    mounted, self_hits = MountedSensor(LIDAR, TILES, scene), []
+    for step in (0, 3, 4, 5, 9):
+        instant = scene.at(step, within_m=40.0)
+        seen, expected = mounted.scan(instant), afresh(instant)
+        np.testing.assert_array_equal(seen.points.view(np.int32), expected.points.view(np.int32))
+        np.testing.assert_array_equal(seen.ray, expected.ray)
+        assert (seen.rays, seen.self_hits) == (expected.rays, expected.self_hits)
+        self_hits.append(seen.self_hits)
+    # The bar comes between the sensor and the ego's body while the ego passes below it.
+    assert self_hits[0] > 500
+    assert (min(self_hits) < self_hits[0] - 20) == ego_moves
+
+
+def test_a_scan_is_made_again_only_where_something_moves(monkeypatch):
+    scans, original = [], Instant.scan
+    monkeypatch.setattr(Instant, "scan", lambda *args, **options: scans.append(1) or original(*args, **options))
+    for moves, expected in [((False, False), 1), ((False, True), 3), ((True, False), 3)]:
+        scans.clear()
+        scene = Scene(world(*moves))
+        mounted = MountedSensor(LIDAR, TILES, scene)
+        for step in (0, 1, 2):
+            mounted.scan(scene.at(step))
+        assert len(scans) == expected
+
+
+def test_rays_that_the_ego_ends_are_not_cast_at_it():
+    scene = Scene(world())
+    instant = scene.at(0)
+    assert MountedSensor(LIDAR, TILES, scene).scan(instant).body_casts < afresh(instant).body_casts - 500
+
+
+def test_the_ego_is_at_its_own_place_to_the_last_bit():
+    """Coordinates of UTM size: a pose and its inverse make the identity only nearly."""
+    made = world(origin_m=UTM)
+    turned = replace(made, ego=replace(made.ego, trajectory=driving(UTM, (10, 0, 0), yaw_deg=37.3)), actors=())
+    for step in (0, 3, 7):
+        (ego,) = Scene(turned).at(step).moving
+        np.testing.assert_array_equal(ego.part_T_vehicle, np.eye(4))

@@ -1,0 +1,139 @@
+"""Which rays of a sensor may hit which of the bodies around it: a test that is cheaper than casting.
+
+Seen from one place, a box fills a pyramid: four planes through that place bound it. A ray on the outer side of one of
+them misses the box, and so does a whole cone of rays that lies there. Nothing is left out that could be hit.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.simulation.rays import Tile
+
+# Angles between float32 directions are off by less than this, in radians.
+ROUNDING = 1e-5
+# A box whose corners are not all this far in front of the sensor has no pyramid, in metres.
+CLOSEST_M = 0.05
+# By how much boxes are grown for their bodies' float32 coordinates: in metres, and as a share of their coordinates.
+SLACK_M = 1e-3
+SLACK_SHARE = 1e-6
+# Ranges are compared with this much to spare, in metres: a grazing ray's range is not exact.
+RANGE_SLACK_M = 0.01
+
+Float64 = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+
+class Outlines(NamedTuple):
+    """P boxes as one place sees them.
+
+    `normals` (P, 4, 3) of planes through the place with the box on the inner side, zeros where there is none;
+    `nearest_m` (P,) is a distance that no point of the box falls below.
+    """
+
+    normals: Float64
+    nearest_m: Float64
+
+    def kept(self, boxes: NDArray[np.intp]) -> "Outlines":
+        """Some of them."""
+        return Outlines(self.normals[boxes], self.nearest_m[boxes])
+
+
+def outlines(corners_m: Float64, origin_m: Float64) -> Outlines:
+    """How boxes look from a place.
+
+    Args:
+        corners_m: (P, 8, 3) their corners.
+        origin_m: (3,) the place, in the same frame.
+    """
+    ways_m = corners_m - origin_m
+    forward = _unit(ways_m.mean(axis=1))
+    # Upright bodies fill a pyramid whose sides are upright.
+    steep = np.abs(forward[:, 2:]) > 0.99
+    left = _unit(np.cross(np.where(steep, [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]]), forward))
+    up = np.cross(forward, left)
+    depth_m = np.einsum("pkc,pc->pk", ways_m, forward)
+    nearest_m = depth_m.min(axis=1)
+    too_close = nearest_m < CLOSEST_M
+    depth_m[too_close] = 1.0
+    normals = []
+    for side in (left, up):
+        slope = np.einsum("pkc,pc->pk", ways_m, side) / depth_m
+        normals += [side - slope.max(axis=1, keepdims=True) * forward]
+        normals += [slope.min(axis=1, keepdims=True) * forward - side]
+    planes = _unit(np.stack(normals, axis=1))
+    planes[too_close] = _faces_towards(ways_m[too_close])
+    return Outlines(planes, np.where(too_close, 0.0, nearest_m) - RANGE_SLACK_M)
+
+
+def _faces_towards(ways_m: Float64) -> Float64:
+    """(P, 4, 3) normals of those faces of boxes whose outer side the place is on: no ray that leaves it turns back.
+
+    Args:
+        ways_m: (P, 8, 3) from the place to the corners, in the order of `Box.corners_m`.
+    """
+    normals = np.zeros((len(ways_m), 4, 3))
+    for axis, across in enumerate((4, 2, 1)):
+        along = _unit(ways_m[:, across] - ways_m[:, 0])
+        behind = np.einsum("pc,pc->p", along, ways_m[:, 0]) > 0
+        beyond = np.einsum("pc,pc->p", along, ways_m[:, across]) < 0
+        normals[:, axis] = along * (beyond.astype(np.float64) - behind)[:, None]
+    return normals
+
+
+def boxes_in_cone(outlines: Outlines, axis: Float64, half_angle: float, range_m: float) -> NDArray[np.intp]:
+    """Numbers of the boxes that a ray of a cone may meet before it ends.
+
+    Args:
+        outlines: The boxes, seen from the tip of the cone.
+        axis: (3,) middle of the cone, in the frame of the boxes.
+        half_angle: Half its opening in radians.
+        range_m: Where its longest ray ends.
+    """
+    wider = half_angle + ROUNDING
+    # Beyond a right angle no plane has a cone on one side of it.
+    outside = (outlines.normals @ axis).max(axis=1) > (np.sin(wider) if wider < np.pi / 2 else np.inf)
+    return np.flatnonzero(~outside & (outlines.nearest_m <= range_m))
+
+
+def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, range_m: Float32) -> NDArray[np.bool_]:
+    """(P, B) whether a ray of each block of a tile may meet each box before it ends.
+
+    Args:
+        outlines: The boxes, seen from the sensor.
+        tile: Rays of the sensor.
+        vehicle_R_sensor: (3, 3) rotation from the sensor's frame to that of the boxes.
+        range_m: (n,) where each of the tile's rays ends.
+    """
+    ends_m = range_m.take(tile.blocks).max(axis=1)
+    normals = outlines.normals @ vehicle_R_sensor
+    # No direction between the lower and the upper bounds of a block has a smaller product with a normal.
+    least = np.maximum(normals, 0.0) @ tile.block_lower + np.minimum(normals, 0.0) @ tile.block_upper
+    reached: NDArray[np.bool_] = (least.max(axis=1) <= ROUNDING) & (outlines.nearest_m[:, None] <= ends_m)
+    return reached
+
+
+def rays_towards(
+    outlines: Outlines, box: int, rays: NDArray[np.int64], directions: Float32, range_m: Float32
+) -> NDArray[np.int64]:
+    """Which of some rays may meet one box before they end.
+
+    Args:
+        outlines: The boxes.
+        box: Number of the box.
+        rays: (K,) numbers of the rays.
+        directions: (3, n) all rays, in the frame of the boxes.
+        range_m: (n,) where they end.
+    """
+    across = outlines.normals[box].astype(np.float32) @ directions.take(rays, axis=1)
+    within = (across.max(axis=0) <= ROUNDING) & (range_m.take(rays) >= outlines.nearest_m[box])
+    found: NDArray[np.int64] = rays[within]
+    return found
+
+
+def _unit(vectors: Float64) -> Float64:
+    # A vector of length 0 has no direction; it is left as it is.
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    unit: Float64 = vectors / np.maximum(length, np.finfo(np.float64).tiny)
+    return unit

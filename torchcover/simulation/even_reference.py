@@ -1,0 +1,189 @@
+"""A reference sensor that spreads its rays over the places that are asked about."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import Box, rigid
+from torchcover.simulation.rays import Tile, into_tiles
+from torchcover.simulation.reference import MAX_TILT_DEG, position_in_shell
+
+# Height above the ground up to which half of the rays look for bodies that stand on it.
+TOP_M = 2.0
+# Steps in elevation at which the density of the paper's sensor is tabulated.
+ELEVATIONS = 181
+ORIENTATIONS = 48
+
+Float64 = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class EvenReference:
+    """Rays from the paper's places, aimed at points that lie evenly in given areas.
+
+    Half of the rays aim at points on the ground, z = 0, half at points between it and 2 m above; of both, every area
+    gets the same number. Targets are stratified: each area is cut into as many nearly square patches as it has rays,
+    and each ray aims at a random point of its patch, another one at every step. What stands in the way of a target is
+    hit instead, as ever.
+
+    The paper's sensor asks the same question with another density of rays: nearly all of its million look at the
+    ground near the vehicle. `weights` holds the ratio of the two densities, with which the means over a cell have the
+    same expectation.
+
+    Args:
+        areas: Rectangles x, y in the vehicle frame in metres, ((x_low, x_high), (y_low, y_high)) each. They may
+            overlap: small ones inside of large ones get more rays.
+        rays: About how many rays there are in all; patches are whole.
+        shell_m: Thickness of the shell around the ego in which the sensor is.
+        max_range_m: Farther hits give no point.
+
+    Raises:
+        ValueError: No area, an area with inverted or infinite bounds, fewer than 2 rays an area, a shell or a range
+            that is not positive.
+
+    Example:
+        >>> sensor = EvenReference(areas=(((0.0, 20.0), (-5.0, 5.0)),), rays=1024)
+        >>> pose = sensor.vehicle_T_reference(Box((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6)), np.random.default_rng(0))
+        >>> tiles = sensor.tiles(pose, np.random.default_rng(0))
+        >>> sum(tile.directions.shape[1] for tile in tiles)
+        1024
+    """
+
+    areas: tuple[tuple[tuple[float, float], tuple[float, float]], ...]
+    rays: int = 16_384
+    shell_m: float = 0.5
+    max_range_m: float = 250.0
+
+    def __post_init__(self) -> None:
+        if not self.areas:
+            raise ValueError("areas: at least one rectangle ((x_low, x_high), (y_low, y_high)) is needed")
+        for area in self.areas:
+            if not all(-math.inf < low < high < math.inf for low, high in area):
+                raise ValueError(f"areas: finite bounds, lower first, are needed; got {area}")
+        if self.rays < 2 * len(self.areas):
+            raise ValueError(f"rays: at least 2 for each of {len(self.areas)} areas are needed; got {self.rays}")
+        if not self.shell_m > 0:
+            raise ValueError(f"shell_m: a positive thickness in metres is needed; got {self.shell_m}")
+        if not self.max_range_m > 0:
+            raise ValueError(f"max_range_m: a positive distance in metres is needed; got {self.max_range_m}")
+
+    def vehicle_T_reference(self, ego: Box, generator: np.random.Generator) -> Float64:
+        """Draw the pose of one step: its place is the paper's; its axes are those of the vehicle.
+
+        Args:
+            ego: Bounding box of the ego in the vehicle frame.
+            generator: Source of the random numbers.
+
+        Returns:
+            (4, 4) transform.
+        """
+        return rigid(np.eye(3), position_in_shell(ego, self.shell_m, generator))
+
+    def tiles(self, vehicle_T_reference: Float64, generator: np.random.Generator) -> tuple[Tile, ...]:
+        """Aim the rays of one step.
+
+        Args:
+            vehicle_T_reference: (4, 4) pose, from `vehicle_T_reference`.
+            generator: Source of the random numbers.
+
+        Returns:
+            The rays in the sensor's frame.
+        """
+        place_m = vehicle_T_reference[:3, 3]
+        each = self.rays // (2 * len(self.areas))
+        tiles: list[Tile] = []
+        for area in self.areas:
+            for top_m in (0.0, TOP_M):
+                targets_m = _stratified(area, top_m, each, generator)
+                way_m = targets_m - place_m[:, None, None]
+                tiles += into_tiles(way_m / np.linalg.norm(way_m, axis=0))
+        return tuple(tiles)
+
+    def weights(
+        self, vehicle_T_reference: Float64, tiles: tuple[Tile, ...], ray: NDArray[np.int64]
+    ) -> NDArray[np.float32]:
+        """Density of the paper's sensor over the density of this one, both per solid angle.
+
+        Args:
+            vehicle_T_reference: (4, 4) pose, from `vehicle_T_reference`.
+            tiles: The rays of the step, from `tiles`.
+            ray: (N,) numbers of the rays, counted over the tiles.
+
+        Returns:
+            (N,) positive weights.
+        """
+        towards = np.concatenate([tile.directions for tile in tiles], axis=1)[:, ray].astype(np.float64)
+        place_m = vehicle_T_reference[:3, 3]
+        density = np.mean([_density(area, place_m, towards) for area in self.areas], axis=0)
+        elevation = np.arcsin(np.clip(towards[2], -1.0, 1.0))
+        paper = np.interp(elevation, np.linspace(-np.pi / 2, np.pi / 2, ELEVATIONS), paper_density())
+        # The paper's sensor never looks up steeply, and a ray aimed at the very border of an area may have been rounded
+        # out of it: neither may make a weight of 0 or infinity.
+        weights: NDArray[np.float32] = (np.maximum(paper, 1e-6) / np.maximum(density, 1e-6)).astype(np.float32)
+        return weights
+
+
+def _stratified(
+    area: tuple[tuple[float, float], tuple[float, float]], top_m: float, count: int, generator: np.random.Generator
+) -> Float64:
+    """(3, rows, columns) points, one at random in each of about `count` patches; z between 0 and `top_m`."""
+    (x_low, x_high), (y_low, y_high) = area
+    length_m, width_m = x_high - x_low, y_high - y_low
+    columns = min(count, max(1, round(math.sqrt(count * length_m / width_m))))
+    rows = count // columns
+    jitter = generator.random((3, rows, columns))
+    x = x_low + length_m * (np.arange(columns)[None] + jitter[0]) / columns
+    y = y_low + width_m * (np.arange(rows)[:, None] + jitter[1]) / rows
+    return np.stack([x, y, top_m * jitter[2]])
+
+
+def _density(area: Sequence[tuple[float, float]], place_m: Float64, directions: Float64) -> Float64:
+    """Rays of one area per solid angle, of each of some directions: half aimed at the ground, half above it."""
+    (x_low, x_high), (y_low, y_high) = area
+    size_m2 = (x_high - x_low) * (y_high - y_low)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ground_m = -place_m[2] / directions[2]
+        x, y = (place_m[axis] + ground_m * directions[axis] for axis in range(2))
+        meets = (ground_m > 0) & (x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high)
+        on_ground = np.where(meets, ground_m**2 / (np.abs(directions[2]) * size_m2), 0.0)
+    near_m, far_m = _stretch_within(
+        np.array([x_low, y_low, 0.0]), np.array([x_high, y_high, TOP_M]), place_m, directions
+    )
+    above = (far_m**3 - near_m**3) / (3 * size_m2 * TOP_M)
+    return (on_ground + above) / 2
+
+
+def _stretch_within(
+    lower_m: Float64, upper_m: Float64, place_m: Float64, directions: Float64
+) -> tuple[Float64, Float64]:
+    """Where rays enter and leave a box, as distances from their origin; the same number twice if they miss it."""
+    near_m = np.zeros(directions.shape[1])
+    far_m = np.full(directions.shape[1], np.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for axis in range(3):
+            bounds = np.stack([lower_m[axis] - place_m[axis] + 0 * near_m, upper_m[axis] - place_m[axis] + 0 * near_m])
+            ends = np.sort(bounds / directions[axis], axis=0)
+            near_m, far_m = np.fmax(near_m, ends[0]), np.fmin(far_m, ends[1])
+    return near_m, np.maximum(near_m, far_m)
+
+
+@lru_cache
+def paper_density() -> Float64:
+    """Rays of the paper's sensor per solid angle at elevations from -90 to 90 degrees, averaged over its orientations.
+
+    Its rows are even in elevation below its own horizon: 1 / (pi^2 cos(elevation)) there, and nothing above. Yaw
+    being uniform, what is left of an orientation is the tilt of its axis: pitch and roll uniform in +-45 degrees.
+    """
+    middle = (np.arange(ORIENTATIONS) + 0.5) / ORIENTATIONS
+    tilt = np.deg2rad(MAX_TILT_DEG) * middle
+    cosine = (np.cos(tilt)[:, None] * np.cos(tilt)[None]).reshape(-1, 1, 1)
+    sine = np.sqrt(1 - cosine**2)
+    elevation = np.linspace(-np.pi / 2, np.pi / 2, ELEVATIONS)[:, None]
+    towards_axis = cosine * np.sin(elevation) + sine * np.cos(elevation) * np.cos(np.pi * middle)
+    density = np.where(towards_axis < 0, 1 / np.sqrt(np.maximum(1 - towards_axis**2, 1e-12)), 0.0)
+    average: Float64 = density.mean(axis=(0, 2)) / np.pi**2
+    return average

@@ -1,0 +1,222 @@
+"""A scene at one time, which sensors scan."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import transform
+from torchcover.simulation.culling import Outlines, blocks_towards, boxes_in_cone, outlines, rays_towards
+from torchcover.simulation.raycaster import Hits, RayCaster
+from torchcover.simulation.rays import TILE_ROWS, Tile, into_tiles, unit_directions
+
+# Directions all around, to find out whether a place lies inside a body.
+ALL_AROUND = unit_directions(np.linspace(-85.0, 85.0, 12)[:, None], np.arange(0.0, 360.0, 30.0)[None])
+ALL_AROUND_RAYS = ALL_AROUND.reshape(3, -1).astype(np.float32)
+# Above the ground no ray meets the back of a face; below it, those that go up do.
+BURIED_SHARE = 0.25
+# Seen from farther than this many radii, fewer of those directions than that share point at a ball.
+CLEAR_RADII = 2.0
+
+Matrix = NDArray[np.float64]
+Float32 = NDArray[np.float32]
+
+
+class Scan(NamedTuple):
+    """What one sensor saw: `points` (N, 3) float32 in the vehicle frame, and how many rays went where.
+
+    `ray` (N,) says which ray, counted over the tiles, made each point. `body_casts` is the number of pairs of a ray and
+    a moving body at which it was cast: the other pairs could not meet.
+    """
+
+    points: Float32
+    ray: NDArray[np.int64]
+    rays: int
+    self_hits: int
+    body_casts: int = 0
+
+
+class Part(NamedTuple):
+    """A body that moves, placed at one instant; `body` is its number.
+
+    `corners_m` (8, 3) of the box around it, and a ball around it, both in the vehicle frame.
+    """
+
+    caster: RayCaster
+    part_T_vehicle: Matrix
+    body: int
+    corners_m: Matrix
+    centre_m: Matrix
+    radius_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Instant:
+    """A scene at one time. Its bodies are numbered: what never moves, then what moves.
+
+    Args:
+        static: What never moves.
+        static_T_vehicle: From the vehicle frame to that of what never moves.
+        moving: The bodies that move and are near.
+        ego: Number of the ego.
+        out_of_range: How many bodies that move are not near, or not there.
+    """
+
+    static: RayCaster
+    static_T_vehicle: Matrix
+    moving: tuple[Part, ...]
+    ego: int
+    out_of_range: int = 0
+
+    def scan(
+        self,
+        vehicle_T_sensor: Matrix,
+        tiles: Sequence[Tile],
+        *,
+        min_range_m: float = 0.0,
+        max_range_m: float = np.inf,
+        own_m: Sequence[Float32] = (),
+        threads: int = 1,
+    ) -> Scan:
+        """Cast the rays of one sensor. The ego occludes, but its own points are left out.
+
+        Args:
+            vehicle_T_sensor: (4, 4) pose of the sensor.
+            tiles: Its rays, from `into_tiles`.
+            min_range_m: Closer hits give no point; they hide what lies behind all the same.
+            max_range_m: Farther hits give no point.
+            own_m: Of a sensor that is fixed to the ego: where the ego's body ends the rays of each tile, from
+                `Scene.own_m`. They are not cast at it again. The result is the same.
+            threads: Number of threads; the result does not depend on it.
+
+        Returns:
+            A `Scan`, the points in the order of the tiles.
+        """
+        bodies = self._outlines(vehicle_T_sensor[:3, 3])
+
+        def scan_tile(tile: Tile, own_m: Float32 | None) -> tuple[Float32, NDArray[np.bool_], int, int]:
+            directions, hits, casts = self._cast_tile(vehicle_T_sensor, tile, max_range_m, bodies, own_m)
+            seen = (hits.body >= 0) & (hits.body != self.ego)
+            if min_range_m > 0:
+                seen &= hits.range_m >= min_range_m
+            points = _points(vehicle_T_sensor[:3, 3], directions, hits.range_m, seen)
+            return points, seen, int(np.count_nonzero(hits.body == self.ego)), casts
+
+        own: Sequence[Float32 | None] = own_m or [None] * len(tiles)
+        if threads <= 1 or len(tiles) <= 1:
+            scans = list(map(scan_tile, tiles, own))
+        else:
+            # A pool for each scan: threads do not survive the fork that makes a DataLoader worker.
+            with ThreadPoolExecutor(threads) as pool:
+                scans = list(pool.map(scan_tile, tiles, own))
+        points, seen, self_hits, casts = zip(*scans, strict=True)
+        rays = sum(tile.directions.shape[1] for tile in tiles)
+        return Scan(np.concatenate(points), np.flatnonzero(np.concatenate(seen)), rays, sum(self_hits), sum(casts))
+
+    def range_image(
+        self, vehicle_T_sensor: Matrix, directions: NDArray[np.float64], *, max_range_m: float = np.inf
+    ) -> Float32:
+        """Distance along the ray of every pixel, the ego's body included.
+
+        Args:
+            vehicle_T_sensor: (4, 4) pose of the frame of the directions.
+            directions: (3, rows, columns) unit directions; NaN for a pixel that has no ray.
+            max_range_m: Hits farther than this are none.
+
+        Returns:
+            (rows, columns) metres; infinite where a ray hits nothing, NaN where there is none.
+        """
+        image = np.full(directions.shape[1:], np.nan, dtype=np.float32)
+        bodies = self._outlines(vehicle_T_sensor[:3, 3])
+        for top in range(0, len(image), TILE_ROWS):
+            rows = slice(top, top + TILE_ROWS)
+            (tile,) = into_tiles(directions[:, rows], tile_columns=directions.shape[2])
+            _, hits, _ = self._cast_tile(vehicle_T_sensor, tile, max_range_m, bodies)
+            image[rows][~np.isnan(directions[0, rows])] = np.where(hits.body >= 0, hits.range_m, np.inf)
+        return image
+
+    def buried(self, position_m: Matrix) -> bool:
+        """Whether a place in the vehicle frame lies below the ground or inside a wall or another body."""
+        casters = [(self.static, self.static_T_vehicle)]
+        casters += [
+            (part.caster, part.part_T_vehicle)
+            for part in self.moving
+            if np.linalg.norm(part.centre_m - position_m) <= CLEAR_RADII * part.radius_m
+        ]
+        return any(
+            caster.back_faces(transform(part_T_vehicle, position_m[None])[0], ALL_AROUND_RAYS).mean() > BURIED_SHARE
+            for caster, part_T_vehicle in casters
+        )
+
+    def _outlines(self, origin_m: Matrix) -> Outlines:
+        """The bodies that move, as a sensor sees them."""
+        corners_m = [part.corners_m for part in self.moving]
+        return outlines(np.array(corners_m).reshape(-1, 8, 3), origin_m)
+
+    def _cast_tile(
+        self,
+        vehicle_T_sensor: Matrix,
+        tile: Tile,
+        max_range_m: float,
+        bodies: Outlines,
+        own_m: Float32 | None = None,
+    ) -> tuple[Float32, Hits, int]:
+        """Directions in the vehicle frame, their hits, and how many rays were cast at bodies that move."""
+        origin_m, vehicle_R_sensor = vehicle_T_sensor[:3, 3], vehicle_T_sensor[:3, :3]
+        directions = rotate(vehicle_R_sensor, tile.directions)
+        limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
+        if own_m is not None:
+            limit_m = np.minimum(limit_m, own_m)
+        hits = cast_from(self.static, self.static_T_vehicle, origin_m, directions, limit_m)
+        if own_m is not None:
+            hits.body[(hits.body < 0) & (own_m <= limit_m)] = self.ego
+        casts = 0
+        farthest_m = float(hits.range_m.max(initial=0.0))
+        near = boxes_in_cone(bodies, vehicle_R_sensor @ tile.axis, tile.half_angle, farthest_m)
+        if len(near) == 0:
+            return directions, hits, 0
+        reached = blocks_towards(bodies.kept(near), tile, vehicle_R_sensor, hits.range_m)
+        # In the order of the bodies: which of two coincident ones a ray hits depends on it.
+        for k, blocks in zip(near[reached.any(axis=1)].tolist(), reached[reached.any(axis=1)], strict=True):
+            part = self.moving[k]
+            if own_m is not None and part.body == self.ego:
+                continue
+            rays = rays_towards(bodies, k, tile.blocks[blocks].ravel(), directions, hits.range_m)
+            casts += len(rays)
+            if len(rays):
+                nearer = cast_from(part.caster, part.part_T_vehicle, origin_m, directions[:, rays], hits.range_m[rays])
+                hits.range_m[rays] = nearer.range_m
+                hits.body[rays[nearer.body >= 0]] = part.body
+        return directions, hits, casts
+
+
+def _points(origin_m: Matrix, directions: Float32, range_m: Float32, seen: NDArray[np.bool_]) -> Float32:
+    """(K, 3) where the rays that saw something ended."""
+    points = np.empty((np.count_nonzero(seen), 3), dtype=np.float32)
+    for axis in range(3):
+        coordinate = directions[axis] * range_m
+        coordinate += np.float32(origin_m[axis])
+        points[:, axis] = coordinate[seen]
+    return points
+
+
+def cast_from(
+    caster: RayCaster, part_T_vehicle: Matrix, origin_m: Matrix, directions: Float32, limit_m: Float32
+) -> Hits:
+    """Cast rays of the vehicle frame at a caster in its own frame."""
+    towards = rotate(part_T_vehicle[:3, :3], directions)
+    return caster.cast(transform(part_T_vehicle, origin_m[None])[0], towards, limit_m)
+
+
+def rotate(rotation: Matrix, directions: Float32) -> Float32:
+    """Turn (3, n) directions. What becomes of one does not depend on the others."""
+    if np.array_equal(rotation, np.eye(3)):
+        return directions
+    if directions.shape[1] == 1:
+        # BLAS has another routine for a single column, which rounds differently: a ray must not depend on its company.
+        return rotate(rotation, directions.repeat(2, axis=1))[:, :1]
+    rotated: Float32 = rotation.astype(np.float32) @ directions
+    return rotated
