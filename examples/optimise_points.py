@@ -1,0 +1,86 @@
+"""Lower the mean blind spot radius by moving points: `python examples/optimise_points.py`.
+
+The radius is differentiable in the points of the sensor cloud: the gradient of each reference point's radius pulls its
+nearest sensor point towards it. Here some points of a rig's cloud, in an instant of city traffic, are set free and
+follow that gradient (Adam), each towards the middle of the reference points that it is nearest to.
+
+Free points are no sensor: nothing keeps them on rays, and nothing hides them. How a mount changes what occludes what is
+not differentiable here; see docs/training.md.
+"""
+
+import argparse
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")  # before pyplot: no display is needed
+import matplotlib.pyplot as plt
+import torch
+from rich.console import Console
+from rich.progress import track
+
+from torchcover import blind_spot_radius
+from torchcover.data import SimulatedFrames
+
+X_M, Y_M, Z_M = (2.5, 42.5), (-12.0, 12.0), (-0.5, 2.0)
+THRESHOLD_M = 0.4
+
+
+def inside(cloud):
+    """The points of the region."""
+    x, y, z = cloud.T
+    return cloud[(x >= X_M[0]) & (x < X_M[1]) & (y >= Y_M[0]) & (y < Y_M[1]) & (z >= Z_M[0]) & (z < Z_M[1])]
+
+
+def some(cloud, count, generator):
+    """A random sample, or all if there are fewer."""
+    return cloud[torch.randperm(len(cloud), generator=generator)[:count]]
+
+
+def draw(reference, before, after, path):
+    """The reference coloured by its radius, under the points, before and after."""
+    figure, axes = plt.subplots(2, 1, figsize=(9.0, 11.0), layout="constrained")
+    for ax, points, title in zip(axes, (before, after), ("before", "after"), strict=True):
+        radius = blind_spot_radius(reference, points)
+        dots = ax.scatter(*reference[:, :2].T, c=radius, s=3, cmap="viridis_r", vmin=0.0, vmax=3.0, linewidths=0)
+        ax.plot(*points[:, :2].T, "r.", markersize=3)
+        ax.set(title=f"{title}: mean radius {radius.mean():.2f} m", xlabel="x in m", ylabel="y in m", aspect="equal")
+    figure.colorbar(dots, ax=axes, label="blind spot radius of the reference points in m", extend="max", shrink=0.6)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=120)
+    plt.close(figure)
+
+
+def main():
+    """Optimise; print the numbers, draw the picture."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--points", type=int, default=400, help="free points")
+    parser.add_argument("--steps", type=int, default=200, help="steps of gradient descent")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("out/optimise_points.png"))
+    options = parser.parse_args()
+
+    console = Console()
+    generator = torch.Generator().manual_seed(options.seed)
+    frame = SimulatedFrames("urban", "front_roof_32", steps=1, seed=options.seed)[0]
+    reference = some(inside(frame.reference), 20_000, generator)
+    before = some(inside(frame.sensor), options.points, generator)
+
+    points = before.clone().requires_grad_()
+    descent = torch.optim.Adam([points], lr=0.1)
+    for _ in track(range(options.steps), description="gradient steps", console=console):
+        descent.zero_grad()
+        blind_spot_radius(reference, points).mean().backward()
+        descent.step()
+
+    after = points.detach()
+    for name, cloud in (("before", before), ("after", after)):
+        radius = blind_spot_radius(reference, cloud)
+        seen = (radius <= THRESHOLD_M).float().mean()
+        console.print(f"{name}: mean radius {radius.mean():.3f} m, {seen:.1%} of the reference within {THRESHOLD_M} m")
+    draw(reference, before, after, options.out)
+    console.print(f"Wrote {options.out}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,386 @@
+"""Train a 3D detector on two rigs and ask whether what it misses was visible: `python examples/train_detector.py`.
+
+A PointPillars-like encoder (Lang et al. 2019) with a CenterPoint-like head (Yin et al. 2021) learns to find cars in
+simulated city traffic, once with each rig, from the same instants. Every epoch logs average precision, coverage by
+region and recall by visibility, side by side. At the end: a table, a figure, and how strongly visibility and recall
+agree. Needs `pip install 'torchcover[lightning,tensorboard]'`; uses a GPU if there is one.
+"""
+
+import argparse
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import lightning
+import matplotlib
+
+matplotlib.use("Agg")  # before pyplot: no display is needed
+import matplotlib.pyplot as plt
+import numpy as np
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+from torch import nn
+from torch.nn import functional
+from torch.utils.data import DataLoader
+
+from torchcover import BevGrid, CoverageMetric, Region
+from torchcover.data import Augmentation, SimulatedFrames, collate_frames
+from torchcover.simulation import EvenReference, ReferenceSensor
+from torchcover.training import CoverageCallback, RecallByVisibility, box_visibility, match
+
+RIGS = ("front_roof_128", "front_roof_32")
+X_M, Y_M, Z_M = (0.0, 51.2), (-25.6, 25.6), (-1.0, 3.0)
+PILLAR_M, CELL_M = 0.4, 0.8
+PILLARS, CELLS = 128, 64
+# What the network is fed: one point in each such cube.
+VOXEL_M = 0.1
+REGIONS = (Region("0-25m", (0.0, 25.6), (-12.8, 12.8)), Region("0-51m", X_M, Y_M))
+# A car that the rig hardly touched teaches nothing; in the evaluation it counts.
+LEAST_HITS = 3
+SCORES = tuple(np.linspace(0.05, 0.95, 46).round(3).tolist())
+OPERATING_SCORE = 0.31
+MATCH_M = 2.0
+
+
+# Data.
+
+
+def in_region(boxes):
+    """The cars whose centre lies in the region."""
+    x, y, _ = boxes.centre_m.T
+    inside = (x >= X_M[0]) & (x < X_M[1]) & (y >= Y_M[0]) & (y < Y_M[1])
+    return boxes.select(inside).of_category("car")
+
+
+def thinned(cloud):
+    """The points of the region, one a voxel."""
+    x, y, z = cloud.T
+    cloud = cloud[(x >= X_M[0]) & (x < X_M[1]) & (y >= Y_M[0]) & (y < Y_M[1]) & (z >= Z_M[0]) & (z < Z_M[1])]
+    _, first = np.unique((cloud.numpy() / VOXEL_M).astype(np.int32), axis=0, return_index=True)
+    return cloud[torch.from_numpy(np.sort(first))]
+
+
+def simulate(steps, seed, reference, name, keep_clouds):
+    """Frames with both rigs, 4 from each drive of a minute; `network RIG` is what the detector is fed."""
+    frames = SimulatedFrames(
+        "urban", rigs={rig: rig for rig in RIGS}, steps=steps, seed=seed, every_s=15.0, reference=reference, boxes=True
+    )
+    kept = []
+    for index in track(range(steps), description=f"simulating {name}"):
+        frame = frames[index]
+        fed = {f"network {rig}": thinned(cloud) for rig, cloud in frame.sensors.items()}
+        clouds = {**frame.sensors, **fed} if keep_clouds else fed
+        kept.append(replace(frame, sensors=clouds, boxes=in_region(frame.boxes)))
+    return kept
+
+
+# The detector.
+
+
+class Pillars(nn.Module):
+    """Points to a picture from above: the largest of each feature over the points of a pillar."""
+
+    def __init__(self, channels):
+        super().__init__()
+        self.encode = nn.Sequential(nn.Linear(7, channels, bias=False), nn.BatchNorm1d(channels), nn.ReLU())
+        self.channels = channels
+
+    def forward(self, clouds):
+        """Lists of (N, 3) to (B, C, y, x)."""
+        numbers = [torch.full((len(cloud),), k, device=cloud.device) for k, cloud in enumerate(clouds)]
+        points, frame = torch.cat(clouds), torch.cat(numbers)
+        column = ((points[:, 0] - X_M[0]) / PILLAR_M).long()
+        row = ((points[:, 1] - Y_M[0]) / PILLAR_M).long()
+        inside = (column >= 0) & (column < PILLARS) & (row >= 0) & (row < PILLARS)
+        points, frame, column, row = points[inside], frame[inside], column[inside], row[inside]
+        pillar = (frame * PILLARS + row) * PILLARS + column
+        count = torch.bincount(pillar, minlength=len(clouds) * PILLARS**2).clamp(min=1)
+        mean = points.new_zeros(len(count), 3).index_add(0, pillar, points) / count[:, None]
+        middle = torch.stack([column * PILLAR_M + X_M[0], row * PILLAR_M + Y_M[0]], dim=1) + PILLAR_M / 2
+        features = torch.cat(
+            [points - mean[pillar], points[:, :2] - middle, points[:, 2:], count[pillar, None].float().log()], dim=1
+        )
+        encoded = self.encode(features)
+        picture = encoded.new_zeros(len(count), self.channels)
+        picture = picture.scatter_reduce(0, pillar[:, None].expand_as(encoded), encoded, "amax")
+        return picture.view(len(clouds), PILLARS, PILLARS, self.channels).permute(0, 3, 1, 2)
+
+
+def block(inputs, outputs, stride=1):
+    """Convolution, normalisation, ReLU."""
+    layer = nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False)
+    return nn.Sequential(layer, nn.BatchNorm2d(outputs), nn.ReLU())
+
+
+class Detector(nn.Module):
+    """Heat of a centre, and of the box there: offset x, y, z, log of length, width, height, sine and cosine of yaw."""
+
+    def __init__(self):
+        super().__init__()
+        self.pillars = Pillars(32)
+        self.fine = nn.Sequential(block(32, 48, 2), block(48, 48), block(48, 48))
+        self.coarse = nn.Sequential(block(48, 64, 2), block(64, 64), block(64, 64), nn.Upsample(scale_factor=2))
+        self.head = nn.Sequential(block(112, 64), nn.Conv2d(64, 9, 1))
+        nn.init.constant_(self.head[-1].bias[0], -4.0)
+
+    def forward(self, clouds):
+        """Lists of (N, 3) to heat (B, y, x) and boxes (B, 8, y, x)."""
+        fine = self.fine(self.pillars(clouds))
+        answer = self.head(torch.cat([fine, self.coarse(fine)], dim=1))
+        return answer[:, 0], answer[:, 1:]
+
+
+def cell_of(rows):
+    """Which cell holds each centre."""
+    column = ((rows[:, 0] - X_M[0]) / CELL_M).long()
+    row = ((rows[:, 1] - Y_M[0]) / CELL_M).long()
+    inside = (column >= 0) & (column < CELLS) & (row >= 0) & (row < CELLS)
+    return row, column, inside
+
+
+def loss_of(heat, boxes, truth):
+    """Focal loss of the heat (Zhou et al. 2019) plus the absolute error of the boxes, both per object."""
+    centres = torch.arange(CELLS, device=heat.device) + 0.5
+    total, objects = heat.new_zeros(()), sum(map(len, truth))
+    for frame_heat, frame_boxes, objects_there in zip(heat, boxes, truth, strict=True):
+        row, column, inside = cell_of(objects_there)
+        rows, row, column = objects_there[inside], row[inside], column[inside]
+        y, x = (rows[:, 1] - Y_M[0]) / CELL_M, (rows[:, 0] - X_M[0]) / CELL_M
+        apart = (centres[None, :, None] - y[:, None, None]) ** 2 + (centres[None, None] - x[:, None, None]) ** 2
+        near = torch.cat([torch.exp(-apart / 2), apart.new_zeros(1, CELLS, CELLS)]).amax(dim=0)
+        positive = torch.zeros_like(near, dtype=torch.bool)
+        positive[row, column] = True
+        p = frame_heat.sigmoid()
+        total = total - ((1 - p) ** 2 * functional.logsigmoid(frame_heat))[positive].sum()
+        total = total - (p**2 * (1 - near) ** 4 * functional.logsigmoid(-frame_heat))[~positive].sum()
+        wanted = torch.stack(
+            [x - column - 0.5, y - row - 0.5, rows[:, 2], *rows[:, 3:6].log().T, rows[:, 6].sin(), rows[:, 6].cos()]
+        )
+        total = total + (frame_boxes[:, row, column] - wanted).abs().sum() / 2
+    return total / max(objects, 1)
+
+
+def decode(heat, boxes, most=100):
+    """(N, 7) rows and (N,) scores of one frame: the peaks of the heat."""
+    score = heat.sigmoid()
+    peak = score == functional.max_pool2d(score[None], 3, 1, 1)[0]
+    score, place = (score * peak).flatten().topk(most)
+    score, place = score[score >= SCORES[0]], place[score >= SCORES[0]]
+    dx, dy, z, *size, sine, cosine = boxes.flatten(1)[:, place]
+    x = X_M[0] + (place % CELLS + 0.5 + dx) * CELL_M
+    y = Y_M[0] + (place // CELLS + 0.5 + dy) * CELL_M
+    return torch.stack([x, y, z, *(s.clamp(-2, 3).exp() for s in size), torch.atan2(sine, cosine)], dim=1), score
+
+
+def average_precision(counts):
+    """Mean over 101 recalls of the precision there, as in nuScenes but without its cut-offs."""
+    curve = counts.overall()
+    recall, precision = curve.recall.value[:, 0].numpy(), curve.precision.value[:, 0].numpy()
+    used = curve.precision.trials[:, 0].numpy() > 0
+    if not used.any():
+        return 0.0
+    recall, precision = recall[used][::-1], precision[used][::-1]  # recall ascends
+    recall, precision = np.append(0.0, recall), np.append(precision[0], precision)
+    return float(np.interp(np.linspace(0, 1, 101), recall, precision, right=0).mean())
+
+
+class Training(lightning.LightningModule):
+    """One rig's detector, its losses and its logs."""
+
+    def __init__(self, rig, visibility, steps, seed):
+        super().__init__()
+        self.rig = rig
+        self.detector = Detector()
+        self.recall = RecallByVisibility(threshold=MATCH_M, score_thresholds=SCORES)
+        self.visibility = visibility
+        self.steps = steps
+        self.augment = Augmentation(max_yaw_rad=math.radians(15.0), seed=seed)
+        self.objects = []
+
+    def training_step(self, batch, _):
+        """The loss of augmented frames."""
+        frames = [self.augment(frame, self.current_epoch) for frame in batch.frames]
+        heat, boxes = self.detector([frame.sensors[f"network {self.rig}"] for frame in frames])
+        truth = [frame.boxes.select(frame.boxes.hits[self.rig] >= LEAST_HITS).rows for frame in frames]
+        loss = loss_of(heat, boxes, truth)
+        self.log("loss", loss, batch_size=len(batch), prog_bar=True)
+        return loss
+
+    def on_validation_epoch_start(self):
+        """Keep the objects of the last epoch only."""
+        self.objects = []
+
+    def validation_step(self, batch, _):
+        """Count what was found, of what was visible."""
+        heat, boxes = self.detector(batch.sensors(f"network {self.rig}"))
+        for frame, frame_heat, frame_boxes in zip(batch.frames, heat, boxes, strict=True):
+            rows, scores = decode(frame_heat, frame_boxes)
+            seen = self.visibility[frame.index]
+            self.recall.update(rows, frame.boxes, seen, scores)
+            chosen = match(rows, scores, frame.boxes.rows, "distance", MATCH_M)
+            found = torch.zeros(len(frame.boxes))
+            found[chosen[chosen >= 0]] = scores.cpu()[chosen >= 0]
+            columns = [frame.boxes.centre_m[:, 0], frame.boxes.centre_m[:, 1], seen.share.cpu(), found]
+            world = torch.full((len(found),), float(frame.index // 4))
+            self.objects.append(torch.stack([world, *(column.cpu().float() for column in columns)], dim=1))
+
+    def on_validation_epoch_end(self):
+        """Log average precision and recall beside the coverage."""
+        self.counts = self.recall.compute()
+        row = SCORES.index(OPERATING_SCORE)
+        curve = self.counts.over("visibility")
+        scalars = {
+            f"val/recall/visibility {name}": r for name, r in zip(curve.bins, curve.recall.value[row], strict=True)
+        }
+        self.log_dict({"val/AP": average_precision(self.counts), **{k: v.float() for k, v in scalars.items()}})
+        self.recall.reset()
+
+    def configure_optimizers(self):
+        """Adam with one cycle of the learning rate."""
+        optimizer = torch.optim.AdamW(self.parameters(), lr=1e-3, weight_decay=0.01)
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, max_lr=3e-3, total_steps=self.steps)
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def train(rig, training_frames, validation_frames, visibility, options):
+    """Train one rig's detector; its module, and its coverage by region."""
+    lightning.seed_everything(options.seed, verbose=False)
+    loaders = [
+        DataLoader(training_frames, batch_size=8, shuffle=True, drop_last=True, collate_fn=collate_frames),
+        DataLoader(validation_frames, batch_size=8, collate_fn=collate_frames),
+    ]
+    grid = BevGrid(x=X_M, y=Y_M, cell=1.6, heights={"body": (0.3, 2.0)})
+    coverage = CoverageCallback(CoverageMetric(grid, max_radius=grid.diagonal_m), regions=REGIONS, rig=rig)
+    module = Training(rig, visibility, steps=options.epochs * len(loaders[0]), seed=options.seed)
+    trainer = lightning.Trainer(
+        max_epochs=options.epochs,
+        logger=TensorBoardLogger(options.out, name=rig, version=""),
+        callbacks=[coverage],
+        num_sanity_val_steps=0,
+        log_every_n_steps=1,
+        enable_checkpointing=False,
+        enable_model_summary=False,
+    )
+    trainer.fit(module, *loaders)
+    return module, coverage.coverage
+
+
+# What came of it.
+
+
+def ranks(values):
+    """Ranks, ties sharing their mean."""
+    _, group, count = np.unique(values, return_inverse=True, return_counts=True)
+    return (np.cumsum(count) - (count - 1) / 2)[group]
+
+
+def spearman(a, b):
+    """Rank correlation; NaN where one of the two does not vary."""
+    a, b = ranks(a), ranks(b)
+    return float(np.corrcoef(a, b)[0, 1]) if a.std() > 0 and b.std() > 0 else math.nan
+
+
+def over_drives(objects, statistic, draws=1000):
+    """A statistic of the objects and its 95 % interval, from drawing whole drives again and again."""
+    worlds = [objects[objects[:, 0] == world] for world in np.unique(objects[:, 0])]
+    generator = np.random.default_rng(0)
+    values = [
+        statistic(np.concatenate([worlds[k] for k in generator.integers(len(worlds), size=len(worlds))]))
+        for _ in range(draws)
+    ]
+    return statistic(objects), *np.nanquantile(values, [0.025, 0.975])
+
+
+def agreement(objects):
+    """Rank correlation of an object's visibility with the score at which it was found, 0 if it was not."""
+    return spearman(objects[:, 3], objects[:, 4])
+
+
+def cell_agreement(objects, side_m=6.4, least=5):
+    """Rank correlation over cells of the plane: the mean visibility of their objects with their recall."""
+    column, row = (objects[:, 1] // side_m).astype(int), ((objects[:, 2] - Y_M[0]) // side_m).astype(int)
+    _, cell = np.unique(row * 1000 + column, return_inverse=True)
+    count = np.bincount(cell)
+    visible, found = (np.bincount(cell, weights=w) / count for w in (objects[:, 3], objects[:, 4] >= OPERATING_SCORE))
+    return spearman(visible[count >= least], found[count >= least])
+
+
+def report(results, console):
+    """Print the table of both rigs, and how strongly visibility and recall agree."""
+    table = Table("rig", "AP", *(f"seen within 0.4 m, {region.name}" for region in REGIONS), "recall", "precision")
+    row = SCORES.index(OPERATING_SCORE)
+    for rig, (module, coverage) in results.items():
+        curve = module.counts.overall()
+        seen = [f"{line.detection[0.4]:.3f} ({line.known_share:.0%} known)" for line in coverage.summary(REGIONS)]
+        shares = [f"{ratio.value[row, 0]:.3f}" for ratio in (curve.recall, curve.precision)]
+        table.add_row(rig, f"{average_precision(module.counts):.3f}", *seen, *shares)
+    console.print(table)
+    for rig, (module, _) in results.items():
+        objects = torch.cat(module.objects).double().numpy()
+        objects = objects[np.isfinite(objects[:, 3])]
+        distance = np.hypot(objects[:, 1], objects[:, 2])
+        parts = {"all": distance >= 0, "0-25 m": distance < 25.0, "over 25 m": distance >= 25.0}
+        for name, part in parts.items():
+            value, low, high = over_drives(objects[part], agreement)
+            console.print(f"{rig}, {name}: Spearman {value:.2f} ({low:.2f} to {high:.2f}), {part.sum()} cars")
+        value, low, high = over_drives(objects, cell_agreement, draws=300)
+        console.print(f"{rig}, cells of 6.4 m: Spearman {value:.2f} ({low:.2f} to {high:.2f})")
+
+
+def draw(results, path):
+    """Recall over visibility and over distance; AP and coverage."""
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(14.0, 4.4), layout="constrained")
+    row = SCORES.index(OPERATING_SCORE)
+    for shift, (rig, (module, coverage)) in zip((-0.05, 0.05), results.items(), strict=True):
+        for ax, axis in ((left, "visibility"), (middle, "distance")):
+            curve = module.counts.over(axis)
+            ratio = curve.recall
+            value, low, high, trials = (t[row].numpy() for t in (ratio.value, ratio.low, ratio.high, ratio.trials))
+            error = np.abs(np.stack([value - low, high - value]))
+            labels = [f"{name}\n{n}" for name, n in zip(curve.bins, trials, strict=True)]
+            ax.errorbar(np.arange(len(value)) + shift, value, error, fmt="o-", capsize=3, label=rig)
+            ax.set_xticks(range(len(value)), labels)
+            ax.set(xlabel=f"{axis} of the car; below, number of cars", ylabel="recall", ylim=(0, 1))
+        seen = [line.detection[0.4] for line in coverage.summary(REGIONS)]
+        bars = [average_precision(module.counts), *seen]
+        right.bar(np.arange(len(bars)) + 4 * shift, bars, width=0.38, label=rig)
+    right.set_xticks(range(3), ["AP", *(f"seen within\n0.4 m, {region.name}" for region in REGIONS)])
+    right.set(ylim=(0, 1))
+    right.legend()
+    left.set_title(f"recall at score {OPERATING_SCORE}, 95 % Wilson intervals")
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main():
+    """Simulate, train both detectors, report."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--train", type=int, default=192, help="frames to train on")
+    parser.add_argument("--validate", type=int, default=64, help="frames to validate on, 4 from a drive")
+    parser.add_argument("--epochs", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("out/train_detector"))
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+
+    console = Console()
+    unused = ReferenceSensor(rows=1, columns=1)
+    even = EvenReference((((X_M[0], X_M[1]), (Y_M[0], Y_M[1])),), rays=65_536)
+    training_frames = simulate(options.train, options.seed, unused, "training frames", keep_clouds=False)
+    validation_frames = simulate(options.validate, options.seed + 1, even, "validation frames", keep_clouds=True)
+    results = {}
+    for rig in RIGS:
+        visibility = {
+            frame.index: box_visibility(frame.sensors[rig], frame.reference, frame.boxes) for frame in validation_frames
+        }
+        results[rig] = train(rig, training_frames, validation_frames, visibility, options)
+    report(results, console)
+    draw(results, options.out / "detector.png")
+    console.print(f"Wrote {options.out / 'detector.png'} and event files for TensorBoard beside it")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""What frames do not need is left out, counted, and does not change them."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover import Rig
+from torchcover.data import SimulatedFrames
+from torchcover.simulation import ReferenceSensor
+from torchcover.simulation.instant import Instant
+from torchcover.simulation.scene import Scene
+
+
+def rig(max_range_m=60.0, **keys):
+    lidar = {"name": "a", "mount": {"z_m": 1.8}, "channels": 16, "vertical_fov_deg": [-40, 5], "columns": 90}
+    return Rig.model_validate(
+        {"name": "r", "sensors": [{**lidar, "horizontal_fov_deg": 360, "max_range_m": max_range_m, **keys}]}
+    )
+
+
+def frames(scenario, keys=None, max_range_m=60.0):
+    reference = ReferenceSensor(rows=24, columns=32, max_range_m=max_range_m)
+    return SimulatedFrames(scenario, rig(max_range_m, **(keys or {})), steps=30, seed=1, reference=reference)
+
+
+def test_counts_say_what_was_left_out_in_traffic():
+    near, far = (frames("urban", max_range_m=metres)[5].counts for metres in (30.0, 200.0))
+    assert near["moving_bodies"] == far["moving_bodies"]
+    assert near["moving_bodies_out_of_range"] > far["moving_bodies_out_of_range"]
+    for counts in (near, far):
+        in_range = counts["moving_bodies"] - counts["moving_bodies_out_of_range"]
+        assert in_range >= 1
+        assert counts["ray_body_pairs"] == in_range * (counts["sensor_rays"] + counts["reference_rays"])
+        assert 0.8 < counts["ray_body_pairs_left_out"] / counts["ray_body_pairs"] < 1
+        assert counts["sensor_rays_reused"] == 0
+        assert counts["sensor_self_hits_reused"] == counts["sensor_self_hits"] > 0
+
+
+def test_counts_say_what_was_left_out_where_nothing_moves():
+    counts = frames("courtyard")[5].counts
+    assert counts["sensor_rays_reused"] == counts["sensor_rays"] == 16 * 90
+    assert counts["sensor_self_hits_reused"] == counts["sensor_self_hits"] > 0
+    assert counts["moving_bodies"] == counts["ray_body_pairs"] == counts["ray_body_pairs_left_out"] == 0
+
+
+@pytest.mark.parametrize("keys", [{}, {"range_noise_m": 0.05, "dropout": 0.2}])
+def test_a_reused_scan_gives_the_frames_of_fresh_ones(keys):
+    dataset = frames("courtyard", keys)
+    for index in (4, 2, 3):
+        reused, fresh = dataset[index], frames("courtyard", keys)[index]
+        assert torch.equal(reused.sensor, fresh.sensor)
+        assert torch.equal(reused.reference, fresh.reference)
+        assert reused.counts == fresh.counts
+    assert torch.equal(dataset[2].sensor, dataset[3].sensor) == (not keys)
+
+
+def test_a_change_of_one_frame_does_not_reach_the_next():
+    dataset = frames("courtyard")
+    first = dataset[0]
+    kept = first.sensor.clone()
+    first.sensor.zero_()
+    assert torch.equal(dataset[1].sensor, kept)
+
+
+def test_the_rig_is_scanned_once_where_nothing_moves_and_the_reference_at_every_step(monkeypatch):
+    ranges, original = [], Instant.scan
+
+    def scan(self, pose, tiles, **options):
+        ranges.append("mounted" if "own_m" in options else "reference")
+        return original(self, pose, tiles, **options)
+
+    monkeypatch.setattr(Instant, "scan", scan)
+    dataset = frames("courtyard")
+    for index in range(4):
+        dataset[index]
+    assert sorted(ranges) == ["mounted"] + 4 * ["reference"]
+
+
+def test_bodies_out_of_range_change_nothing(monkeypatch):
+    limited = frames("urban", max_range_m=40.0)[7]
+    original = Scene.at
+    monkeypatch.setattr(Scene, "at", lambda self, step, within_m: original(self, step, np.inf))
+    unlimited = frames("urban", max_range_m=40.0)[7]
+    assert limited.counts["moving_bodies_out_of_range"] > 0 == unlimited.counts["moving_bodies_out_of_range"]
+    assert torch.equal(limited.sensor, unlimited.sensor)
+    assert torch.equal(limited.reference, unlimited.reference)

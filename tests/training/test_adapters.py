@@ -1,0 +1,201 @@
+"""Frames out of other frameworks' batches, and the metric of MMEngine beside its real classes."""
+
+import math
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from mmengine.evaluator import BaseMetric, Evaluator
+from mmengine.registry import METRICS
+
+from torchcover import BevGrid, CoverageMetric, Region
+from torchcover.training import MMEngineCoverage, frames_of_batch_dict, frames_of_data_batch
+from torchcover.training import mmengine as adapter
+
+GRID = {"x": (0.0, 8.0), "y": (-2.0, 2.0), "cell": 1.0}
+REGION = {"name": "all", "x": GRID["x"], "y": GRID["y"]}
+# 1.7 m above the ground, turned by 90 degrees to the left.
+VEHICLE_T_LIDAR = torch.tensor(
+    [[0.0, -1.0, 0.0, 0.5], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.7], [0.0, 0.0, 0.0, 1.0]]
+)
+
+
+def cloud(points, seed, columns=4):
+    generator = torch.Generator().manual_seed(seed)
+    scale = torch.tensor([8.0, 4.0, 2.0, *[1.0] * (columns - 3)])
+    return torch.rand(points, columns, generator=generator) * scale - torch.tensor(
+        [0.0, 2.0, 0.2, *[0.0] * (columns - 3)]
+    )
+
+
+def make_metric():
+    return CoverageMetric(BevGrid(**GRID), max_radius=9.0)
+
+
+def truth_of(pairs):
+    metric = make_metric()
+    for sensor, reference in pairs:
+        metric.update(sensor[:, :3], reference[:, :3])
+    return metric.compute()
+
+
+def in_one_array(clouds):
+    """As OpenPCDet's `collate_batch`: the number of the sample in front of each point."""
+    padded = [np.pad(cloud.numpy(), ((0, 0), (1, 0)), constant_values=k) for k, cloud in enumerate(clouds)]
+    return np.concatenate(padded, axis=0)
+
+
+@pytest.mark.parametrize("convert", [lambda array: array, torch.from_numpy], ids=["arrays", "tensors"])
+def test_a_batch_dict_of_openpcdet(convert):
+    sensors, references = [cloud(30, 0), cloud(0, 1), cloud(20, 2)], [cloud(50, 3), cloud(40, 4), cloud(0, 5)]
+    batch_dict = {
+        "points": convert(in_one_array(sensors)),
+        "reference_points": convert(in_one_array(references)),
+        "frame_id": np.array(["000134", "000007", "a1"]),
+        "batch_size": 3,
+    }
+    batch = frames_of_batch_dict(batch_dict)
+    assert [(frame.name, frame.index) for frame in batch.frames] == [("000134", 134), ("000007", 7), ("a1", -1)]
+    for frame, sensor, reference in zip(batch.frames, sensors, references, strict=True):
+        assert frame.sensor.dtype == torch.float32
+        torch.testing.assert_close(frame.sensor, sensor[:, :3])
+        torch.testing.assert_close(frame.reference, reference[:, :3])
+    metric = make_metric()
+    metric.update(batch.sensor, batch.reference)
+    np.testing.assert_array_equal(metric.compute().radius, truth_of(zip(sensors, references, strict=True)).radius)
+
+
+def test_points_of_a_lidar_are_moved_into_the_vehicle_frame():
+    points = in_one_array([torch.tensor([[3.0, 1.0, -1.7, 0.5]])])
+    batch = frames_of_batch_dict(
+        {"points": points, "reference_points": points, "batch_size": 1}, vehicle_T_lidar=VEHICLE_T_LIDAR
+    )
+    torch.testing.assert_close(batch.sensor[0], torch.tensor([[-0.5, 3.0, 0.0]]))
+    torch.testing.assert_close(batch.reference[0], batch.sensor[0])
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"points": None}, "has no 'points'; it has reference_points, batch_size"),
+        ({"reference_points": None}, "has no 'reference_points'"),
+        ({"points": np.zeros((5, 3))}, r"points: shape \(N, 1 \+ 3 \+ ...\)"),
+        ({"batch_size": 1}, "sample numbers 0 to 0 are needed; got 0 to 1"),
+    ],
+)
+def test_wrong_batch_dicts_are_refused(change, complaint):
+    points = in_one_array([cloud(3, 0), cloud(4, 1)])
+    batch_dict = {"points": points, "reference_points": points, "batch_size": 2, **change}
+    with pytest.raises(ValueError, match=complaint):
+        frames_of_batch_dict({key: value for key, value in batch_dict.items() if value is not None})
+
+
+def data_batch(numbers):
+    """What MMEngine hands to a metric of MMDetection3D: the inputs, and the samples as dicts."""
+    samples = [{"sample_idx": k, "reference_points": cloud(40, 100 + k).numpy()} for k in numbers]
+    return {"inputs": {"points": [cloud(20 + k, k) for k in numbers]}}, samples
+
+
+def pairs(numbers):
+    return [(cloud(20 + k, k), cloud(40, 100 + k)) for k in numbers]
+
+
+def test_a_data_batch_of_mmdetection3d():
+    batch = frames_of_data_batch(*data_batch([3, 1]))
+    assert [(frame.name, frame.index, len(frame.sensor)) for frame in batch.frames] == [("3", 3, 23), ("1", 1, 21)]
+    inputs, samples = data_batch([0, 1])
+    with pytest.raises(ValueError, match=r"a cloud for each of the 1 samples is needed; got 2"):
+        frames_of_data_batch(inputs, samples[:1])
+    with pytest.raises(ValueError, match="sample 1 has no 'reference_points'; add it"):
+        frames_of_data_batch(inputs, [samples[0], {"sample_idx": 1}])
+    with pytest.raises(ValueError, match=r"vehicle_T_lidar: shape \(4, 4\)"):
+        frames_of_data_batch(inputs, samples, vehicle_T_lidar=torch.eye(3))
+
+
+def test_mmengine_evaluates_it_as_any_of_its_metrics():
+    """Built from a config by the registry, run by the real `Evaluator`, twice."""
+    config = {
+        "type": "MMEngineCoverage",
+        "metric": {"grid": GRID, "thresholds": (0.4,), "max_radius": 9.0},
+        "regions": [REGION],
+    }
+    evaluator = Evaluator([config])
+    (metric,) = evaluator.metrics
+    assert isinstance(metric, BaseMetric)
+    assert METRICS.get("MMEngineCoverage") is MMEngineCoverage
+    evaluator.dataset_meta = {"classes": ("car",)}
+    truth = truth_of(pairs(range(5)))
+    for _ in range(2):
+        for numbers in ([0, 1], [2, 3], [4]):
+            inputs, samples = data_batch(numbers)
+            evaluator.process(data_samples=samples, data_batch=inputs)
+        scalars = evaluator.evaluate(5)
+        expected = {f"coverage/{name}": value for name, value in truth.scalars([Region(**REGION)]).items()}
+        assert scalars == pytest.approx(expected, rel=1e-12)
+        np.testing.assert_array_equal(metric.coverage.radius, truth.radius)
+        assert metric.results == []
+
+
+@pytest.mark.parametrize(("samples", "processes"), [(5, 1), (5, 2), (7, 4), (1, 3)])
+def test_mmengine_padding_is_left_out_by_the_size_of_the_dataset(monkeypatch, samples, processes):
+    """What MMEngine's `DefaultSampler` gives each process: rounds that start with the first samples again."""
+    rounds = math.ceil(samples / processes)
+    dealt = (list(range(samples)) * processes)[: rounds * processes]
+    total = make_metric()
+    for rank in range(processes):
+        monkeypatch.setattr(adapter, "get_dist_info", lambda rank=rank: (rank, processes))
+        metric = MMEngineCoverage(make_metric(), regions=[REGION], prefix="rig")
+        for number in dealt[rank::processes]:
+            metric.process(*data_batch([number]))
+        scalars = metric.evaluate(samples)
+        assert all(name.startswith("rig/") for name in scalars)
+        own = [k for position, k in enumerate(dealt) if position % processes == rank and position < samples]
+        assert metric.coverage.counts["steps"] == len(own)
+        for sensor, reference in pairs(own):
+            total.update(sensor[:, :3], reference[:, :3])
+    assert total.steps == samples
+
+
+def test_other_batches_of_mmengine():
+    metric = MMEngineCoverage(
+        make_metric(),
+        regions=[Region(**REGION)],
+        frames_of=lambda batch, samples: frames_of_batch_dict({**batch, "batch_size": len(samples)}),
+    )
+    points = in_one_array([cloud(30, 0)])
+    metric.process({"points": points, "reference_points": points}, [{}])
+    assert metric.evaluate(1)["coverage/radius_m/all/ground"] == 0
+
+
+HIDE = """
+import sys
+class Hidden:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {hidden}:
+            raise ModuleNotFoundError(name)
+sys.meta_path.insert(0, Hidden())
+import torchcover.training
+assert not {{"lightning", "mmengine", "tensorboard", "matplotlib"}} & set(sys.modules)
+torchcover.training.frames_of_batch_dict, torchcover.training.CountOnce
+assert not {{"lightning", "mmengine", "tensorboard", "matplotlib"}} & set(sys.modules)
+try:
+    from torchcover.training import {name}
+except ImportError as error:
+    print(error)
+"""
+
+
+@pytest.mark.parametrize(
+    ("hidden", "name", "remedy"),
+    [
+        ("lightning", "CoverageCallback", "pip install 'torchcover[lightning]'"),
+        ("mmengine", "MMEngineCoverage", "pip install mmengine"),
+    ],
+)
+def test_without_a_framework_only_its_own_class_is_missing(hidden, name, remedy):
+    code = HIDE.format(hidden={hidden}, name=name)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    assert remedy in done.stdout

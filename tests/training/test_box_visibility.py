@@ -1,0 +1,138 @@
+"""The visibility of a box is the coverage of the reference points in it."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+
+from torchcover.data import Boxes, SimulatedFrames
+from torchcover.simulation import ReferenceSensor
+from torchcover.training import box_visibility
+
+TWO = Boxes.from_rows(torch.tensor([[10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0], [30.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.6]]))
+
+
+def slow_visibility(sensor, reference, boxes, threshold, weights):
+    """From the definition in float64 NumPy, box by box."""
+    r = cdist(reference.double().numpy(), sensor.double().numpy()).min(axis=1, initial=math.inf)
+    results = []
+    for x, y, z, length, width, height, yaw in boxes.rows.double().tolist():
+        d = reference.double().numpy() - [x, y, z]
+        along = np.abs(d[:, 0] * np.cos(yaw) + d[:, 1] * np.sin(yaw)) <= length / 2 + 0.01
+        across = np.abs(d[:, 1] * np.cos(yaw) - d[:, 0] * np.sin(yaw)) <= width / 2 + 0.01
+        inside = along & across & (d[:, 2] > -height / 2 + 0.01) & (d[:, 2] <= height / 2 + 0.01)
+        w = weights[inside]
+        known = inside.any()
+        share = (w * (r[inside] <= threshold)).sum() / w.sum() if known else math.nan
+        mean = (w * r[inside]).sum() / w.sum() if known else math.nan
+        results.append((share, mean, inside.sum()))
+    return [np.array(column) for column in zip(*results, strict=True)]
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_against_a_slow_twin(weighted):
+    generator = torch.Generator().manual_seed(1)
+    rows = torch.rand(20, 7, generator=generator) * torch.tensor([20.0, 20, 1, 5, 3, 3, 6]) + 0.1
+    boxes = Boxes.from_rows(rows)
+    sensor, reference = (torch.rand(n, 3, generator=generator) * torch.tensor([20.0, 20, 3]) for n in (700, 1500))
+    weights = torch.rand(1500, generator=generator).double() + 0.1 if weighted else torch.ones(1500).double()
+    found = box_visibility(sensor, reference, boxes, threshold=0.7, reference_weights=weights if weighted else None)
+    share, mean, count = slow_visibility(sensor, reference, boxes, 0.7, weights.numpy())
+    np.testing.assert_allclose(found.share.numpy(), share, atol=1e-12)
+    np.testing.assert_allclose(found.mean_radius_m.numpy(), mean, rtol=1e-6)
+    np.testing.assert_array_equal(found.reference_points.numpy(), count)
+    assert 0.0 < np.nanquantile(share, 0.2) < np.nanquantile(share, 0.8) < 1.0
+    assert found.threshold_m == 0.7
+
+
+def test_weights_that_are_all_equal_change_nothing():
+    sensor, reference = torch.rand(50, 3) * 4, torch.rand(300, 3) * 4 + torch.tensor([8.0, -2.0, 0.0])
+    plain = box_visibility(sensor, reference, TWO)
+    weighted = box_visibility(sensor, reference, TWO, reference_weights=torch.full((300,), 7.0))
+    torch.testing.assert_close(plain.mean_radius_m, weighted.mean_radius_m, equal_nan=True)
+    torch.testing.assert_close(plain.share, weighted.share, equal_nan=True)
+
+
+def test_a_box_without_reference_points_is_unknown_whatever_the_rig_saw_in_it():
+    sensor, reference = torch.tensor([[30.0, 0.0, 1.0]] * 5), torch.tensor([[10.0, 0.0, 1.0]])
+    seen = box_visibility(sensor, reference, TWO)
+    assert seen.share[0] == 0.0
+    assert seen.mean_radius_m[0] == 20.0
+    assert seen.share[1].isnan()
+    assert seen.mean_radius_m[1].isnan()
+    assert seen.known.tolist() == [True, False]
+    assert seen.reference_points.tolist() == [1, 0]
+    assert seen.sensor_points.tolist() == [0, 5]
+
+
+def test_the_nearest_sensor_point_may_lie_outside_the_box():
+    """At 0.3 m in front of the box, below the threshold: seen, although no point of the rig is in the box."""
+    seen = box_visibility(torch.tensor([[7.7, 0.0, 1.0]]), torch.tensor([[8.0, 0.0, 1.0]]), TWO)
+    assert seen.share[0] == 1.0
+    assert seen.mean_radius_m[0] == pytest.approx(0.3, abs=1e-6)
+    assert seen.sensor_points[0] == 0
+
+
+def test_a_radius_of_exactly_the_threshold_counts_as_seen():
+    seen = box_visibility(torch.tensor([[8.5, 0.0, 1.0]]), torch.tensor([[8.0, 0.0, 1.0]]), TWO, threshold=0.5)
+    assert seen.share[0] == 1.0
+
+
+def test_a_rig_that_saw_nothing_is_blind():
+    seen = box_visibility(torch.empty(0, 3), torch.tensor([[10.0, 0.0, 1.0]]), TWO)
+    assert seen.share[0] == 0.0
+    assert seen.mean_radius_m[0] == math.inf
+
+
+def test_no_boxes_give_an_empty_answer():
+    seen = box_visibility(torch.rand(5, 3), torch.rand(5, 3), Boxes.from_rows(torch.empty(0, 7)))
+    assert len(seen) == 0
+    assert seen.share.dtype == torch.float64
+
+
+def test_selecting_keeps_the_columns_together():
+    seen = box_visibility(torch.rand(5, 3), torch.tensor([[10.0, 0.0, 1.0]]), TWO)
+    one = seen.select(seen.known)
+    assert len(one) == 1
+    assert one.reference_points.tolist() == [1]
+
+
+@pytest.mark.parametrize("reference", [None, torch.empty(0, 3)])
+def test_a_frame_without_reference_is_an_error_that_says_what_to_do(reference):
+    with pytest.raises(ValueError, match="reference: the frame has none, and visibility is measured against it; use"):
+        box_visibility(torch.rand(5, 3), reference, TWO)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"sensor": torch.full((5, 3), math.nan)}, "sensor: 5 of 5 points have NaN"),
+        ({"reference": torch.zeros(5, 4)}, r"reference: shape \(N, 3\) is needed; got \(5, 4\)"),
+        ({"threshold": -0.1}, "threshold: a distance >= 0 in metres is needed; got -0.1"),
+        ({"threshold": math.nan}, "threshold: .* got nan"),
+        ({"reference_weights": torch.ones(4)}, r"reference_weights: shape \(5,\) is needed.*got \(4,\)"),
+        ({"reference_weights": torch.zeros(5)}, "reference_weights: finite weights > 0"),
+        ({"reference_weights": torch.full((5,), math.nan)}, "reference_weights: finite weights > 0"),
+    ],
+)
+def test_bad_input_is_refused(changes, message):
+    good = {"sensor": torch.rand(5, 3), "reference": torch.rand(5, 3), "boxes": TWO}
+    with pytest.raises(ValueError, match=message):
+        box_visibility(**{**good, **changes})
+
+
+def test_in_a_simulated_frame_what_lies_behind_the_rig_is_blind_and_what_is_seen_holds_points():
+    # Level, it sees all around.
+    reference = ReferenceSensor(rows=512, columns=512, max_tilt_deg=0.0)
+    frame = SimulatedFrames("highway", "front_roof_128", steps=1, seed=1, reference=reference, boxes=True)[0]
+    seen = box_visibility(frame.sensor, frame.reference, frame.boxes)
+    known = seen.known
+    assert known.sum() >= 5
+    assert torch.equal(seen.sensor_points, frame.boxes.hits["front_roof_128"])
+    # The rig looks 120 degrees forward: what is behind is blind, and what it sees, it has points on.
+    behind = known & (frame.boxes.centre_m[:, 0] < -10.0)
+    assert (seen.share[behind] == 0).all()
+    assert (seen.sensor_points[known & (seen.share > 0.5)] > 0).all()
+    assert (seen.share[known] > 0.5).any()

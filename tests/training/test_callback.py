@@ -1,0 +1,405 @@
+"""Coverage in Lightning runs: what is measured, what is logged where, and what a checkpoint holds."""
+
+import gc
+import math
+from dataclasses import replace
+
+import lightning.pytorch as pl
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from torch.utils.data import DataLoader, Dataset
+
+from torchcover import BevGrid, CoverageMetric, Region
+from torchcover.data import Frame, collate_frames
+from torchcover.training import CoverageCallback
+
+GRID = {"x": (0.0, 8.0), "y": (-2.0, 2.0), "cell": 1.0}
+REGIONS = [Region("near", x=(0.0, 4.0), y=(-2.0, 2.0)), Region("all", x=(0.0, 8.0), y=(-2.0, 2.0))]
+SIZE = torch.tensor([8.0, 4.0, 2.0])
+CORNER = torch.tensor([0.0, -2.0, -0.2])
+
+
+class RandomFrames(Dataset):
+    """Frames of random points; frame k is the same whenever it is asked for."""
+
+    def __init__(self, frames, reference_points=40):
+        self.frames = frames
+        self.reference_points = reference_points
+
+    def __len__(self):
+        return self.frames
+
+    def __getitem__(self, index):
+        if index >= self.frames:
+            raise IndexError(index)
+        generator = torch.Generator().manual_seed(index)
+        sensor = torch.rand(20 + index, 3, generator=generator) * SIZE + CORNER
+        reference = torch.rand(self.reference_points, 3, generator=generator) * SIZE + CORNER
+        return Frame({"rig": sensor}, reference, index=index, name="random")
+
+
+class Model(pl.LightningModule):
+    """One number to train, whatever the frames."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.tensor(1.0))
+
+    def training_step(self, batch, batch_idx):
+        return self.weight**2 * len(batch)
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.01)
+
+
+class Validated(Model):
+    """The same with a validation."""
+
+    def validation_step(self, batch, batch_idx, dataloader_idx=0):
+        pass
+
+
+def loader(frames, batch_size=2, **options):
+    dataset = RandomFrames(frames) if isinstance(frames, int) else frames
+    return DataLoader(dataset, batch_size=batch_size, collate_fn=collate_frames, **options)
+
+
+def make_metric(**options):
+    return CoverageMetric(BevGrid(**GRID), max_radius=9.0, **options)
+
+
+def expected(frames):
+    metric = make_metric()
+    for frame in frames:
+        metric.update(frame.sensor, frame.reference, index=frame.index)
+    return metric.compute()
+
+
+def assert_same(coverage, other):
+    for name in ("frames", "points", "radius", "detection"):
+        np.testing.assert_allclose(getattr(coverage, name), getattr(other, name), rtol=1e-12, err_msg=name)
+    assert coverage.counts == other.counts
+
+
+def make_trainer(folder, *callbacks, logger=False, **options):
+    options = {"max_epochs": 1, "num_sanity_val_steps": 0, "enable_checkpointing": False, **options}
+    return pl.Trainer(
+        default_root_dir=folder,
+        accelerator="cpu",
+        callbacks=list(callbacks),
+        logger=logger,
+        log_every_n_steps=1,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        **options,
+    )
+
+
+def test_a_validation_logs_the_coverage_of_its_frames(tmp_path):
+    callback = CoverageCallback(make_metric(), regions=REGIONS)
+    trainer = make_trainer(tmp_path, callback, num_sanity_val_steps=2)
+    trainer.fit(Validated(), loader(3), loader(5))
+    truth = expected(RandomFrames(5))
+    assert_same(callback.coverage, truth)
+    logged = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    scalars = {f"coverage/val/{name}": value for name, value in truth.scalars(REGIONS).items()}
+    assert logged == pytest.approx({**scalars, "coverage/val/frames": 5.0}, rel=1e-6)
+
+
+def test_the_numbers_can_be_monitored_and_changed_outside_of_the_inference_mode(tmp_path):
+    callback = CoverageCallback(make_metric(), regions=REGIONS)
+    monitor = ModelCheckpoint(tmp_path / "best", monitor="coverage/val/detection_0.4m/near/ground", mode="max")
+    trainer = make_trainer(tmp_path, callback, monitor, enable_checkpointing=True)
+    trainer.fit(Validated(), loader(2), loader(3))
+    assert float(monitor.best_model_score) == pytest.approx(
+        callback.coverage.scalars(REGIONS)["detection_0.4m/near/ground"], rel=1e-6
+    )
+    callback.coverage.radius[0, 0, 0] = 1.0
+    callback.metric.update(torch.zeros(1, 3), torch.zeros(1, 3))
+
+
+def test_every_epoch_starts_anew_and_those_between_cost_nothing(tmp_path):
+    seen = []
+
+    class Spy(CoverageMetric):
+        def update(self, sensor, *arguments, **options):
+            seen.append((trainer.current_epoch, len(sensor)))
+            super().update(sensor, *arguments, **options)
+
+    callback = CoverageCallback(Spy(BevGrid(**GRID), max_radius=9.0), every_n_epochs=2)
+    trainer = make_trainer(tmp_path, callback, max_epochs=5)
+    trainer.fit(Validated(), loader(2), loader(5))
+    measured = [epoch for epoch, frames in seen if frames]
+    assert measured == [1, 1, 1, 3, 3, 3]
+    assert_same(callback.coverage, expected(RandomFrames(5)))
+    # A validation on its own is always due.
+    callback.coverage = None
+    make_trainer(tmp_path, callback).validate(Validated(), loader(4), verbose=False)
+    assert_same(callback.coverage, expected(RandomFrames(4)))
+
+
+def test_frames_that_a_sampler_repeats_are_counted_once(tmp_path):
+    callback = CoverageCallback(make_metric(), stage="train")
+    make_trainer(tmp_path, callback).fit(Model(), loader(4, sampler=[0, 1, 2, 3, 0, 1, 2]))
+    assert_same(callback.coverage, expected(RandomFrames(4)))
+
+
+def test_frames_of_two_loaders_are_different_ones(tmp_path):
+    callback = CoverageCallback(make_metric())
+    make_trainer(tmp_path, callback).fit(Validated(), loader(2), [loader(3), loader(4)])
+    assert_same(callback.coverage, expected([*RandomFrames(3), *RandomFrames(4)]))
+
+
+def test_the_weights_of_reference_points_count(tmp_path):
+    weights = torch.linspace(0.1, 3.0, 40)
+    frames = [replace(frame, reference_weights=weights) for frame in RandomFrames(3)]
+    callback = CoverageCallback(make_metric())
+    make_trainer(tmp_path, callback).fit(Validated(), loader(2), loader(frames))
+    metric = make_metric()
+    for frame in frames:
+        metric.update(frame.sensor, frame.reference, weights=weights, index=frame.index)
+    assert_same(callback.coverage, metric.compute())
+    assert not torch.equal(callback.coverage.radius, expected(frames).radius)
+
+
+def test_every_n_steps_logs_the_epoch_so_far(tmp_path):
+    callback = CoverageCallback(make_metric(), regions=REGIONS, stage="train", every_n_steps=2)
+    logger = TakesImages()
+    make_trainer(tmp_path, callback, logger=logger).fit(Model(), loader(9))
+    tag = "coverage/train/radius_m/all/ground"
+    frames = list(RandomFrames(9))
+    # Batches count from 0: after two of them, after four, and at the end.
+    truth = {k: expected(frames[: 2 * k + 2]).scalars(REGIONS)["radius_m/all/ground"] for k in (1, 3, 4)}
+    assert {step: values[tag] for step, values in logger.scalars if tag in values} == pytest.approx(truth, rel=1e-6)
+    assert [step for key, step, _ in logger.images if key == "coverage/train/radius"] == [1, 3, 4]
+
+
+def test_another_rig_other_batches_and_frames(tmp_path):
+    def frames_of(batch):
+        return [Frame({"a": f.sensor, "b": f.sensor[:5]}, f.reference, f.index, f.name) for f in batch["frames"]]
+
+    def collate(frames):
+        return {"frames": frames, "target": torch.zeros(len(frames))}
+
+    batches = DataLoader(RandomFrames(3), batch_size=2, collate_fn=collate)
+    callback = CoverageCallback(make_metric(), rig="b", frames_of=frames_of)
+    trainer = make_trainer(tmp_path, callback, CoverageCallback(make_metric(), rig="a", frames_of=frames_of))
+    trainer.fit(Validated(), loader(2), batches)
+    truth = expected([Frame({"b": f.sensor[:5]}, f.reference, f.index, f.name) for f in RandomFrames(3)])
+    assert_same(callback.coverage, truth)
+    assert {name.split("/")[1] for name in trainer.callback_metrics} == {"a", "b"}
+
+
+class TakesImages(Logger):
+    """A logger with `log_image`, as that of Weights & Biases."""
+
+    name, version = "images", 0
+
+    def __init__(self):
+        super().__init__()
+        self.images, self.scalars = [], []
+
+    def log_metrics(self, metrics, step=None):
+        self.scalars.append((step, metrics))
+
+    def log_hyperparams(self, *arguments, **options):
+        pass
+
+    def log_image(self, key, images, step=None):
+        self.images += [(key, step, image) for image in images]
+
+
+def test_tensorboard_holds_the_tags_values_and_maps(tmp_path):
+    logger = TensorBoardLogger(tmp_path, name="", version="run")
+    callback = CoverageCallback(make_metric(thresholds=(0.4, 0.8)), regions=REGIONS)
+    trainer = make_trainer(tmp_path, callback, logger=logger, max_epochs=2)
+    trainer.fit(Validated(), loader(4), loader(5))
+    events = EventAccumulator(str(tmp_path / "run"))
+    events.Reload()
+    truth = callback.coverage.scalars(REGIONS)
+    tags = {f"coverage/val/{name}" for name in truth} | {"coverage/val/frames"}
+    assert {tag for tag in events.Tags()["scalars"] if tag.startswith("coverage")} == tags
+    for name, value in truth.items():
+        last = events.Scalars(f"coverage/val/{name}")
+        assert [event.value for event in last] == pytest.approx([value] * 2, rel=1e-6)
+        assert [event.step for event in last] == [1, 3]
+    maps = {f"coverage/val/{name}" for name in ("radius", "detection_0.4m", "detection_0.8m")}
+    assert set(events.Tags()["images"]) == maps
+    for tag in maps:
+        images = events.Images(tag)
+        assert [event.step for event in images] == [1, 3]
+        assert images[0].encoded_image_string.startswith(b"\x89PNG")
+        assert min(images[0].width, images[0].height) > 100
+
+
+def test_a_logger_that_takes_images_gets_pixels(tmp_path):
+    logger = TakesImages()
+    make_trainer(tmp_path, CoverageCallback(make_metric()), logger=logger).fit(Validated(), loader(2), loader(3))
+    assert [key for key, _, _ in logger.images] == ["coverage/val/radius", "coverage/val/detection_0.4m"]
+    for _, _, image in logger.images:
+        assert image.dtype == np.uint8
+        assert image.shape[2] == 3
+        assert image.std() > 20, "an empty picture"
+
+
+def test_a_logger_that_takes_no_figures_gets_numbers_and_one_warning(tmp_path):
+    logger = CSVLogger(tmp_path, name="", version="run")
+    trainer = make_trainer(tmp_path, CoverageCallback(make_metric()), logger=logger, max_epochs=3)
+    with pytest.warns(UserWarning, match="the numbers alone") as caught:
+        trainer.fit(Validated(), loader(2), loader(3))
+    assert sum("CSVLogger takes neither figures nor images" in str(warning.message) for warning in caught) == 1
+    rows = (tmp_path / "run" / "metrics.csv").read_text().splitlines()
+    assert "coverage/val/frames" in rows[0]
+    assert len(rows) == 4
+
+
+def test_without_maps_nothing_is_drawn(tmp_path):
+    logger = TakesImages()
+    make_trainer(tmp_path, CoverageCallback(make_metric(), maps=False), logger=logger).fit(
+        Validated(), loader(2), loader(3)
+    )
+    assert logger.images == []
+    assert any("coverage/val/frames" in values for _, values in logger.scalars)
+
+
+def test_frames_without_reference_points_are_unknown_and_said_so_once(tmp_path):
+    callback = CoverageCallback(make_metric(), regions=REGIONS)
+    trainer = make_trainer(tmp_path, callback, max_epochs=2)
+    with pytest.warns(UserWarning, match="is unknown") as caught:
+        trainer.fit(Validated(), loader(2), loader(RandomFrames(3, reference_points=0)))
+    assert sum("no reference point lies in the grid" in str(warning.message) for warning in caught) == 1
+    assert math.isnan(trainer.callback_metrics["coverage/val/radius_m/all/ground"])
+    assert trainer.callback_metrics["coverage/val/known_share/all/ground"] == 0
+    assert callback.coverage.counts["empty_reference_steps"] == 3
+
+
+class Save(pl.Callback):
+    """Takes a checkpoint after a number of steps, as `ModelCheckpoint` does."""
+
+    def __init__(self, path, step):
+        self.path, self.step = path, step
+
+    def on_train_batch_end(self, trainer, *arguments):
+        if trainer.global_step == self.step:
+            trainer.save_checkpoint(self.path)
+
+
+class Resumable(DataLoader):
+    """A loader that goes on where a checkpoint was taken; Lightning looks for these two methods."""
+
+    start = 0
+
+    def __iter__(self):
+        self.given = self.start
+        first, self.start = self.start, 0
+        for position, batch in enumerate(super().__iter__()):
+            if position >= first:
+                self.given += 1
+                yield batch
+
+    def state_dict(self):
+        return {"given": self.given}
+
+    def load_state_dict(self, state):
+        self.start = state["given"] % len(self)
+
+
+class SevenAnEpoch:
+    """A sampler that gives other frames in every epoch, as Lightning tells it which one it is."""
+
+    epoch = 0
+
+    def set_epoch(self, epoch):
+        self.epoch = epoch
+
+    def __len__(self):
+        return 7
+
+    def __iter__(self):
+        return iter(range(7 * self.epoch, 7 * self.epoch + 7))
+
+
+@pytest.mark.parametrize("at", [1, 2, 3, 4, 6, 7])
+def test_a_run_resumed_within_an_epoch_ends_with_the_same_numbers(tmp_path, at):
+    """Two epochs of four batches; the checkpoint is taken after one of them."""
+    path = tmp_path / "within.ckpt"
+
+    def run(*callbacks, ckpt_path=None):
+        results = {}
+
+        class Keep(CoverageCallback):
+            def on_train_epoch_end(self, trainer, pl_module):
+                super().on_train_epoch_end(trainer, pl_module)
+                results[trainer.current_epoch] = self.coverage
+
+        trainer = make_trainer(tmp_path, Keep(make_metric(), stage="train"), *callbacks, max_epochs=2)
+        batches = Resumable(RandomFrames(14), batch_size=2, collate_fn=collate_frames, sampler=SevenAnEpoch())
+        trainer.fit(Model(), batches, ckpt_path=ckpt_path)
+        return results
+
+    whole = run(Save(path, at))
+    resumed = run(ckpt_path=path)
+    assert (sorted(whole), sorted(resumed)) == ([0, 1], [0, 1] if at < 4 else [1])
+    for epoch, coverage in [*whole.items(), *resumed.items()]:
+        assert_same(coverage, expected(list(RandomFrames(14))[7 * epoch : 7 * epoch + 7]))
+
+
+def test_frames_that_a_resumed_loader_gives_again_are_counted_once(tmp_path):
+    callback = CoverageCallback(make_metric(), stage="train")
+    make_trainer(tmp_path, callback, Save(tmp_path / "within.ckpt", 2)).fit(Model(), loader(8))
+    with pytest.warns(UserWarning, match="your dataloader is not resumable"):
+        make_trainer(tmp_path, callback).fit(Model(), loader(8), ckpt_path=tmp_path / "within.ckpt")
+    # The loader starts with the first batches again, in place of the last two.
+    assert_same(callback.coverage, expected(RandomFrames(4)))
+
+
+def test_a_checkpoint_between_epochs_holds_no_sums_and_one_within_an_epoch_does(tmp_path):
+    callback = CoverageCallback(make_metric(), stage="train")
+    trainer = make_trainer(tmp_path, callback)
+    trainer.fit(Model(), loader(4))
+    assert callback.state_dict() == {}
+    assert CoverageCallback(make_metric()).state_key != callback.state_key
+
+
+def test_memory_does_not_grow_over_epochs(tmp_path):
+    counts = []
+
+    class Count(pl.Callback):
+        def on_train_epoch_end(self, trainer, pl_module):
+            gc.collect()
+            # `type`, as `isinstance` asks deprecated objects of torch for their class.
+            tensors = [thing for thing in gc.get_objects() if issubclass(type(thing), torch.Tensor)]
+            size = sum(tensor.numel() * tensor.element_size() for tensor in tensors)
+            counts.append((len(tensors), size, len(callback._once._counted)))
+
+    callback = CoverageCallback(make_metric(), stage="train")
+    logger = TensorBoardLogger(tmp_path, name="", version="run")
+    trainer = make_trainer(tmp_path, callback, Count(), logger=logger, max_epochs=4)
+    trainer.fit(Model(), loader(6))
+    assert counts[1:] == [counts[1]] * 3
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"stage": "test"}, "one of validation, train"),
+        ({"every_n_epochs": 0}, "at least 1"),
+        ({"stage": "train", "every_n_steps": 0}, "at least 1"),
+        ({"every_n_steps": 5}, "needs stage='train'"),
+    ],
+)
+def test_wrong_arguments_are_refused(options, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        CoverageCallback(make_metric(), **options)
+
+
+def test_batches_without_frames_and_unknown_rigs_are_refused(tmp_path):
+    plain = DataLoader(RandomFrames(2), batch_size=2, collate_fn=lambda frames: {"points": [f.sensor for f in frames]})
+    with pytest.raises(TypeError, match=r"got dict; say how.*frames_of"):
+        make_trainer(tmp_path, CoverageCallback(make_metric())).fit(Validated(), loader(2), plain)
+    with pytest.raises(ValueError, match="has no rig 'roof'; it has rig"):
+        make_trainer(tmp_path, CoverageCallback(make_metric(), rig="roof")).fit(Validated(), loader(2), loader(2))

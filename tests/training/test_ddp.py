@@ -1,0 +1,131 @@
+"""Two processes give the numbers of one, whatever the sampler fills up its last round with."""
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import BatchSampler, DataLoader, DistributedSampler
+
+from torchcover import BevGrid, Coverage, CoverageMetric, Region
+from torchcover.data import Frame, collate_frames
+from torchcover.training import CountOnce, shard_of
+
+GRID = {"x": (0.0, 8.0), "y": (-2.0, 2.0), "cell": 1.0}
+REGION = Region("all", x=GRID["x"], y=GRID["y"])
+
+
+def clouds(seed):
+    generator = torch.Generator().manual_seed(seed)
+    size, corner = torch.tensor([8.0, 4.0, 2.0]), torch.tensor([0.0, -2.0, -0.2])
+    return tuple(torch.rand(points, 3, generator=generator) * size + corner for points in (20 + seed, 40))
+
+
+def test_two_processes_give_the_numbers_of_one(tmp_path):
+    """Seven frames for two processes: the eighth that the sampler deals out is the first one again."""
+    frames = [clouds(seed) for seed in range(7)]
+    torch.save({"grid": GRID, "frames": frames}, tmp_path / "frames.pt")
+    environment = {**os.environ, "GLOO_SOCKET_IFNAME": "lo0" if sys.platform == "darwin" else "lo"}
+    environment.update(OMP_NUM_THREADS="1", PYTHONPATH=os.pathsep.join(p for p in sys.path if p))
+    run = subprocess.Popen(
+        [sys.executable, str(Path(__file__).with_name("two_ranks.py")), str(tmp_path)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,  # the second process is started by the first, and ends with it
+    )
+    try:
+        output = run.communicate(timeout=240)[0]
+    finally:
+        if run.poll() is None:
+            os.killpg(run.pid, signal.SIGKILL)
+    assert run.returncode == 0, output
+
+    metric = CoverageMetric(BevGrid(**GRID), max_radius=9.0, blocks=8)
+    for index, (sensor, reference) in enumerate(frames):
+        metric.update(sensor, reference, index=index)
+    truth = metric.compute()
+    for name in ("whole", "resumed"):
+        for rank in range(2):
+            job = torch.load(tmp_path / f"{name}_{rank}.pt")
+            for stage in ("train", "val"):
+                assert_same(Coverage.load(tmp_path / f"{name}_{stage}_{rank}.npz"), truth)
+                np.testing.assert_allclose(job["blocks"][stage], truth.blocks.radius_sum, rtol=1e-12)
+                assert job["logged"][f"coverage/{stage}/frames"] == 7
+                for tag, value in truth.scalars([REGION]).items():
+                    assert job["logged"][f"coverage/{stage}/{tag}"] == pytest.approx(value, rel=1e-6, nan_ok=True)
+            assert job["images"] == (2 if rank == 0 else 0), "maps are drawn by one process"
+
+
+def assert_same(coverage, other):
+    for name in ("frames", "points", "radius", "detection"):
+        np.testing.assert_allclose(getattr(coverage, name), getattr(other, name), rtol=1e-12, err_msg=name)
+    assert coverage.counts == other.counts
+
+
+class Clouds:
+    """Frames with an index and hardly any points."""
+
+    def __init__(self, frames):
+        self.frames = frames
+
+    def __len__(self):
+        return self.frames
+
+    def __getitem__(self, index):
+        return Frame({"rig": torch.zeros(1, 3)}, torch.zeros(1, 3), index=index, name="cloud")
+
+
+@pytest.mark.parametrize("drop_last", [False, True])
+@pytest.mark.parametrize("shuffle", [False, True])
+@pytest.mark.parametrize(("samples", "processes"), [(1, 1), (1, 4), (3, 8), (4, 4), (5, 4), (7, 2), (8, 3), (10, 4)])
+def test_every_frame_is_counted_by_one_process(samples, processes, shuffle, drop_last):
+    dataset, counted, dealt = Clouds(samples), [], []
+    for rank in range(processes):
+        sampler = DistributedSampler(dataset, processes, rank, shuffle=shuffle, drop_last=drop_last)
+        loader = DataLoader(dataset, batch_size=2, sampler=sampler, collate_fn=collate_frames)
+        once = CountOnce()
+        for batch in loader:
+            dealt += [frame.index for frame in batch.frames]
+            counted += [frame.index for frame in once.new(batch.frames, shard_of(loader))]
+    assert sorted(counted) == sorted(set(dealt))
+
+
+def test_a_batch_sampler_is_looked_through():
+    sampler = DistributedSampler(range(5), num_replicas=2, rank=1)
+    loader = DataLoader(range(5), batch_sampler=BatchSampler(sampler, 2, drop_last=False))
+    assert shard_of(loader) == (1, 2, 5)
+    assert shard_of(DataLoader(range(5))) is None
+    assert shard_of([1, 2, 3]) is None
+
+
+def test_frames_of_two_datasets_with_the_same_index_are_different_ones():
+    """Datasets side by side count from 0 each; their frames differ in name, or by seed in the numbers of points."""
+    first = Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=0, name="a")
+    others = [
+        Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=0, name="b"),
+        Frame({"rig": torch.zeros(6, 3)}, torch.zeros(9, 3), index=0, name="a"),
+        Frame({"rig": torch.zeros(5, 3)}, torch.zeros(8, 3), index=0, name="a"),
+    ]
+    flipped = Frame({"rig": -torch.ones(5, 3)}, torch.ones(9, 3), index=0, name="a")
+    once = CountOnce()
+    assert once.new([first, *others]) == [first, *others]
+    assert once.new([flipped]) == []
+    assert once.new([first], loader=1) == [first]
+    once.start_epoch()
+    assert once.new([first]) == [first]
+
+
+def test_the_state_goes_on_within_an_epoch():
+    frames = [Clouds(6)[k] for k in range(6)]
+    once, resumed = CountOnce(), CountOnce()
+    once.new(frames[:3], shard_of(DataLoader(frames, sampler=DistributedSampler(frames, 2, 1))))
+    resumed.load_state_dict(once.state_dict())
+    shard = shard_of(DataLoader(frames[:5], sampler=DistributedSampler(frames[:5], 2, 1)))
+    # The positions of this process are 1, 3, 5 of five samples: the last is padding.
+    assert resumed.new(frames[2:4], shard) == once.new(frames[2:4], shard) == []

@@ -1,0 +1,106 @@
+"""A Lightning run in two processes: `python two_ranks.py FOLDER`, on the frames in FOLDER/frames.pt."""
+
+import sys
+import warnings
+from pathlib import Path
+
+import lightning.pytorch as pl
+import torch
+from torch.utils.data import DataLoader
+
+from torchcover import BevGrid, CoverageMetric, Region
+from torchcover.data import Frame, collate_frames
+from torchcover.training import CoverageCallback
+
+warnings.simplefilter("error")
+warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.. is deprecated", FutureWarning)
+warnings.filterwarnings("ignore", "The '.*dataloader' does not have many workers")
+folder = Path(sys.argv[1])
+job = torch.load(folder / "frames.pt")
+frames = [Frame({"rig": sensor}, reference, k, "saved") for k, (sensor, reference) in enumerate(job["frames"])]
+
+
+class Model(pl.LightningModule):
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.tensor(1.0))
+
+    def training_step(self, batch, batch_idx):
+        return self.weight**2
+
+    def validation_step(self, batch, batch_idx):
+        pass
+
+    def configure_optimizers(self):
+        return torch.optim.SGD(self.parameters(), lr=0.01)
+
+
+class SaveWithinEpoch(pl.Callback):
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        if batch_idx == 1:
+            trainer.save_checkpoint(folder / "within.ckpt")
+
+
+class TakesImages(pl.loggers.CSVLogger):
+    images = 0
+
+    def log_image(self, key, images, step):
+        self.images += 1
+
+
+class Resumable(DataLoader):
+    """A loader that goes on after the batches of a checkpoint; Lightning looks for these two methods."""
+
+    start = 0
+
+    def __iter__(self):
+        first, self.start = self.start, 0
+        for self.given, batch in enumerate(super().__iter__(), 1):
+            if self.given > first:
+                yield batch
+
+    def state_dict(self):
+        return {"given": self.given}
+
+    def load_state_dict(self, state):
+        self.start = state["given"]
+
+
+def fit(name, *callbacks, ckpt_path=None):
+    def metric():
+        return CoverageMetric(BevGrid(**job["grid"]), max_radius=9.0, blocks=8)
+
+    regions = [Region("all", **{axis: job["grid"][axis] for axis in "xy"})]
+    train = CoverageCallback(metric(), regions=regions, stage="train", maps=False)
+    validation = CoverageCallback(metric(), regions=regions)
+    logger = TakesImages(folder, name="", version=name)
+    trainer = pl.Trainer(
+        accelerator="cpu",
+        devices=2,
+        strategy="ddp",
+        max_epochs=1,
+        num_sanity_val_steps=0,
+        callbacks=[train, validation, *callbacks],
+        logger=logger,
+        log_every_n_steps=1,
+        default_root_dir=folder,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    # Lightning deals the frames out to the two processes; those of the training are shuffled.
+    train_frames = Resumable(frames, shuffle=True, batch_size=1, collate_fn=collate_frames)
+    validation_frames = DataLoader(frames, batch_size=2, collate_fn=collate_frames)
+    trainer.fit(Model(), train_frames, validation_frames, ckpt_path=ckpt_path)
+    blocks = {}
+    for stage, callback in (("train", train), ("val", validation)):
+        callback.coverage.save(folder / f"{name}_{stage}_{trainer.global_rank}.npz")
+        blocks[stage] = callback.coverage.blocks.radius_sum
+    logged = {tag: float(value) for tag, value in trainer.callback_metrics.items()}
+    result = {"logged": logged, "images": logger.images, "blocks": blocks}
+    torch.save(result, folder / f"{name}_{trainer.global_rank}.pt")
+
+
+if __name__ == "__main__":
+    fit("whole", SaveWithinEpoch())
+    fit("resumed", ckpt_path=folder / "within.ckpt")

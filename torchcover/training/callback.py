@@ -1,0 +1,245 @@
+"""Coverage in a Lightning run: measured beside the model, logged beside its metrics."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+try:
+    from lightning.pytorch import Callback, LightningModule, Trainer
+except ImportError as error:
+    raise ImportError("CoverageCallback needs Lightning: pip install 'torchcover[lightning]'") from error
+from lightning.pytorch.utilities import rank_zero_warn
+
+from torchcover.coverage import Coverage, CoverageMetric, Region
+from torchcover.data import FrameBatch
+from torchcover.training.batches import UNKNOWN_INDEX, frames_in, sensor_of
+from torchcover.training.counting import CountOnce, Shard, is_distributed, shard_of
+
+# Names of the stages in tags, as Lightning users write them.
+STAGES = {"validation": "val", "train": "train"}
+
+
+class CoverageCallback(Callback):
+    """Measures the coverage of the frames that a model trains or is validated on, and logs it.
+
+    At the end of an epoch every number of `Coverage.scalars(regions)` and the number of frames go to `self.log_dict`
+    under `coverage/val/` or `coverage/train/`, so that loggers, `ModelCheckpoint` and `EarlyStopping` see them; the
+    maps go to the loggers that take figures or images, from rank zero. The other loggers get the numbers, and one
+    warning says so.
+
+    With several processes each measures its own frames and the sums are added up. The samples that a
+    `DistributedSampler` repeats to fill the last batch are left out, see `CountOnce`. A checkpoint within an epoch
+    holds the sums so far of all processes, so that a resumed run ends with the same numbers; other checkpoints hold
+    nothing. The sanity check before training is not measured.
+
+    Args:
+        metric: What to measure. The callback resets it at the start of each epoch and moves it to the model's device.
+        regions: Regions to log; those of the paper that fit the grid if not given.
+        stage: `"validation"` or `"train"`: whose batches to measure.
+        every_n_epochs: Measure the last of every n epochs. The others cost nothing.
+        every_n_steps: With `stage="train"`: also log the coverage of the epoch so far after every n batches.
+        maps: Whether to log maps.
+        rig: Which of several rigs in a frame; part of the tags if given.
+        frames_of: Gives the frames of a batch: a `FrameBatch` or a sequence of `Frame`, one for each sample, in order.
+            If not given, the batch is one of the two or has them as `frames`.
+
+    Attributes:
+        coverage: The last `Coverage` that was logged, the same on every process; None before.
+
+    Raises:
+        ValueError: An unknown stage, a number of epochs or steps below 1, steps outside training.
+        ImportError: On import, without Lightning.
+
+    Example:
+        >>> from torchcover import BevGrid
+        >>> metric = CoverageMetric(BevGrid(x=(0.0, 20.0), y=(-5.0, 5.0)), max_radius=25.0)
+        >>> CoverageCallback(metric, every_n_epochs=5).tag
+        'coverage/val'
+    """
+
+    def __init__(
+        self,
+        metric: CoverageMetric,
+        *,
+        regions: Sequence[Region] | None = None,
+        stage: str = "validation",
+        every_n_epochs: int = 1,
+        every_n_steps: int | None = None,
+        maps: bool = True,
+        rig: str | None = None,
+        frames_of: Callable[[Any], Any] | None = None,
+    ) -> None:
+        _check_arguments(stage, every_n_epochs, every_n_steps)
+        self.metric = metric
+        self.regions = regions
+        self.stage = stage
+        self.every_n_epochs = every_n_epochs
+        self.every_n_steps = every_n_steps
+        self.maps = maps
+        self.rig = rig
+        self.frames_of = frames_of
+        self.tag = "/".join(["coverage", *([rig] if rig else []), STAGES[stage]])
+        self.coverage: Coverage | None = None
+        self._epoch: int | None = None  # being measured; the same on every process, as collective calls need it
+        self._once = CountOnce()
+        self._warned: set[str] = set()
+
+    @property
+    def state_key(self) -> str:
+        """Where a checkpoint keeps the state: one place for each tag."""
+        return self._generate_state_key(tag=self.tag)
+
+    def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """Forget an epoch that was broken off; a checkpoint is restored after this."""
+        self._epoch = None
+
+    def _start(self, trainer: Trainer) -> None:
+        if self._epoch == trainer.current_epoch:
+            return
+        due = trainer.state.fn != "fit" or (trainer.current_epoch + 1) % self.every_n_epochs == 0
+        self._epoch = trainer.current_epoch if due and not trainer.sanity_checking else None
+        if self._epoch is not None:
+            self._once.start_epoch()
+            with torch.inference_mode(False):  # or the sums could not be added to outside a validation
+                self.metric.reset()
+
+    def _add(self, trainer: Trainer, pl_module: LightningModule, batch: object, loader_index: int) -> None:
+        self._start(trainer)  # after a checkpoint at the last batch of an epoch, Lightning leaves out the hook for it
+        if self._epoch is None:
+            return
+        frames = frames_in(batch if self.frames_of is None else self.frames_of(batch))
+        new = FrameBatch(tuple(self._once.new(frames, self._shard(trainer, loader_index), loader_index)))
+        indices = [frame.index for frame in new.frames]
+        with torch.inference_mode(False):
+            # The sums live where the processes can exchange them; Apple's GPUs have no float64.
+            self.metric.to("cpu" if pl_module.device.type == "mps" else pl_module.device)
+            self.metric.update(
+                [sensor_of(frame, self.rig) for frame in new.frames],
+                new.reference,
+                weights=new.weights,
+                index=None if UNKNOWN_INDEX in indices else indices,
+            )
+
+    def _shard(self, trainer: Trainer, loader_index: int) -> Shard | None:
+        loaders: Any = trainer.train_dataloader if self.stage == "train" else trainer.val_dataloaders
+        loader = loaders[loader_index] if isinstance(loaders, list | tuple) else loaders
+        shard = shard_of(loader)
+        if shard is None and trainer.world_size > 1:
+            self._warn_once(
+                "the loader has no DistributedSampler: a frame that several processes get is counted several times"
+            )
+        return shard
+
+    def _finish(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._epoch is None:
+            return
+        scalars = self._compute()
+        self._epoch = None
+        # All processes log the same values, so that their maximum is the value, not rounded; Lightning wants some
+        # reduction to be named.
+        pl_module.log_dict(scalars, on_step=False, on_epoch=True, sync_dist=True, reduce_fx="max")
+        self._log_maps(trainer)
+
+    def _compute(self) -> dict[str, float]:
+        with torch.inference_mode(False):
+            self.metric.update([], [])  # a process that was dealt nothing but padding has not updated yet
+            coverage: Coverage = self.metric.compute()
+        self.coverage = coverage
+        if not bool((coverage.frames > 0).any()):
+            self._warn_once("no reference point lies in the grid: the coverage of these frames is unknown (NaN)")
+        scalars = {**coverage.scalars(self.regions), "frames": float(coverage.counts["steps"])}
+        return {f"{self.tag}/{name}": value for name, value in scalars.items()}
+
+    def _log_maps(self, trainer: Trainer) -> None:
+        if not (self.maps and trainer.is_global_zero and trainer.loggers and self.coverage):
+            return
+        from torchcover.training.figures import log_maps  # matplotlib only where there is something to draw
+
+        if refused := log_maps(self.coverage, trainer.loggers, self.tag, _step(trainer)):
+            self._warn_once(f"{', '.join(refused)} takes neither figures nor images: it gets the numbers alone")
+
+    def _warn_once(self, text: str) -> None:
+        if text not in self._warned:
+            self._warned.add(text)
+            rank_zero_warn(f"{self.tag}: {text}")
+
+    def state_dict(self) -> dict[str, Any]:
+        """The sums so far of all processes, within an epoch; every process must call it, as Lightning does."""
+        if self._epoch is None:
+            return {}
+        with self.metric.sync_context():
+            sums = {name: torch.as_tensor(total).cpu().clone() for name, total in self.metric.metric_state.items()}
+        return {"epoch": self._epoch, "metric": sums, "frames": self._once.state_dict()}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on within an epoch: rank zero takes over the sums, the others start from nothing."""
+        self._epoch = state_dict["epoch"]
+        self._once.load_state_dict(state_dict["frames"])
+        self.metric.reset()
+        if not is_distributed() or torch.distributed.get_rank() == 0:
+            sums = {name: total.to(self.metric.device) for name, total in state_dict["metric"].items()}
+            self.metric.merge_state(sums)
+
+    def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start from nothing."""
+        if self.stage == "validation":
+            self._start(trainer)
+
+    def on_validation_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: object,
+        batch: object,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Add the frames of a batch."""
+        if self.stage == "validation":
+            self._add(trainer, pl_module, batch, dataloader_idx)
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log."""
+        if self.stage == "validation":
+            self._finish(trainer, pl_module)
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Start from nothing, unless the epoch was resumed."""
+        if self.stage == "train":
+            self._start(trainer)
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
+    ) -> None:
+        """Add the frames of a batch, and log if it is time."""
+        if self.stage != "train":
+            return
+        self._add(trainer, pl_module, batch, 0)
+        if self._epoch is not None and self.every_n_steps and (batch_idx + 1) % self.every_n_steps == 0:
+            scalars = self._compute()
+            # `log_dict` would drop the values of steps that are no multiples of the trainer's log_every_n_steps.
+            for logger in trainer.loggers:
+                logger.log_metrics(scalars, step=_step(trainer))
+            self._log_maps(trainer)
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log."""
+        if self.stage == "train":
+            self._finish(trainer, pl_module)
+
+
+def _step(trainer: Trainer) -> int:
+    """Where Lightning puts what `log_dict` logs now: steps count from 0, and the last one has been taken."""
+    return max(trainer.global_step - 1, 0)
+
+
+def _check_arguments(stage: str, every_n_epochs: int, every_n_steps: int | None) -> None:
+    if stage not in STAGES:
+        raise ValueError(f"stage: one of {', '.join(STAGES)} is needed; got {stage!r}")
+    if every_n_epochs < 1:
+        raise ValueError(f"every_n_epochs: at least 1 is needed; got {every_n_epochs}")
+    if every_n_steps is not None and every_n_steps < 1:
+        raise ValueError(f"every_n_steps: at least 1 is needed; got {every_n_steps}")
+    if every_n_steps is not None and stage != "train":
+        raise ValueError("every_n_steps: needs stage='train'; a validation is logged at its end")

@@ -1,0 +1,131 @@
+"""Which frames of a batch to count: in an epoch each frame once, on whatever process it turns up."""
+
+import hashlib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch.utils.data.distributed import DistributedSampler
+
+from torchcover.data import Frame
+
+
+class Shard(NamedTuple):
+    """How samples are dealt out: number k of a process is number `k * processes + process` of all.
+
+    Args:
+        process: Rank of this process.
+        processes: Number of processes.
+        samples: Number of different samples; what is dealt out beyond it repeats the first ones.
+    """
+
+    process: int
+    processes: int
+    samples: int
+
+
+class CountOnce:
+    """Leaves out the frames that this or another process counts, without talking to the other processes.
+
+    A `torch.utils.data.DistributedSampler` deals out the same number of samples to every process and fills the last
+    round with the first samples again. The position of a sample in the whole deal tells, whatever the order of the
+    samples: from `len(dataset)` on it is a repetition. This covers samplers that deal out in the same way: those that
+    Lightning and OpenPCDet put in. It needs batches in order (`DataLoader(in_order=True)`, the default) with one frame
+    for each sample.
+
+    Within a process a frame that comes again in the same epoch is recognised by its index, name and numbers of points,
+    and counted once. That covers samplers that repeat samples on purpose, and epochs that were resumed. A frame that a
+    sampler of another kind gives to two processes is counted twice.
+
+    The memory is one number for each frame of an epoch.
+
+    Example:
+        >>> import torch
+        >>> frames = [Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=k, name="a") for k in (0, 1, 0)]
+        >>> once = CountOnce()
+        >>> [frame.index for frame in once.new(frames)]
+        [0, 1]
+        >>> once.start_epoch()
+        >>> [frame.index for frame in once.new(frames[:2], Shard(process=1, processes=2, samples=3))]
+        [0]
+    """
+
+    def __init__(self) -> None:
+        self.start_epoch()
+
+    def start_epoch(self) -> None:
+        """Forget the frames so far."""
+        self._counted: set[int] = set()
+        self._position: dict[int, int] = {}
+
+    def new(self, frames: Sequence[Frame], shard: Shard | None = None, loader: int = 0) -> list[Frame]:
+        """The frames of the next batch that are to be counted.
+
+        Args:
+            frames: One for each sample of the batch, in order.
+            shard: How the loader's samples are dealt out, see `shard_of`; None if this process gets all of them.
+            loader: Number of the loader, if there are several: equal frames of two loaders are different ones.
+
+        Returns:
+            Some or all of the frames, in order.
+        """
+        first = self._position.get(loader, 0)
+        self._position[loader] = first + len(frames)
+        new = []
+        for position, frame in enumerate(frames, first):
+            padding = shard is not None and position * shard.processes + shard.process >= shard.samples
+            identity = _identity(frame, loader)
+            if not padding and identity not in self._counted:
+                self._counted.add(identity)
+                new.append(frame)
+        return new
+
+    def state_dict(self) -> dict[str, Any]:
+        """What `load_state_dict` takes, plain numbers: the frames that all processes have counted.
+
+        With `torch.distributed` in use, every process must call it.
+        """
+        counted = self._counted
+        if is_distributed():
+            of_process: list[set[int]] = [set()] * torch.distributed.get_world_size()
+            torch.distributed.all_gather_object(of_process, self._counted)
+            counted = set().union(*of_process)
+        return {"counted": sorted(counted), "position": dict(self._position)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on within an epoch."""
+        self._counted, self._position = set(state["counted"]), dict(state["position"])
+
+
+def shard_of(loader: object) -> Shard | None:
+    """How a DataLoader's samples are dealt out to processes.
+
+    Args:
+        loader: A DataLoader, or whatever gives the batches.
+
+    Returns:
+        None without a `DistributedSampler`.
+
+    Example:
+        >>> from torch.utils.data import DataLoader
+        >>> sampler = DistributedSampler(range(5), num_replicas=2, rank=1)
+        >>> shard_of(DataLoader(range(5), sampler=sampler))
+        Shard(process=1, processes=2, samples=5)
+    """
+    sampler = getattr(getattr(loader, "batch_sampler", None), "sampler", None) or getattr(loader, "sampler", None)
+    if not isinstance(sampler, DistributedSampler):
+        return None
+    return Shard(sampler.rank, sampler.num_replicas, len(sampler.dataset))  # type: ignore[arg-type]  # a sampler needs it
+
+
+def is_distributed() -> bool:
+    """Whether this is one of several processes that `torch.distributed` connects."""
+    return torch.distributed.is_available() and torch.distributed.is_initialized()
+
+
+def _identity(frame: Frame, loader: int) -> int:
+    # Two datasets side by side have frames of the same index, and of the same name if only their seed differs. Flips
+    # and rotations change coordinates, but no number of points.
+    sizes = [len(frame.reference), *(len(cloud) for cloud in frame.sensors.values())]
+    text = repr((loader, frame.index, frame.name, sizes))
+    return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=7).digest(), "big")

@@ -1,0 +1,68 @@
+"""One frame of what a detector found, as it comes in."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchcover.data import Boxes
+from torchcover.training.visibility import BoxVisibility
+
+
+class DetectedFrame:
+    """The objects and the detections of one frame in float64 on the CPU, checked.
+
+    Args:
+        detections: (N, 7) or wider.
+        boxes: K objects.
+        visibility: Of the objects.
+        scores: (N,) scores.
+        detection_visibility: Of the detections' own boxes.
+
+    Raises:
+        ValueError: See `RecallByVisibility.update`.
+    """
+
+    def __init__(
+        self,
+        detections: Tensor,
+        boxes: Boxes,
+        visibility: BoxVisibility | Tensor,
+        scores: Tensor | None,
+        detection_visibility: BoxVisibility | Tensor | None,
+    ) -> None:
+        if detections.ndim != 2 or detections.shape[1] < 7:
+            raise ValueError(
+                f"detections: shape (N, 7) is needed, x y z length width height yaw; got {tuple(detections.shape)}"
+            )
+        self.detections = detections[:, :7].detach().cpu().double()
+        bad = ~self.detections.isfinite().all(dim=1) | (self.detections[:, 3:6] < 0).any(dim=1)
+        if bad.any():
+            raise ValueError(
+                f"detections: {int(bad.sum())} of {len(bad)} have NaN or infinite numbers or a negative size, "
+                f"the first is {int(bad.nonzero()[0])}; drop them"
+            )
+        self.truth = boxes.rows.detach().cpu().double()
+        self.share = _shares(visibility, len(boxes), "visibility")
+        given = torch.zeros(len(bad)) if scores is None else scores.detach().cpu()
+        if given.shape != (len(bad),) or given.isnan().any():
+            raise ValueError(
+                f"scores: one number for each of {len(bad)} detections is needed; got shape {tuple(given.shape)} with "
+                f"{int(given.isnan().sum())} NaN"
+            )
+        # Without scores every detection counts at every threshold.
+        self.scores = given.double() if scores is not None else given.double() + math.inf
+        unknown = torch.full((len(bad),), math.nan)
+        own = unknown if detection_visibility is None else detection_visibility
+        self.detection_share = _shares(own, len(bad), "detection_visibility")
+
+
+def _shares(visibility: BoxVisibility | Tensor, count: int, name: str) -> Tensor:
+    share = visibility.share if isinstance(visibility, BoxVisibility) else visibility
+    share = share.detach().cpu().double()
+    if share.shape != (count,) or ((share < 0) | (share > 1)).any():
+        raise ValueError(
+            f"{name}: {count} shares in [0, 1] are needed, NaN where unknown; got shape {tuple(share.shape)}, "
+            f"{int(((share < 0) | (share > 1)).sum())} of them outside"
+        )
+    return share

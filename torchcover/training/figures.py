@@ -1,0 +1,70 @@
+"""Coverage maps as figures and images, for whichever logger takes them."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from torchcover.coverage import Coverage
+from torchcover.report import draw_side_by_side
+from torchcover.report.metrics import metrics_of
+from torchcover.report.wording import span, steps_and_cell
+
+
+def map_figures(coverage: Coverage) -> Iterator[tuple[str, Figure]]:
+    """The maps of a coverage: for each metric a tag such as `radius` or `detection_0.4m` and a figure of all bands.
+
+    Args:
+        coverage: What `CoverageMetric.compute` returned.
+    """
+    heights = coverage.grid.heights
+    headings = [f"{name}, z {span(band)}" for name, band in heights.items()]
+    conditions = steps_and_cell(coverage.counts["steps"], coverage.grid)
+    for metric in metrics_of([coverage]):
+        bands = dict(zip(headings, metric.values[0], strict=True))
+        figure = draw_side_by_side(bands, coverage.grid, metric.scale, title=metric.title, subtitle=conditions)
+        yield metric.stem, figure
+
+
+def log_maps(coverage: Coverage, loggers: Sequence[Any], prefix: str, step: int) -> list[str]:
+    """Hand the maps to every logger that takes figures or images.
+
+    A logger takes them by `log_image(key, images, step)`, by `add_figure(tag, figure, step)`, or by an `add_figure` of
+    its `experiment`, as TensorBoard's.
+
+    Args:
+        coverage: What `CoverageMetric.compute` returned.
+        loggers: Lightning's loggers, or objects like them.
+        prefix: In front of the tags of `map_figures`, with a slash between.
+        step: Where on the logger's axis.
+
+    Returns:
+        The names of the classes of the loggers that take neither.
+    """
+    takers = [(logger, _taker(logger)) for logger in loggers]
+    able = [take for _, take in takers if take is not None]
+    if able:
+        for tag, figure in map_figures(coverage):
+            for take in able:
+                take(f"{prefix}/{tag}", figure, step)
+    return [type(logger).__name__ for logger, take in takers if take is None]
+
+
+def _taker(logger: Any) -> Callable[[str, Figure, int], Any] | None:  # noqa: ANN401  (any logger)
+    if callable(log_image := getattr(logger, "log_image", None)):
+        return lambda tag, figure, step: log_image(key=tag, images=[rgb_image(figure)], step=step)
+    for owner in (logger, getattr(logger, "experiment", None)):
+        if callable(add_figure := getattr(owner, "add_figure", None)):
+            taker: Callable[[str, Figure, int], Any] = add_figure
+            return taker
+    return None
+
+
+def rgb_image(figure: Figure) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 pixels of a figure."""
+    canvas: Any = FigureCanvasAgg(figure)  # without types for what it draws
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()

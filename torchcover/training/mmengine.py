@@ -1,0 +1,107 @@
+"""Coverage as a metric of MMEngine, for MMDetection3D. Importing this registers it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
+
+import torch
+
+try:
+    from mmengine.evaluator import BaseMetric
+    from mmengine.registry import METRICS
+except ImportError as error:
+    raise ImportError("MMEngineCoverage needs MMEngine: pip install mmengine (or mmengine-lite)") from error
+from mmengine.dist import get_dist_info
+
+from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
+from torchcover.data import Frame
+from torchcover.training.batches import UNKNOWN_INDEX, frames_in, frames_of_data_batch, sensor_of
+
+
+@METRICS.register_module()
+class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no types
+    """Coverage of the frames that a model is validated on, under the names of `Coverage.scalars`.
+
+    Where a `BaseMetric` gathers a result for each sample, this adds up fixed-size sums, which are reduced over the
+    processes. As MMEngine drops padding samples by the size of the dataset, which it tells at the end, the last frame
+    is held back until then.
+
+    Args:
+        metric: A `CoverageMetric`, or its arguments as a config has them, with `grid` as a dict of those of `BevGrid`.
+        regions: Regions to report, or dicts of their arguments; those of the paper that fit the grid if not given.
+        vehicle_T_lidar: (4, 4) pose of the points' frame, as `frames_of_data_batch` takes it.
+        frames_of: Gives the frames from `data_batch` and `data_samples`; `frames_of_data_batch` if not given.
+        prefix: In front of the names, with a slash between; "coverage" if not given.
+
+    Attributes:
+        coverage: The last `Coverage` that was evaluated; None before.
+
+    Example:
+        >>> metric = MMEngineCoverage({"grid": {"x": (0.0, 20.0), "y": (-5.0, 5.0)}, "max_radius": 25.0})
+        >>> points = torch.tensor([[3.0, 1.0, 0.0], [7.0, 0.0, 0.0]])
+        >>> sample = {"sample_idx": 0, "reference_points": torch.tensor([[3.0, 1.0, 0.3]])}
+        >>> metric.process({"inputs": {"points": [points]}}, [sample])
+        >>> round(metric.evaluate(size=1)["coverage/radius_m/20m/ground"], 3)
+        0.3
+    """
+
+    default_prefix = "coverage"
+
+    def __init__(
+        self,
+        metric: CoverageMetric | Mapping[str, Any],
+        *,
+        regions: Sequence[Region | Mapping[str, Any]] | None = None,
+        vehicle_T_lidar: Sequence[Sequence[float]] | None = None,
+        frames_of: Callable[[Any, Any], Any] | None = None,
+        prefix: str | None = None,
+    ) -> None:
+        super().__init__(prefix=prefix)
+        self.metric = metric if isinstance(metric, CoverageMetric) else _metric_of(metric)
+        self.regions = None if regions is None else [r if isinstance(r, Region) else Region(**r) for r in regions]
+        pose = None if vehicle_T_lidar is None else torch.as_tensor(vehicle_T_lidar, dtype=torch.float64)
+        self.frames_of = frames_of or partial(frames_of_data_batch, vehicle_T_lidar=pose)
+        self.coverage: Coverage | None = None
+        self._held_back: Frame | None = None
+        self._frames = 0
+
+    def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:  # noqa: ANN401  (MMEngine's)
+        """Add the frames of a batch."""
+        for frame in frames_in(self.frames_of(data_batch, data_samples)):
+            self._count_held_back()
+            self._held_back = frame
+            self._frames += 1
+
+    def _count_held_back(self) -> None:
+        if (frame := self._held_back) is not None:
+            index = None if frame.index == UNKNOWN_INDEX else frame.index
+            self.metric.update(sensor_of(frame), frame.reference, weights=frame.reference_weights, index=index)
+
+    def compute_metrics(self, results: list[Any]) -> dict[str, float]:
+        """The coverage so far of all processes; `results` stays empty."""
+        coverage: Coverage = self.metric.compute()
+        self.coverage = coverage
+        return coverage.scalars(self.regions)
+
+    def evaluate(self, size: int) -> dict[str, float]:
+        """Count the last frame unless it is padding, add up the processes, and start anew.
+
+        Args:
+            size: Number of samples in the dataset. Of what a sampler deals out in turns, the rest is padding.
+
+        Returns:
+            The numbers under `prefix/`, the same on every process.
+        """
+        rank, processes = get_dist_info()
+        if (self._frames - 1) * processes + rank < size:
+            self._count_held_back()
+        self.metric.update([], [])  # a process that was dealt nothing but padding has not updated yet
+        scalars = self.compute_metrics(self.results)
+        self.metric.reset()
+        self._held_back, self._frames = None, 0
+        return {f"{self.prefix}/{name}": value for name, value in scalars.items()}
+
+
+def _metric_of(arguments: Mapping[str, Any]) -> CoverageMetric:
+    grid = arguments["grid"]
+    return CoverageMetric(**{**arguments, "grid": grid if isinstance(grid, BevGrid) else BevGrid(**grid)})

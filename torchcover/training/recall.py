@@ -1,0 +1,195 @@
+"""Recall and precision of a detector over what was visible."""
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+
+from torchcover.data import Boxes
+from torchcover.training.detected_frame import DetectedFrame
+from torchcover.training.matching import MatchBy, match
+from torchcover.training.recall_curve import DetectionCounts
+from torchcover.training.visibility import BoxVisibility
+
+T = TypeVar("T")
+
+
+class RecallByVisibility(Metric):
+    """Recall and precision in bins of visibility and of distance, so that a miss and a blind spot can be told apart.
+
+    Detections are matched to objects by `torchcover.training.match`. An object's visibility is its share from
+    `box_visibility`, and its distance that of its centre from the vehicle's origin, over ground. Bins are half-open
+    [lo, hi), the last ones closed by 1 and open to infinity; objects of unknown visibility have a bin of their own.
+
+    A false detection has no object, so precision goes by the visibility and distance of the detection's own box; see
+    `update`. All objects and detections count, whatever their category: give one category at a time for figures by
+    category.
+
+    The state is a few counts, whatever the number of frames; ranks are added up when `compute` is called.
+
+    Args:
+        by: "distance" of the centres over ground, or "iou", the overlap seen from above.
+        threshold: Of the match, in metres or as a share; 2 m, the third of nuScenes' four thresholds, or 0.5 if None.
+        visibility_borders: Borders between bins of visibility, ascending, within (0, 1).
+        distance_borders: Borders between bins of distance in metres, ascending, positive.
+        score_thresholds: Detections with lower scores do not count; recall and precision have a row for each.
+        kwargs: For `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
+
+    Raises:
+        ValueError: An unknown way to match, a threshold or borders out of range or order, no score threshold.
+
+    Example:
+        >>> truth = Boxes.from_rows(torch.tensor([[9.0, 0, 1, 4, 2, 2, 0], [30.0, 0, 1, 4, 2, 2, 0]]))
+        >>> metric = RecallByVisibility(visibility_borders=(0.5,), distance_borders=(20.0,))
+        >>> metric.update(truth.rows[:1], truth, torch.tensor([0.9, 0.1]))
+        >>> curve = metric.compute().over("visibility")
+        >>> curve.bins, curve.recall.value, curve.recall.trials
+        (('0-0.5', '0.5-1', 'unknown'), tensor([[0., 1., nan]], dtype=torch.float64), tensor([[1, 1, 0]]))
+    """
+
+    is_differentiable = False
+    higher_is_better = None
+    full_state_update = False
+
+    objects: Tensor
+    found: Tensor
+    detections: Tensor
+    true_detections: Tensor
+    frames: Tensor
+
+    def __init__(
+        self,
+        *,
+        by: MatchBy = "distance",
+        threshold: float | None = None,
+        visibility_borders: Sequence[float] = (0.2, 0.4, 0.6, 0.8),
+        distance_borders: Sequence[float] = (20.0, 40.0, 60.0),
+        score_thresholds: Sequence[float] = (-math.inf,),
+        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+    ) -> None:
+        super().__init__(**kwargs)
+        self.by = by
+        self.threshold = float({"distance": 2.0, "iou": 0.5}.get(by, 0.0) if threshold is None else threshold)
+        self.visibility_borders = tuple(float(border) for border in visibility_borders)
+        self.distance_borders = tuple(float(border) for border in distance_borders)
+        self.score_thresholds = tuple(float(score) for score in score_thresholds)
+        self._check_parameters()
+        bins = (len(self.visibility_borders) + 2, len(self.distance_borders) + 1)
+        shapes = {"objects": bins, "frames": ()}
+        shapes |= {name: (len(self.score_thresholds), *bins) for name in ("found", "detections", "true_detections")}
+        for name, shape in shapes.items():
+            zeros = torch.zeros(shape, dtype=torch.int64)
+            self.add_state(name, zeros, dist_reduce_fx="sum", persistent=True)
+
+    def update(
+        self,
+        detections: Tensor | Sequence[Tensor],
+        boxes: Boxes | Sequence[Boxes],
+        visibility: BoxVisibility | Tensor | Sequence[BoxVisibility | Tensor],
+        scores: Tensor | Sequence[Tensor] | None = None,
+        detection_visibility: BoxVisibility | Tensor | Sequence[BoxVisibility | Tensor] | None = None,
+    ) -> None:
+        """Add a frame, or lists with one entry for each frame.
+
+        Args:
+            detections: (N, 7) x, y, z of the centre, length, width, height, yaw; further columns are ignored.
+            boxes: The K objects.
+            visibility: What `box_visibility` said of them, or (K,) shares, NaN where unknown.
+            scores: (N,) scores; without them, detections choose their objects in the order given and all count.
+            detection_visibility: What `box_visibility` says of the detections' boxes, or (N,) shares. Without it,
+                precision is known over distance only: detections are in the bin of unknown visibility.
+
+        Raises:
+            ValueError: Lists of different lengths, shapes that do not fit, NaN in detections or scores, a negative
+                size, shares outside [0, 1].
+        """
+        frames = [_as_list(given) for given in (detections, boxes, visibility)]
+        count = len(frames[0])
+        frames += [[None] * count if given is None else _as_list(given) for given in (scores, detection_visibility)]
+        if len({len(column) for column in frames}) > 1:
+            lengths = ", ".join(str(len(column)) for column in frames)
+            raise ValueError(
+                f"one entry for each frame is needed in every list; got {lengths} entries (detections, boxes, "
+                "visibility, scores, detection_visibility)"
+            )
+        checked = [DetectedFrame(*frame) for frame in zip(*frames, strict=True)]
+        for frame in checked:
+            self._add_frame(frame)
+
+    @torch.no_grad()
+    def _add_frame(self, frame: DetectedFrame) -> None:
+        chosen = match(frame.detections, frame.scores, frame.truth, self.by, self.threshold)
+        hit = chosen >= 0
+        # The score at which an object is found; NaN, at no threshold, if it is not.
+        found_at = torch.full((len(frame.truth),), math.nan, dtype=torch.float64)
+        found_at[chosen[hit]] = frame.scores[hit]
+        object_bin = self._bin(frame.truth, frame.share)
+        detection_bin = self._bin(frame.detections, frame.detection_share)
+        counts = [frame.scores >= score for score in self.score_thresholds]
+        # Not in place: a state that was reset under `torch.inference_mode` could not be added to outside of it.
+        self.objects = self.objects + self._counted([object_bin])[0]
+        self.found = self.found + self._counted([object_bin[found_at >= score] for score in self.score_thresholds])
+        self.detections = self.detections + self._counted([detection_bin[some] for some in counts])
+        self.true_detections = self.true_detections + self._counted([detection_bin[some & hit] for some in counts])
+        self.frames = self.frames + 1
+
+    def _bin(self, rows: Tensor, share: Tensor) -> Tensor:
+        distance = torch.linalg.vector_norm(rows[:, :2].double(), dim=1)
+        column = torch.bucketize(distance, torch.tensor(self.distance_borders, dtype=torch.float64), right=True)
+        line = torch.bucketize(share, torch.tensor(self.visibility_borders, dtype=torch.float64), right=True)
+        line[share.isnan()] = len(self.visibility_borders) + 1
+        return line * (len(self.distance_borders) + 1) + column
+
+    def _counted(self, lists: list[Tensor]) -> Tensor:
+        """(lists, V, D) how many entries of each list fall into each bin."""
+        rows = [torch.bincount(bins, minlength=self.objects.numel()) for bins in lists]
+        return torch.stack(rows).view(len(lists), *self.objects.shape).to(self.objects.device)
+
+    def compute(self) -> DetectionCounts:
+        """The counts so far, which give recall and precision: `over("visibility")`, `over("distance")`, `overall()`."""
+        visibility, distance = (0.0, *self.visibility_borders, 1.0), (0.0, *self.distance_borders)
+        return DetectionCounts(
+            objects=self.objects.clone(),
+            found=self.found.clone(),
+            detections=self.detections.clone(),
+            true_detections=self.true_detections.clone(),
+            visibility_bins=(*(f"{a:g}-{b:g}" for a, b in pairwise(visibility)), "unknown"),
+            distance_bins=(
+                *(f"{a:g}-{b:g} m" for a, b in pairwise(distance)),
+                f"over {distance[-1]:g} m",
+            ),
+            score_thresholds=self.score_thresholds,
+            frames=int(self.frames),
+        )
+
+    def merge_state(self, incoming_state: "dict[str, Any] | Metric") -> None:
+        """Add the frames of another metric with the same parameters, or its `metric_state`."""
+        if isinstance(incoming_state, RecallByVisibility):
+            for name in ("by", "threshold", "visibility_borders", "distance_borders", "score_thresholds"):
+                mine, other = getattr(self, name), getattr(incoming_state, name)
+                if mine != other:
+                    raise ValueError(f"cannot merge metrics with different {name}: {mine} and {other}")
+        super().merge_state(incoming_state)
+        # torchmetrics would go on answering from the result it had cached.
+        self._computed = None
+        self._update_count = int(self.frames)
+
+    def _check_parameters(self) -> None:
+        if self.by not in ("distance", "iou"):
+            raise ValueError(f"by: 'distance' or 'iou' is needed; got {self.by!r}")
+        if not 0 < self.threshold < math.inf or (self.by == "iou" and self.threshold > 1):
+            raise ValueError(f"threshold: metres > 0, or a share in (0, 1] for 'iou', is needed; got {self.threshold}")
+        for name, highest in (("visibility_borders", 1.0), ("distance_borders", math.inf)):
+            borders = (0.0, *getattr(self, name), highest)
+            if not all(low < high for low, high in pairwise(borders)):
+                raise ValueError(f"{name}: ascending numbers within (0, {highest:g}) are needed; got {borders[1:-1]}")
+        if not self.score_thresholds or any(math.isnan(score) for score in self.score_thresholds):
+            raise ValueError(f"score_thresholds: at least one number is needed; got {self.score_thresholds}")
+
+
+def _as_list(given: T | Sequence[T]) -> list[Any]:
+    return list(given) if isinstance(given, (list, tuple)) else [given]

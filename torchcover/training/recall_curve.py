@@ -1,0 +1,132 @@
+"""Counts of objects and detections as recall and precision, with their uncertainty."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from torch import Tensor
+
+# Two-sided 95 %.
+NORMAL_QUANTILE = 1.959963984540054
+
+
+@dataclass(frozen=True, eq=False)
+class Ratio:
+    """A share of successes for each entry, in float64; NaN where nothing was counted.
+
+    Args:
+        value: Successes by trials.
+        low: Lower end of the 95 % Wilson interval (Wilson 1927).
+        high: Its upper end.
+        trials: int64 number of trials.
+
+    Example:
+        >>> import torch
+        >>> Ratio.of(torch.tensor([8, 0]), torch.tensor([10, 0])).value
+        tensor([0.8000,    nan], dtype=torch.float64)
+    """
+
+    value: Tensor
+    low: Tensor
+    high: Tensor
+    trials: Tensor
+
+    @classmethod
+    def of(cls, successes: Tensor, trials: Tensor) -> "Ratio":
+        """From counts. The interval takes trials as independent; the same object in frames 0.1 s apart is not."""
+        trials = trials.expand_as(successes)
+        n = trials.double().where(trials > 0, math.nan)
+        p = successes / n
+        pull = NORMAL_QUANTILE**2 / n
+        middle = (p + pull / 2) / (1 + pull)
+        half = (pull * (p * (1 - p) + pull / 4)).sqrt() / (1 + pull)
+        return cls(p, (middle - half).clamp(min=0.0), (middle + half).clamp(max=1.0), trials)
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Recall and precision over bins, (S, B) for S score thresholds and B bins.
+
+    Args:
+        bins: What each bin holds, in words: "0.2-0.4", "unknown".
+        recall: Objects found, of the objects of the bin.
+        precision: Detections that found an object, of the detections of the bin.
+    """
+
+    bins: tuple[str, ...]
+    recall: Ratio
+    precision: Ratio
+
+
+class DetectionCounts:
+    """What was there and what was found, by visibility and distance: V bins, of which the last is unknown, and D bins.
+
+    Args:
+        objects: (V, D) int64 objects.
+        found: (S, V, D) those that a detection of at least the score threshold found.
+        detections: (S, V, D) detections of at least the score threshold, by the visibility of their own boxes.
+        true_detections: (S, V, D) those of them that found an object.
+        visibility_bins: Names of the V bins.
+        distance_bins: Names of the D bins.
+        score_thresholds: The S score thresholds.
+        frames: Number of frames.
+    """
+
+    # No dataclass: torchmetrics would take it apart and squeeze its tensors.
+    def __init__(
+        self,
+        *,
+        objects: Tensor,
+        found: Tensor,
+        detections: Tensor,
+        true_detections: Tensor,
+        visibility_bins: tuple[str, ...],
+        distance_bins: tuple[str, ...],
+        score_thresholds: tuple[float, ...],
+        frames: int,
+    ) -> None:
+        self.objects = objects
+        self.found = found
+        self.detections = detections
+        self.true_detections = true_detections
+        self.visibility_bins = visibility_bins
+        self.distance_bins = distance_bins
+        self.score_thresholds = score_thresholds
+        self.frames = frames
+
+    def over(self, axis: Literal["visibility", "distance"]) -> Curve:
+        """Recall and precision over bins of visibility or of distance."""
+        bins, other = {"visibility": (self.visibility_bins, -1), "distance": (self.distance_bins, -2)}[axis]
+        counts = (self.found, self.objects, self.true_detections, self.detections)
+        found, objects, true_detections, detections = (count.sum(dim=other) for count in counts)
+        return Curve(bins, Ratio.of(found, objects), Ratio.of(true_detections, detections))
+
+    def by_both(self) -> Ratio:
+        """(S, V, D) recall over visibility and distance together: at equal distance, what does visibility do?"""
+        return Ratio.of(self.found, self.objects)
+
+    def overall(self) -> Curve:
+        """(S, 1) recall and precision of everything."""
+        counts = (self.found, self.objects, self.true_detections, self.detections)
+        found, objects, true_detections, detections = (count.sum(dim=(-2, -1))[..., None] for count in counts)
+        return Curve(("all",), Ratio.of(found, objects), Ratio.of(true_detections, detections))
+
+    def scalars(self) -> dict[str, float]:
+        """A flat dict for a logger.
+
+        Returns:
+            `"recall/all"`, `"recall/visibility 0.2-0.4"`, `"objects/visibility 0.2-0.4"`,
+            `"precision/distance 0-20 m"`, `"detections/distance 0-20 m"` and so on; with several score thresholds
+            `"recall@0.5/all"`.
+        """
+        flat = {}
+        curves = {"": self.overall(), "visibility ": self.over("visibility"), "distance ": self.over("distance")}
+        for row, score in enumerate(self.score_thresholds):
+            at = f"@{score:g}" if len(self.score_thresholds) > 1 else ""
+            for axis, curve in curves.items():
+                for column, name in enumerate(curve.bins):
+                    flat[f"recall{at}/{axis}{name}"] = float(curve.recall.value[row, column])
+                    flat[f"precision{at}/{axis}{name}"] = float(curve.precision.value[row, column])
+                    flat[f"objects/{axis}{name}"] = float(curve.recall.trials[row, column])
+                    flat[f"detections{at}/{axis}{name}"] = float(curve.precision.trials[row, column])
+        return flat

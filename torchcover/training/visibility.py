@@ -1,0 +1,125 @@
+"""How much of each object the rig could see."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from torchcover.data import Boxes, points_in_boxes
+from torchcover.neighbors import blind_spot_radius, check_cloud
+
+
+@dataclass(frozen=True, eq=False)
+class BoxVisibility:
+    """What the rig saw of each of K boxes, in float64. A box without a reference point is unknown: NaN.
+
+    Args:
+        share: (K,) share of the reference points in the box whose blind spot radius is within the threshold.
+        mean_radius_m: (K,) mean blind spot radius of the reference points in the box.
+        reference_points: (K,) int64 reference points in the box.
+        sensor_points: (K,) int64 points of the rig in the box.
+        threshold_m: The threshold.
+    """
+
+    share: Tensor
+    mean_radius_m: Tensor
+    reference_points: Tensor
+    sensor_points: Tensor
+    threshold_m: float
+
+    @property
+    def known(self) -> Tensor:
+        """(K,) bool whether any reference point fell into the box."""
+        return self.reference_points > 0
+
+    def __len__(self) -> int:
+        return len(self.share)
+
+    def select(self, which: Tensor) -> "BoxVisibility":
+        """Some of them, as `Boxes.select` does."""
+        names = ("share", "mean_radius_m", "reference_points", "sensor_points")
+        return replace(self, **{name: getattr(self, name)[which.to(self.share.device)] for name in names})
+
+
+@torch.no_grad()
+def box_visibility(
+    sensor: Tensor,
+    reference: Tensor,
+    boxes: Boxes,
+    threshold: float = 0.4,
+    *,
+    reference_weights: Tensor | None = None,
+) -> BoxVisibility:
+    """Share of each box's reference points that the rig saw, and their mean blind spot radius.
+
+        share[k]       = sum over q in box k of w(q) 1(r(q) <= threshold) / sum over q in box k of w(q)
+        mean_radius[k] = sum over q in box k of w(q) r(q) / sum over q in box k of w(q)
+
+    with r(q) from `torchcover.blind_spot_radius`, and every point of the same weight unless `reference_weights` says
+    otherwise. The nearest sensor point may lie outside the box: an object right beside a wall that is seen counts as
+    seen as far as the threshold reaches. `sensor_points` are those in the box itself; see `points_in_boxes`.
+
+    The reference sensor is itself occluded: it looks from beside the ego, so a box that nothing can see from there is
+    unknown, and of a box that is known the far side is missing.
+
+    Args:
+        sensor: (N, 3) points of the rig in the vehicle frame in metres, all of them. N = 0: nothing was seen, so the
+            radius is infinite and the share 0.
+        reference: (M, 3) points of the reference sensor in the same frame.
+        boxes: K objects of the same instant; K = 0 gives an empty result.
+        threshold: Radius in metres up to which a point counts as seen.
+        reference_weights: (M,) weight of each reference point, positive; of its area, say.
+
+    Returns:
+        `BoxVisibility` on the device of `reference`.
+
+    Raises:
+        ValueError: No reference, a negative threshold, NaN, weights that are not positive, or shapes that do not fit.
+        TypeError: A cloud is no floating-point tensor.
+
+    Example:
+        >>> boxes = Boxes.from_rows(torch.tensor([[10.0, 0, 1, 4, 2, 2, 0], [30.0, 0, 1, 4, 2, 2, 0]]))
+        >>> reference = torch.tensor([[8.0, 0.0, 0.5], [8.0, 0.0, 1.5]])
+        >>> seen = box_visibility(sensor=torch.tensor([[8.0, 0.0, 0.6]]), reference=reference, boxes=boxes)
+        >>> seen.share, seen.reference_points
+        (tensor([0.5000,    nan], dtype=torch.float64), tensor([2, 0]))
+    """
+    _check(sensor, reference, threshold, reference_weights)
+    sensor, boxes = sensor.to(reference.device), boxes.to(reference.device)
+    box, point = points_in_boxes(reference, boxes)
+    # Only the reference may be cropped to the boxes.
+    radius = blind_spot_radius(reference[point], sensor).double()
+    weight = torch.ones_like(radius) if reference_weights is None else reference_weights.to(radius)[point]
+
+    def sum_by_box(values: Tensor) -> Tensor:
+        return torch.zeros(len(boxes), dtype=torch.float64, device=reference.device).index_add_(0, box, values)
+
+    count = torch.bincount(box, minlength=len(boxes))
+    total = sum_by_box(weight).where(count > 0, math.nan)
+    return BoxVisibility(
+        share=sum_by_box(weight * (radius <= threshold)) / total,
+        mean_radius_m=sum_by_box(weight * radius) / total,
+        reference_points=count,
+        sensor_points=torch.bincount(points_in_boxes(sensor, boxes).box, minlength=len(boxes)),
+        threshold_m=float(threshold),
+    )
+
+
+def _check(sensor: Tensor, reference: Tensor, threshold: float, weights: Tensor | None) -> None:
+    if reference is None or (isinstance(reference, Tensor) and reference.shape == (0, 3)):
+        raise ValueError(
+            "reference: the frame has none, and visibility is measured against it; use frames of SimulatedFrames, or a "
+            "recording with a reference cloud"
+        )
+    check_cloud(reference, "reference")
+    check_cloud(sensor, "sensor")
+    if not threshold >= 0:
+        raise ValueError(f"threshold: a distance >= 0 in metres is needed; got {threshold}")
+    if weights is not None and weights.shape != (len(reference),):
+        raise ValueError(
+            f"reference_weights: shape ({len(reference)},) is needed, one for each reference point; got "
+            f"{tuple(weights.shape)}"
+        )
+    if weights is not None and not (weights.isfinite() & (weights > 0)).all():
+        raise ValueError("reference_weights: finite weights > 0 are needed")
