@@ -1,13 +1,10 @@
 """The command in this process, and worlds small enough to be cast at once."""
 
 import sys
-from functools import partial
 
 import pytest
 
 from torchcover.cli import app
-from torchcover.data import simulated
-from torchcover.simulation import ReferenceSensor
 
 
 @pytest.fixture
@@ -22,12 +19,6 @@ def torchcover(monkeypatch, capsys):
         return stop.value.code, captured.out, captured.err
 
     return run
-
-
-@pytest.fixture
-def few_rays(monkeypatch):
-    """A reference sensor with 4,096 rays instead of a million."""
-    monkeypatch.setattr(simulated, "ReferenceSensor", partial(ReferenceSensor, rows=64, columns=64))
 
 
 @pytest.fixture

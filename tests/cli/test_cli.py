@@ -1,14 +1,16 @@
 """The command line as a user meets it: files that agree with each other, and one line for each mistake."""
 
 import csv
+import io
 import json
 import subprocess
 import sys
 
 import numpy as np
 import pytest
+import typer
 
-from torchcover import Coverage
+from torchcover import Coverage, CoverageMetric
 
 
 @pytest.fixture
@@ -101,7 +103,8 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
         " horizontal_fov_deg: 360, columns: 90, max_range_m: 60}\n"
     )
     for out in ("a", "b"):
-        assert torchcover("evaluate", tmp_path / "rig.yaml", "--steps", 1, "--cell", 1, "--out", tmp_path / out)[0] == 0
+        arguments = ["--steps", 1, "--cell", 1, "--reference", "paper", "--out", tmp_path / out]
+        assert torchcover("evaluate", tmp_path / "rig.yaml", *arguments)[0] == 0
     a, b = (Coverage.load(tmp_path / out / "coverage.npz") for out in "ab")
     np.testing.assert_array_equal(a.radius, b.radius)
     assert a.grid.cell == 1.0
@@ -109,6 +112,49 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
     assert 0 < a.summary()[0].known_share <= 1
     summary = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert summary["frame_counts"]["reference_rays"] == 1024 * 1024
+    assert summary["reference"] == {"sensor": "paper", "rays_per_step": 1024 * 1024}
+
+
+def test_the_weights_of_an_even_reference_reach_the_metric(torchcover, worlds, monkeypatch):
+    given = []
+
+    def noted(self, sensor, reference, *, weights, index):
+        given.append((len(reference), weights, index))
+        update(self, sensor, reference, weights=weights, index=index)
+
+    update = CoverageMetric.update
+    monkeypatch.setattr(CoverageMetric, "update", noted)
+    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell", 4, "--rays", 4096, "--out", worlds / "out"]
+    for reference in ("even", "paper"):
+        assert torchcover("evaluate", worlds / "low.yaml", *options, "--reference", reference)[0] == 0
+    (points, weights, _), _, (_, none, _), _ = given
+    assert weights.shape == (points,)
+    assert float(weights.max() / weights.min()) > 2
+    assert none is None
+    assert [index for *_, index in given] == [0, 1, 0, 1]
+
+
+def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording, tmp_path, monkeypatch):
+    (recording / "reference" / "f2.npy").write_bytes(b"rubbish")
+    update, given = CoverageMetric.update, []
+    monkeypatch.setattr(
+        CoverageMetric,
+        "update",
+        lambda self, *clouds, **more: given.append(more["index"]) or update(self, *clouds, **more),
+    )
+    assert torchcover("evaluate", "--frames", recording, "--out", tmp_path / "out", "--skip-bad-frames")[0] == 0
+    assert given == [0, 2, 3]
+
+
+def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sensor(torchcover, recording, tmp_path):
+    _, printed, _ = torchcover("evaluate", "--frames", recording, "--out", tmp_path / "out", "--error-maps")
+    assert "Not enough steps for errors: 4 blocks, 8 are needed." in printed
+    assert "±" not in printed
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["reference"], summary["target_error"]) == (None, None)
+    assert (summary["blocks"], summary["steps_per_block"]) == (4, 1)
+    assert summary["rows"][0]["radius_error_m"] is None
+    assert (tmp_path / "out" / "maps" / "radius_error_ground.png").is_file()
 
 
 @pytest.mark.parametrize(
@@ -128,6 +174,14 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
         (["evaluate", "front_roof_128", "--seed", "-1"], "--seed"),
         (["evaluate", "front_roof_128", "--device", "abacus"], "--device abacus: cannot be used here"),
         (["evaluate", "front_roof_128", "--colour"], "No such option: --colour"),
+        (["evaluate", "front_roof_128", "--target-error", "5"], "--target-error 5: a positive number with its unit"),
+        (["evaluate", "front_roof_128", "--target-error", "-1m"], "--target-error -1m: a positive number"),
+        (["evaluate", "front_roof_128", "--target-error", "1m", "--target-error", "2m"], "another number in m"),
+        (["evaluate", "front_roof_128", "--reference", "best"], "--reference best: `even` or `paper` is needed"),
+        (["evaluate", "front_roof_128", "--rays", "7"], "rays: at least 2 for each of 4 areas are needed; got 7"),
+        (["evaluate", "front_roof_128", "--rays", "0"], "--rays"),
+        (["evaluate", "--frames", "x", "--rays", "9"], "--reference and --rays are for simulations"),
+        (["evaluate", "--frames", "x", "--reference", "even"], "--reference and --rays are for simulations"),
         (["measure"], "No such command 'measure'"),
     ],
 )
@@ -153,6 +207,14 @@ def test_an_impossible_output_folder_is_found_before_the_run(torchcover, recordi
         code, _, error = torchcover("evaluate", "--frames", recording, "--out", out)
         assert code == 2
         assert f"--out {out}: " in error
+
+
+def test_an_output_without_the_signs_of_the_tables_gets_question_marks_not_an_error(torchcover, monkeypatch):
+    buffer = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(buffer, encoding="ascii"))
+    monkeypatch.setattr("torchcover.cli.listing.run", lambda: typer.echo("0.3 ± 0.1"))
+    assert torchcover("list")[0] == 0
+    assert buffer.getvalue() == b"0.3 ? 0.1\n"
 
 
 def test_list_names_everything_built_in(torchcover):

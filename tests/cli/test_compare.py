@@ -10,14 +10,13 @@ import pytest
 
 from torchcover import Coverage, CoverageMetric
 
-pytestmark = pytest.mark.usefixtures("few_rays")
 
-
-def compare(torchcover, worlds, *rigs, steps=1, out="out"):
+def compare(torchcover, worlds, *rigs, steps=1, out="out", options=()):
     """Run it on the tiny yard; returns exit code, stdout, stderr, and the folder."""
     paths = [worlds / f"{rig}.yaml" for rig in rigs]
     folder = worlds / out
     arguments = ["--scenario", worlds / "yard.yaml", "--steps", steps, "--cell", 4, "--threshold", 2, "--out", folder]
+    arguments += ["--rays", 4096, *options]
     return *torchcover("compare", *paths, *arguments), folder
 
 
@@ -40,7 +39,7 @@ def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
         assert row["radius_m_best"] == str(same["radius_m_best"])
     alone = worlds / "alone"
     options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell", 4, "--threshold", 2, "--out", alone]
-    assert torchcover("evaluate", worlds / "both.yaml", *options)[0] == 0
+    assert torchcover("evaluate", worlds / "both.yaml", *options, "--rays", 4096)[0] == 0
     np.testing.assert_array_equal(Coverage.load(alone / "coverage.npz").radius, coverages["both"].radius)
 
 
@@ -82,6 +81,35 @@ def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
     )
 
 
+def test_errors_are_drawn_if_asked_for_and_differences_come_with_theirs(torchcover, worlds):
+    *_, out = compare(torchcover, worlds, "low", "both", steps=9, options=["--error-maps"])
+    names = {path.name for path in (out / "maps").iterdir()}
+    errors = {f"{metric}_error_{band}.png" for metric in ("radius", "detection_2m") for band in ("ground", "obstacle")}
+    assert {name for name in names if "error" in name} == errors
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["blocks"], summary["steps_per_block"]) == (9, 1)
+    known = [row for row in summary["rows"] if row["rig"] == "both" and row["height"] == "ground"]
+    assert len(known) == 3
+    for row in known:
+        assert row["radius_error_m"] > 0
+        assert row["radius_m_difference_error"] >= 0
+        assert isinstance(row["radius_m_difference_significant"], bool)
+    first = [row for row in summary["rows"] if row["rig"] == "low" and row["height"] == "ground"]
+    assert [row["radius_m_difference_error"] for row in first] == [0.0, 0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("options", "sensor", "rays"),
+    [([], "even", 4080), (["--reference", "even"], "even", 4080), (["--reference", "paper"], "paper", 64 * 64)],
+)
+def test_the_reference_sensor_is_the_one_that_was_asked_for_and_is_named(torchcover, worlds, options, sensor, rays):
+    _, printed, _, out = compare(torchcover, worlds, "low", "both", steps=2, options=options)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["reference"] == {"sensor": sensor, "rays_per_step": rays}
+    assert summary["frame_counts"]["reference_rays"] == 2 * rays
+    assert f"Reference sensor: {sensor}, {rays:,} rays a step." in printed
+
+
 @pytest.fixture
 def handler():
     """Set what Ctrl-C does."""
@@ -99,11 +127,11 @@ def test_ctrl_c_between_two_rigs_leaves_a_paired_result(
     handler(action)
     update, calls = CoverageMetric.update, []
 
-    def interrupted(self, *clouds):
+    def interrupted(self, *clouds, **more):
         calls.append(self)
         if len(calls) == 3:  # the first rig in the second step
             os.kill(os.getpid(), signal.SIGINT)
-        update(self, *clouds)
+        update(self, *clouds, **more)
 
     monkeypatch.setattr(CoverageMetric, "update", interrupted)
     code, _, _, out = compare(torchcover, worlds, "low", "both", steps=3)
@@ -126,6 +154,9 @@ def test_ctrl_c_between_two_rigs_leaves_a_paired_result(
         (["kitti", "nuscenes", "--threshold", "-1"], "thresholds: distances >= 0"),
         (["kitti", "nuscenes", "--device", "abacus"], "--device abacus: cannot be used here"),
         (["kitti", "nuscenes", "--steps", "0"], "--steps"),
+        (["kitti", "nuscenes", "--target-error", "10cm"], "--target-error 10cm: a positive number with its unit"),
+        (["kitti", "nuscenes", "--reference", "best"], "--reference best: `even` or `paper` is needed"),
+        (["kitti", "nuscenes", "--rays", "7"], "rays: at least 2 for each of 4 areas are needed; got 7"),
     ],
 )
 def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, arguments, message, tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from matplotlib.image import imread
 
 from torchcover.cli import show
-from torchcover.simulation import Rig
+from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.documents import builtin_names
 
 
@@ -13,7 +13,7 @@ from torchcover.simulation.documents import builtin_names
 def drawn(monkeypatch):
     """What was drawn: the arguments of the last call."""
     calls: dict = {}
-    for name in ("draw_rig", "draw_scene"):
+    for name in ("draw_rig", "draw_scene", "draw_depths"):
         draw = getattr(show, name)
         monkeypatch.setattr(
             show, name, lambda *args, draw=draw, **kwargs: calls.update(kwargs, args=args) or draw(*args, **kwargs)
@@ -54,6 +54,48 @@ def test_a_scenario_is_drawn_in_the_frame_of_the_ego(torchcover, worlds, drawn):
     assert len(drawn["reference"]) > 1000
 
 
+def test_the_depth_images_of_a_rig_are_those_of_its_cameras_in_the_frame(torchcover, worlds, drawn):
+    """A wall fills the left half of the image: from the bumper 20 m ahead at first, 15 m when the frame is taken."""
+    (worlds / "cameras.yaml").write_text(
+        "name: cameras\nsensors:\n"
+        "  - {type: camera, name: a, mount: {x_m: 2, z_m: 1}, width: 40, height: 20, fov_deg: 90, max_range_m: 60}\n"
+        "  - {type: camera, name: b, mount: {x_m: 2, z_m: 1}, width: 40, height: 40, stride: 2, fx: 20, fy: 20,"
+        " cx: 19.5, cy: 19.5, lens: brown_conrady, coefficients: [-0.5, 0, 0, 0], max_range_m: 60}\n"
+    )
+    (worlds / "wall.yaml").write_text(
+        "name: wall\n"
+        "ego: {shape: {type: box, size_m: [3.8, 2, 0.5]}, trajectory: drive.csv}\n"
+        "bodies:\n"
+        "  - {name: ground, shape: {type: plane, size_m: [400, 400]}}\n"
+        "  - {name: wall, shape: {type: box, size_m: [1, 50, 3]}, poses: [{x_m: 22.5, y_m: 25}]}\n"
+        "duration_s: 1\ntime_step_s: 0.5\n"
+    )
+    (worlds / "drive.csv").write_text("t,x,y,z,roll,pitch,yaw\n0,0,0,0,0,0,0\n0.5,2.5,0,0,0,0,0\n1,5,0,0,0,0,0\n")
+    code, printed, _ = torchcover(
+        "show", worlds / "cameras.yaml", "--scenario", worlds / "wall.yaml", "--step", 2, "--out", worlds
+    )
+    assert code == 0
+    assert "cameras_depth.png" in printed
+    assert imread(worlds / "cameras_depth.png").shape[1] > 500
+    (images,) = drawn["args"]
+    assert {name: image.shape for name, image in images.items()} == {"a": (20, 40), "b": (20, 20)}
+    # One row above the middle the rays rise by half a pixel of 20 a metre.
+    across = (19.5 - np.arange(20)) / 20
+    np.testing.assert_allclose(images["a"][9, :20], 15 * np.sqrt(1 + across**2 + (0.5 / 20) ** 2), rtol=1e-5)
+    assert np.isinf(images["a"][9, 20:]).all()
+    assert np.isnan(images["b"]).any()
+    assert "t = 1 s" in drawn["subtitle"]
+
+
+@pytest.mark.parametrize("arguments", [["three_cameras", "--scenario"], []])
+def test_a_world_is_built_once(torchcover, worlds, monkeypatch, arguments):
+    built = []
+    build = Scenario.world
+    monkeypatch.setattr(Scenario, "world", lambda *args: built.append(args) or build(*args))
+    assert torchcover("show", *arguments, worlds / "yard.yaml", "--out", worlds)[0] == 0
+    assert len(built) == 1
+
+
 @pytest.mark.parametrize("name", builtin_names("rigs"))
 def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
     for sensor in map(show._sensor_view, Rig.load(name).sensors):
@@ -70,7 +112,11 @@ def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
         (["moon"], "'moon' is neither a .yaml file nor built in; rigs: argoverse2, "),
         (["moon"], "; scenarios: courtyard, "),
         (["none.yaml"], "none.yaml: no such file"),
-        (["kitti", "--rig", "nuscenes", "--step", "1"], "--rig, --step: for a scenario only, and 'kitti' is a rig"),
+        (["kitti", "--rig", "nuscenes"], "--rig: for a scenario only, and 'kitti' is a rig"),
+        (
+            ["kitti", "--step", "1", "--seed", "2"],
+            "--step, --seed: for a scenario or cameras only, and 'kitti' is a rig",
+        ),
         (["courtyard", "--scenario", "urban"], "--scenario: for a rig only, and 'courtyard' is a scenario"),
         (["courtyard", "--rig", "moon"], "built-in rigs: argoverse2,"),
         (["kitti", "--scenario", "moon"], "built-in scenarios: courtyard,"),
@@ -104,3 +150,26 @@ def test_a_name_of_both_kinds_asks_for_the_file(torchcover, monkeypatch):
     code, _, error = torchcover("show", "twin")
     assert code == 2
     assert "both a rig and a scenario: give the YAML file" in error
+
+
+@pytest.mark.filterwarnings("default")
+def test_a_warning_is_one_line_on_stderr_and_said_once(torchcover, worlds):
+    """Two actors of one open mesh in millimetres."""
+    mesh = Scenario.load(worlds / "yard.yaml").ego.shape.mesh()
+    corners = "".join(f"v {x * 1000} {y * 1000} {z * 1000}\n" for x, y, z in mesh.vertices_m)
+    (worlds / "car.obj").write_text(corners + "".join(f"f {a} {b} {c}\n" for a, b, c in mesh.faces[1:] + 1))
+    shape = "shape: {type: mesh, path: car.obj}"
+    (worlds / "yard.yaml").write_text(
+        "name: yard\n"
+        "ego: {shape: {type: box, size_m: [4, 2, 1]}}\n"
+        "bodies: [{name: ground, shape: {type: plane, size_m: [400, 400]}}]\n"
+        f"actors: [{{name: a, category: car, {shape}, pose: {{x_m: 9000}}}}, {{name: b, category: car, {shape},"
+        " pose: {x_m: -9000}}]\n"
+    )
+    code, _, error = torchcover("show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--out", worlds)
+    assert code == 0
+    lines = error.splitlines()
+    assert all(line.startswith("torchcover: warning: ") for line in lines)
+    assert ["car.obj: the mesh is not closed" in line for line in lines].count(True) == 1
+    assert ["a: its body is 4,000 x 2,000 x 1,000 m" in line for line in lines].count(True) == 1
+    assert len(lines) == 3

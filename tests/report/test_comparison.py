@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from rich.console import Console
+from scipy import stats
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.report import (
@@ -27,6 +28,7 @@ from torchcover.report import (
     radius_scale,
     write_comparison,
 )
+from torchcover.report.paired import differences, is_significant, student_t95
 
 GRID = BevGrid(x=(-8.0, 12.0), y=(-5.0, 5.0), cell=1.0)
 AROUND = BevGrid(x=(-10.0, 10.0), y=(-10.0, 10.0), cell=0.25)
@@ -41,6 +43,22 @@ def cloud(count: int, seed: int) -> torch.Tensor:
     return unit * torch.tensor([17.0, 10.0, 2.4]) + torch.tensor([-5.0, -5.0, -0.45])
 
 
+def over_steps(sensors: list[torch.Tensor], **options) -> Coverage:
+    """One cloud of the rig a step, against reference points of that step."""
+    metric = CoverageMetric(GRID, blocks=16, **options)
+    for index, sensor in enumerate(sensors):
+        metric.update(sensor, cloud(100, 1000 + index), index=index)
+    return metric.compute()
+
+
+def trio(steps: int) -> dict[str, Coverage]:
+    """Few points, as many other points, and many more, in every step."""
+    few, other, more = (
+        [cloud(size, seed * 100 + at) for at in range(steps)] for seed, size in ((1, 20), (2, 20), (3, 300))
+    )
+    return {"few": over_steps(few), "other": over_steps(other), "many": over_steps(more)}
+
+
 def coverage(sensor: torch.Tensor, *, grid: BevGrid = GRID, seed: int = 0, **options) -> Coverage:
     metric = CoverageMetric(grid, **options)
     metric.update(sensor, cloud(300, seed))
@@ -53,9 +71,9 @@ def pair(**options) -> dict[str, Coverage]:
     return {"few": coverage(few, **options), "many": coverage(torch.cat([few, more]), **options)}
 
 
-def printed(coverages, width=200) -> str:
+def printed(coverages, width=200, regions=REGIONS) -> str:
     console = Console(file=io.StringIO(), width=width)
-    for table in comparison_tables(coverages, REGIONS):
+    for table in comparison_tables(coverages, regions):
         console.print(table)
     return console.file.getvalue()
 
@@ -146,7 +164,7 @@ def test_on_a_narrow_terminal_names_fold_but_numbers_stay_whole(rigs):
     one, other = pair().values()
     named = {f"rig_number_{at}_with_a_long_name": (one, other)[at % 2] for at in range(rigs)}
     narrowest = narrowest_width(comparison_tables(named, REGIONS), list(named))
-    assert narrowest == 35 + 13 * rigs
+    assert narrowest == 35 + (len("unknown") + 3) * rigs
     narrow, wide = (printed(named, width).split("the best of")[0] for width in (narrowest, 400))
     assert max(map(len, narrow.splitlines())) == narrowest
     numbers = re.compile(r"(?:\* )?[\d.]+ │|unknown")
@@ -180,6 +198,120 @@ def test_the_csv_has_a_row_for_each_rig_region_and_band(tmp_path):
         float(table[4]["radius_m"]) - float(table[0]["radius_m"])
     )
     assert table[7]["radius_m"] == ""
+
+
+# Standard errors
+
+
+@pytest.mark.parametrize("freedom", [7, 8, 9, 11, 15, 31, 200, 10_000])
+def test_students_t_is_that_of_scipy_and_decides(freedom):
+    limit = float(stats.t.ppf(0.975, freedom))
+    assert student_t95(freedom) == pytest.approx(limit, abs=1e-4)
+    for sign in (-1, 1):
+        assert is_significant(sign * 1.001 * limit * 0.2, 0.2, freedom) is True
+        assert is_significant(sign * 0.999 * limit * 0.2, 0.2, freedom) is False
+    assert is_significant(1e-17, 0.0, freedom) is False
+    assert is_significant(1.0, math.nan, freedom) is None
+
+
+@pytest.mark.parametrize("shift", [0.0, 0.05, 0.1, 0.3])
+@pytest.mark.parametrize("seed", range(4))
+def test_significant_is_what_a_paired_t_test_calls_so(shift, seed):
+    """One step a block and one cell: radii whose differences are `shift` and noise."""
+    random = np.random.default_rng(seed)
+    shared = 1 + random.random(16)
+    radii = {"a": shared, "b": shared + shift + 0.2 * random.standard_normal(16)}
+    coverages = {}
+    for name, own in radii.items():
+        metric = CoverageMetric(SQUARE, blocks=16)
+        for at, radius in enumerate(own.tolist()):
+            metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), index=at)
+        coverages[name] = metric.compute()
+    itself, (found, _) = differences(coverages, REGIONS[0], "ground").values()
+    test = stats.ttest_rel(radii["b"], radii["a"])
+    assert found.value == pytest.approx(radii["b"].mean() - radii["a"].mean(), abs=1e-6)
+    assert abs(found.value) / found.error == pytest.approx(abs(test.statistic), rel=1e-4)
+    assert found.significant is bool(test.pvalue < 0.05)
+    assert itself[0] == (0.0, 0.0, False)
+
+
+def test_differences_have_a_part_of_their_own_and_what_is_no_chance_is_marked():
+    coverages = trio(24)
+    text = printed(coverages)
+    parts = re.split(
+        r"Difference to few: (?:mean blind spot radius \(m\)|detection within 0.4 m \(percentage points\))", text
+    )
+    assert len(parts) == 3
+    for part, sign in zip(parts[1:], "-+", strict=True):
+        for line in [line for line in part.splitlines() if "│ near " in line]:
+            _, _, _, other, many, _, _ = (cell.strip() for cell in line.split("│"))
+            assert re.fullmatch(r"(! )?[+-][\d.]+ ± [\d.]+", other)
+            assert re.fullmatch(rf"! \{sign}[\d.]+ ± [\d.]+", many)
+        unknown = [line for line in part.splitlines() if "│ behind" in line]
+        assert len(unknown) == 2
+        assert all(line.count("unknown") == 2 and "!" not in line for line in unknown)
+    assert "of 20 rows without a difference, one is marked" in re.sub(r"\s+", " ", text)
+    values = parts[0].splitlines()
+    assert any(re.search(r"│ +[\d.]+ ± [\d.]+ │ +[\d.]+ ± [\d.]+ │ +\* [\d.]+ ± [\d.]+ │", line) for line in values)
+
+
+def test_files_say_how_sure_a_difference_is(tmp_path):
+    coverages = trio(24)
+    few, other, many = rows(coverages).values()
+    for row in many[:2]:
+        assert row["radius_m_difference_significant"] is row["detection_0.4m_difference_significant"] is True
+        assert 0 < row["radius_m_difference_error"] < abs(row["radius_m_difference"])
+    for row in few[:2]:
+        assert (row["radius_m_difference_error"], row["radius_m_difference_significant"]) == (0.0, False)
+    expected = differences(coverages, REGIONS[0], "ground")["other"][0]
+    assert other[0]["radius_m_difference_error"] == expected.error
+    assert other[0]["radius_m_difference_significant"] is expected.significant
+    for row in (few[2], many[3]):
+        assert (row["radius_m_difference_error"], row["radius_m_difference_significant"]) == (None, None)
+    write_comparison(coverages, REGIONS, tmp_path / "summary.csv")
+    with (tmp_path / "summary.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert (table[8]["rig"], table[8]["radius_m_difference_significant"]) == ("many", "True")
+    assert float(table[8]["radius_m_difference_error"]) == many[0]["radius_m_difference_error"]
+    assert table[11]["radius_m_difference_significant"] == ""
+
+
+def test_from_too_few_steps_no_difference_is_called_significant():
+    text = printed(trio(5))
+    assert "±" not in text
+    assert text.count("Not enough steps for errors: 5 blocks, 8 are needed.") == 1
+    assert "Difference to few" in text
+    for rig_rows in rows(trio(5)).values():
+        for row in rig_rows:
+            assert row["radius_m_difference_error"] is None
+            assert row["detection_0.4m_difference_significant"] is None
+
+
+@pytest.mark.parametrize("steps", [5, 24])
+def test_on_a_narrow_terminal_numbers_with_errors_stay_whole(steps):
+    one, two, three = trio(steps).values()
+    named = {"a_rig_with_quite_a_long_name": one, "another_rig_with_a_long_name": two, "and_one_more_of_those": three}
+    tables = comparison_tables(named, REGIONS)
+    narrowest = narrowest_width(tables, list(named))
+    narrow, wide = (re.split("the best of", printed(named, width))[0] for width in (narrowest, 400))
+    assert max(map(len, narrow.splitlines())) == narrowest
+    numbers = re.compile(r"(?:[*!] )?[+-]?[\d.]+(?: ± [\d.]+)? │|unknown")
+    assert len(numbers.findall(wide)) > 20
+    assert numbers.findall(narrow) == numbers.findall(wide)
+
+
+def test_without_regions_the_tables_say_so():
+    assert "No region" in printed(trio(9), regions=())
+
+
+@pytest.mark.parametrize("errors", [False, True])
+def test_errors_are_drawn_side_by_side_if_asked_for_and_never_as_differences(tmp_path, errors):
+    names = {path.name for path in draw_comparison(trio(12), tmp_path, errors=errors)}
+    drawn = {name for name in names if "error" in name}
+    expected = {
+        f"{quantity}_error_{band}.png" for quantity in ("radius", "detection_0.4m") for band in ("ground", "obstacle")
+    }
+    assert drawn == (expected if errors else set())
 
 
 @pytest.mark.parametrize(

@@ -316,3 +316,44 @@ def test_an_impossible_sensor_is_refused_by_name(field, value):
     good = {"name": "lidar", "x_m": 0.0, "y_m": 0.0, "yaw_deg": 0.0, "horizontal_fov_deg": 90.0, "range_m": 10.0}
     with pytest.raises(ValueError, match=f"'lidar': .*{field}"):
         SensorMark(**{**good, field: value})
+
+
+# Maps of the standard errors
+
+
+def blocked(steps: int) -> Coverage:
+    metric = CoverageMetric(SQUARE, blocks=16)
+    for index in range(steps):
+        points = [[0.5, 0.5, 0.0]] if index % 8 else [[0.5, 0.5, 0.0], [9.5, 0.5, 0.0]]
+        metric.update(torch.tensor([[0.5, 0.5, -0.3 - 0.02 * (index % 16)]]), torch.tensor(points), index=index)
+    return metric.compute()
+
+
+def test_errors_are_drawn_only_if_asked_for(tmp_path):
+    coverage = blocked(16)
+    plain = {path.name for path in draw_maps(coverage, tmp_path / "plain")}
+    more = {path.name for path in draw_maps(coverage, tmp_path / "more", errors=True)}
+    bands = ("ground", "obstacle")
+    assert more - plain == {f"{stem}_{band}.png" for stem in ("radius_error", "detection_0.4m_error") for band in bands}
+    assert plain < more
+    assert not any("error" in name for name in plain)
+    without_blocks = draw_maps(coverage_of(SQUARE), tmp_path / "none", errors=True)
+    assert not any("error" in path.name for path in without_blocks)
+
+
+def test_a_map_of_errors_says_what_it_shows_in_which_unit_and_why_cells_are_unknown(tmp_path, monkeypatch):
+    drawn: dict[str, Picture] = {}
+    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: drawn.update({path.name: Picture(self)}))
+    coverage = blocked(16)
+    draw_maps(coverage, tmp_path, errors=True)
+    radius, detection = drawn["radius_error_ground.png"], drawn["detection_0.4m_error_ground.png"]
+    assert radius.axes.texts[0].get_text() == "Standard error of the mean blind spot radius, ground"
+    assert radius.bar.get_ylabel() == "standard error of the mean blind spot radius (m)"
+    assert detection.axes.texts[0].get_text() == "Standard error of the detection within 0.4 m, ground"
+    assert detection.bar.get_ylabel() == "standard error of the detection within 0.4 m (percentage points)"
+    assert detection.bar.get_ylim()[1] >= 100 * float(coverage.detection_error[0, 0, 10, 20]) > 1
+    # Two of the sixteen blocks probed x = 9.5 m: known, but without an error.
+    assert radius.legend[0] == "unknown: probed in fewer than 4 blocks of steps (99.9 % of the cells)"
+    red, green, blue = radius.at(9.4, 0.3)
+    assert red == green == blue
+    assert drawn["radius_ground.png"].legend[0].startswith("unknown: never probed (99.8 %")

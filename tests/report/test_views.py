@@ -2,13 +2,18 @@
 
 import numpy as np
 import pytest
+import torch
+from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
+from torchcover import BevGrid
 from torchcover.geometry import rigid, rotation_from_euler
-from torchcover.report import ActorMark, SensorView, draw_rig, draw_scene
-from torchcover.report.rig_view import COLOURS, FIRST_REACH_M
+from torchcover.report import ActorMark, SensorMark, SensorView, draw_depths, draw_four_views, draw_rig, draw_scene
+from torchcover.report.depth_view import SKY
+from torchcover.report.overlay import COLOURS
+from torchcover.report.rig_view import FIRST_REACH_M
 from torchcover.report.scene_view import REFERENCE, SENSOR
 
 VERTICES = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (0.0, 1.5)])
@@ -144,3 +149,124 @@ def test_clouds_are_drawn_the_rig_over_the_reference():
 
 def test_colours_of_sensors_differ():
     assert len(set(COLOURS)) == len(COLOURS)
+
+
+def depths(images, **options) -> Picture:
+    return Picture(draw_depths(images, title=options.pop("title", "Depths"), **options))
+
+
+def test_a_depth_image_stands_upright_and_shows_what_has_no_depth():
+    image = np.full((20, 30), 10.0)
+    image[:5] = np.inf
+    image[-5:] = 2.0
+    image[:, :3] = np.nan
+    picture = depths({"front": image})
+    # Cells count from below, rows of an image from above.
+    sky, wall, road = (picture.at(0, 15, height) for height in (18, 10, 2))
+    assert sky == pytest.approx(to_rgb(SKY), abs=0.02)
+    assert abs(wall - road).max() > 0.2
+    hatched = np.array([picture.at(0, 1, height) for height in np.arange(0.5, 19.0, 0.1)])
+    assert np.ptp(hatched, axis=1).max() < 0.02
+    assert np.ptp(hatched[:, 0]) > 0.02
+    entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
+    assert entries == ["nothing within range (22.5 % of the pixels)", "no ray: beyond the lens (10.0 % of the pixels)"]
+
+
+def test_depth_images_of_one_rig_share_their_colours_and_twice_as_far_is_one_step():
+    near, middle, far, all_of_them = (np.full((10, 12), value) for value in (4.0, 8.0, 16.0, 4.0))
+    all_of_them[:5] = 16.0
+    picture = depths({"a": near, "b": middle, "c": far, "d": all_of_them})
+    assert picture.at(0, 5, 5) == pytest.approx(picture.at(3, 5, 2))
+    assert picture.at(2, 5, 5) == pytest.approx(picture.at(3, 5, 8))
+    # The middle colour is that of the geometric mean.
+    assert picture.at(1, 5, 5) == pytest.approx(colormaps["viridis_r"](0.5)[:3], abs=0.02)
+
+
+def test_images_of_several_sizes_keep_square_pixels_and_do_not_overlap():
+    picture = depths({f"camera {k}": np.full((10 + 5 * k, 30), 1.0 + k) for k in range(8)})
+    *views, bar = picture.figure.axes
+    boxes = [axes.get_window_extent() for axes in views]
+    for axes, box_ in zip(views, boxes, strict=True):
+        assert box_.width / np.ptp(axes.get_xlim()) == pytest.approx(box_.height / np.ptp(axes.get_ylim()), rel=1e-3)
+    everything = [*boxes, bar.get_window_extent()]
+    assert not any(a.overlaps(b) for k, a in enumerate(everything) for b in everything[:k])
+
+
+@pytest.mark.parametrize("image", [np.full((3, 3), np.inf), np.full((3, 3), np.nan), np.full((1, 1), 7.0)])
+def test_images_without_a_range_of_depths_are_drawn_too(image):
+    depths({"only": image})
+
+
+@pytest.mark.parametrize(
+    ("images", "message"),
+    [({}, "at least one"), ({"x": np.zeros(3)}, "'x'.*shape \\(3,\\)"), ({"x": np.zeros((0, 3))}, "'x'")],
+)
+def test_what_is_no_image_is_refused(images, message):
+    with pytest.raises(ValueError, match=message):
+        draw_depths(images, title="t")
+
+
+GRID = BevGrid(x=(-10.0, 10.0), y=(-8.0, 8.0), cell=0.5)
+FORWARD = SensorMark("front", x_m=2.0, y_m=0.0, yaw_deg=0.0, horizontal_fov_deg=90.0, range_m=200.0)
+LEFT = SensorMark("left", x_m=0.0, y_m=1.0, yaw_deg=90.0, horizontal_fov_deg=60.0, range_m=5.0)
+
+
+def four_views(radius=None, points=None, **options) -> Picture:
+    given = {"steps": 10, "title": "Four", "ego_outline_m": box(0, 0), "sensors": [FORWARD, LEFT]}
+    radius = torch.full(GRID.shape, 1.0) if radius is None else radius
+    points = torch.ones(GRID.shape[1:]) if points is None else points
+    return Picture(draw_four_views(radius, points, GRID, **(given | options)))
+
+
+def test_four_panels_share_frame_extent_and_axes():
+    picture = four_views()
+    *panels, points_bar, radius_bar = picture.figure.axes
+    assert [(axes.get_xlim(), axes.get_ylim()) for axes in panels] == [(GRID.x, GRID.y)] * 4
+    sizes = {tuple(axes.get_window_extent().size.round(6)) for axes in panels}
+    assert len(sizes) == 1
+    (width, height) = sizes.pop()
+    assert width / 20 == pytest.approx(height / 16)
+    assert points_bar.get_ylabel().startswith("points in a cell (mean of the steps)")
+    assert radius_bar.get_ylabel().startswith("mean blind spot radius (m)")
+    assert picture.figure.axes[0].get_window_extent().height == pytest.approx(points_bar.get_window_extent().height)
+
+
+def test_sectors_lie_where_the_sensors_look_and_end_at_their_range():
+    picture = four_views()
+    assert picture.tinted(0, 9.0, 3.0)
+    assert not picture.tinted(0, 2.5, 3.0)
+    assert picture.tinted(0, 0.0, 5.0)
+    assert not picture.tinted(0, 0.0, 6.5)
+    assert not picture.tinted(0, -8.0, 0.0)
+    assert abs(picture.at(0, 9.0, 3.0) - picture.at(0, 0.0, 5.0)).max() > 0.05
+
+
+def test_the_histogram_says_no_point_where_the_maps_say_unknown():
+    radius, points = torch.full(GRID.shape, 1.0), torch.full(GRID.shape[1:], 10.0)
+    radius[0, :, :8] = float("nan")
+    points[:, :8] = 0.0
+    points[:, 30:] = 1000.0
+    picture = four_views(radius, points, sensors=[])
+    assert picture.at(1, -8.1, 4.1) == pytest.approx((1, 1, 1))
+    assert abs(picture.at(1, 0.1, 5.1) - picture.at(1, 8.1, 5.1)).max() > 0.3
+    hatched = np.array([picture.at(2, -8.0, y) for y in np.arange(2.0, 7.0, 0.02)])
+    assert hatched.max() < 0.9
+    assert picture.tinted(3, -8.1, 4.1)
+    entries = [text.get_text() for text in picture.figure.axes[2].get_legend().get_texts()]
+    assert entries == ["no point of the rig in any step", "unknown: never probed (10.0 % of the cells)", "ego"]
+
+
+def test_a_rig_without_a_point_is_drawn_too():
+    four_views(torch.full(GRID.shape, float("nan")), torch.zeros(GRID.shape[1:]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"radius": torch.zeros(2, 3, 4)}, r"radius: shape \(2, 32, 40\)"),
+        ({"points": torch.zeros(3, 4)}, "points: shape"),
+    ],
+)
+def test_arrays_of_another_grid_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        four_views(**arguments)

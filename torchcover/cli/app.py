@@ -1,10 +1,14 @@
 """The commands and their options."""
 
+import io
 import sys
+import warnings
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
+
+from torchcover.cli import options
 
 app = typer.Typer(
     name="torchcover",
@@ -19,9 +23,14 @@ USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
 
 
 def main() -> None:
-    """Run the command line; a user's mistake ends in one line on stderr and exit code 2."""
+    """Run the command line; a user's mistake ends in one line on stderr and exit code 2, a warning is one line too."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # where there is no ±, a result with ? is better than none
     try:
-        code = typer.main.get_command(app).main(standalone_mode=False)
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            code = typer.main.get_command(app).main(standalone_mode=False)
     except USAGE_ERROR as error:
         _fail(error.format_message())  # type: ignore[attr-defined]  # the typed name is private
     except (ValueError, TypeError, OSError) as error:
@@ -53,66 +62,117 @@ def evaluate(
     steps: Annotated[
         int | None, typer.Option(min=1, help="Steps to simulate (64), or most frames of a recording to use (all).")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulation.")] = 0,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out"),
-    cell: Annotated[float, typer.Option(help="Side of a grid cell in metres.")] = 0.25,
-    threshold: Annotated[
-        list[float] | None, typer.Option(help="Detection threshold in metres (0.4); may be repeated.")
-    ] = None,
-    device: Annotated[str, typer.Option(help="Where the search and the sums run: cpu, cuda, cuda:1, ...")] = "cpu",
-    workers: Annotated[int, typer.Option(min=0, help="Processes that make frames; 0 makes them in this one.")] = 0,
+    seed: options.Seed = 0,
+    out: options.Out = Path("out"),
+    cell: options.Cell = 0.25,
+    threshold: options.Thresholds = None,
+    reference: options.Reference = None,
+    rays: options.Rays = None,
+    every: options.Every = None,
+    target_error: options.TargetErrors = None,
+    error_maps: options.ErrorMaps = False,
+    device: options.Device = "cpu",
+    workers: options.Workers = 0,
     skip_bad_frames: Annotated[
         bool, typer.Option("--skip-bad-frames", help="Skip and count frames that cannot be read, instead of stopping.")
     ] = False,
 ) -> None:
     """Measure the coverage of a rig: a table, maps, and files to compare and to log."""
     from torchcover.cli.evaluate import Request, run
+    from torchcover.cli.settings import Settings
+    from torchcover.cli.stopping import TargetError
 
-    run(
-        Request(
-            rig=rig,
-            scenario=scenario,
-            recording=frames,
-            steps=steps,
-            seed=seed,
-            out=out,
-            cell=cell,
-            thresholds=tuple(threshold or (0.4,)),
-            device=device,
-            workers=workers,
-            skip_bad_frames=skip_bad_frames,
-        )
+    settings = Settings(
+        steps=steps,
+        seed=seed,
+        out=out,
+        cell=cell,
+        thresholds=tuple(threshold or (0.4,)),
+        reference=reference,
+        rays=rays,
+        every_s=every,
+        target=TargetError.parse(target_error or ()),
+        error_maps=error_maps,
+        device=device,
+        workers=workers,
     )
+    run(Request(rig=rig, scenario=scenario, recording=frames, skip_bad_frames=skip_bad_frames, settings=settings))
 
 
 @app.command()
 def compare(
     rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; two or more.")],
     scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "courtyard",
-    steps: Annotated[int, typer.Option(min=1, help="Steps to simulate.")] = 64,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the simulation.")] = 0,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out"),
-    cell: Annotated[float, typer.Option(help="Side of a grid cell in metres.")] = 0.25,
-    threshold: Annotated[
-        list[float] | None, typer.Option(help="Detection threshold in metres (0.4); may be repeated.")
-    ] = None,
-    device: Annotated[str, typer.Option(help="Where the search and the sums run: cpu, cuda, cuda:1, ...")] = "cpu",
-    workers: Annotated[int, typer.Option(min=0, help="Processes that make frames; 0 makes them in this one.")] = 0,
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps to simulate (64).")] = None,
+    seed: options.Seed = 0,
+    out: options.Out = Path("out"),
+    cell: options.Cell = 0.25,
+    threshold: options.Thresholds = None,
+    reference: options.Reference = None,
+    rays: options.Rays = None,
+    every: options.Every = None,
+    target_error: options.TargetErrors = None,
+    error_maps: options.ErrorMaps = False,
+    device: options.Device = "cpu",
+    workers: options.Workers = 0,
 ) -> None:
     """Compare rigs in the same frames: a table with the better values marked, maps side by side, differences."""
     from torchcover.cli.compare import Request, run
+    from torchcover.cli.settings import Settings
+    from torchcover.cli.stopping import TargetError
+
+    settings = Settings(
+        steps=steps,
+        seed=seed,
+        out=out,
+        cell=cell,
+        thresholds=tuple(threshold or (0.4,)),
+        reference=reference,
+        rays=rays,
+        every_s=every,
+        target=TargetError.parse(target_error or ()),
+        error_maps=error_maps,
+        device=device,
+        workers=workers,
+    )
+    run(Request(rigs=tuple(rigs), scenario=scenario, settings=settings))
+
+
+@app.command()
+def study(
+    rig: Annotated[str, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file.")],
+    scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "courtyard",
+    rays: Annotated[
+        list[int] | None,
+        typer.Option(min=8, help="Rays of the reference at each step; may be repeated (1024 to 1048576)."),
+    ] = None,
+    steps: Annotated[int, typer.Option(min=1, help="Most steps of a run.")] = 64,
+    runs: Annotated[int, typer.Option(min=1, help="Runs with other seeds that errors are averaged over.")] = 3,
+    long_run_steps: Annotated[
+        int, typer.Option(min=8, help="Steps of the run that the others are measured against.")
+    ] = 512,
+    every: options.Every = None,
+    seed: options.Seed = 0,
+    out: options.Out = Path("out"),
+    cell: options.Cell = 0.5,
+    threshold: Annotated[float, typer.Option(help="Detection threshold in metres.")] = 0.4,
+) -> None:
+    """Measure error against run time for reference sensors and numbers of steps, and recommend a setting."""
+    from torchcover.cli.study import DEFAULT_RAYS, Request, run
 
     run(
         Request(
-            rigs=tuple(rigs),
+            rig=rig,
             scenario=scenario,
+            rays=tuple(rays or DEFAULT_RAYS),
             steps=steps,
+            runs=runs,
+            long_run_steps=long_run_steps,
+            every_s=every,
             seed=seed,
-            out=out,
             cell=cell,
-            thresholds=tuple(threshold or (0.4,)),
-            device=device,
-            workers=workers,
+            threshold=threshold,
+            out=out,
         )
     )
 
@@ -121,14 +181,14 @@ def compare(
 def show(
     name: Annotated[str, typer.Argument(help="Rig or scenario: a built-in name (see `list`) or a YAML file.")],
     scenario: Annotated[
-        str | None, typer.Option(help="For a rig: the scenario whose ego carries it (courtyard).")
+        str | None, typer.Option(help="For a rig: the scenario whose ego carries it and that it sees (courtyard).")
     ] = None,
     rig: Annotated[str | None, typer.Option(help="For a scenario: whose points to draw (front_roof_128).")] = None,
-    step: Annotated[int | None, typer.Option(min=0, help="For a scenario: which time step (0).")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="For a scenario: seed of the simulation (0).")] = None,
+    step: Annotated[int | None, typer.Option(min=0, help="Time step of the scenario or the depth images (0).")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the simulation, likewise (0).")] = None,
     out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
 ) -> None:
-    """Draw a rig on its vehicle, or a frame of a scenario from above."""
+    """Draw a rig on its vehicle and the depth images of its cameras, or a frame of a scenario from above."""
     from torchcover.cli.show import run
 
     run(name, scenario=scenario, rig=rig, step=step, seed=seed, out=out)
@@ -140,6 +200,10 @@ def list_builtin() -> None:
     from torchcover.cli.listing import run
 
     run()
+
+
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)
+    typer.echo(f"torchcover: warning: {' '.join(str(message).split())}", err=True)
 
 
 def _fail(message: str) -> None:

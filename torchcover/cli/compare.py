@@ -9,8 +9,9 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from torchcover import __version__
 from torchcover.cli.run import Progression, accumulate, check_out, device_called, new_metric, outline_m, sensor_marks
+from torchcover.cli.settings import Settings, reference_note, reference_record, run_record, simulated_frames
+from torchcover.cli.stopping import TargetWatch, outcome
 from torchcover.coverage import Coverage, forward_regions
 from torchcover.data import SimulatedFrames
 from torchcover.report import comparison_dict, comparison_tables, draw_comparison, narrowest_width, write_comparison
@@ -23,13 +24,7 @@ class Request:
 
     rigs: tuple[str, ...]
     scenario: str
-    steps: int
-    seed: int
-    out: Path
-    cell: float
-    thresholds: tuple[float, ...]
-    device: str
-    workers: int
+    settings: Settings
 
 
 def run(request: Request) -> None:
@@ -42,14 +37,15 @@ def run(request: Request) -> None:
     """
     if len(request.rigs) < 2:
         raise ValueError(f"compare needs at least two rigs; got {request.rigs[0]!r} only (for one: `evaluate`)")
-    check_out(request.out)
-    device = device_called(request.device)
+    settings = request.settings
+    check_out(settings.out)
+    device = device_called(settings.device)
     rigs = {name: Rig.load(rig) for name, rig in zip(distinct_names(request.rigs), request.rigs, strict=True)}
-    metrics = [new_metric(request.cell, request.thresholds, device) for _ in rigs]
-    frames = SimulatedFrames(request.scenario, rigs=rigs, steps=request.steps, seed=request.seed)
-    progression = accumulate(frames, metrics, device, workers=request.workers)
-    coverages = {name: metric.compute() for name, metric in zip(rigs, metrics, strict=True)}
-    _write(coverages, request, progression, frames)
+    metrics = {name: new_metric(settings.cell, settings.thresholds, device) for name in rigs}
+    frames = simulated_frames(settings, request.scenario, rigs=rigs)
+    watch = TargetWatch(settings.target, metrics, forward_regions()) if settings.target else None
+    progression = accumulate(frames, list(metrics.values()), device, workers=settings.workers, watch=watch)
+    _write({name: metric.compute() for name, metric in metrics.items()}, request, progression, frames)
     progression.raise_failure()
 
 
@@ -73,32 +69,36 @@ def distinct_names(rigs: Sequence[str]) -> list[str]:
 def _write(
     coverages: Mapping[str, Coverage], request: Request, progression: Progression, frames: SimulatedFrames
 ) -> None:
-    (request.out / "coverage").mkdir(parents=True, exist_ok=True)
-    regions = forward_regions()
-    _print(comparison_tables(coverages, regions), list(coverages))
+    settings, regions, console = request.settings, forward_regions(), Console()
+    (settings.out / "coverage").mkdir(parents=True, exist_ok=True)
+    steps = next(iter(coverages.values())).counts["steps"]
+    reference = reference_record(settings, progression, frames, steps)
+    target_record, target_lines = outcome(settings.target, coverages, regions)
+    _print(comparison_tables(coverages, regions, [reference_note(reference)]), list(coverages))
+    for line in target_lines:
+        console.print(line, markup=False, soft_wrap=True)
     for name, coverage in coverages.items():
-        coverage.save(request.out / "coverage" / f"{name}.npz")
-    write_comparison(coverages, regions, request.out / "summary.csv")
+        coverage.save(settings.out / "coverage" / f"{name}.npz")
+    write_comparison(coverages, regions, settings.out / "summary.csv")
     content: dict[str, Any] = {
-        "torchcover": __version__,
         "rigs": dict(zip(coverages, request.rigs, strict=True)),
         "scenario": request.scenario,
-        "seed": request.seed,
-        "device": request.device,
-        "seconds": round(progression.seconds, 3),
-        "complete": progression.complete,
-        "frame_counts": dict(progression.counts),
+        "seed": settings.seed,
+        "reference": reference,
+        **run_record(settings, progression),
+        "target_error": target_record,
         **comparison_dict(coverages, regions),
     }
-    (request.out / "summary.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    (settings.out / "summary.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     maps = draw_comparison(
         coverages,
-        request.out / "maps",
+        settings.out / "maps",
         ego_outline_m=outline_m(frames.scene.ego_box),
         sensors={name: sensor_marks(rig) for name, rig in frames.rigs.items()},
+        errors=settings.error_maps,
     )
-    Console().print(
-        f"Wrote summary.json, summary.csv, {len(coverages)} coverage files and {len(maps)} maps to {request.out}",
+    console.print(
+        f"Wrote summary.json, summary.csv, {len(coverages)} coverage files and {len(maps)} maps to {settings.out}",
         soft_wrap=True,
     )
 

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch.utils.data import Dataset, Subset
 
-from torchcover import __version__
 from torchcover.cli.run import (
     DEFAULT_SCENARIO,
-    DEFAULT_STEPS,
     Progression,
     accumulate,
     check_out,
@@ -22,7 +20,9 @@ from torchcover.cli.run import (
     outline_m,
     sensor_marks,
 )
-from torchcover.coverage import Coverage, Region, forward_regions
+from torchcover.cli.settings import Settings, reference_note, reference_record, run_record, simulated_frames
+from torchcover.cli.stopping import TargetWatch, outcome
+from torchcover.coverage import Coverage, forward_regions
 from torchcover.data import Frame, RecordedFrames, SimulatedFrames
 from torchcover.report import coverage_table, draw_maps, summary_dict, write_csv
 from torchcover.simulation import Rig
@@ -35,14 +35,8 @@ class Request:
     rig: str | None
     scenario: str | None
     recording: Path | None
-    steps: int | None
-    seed: int
-    out: Path
-    cell: float
-    thresholds: tuple[float, ...]
-    device: str
-    workers: int
     skip_bad_frames: bool
+    settings: Settings
 
 
 def run(request: Request) -> None:
@@ -53,64 +47,79 @@ def run(request: Request) -> None:
         FileNotFoundError: A name or a file is unknown.
         KeyboardInterrupt: The user stopped the run.
     """
-    check_out(request.out)
-    device = device_called(request.device)
-    metric = new_metric(request.cell, request.thresholds, device)
+    settings = request.settings
+    check_out(settings.out)
+    device = device_called(settings.device)
+    metric = new_metric(settings.cell, settings.thresholds, device)
     frames = _frames(request)
-    progression = accumulate(frames, [metric], device, workers=request.workers, skip_bad_frames=request.skip_bad_frames)
+    progression = accumulate(
+        frames,
+        [metric],
+        device,
+        workers=settings.workers,
+        skip_bad_frames=request.skip_bad_frames,
+        watch=TargetWatch(settings.target, {_name(request): metric}, forward_regions()) if settings.target else None,
+    )
     _write(metric.compute(), request, progression, frames)
     progression.raise_failure()
 
 
 def _frames(request: Request) -> Dataset[Frame]:
+    settings = request.settings
     if request.recording is not None:
         if request.scenario is not None:
             raise ValueError("--scenario and --frames exclude each other: simulate a scenario or read a recording")
+        if any(option is not None for option in (settings.reference, settings.rays, settings.every_s)):
+            raise ValueError(
+                "--reference, --rays and --every are for simulations; a recording has its reference points"
+            )
         recorded = RecordedFrames(request.recording)
-        return recorded if request.steps is None else Subset(recorded, range(min(request.steps, len(recorded))))
+        return recorded if settings.steps is None else Subset(recorded, range(min(settings.steps, len(recorded))))
     if request.rig is None:
         raise ValueError("which rig? Give a built-in name (see `torchcover list`) or a YAML file, or use --frames")
-    return SimulatedFrames(
-        request.scenario or DEFAULT_SCENARIO, request.rig, steps=request.steps or DEFAULT_STEPS, seed=request.seed
-    )
+    return simulated_frames(settings, request.scenario or DEFAULT_SCENARIO, rig=request.rig)
+
+
+def _name(request: Request) -> str:
+    return request.rig or str(request.recording)
 
 
 def _write(coverage: Coverage, request: Request, progression: Progression, frames: Dataset[Frame]) -> None:
-    request.out.mkdir(parents=True, exist_ok=True)
-    regions = forward_regions()
-    console = Console()
-    console.print(coverage_table(coverage, regions))
+    out, regions, console = request.settings.out, forward_regions(), Console()
+    out.mkdir(parents=True, exist_ok=True)
+    target_record, target_lines = outcome(request.settings.target, {_name(request): coverage}, regions)
+    record = {**_run_record(request, progression, frames, coverage.counts["steps"]), "target_error": target_record}
+    notes = [reference_note(record["reference"])] if record["reference"] else []
+    console.print(coverage_table(coverage, regions, notes))
     for line in progression.skipped:
         console.print(f"skipped: {line}", style="yellow", markup=False)
-    coverage.save(request.out / "coverage.npz")
-    write_csv(coverage, regions, request.out / "summary.csv")
-    _write_summary(coverage, regions, request, progression)
+    for line in target_lines:
+        console.print(line, markup=False, soft_wrap=True)
+    coverage.save(out / "coverage.npz")
+    write_csv(coverage, regions, out / "summary.csv")
+    record |= summary_dict(coverage, regions)
+    (out / "summary.json").write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     maps = draw_maps(
         coverage,
-        request.out / "maps",
+        out / "maps",
         ego_outline_m=_ego_outline(frames),
         sensors=[] if request.rig is None else sensor_marks(Rig.load(request.rig)),
+        errors=request.settings.error_maps,
     )
-    console.print(
-        f"Wrote summary.json, summary.csv, coverage.npz and {len(maps)} maps to {request.out}", soft_wrap=True
-    )
+    console.print(f"Wrote summary.json, summary.csv, coverage.npz and {len(maps)} maps to {out}", soft_wrap=True)
 
 
-def _write_summary(coverage: Coverage, regions: tuple[Region, ...], request: Request, progression: Progression) -> None:
-    content: dict[str, Any] = {
-        "torchcover": __version__,
+def _run_record(request: Request, progression: Progression, frames: Dataset[Frame], steps: int) -> dict[str, Any]:
+    settings, simulated = request.settings, request.recording is None
+    return {
         "rig": request.rig,
-        "scenario": None if request.recording else request.scenario or DEFAULT_SCENARIO,
-        "frames": str(request.recording) if request.recording else None,
-        "seed": None if request.recording else request.seed,
-        "device": request.device,
-        "seconds": round(progression.seconds, 3),
-        "complete": progression.complete,
+        "scenario": request.scenario or DEFAULT_SCENARIO if simulated else None,
+        "frames": None if simulated else str(request.recording),
+        "seed": settings.seed if simulated else None,
+        "reference": reference_record(settings, progression, frames, steps) if simulated else None,
+        **run_record(settings, progression),
         "skipped_frames": progression.skipped,
-        "frame_counts": dict(progression.counts),
-        **summary_dict(coverage, regions),
     }
-    (request.out / "summary.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _ego_outline(frames: Dataset[Frame]) -> NDArray[np.float64] | None:

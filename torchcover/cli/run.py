@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from torch.utils.data import DataLoader, Dataset
 
+from torchcover.cli.stopping import TargetWatch
 from torchcover.coverage import BevGrid, CoverageMetric
 from torchcover.data import BadFrameError, Frame, FrameBatch, collate_frames
 from torchcover.geometry import Box, euler_from_rotation
@@ -24,7 +25,8 @@ from torchcover.report import SensorMark
 from torchcover.simulation import Rig
 
 DEFAULT_SCENARIO = "courtyard"
-DEFAULT_STEPS = 64
+# For standard errors: at least half as many are in use at the end of a long run.
+BLOCKS = 16
 # Holds the paper's regions, and the space beside and behind the vehicle.
 GRID_X_M = (-40.0, 160.0)
 GRID_Y_M = (-40.0, 40.0)
@@ -42,7 +44,7 @@ class Progression:
 
     @property
     def complete(self) -> bool:
-        """Whether every frame had its turn."""
+        """Whether nothing but the end of the frames, or a target error that was reached, ended it."""
         return self.failure is None and not self.interrupted
 
     def raise_failure(self) -> None:
@@ -80,14 +82,16 @@ def check_out(folder: Path) -> None:
         raise ValueError(f"--out {folder}: {nearest} may not be written to; choose another folder")
 
 
-def new_metric(cell: float, thresholds: tuple[float, ...], device: torch.device) -> CoverageMetric:
-    """An empty metric over the command line's grid.
+def new_metric(
+    cell: float, thresholds: tuple[float, ...], device: torch.device, *, blocks: int = BLOCKS
+) -> CoverageMetric:
+    """An empty metric over the command line's grid, with standard errors unless there is one block only.
 
     Raises:
         ValueError: A cell or a threshold that makes no sense.
     """
     grid = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=cell)
-    return CoverageMetric(grid, thresholds, max_radius=grid.diagonal_m).to(device)
+    return CoverageMetric(grid, thresholds, max_radius=grid.diagonal_m, blocks=blocks).to(device)
 
 
 def accumulate(
@@ -97,8 +101,9 @@ def accumulate(
     *,
     workers: int,
     skip_bad_frames: bool = False,
+    watch: TargetWatch | None = None,
 ) -> Progression:
-    """Feed every frame to the metrics.
+    """Feed every frame to the metrics, or as many as the target error needs.
 
     Args:
         frames: A map-style dataset.
@@ -106,6 +111,7 @@ def accumulate(
         device: Where the metrics are.
         workers: Processes that make frames.
         skip_bad_frames: Skip and note frames that cannot be read, instead of stopping at the first.
+        watch: Ends the run when its target error is reached.
 
     Returns:
         How it went; a bad frame or Ctrl-C after the first step is noted there, not raised.
@@ -116,15 +122,22 @@ def accumulate(
     progression = Progression()
     start = time.perf_counter()
     with _progress_bar() as bar:
-        task = bar.add_task("steps", total=len(frames), rate="")  # type: ignore[arg-type]  # map-style: has a length
+        most: int = len(frames)  # type: ignore[arg-type]  # map-style: has a length
+        task = bar.add_task("steps", total=most, rate="", error="")
         try:
             for batch in _batches(frames, workers, skip_bad_frames, progression):
                 (frame,) = batch.to(device).frames
                 with _to_the_end():
                     for metric, sensor in zip(metrics, frame.sensors.values(), strict=True):
-                        metric.update(sensor, frame.reference)
+                        metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.index)
                     progression.counts.update(frame.counts)
                 _advance(bar, task)
+                if watch is not None:
+                    reached = watch.is_reached(steps := int(metrics[0].steps))
+                    error = watch.worst.words if watch.worst else ""
+                    bar.update(task, total=steps if reached else watch.expected_steps(most), error=error)
+                    if reached:
+                        break
         except KeyboardInterrupt:
             progression.interrupted = True
     progression.seconds = time.perf_counter() - start
@@ -196,6 +209,7 @@ def _progress_bar() -> Progress:
         BarColumn(),
         MofNCompleteColumn(),
         TextColumn("{task.fields[rate]}"),
+        TextColumn("{task.fields[error]}"),
         TimeRemainingColumn(),
         TextColumn("left"),
         console=Console(stderr=True),

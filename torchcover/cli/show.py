@@ -1,4 +1,4 @@
-"""`torchcover show`: a rig on its vehicle, or a frame of a scenario from above."""
+"""`torchcover show`: a rig on its vehicle and what its cameras see, or a frame of a scenario from above."""
 
 from pathlib import Path
 from typing import Any
@@ -6,14 +6,16 @@ from typing import Any
 import numpy as np
 import yaml
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from rich.console import Console
 
 from torchcover.cli.run import DEFAULT_SCENARIO, GRID_X_M, GRID_Y_M, outline_m
 from torchcover.data import SimulatedFrames
 from torchcover.geometry import Box, invert, transform
 from torchcover.geometry.rigid import Matrix
-from torchcover.report import ActorMark, SensorView, draw_rig, draw_scene
-from torchcover.simulation import ReferenceSensor, Rig, Scenario, builtin_names
+from torchcover.report import ActorMark, SensorView, draw_depths, draw_rig, draw_scene
+from torchcover.simulation import CameraSensor, ReferenceSensor, Rig, Scenario, builtin_names
+from torchcover.simulation.instant import Instant
 from torchcover.simulation.rig import Sensor
 from torchcover.simulation.world import Actor, World
 
@@ -23,22 +25,26 @@ REFERENCE = ReferenceSensor(rows=256, columns=512)
 
 
 def run(name: str, *, scenario: str | None, rig: str | None, step: int | None, seed: int | None, out: Path) -> None:
-    """Draw what has this name into `out/NAME.png`.
+    """Draw what has this name into `out/NAME.png`, and the depth images of a rig's cameras into `out/NAME_depth.png`.
 
     Raises:
         ValueError: The name of neither or of both, an option for the other kind, or a document that is not valid.
         FileNotFoundError: No such file.
     """
     if _is_rig(name):
-        _refuse("a scenario", {"--rig": rig, "--step": step, "--seed": seed}, f"{name!r} is a rig")
-        figure = _draw_rig(Rig.load(name), Scenario.load(scenario or DEFAULT_SCENARIO))
+        _refuse("a scenario", {"--rig": rig}, f"{name!r} is a rig")
+        shown = Rig.load(name)
+        if not _cameras(shown):
+            _refuse("a scenario or cameras", {"--step": step, "--seed": seed}, f"{name!r} is a rig without cameras")
+        figures = _draw_rig(shown, Scenario.load(scenario or DEFAULT_SCENARIO), step or 0, seed or 0)
     else:
         _refuse("a rig", {"--scenario": scenario}, f"{name!r} is a scenario")
-        figure = _draw_scenario(Scenario.load(name), Rig.load(rig or DEFAULT_RIG), step or 0, seed or 0)
-    path = out / f"{Path(name).stem}.png"
+        figures = {"": _draw_scenario(Scenario.load(name), Rig.load(rig or DEFAULT_RIG), step or 0, seed or 0)}
     out.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=figure.dpi)
-    Console().print(f"Wrote {path}", soft_wrap=True)
+    for suffix, figure in figures.items():
+        path = out / f"{Path(name).stem}{suffix}.png"
+        figure.savefig(path, dpi=figure.dpi)
+        Console().print(f"Wrote {path}", soft_wrap=True)
 
 
 def _is_rig(name: str) -> bool:
@@ -67,12 +73,29 @@ def _refuse(kind: str, options: dict[str, Any], reason: str) -> None:
         raise ValueError(f"{', '.join(given)}: for {kind} only, and {reason}")
 
 
-def _draw_rig(rig: Rig, scenario: Scenario) -> Figure:
-    ego = scenario.world().ego.mesh
+def _cameras(rig: Rig) -> list[CameraSensor]:
+    return [sensor for sensor in rig.sensors if isinstance(sensor, CameraSensor)]
+
+
+def _draw_rig(rig: Rig, scenario: Scenario, step: int, seed: int) -> dict[str, Figure]:
+    """The rig on its vehicle, and the depth images if it has cameras, by the suffix of the file name."""
+    frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference=REFERENCE)
+    scene, step_of_world = frames.scene_of(step)
+    ego = scene.world.ego.mesh
     length, width, height = Box.around(ego.vertices_m).size_m
     subtitle = f"on the ego of {scenario.name}, {length:.2f} x {width:.2f} x {height:.2f} m"
     sensors = [_sensor_view(sensor) for sensor in rig.sensors]
-    return draw_rig(ego.vertices_m, ego.faces, sensors, title=rig.name, subtitle=subtitle)
+    figures = {"": draw_rig(ego.vertices_m, ego.faces, sensors, title=rig.name, subtitle=subtitle)}
+    if cameras := _cameras(rig):
+        instant = scene.at(step_of_world)
+        images = {camera.name: _depth_image(camera, instant) for camera in cameras}
+        when = f"{scenario.name}, step {step}, t = {step_of_world * scene.world.time_step_s:g} s, seed {seed}"
+        figures["_depth"] = draw_depths(images, title=f"{rig.name}: distance along the ray", subtitle=when)
+    return figures
+
+
+def _depth_image(camera: CameraSensor, instant: Instant) -> NDArray[np.float32]:
+    return instant.range_image(camera.mount.matrix(), camera.directions(), max_range_m=camera.max_range_m)
 
 
 def _sensor_view(sensor: Sensor) -> SensorView:
@@ -89,9 +112,10 @@ def _sensor_view(sensor: Sensor) -> SensorView:
 
 
 def _draw_scenario(scenario: Scenario, rig: Rig, step: int, seed: int) -> Figure:
-    frame = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference=REFERENCE)[step]
-    episode, step_of_world = scenario.locate(step)
-    world = scenario.world(seed, episode)
+    frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference=REFERENCE)
+    frame = frames[step]
+    scene, step_of_world = frames.scene_of(step)
+    world = scene.world
     time_s = step_of_world * world.time_step_s
     return draw_scene(
         GRID_X_M,

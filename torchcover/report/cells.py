@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
@@ -16,36 +16,40 @@ from torchcover.report.wording import percent
 
 UNKNOWN: dict[str, Any] = {"facecolor": "#c4c4c4", "edgecolor": "#b2b2b2", "hatch": "////"}
 INFINITE = "#d55e00"
+NEVER_PROBED = "never probed"
 
 
-def draw_cells(axes: Axes, array: NDArray[np.float64], scale: ColourScale) -> AxesImage:
+def draw_cells(axes: Axes, array: NDArray[np.float64], scale: ColourScale, *, infinite: str = INFINITE) -> AxesImage:
     """Colour each cell; unknown ones are hatched grey, infinite ones have a colour of their own.
 
     Args:
         axes: Axes of a map, with limits set to the grid's bounds.
         array: (Y, X) values, NaN where unknown.
         scale: What the colours mean.
+        infinite: Colour of infinite cells.
 
     Returns:
         The image, for the colour bar.
     """
     # Unknown cells are holes through which the ground of the axes shows.
     axes.patch.set(**UNKNOWN, linewidth=0)
-    image = _draw_image(axes, np.ma.masked_invalid(array), cmap=scale.colormap, vmin=scale.low, vmax=scale.high)
-    infinite = np.isinf(array)
-    if infinite.any():
-        _draw_image(axes, np.ma.masked_where(~infinite, infinite), cmap=ListedColormap([INFINITE]))
+    norm = (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
+    image = _draw_image(axes, np.ma.masked_invalid(array), cmap=scale.colormap, norm=norm)
+    endless = np.isinf(array)
+    if endless.any():
+        _draw_image(axes, np.ma.masked_where(~endless, endless), cmap=ListedColormap([infinite]))
     return image
 
 
-def cell_entries(array: NDArray[np.float64]) -> list[Artist]:
+def cell_entries(array: NDArray[np.float64], unknown: str = NEVER_PROBED) -> list[Artist]:
     """The legend entries for cells without a colour of the scale.
 
     Args:
         array: Values of one map, or of several, NaN where unknown.
+        unknown: Why they are.
     """
     unknown_share = percent(float(np.isnan(array).mean()))
-    entries: list[Artist] = [Patch(label=f"unknown: never probed ({unknown_share} % of the cells)", **UNKNOWN)]
+    entries: list[Artist] = [Patch(label=f"unknown: {unknown} ({unknown_share} % of the cells)", **UNKNOWN)]
     infinite = np.isinf(array)
     if infinite.any():
         label = f"infinite: a step saw nothing ({percent(float(infinite.mean()))} % of the cells)"

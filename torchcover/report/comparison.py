@@ -1,25 +1,32 @@
 """Maps of several rigs: side by side on one colour scale, and as differences to the first."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import torch
-from matplotlib.artist import Artist
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage
-from torchcover.report.cells import cell_entries, draw_cells, draw_colour_bar
+from torchcover.report.cells import NEVER_PROBED, cell_entries, draw_cells, draw_colour_bar
 from torchcover.report.file_names import file_stems
 from torchcover.report.maps import draw_map
-from torchcover.report.metrics import Metric, metrics_of
+from torchcover.report.metrics import Metric, error_metrics_of, metrics_of
 from torchcover.report.overlay import SensorMark, draw_ego, draw_sensors
 from torchcover.report.paired import check_paired
 from torchcover.report.scale import ColourScale, difference_scale
-from torchcover.report.sheet import HEADING_POINTS, Sheet, fit_paper, lay_out, write_heading, write_legend, write_title
+from torchcover.report.sheet import (
+    HEADING_POINTS,
+    fit_paper,
+    lay_out,
+    lower_left,
+    write_heading,
+    write_legend,
+    write_title,
+)
 from torchcover.report.wording import span, steps_and_cell
 
 Outline = NDArray[np.floating]
@@ -31,6 +38,7 @@ def draw_comparison(
     *,
     ego_outline_m: Outline | None = None,
     sensors: Mapping[str, Sequence[SensorMark]] | None = None,
+    errors: bool = False,
 ) -> list[Path]:
     """Draw every metric of several rigs in every height band.
 
@@ -43,6 +51,7 @@ def draw_comparison(
         folder: Where to write; made if it does not exist.
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark, by the name of the rig.
+        errors: Whether to draw the standard errors of the rigs too, side by side.
 
     Returns:
         The PNG files.
@@ -55,15 +64,16 @@ def draw_comparison(
     folder.mkdir(parents=True, exist_ok=True)
     rigs, grid = list(coverages), next(iter(coverages.values())).grid
     conditions = steps_and_cell(next(iter(coverages.values())).counts["steps"], grid)
-    paths = []
+    pictures: list[Iterator[tuple[str, Figure]]] = []
     for metric in metrics_of(list(coverages.values())):
-        pictures = [
-            *_side_by_side(metric, rigs, grid, conditions, ego_outline_m, sensors or {}),
-            *_differences(metric, rigs, grid, conditions, ego_outline_m),
-        ]
-        for stem, figure in pictures:
-            paths.append(folder / f"{stem}.png")
-            figure.savefig(paths[-1], dpi=figure.dpi)
+        pictures.append(_side_by_side(metric, rigs, grid, conditions, ego_outline_m, sensors or {}))
+        pictures.append(_differences(metric, rigs, grid, conditions, ego_outline_m))
+    for metric in error_metrics_of(list(coverages.values())) if errors else ():
+        pictures.append(_side_by_side(metric, rigs, grid, conditions, ego_outline_m, sensors or {}))
+    paths = []
+    for stem, figure in chain.from_iterable(pictures):
+        paths.append(folder / f"{stem}.png")
+        figure.savefig(paths[-1], dpi=figure.dpi)
     return paths
 
 
@@ -76,6 +86,7 @@ def draw_side_by_side(
     subtitle: str = "",
     ego_outline_m: Outline | None = None,
     sensors: Mapping[str, Sequence[SensorMark]] | None = None,
+    unknown: str = NEVER_PROBED,
 ) -> Figure:
     """Draw several arrays over one grid, with one colour bar.
 
@@ -87,6 +98,7 @@ def draw_side_by_side(
         subtitle: Second line, smaller.
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark, by the headings.
+        unknown: Why a cell is, for the legend.
 
     Returns:
         A figure of its own, outside pyplot.
@@ -99,14 +111,14 @@ def draw_side_by_side(
     images = [draw_cells(sheet.axes, array, scale) for sheet, array in zip(sheets, arrays, strict=True)]
     together = np.stack(arrays)
     draw_colour_bar(sheets[0], images[0], together, scale)
-    entries = cell_entries(together)
+    entries = cell_entries(together, unknown)
     for sheet, name in zip(sheets, values, strict=True):
         write_heading(sheet.axes, name)
         if ego_outline_m is not None:
             entries += draw_ego(sheet.axes, ego_outline_m)
         entries += draw_sensors(sheet, (sensors or {}).get(name, ()), named=False)
     write_title(sheets[0].axes, title, subtitle, lift_points=HEADING_POINTS)
-    write_legend(_lower_left(sheets), _once_each(entries), sheets[0].legend_columns)
+    write_legend(lower_left(sheets), entries, sheets[0].legend_columns)
     fit_paper(sheets[0].figure)
     return sheets[0].figure
 
@@ -130,6 +142,7 @@ def _side_by_side(
                 subtitle=f"z {span(band)}; {conditions}",
                 ego_outline_m=ego_outline_m,
                 sensors=sensors,
+                unknown=metric.unknown,
             ),
         )
 
@@ -155,11 +168,3 @@ def _differences(
                 ego_outline_m=ego_outline_m,
             )
             yield f"difference_{metric.stem}_{stem}_{rig_stem}_minus_{rig_stems[0]}", figure
-
-
-def _lower_left(sheets: Sequence[Sheet]) -> Axes:
-    return min((sheet.axes for sheet in sheets), key=lambda axes: (axes.get_position().y0, axes.get_position().x0))
-
-
-def _once_each(entries: Sequence[Artist]) -> list[Artist]:
-    return list({entry.get_label(): entry for entry in entries}.values())

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage
-from torchcover.report.cells import cell_entries, draw_cells, draw_colour_bar
+from torchcover.report.cells import NEVER_PROBED, cell_entries, draw_cells, draw_colour_bar
 from torchcover.report.file_names import file_stems
-from torchcover.report.metrics import metrics_of
+from torchcover.report.metrics import error_metrics_of, metrics_of
 from torchcover.report.overlay import SensorMark, draw_ego, draw_sensors
 from torchcover.report.scale import ColourScale
 from torchcover.report.sheet import fit_paper, lay_out, write_legend, write_title
@@ -24,6 +24,7 @@ def draw_maps(
     *,
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Sequence[SensorMark] = (),
+    errors: bool = False,
 ) -> list[Path]:
     """Draw every metric of a coverage in every height band: `radius_ground.png`, `detection_0.4m_obstacle.png`, ...
 
@@ -34,6 +35,7 @@ def draw_maps(
         folder: Where to write; made if it does not exist.
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark.
+        errors: Whether to draw the standard errors too, `radius_error_ground.png`, `detection_0.4m_error_ground.png`.
 
     Returns:
         The PNG files: metric by metric, in each the bands in the order of the grid.
@@ -47,7 +49,7 @@ def draw_maps(
     stems = file_stems(list(heights))
     conditions = steps_and_cell(coverage.counts["steps"], coverage.grid)
     paths = []
-    for metric in metrics_of([coverage]):
+    for metric in (*metrics_of([coverage]), *(error_metrics_of([coverage]) if errors else ())):
         for values, stem, (name, band) in zip(metric.values[0], stems, heights.items(), strict=True):
             figure = draw_map(
                 values,
@@ -57,6 +59,7 @@ def draw_maps(
                 subtitle=f"z {span(band)}; {conditions}",
                 ego_outline_m=ego_outline_m,
                 sensors=sensors,
+                unknown=metric.unknown,
             )
             paths.append(folder / f"{metric.stem}_{stem}.png")
             figure.savefig(paths[-1], dpi=figure.dpi)
@@ -72,6 +75,7 @@ def draw_map(
     subtitle: str = "",
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Sequence[SensorMark] = (),
+    unknown: str = NEVER_PROBED,
 ) -> Figure:
     """Draw one array over a grid, seen from above: x forward to the right, y left upwards.
 
@@ -84,6 +88,7 @@ def draw_map(
         subtitle: Second line, smaller.
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark.
+        unknown: Why a cell is, for the legend.
 
     Returns:
         A figure of its own, outside pyplot: `figure.savefig(path)`, or hand it to a logger.
@@ -106,7 +111,7 @@ def draw_map(
     array = values.detach().cpu().double().numpy()
     (sheet,) = lay_out(grid)
     draw_colour_bar(sheet, draw_cells(sheet.axes, array, scale), array, scale)
-    entries = cell_entries(array)
+    entries = cell_entries(array, unknown)
     if ego_outline_m is not None:
         entries += draw_ego(sheet.axes, ego_outline_m)
     entries += draw_sensors(sheet, sensors)

@@ -10,12 +10,14 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.patches import FancyArrowPatch, Polygon, Wedge
+from matplotlib.patches import FancyArrowPatch, Patch, Polygon, Wedge
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 from numpy.typing import NDArray
 
 from torchcover.report.sheet import Sheet
 
+# Okabe and Ito's colours, which the colour-blind can tell apart.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 ARROW_POINTS = 20.0
 NUMBER_POINTS = 24.0
 OVERLAP_POINTS = 9.0
@@ -104,7 +106,30 @@ def draw_sensors(sheet: Sheet, sensors: Sequence[SensorMark], *, named: bool = T
     return [*(_legend_entry(sheet, *pair) for pair in zip(numbers, sensors, strict=True)), view]
 
 
+def draw_sectors(sheet: Sheet, sensors: Sequence[SensorMark]) -> list[Artist]:
+    """Fill the horizontal field of view of each sensor, as if nothing were in its way: all that geometry alone says.
+
+    Args:
+        sheet: The sheet of an empty map.
+        sensors: What to draw.
+
+    Returns:
+        Legend entries.
+    """
+    entries: list[Artist] = []
+    for at, sensor in enumerate(sensors):
+        colour = COLOURS[at % len(COLOURS)]
+        _draw_wedge(sheet, sensor, facecolor=(colour, 0.3), edgecolor=colour, linewidth=1.0)
+        entries.append(Patch(facecolor=(colour, 0.3), edgecolor=colour, label=f"field of view: {sensor.name}"))
+    return entries
+
+
 def _draw_view(sheet: Sheet, sensor: SensorMark) -> None:
+    dashes = {"fill": False, "edgecolor": "black", "linewidth": 0.8, "linestyle": (0, (5, 3))}
+    _draw_wedge(sheet, sensor, zorder=2.5, path_effects=THIN_HALO, **dashes)
+
+
+def _draw_wedge(sheet: Sheet, sensor: SensorMark, **style: Any) -> None:  # noqa: ANN401  (matplotlib's own)
     start, half = (sensor.x_m, sensor.y_m), sensor.horizontal_fov_deg / 2
     furthest = max(math.dist(start, corner) for corner in product(sheet.axes.get_xlim(), sheet.axes.get_ylim()))
     wedge = Wedge(
@@ -112,12 +137,7 @@ def _draw_view(sheet: Sheet, sensor: SensorMark) -> None:
         min(sensor.range_m, 2 * furthest),  # infinity cannot be drawn; beyond the map all ranges look the same
         sensor.yaw_deg - half,
         sensor.yaw_deg + half,
-        fill=False,
-        edgecolor="black",
-        linewidth=0.8,
-        linestyle=(0, (5, 3)),
-        zorder=2.5,
-        path_effects=THIN_HALO,
+        **style,
     )
     sheet.axes.add_patch(wedge)
 

@@ -14,6 +14,7 @@ from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
 from torchcover.geometry import euler_from_rotation
+from torchcover.report.overlay import COLOURS
 from torchcover.report.sheet import HEADING_POINTS, fit_paper, write_heading, write_legend, write_title
 from torchcover.report.views import stack_views
 
@@ -25,8 +26,6 @@ MARGIN_M = 0.6
 FIRST_REACH_M, REACH_STEP_M = 4.0, 0.6
 ARC_POINTS = 241
 GROUND_M = -0.4
-# Okabe and Ito's colours, which the colour-blind can tell apart.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 LIGHT = np.array([0.3, -0.5, 0.81])
 
 

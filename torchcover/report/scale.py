@@ -23,9 +23,11 @@ class ColourScale:
         colormap: Name of a matplotlib colour map.
         low: Value of the first colour.
         high: Value of the last colour. Values beyond either end keep its colour, and the colour bar says so.
+        logarithmic: Whether equal ratios, rather than equal differences, are equally far apart in colour.
 
     Raises:
-        ValueError: `low` is not below `high`, or one of them is not finite.
+        ValueError: `low` is not below `high`, or one of them is not finite; a logarithmic scale that does not begin
+            above 0.
 
     Example:
         >>> ColourScale("change of the blind spot radius", "m", "PuOr", -1.0, 1.0).label
@@ -37,10 +39,13 @@ class ColourScale:
     colormap: str
     low: float
     high: float
+    logarithmic: bool = False
 
     def __post_init__(self) -> None:
         if not (-math.inf < self.low < self.high < math.inf):
             raise ValueError(f"a colour scale needs finite low < high; got {self.low} and {self.high}")
+        if self.logarithmic and not self.low > 0:
+            raise ValueError(f"a logarithmic colour scale needs low > 0; got {self.low}")
 
     @property
     def label(self) -> str:

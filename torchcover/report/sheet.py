@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox, ScaledTranslation
+from numpy.typing import NDArray
 
 from torchcover.coverage import BevGrid
 
@@ -39,7 +40,7 @@ class Sheet:
     Args:
         figure: The whole paper.
         axes: The map: x to the right and y upwards, in equal metres.
-        bar: Place of the colour bar, which maps on one paper share.
+        bar: Place of the colour bar, which the maps on one paper share, or those of one row.
         legend_columns: How many entries of a legend fit beside each other.
         metres_per_inch: Scale of the map.
     """
@@ -51,38 +52,47 @@ class Sheet:
     metres_per_inch: float
 
 
-def lay_out(grid: BevGrid, maps: int = 1) -> list[Sheet]:
+def lay_out(grid: BevGrid, maps: int = 1, *, across: int | None = None) -> list[Sheet]:
     """Empty maps of the grid on one paper: long ones below each other, others beside each other.
 
     Args:
         grid: Bounds and cells.
         maps: How many.
+        across: How many in a row; each row then has its own colour bar.
 
     Returns:
         The maps, row by row from the upper left.
     """
     _, rows, columns = grid.shape
-    across, inches_per_cell = _arrange(grid, maps)
+    bar_for_all = across is None
+    across, inches_per_cell = _arrange(grid, maps, across)
     dpi = min(math.ceil(DOTS_PER_INCH * inches_per_cell) / inches_per_cell, MOST_DOTS_PER_INCH)
     map_in = inches_per_cell * np.array([columns, rows])
     # Gaps of whole pixels, so that every cell of every map is whole pixels.
     step_in = map_in + np.round(np.array([BESIDE_IN, BELOW_IN]) * dpi) / dpi
     paper_in = map_in + step_in * [across - 1, math.ceil(maps / across) - 1]
     figure = Figure(figsize=tuple(paper_in), dpi=dpi)
+
+    def place(left_in: float, top_in: float, size_in: NDArray[np.float64]) -> tuple[float, float, float, float]:
+        corner = np.array([left_in, paper_in[1] - top_in - size_in[1]]) / paper_in
+        return (*corner.tolist(), *(size_in / paper_in).tolist())
+
+    views = []
     for at in range(maps):
-        left_in, top_in = step_in * [at % across, at // across]
-        place_in = (left_in, paper_in[1] - top_in - map_in[1])
-        axes = figure.add_axes((*(place_in / paper_in), *(map_in / paper_in)), xlim=grid.x, ylim=grid.y)
-        _label(axes, left=at % across == 0, lowest=at + across >= maps)
-    bar_in = np.array([COLOUR_BAR_IN, max(paper_in[1], SHORTEST_COLOUR_BAR_IN)])
+        left_in, top_in = (step_in * [at % across, at // across]).tolist()
+        views.append(figure.add_axes(place(left_in, top_in, map_in), xlim=grid.x, ylim=grid.y))
+        _label(views[-1], left=at % across == 0, lowest=at + across >= maps)
+    bar_in = np.array([COLOUR_BAR_IN, max(paper_in[1] if bar_for_all else map_in[1], SHORTEST_COLOUR_BAR_IN)])
     gap_in = GAP_IN if maps == 1 else BESIDE_IN  # the axis of a map above the last row has labels beside the bar
-    bar_place_in = (paper_in[0] + gap_in, paper_in[1] - bar_in[1])
-    bar = figure.add_axes((*(bar_place_in / paper_in), *(bar_in / paper_in)))
+    tops_in = [0.0] if bar_for_all else [step_in[1] * row for row in range(math.ceil(maps / across))]
+    bars = [figure.add_axes(place(paper_in[0] + gap_in, top_in, bar_in)) for top_in in tops_in]
     legend_columns = max(1, int(paper_in[0] / LEGEND_COLUMN_IN))
-    return [Sheet(figure, axes, bar, legend_columns, grid.cell / inches_per_cell) for axes in figure.axes[:-1]]
+    bar_of = [bars[0 if bar_for_all else at // across] for at in range(maps)]
+    scale = grid.cell / inches_per_cell
+    return [Sheet(figure, axes, bar, legend_columns, scale) for axes, bar in zip(views, bar_of, strict=True)]
 
 
-def _arrange(grid: BevGrid, maps: int) -> tuple[int, float]:
+def _arrange(grid: BevGrid, maps: int, across: int | None) -> tuple[int, float]:
     """How many maps beside each other, and inches for each cell: the most that the paper allows."""
     _, rows, columns = grid.shape
     width_in, height_in = LARGEST_MAP_IN if maps == 1 else LARGEST_PAPER_IN
@@ -90,7 +100,7 @@ def _arrange(grid: BevGrid, maps: int) -> tuple[int, float]:
     def inches_per_cell(across: int) -> float:
         return min(width_in / (across * columns), height_in / (math.ceil(maps / across) * rows))
 
-    across = max(range(1, maps + 1), key=inches_per_cell)
+    across = across or max(range(1, maps + 1), key=inches_per_cell)
     return across, inches_per_cell(across)
 
 
@@ -111,11 +121,16 @@ def write_heading(axes: Axes, heading: str) -> None:
     axes.annotate(heading, (0, 1), (0, 5), fontsize=9, fontweight="bold", **ABOVE)
 
 
+def lower_left(sheets: Sequence[Sheet]) -> Axes:
+    """The map in the lower left corner, under which the legend of all has its place."""
+    return min((sheet.axes for sheet in sheets), key=lambda axes: (axes.get_position().y0, axes.get_position().x0))
+
+
 def write_legend(axes: Axes, entries: Sequence[Artist], columns: int) -> None:
-    """Write the legend under the map, where it hides nothing."""
+    """Write the legend under the map, where it hides nothing; what several maps share is in it once."""
     below = ScaledTranslation(0, -X_LABEL_IN, axes.figure.dpi_scale_trans)
     legend = axes.legend(
-        handles=entries,
+        handles=list({entry.get_label(): entry for entry in entries}.values()),
         loc="upper left",
         bbox_to_anchor=(0, 0),
         bbox_transform=axes.transAxes + below,

@@ -9,36 +9,37 @@ from rich.table import Table
 from rich.text import Text
 
 from torchcover.coverage import Coverage, Region, RegionSummary
+from torchcover.coverage.blocks import FEWEST_BLOCKS
 from torchcover.report.records import columns_of, conditions_of, json_record, records_of, write_records
-from torchcover.report.wording import metres, percent, span, steps_and_cell
+from torchcover.report.wording import blocks_of_steps, metres, percent, span, steps_and_cell
 
 
-def coverage_table(coverage: Coverage, regions: Sequence[Region]) -> Table:
+def coverage_table(coverage: Coverage, regions: Sequence[Region], notes: Sequence[str] = ()) -> Table:
     """The table for the terminal; the conditions it holds under, and what went wrong, are its caption.
 
     Args:
         coverage: What `CoverageMetric.compute` returned.
         regions: Regions within the grid.
+        notes: More conditions for the caption.
 
     Returns:
         A table for `rich.console.Console.print`: mean blind spot radius in metres, detection and known cells in
-        percent. A number over no known cell reads "unknown".
+        percent, with standard errors if there are any. A number over no known cell reads "unknown".
 
     Raises:
         ValueError: As `Coverage.summary`.
     """
-    notes = "\n".join(notes_on(coverage, coverage.summary(regions)))
-    table = Table(caption=Text(notes), caption_justify="left", caption_style="")
+    rows = coverage.summary(regions)
+    caption = Text("\n".join([*notes_on(coverage, rows), *notes]))
+    table = Table(caption=caption, caption_justify="left", caption_style="")
     table.add_column("region")
     table.add_column("height")
     table.add_column("mean blind spot\nradius (m)", justify="right")
     for threshold in coverage.thresholds:
         table.add_column(f"detection within\n{threshold:g} m (%)", justify="right")
     table.add_column("known cells\n(%)", justify="right")
-    for region in regions:
-        for row in coverage.summary([region]):
-            table.add_row(*_cells(row))
-        table.add_section()
+    for at, row in enumerate(rows, 1):
+        table.add_row(*_cells(row), end_section=at % len(coverage.grid.heights) == 0)
     return table
 
 
@@ -53,7 +54,7 @@ def write_csv(coverage: Coverage, regions: Sequence[Region], path: str | Path) -
     Raises:
         ValueError: As `Coverage.summary`.
     """
-    write_records(columns_of(coverage), records_of(coverage, regions), path)
+    write_records(columns_of(coverage), records_of(coverage, regions, coverage.summary(regions)), path)
 
 
 def summary_dict(coverage: Coverage, regions: Sequence[Region]) -> dict[str, Any]:
@@ -73,7 +74,7 @@ def summary_dict(coverage: Coverage, regions: Sequence[Region]) -> dict[str, Any
     return {
         **conditions_of(coverage),
         "counts": dict(coverage.counts),
-        "rows": [json_record(record) for record in records_of(coverage, regions)],
+        "rows": [json_record(record) for record in records_of(coverage, regions, coverage.summary(regions))],
     }
 
 
@@ -85,13 +86,26 @@ def notes_on(coverage: Coverage, rows: Sequence[RegionSummary]) -> list[str]:
         notes.append("No region, so no number: the maps cover the whole grid.")
     if any(row.known_cells < row.cells for row in rows):
         notes.append("Means over the known cells only; the fewer are known, the more the numbers may flatter the rig.")
-    return notes + _trouble(coverage)
+    return notes + _on_errors(coverage, rows) + _trouble(coverage)
+
+
+def _on_errors(coverage: Coverage, rows: Sequence[RegionSummary]) -> list[str]:
+    blocks, steps = blocks_of_steps(coverage)
+    if blocks is None:
+        return []
+    if blocks < FEWEST_BLOCKS:
+        return [f"Not enough steps for errors: {blocks} block{'s' * (blocks != 1)}, {FEWEST_BLOCKS} are needed."]
+    notes = [f"± is one standard error, from {blocks} blocks of up to {steps:,} steps in a row."]
+    if any(math.isfinite(row.radius_m) and math.isnan(row.radius_error_m) for row in rows):
+        notes.append("No ± where one block alone has probed the region.")
+    return notes
 
 
 def _cells(row: RegionSummary) -> list[Text]:
-    detection = [percent(probability) for probability in row.detection.values()]
+    radius = metres(row.radius_m, row.radius_error_m)
+    detection = [percent(row.detection[threshold], row.detection_error[threshold]) for threshold in row.detection]
     # As Text, for names may hold what rich takes for markup.
-    return [Text(c) for c in (row.region, row.height, metres(row.radius_m), *detection, percent(row.known_share))]
+    return [Text(cell) for cell in (row.region, row.height, radius, *detection, percent(row.known_share))]
 
 
 def _trouble(coverage: Coverage) -> list[str]:
