@@ -1,0 +1,210 @@
+"""Lenses at their folds and rims."""
+
+from functools import lru_cache, partial
+
+import numpy as np
+import torch
+from kornia.geometry.calibration import undistort_points
+from kornia.geometry.camera.distortion_kannala_brandt import undistort_points_kannala_brandt
+
+from torchcover.cameras import Camera
+
+from .case import Case, most
+
+FOCAL_PX = 400.0
+FOLDING = {"brown_conrady": [-0.3, 0.0, 0.0, 0.0], "kannala_brandt": [-0.15, 0.0, 0.0, 0.0]}
+
+
+@lru_cache
+def folding(model):
+    return Camera(100, 100, FOCAL_PX, FOCAL_PX, 0.0, 0.0, model, FOLDING[model])
+
+
+def fold_px(model):
+    """Where r + k r^3 turns round: r^2 = -1 / 3k, at two thirds of r."""
+    return FOCAL_PX * 2 / 3 * np.sqrt(-1 / (3 * FOLDING[model][0]))
+
+
+@lru_cache
+def near_the_fold(model, side):
+    """Pixels 1 px to 1e-9 px inside of the fold (`side` -1) or outside of it (+1), all around."""
+    radius = fold_px(model) + side * np.geomspace(1e-9, 1.0, 40)[:, None]
+    azimuth = np.linspace(0.0, 2 * np.pi, 50)
+    return torch.from_numpy(np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth)], axis=-1).reshape(-1, 2))
+
+
+def drawn_radius(model, rays):
+    """Radius on the chart of unit directions: the tangent of the angle, or the angle."""
+    across, z = np.hypot(*rays[:, :2].T.astype(np.longdouble)), rays[:, 2].astype(np.longdouble)
+    return across / z if model == "brown_conrady" else np.arctan2(across, z)
+
+
+def image_error_px(model, pixels, rays):
+    """Distance in the image from where the rays are seen, in longdouble."""
+    radius = drawn_radius(model, rays.numpy())
+    seen = FOCAL_PX * radius * (1 + FOLDING[model][0] * radius**2)
+    error = np.abs(seen - np.hypot(*pixels.numpy().T))
+    return most(error) if (rays.isfinite().all(1)).all() else np.inf
+
+
+def our_rays(model, pixels):
+    return folding(model).rays(pixels)[0]
+
+
+def inside_fold(model, inverse):
+    pixels = near_the_fold(model, -1)
+    return image_error_px(model, pixels, inverse(model, pixels))
+
+
+def kornia_rays(model, pixels):
+    """Directions from kornia's inverse, which iterates a fixed number of times."""
+    camera = folding(model)
+    if model == "kannala_brandt":
+        plane = undistort_points_kannala_brandt(pixels, torch.cat([camera.intrinsics, camera.coefficients]))
+    else:
+        matrix, identity = torch.diag(torch.tensor([FOCAL_PX, FOCAL_PX, 1.0]).double()), torch.eye(3).double()
+        plane = undistort_points(pixels, matrix, camera.coefficients, identity)
+    return torch.nn.functional.pad(plane, (0, 1), value=1.0)
+
+
+def outside_fold(model, inverse):
+    return int(inverse(model, near_the_fold(model, 1)).isfinite().all(1).sum())
+
+
+def one_pixel_inside(model, inverse):
+    """Direction a pixel inside of the fold, against the trigonometric root of the cubic."""
+    image = np.longdouble((fold_px(model) - 1.0) / FOCAL_PX)
+    fold = np.sqrt(-1 / (3 * np.longdouble(FOLDING[model][0])))
+    root = 2 * fold * np.sin(np.arcsin(1.5 * image / fold) / 3)
+    rays = inverse(model, torch.tensor([[fold_px(model) - 1.0, 0.0]], dtype=torch.float64))
+    return float(abs(drawn_radius(model, rays.numpy())[0] - root))
+
+
+# Wide angles
+
+
+FISHEYE = (-0.02, 0.003, -0.001, 0.0001)
+WIDE = Camera(100, 100, FOCAL_PX, FOCAL_PX, 0.0, 0.0, "kannala_brandt", FISHEYE)
+
+
+@lru_cache
+def sideways():
+    """Pixels of directions 89.9999999 to 100 degrees off the axis, 90 degrees among them."""
+    off_axis = np.deg2rad(np.append(90 + np.geomspace(1e-7, 10, 20), [90, 90 - 1e-7]))
+    image = off_axis.astype(np.longdouble)
+    gain = sum((k * image ** (2 * n + 2) for n, k in enumerate(FISHEYE)), start=np.longdouble(1))
+    pixels = torch.from_numpy(np.stack([FOCAL_PX * image * gain, 0 * image], axis=1).astype(np.float64))
+    return pixels, off_axis
+
+
+def fisheye_angles():
+    pixels, off_axis = sideways()
+    rays = WIDE.rays(pixels)[0].numpy()
+    return most(np.arctan2(rays[:, 0], rays[:, 2]) - off_axis)
+
+
+def fisheye_angles_kornia():
+    pixels, off_axis = sideways()
+    plane = undistort_points_kannala_brandt(pixels, torch.cat([WIDE.intrinsics, WIDE.coefficients]))
+    return most(np.arctan2(plane[:, 0].numpy(), 1.0) - off_axis)
+
+
+def z_depth_sideways():
+    """Points that pixels at 90 degrees and beyond become when their depth is along the axis."""
+    camera = Camera(2400, 1, FOCAL_PX, FOCAL_PX, -10.0, 0.0, "kannala_brandt", FISHEYE)
+    sideways = camera.rays()[0][..., 2] <= 0
+    points = camera.unproject(torch.where(sideways, 5.0, 0.0))
+    return len(points) if sideways.any() else np.inf
+
+
+def z_depth_by_division():
+    camera = Camera(2400, 1, FOCAL_PX, FOCAL_PX, -10.0, 0.0, "kannala_brandt", FISHEYE)
+    rays, _ = camera.rays()
+    points = rays * (5.0 / rays[..., 2:])
+    return int((points.isfinite().all(dim=-1) & (rays[..., 2] <= 0)).sum())
+
+
+# Model -> coefficients, and radius of the image at which it folds.
+RIMS = {
+    "eucm": ([0.6, 1.1], (1.1 * 0.2) ** -0.5),
+    "double_sphere": ([-0.2, 0.6], 0.2**-0.5),
+    "mei": ([1.5], 1.25**-0.5),
+}
+
+
+@lru_cache
+def at_the_rim(model):
+    """Pixels from the rim of the image inwards, by roundings and then more, all around."""
+    inwards = np.append(np.geomspace(4e-16, 1e-2, 50), 0.5)
+    azimuth = np.linspace(0.1, 6.2, 20)[:, None]
+    radius = FOCAL_PX * RIMS[model][1] * (1 - inwards)
+    return torch.from_numpy(np.stack([radius * np.cos(azimuth), radius * np.sin(azimuth)], axis=-1).reshape(-1, 2))
+
+
+def rim():
+    """Distance from pixels to where their rays are seen; infinite if one has no ray or is not shown."""
+    errors = []
+    for model, (coefficients, _) in RIMS.items():
+        camera, pixels = Camera(100, 100, FOCAL_PX, FOCAL_PX, 0.0, 0.0, model, coefficients), at_the_rim(model)
+        errors.append(most((camera.project(camera.rays(pixels)[0])[0] - pixels).numpy()))
+    return max(errors)
+
+
+def rim_in_float32():
+    """EUCM's closed form."""
+    (alpha, beta), _ = RIMS["eucm"]
+    pixels = at_the_rim("eucm")
+    a, b = (pixels / FOCAL_PX).float().unbind(1)
+    s = beta * (a * a + b * b)
+    z = (1 - alpha * alpha * s) / (alpha * torch.sqrt(1 - (2 * alpha - 1) * s) + 1 - alpha)
+    below = alpha * torch.sqrt(beta * (a * a + b * b) + z * z) + (1 - alpha) * z
+    return most((FOCAL_PX * torch.stack((a / below, b / below), 1) - pixels).numpy())
+
+
+def double_sphere_hidden(shown):
+    """Directions up to 0.001 degrees before the image of a double sphere folds, that are said not to be seen."""
+    (xi, alpha), _ = RIMS["double_sphere"]
+    off_axis = np.deg2rad(np.linspace(0.0, 180.0, 180_001))
+    second = xi + np.cos(off_axis)
+    radius = np.sin(off_axis) / (alpha * np.hypot(np.sin(off_axis), second) + (1 - alpha) * second)
+    off_axis = off_axis[: np.argmax(np.diff(radius) < 0)]
+    return int((~shown(np.stack([np.sin(off_axis), 0 * off_axis, np.cos(off_axis)], axis=1), xi, alpha)).sum())
+
+
+def projected(points, *coefficients):
+    camera = Camera(100, 100, FOCAL_PX, FOCAL_PX, 0.0, 0.0, "double_sphere", coefficients)
+    return camera.project(torch.from_numpy(points))[0].isfinite().all(dim=1).numpy()
+
+
+def by_the_paper(points, xi, alpha):
+    """z > -w2 |p| as Usenko et al. 2018 give it."""
+    w1 = (1 - alpha) / alpha
+    return points[:, 2] > -(w1 + xi) / np.sqrt(2 * w1 * xi + xi * xi + 1)
+
+
+def folds(name, model, naive_way, naive_fails):
+    """The cases of one lens with a fold."""
+    return [
+        Case(f"{name}, 1 to 1e-9 px inside its fold", "longdouble", "px", 1e-9, partial(inside_fold, model, our_rays),
+             naive_way, partial(inside_fold, model, kornia_rays)),
+        Case(f"{name}, 1 px inside its fold", "root of the cubic", "rad", 1e-10,
+             partial(one_pixel_inside, model, our_rays),
+             naive_way, partial(one_pixel_inside, model, kornia_rays), naive_fails),
+        Case(f"{name}, 1e-9 to 1 px outside its fold", "no ray", "of 2,000 answered", 0,
+             partial(outside_fold, model, our_rays),
+             naive_way, partial(outside_fold, model, kornia_rays)),
+    ]  # fmt: skip
+
+
+CASES = [
+    *folds("Brown-Conrady", "brown_conrady", "kornia, 5 iterations", True),
+    *folds("Kannala-Brandt", "kannala_brandt", "kornia", False),
+    Case("fisheye at 90 degrees off its axis and beyond", "longdouble", "rad", 1e-11, fisheye_angles,
+         "kornia", fisheye_angles_kornia),
+    Case("z-depth at 90 degrees and beyond", "no point", "points made", 0, z_depth_sideways,
+         "ray times depth / z", z_depth_by_division),
+    Case("unified models at their rim", "closed form, and back", "px", 1e-9, rim, "EUCM in float32", rim_in_float32),
+    Case("double sphere up to its fold", "every one is seen", "of 123,237 hidden", 0,
+         partial(double_sphere_hidden, projected), "the limit of its paper",
+         partial(double_sphere_hidden, by_the_paper)),
+]  # fmt: skip

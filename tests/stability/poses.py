@@ -1,0 +1,127 @@
+"""Poses and points where angles, lengths and types run out."""
+
+from functools import lru_cache, partial
+
+import numpy as np
+import torch
+
+from torchcover.cameras import Camera
+from torchcover.geometry import (
+    euler_from_rotation,
+    invert,
+    rigid,
+    rotation_from_euler,
+    rotation_from_quaternion,
+    transform,
+)
+
+from .case import Case, most
+
+
+def as_angle(rotation, other):
+    """Angle between rotations in radians, as the size of their difference."""
+    return float(np.abs(rotation - other).max())
+
+
+STEEP = (90.0, -90.0, 90.0 - 3e-8, 90.0 - 1e-7, 1e-7 - 90.0, 90.0 - 1e-5)
+
+
+@lru_cache
+def steep_rotations():
+    """Rotations pitched by +-90 degrees and nearly so, as products of others: with the rounding of real ones."""
+    generator = np.random.default_rng(0)
+    turns = [rotation_from_euler(*generator.uniform(-180, 180, 3)) for _ in range(200)]
+    yaw_roll = generator.uniform(-180, 180, size=(200, 2))
+    return [
+        turn @ (turn.T @ rotation_from_euler(yaw, pitch, roll))
+        for turn, (yaw, roll) in zip(turns, yaw_roll, strict=True)
+        for pitch in STEEP
+    ]
+
+
+def steep(euler):
+    return max(as_angle(rotation_from_euler(*euler(rotation)), rotation) for rotation in steep_rotations())
+
+
+def euler_by_the_book(r):
+    """Each angle on its own."""
+    angles = np.arctan2(r[1, 0], r[0, 0]), np.arcsin(np.clip(-r[2, 0], -1, 1)), np.arctan2(r[2, 1], r[2, 2])
+    return np.rad2deg(angles)
+
+
+def straight_down():
+    """A sensor pitched by 90 degrees looks down, and by -90 degrees up: the error of its axis."""
+    return max(as_angle(rotation_from_euler(yaw, pitch, 0.0)[:, 0], [0, 0, -np.sign(pitch)])
+               for yaw in (0.0, 33.0, -120.0) for pitch in (90.0, -90.0))  # fmt: skip
+
+
+def straight_down_in_float32():
+    pitch = np.deg2rad(np.float32(90.0))
+    return most([np.cos(pitch), np.sin(pitch) - 1])
+
+
+def quaternions(of):
+    """Quaternions of any length are the same rotation; the largest deviation over lengths from 1e-300 to 1e300."""
+    unit = np.array([0.5, -0.5, 0.5, 0.5])
+    return max(as_angle(of(unit * 10.0**exponent), of(unit)) for exponent in range(-300, 301, 20))
+
+
+def quaternion_by_norm(wxyz):
+    with np.errstate(all="ignore"):
+        w, x, y, z = np.nan_to_num(wxyz / np.sqrt((wxyz**2).sum()), nan=0.0, posinf=1.0, neginf=-1.0)
+    return np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                     [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                     [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)]])  # fmt: skip
+
+
+@lru_cache
+def far_pose(offset_m):
+    points = np.random.default_rng(1).uniform(-80, 80, size=(500, 3))
+    return rigid(rotation_from_euler(37.0, 2.0, -1.0), [offset_m, -offset_m, 300.0]), points
+
+
+def there_and_back(offset_m):
+    world_T_vehicle, points = far_pose(offset_m)
+    return most(transform(invert(world_T_vehicle), transform(world_T_vehicle, points)) - points)
+
+
+def there_and_back_in_float32(offset_m):
+    pose, points = far_pose(offset_m)
+    there, back = pose.astype(np.float32), invert(pose).astype(np.float32)
+    world = points.astype(np.float32) @ there[:3, :3].T + there[:3, 3]
+    return most(world @ back[:3, :3].T + back[:3, 3] - points)
+
+
+@lru_cache
+def camera_cloud():
+    """A camera on a vehicle, points within 100 m of it, float32, and where they are in the vehicle frame."""
+    camera = Camera.from_fov(10, 10, 90.0, vehicle_T_camera=rigid(rotation_from_euler(30.0, 20.0, 10.0), [1, 2, 3]))
+    points = torch.from_numpy(np.random.default_rng(2).uniform(-100, 100, size=(1000, 3))).float()
+    return camera, points, transform(camera.vehicle_T_camera, points.double().numpy())
+
+
+def moved_under_autocast(move):
+    camera, points, expected = camera_cloud()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        return most(move(camera, points).double().numpy() - expected)
+
+
+def moved_by_product(camera, points):
+    pose = torch.from_numpy(camera.vehicle_T_camera).float()
+    return points @ pose[:3, :3].T + pose[:3, 3]
+
+
+CASES = [
+    Case("pitch of +-90 degrees and 3e-8 beside, to angles and back", "the same rotation", "rad", 2e-9,
+         partial(steep, euler_from_rotation), "each angle on its own", partial(steep, euler_by_the_book)),
+    Case("axis of a sensor pitched by +-90 degrees", "-z, +z", "rad", 1e-15, straight_down,
+         "float32", straight_down_in_float32),
+    Case("quaternions of length 1e-300 to 1e300", "the same rotation", "rad", 1e-15,
+         partial(quaternions, rotation_from_quaternion), "divided by its norm",
+         partial(quaternions, quaternion_by_norm)),
+    Case("there and back, 1e7 m from the origin", "the same points", "m", 1e-8, partial(there_and_back, 1e7),
+         "float32", partial(there_and_back_in_float32, 1e7)),
+    Case("camera points to the vehicle under autocast", "float64", "m", 1e-5,
+         partial(moved_under_autocast, Camera.to_vehicle), "matrix product",
+         partial(moved_under_autocast, moved_by_product)),
+]  # fmt: skip

@@ -1,0 +1,245 @@
+"""Ray casting at the extremes, against closed forms."""
+
+from functools import lru_cache, partial
+
+import numpy as np
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from torchcover.geometry import rigid, rotation_from_euler, transform
+from torchcover.simulation.raycaster import RayCaster
+from torchcover.simulation.rays import into_tiles
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.shapes import Box, Mesh, Plane
+from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.world import Actor, World
+
+from .case import Case, most, relative
+
+ROOM_M = np.array([60.37, 40.59, 12.83])
+
+
+def box(*size_m):
+    return Box.model_validate({"type": "box", "size_m": size_m}).mesh()
+
+
+def plane(*size_m):
+    return Plane.model_validate({"type": "plane", "size_m": size_m}).mesh()
+
+
+def at(*position_m):
+    return rigid(np.eye(3), position_m)
+
+
+@lru_cache
+def directions(count, seed=0):
+    """(3, N) float32 unit vectors all around."""
+    rows = np.random.default_rng(seed).normal(size=(3, count))
+    return (rows / np.linalg.norm(rows, axis=0)).astype(np.float32)
+
+
+def cast(bodies, origin_m, towards):
+    return RayCaster(bodies).cast(np.asarray(origin_m), towards, np.full(towards.shape[1], np.inf, np.float32))
+
+
+def bare_embree(bodies, origin_m, towards, robust=True):
+    """(N,) distances from Embree as it comes; a miss is infinite."""
+    scene = EmbreeScene(robust=robust)
+    for body in bodies:
+        TriangleMesh(scene, body.vertices_m.astype(np.float32), body.faces.astype(np.int32))
+    origins = np.repeat(np.asarray(origin_m, dtype=np.float32)[None], towards.shape[1], axis=0)
+    answer = scene.run(origins, towards.T, output=True)
+    return np.where(answer["geomID"] >= 0, answer["tfar"], np.inf)
+
+
+def moeller_trumbore(mesh, origin_m, towards, least_determinant=1e-6):
+    """(N,) distances by the formula, in float32, with the customary epsilon; a miss is infinite."""
+    a, b, c = (mesh.vertices_m[mesh.faces[:, k]].astype(np.float32) for k in range(3))
+    d, s = towards.T[:, None], np.asarray(origin_m, dtype=np.float32) - a
+    with np.errstate(all="ignore"):
+        p = np.cross(d, c - a)
+        determinant = ((b - a) * p).sum(-1)
+        q = np.cross(s, b - a)
+        u, v, t = (s * p).sum(-1) / determinant, (d * q).sum(-1) / determinant, ((c - a) * q).sum(-1) / determinant
+        hit = (np.abs(determinant) > least_determinant) & (u >= 0) & (v >= 0) & (u + v <= 1) & (t >= 0)
+    return np.where(hit, t, np.inf).min(axis=1)
+
+
+def to_walls(towards, lower_m, upper_m):
+    """(N,) distance from the origin to the walls of a room around it, for the float32 directions as they are."""
+    with np.errstate(divide="ignore"):
+        walls = np.where(towards.T < 0, -np.asarray(lower_m), np.asarray(upper_m)) / np.abs(
+            towards.T.astype(np.float64)
+        )
+    return walls.min(axis=1)
+
+
+def missed(range_m):
+    return int((~np.isfinite(range_m)).sum())
+
+
+# A room around the sensor
+
+
+def far_room(offset_m):
+    """Walls at UTM-like coordinates, and a vehicle among them."""
+    here = np.array([offset_m, -offset_m, 0.0])
+    ego = Actor("ego", "car", box(0.1, 0.1, 0.1), Trajectory.resting(here))
+    return World(static=(box(*ROOM_M).moved(at(*here)),), ego=ego)
+
+
+def from_mid_room(caster):
+    """Upward rays, which pass the vehicle by, from 2 m above the floor."""
+    towards = directions(5000) * np.sign(directions(5000)[2])
+    return most(caster(towards) - to_walls(towards, -ROOM_M / 2, ROOM_M * [0.5, 0.5, 1.0] - [0.0, 0.0, 2.0]))
+
+
+def offset(offset_m):
+    instant = Scene(far_room(offset_m)).at(0)
+    return from_mid_room(lambda rays: instant.range_image(at(0.0, 0.0, 2.0), rays[:, None].astype(np.float64))[0])
+
+
+def offset_in_float32(offset_m):
+    return from_mid_room(partial(bare_embree, far_room(offset_m).static, [offset_m, -offset_m, 2.0]))
+
+
+def scaled(scale, caster):
+    """The room in other units; the sensor in its middle."""
+    room = box(*ROOM_M).moved(at(0.0, 0.0, -ROOM_M[2] / 2))
+    mesh = Mesh(room.vertices_m * scale, room.faces)
+    return relative(caster(mesh), to_walls(directions(5000), -ROOM_M / 2, ROOM_M / 2) * scale)
+
+
+def ours_scaled(scale):
+    return scaled(scale, lambda mesh: cast([mesh], np.zeros(3), directions(5000)).range_m)
+
+
+def naive_scaled(scale):
+    return scaled(scale, lambda mesh: moeller_trumbore(mesh, np.zeros(3), directions(5000)))
+
+
+# Grazing, touching, coincident
+
+
+def grazing(caster):
+    """Elevations from -1 to -0.0005 degrees, 1.7 m above a plane of 1,000 km: hits up to 195 km away."""
+    elevation = np.deg2rad(-np.geomspace(5e-4, 1.0, 2000))
+    towards = np.stack([np.cos(elevation), 0 * elevation, np.sin(elevation)]).astype(np.float32)
+    height_m = np.float32(1.7).astype(np.longdouble)
+    return relative(caster(plane(1e6, 1e6), [0.0, 0.0, 1.7], towards), height_m / -towards[2].astype(np.longdouble))
+
+
+@lru_cache
+def tilted_floor_and_ceiling():
+    """Two planes 3 m apart in general position, places on the lower one, directions away from it, and the ranges."""
+    rotation = rotation_from_euler(37.0, 21.0, -13.0)
+    floor_T = rigid(rotation, [1.0, 2.0, 3.0])
+    floor = plane(200.0, 200.0).moved(floor_T)
+    ceiling = plane(4000.0, 4000.0).moved(floor_T @ at(0.0, 0.0, 3.0))
+    generator = np.random.default_rng(3)
+    places = np.append(generator.uniform(-80, 80, size=(20, 2)), np.zeros((20, 1)), axis=1)
+    towards = directions(500).astype(np.float64)
+    towards[2] = np.abs(towards[2]) + 0.01
+    towards = (rotation @ (towards / np.linalg.norm(towards, axis=0))).astype(np.float32)
+    return (floor, ceiling), transform(floor_T, places), towards, 3.0 / (rotation[:, 2] @ towards)
+
+
+def from_a_surface(caster):
+    """Rays that do not reach the ceiling where it is."""
+    bodies, places, towards, expected = tilted_floor_and_ceiling()
+    found = [caster(bodies, place, towards) for place in places]
+    return sum(int((~(np.abs(range_m - expected) < 1e-3 * expected)).sum()) for range_m in found)
+
+
+def coincident(caster):
+    """Two boxes with a wall in one plane, one inside the outline of the other."""
+    boxes = box(1.0, 1.0, 1.0).moved(at(5.0, 0.0, -0.5)), box(1.0, 3.0, 3.0).moved(at(5.0, 0.0, -1.5))
+    y, z = np.random.default_rng(4).uniform(-0.49, 0.49, size=(2, 5000))
+    ends = np.stack([np.full(5000, 4.5), y, z])
+    towards = (ends / np.linalg.norm(ends, axis=0)).astype(np.float32)
+    return most(caster(boxes, np.zeros(3), towards) - 4.5 / towards[0].astype(np.float64))
+
+
+# Cones
+
+
+def tile_of(angle_rad):
+    """A tile of two rays this far apart."""
+    elevation = np.array([-angle_rad / 2, angle_rad / 2])
+    return np.stack([np.cos(elevation), 0 * elevation, np.sin(elevation)])[:, :, None]
+
+
+def narrow(angle_rad):
+    (tile,) = into_tiles(tile_of(angle_rad))
+    return relative(tile.half_angle, angle_rad / 2)
+
+
+def narrow_by_arccos(angle_rad):
+    rays = tile_of(angle_rad)[:, :, 0]
+    return relative(np.arccos(np.clip(rays.mean(axis=1) @ rays, -1, 1)).max(), angle_rad / 2)
+
+
+@lru_cache
+def small_and_far():
+    """A box of 0.2 m at 250 m that moves, and rays that end 0.1 mm to 20 mm inside its corners."""
+    mesh, place = box(0.2, 0.2, 0.2), np.array([200.0, 150.0, 0.0])
+    track = Trajectory.of([0.0, 1.0], np.stack([place, place + np.array([0.0, 0.0, 1.0])]), [[0.0, 0.0, 0.0]] * 2)
+    ego = Actor("ego", "car", box(0.1, 0.1, 0.1), Trajectory.resting([0.0, 0.0, 0.0]))
+    inwards = np.geomspace(1e-3, 0.2, 200)[:, None, None]
+    ends = mesh.vertices_m * (1 - inwards) + mesh.vertices_m.mean(axis=0) * inwards + place - [0.0, 0.0, 1.0]
+    towards = ends.reshape(-1, 3) / np.linalg.norm(ends.reshape(-1, 3), axis=1, keepdims=True)
+    return World(static=(), ego=ego, actors=(Actor("body", "box", mesh, track),), duration_s=1.0), towards.T
+
+
+def lost_at_corners():
+    world, towards = small_and_far()
+    return missed(Scene(world).at(0).range_image(at(0.0, 0.0, 1.0), towards[:, None]))
+
+
+def lost_by_cosine():
+    """Of the rays that meet the body, those outside the cone around it by a cosine in float32."""
+    world, towards = small_and_far()
+    mesh = world.actors[0].mesh
+    centre = mesh.vertices_m.mean(axis=0) + np.array([200.0, 150.0, -1.0])
+    distance, radius = (
+        np.linalg.norm(centre),
+        np.linalg.norm(mesh.vertices_m - mesh.vertices_m.mean(axis=0), axis=1).max(),
+    )
+    cosine = (centre / distance).astype(np.float32) @ towards.astype(np.float32)
+    return int((cosine <= np.cos(np.arcsin(radius / distance))).sum())
+
+
+def ours(bodies, origin_m, towards):
+    return cast(bodies, origin_m, towards).range_m
+
+
+def alone(mesh, origin_m, towards):
+    return ours([mesh], origin_m, towards)
+
+
+def formula(bodies, origin_m, towards):
+    return np.minimum.reduce([moeller_trumbore(body, origin_m, towards) for body in bodies])
+
+
+FORMULA = "Möller-Trumbore, float32"
+
+CASES = [
+    Case("world 1e6 m from the origin", "closed form", "m", 2e-5, partial(offset, 1e6 + 0.3),
+         "Embree in world coordinates", partial(offset_in_float32, 1e6 + 0.3)),
+    Case("world 1e7 m from the origin", "closed form", "m", 2e-5, partial(offset, 1e7 + 0.3),
+         "Embree in world coordinates", partial(offset_in_float32, 1e7 + 0.3)),
+    Case("a room of 1e-9 m", "closed form", "relative", 1e-6, partial(ours_scaled, 1e-10),
+         FORMULA + ", epsilon 1e-6", partial(naive_scaled, 1e-10)),
+    Case("a room of 1e9 m", "closed form", "relative", 1e-6, partial(ours_scaled, 1e7),
+         FORMULA + ", epsilon 1e-6", partial(naive_scaled, 1e7), naive_fails=False),
+    Case("grazing rays, down to 0.0005 degrees", "longdouble", "relative", 1e-6, partial(grazing, alone),
+         FORMULA + ", epsilon 1e-6", partial(grazing, moeller_trumbore), naive_fails=False),
+    Case("rays from a surface", "closed form", "of 10,000 wrong", 0, partial(from_a_surface, ours),
+         "Embree as it comes", partial(from_a_surface, bare_embree)),
+    Case("coincident surfaces of two bodies", "closed form", "m", 2e-6, partial(coincident, ours),
+         FORMULA, partial(coincident, formula), naive_fails=False),
+    Case("a cone of rays 1e-9 rad wide", "closed form", "relative", 1e-6, partial(narrow, 1e-9),
+         "arccos of the dot product", partial(narrow_by_arccos, 1e-9)),
+    Case("corners of a moving box of 0.2 m at 250 m", "every ray hits", "of 1,600 missed", 0, lost_at_corners,
+         "cone by a float32 cosine", lost_by_cosine),
+]  # fmt: skip

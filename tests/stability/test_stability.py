@@ -1,0 +1,51 @@
+"""Every case of the stability table of docs/accuracy.md stays within its bound, with every backend of the search."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover.simulation.raycaster import RayCaster
+from torchcover.simulation.shapes import Mesh
+
+from . import faces, lenses, metric, poses, rays, search
+from .case import CPU_SEARCHES, CUDA_SEARCHES
+
+
+def cases_of(*rooms):
+    return [case for room in rooms for case in room.CASES if not case.benchmark_only]
+
+
+def each(cases):
+    return pytest.mark.parametrize("case", cases, ids=lambda case: case.name)
+
+
+@each(cases_of(search, metric))
+@pytest.mark.parametrize("backend", CPU_SEARCHES, ids=str)
+def test_with_every_backend(case, backend):
+    assert case.ours(backend) <= case.bound
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@each(cases_of(search, metric))
+@pytest.mark.parametrize("backend", CUDA_SEARCHES, ids=str)
+def test_on_cuda(case, backend):
+    assert case.ours(backend) <= case.bound
+
+
+@each(cases_of(rays, faces, lenses, poses))
+def test_without_a_search(case):
+    assert case.ours() <= case.bound
+
+
+@each([case for case in cases_of(search, metric, rays, faces, lenses, poses) if case.naive_fails])
+def test_the_naive_way_is_found_out(case):
+    """So that a case whose bound is too wide, or that measures nothing, is noticed."""
+    assert case.naive() > case.bound
+
+
+@pytest.mark.parametrize("coordinate_m", [1e10, 1e300, np.nan])
+def test_a_mesh_that_float32_cannot_hold_is_refused(coordinate_m):
+    """Embree would leave its faces out."""
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, coordinate_m, 0.0]])
+    with pytest.raises(ValueError, match=r"within 1e.09 m of the origin"):
+        RayCaster([Mesh(np.eye(3), np.array([[0, 1, 2]])), Mesh(corners, np.array([[0, 1, 2]]))])
