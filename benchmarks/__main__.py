@@ -3,7 +3,20 @@
 import importlib
 import sys
 
-BENCHMARKS = ("nearest", "crossover", "raycasting", "paper_step", "memory", "imports")
+BENCHMARKS = (
+    "nearest",
+    "crossover",
+    "raycasting",
+    "paper_step",
+    "memory",
+    "imports",
+    "stability",
+    "trade_offs",
+    "moving_actors",
+    "urban_throughput",
+    "five_rigs",
+    "omissions",
+)
 
 
 def main(names):

@@ -49,7 +49,8 @@ def main():
                 list(pool.map(lambda part: bare.run(*part, output=True), rays))
 
             def generate_and_cast(pose=pose):
-                list(pool.map(lambda tile: instant._cast_tile(pose, tile, np.inf), tiles))
+                bodies = instant._outlines(pose[:3, 3])
+                list(pool.map(lambda tile: instant._cast_tile(pose, tile, np.inf, bodies), tiles))
 
             def scan(pose=pose):
                 instant.scan(pose, tiles, threads=THREADS)

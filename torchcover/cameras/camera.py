@@ -348,8 +348,9 @@ class Camera:
 
     @staticmethod
     def _moved(points: Tensor, matrix: Matrix) -> Tensor:
-        transform = torch.as_tensor(matrix, dtype=points.dtype, device=points.device)
-        return points @ transform[:3, :3].T + transform[:3, 3]
+        # In float64, which neither autocast nor TF32 rounds: either would cost decimetres.
+        transform = torch.as_tensor(matrix, dtype=torch.float64, device=points.device)
+        return (points.double() @ transform[:3, :3].T + transform[:3, 3]).to(points.dtype)
 
 
 def _vector(values: Sequence[Scalar]) -> Tensor:

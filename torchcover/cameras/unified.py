@@ -114,8 +114,11 @@ class DoubleSphereChart:
     def draw(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Directions before the fold."""
         xi, alpha = number(self.xi), number(self.alpha)
+        # The image folds where the direction as seen from the second centre has the cosine -w1; w2 is that cosine as
+        # seen from the first. (The paper's w2 takes both distances to that point as 1, and ends degrees too early.)
         w1 = min(alpha, 1.0 - alpha) / max(alpha, 1.0 - alpha)
-        w2 = (w1 + xi) / sqrt(2.0 * w1 * xi + xi * xi + 1.0)
+        across = 1.0 - w1 * w1
+        w2 = xi * across + w1 * sqrt(1.0 - xi * xi * across)
         norm = _norm(x, y, z)
         second = self.xi * norm + z
         below = self.alpha * _norm(x, y, second) + (1.0 - self.alpha) * second

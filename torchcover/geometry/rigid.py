@@ -79,7 +79,11 @@ def euler_from_rotation(rotation: Matrix) -> Matrix:
     horizontal = np.hypot(r[..., 0, 0], r[..., 1, 0])
     upright = horizontal < 1e-9
     yaw = np.where(upright, np.arctan2(-r[..., 0, 1], r[..., 1, 1]), np.arctan2(r[..., 1, 0], r[..., 0, 0]))
-    roll = np.where(upright, 0.0, np.arctan2(r[..., 2, 1], r[..., 2, 2]))
+    # Near the vertical yaw and roll are each uncertain. With the roll taken from what this very yaw leaves of the
+    # rotation, their errors cancel.
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    left = sine * r[..., 0, 2] - cosine * r[..., 1, 2], cosine * r[..., 1, 1] - sine * r[..., 0, 1]
+    roll = np.where(upright, 0.0, np.arctan2(*left))
     pitch = np.arctan2(-r[..., 2, 0], horizontal)
     angles: Matrix = np.rad2deg(np.stack([yaw, pitch, roll], axis=-1))
     return angles
@@ -98,10 +102,11 @@ def rotation_from_quaternion(wxyz: ArrayLike) -> Matrix:
     quaternion = np.asarray(wxyz, dtype=np.float64)
     if quaternion.shape != (4,) or not np.isfinite(quaternion).all():
         raise ValueError(f"a quaternion needs four finite numbers w, x, y, z; got {wxyz!r}")
-    norm = float(np.linalg.norm(quaternion))
-    if norm == 0.0:
+    largest = float(np.abs(quaternion).max())
+    if largest == 0.0:
         raise ValueError("a quaternion of norm 0 is no rotation; the identity is [1, 0, 0, 0] (w, x, y, z)")
-    w, x, y, z = quaternion / norm
+    scaled = quaternion / largest  # whose square neither overflows nor vanishes
+    w, x, y, z = scaled / np.linalg.norm(scaled)
     return np.array(
         [
             [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

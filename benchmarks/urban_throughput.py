@@ -1,0 +1,134 @@
+"""Steps a second in `urban` with two workers, the metric included, and how the time of a step divides."""
+
+import time
+from collections import Counter
+from contextlib import contextmanager
+
+import torch
+from torch.utils.data import DataLoader
+
+from benchmarks.timing import table
+from torchcover import BevGrid, CoverageMetric, forward_regions
+from torchcover.coverage import metric as metric_module
+from torchcover.data import SimulatedFrames, collate_frames
+from torchcover.simulation import EvenReference, ReferenceSensor
+from torchcover.simulation.instant import Instant
+from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.scene import Scene
+
+RIG = "front_roof_128"
+WORKERS = 2
+# Both workers have built their world by then, and the queue is full.
+FIRST, LAST = 10, 110
+STAGE_STEPS = 40
+# Where the time of a step goes, by the functions that take it. A reference sensor's scans are not a mounted sensor's.
+STAGES = {
+    (Scene, "at"): "placing what moves",
+    (MountedSensor, "scan"): "rays of the rig",
+    (Instant, "buried"): "rays of the reference",
+    (Instant, "scan"): "rays of the reference",
+    (EvenReference, "tiles"): "rays of the reference",
+    (EvenReference, "weights"): "rays of the reference",
+    (ReferenceSensor, "tiles"): "rays of the reference",
+    (metric_module, "nearest"): "search",
+    (CoverageMetric, "update"): "binning",
+}
+
+
+def main():
+    """Print both tables, for the paper's pattern of reference rays and for one spread evenly."""
+    areas = tuple((region.x, region.y) for region in forward_regions())
+    references = {
+        "256 x 256, the paper's": ReferenceSensor(rows=256, columns=256),
+        "65,536 spread evenly": EvenReference(areas, rays=65_536),
+    }
+    rates, divided = [], []
+    for name, reference in references.items():
+        frames = SimulatedFrames("urban", RIG, steps=LAST, seed=0, reference=reference)
+        rates.append((name, steps_a_second(frames)))
+        start = time.perf_counter()
+        frames.scene_of(0)
+        built_s = time.perf_counter() - start
+        stages = time_of_stages(frames)
+        total_s = sum(stages.values())
+        divided += [(name, stage, 1000 * taken / STAGE_STEPS, taken / total_s) for stage, taken in stages.items()]
+        divided.append((name, "(building 60 s of traffic, once)", 1000 * built_s, ""))
+    table(("reference rays", f"steps/s, {WORKERS} workers"), rates)
+    print()
+    table(("reference rays", "stage, one thread", "a step (ms)", "share"), divided)
+
+
+def new_metric():
+    """The metric of the command line."""
+    grid = BevGrid(x=(-40.0, 160.0), y=(-40.0, 40.0), cell=0.25)
+    return CoverageMetric(grid, (0.4,), max_radius=grid.diagonal_m)
+
+
+def update(metric, frame):
+    """Add one step."""
+    metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, index=frame.index)
+
+
+def steps_a_second(frames):
+    """From workers, between the first and the last step that count."""
+    metric = new_metric()
+    for number, batch in enumerate(DataLoader(frames, collate_fn=collate_frames, num_workers=WORKERS)):
+        if number == FIRST:
+            start = time.perf_counter()
+        update(metric, batch.frames[0])
+    return (LAST - FIRST - 1) / (time.perf_counter() - start)
+
+
+def time_of_stages(frames):
+    """Seconds of each stage over some steps, in this process and in one thread."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    with stopwatches() as seconds:
+        # A metric binds its `update` when it is made.
+        metric = new_metric()
+        update(metric, frames[0])
+        seconds.clear()
+        start = time.perf_counter()
+        for index in range(1, STAGE_STEPS + 1):
+            update(metric, frames[index])
+        whole_s = time.perf_counter() - start
+    torch.set_num_threads(threads)
+    return {stage: seconds[stage] for stage in dict.fromkeys(STAGES.values())} | {
+        "all else": whole_s - sum(seconds.values())
+    }
+
+
+@contextmanager
+def stopwatches():
+    """Count the time of the functions in STAGES; one that runs within another counts for itself only."""
+    seconds, running, originals = Counter(), [], {}
+
+    def watched(function, stage):
+        def call(*args, **kwargs):
+            # A mounted sensor scans by the same function as the reference: that is the rig's time.
+            inner = running[-1] if running and running[-1] == "rays of the rig" else stage
+            start = time.perf_counter()
+            running.append(inner)
+            try:
+                return function(*args, **kwargs)
+            finally:
+                running.pop()
+                taken = time.perf_counter() - start
+                seconds[inner] += taken
+                if running:
+                    seconds[running[-1]] -= taken
+
+        return call
+
+    for (owner, name), stage in STAGES.items():
+        originals[owner, name] = getattr(owner, name)
+        setattr(owner, name, watched(originals[owner, name], stage))
+    try:
+        yield seconds
+    finally:
+        for (owner, name), function in originals.items():
+            setattr(owner, name, function)
+
+
+if __name__ == "__main__":
+    main()
