@@ -8,7 +8,7 @@ import sys
 
 import numpy as np
 import pytest
-import typer
+from rich.console import Console
 
 from torchcover import Coverage, CoverageMetric
 
@@ -112,7 +112,7 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
     assert 0 < a.summary()[0].known_share <= 1
     summary = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert summary["frame_counts"]["reference_rays"] == 1024 * 1024
-    assert summary["reference"] == {"sensor": "paper", "rays_per_step": 1024 * 1024}
+    assert summary["reference"] == {"sensor": "paper", "rays_per_step": 1024 * 1024, "every_s": 0.1}
 
 
 def test_the_weights_of_an_even_reference_reach_the_metric(torchcover, worlds, monkeypatch):
@@ -180,8 +180,8 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["evaluate", "front_roof_128", "--reference", "best"], "--reference best: `even` or `paper` is needed"),
         (["evaluate", "front_roof_128", "--rays", "7"], "rays: at least 2 for each of 4 areas are needed; got 7"),
         (["evaluate", "front_roof_128", "--rays", "0"], "--rays"),
-        (["evaluate", "--frames", "x", "--rays", "9"], "--reference and --rays are for simulations"),
-        (["evaluate", "--frames", "x", "--reference", "even"], "--reference and --rays are for simulations"),
+        (["evaluate", "--frames", "x", "--rays", "9"], "--reference, --rays and --every are for simulations"),
+        (["evaluate", "--frames", "x", "--reference", "even"], "--reference, --rays and --every are for simulations"),
         (["measure"], "No such command 'measure'"),
     ],
 )
@@ -212,7 +212,7 @@ def test_an_impossible_output_folder_is_found_before_the_run(torchcover, recordi
 def test_an_output_without_the_signs_of_the_tables_gets_question_marks_not_an_error(torchcover, monkeypatch):
     buffer = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(buffer, encoding="ascii"))
-    monkeypatch.setattr("torchcover.cli.listing.run", lambda: typer.echo("0.3 ± 0.1"))
+    monkeypatch.setattr("torchcover.cli.listing.run", lambda: Console().print("0.3 ± 0.1"))
     assert torchcover("list")[0] == 0
     assert buffer.getvalue() == b"0.3 ? 0.1\n"
 

@@ -105,7 +105,7 @@ def test_errors_are_drawn_if_asked_for_and_differences_come_with_theirs(torchcov
 def test_the_reference_sensor_is_the_one_that_was_asked_for_and_is_named(torchcover, worlds, options, sensor, rays):
     _, printed, _, out = compare(torchcover, worlds, "low", "both", steps=2, options=options)
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["reference"] == {"sensor": sensor, "rays_per_step": rays}
+    assert summary["reference"] == {"sensor": sensor, "rays_per_step": rays, "every_s": 0.1}
     assert summary["frame_counts"]["reference_rays"] == 2 * rays
     assert f"Reference sensor: {sensor}, {rays:,} rays a step." in printed
 

@@ -71,6 +71,7 @@ def evaluate(
     every: options.Every = None,
     target_error: options.TargetErrors = None,
     error_maps: options.ErrorMaps = False,
+    explain: options.Explain = False,
     device: options.Device = "cpu",
     workers: options.Workers = 0,
     skip_bad_frames: Annotated[
@@ -93,6 +94,7 @@ def evaluate(
         every_s=every,
         target=TargetError.parse(target_error or ()),
         error_maps=error_maps,
+        explain=explain,
         device=device,
         workers=workers,
     )
@@ -113,6 +115,7 @@ def compare(
     every: options.Every = None,
     target_error: options.TargetErrors = None,
     error_maps: options.ErrorMaps = False,
+    explain: options.Explain = False,
     device: options.Device = "cpu",
     workers: options.Workers = 0,
 ) -> None:
@@ -132,6 +135,7 @@ def compare(
         every_s=every,
         target=TargetError.parse(target_error or ()),
         error_maps=error_maps,
+        explain=explain,
         device=device,
         workers=workers,
     )

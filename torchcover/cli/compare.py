@@ -9,6 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from torchcover.cli.explain import explanation, left_out
 from torchcover.cli.run import Progression, accumulate, check_out, device_called, new_metric, outline_m, sensor_marks
 from torchcover.cli.settings import Settings, reference_note, reference_record, run_record, simulated_frames
 from torchcover.cli.stopping import TargetWatch, outcome
@@ -75,6 +76,9 @@ def _write(
     reference = reference_record(settings, progression, frames, steps)
     target_record, target_lines = outcome(settings.target, coverages, regions)
     _print(comparison_tables(coverages, regions, [reference_note(reference)]), list(coverages))
+    omissions = left_out(progression.counts, list(coverages.values()))
+    if settings.explain:
+        console.print(explanation(omissions))
     for line in target_lines:
         console.print(line, markup=False, soft_wrap=True)
     for name, coverage in coverages.items():
@@ -87,6 +91,7 @@ def _write(
         "reference": reference,
         **run_record(settings, progression),
         "target_error": target_record,
+        "left_out": omissions,
         **comparison_dict(coverages, regions),
     }
     (settings.out / "summary.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")

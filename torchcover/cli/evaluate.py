@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from torch.utils.data import Dataset, Subset
 
+from torchcover.cli.explain import explanation, left_out
 from torchcover.cli.run import (
     DEFAULT_SCENARIO,
     Progression,
@@ -88,9 +89,15 @@ def _write(coverage: Coverage, request: Request, progression: Progression, frame
     out, regions, console = request.settings.out, forward_regions(), Console()
     out.mkdir(parents=True, exist_ok=True)
     target_record, target_lines = outcome(request.settings.target, {_name(request): coverage}, regions)
-    record = {**_run_record(request, progression, frames, coverage.counts["steps"]), "target_error": target_record}
+    record = {
+        **_run_record(request, progression, frames, coverage.counts["steps"]),
+        "target_error": target_record,
+        "left_out": left_out(progression.counts, [coverage]),
+    }
     notes = [reference_note(record["reference"])] if record["reference"] else []
     console.print(coverage_table(coverage, regions, notes))
+    if request.settings.explain:
+        console.print(explanation(record["left_out"]))
     for line in progression.skipped:
         console.print(f"skipped: {line}", style="yellow", markup=False)
     for line in target_lines:

@@ -35,5 +35,6 @@ TargetErrors = Annotated[
     ),
 ]
 ErrorMaps = Annotated[bool, typer.Option("--error-maps", help="Draw maps of the standard errors too.")]
+Explain = Annotated[bool, typer.Option("--explain", help="Say what was left out because the scene did not need it.")]
 Device = Annotated[str, typer.Option(help="Where the search and the sums run: cpu, cuda, cuda:1, ...")]
 Workers = Annotated[int, typer.Option(min=0, help="Processes that make frames; 0 makes them in this one.")]

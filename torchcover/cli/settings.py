@@ -37,6 +37,7 @@ class Settings:
     every_s: float | None
     target: TargetError | None
     error_maps: bool
+    explain: bool
     device: str
     workers: int
 

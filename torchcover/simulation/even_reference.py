@@ -165,9 +165,8 @@ def _stretch_within(
     far_m = np.full(directions.shape[1], np.inf)
     with np.errstate(divide="ignore", invalid="ignore"):
         for axis in range(3):
-            bounds = np.stack([lower_m[axis] - place_m[axis] + 0 * near_m, upper_m[axis] - place_m[axis] + 0 * near_m])
-            ends = np.sort(bounds / directions[axis], axis=0)
-            near_m, far_m = np.fmax(near_m, ends[0]), np.fmin(far_m, ends[1])
+            ends = [(bound_m[axis] - place_m[axis]) / directions[axis] for bound_m in (lower_m, upper_m)]
+            near_m, far_m = np.fmax(near_m, np.fmin(*ends)), np.fmin(far_m, np.fmax(*ends))
     return near_m, np.maximum(near_m, far_m)
 
 

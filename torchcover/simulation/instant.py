@@ -173,12 +173,12 @@ class Instant:
         hits = cast_from(self.static, self.static_T_vehicle, origin_m, directions, limit_m)
         if own_m is not None:
             hits.body[(hits.body < 0) & (own_m <= limit_m)] = self.ego
-        casts = 0
         farthest_m = float(hits.range_m.max(initial=0.0))
         near = boxes_in_cone(bodies, vehicle_R_sensor @ tile.axis, tile.half_angle, farthest_m)
         if len(near) == 0:
             return directions, hits, 0
         reached = blocks_towards(bodies.kept(near), tile, vehicle_R_sensor, hits.range_m)
+        casts = 0
         # In the order of the bodies: which of two coincident ones a ray hits depends on it.
         for k, blocks in zip(near[reached.any(axis=1)].tolist(), reached[reached.any(axis=1)], strict=True):
             part = self.moving[k]
