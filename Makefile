@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STEPS ?= 24
-RAYS ?= 512
+RAYS ?= 16384
 
 .PHONY: demo test lint types doctest smoke bench paper clean
 
@@ -29,7 +29,7 @@ smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the r
 bench: $(VENV)/.ready  ## the speed and memory figures of docs/performance.md
 	$(BIN)/python -m benchmarks
 
-paper: $(VENV)/.ready  ## the paper's three experiments: make paper STEPS=256 (the paper: STEPS=4096 RAYS=1024)
+paper: $(VENV)/.ready  ## the paper's three experiments and Figure 2: make paper STEPS=256 (docs/paper.md: STEPS=4096)
 	$(BIN)/python -m examples.paper --steps $(STEPS) --rays $(RAYS)
 
 clean:

@@ -192,3 +192,27 @@ def test_traffic_plays_the_same_in_any_order_and_starts_anew_at_its_end(name):
     assert not torch.equal(in_order[0].sensor, in_order[3].sensor)
     other = SimulatedFrames(short, lidar(), steps=1, seed=2, reference=SMALL)[0]
     assert not torch.equal(in_order[0].sensor, other.sensor)
+
+
+def test_a_longer_time_between_frames_shows_the_same_world_later():
+    few = ReferenceSensor(rows=2, columns=2)
+    each = SimulatedFrames("parking", "front_roof_32", steps=1301, seed=1, reference=few)
+    spread = SimulatedFrames("parking", "front_roof_32", steps=3, seed=1, reference=few, every_s=65.0)
+    assert (each.every_s, spread.every_s) == (0.1, 65.0)
+    for index in range(3):  # the last one plays in another world
+        assert torch.equal(spread[index].sensor, each[650 * index].sensor)
+
+
+@pytest.mark.parametrize("every_s", [0.0, -0.1, 0.05, 0.15, float("nan"), float("inf")])
+def test_a_time_between_frames_that_is_no_multiple_of_the_time_step_is_refused(every_s):
+    with pytest.raises(ValueError, match="every_s: a positive multiple of the time step of 'urban', 0.1 s, is needed"):
+        SimulatedFrames("urban", "front_roof_32", steps=1, every_s=every_s)
+
+
+def test_another_reference_sees_the_same_instants_and_builds_nothing_again():
+    base = SimulatedFrames("courtyard", "front_roof_32", steps=2, reference=ReferenceSensor(rows=8, columns=8))
+    other = base.with_reference(ReferenceSensor(rows=16, columns=16))
+    assert other.scene is base.scene
+    assert torch.equal(other[1].sensor, base[1].sensor)
+    assert len(other[1].reference) > len(base[1].reference)
+    assert base.reference.rows == 8

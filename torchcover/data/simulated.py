@@ -1,6 +1,5 @@
 """Frames of a simulated world."""
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -115,7 +114,8 @@ class SimulatedFrames(Dataset[Frame]):
 
     def with_reference(self, reference: ReferenceSensor | EvenReference) -> "SimulatedFrames":
         """The same instants as another reference sensor sees them; the geometry is built once for both."""
-        other = copy.copy(self)
+        other = object.__new__(type(self))
+        other.__dict__ |= self.__dict__  # copy.copy would leave the geometry behind, as pickling does
         other.reference = reference
         return other
 
