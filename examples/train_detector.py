@@ -41,6 +41,7 @@ REGIONS = (Region("0-25m", (0.0, 25.6), (-12.8, 12.8)), Region("0-51m", X_M, Y_M
 # A car that the rig hardly touched teaches nothing; in the evaluation it counts.
 LEAST_HITS = 3
 SCORES = tuple(np.linspace(0.05, 0.95, 46).round(3).tolist())
+# The one of SCORES at which recall is shown.
 OPERATING_SCORE = 0.31
 MATCH_M = 2.0
 
@@ -59,7 +60,7 @@ def thinned(cloud):
     """The points of the region, one a voxel."""
     x, y, z = cloud.T
     cloud = cloud[(x >= X_M[0]) & (x < X_M[1]) & (y >= Y_M[0]) & (y < Y_M[1]) & (z >= Z_M[0]) & (z < Z_M[1])]
-    _, first = np.unique((cloud.numpy() / VOXEL_M).astype(np.int32), axis=0, return_index=True)
+    _, first = np.unique(np.floor(cloud.numpy() / VOXEL_M), axis=0, return_index=True)
     return cloud[torch.from_numpy(np.sort(first))]
 
 
@@ -92,8 +93,8 @@ class Pillars(nn.Module):
         """Lists of (N, 3) to (B, C, y, x)."""
         numbers = [torch.full((len(cloud),), k, device=cloud.device) for k, cloud in enumerate(clouds)]
         points, frame = torch.cat(clouds), torch.cat(numbers)
-        column = ((points[:, 0] - X_M[0]) / PILLAR_M).long()
-        row = ((points[:, 1] - Y_M[0]) / PILLAR_M).long()
+        column = ((points[:, 0] - X_M[0]) / PILLAR_M).floor().long()
+        row = ((points[:, 1] - Y_M[0]) / PILLAR_M).floor().long()
         inside = (column >= 0) & (column < PILLARS) & (row >= 0) & (row < PILLARS)
         points, frame, column, row = points[inside], frame[inside], column[inside], row[inside]
         pillar = (frame * PILLARS + row) * PILLARS + column
@@ -133,12 +134,15 @@ class Detector(nn.Module):
         return answer[:, 0], answer[:, 1:]
 
 
-def cell_of(rows):
-    """Which cell holds each centre."""
-    column = ((rows[:, 0] - X_M[0]) / CELL_M).long()
-    row = ((rows[:, 1] - Y_M[0]) / CELL_M).long()
+def encode(rows):
+    """Of the objects in the region: x and y in cells, row and column of the cell, and (8, N) the box to be answered."""
+    x, y = (rows[:, 0] - X_M[0]) / CELL_M, (rows[:, 1] - Y_M[0]) / CELL_M
+    row, column = y.long(), x.long()
     inside = (column >= 0) & (column < CELLS) & (row >= 0) & (row < CELLS)
-    return row, column, inside
+    x, y, row, column, rows = (values[inside] for values in (x, y, row, column, rows))
+    turn = (rows[:, 6].sin(), rows[:, 6].cos())
+    wanted = torch.stack([x - column - 0.5, y - row - 0.5, rows[:, 2], *rows[:, 3:6].log().T, *turn])
+    return x, y, row, column, wanted
 
 
 def loss_of(heat, boxes, truth):
@@ -146,9 +150,7 @@ def loss_of(heat, boxes, truth):
     centres = torch.arange(CELLS, device=heat.device) + 0.5
     total, objects = heat.new_zeros(()), sum(map(len, truth))
     for frame_heat, frame_boxes, objects_there in zip(heat, boxes, truth, strict=True):
-        row, column, inside = cell_of(objects_there)
-        rows, row, column = objects_there[inside], row[inside], column[inside]
-        y, x = (rows[:, 1] - Y_M[0]) / CELL_M, (rows[:, 0] - X_M[0]) / CELL_M
+        x, y, row, column, wanted = encode(objects_there)
         apart = (centres[None, :, None] - y[:, None, None]) ** 2 + (centres[None, None] - x[:, None, None]) ** 2
         near = torch.cat([torch.exp(-apart / 2), apart.new_zeros(1, CELLS, CELLS)]).amax(dim=0)
         positive = torch.zeros_like(near, dtype=torch.bool)
@@ -156,9 +158,6 @@ def loss_of(heat, boxes, truth):
         p = frame_heat.sigmoid()
         total = total - ((1 - p) ** 2 * functional.logsigmoid(frame_heat))[positive].sum()
         total = total - (p**2 * (1 - near) ** 4 * functional.logsigmoid(-frame_heat))[~positive].sum()
-        wanted = torch.stack(
-            [x - column - 0.5, y - row - 0.5, rows[:, 2], *rows[:, 3:6].log().T, rows[:, 6].sin(), rows[:, 6].cos()]
-        )
         total = total + (frame_boxes[:, row, column] - wanted).abs().sum() / 2
     return total / max(objects, 1)
 
@@ -176,10 +175,13 @@ def decode(heat, boxes, most=100):
 
 
 def average_precision(counts):
-    """Mean over 101 recalls of the precision there, as in nuScenes but without its cut-offs."""
+    """Mean over 101 recalls of the precision there, as in nuScenes but without its cut-offs; NaN without objects."""
     curve = counts.overall()
-    recall, precision = curve.recall.value[:, 0].numpy(), curve.precision.value[:, 0].numpy()
-    used = curve.precision.trials[:, 0].numpy() > 0
+    columns = (curve.recall.value, curve.precision.value, curve.precision.trials)
+    recall, precision, detections = (column[:, 0].cpu().numpy() for column in columns)
+    used = detections > 0
+    if not counts.objects.any():
+        return math.nan
     if not used.any():
         return 0.0
     recall, precision = recall[used][::-1], precision[used][::-1]  # recall ascends
@@ -233,9 +235,10 @@ class Training(lightning.LightningModule):
         row = SCORES.index(OPERATING_SCORE)
         curve = self.counts.over("visibility")
         scalars = {
-            f"val/recall/visibility {name}": r for name, r in zip(curve.bins, curve.recall.value[row], strict=True)
+            f"val/recall/visibility {name}": float(r)
+            for name, r in zip(curve.bins, curve.recall.value[row], strict=True)
         }
-        self.log_dict({"val/AP": average_precision(self.counts), **{k: v.float() for k, v in scalars.items()}})
+        self.log_dict({"val/AP": average_precision(self.counts), **scalars})
         self.recall.reset()
 
     def configure_optimizers(self):
@@ -253,9 +256,12 @@ def train(rig, training_frames, validation_frames, visibility, options):
         DataLoader(validation_frames, batch_size=8, collate_fn=collate_frames),
     ]
     grid = BevGrid(x=X_M, y=Y_M, cell=1.6, heights={"body": (0.3, 2.0)})
-    coverage = CoverageCallback(CoverageMetric(grid, max_radius=grid.diagonal_m), regions=REGIONS, rig=rig)
+    # As many blocks as drives, with the defaults: errors of drives that know nothing of each other.
+    metric = CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=16)
+    coverage = CoverageCallback(metric, regions=REGIONS, rig=rig)
     module = Training(rig, visibility, steps=options.epochs * len(loaders[0]), seed=options.seed)
     trainer = lightning.Trainer(
+        devices=1,
         max_epochs=options.epochs,
         logger=TensorBoardLogger(options.out, name=rig, version=""),
         callbacks=[coverage],
@@ -279,19 +285,20 @@ def ranks(values):
 
 def spearman(a, b):
     """Rank correlation; NaN where one of the two does not vary."""
-    a, b = ranks(a), ranks(b)
-    return float(np.corrcoef(a, b)[0, 1]) if a.std() > 0 and b.std() > 0 else math.nan
+    varies = min(len(np.unique(a)), len(np.unique(b))) > 1
+    return float(np.corrcoef(ranks(a), ranks(b))[0, 1]) if varies else math.nan
 
 
 def over_drives(objects, statistic, draws=1000):
-    """A statistic of the objects and its 95 % interval, from drawing whole drives again and again."""
+    """A statistic of the objects and its 95 % interval, from drawing whole drives again and again; NaN if unknown."""
     worlds = [objects[objects[:, 0] == world] for world in np.unique(objects[:, 0])]
     generator = np.random.default_rng(0)
     values = [
         statistic(np.concatenate([worlds[k] for k in generator.integers(len(worlds), size=len(worlds))]))
-        for _ in range(draws)
+        for _ in range(draws if worlds else 0)
     ]
-    return statistic(objects), *np.nanquantile(values, [0.025, 0.975])
+    known = np.array([value for value in values if not math.isnan(value)])
+    return statistic(objects), *(np.quantile(known, [0.025, 0.975]) if len(known) else (math.nan, math.nan))
 
 
 def agreement(objects):
@@ -314,7 +321,8 @@ def report(results, console):
     row = SCORES.index(OPERATING_SCORE)
     for rig, (module, coverage) in results.items():
         curve = module.counts.overall()
-        seen = [f"{line.detection[0.4]:.3f} ({line.known_share:.0%} known)" for line in coverage.summary(REGIONS)]
+        lines = coverage.summary(REGIONS)
+        seen = [f"{x.detection[0.4]:.3f} ± {x.detection_error[0.4]:.3f} ({x.known_share:.0%} known)" for x in lines]
         shares = [f"{ratio.value[row, 0]:.3f}" for ratio in (curve.recall, curve.precision)]
         table.add_row(rig, f"{average_precision(module.counts):.3f}", *seen, *shares)
     console.print(table)
@@ -334,19 +342,21 @@ def draw(results, path):
     """Recall over visibility and over distance; AP and coverage."""
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(14.0, 4.4), layout="constrained")
     row = SCORES.index(OPERATING_SCORE)
-    for shift, (rig, (module, coverage)) in zip((-0.05, 0.05), results.items(), strict=True):
-        for ax, axis in ((left, "visibility"), (middle, "distance")):
-            curve = module.counts.over(axis)
-            ratio = curve.recall
-            value, low, high, trials = (t[row].numpy() for t in (ratio.value, ratio.low, ratio.high, ratio.trials))
+    for ax, axis in ((left, "visibility"), (middle, "distance")):
+        curves = [module.counts.over(axis) for module, _ in results.values()]
+        for shift, rig, curve in zip((-0.05, 0.05), results, curves, strict=True):
+            value, low, high = (t[row].cpu().numpy() for t in (curve.recall.value, curve.recall.low, curve.recall.high))
             error = np.abs(np.stack([value - low, high - value]))
-            labels = [f"{name}\n{n}" for name, n in zip(curve.bins, trials, strict=True)]
             ax.errorbar(np.arange(len(value)) + shift, value, error, fmt="o-", capsize=3, label=rig)
-            ax.set_xticks(range(len(value)), labels)
-            ax.set(xlabel=f"{axis} of the car; below, number of cars", ylabel="recall", ylim=(0, 1))
-        seen = [line.detection[0.4] for line in coverage.summary(REGIONS)]
-        bars = [average_precision(module.counts), *seen]
-        right.bar(np.arange(len(bars)) + 4 * shift, bars, width=0.38, label=rig)
+        cars = torch.stack([curve.recall.trials[row] for curve in curves], dim=1).tolist()
+        labels = ["\n".join(map(str, [name, *counts])) for name, counts in zip(curves[0].bins, cars, strict=True)]
+        ax.set_xticks(range(len(labels)), labels)
+        ax.set(xlabel=f"{axis} of the car; below, cars for each rig, in order", ylabel="recall", ylim=(0, 1))
+    for shift, (rig, (module, coverage)) in zip((-0.2, 0.2), results.items(), strict=True):
+        lines = coverage.summary(REGIONS)
+        bars = [average_precision(module.counts), *(line.detection[0.4] for line in lines)]
+        errors = [math.nan, *(line.detection_error[0.4] for line in lines)]
+        right.bar(np.arange(len(bars)) + shift, bars, width=0.38, yerr=errors, capsize=3, label=rig)
     right.set_xticks(range(3), ["AP", *(f"seen within\n0.4 m, {region.name}" for region in REGIONS)])
     right.set(ylim=(0, 1))
     right.legend()

@@ -242,3 +242,16 @@ def test_help_loads_none_of_the_heavy_libraries():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip().splitlines()[-1] == "[]"
+
+
+def test_a_grid_that_does_not_fit_into_memory_ends_in_one_line(torchcover, tmp_path, monkeypatch):
+    def no_memory(*_, **__):
+        raise RuntimeError("[enforce fail at alloc_cpu.cpp] can't allocate memory")
+
+    monkeypatch.setattr("torchcover.cli.run.CoverageMetric", no_memory)
+    code, _, complaints = torchcover("evaluate", "front_roof_32", "--cell", "0.05", "--out", tmp_path / "out")
+    assert code == 2
+    assert complaints.strip() == (
+        "torchcover: --cell 0.05: there is not enough memory for the sums of 12,800,000 cells in 16 blocks; "
+        "use larger cells"
+    )

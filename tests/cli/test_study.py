@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from torchcover.cli.study import Truth, _errors
+from torchcover.cli.study import Request, Truth, _advice, _errors
 from torchcover.coverage import BevGrid, CoverageMetric, forward_regions
 from torchcover.report import WorkPoint, cheapest, draw_work_precision
 from torchcover.report.work_precision import pareto_front
@@ -18,10 +18,12 @@ def point(seconds, error, rays=1024, reference="even"):
 
 def test_a_small_study_writes_a_table_a_diagram_and_an_advice(torchcover, tmp_path):
     out = tmp_path / "out"
-    options = ["--rays", "64", "--rays", "256", "--steps", "4", "--runs", "2", "--long-run-steps", "8", "--cell", "1"]
+    rays = ["--rays", "64", "--rays", "256", "--rays", "64"]
+    options = [*rays, "--steps", "4", "--runs", "2", "--long-run-steps", "8", "--cell", "1"]
     code, text, complaints = torchcover("study", "front_roof_32", "--scenario", "courtyard", *options, "--out", out)
     assert code == 0, complaints
     assert "percentage points" in text
+    assert "…" not in text
     assert (out / "work_precision.png").read_bytes()[:4] == b"\x89PNG"
     study = json.loads((out / "study.json").read_text())
     settings = {(row["reference"], row["rays"], row["steps"]) for row in study["points"]}
@@ -29,13 +31,29 @@ def test_a_small_study_writes_a_table_a_diagram_and_an_advice(torchcover, tmp_pa
     assert all(row["seconds"] > 0 for row in study["points"])
     best = [row for row in study["points"] if row["best_detection_error"]]
     assert min(row["detection_error"] for row in study["points"]) in {row["detection_error"] for row in best}
-    assert {stage["reference"] for stage in study["stages"]} == {"even", "paper"}
+    assert [(stage["reference"], stage["rays"]) for stage in study["stages"]] == [
+        (name, rays) for rays in (64, 256) for name in ("even", "paper")
+    ]
     assert study["long_run"]["steps"] == 8
 
 
 def test_more_time_without_less_error_is_not_on_the_front():
     front = pareto_front([point(3, 0.3), point(1, 0.5), point(2, 0.6), point(4, 0.3), point(5, 0.1)], "detection_error")
     assert [one.seconds for one in front] == [1, 3, 5]
+
+
+def test_a_point_whose_error_is_unknown_is_not_on_the_front_and_does_not_hide_the_others():
+    front = pareto_front([point(1, math.nan), point(2, 0.3), point(3, math.nan), point(4, 0.1)], "detection_error")
+    assert [one.seconds for one in front] == [2, 4]
+
+
+def test_the_advice_has_every_option_that_decides_about_the_error(tmp_path):
+    request = Request("rig", "urban", (64,), 8, 1, 8, every_s=2.0, seed=0, cell=0.5, threshold=0.4, out=tmp_path)
+    expected = (
+        "For 2 percentage points of detection: --reference even --rays 1024 --steps 1 --cell 0.5 --every 2 (7 s)."
+    )
+    assert _advice(0.02, point(7, 0.01), request) == expected
+    assert _advice(0.02, None, request).endswith("not reached within 8 steps.")
 
 
 def test_the_cheapest_that_is_good_enough_is_advised():

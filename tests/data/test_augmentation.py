@@ -159,6 +159,7 @@ def test_draws_stay_within_their_bounds_and_reach_them():
         (lambda: Augmentation(max_yaw_rad=-1.0), "max_yaw_rad: an angle >= 0 is needed"),
         (lambda: Augmentation(factors=(1.1, 0.9)), "factors: two numbers 0 < lowest <= highest"),
         (lambda: Augmentation(seed=-1), "seed: a number >= 0"),
+        (lambda: Augmentation()(make_frame(index=-1)), "frame 'f', index -1, epoch 0: numbers >= 0 are needed"),
     ],
 )
 def test_impossible_augmentations_are_refused(call, message):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover import Rig
+from torchcover import Rig, Scenario
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import ReferenceSensor
 from torchcover.simulation.instant import Instant
@@ -84,3 +84,16 @@ def test_bodies_out_of_range_change_nothing(monkeypatch):
     assert limited.counts["moving_bodies_out_of_range"] > 0 == unlimited.counts["moving_bodies_out_of_range"]
     assert torch.equal(limited.sensor, unlimited.sensor)
     assert torch.equal(limited.reference, unlimited.reference)
+
+
+def test_a_range_starts_at_the_sensor_not_at_the_vehicle(tmp_path):
+    """32 m ahead of the vehicle, 29 m ahead of a LiDAR with a range of 30 m."""
+    (tmp_path / "t.csv").write_text("t,x,y,z,roll,pitch,yaw\n0,34,0,0,0,0,0\n9,34,9,0,0,0,0\n", encoding="utf-8")
+    box = {"type": "box", "size_m": [4, 2, 2]}
+    mover = {"name": "mover", "category": "car", "shape": box, "trajectory": tmp_path / "t.csv"}
+    ground = {"name": "ground", "shape": {"type": "plane", "size_m": [100, 100]}}
+    scenario = Scenario.model_validate({"name": "s", "ego": {"shape": box}, "bodies": [ground], "actors": [mover]})
+    reference = ReferenceSensor(rows=8, columns=8, max_range_m=30.0)
+    lidar = rig(30.0, mount={"x_m": 3.0, "z_m": 1.0}, vertical_fov_deg=[-1, 1], columns=720)
+    frame = SimulatedFrames(scenario, lidar, steps=1, reference=reference)[0]
+    assert frame.sensor[:, 0].max() == pytest.approx(32.0, abs=1e-3)

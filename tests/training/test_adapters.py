@@ -158,6 +158,26 @@ def test_mmengine_padding_is_left_out_by_the_size_of_the_dataset(monkeypatch, sa
     assert total.steps == samples
 
 
+def test_mmengine_adds_up_where_its_processes_exchange_tensors(monkeypatch):
+    """NCCL refuses tensors of the CPU. Without a GPU: where the sums were sent before they were computed."""
+    calls = []
+
+    class Spy(CoverageMetric):
+        def to(self, device):
+            calls.append(device)
+            return self
+
+        def compute(self):
+            calls.append("compute")
+            return super().compute()
+
+    monkeypatch.setattr(adapter, "get_comm_device", lambda: torch.device("cuda", 1))
+    metric = MMEngineCoverage(Spy(BevGrid(**GRID), max_radius=9.0), regions=[REGION])
+    metric.process(*data_batch([0]))
+    metric.evaluate(1)
+    assert calls == [torch.device("cuda", 1), "compute"]
+
+
 def test_other_batches_of_mmengine():
     metric = MMEngineCoverage(
         make_metric(),

@@ -99,6 +99,11 @@ def test_selecting_keeps_the_columns_together():
     assert one.reference_points.tolist() == [1]
 
 
+def test_a_frame_in_which_nobody_looked_for_objects_is_an_error_that_says_what_to_do():
+    with pytest.raises(TypeError, match=r"boxes: Boxes are needed, .* got NoneType; SimulatedFrames\(.*boxes=True"):
+        box_visibility(torch.rand(5, 3), torch.rand(5, 3), None)
+
+
 @pytest.mark.parametrize("reference", [None, torch.empty(0, 3)])
 def test_a_frame_without_reference_is_an_error_that_says_what_to_do(reference):
     with pytest.raises(ValueError, match="reference: the frame has none, and visibility is measured against it; use"):

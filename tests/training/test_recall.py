@@ -140,6 +140,14 @@ def test_a_distance_of_exactly_the_threshold_is_too_far_and_an_overlap_of_exactl
     assert match(torch.tensor([row(2.0, 0.0)]), torch.ones(1), truth, "iou", third).tolist() == [0]
 
 
+def test_matching_by_something_else_or_without_a_score_for_each_is_refused():
+    boxes = torch.tensor([row(0, 0), row(9, 0)])
+    with pytest.raises(ValueError, match="by: 'distance' or 'iou' is needed; got 'centre'"):
+        match(boxes, torch.ones(2), boxes, "centre", 2.0)
+    with pytest.raises(ValueError, match=r"scores: one for each of 2 detections is needed; got \(1,\)"):
+        match(boxes, torch.ones(1), boxes, "distance", 2.0)
+
+
 def test_nothing_matches_nothing():
     none = torch.empty(0, 7)
     assert match(none, torch.empty(0), torch.tensor([row(0, 0)]), "iou", 0.5).tolist() == []
@@ -403,6 +411,11 @@ def test_bad_frames_are_refused_and_leave_the_state_alone(changes, message):
     with pytest.raises(ValueError, match=message):
         metric.update(**{**good, **changes})
     assert int(metric.frames) == 0
+
+
+def test_a_frame_in_which_nobody_looked_for_objects_is_refused():
+    with pytest.raises(TypeError, match=r"boxes: Boxes are needed, .* got NoneType"):
+        RecallByVisibility().update(torch.empty(0, 7), None, torch.empty(0))
 
 
 def test_metrics_with_different_bins_do_not_merge():

@@ -168,7 +168,7 @@ def study(
         Request(
             rig=rig,
             scenario=scenario,
-            rays=tuple(rays or DEFAULT_RAYS),
+            rays=tuple(dict.fromkeys(rays or DEFAULT_RAYS)),
             steps=steps,
             runs=runs,
             long_run_steps=long_run_steps,

@@ -88,10 +88,16 @@ def new_metric(
     """An empty metric over the command line's grid, with standard errors unless there is one block only.
 
     Raises:
-        ValueError: A cell or a threshold that makes no sense.
+        ValueError: A cell or a threshold that makes no sense, or more cells than the memory has room for.
     """
     grid = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=cell)
-    return CoverageMetric(grid, thresholds, max_radius=grid.diagonal_m, blocks=blocks).to(device)
+    try:
+        return CoverageMetric(grid, thresholds, max_radius=grid.diagonal_m, blocks=blocks).to(device)
+    except RuntimeError as error:  # what torch raises when there is no memory left
+        raise ValueError(
+            f"--cell {cell:g}: there is not enough memory for the sums of {grid.cells:,} cells in {blocks} blocks; "
+            "use larger cells"
+        ) from error
 
 
 def accumulate(

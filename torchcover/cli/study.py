@@ -13,13 +13,21 @@ from rich.progress import Progress
 from rich.table import Table
 
 from torchcover import __version__
-from torchcover.cli.run import BLOCKS, GRID_X_M, GRID_Y_M, check_out
+from torchcover.cli.run import BLOCKS, check_out, new_metric
 from torchcover.cli.settings import every_s_of, reference_called
-from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region, forward_regions
+from torchcover.coverage import Coverage, CoverageMetric, Region, forward_regions
 from torchcover.coverage.estimate import Estimator
 from torchcover.data import SimulatedFrames
 from torchcover.neighbors import nearest
-from torchcover.report import WorkPoint, cheapest, draw_work_precision, study_records, study_table
+from torchcover.report import (
+    WorkPoint,
+    cheapest,
+    draw_work_precision,
+    narrowest_width,
+    study_records,
+    study_table,
+)
+from torchcover.report.records import json_record
 from torchcover.simulation import Scenario
 
 # Rays in a step of the long run that the others are measured against.
@@ -145,8 +153,7 @@ def _frames(request: Request, seed: int, steps: int) -> SimulatedFrames:
 
 
 def _metric(request: Request, blocks: int) -> CoverageMetric:
-    grid = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=request.cell)
-    return CoverageMetric(grid, (request.threshold,), max_radius=grid.diagonal_m, blocks=blocks)
+    return new_metric(request.cell, (request.threshold,), torch.device("cpu"), blocks=blocks)
 
 
 def _errors(coverage: Coverage, truth: Truth) -> torch.Tensor:
@@ -239,7 +246,7 @@ def _write(request: Request, truth: Truth, points: Sequence[WorkPoint], stages: 
         "every_s": every_s,
         "cell_m": request.cell,
         "threshold_m": request.threshold,
-        "long_run": {"steps": request.long_run_steps, "rays": LONG_RUN_RAYS, "standard_errors": floor},
+        "long_run": {"steps": request.long_run_steps, "rays": LONG_RUN_RAYS, "standard_errors": json_record(floor)},
         "points": study_records(points),
         "stages": list(stages),
         "recommended": [
@@ -248,24 +255,28 @@ def _write(request: Request, truth: Truth, points: Sequence[WorkPoint], stages: 
         ],
     }
     (request.out / "study.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    console = Console()
-    console.print(study_table(points))
-    console.print(_stage_table(stages))
+    console, tables = Console(), (study_table(points), _stage_table(stages))
+    # Rather lines that are too long than numbers that are cut off.
+    console.width = max(console.width, narrowest_width(tables, ()))
+    for table in tables:
+        console.print(table)
     console.print(
         f"The long run ({request.long_run_steps:,} steps of {LONG_RUN_RAYS:,} rays, other seed) has itself an error of "
         f"{100 * detection_floor:.2f} percentage points and {radius_floor_m:.3f} m."
     )
     for wanted, point in recommended.items():
-        console.print(_advice(wanted, point, request.steps))
+        console.print(_advice(wanted, point, request), soft_wrap=True)
     console.print(f"Wrote study.json and work_precision.png to {request.out}", soft_wrap=True)
 
 
-def _advice(wanted: float, point: WorkPoint | None, steps: int) -> str:
+def _advice(wanted: float, point: WorkPoint | None, request: Request) -> str:
+    """The options of `evaluate` that reach an error; the size of the cells, which decides about it, among them."""
     if point is None:
-        return f"For {100 * wanted:g} percentage points of detection: not reached within {steps:,} steps."
+        return f"For {100 * wanted:g} percentage points of detection: not reached within {request.steps:,} steps."
+    every = "" if request.every_s is None else f" --every {request.every_s:g}"
     return (
         f"For {100 * wanted:g} percentage points of detection: --reference {point.reference} --rays {point.rays} "
-        f"--steps {point.steps} ({point.seconds:.0f} s)."
+        f"--steps {point.steps} --cell {request.cell:g}{every} ({point.seconds:.0f} s)."
     )
 
 

@@ -212,6 +212,15 @@ def _is_inside(points: Tensor, rows: Tensor) -> Tensor:
     return inside
 
 
+def check_boxes(boxes: object) -> None:
+    """Refuse what is no `Boxes`, such as the None of a frame in which nobody looked for objects."""
+    if not isinstance(boxes, Boxes):
+        raise TypeError(
+            f"boxes: Boxes are needed, if only an empty list of them; got {type(boxes).__name__}; "
+            "SimulatedFrames(..., boxes=True) makes them"
+        )
+
+
 def _check_numbers(name: str, tensor: Tensor) -> None:
     if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
         arrived = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__

@@ -12,6 +12,7 @@ from torch.utils.data import Dataset
 
 from torchcover.data.boxes import Boxes, points_in_boxes
 from torchcover.data.frame import Frame
+from torchcover.geometry import Box
 from torchcover.geometry.rigid import Matrix
 from torchcover.simulation import EvenReference, ReferenceSensor, Rig, Scenario
 from torchcover.simulation.disturbance import disturb
@@ -154,7 +155,7 @@ class SimulatedFrames(Dataset[Frame]):
         if not 0 <= index < self.steps:
             raise IndexError(f"frame {index} of {self.steps}")
         scene, mounted, step = self._stage(index)
-        instant = scene.at(step, within_m=self._longest_range_m())
+        instant = scene.at(step, within_m=self._reach_m(scene.ego_box))
         scans = {name: self._scan_rig(sensors, instant, index) for name, sensors in mounted.items()}
         reference, weights, redrawn = self._scan_reference(scene, instant, index)
         sensors = {name: torch.from_numpy(_fuse(rig_scans)) for name, rig_scans in scans.items()}
@@ -173,9 +174,15 @@ class SimulatedFrames(Dataset[Frame]):
             boxes=_boxes(labels(scene.world, step, self.reference.max_range_m), sensors) if self.boxes else None,
         )
 
-    def _longest_range_m(self) -> float:
-        ranges = [sensor.max_range_m for rig in self.rigs.values() for sensor in rig.sensors]
-        return max(self.reference.max_range_m, *ranges)
+    def _reach_m(self, ego: Box) -> float:
+        """How far from the origin of the vehicle frame a sensor can see: its range starts where it is mounted."""
+        farthest_m = np.abs(ego.corners_m).max(axis=0) + self.reference.shell_m
+        reaches = [
+            float(np.linalg.norm(sensor.mount.matrix()[:3, 3])) + sensor.max_range_m
+            for rig in self.rigs.values()
+            for sensor in rig.sensors
+        ]
+        return max(float(np.linalg.norm(farthest_m)) + self.reference.max_range_m, *reaches)
 
     def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[Scan]:
         scans = []

@@ -56,7 +56,7 @@ PANELS = (
 
 
 def pareto_front(points: Sequence[WorkPoint], error: str) -> list[WorkPoint]:
-    """The points that no other beats in both time and error, fastest first.
+    """The points that no other beats in both time and error, fastest first; none whose error is unknown.
 
     Args:
         points: Measured points.
@@ -70,7 +70,8 @@ def pareto_front(points: Sequence[WorkPoint], error: str) -> list[WorkPoint]:
         [1, 3]
     """
     front: list[WorkPoint] = []
-    for point in sorted(points, key=lambda point: (point.seconds, getattr(point, error))):
+    known = [point for point in points if not math.isnan(getattr(point, error))]
+    for point in sorted(known, key=lambda point: (point.seconds, getattr(point, error))):
         if not front or getattr(point, error) < getattr(front[-1], error):
             front.append(point)
     return front

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchcover.data import Boxes
+from torchcover.data.boxes import check_boxes
 from torchcover.training.visibility import BoxVisibility
 
 
@@ -21,6 +22,7 @@ class DetectedFrame:
 
     Raises:
         ValueError: See `RecallByVisibility.update`.
+        TypeError: See there.
     """
 
     def __init__(
@@ -31,6 +33,7 @@ class DetectedFrame:
         scores: Tensor | None,
         detection_visibility: BoxVisibility | Tensor | None,
     ) -> None:
+        check_boxes(boxes)
         if detections.ndim != 2 or detections.shape[1] < 7:
             raise ValueError(
                 f"detections: shape (N, 7) is needed, x y z length width height yaw; got {tuple(detections.shape)}"

@@ -53,11 +53,18 @@ def match(detections: Tensor, scores: Tensor, truth: Tensor, by: MatchBy, thresh
     Returns:
         (N,) int64 number of the object of each detection, -1 if none; on the CPU.
 
+    Raises:
+        ValueError: Another `by`, or not one score for each detection.
+
     Example:
         >>> truth = torch.tensor([[10.0, 0.0, 0.7, 4.5, 1.8, 1.4, 0.0]])
         >>> match(truth.repeat(2, 1), torch.tensor([0.2, 0.9]), truth, by="distance", threshold=2.0)
         tensor([-1,  0])
     """
+    if by not in ("distance", "iou"):
+        raise ValueError(f"by: 'distance' or 'iou' is needed; got {by!r}")
+    if scores.shape != (len(detections),):
+        raise ValueError(f"scores: one for each of {len(detections)} detections is needed; got {tuple(scores.shape)}")
     if by == "distance":
         # From differences: the matrix product of cdist would lose centimetres at 100 m.
         offset = detections[:, None, :2].double() - truth[None, :, :2].double()

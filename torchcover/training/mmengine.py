@@ -11,7 +11,7 @@ try:
     from mmengine.registry import METRICS
 except ImportError as error:
     raise ImportError("MMEngineCoverage needs MMEngine: pip install mmengine (or mmengine-lite)") from error
-from mmengine.dist import get_dist_info
+from mmengine.dist import get_comm_device, get_dist_info
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.data import Frame
@@ -95,6 +95,7 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         rank, processes = get_dist_info()
         if (self._frames - 1) * processes + rank < size:
             self._count_held_back()
+        self.metric.to(get_comm_device())  # processes on GPUs exchange nothing that lies on the CPU
         self.metric.update([], [])  # a process that was dealt nothing but padding has not updated yet
         scalars = self.compute_metrics(self.results)
         self.metric.reset()

@@ -106,6 +106,7 @@ class RecallByVisibility(Metric):
         Raises:
             ValueError: Lists of different lengths, shapes that do not fit, NaN in detections or scores, a negative
                 size, shares outside [0, 1].
+            TypeError: Boxes that are none, as those of a frame in which nobody looked for objects.
         """
         frames = [_as_list(given) for given in (detections, boxes, visibility)]
         count = len(frames[0])

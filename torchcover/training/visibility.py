@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcover.data import Boxes, points_in_boxes
+from torchcover.data.boxes import check_boxes
 from torchcover.neighbors import blind_spot_radius, check_cloud
 
 
@@ -76,7 +77,7 @@ def box_visibility(
 
     Raises:
         ValueError: No reference, a negative threshold, NaN, weights that are not positive, or shapes that do not fit.
-        TypeError: A cloud is no floating-point tensor.
+        TypeError: A cloud is no floating-point tensor, or the boxes are none.
 
     Example:
         >>> boxes = Boxes.from_rows(torch.tensor([[10.0, 0, 1, 4, 2, 2, 0], [30.0, 0, 1, 4, 2, 2, 0]]))
@@ -85,6 +86,7 @@ def box_visibility(
         >>> seen.share, seen.reference_points
         (tensor([0.5000,    nan], dtype=torch.float64), tensor([2, 0]))
     """
+    check_boxes(boxes)
     _check(sensor, reference, threshold, reference_weights)
     sensor, boxes = sensor.to(reference.device), boxes.to(reference.device)
     box, point = points_in_boxes(reference, boxes)
@@ -98,7 +100,8 @@ def box_visibility(
     count = torch.bincount(box, minlength=len(boxes))
     total = sum_by_box(weight).where(count > 0, math.nan)
     return BoxVisibility(
-        share=sum_by_box(weight * (radius <= threshold)) / total,
+        # A GPU adds weights up in any order, so that even all of them may come to a trifle over the total.
+        share=(sum_by_box(weight * (radius <= threshold)) / total).clamp(max=1.0),
         mean_radius_m=sum_by_box(weight * radius) / total,
         reference_points=count,
         sensor_points=torch.bincount(points_in_boxes(sensor, boxes).box, minlength=len(boxes)),

@@ -1,0 +1,185 @@
+"""The parts of the example that trains a detector: closed forms, and a run on frames of random points."""
+
+import importlib.util
+import math
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import spearmanr
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from torchcover.data import Boxes, Frame, points_in_boxes
+from torchcover.training import RecallByVisibility
+
+EXAMPLE = Path(__file__).parents[2] / "examples" / "train_detector.py"
+
+
+@pytest.fixture(scope="module")
+def example():
+    spec = importlib.util.spec_from_file_location("train_detector", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def cars(count, seed):
+    """(N, 7) cars within the region, 6 m and more apart."""
+    generator = torch.Generator().manual_seed(seed)
+    place = torch.randperm(64, generator=generator)[:count]
+    rows = torch.rand(count, 7, generator=generator) * torch.tensor([0.4, 0.4, 1.0, 3.0, 1.0, 1.0, 6.0])
+    corner = torch.stack([place % 8 * 6.4 + 3.0, place // 8 * 6.4 - 22.6], dim=1)
+    return rows + torch.cat([corner, torch.tensor([[0.5, 2.0, 1.5, 1.0, -3.0]]).expand(count, 5)], dim=1)
+
+
+def answer_to(example, rows, scores):
+    """What a network that knows everything answers: heat and boxes of one frame."""
+    _, _, row, column, wanted = example.encode(rows)
+    heat, boxes = torch.full((64, 64), -20.0), torch.zeros(8, 64, 64)
+    heat[row, column] = scores.logit()
+    boxes[:, row, column] = wanted
+    return heat, boxes
+
+
+def test_decoding_gives_back_what_was_encoded(example):
+    rows, scores = cars(20, seed=0), torch.linspace(0.9, 0.1, 20)
+    found, found_scores = example.decode(*answer_to(example, rows, scores))
+    torch.testing.assert_close(found_scores, scores)
+    torch.testing.assert_close(found[:, :6], rows[:, :6], atol=1e-4, rtol=0)
+    torch.testing.assert_close(torch.exp(1j * found[:, 6]), torch.exp(1j * rows[:, 6]))
+
+
+def test_objects_beyond_the_region_are_not_encoded(example):
+    rows = cars(4, seed=1)
+    rows[0, 0], rows[1, 1], rows[2, 1] = 52.0, 25.7, -26.5
+    assert example.encode(rows)[4].shape == (8, 1)
+
+
+def test_the_loss_is_nothing_for_a_perfect_answer_and_grows_with_the_error_of_the_boxes(example):
+    rows = cars(10, seed=2)
+    heat, boxes = answer_to(example, rows, torch.full((10,), 0.99999))
+    assert example.loss_of(heat[None], boxes[None], [rows]) < 1e-4
+    assert example.loss_of(heat[None], boxes[None] + 0.1, [rows]) == pytest.approx(8 * 0.1 / 2, abs=1e-4)
+    assert example.loss_of(-heat[None], boxes[None], [rows]) > 10
+    assert example.loss_of(torch.full((1, 64, 64), -20.0), boxes[None], [rows[:0]]) < 1e-4
+
+
+def test_the_network_takes_points_in_any_order_and_frames_on_their_own(example):
+    torch.manual_seed(0)
+    detector = example.Detector().eval()
+    clouds = [
+        torch.rand(n, 3) * torch.tensor([60.0, 60.0, 3.0]) - torch.tensor([4.0, 30.0, 0.5]) for n in (900, 0, 500)
+    ]
+    heat, boxes = detector(clouds)
+    assert (heat.shape, boxes.shape) == ((3, 64, 64), (3, 8, 64, 64))
+    shuffled, _ = detector([clouds[0][torch.randperm(900)]])
+    torch.testing.assert_close(shuffled[0], heat[0], atol=1e-4, rtol=1e-4)
+    assert (heat[0] - heat[2]).abs().max() > 1e-3
+
+
+def average_precision(example, frames):
+    metric = RecallByVisibility(score_thresholds=example.SCORES)
+    for x_found, scores, x_there in frames:
+        found, there = (
+            torch.tensor([[x, 0.0, 1.0, 4.0, 2.0, 1.5, 0.0] for x in xs]).view(-1, 7) for xs in (x_found, x_there)
+        )
+        metric.update(found, Boxes.from_rows(there), torch.ones(len(there)), torch.tensor(scores))
+    return example.average_precision(metric.compute())
+
+
+def test_average_precision_in_closed_form(example):
+    assert average_precision(example, [([9.0, 19.0], [0.9, 0.8], [9.0, 19.0])]) == 1.0
+    # Half of the objects: recalls 0 to 0.5 of 101.
+    assert average_precision(example, [([9.0], [0.9], [9.0, 19.0])]) == pytest.approx(51 / 101)
+    # Only false ones, and nothing at all.
+    assert average_precision(example, [([40.0], [0.9], [9.0])]) == 0.0
+    assert average_precision(example, [([], [], [9.0])]) == 0.0
+    # True, false, true: precision 1 below a recall of 0.5, then from 1/2 in a line to 2/3.
+    expected = (50 + 51 * (1 / 2 + 2 / 3) / 2) / 101
+    assert average_precision(example, [([9.0, 40.0, 19.0], [0.9, 0.7, 0.5], [9.0, 19.0])]) == pytest.approx(expected)
+    # If the false one comes last, it costs the recall of 1 alone: of equal recalls the last precision counts.
+    expected = (100 + 2 / 3) / 101
+    assert average_precision(example, [([9.0, 40.0, 19.0], [0.9, 0.3, 0.5], [9.0, 19.0])]) == pytest.approx(expected)
+    assert math.isnan(average_precision(example, [([9.0], [0.9], [])]))
+
+
+@pytest.mark.parametrize("levels", [3, 10, 1000])
+def test_rank_correlation_is_that_of_scipy(example, levels):
+    generator = np.random.default_rng(levels)
+    a = generator.integers(levels, size=60).astype(float)
+    b = a + generator.integers(levels, size=60)
+    assert example.spearman(a, b) == pytest.approx(spearmanr(a, b).statistic, abs=1e-12)
+    assert example.spearman(a, -(a**3)) == pytest.approx(-1.0)
+
+
+def test_what_does_not_vary_has_no_rank_correlation(example):
+    assert math.isnan(example.spearman(np.zeros(5), np.arange(5.0)))
+    assert math.isnan(example.spearman(np.array([]), np.array([])))
+
+
+def objects_of(found):
+    """100 cars in 10 drives: drive, x, y, visibility, score."""
+    generator = np.random.default_rng(3)
+    x, y, visibility = generator.uniform(0, 50, 100), generator.uniform(-25, 25, 100), generator.uniform(size=100)
+    return np.column_stack([np.arange(100) // 10, x, y, visibility, found(visibility)])
+
+
+def test_agreement_over_drives_has_an_interval_and_is_unknown_if_nothing_was_found(example):
+    noisy = objects_of(lambda visibility: visibility + np.random.default_rng(4).normal(0, 0.3, 100))
+    value, low, high = example.over_drives(noisy, example.agreement, draws=200)
+    assert value == pytest.approx(spearmanr(noisy[:, 3], noisy[:, 4]).statistic)
+    assert 0.3 < low < value < high < 1.0
+    nothing = objects_of(np.zeros_like)
+    for statistic in (example.agreement, example.cell_agreement):
+        for objects in (nothing, nothing[:0]):
+            assert all(math.isnan(number) for number in example.over_drives(objects, statistic, draws=10))
+
+
+def test_agreement_over_cells_is_that_of_means_and_recalls(example):
+    # Three cells of 6 cars: visible and found more and more.
+    cell, k = np.repeat(np.arange(3), 6), np.tile(np.arange(6), 3)
+    found = np.where(k < 2 * cell + 1, 0.9, 0.1)
+    objects = np.column_stack([np.zeros(18), 6.4 * cell + 1.0, np.ones(18), 0.3 * cell + 0.01 * k, found])
+    assert example.cell_agreement(objects) == pytest.approx(1.0)
+    assert math.isnan(example.cell_agreement(objects, least=7))
+
+
+def random_frames(steps, seed, reference, name, keep_clouds):
+    """In place of a simulation: cars of random points, one rig with more of them than the other."""
+    frames = []
+    for index in range(steps):
+        generator = torch.Generator().manual_seed(1000 * seed + index)
+        rows = cars(8, seed=1000 * seed + index)
+        rows[:, 6] = 0.0
+        points = (torch.rand(8, 60, 3, generator=generator) - 0.5) * rows[:, None, 3:6] + rows[:, None, :3]
+        sensors = {"front_roof_128": points[:, :40].reshape(-1, 3), "front_roof_32": points[:4, :20].reshape(-1, 3)}
+        boxes = Boxes.from_rows(rows, categories=("car",) * 8)
+        hits = {rig: points_in_boxes(cloud, boxes).box.bincount(minlength=8) for rig, cloud in sensors.items()}
+        boxes = Boxes.from_rows(rows, categories=("car",) * 8, hits=hits)
+        clouds = {**sensors, **{f"network {rig}": cloud for rig, cloud in sensors.items()}}
+        frames.append(Frame(clouds, points[:, 40:].reshape(-1, 3), index, f"frame {index}", boxes=boxes))
+    return frames
+
+
+def test_a_small_run_trains_both_rigs_logs_every_epoch_and_ends_with_table_and_figure(
+    example, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(example, "simulate", random_frames)
+    options = {"--train": 16, "--validate": 32, "--epochs": 2, "--out": tmp_path}
+    monkeypatch.setattr(sys, "argv", ["train_detector.py", *(str(word) for pair in options.items() for word in pair)])
+    monkeypatch.setenv("COLUMNS", "200")
+    example.main()
+    said = capsys.readouterr().out
+    for rig in example.RIGS:
+        assert f"{rig}, all: Spearman" in said
+        events = EventAccumulator(str(tmp_path / rig))
+        events.Reload()
+        tags = {"val/AP", f"coverage/{rig}/val/detection_0.4m/0-51m/body", "val/recall/visibility 0.8-1"}
+        tags |= {f"coverage/{rig}/val/detection_0.4m_error/0-51m/body"}
+        assert tags <= set(events.Tags()["scalars"])
+        assert all(len(events.Scalars(tag)) == 2 for tag in tags)
+        assert all(math.isfinite(events.Scalars(tag)[1].value) for tag in tags if "recall" not in tag)
+    assert "±" in said
+    assert (tmp_path / "detector.png").stat().st_size > 20_000
