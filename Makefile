@@ -2,11 +2,11 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-STEPS ?= 24
 RAYS ?= 16384
 
 .PHONY: demo test lint types doctest smoke bench paper clean
 
+demo: STEPS ?= 24
 demo: $(VENV)/.ready  ## evaluate a built-in rig in the built-in courtyard; writes to out/demo
 	$(BIN)/torchcover evaluate front_roof_128 --scenario courtyard --steps $(STEPS) --out out/demo
 
@@ -29,6 +29,7 @@ smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the r
 bench: $(VENV)/.ready  ## the speed and memory figures of docs/performance.md
 	$(BIN)/python -m benchmarks
 
+paper: STEPS ?= 4096
 paper: $(VENV)/.ready  ## the paper's three experiments and Figure 2: make paper STEPS=256 (docs/paper.md: STEPS=4096)
 	$(BIN)/python -m examples.paper --steps $(STEPS) --rays $(RAYS)
 

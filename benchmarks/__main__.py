@@ -16,6 +16,10 @@ BENCHMARKS = (
     "urban_throughput",
     "five_rigs",
     "omissions",
+    "even_reference",
+    "calibration",
+    "training_overhead",
+    "known_boxes",
 )
 
 

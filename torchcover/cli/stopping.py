@@ -185,8 +185,12 @@ def outcome(
     """
     if target is None:
         return None, []
-    found = standings(target, coverages, regions)
-    return _record(target, found), _lines(found, next(iter(coverages.values())).counts["steps"])
+    found, first = standings(target, coverages, regions), next(iter(coverages.values()))
+    blank = [f"{row.region} {row.height}" for row in first.summary(regions) if not row.known_cells]
+    lines = _lines(found, first.counts["steps"])
+    if blank:
+        lines.append(f"Not waited for, as no cell of it is known: {', '.join(blank)}.")
+    return _record(target, found) | {"unknown": blank}, lines
 
 
 def _record(target: TargetError, found: Sequence[Standing]) -> dict[str, Any]:

@@ -1,10 +1,12 @@
 """`torchcover study`: error against run time, and the setting to use for a wanted error."""
 
 import json
+import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import torch
@@ -32,6 +34,8 @@ from torchcover.simulation import Scenario
 
 # Rays in a step of the long run that the others are measured against.
 LONG_RUN_RAYS = 65_536
+# The other backend of the search is tried up to here; beyond, it takes minutes.
+MOST_RAYS_BY_BRUTE_FORCE = 4096
 # Seeds of the runs are next to each other; the long run's is far away.
 LONG_RUN_SEED = 1_000_003
 # Detection errors that a setting is recommended for.
@@ -199,22 +203,15 @@ def _stages(request: Request) -> list[dict[str, Any]]:
     """How a step of each setting divides into the rays, the search and the binning, in seconds; medians of five."""
     stages = []
     for setting in _settings(request, request.seed):
-        setting.frames.scene_of(0)
-        times = sorted(_one_step(setting, index % request.steps) for index in range(5))
-        rays_s, search_s, binning_s = times[2]
-        stages.append(
-            {
-                "reference": setting.name,
-                "rays": setting.rays,
-                "rays_s": rays_s,
-                "search_s": search_s,
-                "binning_s": binning_s,
-            }
-        )
+        times = zip(*(_one_step(setting, index % request.steps) for index in range(5)), strict=True)
+        names = ("rays_s", "search_s", "binning_s", "cdist_s")
+        medians = {name: median(seconds) for name, seconds in zip(names, times, strict=True)}
+        stages.append({"reference": setting.name, "rays": setting.rays, **medians})
     return stages
 
 
-def _one_step(setting: Setting, index: int) -> tuple[float, float, float]:
+def _one_step(setting: Setting, index: int) -> tuple[float, float, float, float]:
+    setting.frames.scene_of(index)  # not counted: it comes once for many steps
     start = time.perf_counter()
     frame = setting.frames[index]
     cast = time.perf_counter()
@@ -223,8 +220,12 @@ def _one_step(setting: Setting, index: int) -> tuple[float, float, float]:
     inside = setting.metric.grid.cell_of(frame.reference) >= 0
     searching = time.perf_counter()
     nearest(frame.reference[inside], frame.sensor, max_distance=setting.metric.max_radius)
-    search_s = time.perf_counter() - searching
-    return cast - start, search_s, max(0.0, updated - cast - search_s)
+    searched = time.perf_counter()
+    search_s, brute_force_s = searched - searching, math.nan
+    if setting.rays <= MOST_RAYS_BY_BRUTE_FORCE:
+        nearest(frame.reference[inside], frame.sensor, max_distance=setting.metric.max_radius, backend="cdist")
+        brute_force_s = time.perf_counter() - searched
+    return cast - start, search_s, max(0.0, updated - cast - search_s), brute_force_s
 
 
 def _write(request: Request, truth: Truth, points: Sequence[WorkPoint], stages: Sequence[Mapping[str, Any]]) -> None:
@@ -248,7 +249,7 @@ def _write(request: Request, truth: Truth, points: Sequence[WorkPoint], stages: 
         "threshold_m": request.threshold,
         "long_run": {"steps": request.long_run_steps, "rays": LONG_RUN_RAYS, "standard_errors": json_record(floor)},
         "points": study_records(points),
-        "stages": list(stages),
+        "stages": [json_record(stage) for stage in stages],
         "recommended": [
             {"detection_error": wanted, **({} if point is None else study_records([point])[0])}
             for wanted, point in recommended.items()
@@ -283,10 +284,11 @@ def _advice(wanted: float, point: WorkPoint | None, request: Request) -> str:
 def _stage_table(stages: Sequence[Mapping[str, Any]]) -> Table:
     table = Table(title="One step: where the time goes", title_justify="left")
     table.add_column("reference")
-    for column in ("rays", "step (ms)", "rays (%)", "search (%)", "binning (%)"):
+    for column in ("rays", "step (ms)", "rays (%)", "search (%)", "binning (%)", "search by cdist (ms)"):
         table.add_column(column, justify="right")
     for stage in stages:
         parts = [stage["rays_s"], stage["search_s"], stage["binning_s"]]
         shares = [f"{100 * part / sum(parts):.0f}" for part in parts]
-        table.add_row(stage["reference"], f"{stage['rays']:,}", f"{1000 * sum(parts):.0f}", *shares)
+        brute_force = "" if math.isnan(stage["cdist_s"]) else f"{1000 * stage['cdist_s']:.0f}"
+        table.add_row(stage["reference"], f"{stage['rays']:,}", f"{1000 * sum(parts):.0f}", *shares, brute_force)
     return table

@@ -199,7 +199,7 @@ class CoverageMetric(Metric):
         if index is None:
             numbers: Sequence[int] = [int(self.steps) + step for step in range(count)]
         else:
-            numbers = [index] if isinstance(index, int) else [int(number) for number in index]
+            numbers = [int(number) for number in index] if isinstance(index, Sequence) else [int(index)]
         if len(sensors) != count:
             raise ValueError(f"{len(sensors)} sensor clouds for {count} reference clouds; one pair a step")
         if len(all_weights) != count or len(numbers) != count:

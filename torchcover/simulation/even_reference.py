@@ -94,14 +94,18 @@ class EvenReference:
             The rays in the sensor's frame.
         """
         place_m = vehicle_T_reference[:3, 3]
-        each = self.rays // (2 * len(self.areas))
         tiles: list[Tile] = []
         for area in self.areas:
             for top_m in (0.0, TOP_M):
-                targets_m = _stratified(area, top_m, each, generator)
+                targets_m = _stratified(area, top_m, self._rays_each, generator)
                 way_m = targets_m - place_m[:, None, None]
                 tiles += into_tiles(way_m / np.linalg.norm(way_m, axis=0))
         return tuple(tiles)
+
+    @property
+    def _rays_each(self) -> int:
+        """Rays for the ground, and as many for the space above it, of one area."""
+        return self.rays // (2 * len(self.areas))
 
     def weights(
         self, vehicle_T_reference: Float64, tiles: tuple[Tile, ...], ray: NDArray[np.int64]
@@ -118,7 +122,8 @@ class EvenReference:
         """
         towards = np.concatenate([tile.directions for tile in tiles], axis=1)[:, ray].astype(np.float64)
         place_m = vehicle_T_reference[:3, 3]
-        density = np.mean([_density(area, place_m, towards) for area in self.areas], axis=0)
+        counts = [math.prod(_patches(area, self._rays_each)) for area in self.areas]
+        density = np.average([_density(area, place_m, towards) for area in self.areas], axis=0, weights=counts)
         elevation = np.arcsin(np.clip(towards[2], -1.0, 1.0))
         paper = np.interp(elevation, np.linspace(-np.pi / 2, np.pi / 2, ELEVATIONS), paper_density())
         # The paper's sensor never looks up steeply, and a ray aimed at the very border of an area may have been rounded
@@ -133,12 +138,18 @@ def _stratified(
     """(3, rows, columns) points, one at random in each of about `count` patches; z between 0 and `top_m`."""
     (x_low, x_high), (y_low, y_high) = area
     length_m, width_m = x_high - x_low, y_high - y_low
-    columns = min(count, max(1, round(math.sqrt(count * length_m / width_m))))
-    rows = count // columns
+    rows, columns = _patches(area, count)
     jitter = generator.random((3, rows, columns))
     x = x_low + length_m * (np.arange(columns)[None] + jitter[0]) / columns
     y = y_low + width_m * (np.arange(rows)[:, None] + jitter[1]) / rows
     return np.stack([x, y, top_m * jitter[2]])
+
+
+def _patches(area: Sequence[tuple[float, float]], count: int) -> tuple[int, int]:
+    """Rows and columns of nearly square patches, together at most `count`."""
+    (x_low, x_high), (y_low, y_high) = area
+    columns = min(count, max(1, round(math.sqrt(count * (x_high - x_low) / (y_high - y_low)))))
+    return count // columns, columns
 
 
 def _density(area: Sequence[tuple[float, float]], place_m: Float64, directions: Float64) -> Float64:
