@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.coverage.result import histogram_quantiles
+from torchcover.coverage.quantiles import histogram_quantiles
 
 GRID = BevGrid(x=(-1.0, 20.0), y=(-5.0, 5.0), cell=0.5)
 COUNTS = dict.fromkeys(Coverage.COUNTS, 3)

@@ -13,11 +13,10 @@ from torchmetrics.utilities.distributed import gather_all_tensors
 from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.blocks import Blocks, check_blocks, pair_up
 from torchcover.coverage.grid import BevGrid, bin_of
-from torchcover.coverage.result import Coverage, histogram_quantiles
-from torchcover.neighbors import check_cloud, nearest
-
-# Bins of the histogram behind the quantiles: 20 a decade from 1 cm to 100 m, and one beyond each end.
-QUANTILE_EDGES_M = torch.cat([torch.tensor([0.0]), torch.logspace(-2, 2, 81), torch.tensor([math.inf])]).double()
+from torchcover.coverage.quantiles import QUANTILE_EDGES_M, histogram_quantiles
+from torchcover.coverage.result import Coverage
+from torchcover.coverage.steps import Clouds, Step, as_list, check_parameters, checked_steps
+from torchcover.neighbors import nearest
 
 
 class CoverageMetric(Metric):
@@ -101,7 +100,7 @@ class CoverageMetric(Metric):
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         super().__init__(**kwargs)
-        _check_parameters(thresholds, max_radius, quantiles)
+        check_parameters(thresholds, max_radius, quantiles)
         check_blocks(blocks)
         self.grid = grid
         self.thresholds = tuple(float(threshold) for threshold in thresholds)
@@ -146,10 +145,10 @@ class CoverageMetric(Metric):
 
     def update(
         self,
-        sensor: Tensor | Sequence[Tensor],
-        reference: Tensor | Sequence[Tensor],
+        sensor: Clouds,
+        reference: Clouds,
         *,
-        weights: Tensor | Sequence[Tensor] | None = None,
+        weights: Clouds | None = None,
         index: int | Sequence[int] | None = None,
     ) -> None:
         """Add one step, or one step for each entry of two lists.
@@ -169,53 +168,26 @@ class CoverageMetric(Metric):
                 that are not positive and finite, a negative index.
             TypeError: A cloud is not a floating-point tensor.
         """
-        steps = self._checked(_as_list(sensor), _as_list(reference), weights, index)
-        for step in steps:
-            self._add_step(*step)
+        for step in checked_steps(sensor, reference, weights, index, first=int(self.steps)):
+            self._add_step(step)
 
     def forward(
         self,
-        sensor: Tensor | Sequence[Tensor],
-        reference: Tensor | Sequence[Tensor],
+        sensor: Clouds,
+        reference: Clouds,
         *,
-        weights: Tensor | Sequence[Tensor] | None = None,
+        weights: Clouds | None = None,
         index: int | Sequence[int] | None = None,
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
         if index is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
-            index = [int(self.steps) + step for step in range(len(_as_list(sensor)))]
+            index = [int(self.steps) + step for step in range(len(as_list(sensor)))]
         coverage: Coverage = super().forward(sensor, reference, weights=weights, index=index)
         return coverage
 
-    def _checked(
-        self,
-        sensors: Sequence[Tensor],
-        references: Sequence[Tensor],
-        weights: Tensor | Sequence[Tensor] | None,
-        index: int | Sequence[int] | None,
-    ) -> list[tuple[Tensor, Tensor, Tensor | None, int]]:
-        count = len(references)
-        all_weights: Sequence[Tensor | None] = [None] * count if weights is None else _as_list(weights)
-        if index is None:
-            numbers: Sequence[int] = [int(self.steps) + step for step in range(count)]
-        else:
-            numbers = [int(number) for number in index] if isinstance(index, Sequence) else [int(index)]
-        if len(sensors) != count:
-            raise ValueError(f"{len(sensors)} sensor clouds for {count} reference clouds; one pair a step")
-        if len(all_weights) != count or len(numbers) != count:
-            raise ValueError(
-                f"{len(all_weights)} weights and {len(numbers)} indices for {count} reference clouds; one a step each"
-            )
-        for step in range(count):
-            check_cloud(sensors[step], f"sensor[{step}]")
-            check_cloud(references[step], f"reference[{step}]")
-            _check_weights(all_weights[step], len(references[step]), f"weights[{step}]")
-            if numbers[step] < 0:
-                raise ValueError(f"index[{step}]: a number >= 0 is needed; got {numbers[step]}")
-        return list(zip(sensors, references, all_weights, numbers, strict=True))
-
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
-    def _add_step(self, sensor: Tensor, reference: Tensor, weights: Tensor | None, index: int) -> None:
+    def _add_step(self, step: Step) -> None:
+        sensor, reference, weights, index = step
         cell = self.grid.cell_of(reference)
         inside = cell >= 0
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
@@ -370,33 +342,3 @@ class CoverageMetric(Metric):
     def _quantiles(self) -> Tensor:
         values = histogram_quantiles(self.histogram, QUANTILE_EDGES_M.to(self.histogram.device), self.quantiles)
         return values.clamp(max=self.max_radius).view(-1, *self.grid.shape)
-
-
-def _check_parameters(thresholds: Sequence[float], max_radius: float, quantiles: Sequence[float]) -> None:
-    if not all(threshold >= 0 for threshold in thresholds):
-        raise ValueError(f"thresholds: distances >= 0 in metres are needed; got {tuple(thresholds)}")
-    if len(set(thresholds)) != len(thresholds):
-        raise ValueError(f"thresholds: each may be given once; got {tuple(thresholds)}")
-    if not max_radius > 0:
-        raise ValueError(f"max_radius: a positive distance in metres is needed; got {max_radius}")
-    if any(threshold > max_radius for threshold in thresholds):
-        raise ValueError(
-            f"thresholds: at most max_radius = {max_radius} m, where r saturates, is possible; got {tuple(thresholds)}"
-        )
-    if not all(0 <= quantile <= 1 for quantile in quantiles):
-        raise ValueError(f"quantiles: numbers in [0, 1] are needed; got {tuple(quantiles)}")
-
-
-def _as_list(clouds: Tensor | Sequence[Tensor]) -> list[Tensor]:
-    return [clouds] if isinstance(clouds, Tensor) else list(clouds)
-
-
-def _check_weights(weights: Tensor | None, points: int, name: str) -> None:
-    if weights is None:
-        return
-    if weights.shape != (points,):
-        raise ValueError(
-            f"{name}: shape ({points},), one for each reference point, is needed; got {tuple(weights.shape)}"
-        )
-    if not bool(((weights > 0) & weights.isfinite()).all()):
-        raise ValueError(f"{name}: positive, finite numbers are needed")

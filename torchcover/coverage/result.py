@@ -1,9 +1,7 @@
 """The result: maps over the grid, and one number a region."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,52 +15,9 @@ from torchcover.coverage.errors import cell_errors
 from torchcover.coverage.estimate import Estimator, RegionEstimate, estimate_region, unseen_cells
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.regions import Region, forward_regions
+from torchcover.coverage.summary import RegionNumbers, RegionSummary
 
 FORMAT_VERSION = 1
-
-
-@dataclass(frozen=True)
-class RegionNumbers:
-    """Means over the cells of one region in one height band, every cell weighing the same.
-
-    Args:
-        radius_m: Mean blind spot radius in metres; NaN if no cell is known.
-        detection: Threshold in metres -> mean detection probability.
-        radius_error_m: Standard error of `radius_m`; NaN if it was not asked for, or if there are not enough steps.
-        detection_error: Threshold -> standard error of `detection`.
-    """
-
-    radius_m: float
-    detection: Mapping[float, float]
-    radius_error_m: float
-    detection_error: Mapping[float, float]
-
-
-@dataclass(frozen=True)
-class RegionSummary(RegionNumbers):
-    """The numbers of one region in one height band, over its known cells.
-
-    Args:
-        region: Name of the region.
-        height: Name of the height band.
-        cells: Number of cells in the region.
-        known_cells: How many of them a reference point has probed.
-        unseen_cells: About how many more would become known with more steps.
-        completed: The numbers with these cells, as far as can be told; less biased as long as there are many. See
-            `torchcover.coverage.estimate.completed_mean`.
-    """
-
-    region: str
-    height: str
-    cells: int
-    known_cells: int
-    unseen_cells: float
-    completed: RegionNumbers
-
-    @property
-    def known_share(self) -> float:
-        """Share of the region's cells that are known. The numbers are about this share, and biased when it is low."""
-        return self.known_cells / self.cells
 
 
 class Coverage:
@@ -296,33 +251,6 @@ class Coverage:
             "radius_error_m": radius_error_m,
             "detection_error": dict(zip(self.thresholds, detection_error, strict=True)),
         }
-
-
-def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float]) -> Tensor:
-    """Quantiles from weights in bins, linear within a bin.
-
-    Args:
-        histogram: (B, C) weight in each bin, one column a cell.
-        edges: (B + 1,) bin edges, ascending; the last may be infinite.
-        levels: Q levels in [0, 1].
-
-    Returns:
-        (Q, C) quantiles; infinite in the last bin if its upper edge is; NaN in a column without weight.
-    """
-    cumulative = histogram.cumsum(dim=0)
-    total = cumulative[-1]
-    rows = []
-    for level in levels:
-        target = total * level
-        # The second condition matters at level 0: the least value lies in the first bin that has any weight.
-        at = ((cumulative < target) | (cumulative == 0)).sum(dim=0).clamp(max=len(histogram) - 1)
-        weight = histogram.gather(0, at[None])[0]
-        below = cumulative.gather(0, at[None])[0] - weight
-        share = ((target - below) / weight).nan_to_num(0.0).clamp(0, 1)
-        low, high = edges[at], edges[at + 1]
-        value = torch.where(high.isinf(), high, low + share * (high - low))
-        rows.append(value.where(total > 0, math.nan))
-    return torch.stack(rows)
 
 
 def _read_npz(path: str | Path) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -1,0 +1,37 @@
+"""Quantiles from a histogram, whose size does not grow with the steps."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+# Bins of the histogram behind the quantiles: 20 a decade from 1 cm to 100 m, and one beyond each end.
+QUANTILE_EDGES_M = torch.cat([torch.tensor([0.0]), torch.logspace(-2, 2, 81), torch.tensor([math.inf])]).double()
+
+
+def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float]) -> Tensor:
+    """Quantiles from weights in bins, linear within a bin.
+
+    Args:
+        histogram: (B, C) weight in each bin, one column a cell.
+        edges: (B + 1,) bin edges, ascending; the last may be infinite.
+        levels: Q levels in [0, 1].
+
+    Returns:
+        (Q, C) quantiles; infinite in the last bin if its upper edge is; NaN in a column without weight.
+    """
+    cumulative = histogram.cumsum(dim=0)
+    total = cumulative[-1]
+    rows = []
+    for level in levels:
+        target = total * level
+        # The second condition matters at level 0: the least value lies in the first bin that has any weight.
+        at = ((cumulative < target) | (cumulative == 0)).sum(dim=0).clamp(max=len(histogram) - 1)
+        weight = histogram.gather(0, at[None])[0]
+        below = cumulative.gather(0, at[None])[0] - weight
+        share = ((target - below) / weight).nan_to_num(0.0).clamp(0, 1)
+        low, high = edges[at], edges[at + 1]
+        value = torch.where(high.isinf(), high, low + share * (high - low))
+        rows.append(value.where(total > 0, math.nan))
+    return torch.stack(rows)

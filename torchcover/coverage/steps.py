@@ -1,0 +1,97 @@
+"""What the metric takes, checked once at the door."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias
+
+from torch import Tensor
+
+from torchcover.neighbors import check_cloud
+
+# One step, or a list with an entry for each.
+Clouds: TypeAlias = Tensor | Sequence[Tensor]
+
+
+class Step(NamedTuple):
+    """One step: two clouds in the vehicle frame, weights of the reference points, and its number in time."""
+
+    sensor: Tensor
+    reference: Tensor
+    weights: Tensor | None
+    number: int
+
+
+def check_parameters(thresholds: Sequence[float], max_radius: float, quantiles: Sequence[float]) -> None:
+    """Refuse parameters of a metric that make no sense.
+
+    Raises:
+        ValueError: A threshold that is negative, NaN, over `max_radius`, or given twice; a `max_radius` that is not
+            positive; a quantile outside [0, 1].
+    """
+    if not all(threshold >= 0 for threshold in thresholds):
+        raise ValueError(f"thresholds: distances >= 0 in metres are needed; got {tuple(thresholds)}")
+    if len(set(thresholds)) != len(thresholds):
+        raise ValueError(f"thresholds: each may be given once; got {tuple(thresholds)}")
+    if not max_radius > 0:
+        raise ValueError(f"max_radius: a positive distance in metres is needed; got {max_radius}")
+    if any(threshold > max_radius for threshold in thresholds):
+        raise ValueError(
+            f"thresholds: at most max_radius = {max_radius} m, where r saturates, is possible; got {tuple(thresholds)}"
+        )
+    if not all(0 <= quantile <= 1 for quantile in quantiles):
+        raise ValueError(f"quantiles: numbers in [0, 1] are needed; got {tuple(quantiles)}")
+
+
+def checked_steps(
+    sensor: Clouds, reference: Clouds, weights: Clouds | None, index: int | Sequence[int] | None, first: int
+) -> list[Step]:
+    """The steps of an update, in order.
+
+    Args:
+        sensor: As in `CoverageMetric.update`, and so are the others.
+        reference: Reference points.
+        weights: Their weights.
+        index: Numbers of the steps in time.
+        first: Number of the first step if `index` is not given.
+
+    Raises:
+        ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights that are
+            not positive and finite, a negative index.
+        TypeError: A cloud is not a floating-point tensor.
+    """
+    sensors, references = as_list(sensor), as_list(reference)
+    count = len(references)
+    every_weights: Sequence[Tensor | None] = [None] * count if weights is None else as_list(weights)
+    if index is None:
+        numbers = list(range(first, first + count))
+    else:
+        numbers = [int(number) for number in index] if isinstance(index, Sequence) else [int(index)]
+    if len(sensors) != count:
+        raise ValueError(f"{len(sensors)} sensor clouds for {count} reference clouds; one pair a step")
+    if len(every_weights) != count or len(numbers) != count:
+        raise ValueError(
+            f"{len(every_weights)} weights and {len(numbers)} indices for {count} reference clouds; one a step each"
+        )
+    steps = [Step(*parts) for parts in zip(sensors, references, every_weights, numbers, strict=True)]
+    for at, step in enumerate(steps):
+        check_cloud(step.sensor, f"sensor[{at}]")
+        check_cloud(step.reference, f"reference[{at}]")
+        _check_weights(step.weights, len(step.reference), f"weights[{at}]")
+        if step.number < 0:
+            raise ValueError(f"index[{at}]: a number >= 0 is needed; got {step.number}")
+    return steps
+
+
+def as_list(clouds: Clouds) -> list[Tensor]:
+    """A list with an entry for each step."""
+    return [clouds] if isinstance(clouds, Tensor) else list(clouds)
+
+
+def _check_weights(weights: Tensor | None, points: int, name: str) -> None:
+    if weights is None:
+        return
+    if weights.shape != (points,):
+        raise ValueError(
+            f"{name}: shape ({points},), one for each reference point, is needed; got {tuple(weights.shape)}"
+        )
+    if not bool(((weights > 0) & weights.isfinite()).all()):
+        raise ValueError(f"{name}: positive, finite numbers are needed")
