@@ -154,7 +154,7 @@ def study(
     runs: Annotated[int, typer.Option(min=1, help="Runs with other seeds that errors are averaged over.")] = 3,
     long_run_steps: Annotated[
         int, typer.Option(min=8, help="Steps of the run that the others are measured against.")
-    ] = 512,
+    ] = 256,
     every: options.Every = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
