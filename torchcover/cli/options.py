@@ -17,7 +17,7 @@ Reference = Annotated[
 ]
 Rays = Annotated[
     int | None,
-    typer.Option(min=1, help="Rays of the reference sensor at each step (even: 16384; paper: 1048576, a square)."),
+    typer.Option(min=1, help="Rays of the reference sensor at each step (even: 262144; paper: 1048576, a square)."),
 ]
 Every = Annotated[
     float | None,

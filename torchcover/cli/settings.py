@@ -16,6 +16,8 @@ from torchcover.data import Frame, SimulatedFrames
 from torchcover.simulation import EvenReference, ReferenceSensor, Rig, Scenario
 
 DEFAULT_REFERENCE = "even"
+# The best of those tried for runs of seconds to a minute: `torchcover study`, docs/accuracy.md.
+DEFAULT_EVEN_RAYS = 262_144
 DEFAULT_STEPS = 64
 # A world is built once a minute of traffic, for about the price of eight steps: docs/accuracy.md has the trade.
 EVERY_S_IN_TRAFFIC = 10.0
@@ -80,7 +82,7 @@ def reference_called(name: str | None, rays: int | None) -> ReferenceSensor | Ev
     """
     if (name or DEFAULT_REFERENCE) == "even":
         areas = (*((region.x, region.y) for region in forward_regions()), (GRID_X_M, GRID_Y_M))
-        return EvenReference(areas) if rays is None else EvenReference(areas, rays=rays)
+        return EvenReference(areas, rays=rays or DEFAULT_EVEN_RAYS)
     if name == "paper":
         side = 1024 if rays is None else max(1, round(math.sqrt(rays)))
         return ReferenceSensor(rows=side, columns=side)
