@@ -107,7 +107,7 @@ def test_the_reference_sensor_is_the_one_that_was_asked_for_and_is_named(torchco
     summary = json.loads((out / "summary.json").read_text())
     assert summary["reference"] == {"sensor": sensor, "rays_per_step": rays, "every_s": 0.1}
     assert summary["frame_counts"]["reference_rays"] == 2 * rays
-    assert f"Reference sensor: {sensor}, {rays:,} rays a step." in printed
+    assert f"Reference sensor: {sensor}, {rays:,} rays a step; a step every 0.1 s." in " ".join(printed.split())
 
 
 @pytest.fixture
