@@ -16,6 +16,7 @@ BENCHMARKS = (
     "urban_throughput",
     "five_rigs",
     "omissions",
+    "metric_omissions",
     "even_reference",
     "calibration",
     "training_overhead",

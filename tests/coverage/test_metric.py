@@ -184,6 +184,14 @@ def test_max_radius_saturates_every_number(max_radius):
     assert result.quantiles.item() <= max_radius
 
 
+def test_a_search_bounded_by_the_threshold_detects_the_same_to_the_last_bit():
+    """Whoever wants detection only may bound the search by the largest threshold."""
+    steps = random_steps(11, steps=6)
+    whole, bounded = (coverage(steps, GRID, (0.25, 0.5), max_radius=limit) for limit in (math.inf, 0.5))
+    assert torch.equal(whole.detection.nan_to_num(-1), bounded.detection.nan_to_num(-1))
+    assert (bounded.radius[bounded.frames > 0] <= 0.5).all()
+
+
 # Against plain loops
 
 

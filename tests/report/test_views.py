@@ -194,7 +194,7 @@ def test_images_of_several_sizes_keep_square_pixels_and_do_not_overlap():
 
 @pytest.mark.parametrize("image", [np.full((3, 3), np.inf), np.full((3, 3), np.nan), np.full((1, 1), 7.0)])
 def test_images_without_a_range_of_depths_are_drawn_too(image):
-    depths({"only": image})
+    assert depths({"only": image}).figure.axes
 
 
 @pytest.mark.parametrize(
@@ -257,7 +257,7 @@ def test_the_histogram_says_no_point_where_the_maps_say_unknown():
 
 
 def test_a_rig_without_a_point_is_drawn_too():
-    four_views(torch.full(GRID.shape, float("nan")), torch.zeros(GRID.shape[1:]))
+    assert len(four_views(torch.full(GRID.shape, float("nan")), torch.zeros(GRID.shape[1:])).figure.axes) >= 4
 
 
 @pytest.mark.parametrize(

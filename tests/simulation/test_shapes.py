@@ -164,12 +164,13 @@ def test_a_mesh_that_is_not_closed_is_named_with_what_it_means(tmp_path):
 @pytest.mark.parametrize("shape", [CAR, Cylinder(type="cylinder", radius_m=2, height_m=5)])
 def test_closed_meshes_give_no_warning_however_they_are_written(tmp_path, shape):
     mesh = shape.mesh()
-    mesh_file(tmp_path, ply_of(mesh)).mesh()
+    # Warnings are errors here: what is read without one has all its faces.
+    assert len(mesh_file(tmp_path, ply_of(mesh)).mesh().faces) == len(mesh.faces)
     # Each face with corners of its own, as STL has it; then with half of the faces flipped, which is harmless.
     apart = mesh._replace(
         vertices_m=mesh.vertices_m[mesh.faces.ravel()], faces=np.arange(mesh.faces.size).reshape(-1, 3)
     )
-    mesh_file(tmp_path, ply_of(apart)).mesh()
+    assert len(mesh_file(tmp_path, ply_of(apart)).mesh().faces) == len(mesh.faces)
     flipped = mesh.faces.copy()
     flipped[::2] = flipped[::2, ::-1]
     mesh_file(tmp_path, ply_of(mesh._replace(faces=flipped))).mesh()
