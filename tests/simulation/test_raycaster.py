@@ -82,6 +82,26 @@ def test_no_ray_slips_out_of_a_closed_box_through_its_edges():
     np.testing.assert_allclose(hits.range_m, range_m, atol=1e-5)
 
 
+@pytest.mark.parametrize("gap_m", [0.001, 0.01, 0.4])
+def test_a_mountain_far_away_does_not_blur_the_wall_in_front(gap_m):
+    mountain = Mesh(np.array([[1e6, 0, 0], [1e6, 100, 0], [1e6, 0, 100]]), np.array([[0, 1, 2]]))
+    ahead = np.array([[1], [0], [0]], np.float32)
+    hits = RayCaster([mountain, box_at(0.5 + gap_m)]).cast(HERE, ahead, endless(ahead))
+    assert hits.body == [1]
+    np.testing.assert_allclose(hits.range_m, gap_m, rtol=1e-4)
+
+
+def test_rays_leave_each_of_several_faces_that_meet_where_they_start():
+    corner_m = np.array([0.5, 0.5, 0.5])
+    directions = random_directions(500)
+    outwards = (directions > 0.01).any(axis=0)
+    hits = RayCaster([box_at(0.0)]).cast(corner_m, directions, endless(directions))
+    assert (hits.body[outwards] == -1).all()
+    hits = RayCaster([box_at(0.0), box_at(50.0, size=200.0)]).cast(corner_m, directions, endless(directions))
+    assert (hits.body[outwards] == 1).all()
+    assert (hits.range_m[outwards] > 40.0).all()
+
+
 def test_hits_name_their_body():
     directions = np.array([[1, 0, 0], [0, 1, 0], [-1, 0, 0]], dtype=np.float32).T
     hits = RayCaster([box_at(5.0), box_at(0.0, 7.0)]).cast(HERE, directions, endless(directions))

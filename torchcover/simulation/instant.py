@@ -173,6 +173,8 @@ class Instant:
         hits = cast_from(self.static, self.static_T_vehicle, origin_m, directions, limit_m)
         if own_m is not None:
             hits.body[(hits.body < 0) & (own_m <= limit_m)] = self.ego
+        if not self.moving:
+            return directions, hits, 0
         farthest_m = float(hits.range_m.max(initial=0.0))
         near = boxes_in_cone(bodies, vehicle_R_sensor @ tile.axis, tile.half_angle, farthest_m)
         if len(near) == 0:
@@ -215,8 +217,6 @@ def rotate(rotation: Matrix, directions: Float32) -> Float32:
     """Turn (3, n) directions. What becomes of one does not depend on the others."""
     if np.array_equal(rotation, np.eye(3)):
         return directions
-    if directions.shape[1] == 1:
-        # BLAS has another routine for a single column, which rounds differently: a ray must not depend on its company.
-        return rotate(rotation, directions.repeat(2, axis=1))[:, :1]
-    rotated: Float32 = rotation.astype(np.float32) @ directions
+    # No matrix product: BLAS rounds a single column differently, and wakes threads of its own for many.
+    rotated: Float32 = np.einsum("ij,jn->in", rotation.astype(np.float32), directions)
     return rotated

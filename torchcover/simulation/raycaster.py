@@ -6,23 +6,22 @@ interpreter lock, so that threads add up.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
+from torchcover.simulation.contact import Faces
 from torchcover.simulation.shapes import Mesh
 
 Float32 = NDArray[np.float32]
 
 # Farther from the origin float32 resolves no better than 64 m, and at 2e18 Embree drops faces without a word.
 MOST_M = 1e9
-# An origin lies on a face if it is no farther from its plane than this many roundings of the largest coordinate.
-CONTACT_ROUNDINGS = 4
-# Only hits this near are looked at: what a sensor is mounted on.
-TOUCHING_M = 1.0
+# A ray leaves at most so many faces that meet where it starts.
+MOST_FACES = 8
 
 
 class Hits(NamedTuple):
@@ -51,7 +50,9 @@ class RayCaster:
             raise ValueError(
                 f"bodies within {MOST_M:g} m of the origin are needed; a vertex has the coordinate {reach_m}"
             )
-        self._contact_m = CONTACT_ROUNDINGS * float(np.finfo(np.float32).eps) * reach_m
+        self._faces = Faces(bodies, reach_m)
+        self._first_face = np.cumsum([0] + [len(body.faces) for body in bodies])
+        self._last_asked = (b"", False)
         # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
         self._scene = EmbreeScene(robust=True)
         for body in bodies:
@@ -76,27 +77,48 @@ class RayCaster:
         )
         answer = self._scene.run(origins, directions.T, dists=limit_m.copy(), output=True)
         hits = Hits(answer["tfar"], answer["geomID"])
-        self._leave_faces(origin_m, directions, limit_m, answer["Ng"], hits)
+        if self._starts_on_a_face(origin_m):
+            self._leave_faces(origin_m, directions, limit_m, hits, self._numbers(answer))
         return hits
 
+    def _numbers(self, answer: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
+        """(N,) which of all faces each ray hit; any number where it hit none."""
+        numbers: NDArray[np.int64] = self._first_face[np.maximum(answer["geomID"], 0)] + np.maximum(answer["primID"], 0)
+        return numbers
+
+    def _starts_on_a_face(self, origin_m: NDArray[np.floating]) -> bool:
+        """Whether a place lies on a face: hardly any does, and asking the faces is cheaper than asking the rays.
+
+        The last answer is kept, for all tiles of a scan start at one place.
+        """
+        asked, answer = self._last_asked  # read at once: other threads may ask about other places
+        if asked != origin_m.tobytes():
+            answer = self._faces.hold(origin_m)
+            self._last_asked = (origin_m.tobytes(), answer)
+        return answer
+
     def _leave_faces(
-        self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32, normals: Float32, hits: Hits
+        self,
+        origin_m: NDArray[np.floating],
+        directions: Float32,
+        limit_m: Float32,
+        hits: Hits,
+        faces: NDArray[np.int64],
     ) -> None:
         """Cast the rays again that hit the face they start on, from a place beside it, on the side they point to."""
-        near = np.flatnonzero((hits.range_m < TOUCHING_M) & (hits.body >= 0))
-        if len(near) == 0:
-            return
-        # Column by column: sums over rows of three numbers are slow.
-        (nx, ny, nz), (x, y, z) = normals[near].T, directions[:, near]
-        length, slope = np.sqrt(nx * nx + ny * ny + nz * nz), nx * x + ny * y + nz * z
-        # By the distance from the face, not along the ray: a grazing ray meets the rounded face far from its origin.
-        touching = (hits.range_m[near] * np.abs(slope) <= self._contact_m * length) & (length > 0)
-        near = near[touching]
-        if len(near):
-            away = np.sign(slope[touching]) / length[touching]
-            beside = origin_m + 2 * self._contact_m * away[:, None] * normals[near]
-            answer = self._scene.run(beside.astype(np.float32), directions.T[near], dists=limit_m[near], output=True)
-            hits.range_m[near], hits.body[near] = answer["tfar"], answer["geomID"]
+        rays = np.flatnonzero(hits.body >= 0)
+        faces, starts_m = faces[rays], np.tile(origin_m, (len(rays), 1))
+        for _ in range(MOST_FACES):
+            normals, contact_m = self._faces.normals[:, faces].T, self._faces.contact_m[faces]
+            slope = (normals * directions.T[rays]).sum(axis=1)
+            # By the distance from the face, not along the ray: a grazing ray meets the rounded face far from its start.
+            touching = np.flatnonzero((hits.range_m[rays] * np.abs(slope) <= contact_m) & (hits.body[rays] >= 0))
+            if len(touching) == 0:
+                return
+            rays, starts_m = rays[touching], starts_m[touching]
+            starts_m += (2 * contact_m * np.sign(slope))[touching, None] * normals[touching]
+            answer = self._scene.run(starts_m.astype(np.float32), directions.T[rays], dists=limit_m[rays], output=True)
+            hits.range_m[rays], hits.body[rays], faces = answer["tfar"], answer["geomID"], self._numbers(answer)
 
     def back_faces(self, origin_m: NDArray[np.floating], directions: Float32) -> NDArray[np.bool_]:
         """Which rays first meet a face from behind, as rays that start inside a closed body do.

@@ -1,0 +1,46 @@
+"""Whether a place lies on a face, as far as float32 can tell."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.simulation.shapes import Mesh
+
+# An origin lies on a face if it is no farther from its plane than this many times what rounding makes of that.
+CONTACT_ROUNDINGS = 4
+# Origins are rounded too, before they come here: in float64, as a share of the largest coordinate.
+LEAST_CONTACT = 1e-12
+
+
+class Faces:
+    """The faces of all bodies, one after the other, and how far from each a place counts as on it.
+
+    `contact_m` (F,) bounds the distance from its plane at which float32 may find a place that lies on it.
+    """
+
+    def __init__(self, bodies: Sequence[Mesh], reach_m: float) -> None:
+        first, second, third = np.concatenate([body.vertices_m[body.faces] for body in bodies]).transpose(1, 2, 0)
+        (ax, ay, az), (bx, by, bz) = np.abs(second - first), np.abs(third - first)
+        across = np.cross(second - first, third - first, axis=0)
+        length = np.linalg.norm(across, axis=0)
+        length[length == 0] = np.inf  # Embree does not hit a face without an area
+        # To first order, the roundings of n . x, where n = a x b, are the sum of all its products.
+        products = np.stack([ay * bz + az * by, az * bx + ax * bz, ax * by + ay * bx])
+        rounding_m = (products * np.abs([first, second, third]).max(axis=0)).sum(axis=0) / length
+        rounding_m = np.clip(rounding_m * np.finfo(np.float32).eps, None, np.finfo(np.float32).eps * reach_m)
+        self.contact_m = np.maximum(CONTACT_ROUNDINGS * rounding_m, LEAST_CONTACT * reach_m)
+        self.normals = across / length
+        self._corner_m = first
+        self._lower_m = np.min([first, second, third], axis=0) - 2 * self.contact_m
+        self._upper_m = np.max([first, second, third], axis=0) + 2 * self.contact_m
+
+    def hold(self, place_m: NDArray[np.floating]) -> bool:
+        """Whether a (3,) place lies on one of them."""
+        x, y, z = place_m
+        # One axis after the other: the first, which asks all faces, leaves few to the second.
+        near = np.flatnonzero((self._lower_m[2] <= z) & (z <= self._upper_m[2]))
+        for axis, coordinate_m in ((0, x), (1, y)):
+            near = near[(self._lower_m[axis, near] <= coordinate_m) & (coordinate_m <= self._upper_m[axis, near])]
+        from_plane_m = np.abs(((place_m[:, None] - self._corner_m[:, near]) * self.normals[:, near]).sum(axis=0))
+        return bool((from_plane_m <= 2 * self.contact_m[near]).any())
