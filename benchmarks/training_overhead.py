@@ -44,9 +44,9 @@ class TimedCallback(CoverageCallback):
     def on_train_epoch_end(self, trainer, pl_module):
         self.epochs.append((time.perf_counter() - self.start, self.inside, self.drawing))
 
-    def _log_maps(self, trainer):
+    def _log_maps(self, trainer, coverage):
         start = time.perf_counter()
-        super()._log_maps(trainer)
+        super()._log_maps(trainer, coverage)
         self.drawing += time.perf_counter() - start
 
     def _timed(self, hook, *arguments):

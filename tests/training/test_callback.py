@@ -142,6 +142,55 @@ def test_every_epoch_starts_anew_and_those_between_cost_nothing(tmp_path):
     assert_same(callback.coverage, expected(RandomFrames(4)))
 
 
+def measured_frames(trainer, metric):
+    """Of each epoch, how many frames were given to a metric, as a list that fills up."""
+    seen, update = [], metric.update
+
+    def spy(sensor, *arguments, **options):
+        seen.extend([trainer.current_epoch] * len(sensor))
+        update(sensor, *arguments, **options)
+
+    metric.update = spy
+    return seen
+
+
+def test_fixed_frames_are_measured_once_and_logged_at_every_epoch(tmp_path):
+    callback = CoverageCallback(make_metric(), regions=REGIONS, fixed_frames=True)
+    logger = TensorBoardLogger(tmp_path, name="", version="run")
+    trainer = make_trainer(tmp_path, callback, logger=logger, max_epochs=3)
+    seen = measured_frames(trainer, callback.metric)
+    trainer.fit(Validated(), loader(2), loader(5))
+    assert seen == [0] * 5
+    truth = expected(RandomFrames(5))
+    assert_same(callback.coverage, truth)
+    events = EventAccumulator(logger.log_dir, size_guidance={"images": 0})
+    events.Reload()
+    for name, value in truth.scalars(REGIONS).items():
+        logged = [event.value for event in events.Scalars(f"coverage/val/{name}")]
+        assert logged == pytest.approx([value] * 3, rel=1e-6, nan_ok=True)
+    assert [event.step for event in events.Images("coverage/val/radius")] == [0]
+    # Another fit is another measurement, and has maps of its own.
+    trainer = make_trainer(tmp_path, callback, logger=TensorBoardLogger(tmp_path, name="", version="other"))
+    trainer.fit(Validated(), loader(2), loader(4))
+    assert_same(callback.coverage, expected(RandomFrames(4)))
+    events = EventAccumulator(str(tmp_path / "other"))
+    events.Reload()
+    assert len(events.Images("coverage/val/radius")) == 1
+
+
+def test_frames_that_were_said_to_be_fixed_and_are_not_are_added(tmp_path):
+    class Alternating(Validated):
+        def val_dataloader(self):
+            return loader([RandomFrames(6)[2 * self.current_epoch + k] for k in range(3)])
+
+    callback = CoverageCallback(make_metric(), fixed_frames=True)
+    trainer = make_trainer(tmp_path, callback, max_epochs=2, reload_dataloaders_every_n_epochs=1)
+    seen = measured_frames(trainer, callback.metric)
+    trainer.fit(Alternating(), loader(2))
+    assert seen == [0, 0, 0, 1, 1]
+    assert_same(callback.coverage, expected(RandomFrames(5)))
+
+
 def test_frames_that_a_sampler_repeats_are_counted_once(tmp_path):
     callback = CoverageCallback(make_metric(), stage="train")
     make_trainer(tmp_path, callback).fit(Model(), loader(4, sampler=[0, 1, 2, 3, 0, 1, 2]))
@@ -390,6 +439,7 @@ def test_memory_does_not_grow_over_epochs(tmp_path):
         ({"every_n_epochs": 0}, "at least 1"),
         ({"stage": "train", "every_n_steps": 0}, "at least 1"),
         ({"every_n_steps": 5}, "needs stage='train'"),
+        ({"stage": "train", "fixed_frames": True}, "needs stage='validation'"),
     ],
 )
 def test_wrong_arguments_are_refused(options, complaint):

@@ -72,13 +72,13 @@ def fit(name, *callbacks, ckpt_path=None):
 
     regions = [Region("all", **{axis: job["grid"][axis] for axis in "xy"})]
     train = CoverageCallback(metric(), regions=regions, stage="train", maps=False)
-    validation = CoverageCallback(metric(), regions=regions)
+    validation = CoverageCallback(metric(), regions=regions, fixed_frames=True)
     logger = TakesImages(folder, name="", version=name)
     trainer = pl.Trainer(
         accelerator="cpu",
         devices=2,
         strategy="ddp",
-        max_epochs=1,
+        max_epochs=2,
         num_sanity_val_steps=0,
         callbacks=[train, validation, *callbacks],
         logger=logger,

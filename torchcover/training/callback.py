@@ -39,6 +39,9 @@ class CoverageCallback(Callback):
         stage: `"validation"` or `"train"`: whose batches to measure.
         every_n_epochs: Measure the last of every n epochs. The others cost nothing.
         every_n_steps: With `stage="train"`: also log the coverage of the epoch so far after every n batches.
+        fixed_frames: With `stage="validation"`: say that the frames are the same at every epoch. Each is then measured
+            when it first comes in a fit, later epochs log the numbers again, and maps are logged where frames were
+            added. With several processes, the sampler must not shuffle.
         maps: Whether to log maps.
         rig: Which of several rigs in a frame; part of the tags if given.
         frames_of: Gives the frames of a batch: a `FrameBatch` or a sequence of `Frame`, one for each sample, in order.
@@ -48,7 +51,7 @@ class CoverageCallback(Callback):
         coverage: The last `Coverage` that was logged, the same on every process; None before.
 
     Raises:
-        ValueError: An unknown stage, a number of epochs or steps below 1, steps outside training.
+        ValueError: An unknown stage, a number of epochs or steps below 1, steps outside training, fixed frames in it.
         ImportError: On import, without Lightning.
 
     Example:
@@ -66,16 +69,18 @@ class CoverageCallback(Callback):
         stage: str = "validation",
         every_n_epochs: int = 1,
         every_n_steps: int | None = None,
+        fixed_frames: bool = False,
         maps: bool = True,
         rig: str | None = None,
         frames_of: Callable[[Any], Any] | None = None,
     ) -> None:
-        _check_arguments(stage, every_n_epochs, every_n_steps)
+        _check_arguments(stage, every_n_epochs, every_n_steps, fixed_frames)
         self.metric = metric
         self.regions = regions
         self.stage = stage
         self.every_n_epochs = every_n_epochs
         self.every_n_steps = every_n_steps
+        self.fixed_frames = fixed_frames
         self.maps = maps
         self.rig = rig
         self.frames_of = frames_of
@@ -83,6 +88,8 @@ class CoverageCallback(Callback):
         self.coverage: Coverage | None = None
         self._epoch: int | None = None  # being measured; the same on every process, as collective calls need it
         self._once = CountOnce()
+        self._holds_fit = False  # whether the sums are of this fit
+        self._drawn: dict[str, int] | None = None  # the counts of the last maps of this fit
         self._warned: set[str] = set()
 
     @property
@@ -91,16 +98,23 @@ class CoverageCallback(Callback):
         return self._generate_state_key(tag=self.tag)
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Forget an epoch that was broken off; a checkpoint is restored after this."""
+        """Forget what came before; a checkpoint is restored after this."""
         self._epoch = None
+        self._holds_fit = False
+        self._drawn = None
 
     def _start(self, trainer: Trainer) -> None:
         if self._epoch == trainer.current_epoch:
             return
         due = trainer.state.fn != "fit" or (trainer.current_epoch + 1) % self.every_n_epochs == 0
         self._epoch = trainer.current_epoch if due and not trainer.sanity_checking else None
-        if self._epoch is not None:
+        if self._epoch is None:
+            return
+        if self.fixed_frames and self._holds_fit:
+            self._once.start_epoch(forget=False)
+        else:
             self._once.start_epoch()
+            self._holds_fit = True
             with torch.inference_mode(False):  # or the sums could not be added to outside a validation
                 self.metric.reset()
 
@@ -110,6 +124,8 @@ class CoverageCallback(Callback):
             return
         frames = frames_in(batch if self.frames_of is None else self.frames_of(batch))
         new = FrameBatch(tuple(self._once.new(frames, self._shard(trainer, loader_index), loader_index)))
+        if not new.frames:
+            return
         indices = [frame.index for frame in new.frames]
         with torch.inference_mode(False):
             # The sums live where the processes can exchange them; Apple's GPUs have no float64.
@@ -123,7 +139,8 @@ class CoverageCallback(Callback):
 
     def _shard(self, trainer: Trainer, loader_index: int) -> Shard | None:
         loaders: Any = trainer.train_dataloader if self.stage == "train" else trainer.val_dataloaders
-        loader = loaders[loader_index] if isinstance(loaders, list | tuple) else loaders
+        several = list(loaders.values()) if isinstance(loaders, dict) else loaders
+        loader = several[loader_index] if isinstance(several, list | tuple) else loaders
         shard = shard_of(loader)
         if shard is None and trainer.world_size > 1:
             self._warn_once(
@@ -134,29 +151,34 @@ class CoverageCallback(Callback):
     def _finish(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._epoch is None:
             return
-        scalars = self._compute()
+        coverage = self._compute()
         self._epoch = None
         # All processes log the same values, so that their maximum is the value, not rounded; Lightning wants some
         # reduction to be named.
-        pl_module.log_dict(scalars, on_step=False, on_epoch=True, sync_dist=True, reduce_fx="max")
-        self._log_maps(trainer)
+        pl_module.log_dict(self._scalars(coverage), on_step=False, on_epoch=True, sync_dist=True, reduce_fx="max")
+        if not (self.fixed_frames and coverage.counts == self._drawn):
+            self._log_maps(trainer, coverage)
+            self._drawn = coverage.counts
 
-    def _compute(self) -> dict[str, float]:
+    def _compute(self) -> Coverage:
         with torch.inference_mode(False):
             self.metric.update([], [])  # a process that was dealt nothing but padding has not updated yet
             coverage: Coverage = self.metric.compute()
         self.coverage = coverage
         if not bool((coverage.frames > 0).any()):
             self._warn_once("no reference point lies in the grid: the coverage of these frames is unknown (NaN)")
+        return coverage
+
+    def _scalars(self, coverage: Coverage) -> dict[str, float]:
         scalars = {**coverage.scalars(self.regions), "frames": float(coverage.counts["steps"])}
         return {f"{self.tag}/{name}": value for name, value in scalars.items()}
 
-    def _log_maps(self, trainer: Trainer) -> None:
-        if not (self.maps and trainer.is_global_zero and trainer.loggers and self.coverage):
+    def _log_maps(self, trainer: Trainer, coverage: Coverage) -> None:
+        if not (self.maps and trainer.is_global_zero and trainer.loggers):
             return
         from torchcover.training.figures import log_maps  # matplotlib only where there is something to draw
 
-        if refused := log_maps(self.coverage, trainer.loggers, self.tag, _step(trainer)):
+        if refused := log_maps(coverage, trainer.loggers, self.tag, _step(trainer)):
             self._warn_once(f"{', '.join(refused)} takes neither figures nor images: it gets the numbers alone")
 
     def _warn_once(self, text: str) -> None:
@@ -174,7 +196,7 @@ class CoverageCallback(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on within an epoch: rank zero takes over the sums, the others start from nothing."""
-        self._epoch = state_dict["epoch"]
+        self._epoch, self._holds_fit = state_dict["epoch"], True
         self._once.load_state_dict(state_dict["frames"])
         self.metric.reset()
         if not is_distributed() or torch.distributed.get_rank() == 0:
@@ -217,11 +239,11 @@ class CoverageCallback(Callback):
             return
         self._add(trainer, pl_module, batch, 0)
         if self._epoch is not None and self.every_n_steps and (batch_idx + 1) % self.every_n_steps == 0:
-            scalars = self._compute()
+            coverage = self._compute()
             # `log_dict` would drop the values of steps that are no multiples of the trainer's log_every_n_steps.
             for logger in trainer.loggers:
-                logger.log_metrics(scalars, step=_step(trainer))
-            self._log_maps(trainer)
+                logger.log_metrics(self._scalars(coverage), step=_step(trainer))
+            self._log_maps(trainer, coverage)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Log."""
@@ -234,7 +256,7 @@ def _step(trainer: Trainer) -> int:
     return max(trainer.global_step - 1, 0)
 
 
-def _check_arguments(stage: str, every_n_epochs: int, every_n_steps: int | None) -> None:
+def _check_arguments(stage: str, every_n_epochs: int, every_n_steps: int | None, fixed_frames: bool) -> None:
     if stage not in STAGES:
         raise ValueError(f"stage: one of {', '.join(STAGES)} is needed; got {stage!r}")
     if every_n_epochs < 1:
@@ -243,3 +265,5 @@ def _check_arguments(stage: str, every_n_epochs: int, every_n_steps: int | None)
         raise ValueError(f"every_n_steps: at least 1 is needed; got {every_n_steps}")
     if every_n_steps is not None and stage != "train":
         raise ValueError("every_n_steps: needs stage='train'; a validation is logged at its end")
+    if fixed_frames and stage != "validation":
+        raise ValueError("fixed_frames: needs stage='validation'; the frames of a training are shuffled and augmented")

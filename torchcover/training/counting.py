@@ -53,9 +53,14 @@ class CountOnce:
     def __init__(self) -> None:
         self.start_epoch()
 
-    def start_epoch(self) -> None:
-        """Forget the frames so far."""
-        self._counted: set[int] = set()
+    def start_epoch(self, *, forget: bool = True) -> None:
+        """Begin with the first positions of the loaders again.
+
+        Args:
+            forget: Whether frames that were counted in earlier epochs are to be counted again.
+        """
+        if forget:
+            self._counted: set[int] = set()
         self._position: dict[int, int] = {}
 
     def new(self, frames: Sequence[Frame], shard: Shard | None = None, loader: int = 0) -> list[Frame]:
