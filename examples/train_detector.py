@@ -19,6 +19,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.profilers import SimpleProfiler
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -248,7 +249,7 @@ class Training(lightning.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def train(rig, training_frames, validation_frames, visibility, options):
+def train(rig, training_frames, validation_frames, visibility, options, console):
     """Train one rig's detector; its module, and its coverage by region."""
     lightning.seed_everything(options.seed, verbose=False)
     loaders = [
@@ -258,19 +259,25 @@ def train(rig, training_frames, validation_frames, visibility, options):
     grid = BevGrid(x=X_M, y=Y_M, cell=1.6, heights={"body": (0.3, 2.0)})
     # As many blocks as drives, with the defaults: errors of drives that know nothing of each other.
     metric = CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=16)
-    coverage = CoverageCallback(metric, regions=REGIONS, rig=rig)
+    coverage = CoverageCallback(metric, regions=REGIONS, rig=rig, fixed_frames=True)
     module = Training(rig, visibility, steps=options.epochs * len(loaders[0]), seed=options.seed)
+    profiler = SimpleProfiler(dirpath=options.out, filename=f"profile-{rig}")
     trainer = lightning.Trainer(
         devices=1,
         max_epochs=options.epochs,
         logger=TensorBoardLogger(options.out, name=rig, version=""),
         callbacks=[coverage],
+        profiler=profiler,
         num_sanity_val_steps=0,
         log_every_n_steps=1,
         enable_checkpointing=False,
         enable_model_summary=False,
     )
     trainer.fit(module, *loaders)
+    seconds = {action: sum(durations) for action, durations in profiler.recorded_durations.items()}
+    measuring = sum(time for action, time in seconds.items() if "CoverageCallback" in action)
+    epochs = seconds["run_training_epoch"]
+    console.print(f"{rig}: coverage took {measuring:.1f} s of {epochs:.0f} s of epochs, {measuring / epochs:.1%}")
     return module, coverage.coverage
 
 
@@ -386,7 +393,7 @@ def main():
         visibility = {
             frame.index: box_visibility(frame.sensors[rig], frame.reference, frame.boxes) for frame in validation_frames
         }
-        results[rig] = train(rig, training_frames, validation_frames, visibility, options)
+        results[rig] = train(rig, training_frames, validation_frames, visibility, options, console)
     report(results, console)
     draw(results, options.out / "detector.png")
     console.print(f"Wrote {options.out / 'detector.png'} and event files for TensorBoard beside it")

@@ -174,6 +174,7 @@ def test_a_small_run_trains_both_rigs_logs_every_epoch_and_ends_with_table_and_f
     said = capsys.readouterr().out
     for rig in example.RIGS:
         assert f"{rig}, all: Spearman" in said
+        assert f"{rig}: coverage took" in said
         events = EventAccumulator(str(tmp_path / rig))
         events.Reload()
         tags = {"val/AP", f"coverage/{rig}/val/detection_0.4m/0-51m/body", "val/recall/visibility 0.8-1"}
