@@ -113,6 +113,34 @@ def test_points_of_any_type_are_compared_as_they_are(dtype):
     assert grid.cell_of(points.T.contiguous().T.requires_grad_()).tolist() == expected
 
 
+@pytest.mark.parametrize(
+    ("x", "cell"),
+    [
+        ((-40.0, 160.0), 0.25),
+        ((0.0, 0.7), 0.1),
+        ((1e6, 1e6 + 3.0), 1e-3),
+        ((-1e-9, 1e-9), 1e-11),
+        ((1e8, 1e8 + 2**-16), 2**-24),
+        ((1e8, 1e8 + 2**-20), 2**-28),
+        ((-1e300, 1e300), 1e298),
+    ],
+)
+def test_cells_are_those_of_a_search_among_the_borders(x, cell, monkeypatch):
+    """On every border, beside it, between, far out, and for what is no number; in one part and in several."""
+    grid = BevGrid(x=x, y=(0.0, cell), cell=cell, heights=ONE_BAND)
+    edges = grid.x_edges_m.numpy()
+    between = np.random.default_rng(0).uniform(*x, 5000)
+    far = [-np.inf, np.inf, np.nan, -1.7e308, 1.7e308, 0.0]
+    values = np.concatenate([edges, np.nextafter(edges, -np.inf), np.nextafter(edges, np.inf), between, far])
+    expected = np.searchsorted(edges, values, side="right") - 1
+    expected[~((values >= edges[0]) & (values < edges[-1]))] = -1
+    points = torch.zeros(len(values), 3, dtype=torch.float64)
+    points[:, 0] = torch.from_numpy(values)
+    for part in (65_536, 1000):
+        monkeypatch.setattr("torchcover.coverage.grid.PART", part)
+        np.testing.assert_array_equal(grid.cell_of(points), expected)
+
+
 def test_no_points_have_no_cells():
     cells = BevGrid(x=(0, 1), y=(0, 1), cell=0.1).cell_of(torch.zeros(0, 3))
     assert (cells.shape, cells.dtype) == ((0,), torch.int64)

@@ -18,6 +18,13 @@ MULTIPLE_TOLERANCE_CELLS = 1e-3  # and never more than this share of a cell
 # An int64 count and three float64 sums for every cell: 3 GB.
 MOST_CELLS = 100_000_000
 
+# Points that are looked at together on a CPU.
+PART = 65_536
+# A cell that is smaller than this share of the coordinates is not found by a division.
+FINEST = 1e-14
+# A sum with it is negative, whatever the other terms.
+OUTSIDE = -(2**40)
+
 
 @dataclass(frozen=True)
 class BevGrid:
@@ -124,23 +131,26 @@ class BevGrid:
         Returns:
             (N,) int64 cell numbers; -1 for a point outside every cell or band.
         """
-        x, y, z = points.detach().double().T.contiguous()
-        _, rows, columns = self.shape
-        column = bin_of(x, self.x_edges_m)
-        row = bin_of(y, self.y_edges_m)
-        band = self._band_of(z)
-        inside = (column >= 0) & (row >= 0) & (band >= 0)
-        return ((band * rows + row) * columns + column).where(inside, -1)
-
-    def _band_of(self, z: Tensor) -> Tensor:
-        order = sorted(range(len(self.heights)), key=lambda band: list(self.heights.values())[band])
-        borders = [border for band in order for border in list(self.heights.values())[band]]
+        points = points.detach()
+        bands, rows, columns = self.shape
+        x_edges, y_edges = self.x_edges_m, self.y_edges_m
         # Between the borders of sorted bands lie, in turn, a band and a gap (which may be empty).
-        interval = bin_of(z, torch.tensor(borders, dtype=torch.float64))
-        band_of_interval = torch.full((len(borders),), -1)
-        band_of_interval[torch.arange(0, len(borders), 2)] = torch.tensor(order)
-        # bin_of gives -1 for outside, which picks the last entry: the one after the highest band.
-        return band_of_interval.to(z.device)[interval]
+        order = sorted(range(bands), key=lambda band: list(self.heights.values())[band])
+        borders = [border for band in order for border in list(self.heights.values())[band]]
+        between = [term for band in order for term in (band * rows * columns, OUTSIDE)][:-1]
+        steps = torch.arange(columns), torch.arange(rows) * columns, torch.tensor(between)
+        x_terms, y_terms, z_terms = (_with_outside(terms).to(points.device) for terms in steps)
+
+        def cells_of(points: Tensor) -> Tensor:
+            x, y, z = (points[:, axis].double() for axis in range(3))
+            cell = x_terms.index_select(0, _edges_below(x, x_edges))
+            cell += y_terms.index_select(0, _edges_below(y, y_edges))
+            cell += z_terms.index_select(0, torch.stack([z >= border for border in borders]).sum(dim=0))
+            return cell.clamp_(min=-1)
+
+        # In parts that stay in the processor's cache; a GPU takes all at once.
+        part = PART if points.device.type == "cpu" else max(len(points), 1)
+        return torch.cat([cells_of(some) for some in torch.split(points, part)])
 
 
 def bin_of(values: Tensor, edges: Tensor) -> Tensor:
@@ -161,6 +171,28 @@ def bin_of(values: Tensor, edges: Tensor) -> Tensor:
     """
     index = torch.bucketize(values, edges.to(values.device), right=True) - 1
     return index.where(index < len(edges) - 1, -1)
+
+
+def _edges_below(values: Tensor, edges: Tensor) -> Tensor:
+    """How many of the edges are not above each value, for edges at equal distances: what `torch.bucketize` gives.
+
+    Divided by their distance first, then compared with, as in `bin_of`.
+    """
+    low, high, cells = float(edges[0]), float(edges[-1]), len(edges) - 1
+    edges = edges.to(values.device)
+    if high - low <= FINEST * cells * max(abs(low), abs(high)):  # the quotient would be off by more than one
+        return torch.bucketize(values.contiguous(), edges, right=True)
+    below = values.sub(low).mul_(cells / (high - low)).add_(1.0).clamp_(0, cells + 1).nan_to_num_().long()
+    nothing = edges.new_tensor([math.nan])  # is never less, nor more
+    bounds = torch.cat([nothing, edges, nothing])
+    too_few, too_many = values >= bounds.index_select(0, below + 1), values < bounds.index_select(0, below)
+    return below.add_(too_few).sub_(too_many.long())
+
+
+def _with_outside(terms: Tensor) -> Tensor:
+    """What each bin adds to a cell's number, and what is below the first one and above the last."""
+    outside = torch.tensor([OUTSIDE])
+    return torch.cat([outside, terms, outside])
 
 
 def _check_bounds(name: str, bounds: tuple[float, float]) -> None:
