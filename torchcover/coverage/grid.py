@@ -19,7 +19,7 @@ MULTIPLE_TOLERANCE_CELLS = 1e-3  # and never more than this share of a cell
 MOST_CELLS = 100_000_000
 
 # Points that are looked at together on a CPU.
-PART = 65_536
+PART = 32_768
 # A cell that is smaller than this share of the coordinates is not found by a division.
 FINEST = 1e-14
 # A sum with it is negative, whatever the other terms.

@@ -19,7 +19,7 @@ BACKENDS = {
 FEW_QUERIES = 16
 MANY_POINTS = 10_000
 # Queries that are measured together on a CPU.
-PART = 65_536
+PART = 32_768
 
 Search = Callable[[Tensor, Tensor, float, float], Tensor]
 
