@@ -1,7 +1,8 @@
 """Do the standard errors tell the truth? Their size beside the spread of the numbers over independent seeds.
 
 40 runs over other cities, traffic and reference rays: the spread of a number over the runs is its true error, which
-the reported one should equal within a factor of 1.3. Spread-out steps and steps that follow each other are compared.
+the reported one should equal within a factor of 1.3. The same is asked of the differences between two rigs in the
+same frames. Spread-out steps and steps that follow each other are compared.
 """
 
 import argparse
@@ -18,6 +19,7 @@ from torchcover.coverage.estimate import ESTIMATORS
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import EvenReference
 
+RIG, OTHER = "front_roof_32", "front_roof_128"
 GRID = BevGrid(x=(0.0, 160.0), y=(-40.0, 40.0), cell=0.5)
 REGIONS = forward_regions()
 
@@ -36,26 +38,31 @@ def main():
         with ProcessPoolExecutor(2) as pool:
             results[every_s] = list(pool.map(estimates, jobs))
         print(f"\n{options.seeds} runs of {options.steps} steps, one every {every_s:g} s, {options.rays:,} rays\n")
-        report(results[every_s])
+        for subject in results[every_s][0]:
+            print(f"{subject}:\n")
+            report([run[subject] for run in results[every_s]])
     options.out.parent.mkdir(parents=True, exist_ok=True)
     options.out.write_text(json.dumps(results) + "\n", encoding="utf-8")
 
 
 def estimates(job):
-    """One run: [value, error] of each estimator, region, band and quantity."""
+    """One run: [value, error] of each estimator, region, band and quantity, for a rig and for the difference to it."""
     seed, every_s, steps, rays = job
     torch.set_num_threads(1)
     reference = EvenReference(areas=tuple((region.x, region.y) for region in REGIONS), rays=rays)
-    frames = SimulatedFrames("urban", "front_roof_32", steps=steps, seed=seed, every_s=every_s, reference=reference)
-    metric = CoverageMetric(GRID, max_radius=GRID.diagonal_m, blocks=16)
+    rigs = {rig: rig for rig in (RIG, OTHER)}
+    frames = SimulatedFrames("urban", rigs=rigs, steps=steps, seed=seed, every_s=every_s, reference=reference)
+    metrics = {rig: CoverageMetric(GRID, max_radius=GRID.diagonal_m, blocks=16) for rig in rigs}
     for frame in (frames[index] for index in range(steps)):
-        metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, index=frame.index)
-    coverage = metric.compute()
-    rows = []
+        for rig, metric in metrics.items():
+            metric.update(frame.sensors[rig], frame.reference, weights=frame.reference_weights, index=frame.index)
+    coverages = {rig: metric.compute() for rig, metric in metrics.items()}
+    subjects = {RIG: [], f"{OTHER} - {RIG}": []}
     for estimator, region, height in product(ESTIMATORS, REGIONS, GRID.heights):
-        estimate = coverage.estimate(region, height, estimator)
-        rows += zip(estimate.value.tolist(), estimate.error.tolist(), strict=True)
-    return rows
+        own, other = (coverages[rig].estimate(region, height, estimator) for rig in (RIG, OTHER))
+        for rows, estimate in zip(subjects.values(), (own, other.minus(own)), strict=True):
+            rows.extend(zip(estimate.value.tolist(), estimate.error.tolist(), strict=True))
+    return subjects
 
 
 def report(runs):
@@ -70,7 +77,7 @@ def report(runs):
         ratios.append(spread / error)
         print(f"| {' | '.join(name)} | {values.mean():.4f} | {spread:.4f} | {error:.4f} | {ratios[-1]:.2f} |")
     middle = math.exp(sum(map(math.log, ratios)) / len(ratios))
-    print(f"\nspread over error: {min(ratios):.2f} to {max(ratios):.2f}, geometric mean {middle:.2f}")
+    print(f"\nspread over error: {min(ratios):.2f} to {max(ratios):.2f}, geometric mean {middle:.2f}\n")
 
 
 if __name__ == "__main__":
