@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from torchcover.geometry import rigid
+from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import unit_directions
-from torchcover.simulation.shapes import Box, Mesh, Plane
+from torchcover.simulation.shapes import Box, Ellipsoid, Frustum, Mesh, Plane
 
 HERE = np.zeros(3)
+NUMBERS = np.random.default_rng
 
 
 def endless(directions):
@@ -91,15 +92,71 @@ def test_a_mountain_far_away_does_not_blur_the_wall_in_front(gap_m):
     np.testing.assert_allclose(hits.range_m, gap_m, rtol=1e-4)
 
 
-def test_rays_leave_each_of_several_faces_that_meet_where_they_start():
-    corner_m = np.array([0.5, 0.5, 0.5])
-    directions = random_directions(500)
-    outwards = (directions > 0.01).any(axis=0)
-    hits = RayCaster([box_at(0.0)]).cast(corner_m, directions, endless(directions))
-    assert (hits.body[outwards] == -1).all()
-    hits = RayCaster([box_at(0.0), box_at(50.0, size=200.0)]).cast(corner_m, directions, endless(directions))
-    assert (hits.body[outwards] == 1).all()
-    assert (hits.range_m[outwards] > 40.0).all()
+@pytest.mark.parametrize("width_m", [1e-5, 1e-3, 1.0])
+def test_a_narrow_face_in_front_is_hit(width_m):
+    """Rounding says little about the plane of a sliver; it is never so little that a wall 1 cm ahead is passed."""
+    along, across = np.array([0.3, 1.0, 1.0]), np.array([-0.2, 1.0, -1.0])
+    ahead = np.cross(across, along) / np.linalg.norm(np.cross(across, along))
+    corners = [0.01 * ahead - along - width_m * across, 0.01 * ahead + along - width_m * across]
+    sliver = Mesh(np.array([*corners, 0.01 * ahead + 2 * width_m * across]), np.array([[0, 1, 2]]))
+    rays = ahead[:, None].astype(np.float32)
+    hits = RayCaster([sliver]).cast(HERE, rays, endless(rays))
+    assert hits.body == [0]
+    np.testing.assert_allclose(hits.range_m, 0.01, atol=0.002)
+
+
+def planes_of(mesh):
+    """(F, 3) outward unit normals of a convex body, and (F,) distances of its planes."""
+    first, second, third = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
+    normals = np.cross(second - first, third - first)
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    return normals, (normals * first).sum(axis=1)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        Box(type="box", size_m=(1.0, 2.0, 3.0)),
+        Frustum(type="frustum", bottom_m=(3.04, 1.68), top_m=(1.12, 1.16), height_m=0.59),
+        Ellipsoid(type="ellipsoid", size_m=(1.0, 2.0, 3.0)),
+    ],
+)
+def test_rays_leave_all_faces_that_meet_where_they_start(shape):
+    """From places on edges and in corners: outwards to the walls of a room, inwards to the other side of the body."""
+    mesh, generator = shape.mesh().moved(rigid(rotation_from_euler(10.0, 20.0, 30.0), [1.0, 2.0, 3.0])), NUMBERS(5)
+    room = box_at(0.0, size=40.0)
+    caster = RayCaster([room, mesh])
+    (normals, away), (walls, walls_away) = planes_of(mesh), planes_of(room)
+    for _ in range(60):
+        corner, other, _ = generator.permutation(mesh.vertices_m[generator.choice(mesh.faces)])
+        place = corner + generator.choice([0.0, generator.random()]) * (other - corner)
+        directions = random_directions(200, seed=generator.integers(1000))
+        hits = caster.cast(place, directions, endless(directions))
+        there = np.abs(normals @ place - away) < 1e-9
+        slope = (normals[there] @ directions.astype(np.float64)).max(axis=0)
+        for body, some, planes, reach in ((0, slope > 0.01, walls, walls_away), (1, slope < -0.01, normals, away)):
+            steep = planes @ directions[:, some]
+            gap = (reach - planes @ place)[:, None] * np.ones_like(steep)
+            expected = np.divide(gap, steep, out=np.full_like(steep, np.inf), where=(steep > 0) & (gap > 1e-9)).min(
+                axis=0
+            )
+            assert (hits.body[some] == body).all()
+            np.testing.assert_allclose(hits.range_m[some], expected, atol=2e-3)
+
+
+def test_one_caster_answers_for_one_place_after_the_other():
+    caster, outwards = RayCaster([box_at(9.0), box_at(0.0)]), np.array([[1.0], [0.0], [0.0]], dtype=np.float32)
+    for _ in range(2):
+        inside = caster.cast(HERE, outwards, endless(outwards))
+        assert (inside.body, inside.range_m) == ([1], [0.5])
+        on_the_wall = caster.cast(np.array([0.5, 0.1, 0.1]), outwards, endless(outwards))
+        assert (on_the_wall.body, on_the_wall.range_m) == ([0], [8.0])
+
+
+def test_a_place_on_a_face_up_to_the_rounding_of_doubles_is_on_it():
+    ground, down = Plane(type="plane", size_m=(100, 100)).mesh(), np.array([[0.0], [0.0], [-1.0]], dtype=np.float32)
+    hits = RayCaster([ground]).cast(np.array([1.0, 2.0, 1e-15]), down, endless(down))
+    assert hits.body == [-1]
 
 
 def test_hits_name_their_body():

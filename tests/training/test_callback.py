@@ -171,8 +171,8 @@ def test_fixed_frames_are_measured_once_and_logged_at_every_epoch(tmp_path):
     assert [event.step for event in events.Images("coverage/val/radius")] == [0]
     # Another fit is another measurement, and has maps of its own.
     trainer = make_trainer(tmp_path, callback, logger=TensorBoardLogger(tmp_path, name="", version="other"))
-    trainer.fit(Validated(), loader(2), loader(4))
-    assert_same(callback.coverage, expected(RandomFrames(4)))
+    trainer.fit(Validated(), loader(2), loader(5))
+    assert_same(callback.coverage, truth)
     events = EventAccumulator(str(tmp_path / "other"))
     events.Reload()
     assert len(events.Images("coverage/val/radius")) == 1
@@ -181,14 +181,18 @@ def test_fixed_frames_are_measured_once_and_logged_at_every_epoch(tmp_path):
 def test_frames_that_were_said_to_be_fixed_and_are_not_are_added(tmp_path):
     class Alternating(Validated):
         def val_dataloader(self):
-            return loader([RandomFrames(6)[2 * self.current_epoch + k] for k in range(3)])
+            return loader([RandomFrames(5)[2 * min(self.current_epoch, 1) + k] for k in range(3)])
 
     callback = CoverageCallback(make_metric(), fixed_frames=True)
-    trainer = make_trainer(tmp_path, callback, max_epochs=2, reload_dataloaders_every_n_epochs=1)
+    logger = TensorBoardLogger(tmp_path, name="", version="run")
+    trainer = make_trainer(tmp_path, callback, logger=logger, max_epochs=3, reload_dataloaders_every_n_epochs=1)
     seen = measured_frames(trainer, callback.metric)
     trainer.fit(Alternating(), loader(2))
     assert seen == [0, 0, 0, 1, 1]
     assert_same(callback.coverage, expected(RandomFrames(5)))
+    events = EventAccumulator(logger.log_dir)
+    events.Reload()
+    assert [event.step for event in events.Images("coverage/val/radius")] == [0, 1]
 
 
 def test_frames_that_a_sampler_repeats_are_counted_once(tmp_path):

@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 from torchcover.simulation.shapes import Mesh
 
+FaceNumbers = NDArray[np.int64] | slice
+
 # An origin lies on a face if it is no farther from its plane than this many times what rounding makes of that.
 CONTACT_ROUNDINGS = 4
 # Origins are rounded too, before they come here: in float64, as a share of the largest coordinate.
@@ -30,7 +32,7 @@ class Faces:
         rounding_m = (products * np.abs([first, second, third]).max(axis=0)).sum(axis=0) / length
         rounding_m = np.clip(rounding_m * np.finfo(np.float32).eps, None, np.finfo(np.float32).eps * reach_m)
         self.contact_m = np.maximum(CONTACT_ROUNDINGS * rounding_m, LEAST_CONTACT * reach_m)
-        self.normals = across / length
+        self._normals = across / length
         self._corner_m = first
         self._lower_m = np.min([first, second, third], axis=0) - 2 * self.contact_m
         self._upper_m = np.max([first, second, third], axis=0) + 2 * self.contact_m
@@ -42,5 +44,10 @@ class Faces:
         near = np.flatnonzero((self._lower_m[2] <= z) & (z <= self._upper_m[2]))
         for axis, coordinate_m in ((0, x), (1, y)):
             near = near[(self._lower_m[axis, near] <= coordinate_m) & (coordinate_m <= self._upper_m[axis, near])]
-        from_plane_m = np.abs(((place_m[:, None] - self._corner_m[:, near]) * self.normals[:, near]).sum(axis=0))
-        return bool((from_plane_m <= 2 * self.contact_m[near]).any())
+        return bool((self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]).any())
+
+    def from_plane_m(self, place_m: NDArray[np.floating], faces: FaceNumbers = slice(None)) -> NDArray[np.float64]:
+        """Distance of a (3,) place from the planes of some or all of them."""
+        along_normal = (place_m[:, None] - self._corner_m[:, faces]) * self._normals[:, faces]
+        distance_m: NDArray[np.float64] = np.abs(along_normal.sum(axis=0))
+        return distance_m

@@ -20,8 +20,8 @@ Float32 = NDArray[np.float32]
 
 # Farther from the origin float32 resolves no better than 64 m, and at 2e18 Embree drops faces without a word.
 MOST_M = 1e9
-# A ray leaves at most so many faces that meet where it starts.
-MOST_FACES = 8
+# How far beyond a face that it leaves a ray goes on, in contact distances; farther each time that it hits one again.
+CONTACTS_BEYOND = 2.0 ** np.arange(1, 13)
 
 
 class Hits(NamedTuple):
@@ -105,20 +105,23 @@ class RayCaster:
         hits: Hits,
         faces: NDArray[np.int64],
     ) -> None:
-        """Cast the rays again that hit the face they start on, from a place beside it, on the side they point to."""
-        rays = np.flatnonzero(hits.body >= 0)
-        faces, starts_m = faces[rays], np.tile(origin_m, (len(rays), 1))
-        for _ in range(MOST_FACES):
-            normals, contact_m = self._faces.normals[:, faces].T, self._faces.contact_m[faces]
-            slope = (normals * directions.T[rays]).sum(axis=1)
-            # By the distance from the face, not along the ray: a grazing ray meets the rounded face far from its start.
-            touching = np.flatnonzero((hits.range_m[rays] * np.abs(slope) <= contact_m) & (hits.body[rays] >= 0))
-            if len(touching) == 0:
+        """Let the rays go on that hit a face whose plane they start on: by rounding alone, as they leave it."""
+        on_plane = self._faces.from_plane_m(origin_m) <= self._faces.contact_m
+        rays, travelled_m = np.flatnonzero((hits.body >= 0) & on_plane[faces]), 0.0
+        range_m, faces = hits.range_m[rays], faces[rays]
+        for beyond in CONTACTS_BEYOND:
+            if len(rays) == 0:
                 return
-            rays, starts_m = rays[touching], starts_m[touching]
-            starts_m += (2 * contact_m * np.sign(slope))[touching, None] * normals[touching]
-            answer = self._scene.run(starts_m.astype(np.float32), directions.T[rays], dists=limit_m[rays], output=True)
-            hits.range_m[rays], hits.body[rays], faces = answer["tfar"], answer["geomID"], self._numbers(answer)
+            # The hit is the nearest one, so nothing lies before it.
+            travelled_m = travelled_m + range_m + beyond * self._faces.contact_m[faces]
+            towards, left_m = directions.T[rays], np.maximum(limit_m[rays] - travelled_m, 0.0)
+            starts_m = origin_m + travelled_m[:, None] * towards
+            answer = self._scene.run(starts_m.astype(np.float32), towards, dists=left_m.astype(np.float32), output=True)
+            hit, range_m, faces = answer["geomID"] >= 0, answer["tfar"], self._numbers(answer)
+            hits.range_m[rays] = np.where(hit, travelled_m + range_m, limit_m[rays])
+            hits.body[rays] = answer["geomID"]
+            again = hit & on_plane[faces]
+            rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
 
     def back_faces(self, origin_m: NDArray[np.floating], directions: Float32) -> NDArray[np.bool_]:
         """Which rays first meet a face from behind, as rays that start inside a closed body do.

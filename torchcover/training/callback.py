@@ -196,7 +196,7 @@ class CoverageCallback(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on within an epoch: rank zero takes over the sums, the others start from nothing."""
-        self._epoch, self._holds_fit = state_dict["epoch"], True
+        self._epoch = state_dict["epoch"]
         self._once.load_state_dict(state_dict["frames"])
         self.metric.reset()
         if not is_distributed() or torch.distributed.get_rank() == 0:
