@@ -60,6 +60,22 @@ def test_bands_come_in_any_order_and_with_gaps(order):
         assert (order[found[0]] if found else None) == name
 
 
+def test_many_bands_are_those_that_few_would_be():
+    heights = {
+        f"{k}": (0.1 * k, 0.1 * (k + 1) if k % 3 else 0.1 * k + 0.05) for k in np.random.default_rng(0).permutation(50)
+    }
+    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights=heights)
+    for z in np.linspace(-0.1, 5.1, 300):
+        expected = [band for band, (low, high) in enumerate(heights.values()) if low <= z < high]
+        assert grid.cell_of(at(z=z)).item() == (expected[0] if expected else -1)
+
+
+@pytest.mark.parametrize("shape", [(3,), (5, 2), (5, 4)])
+def test_points_of_another_shape_are_refused(shape):
+    with pytest.raises(ValueError, match=r"shape \(N, 3\) is needed"):
+        BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0).cell_of(torch.zeros(shape))
+
+
 def test_cells_are_numbered_band_by_band_then_row_by_row():
     grid = BevGrid(x=(0.0, 4.0), y=(-1.0, 2.0), cell=1.0, heights={"a": (0.0, 1.0), "b": (1.0, 2.0)})
     assert grid.shape == (2, 3, 4)
@@ -123,6 +139,7 @@ def test_points_of_any_type_are_compared_as_they_are(dtype):
         ((1e8, 1e8 + 2**-16), 2**-24),
         ((1e8, 1e8 + 2**-20), 2**-28),
         ((-1e300, 1e300), 1e298),
+        ((0.0, 1e-310), 1e-313),
     ],
 )
 def test_cells_are_those_of_a_search_among_the_borders(x, cell, monkeypatch):

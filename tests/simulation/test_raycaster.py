@@ -10,6 +10,7 @@ from torchcover.simulation.shapes import Box, Ellipsoid, Frustum, Mesh, Plane
 
 HERE = np.zeros(3)
 NUMBERS = np.random.default_rng
+MOUNTAIN = Mesh(np.array([[1e6, 0, 0], [1e6, 100, 0], [1e6, 0, 100]]), np.array([[0, 1, 2]]))
 
 
 def endless(directions):
@@ -85,9 +86,8 @@ def test_no_ray_slips_out_of_a_closed_box_through_its_edges():
 
 @pytest.mark.parametrize("gap_m", [0.001, 0.01, 0.4])
 def test_a_mountain_far_away_does_not_blur_the_wall_in_front(gap_m):
-    mountain = Mesh(np.array([[1e6, 0, 0], [1e6, 100, 0], [1e6, 0, 100]]), np.array([[0, 1, 2]]))
     ahead = np.array([[1], [0], [0]], np.float32)
-    hits = RayCaster([mountain, box_at(0.5 + gap_m)]).cast(HERE, ahead, endless(ahead))
+    hits = RayCaster([MOUNTAIN, box_at(0.5 + gap_m)]).cast(HERE, ahead, endless(ahead))
     assert hits.body == [1]
     np.testing.assert_allclose(hits.range_m, gap_m, rtol=1e-4)
 
@@ -100,7 +100,7 @@ def test_a_narrow_face_in_front_is_hit(width_m):
     corners = [0.01 * ahead - along - width_m * across, 0.01 * ahead + along - width_m * across]
     sliver = Mesh(np.array([*corners, 0.01 * ahead + 2 * width_m * across]), np.array([[0, 1, 2]]))
     rays = ahead[:, None].astype(np.float32)
-    hits = RayCaster([sliver]).cast(HERE, rays, endless(rays))
+    hits = RayCaster([sliver, MOUNTAIN]).cast(HERE, rays, endless(rays))
     assert hits.body == [0]
     np.testing.assert_allclose(hits.range_m, 0.01, atol=0.002)
 
@@ -142,6 +142,32 @@ def test_rays_leave_all_faces_that_meet_where_they_start(shape):
             )
             assert (hits.body[some] == body).all()
             np.testing.assert_allclose(hits.range_m[some], expected, atol=2e-3)
+
+
+@pytest.mark.parametrize("limit_m", [1e-6, 0.3, 1.0, 7.0, np.inf])
+def test_a_ray_that_leaves_a_face_ends_at_its_limit(limit_m):
+    turned = rigid(rotation_from_euler(37.0, 21.0, -13.0), [1.0, 2.0, 3.0])
+    floor, place = Plane(type="plane", size_m=(200, 200)).mesh().moved(turned), (turned @ [5.1, 7.2, 0.0, 1.0])[:3]
+    away = turned[:3, 2]
+    wall = Mesh(place + 5.0 * away + floor.vertices_m - turned[:3, 3], floor.faces)
+    upwards = random_directions(500)
+    upwards = upwards[:, away @ upwards > 0.06]
+    hits = RayCaster([floor, wall]).cast(place, upwards, np.full(upwards.shape[1], limit_m, np.float32))
+    expected = 5.0 / (away @ upwards)
+    assert (hits.range_m <= np.float32(limit_m)).all()
+    np.testing.assert_array_equal(hits.body, np.where(expected <= limit_m, 1, -1))
+    np.testing.assert_allclose(hits.range_m, np.minimum(expected, limit_m), rtol=1e-4)
+
+
+def test_rays_leave_a_sliver_that_they_start_on():
+    generator = NUMBERS(7)
+    for _ in range(50):
+        along, across = generator.normal(size=(2, 3))
+        corners = generator.normal(size=3) + np.array([0.0 * along, along, 0.4 * along + 1e-4 * across])
+        caster = RayCaster([Mesh(corners, np.array([[0, 1, 2]]))])
+        directions = random_directions(100, seed=generator.integers(1000))
+        hits = caster.cast(generator.dirichlet(np.ones(3)) @ corners, directions, endless(directions))
+        assert (hits.body == -1).all()
 
 
 def test_one_caster_answers_for_one_place_after_the_other():

@@ -10,8 +10,9 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+from lightning.pytorch.utilities import CombinedLoader
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.data import Frame, collate_frames
@@ -61,6 +62,13 @@ class Validated(Model):
 
     def validation_step(self, batch, batch_idx, dataloader_idx=0):
         pass
+
+
+class BothSides(Model):
+    """The same with two batches at a time."""
+
+    def training_step(self, batch, batch_idx):
+        return self.weight**2
 
 
 def loader(frames, batch_size=2, **options):
@@ -187,7 +195,8 @@ def test_frames_that_were_said_to_be_fixed_and_are_not_are_added(tmp_path):
     logger = TensorBoardLogger(tmp_path, name="", version="run")
     trainer = make_trainer(tmp_path, callback, logger=logger, max_epochs=3, reload_dataloaders_every_n_epochs=1)
     seen = measured_frames(trainer, callback.metric)
-    trainer.fit(Alternating(), loader(2))
+    with pytest.warns(UserWarning, match="an epoch had frames that were not there before"):
+        trainer.fit(Alternating(), loader(2))
     assert seen == [0, 0, 0, 1, 1]
     assert_same(callback.coverage, expected(RandomFrames(5)))
     events = EventAccumulator(logger.log_dir)
@@ -205,6 +214,47 @@ def test_frames_of_two_loaders_are_different_ones(tmp_path):
     callback = CoverageCallback(make_metric())
     make_trainer(tmp_path, callback).fit(Validated(), loader(2), [loader(3), loader(4)])
     assert_same(callback.coverage, expected([*RandomFrames(3), *RandomFrames(4)]))
+
+
+def test_frames_of_loaders_within_loaders_are_measured(tmp_path):
+    callback = CoverageCallback(make_metric())
+    make_trainer(tmp_path, callback).fit(Validated(), loader(2), {"a": [loader(3), loader(4)], "b": loader(5)})
+    assert_same(callback.coverage, expected([*RandomFrames(3), *RandomFrames(4), *RandomFrames(5)]))
+
+
+def test_no_frame_of_training_loaders_side_by_side_is_taken_for_padding(tmp_path):
+    """Seven frames for two processes are four for each, and the positions in a batch of both loaders go up to eight."""
+    sides = {
+        side: loader(
+            [replace(frame, name=side) for frame in RandomFrames(7)], sampler=DistributedSampler(range(7), 2, 0)
+        )
+        for side in ("left", "right")
+    }
+    callback = CoverageCallback(
+        make_metric(), stage="train", frames_of=lambda batch: [f for side in batch.values() for f in side.frames]
+    )
+    trainer = make_trainer(tmp_path, callback, use_distributed_sampler=False)
+    seen = measured_frames(trainer, callback.metric)
+    trainer.fit(BothSides(), CombinedLoader(sides, "min_size"))
+    assert len(seen) == 8
+
+
+def test_the_sums_are_where_the_model_is_even_if_no_frame_is_new(tmp_path):
+    class Moved(CoverageMetric):
+        devices = ()
+
+        def to(self, device):
+            self.devices = (*self.devices, str(device))
+            return super().to(device)
+
+    callback = CoverageCallback(Moved(BevGrid(**GRID), max_radius=9.0))
+    padding = DistributedSampler(range(1), num_replicas=2, rank=1, shuffle=False)
+    with pytest.warns(UserWarning, match="no reference point lies in the grid"):
+        make_trainer(tmp_path, callback, use_distributed_sampler=False).fit(
+            Validated(), loader(2), loader(1, sampler=padding)
+        )
+    assert callback.coverage.counts["steps"] == 0
+    assert set(callback.metric.devices) == {"cpu"}
 
 
 def test_the_weights_of_reference_points_count(tmp_path):

@@ -1,7 +1,7 @@
 """The bird's-eye-view grid: which cell a point belongs to. Bins are half-open, [lo, hi), on every axis."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from types import MappingProxyType
@@ -22,6 +22,8 @@ MOST_CELLS = 100_000_000
 PART = 32_768
 # A cell that is smaller than this share of the coordinates is not found by a division.
 FINEST = 1e-14
+# More borders than this are searched.
+FEW_BORDERS = 32
 # A sum with it is negative, whatever the other terms.
 OUTSIDE = -(2**40)
 
@@ -130,22 +132,29 @@ class BevGrid:
 
         Returns:
             (N,) int64 cell numbers; -1 for a point outside every cell or band.
+
+        Raises:
+            ValueError: Another shape.
         """
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"points: shape (N, 3) is needed; got {tuple(points.shape)}")
         points = points.detach()
         bands, rows, columns = self.shape
-        x_edges, y_edges = self.x_edges_m, self.y_edges_m
+        x_bounds, y_bounds = (
+            _with_ends(edges, math.nan).to(points.device) for edges in (self.x_edges_m, self.y_edges_m)
+        )
         # Between the borders of sorted bands lie, in turn, a band and a gap (which may be empty).
         order = sorted(range(bands), key=lambda band: list(self.heights.values())[band])
         borders = [border for band in order for border in list(self.heights.values())[band]]
         between = [term for band in order for term in (band * rows * columns, OUTSIDE)][:-1]
         steps = torch.arange(columns), torch.arange(rows) * columns, torch.tensor(between)
-        x_terms, y_terms, z_terms = (_with_outside(terms).to(points.device) for terms in steps)
+        x_terms, y_terms, z_terms = (_with_ends(terms, OUTSIDE).to(points.device) for terms in steps)
 
         def cells_of(points: Tensor) -> Tensor:
             x, y, z = (points[:, axis].double() for axis in range(3))
-            cell = x_terms.index_select(0, _edges_below(x, x_edges))
-            cell += y_terms.index_select(0, _edges_below(y, y_edges))
-            cell += z_terms.index_select(0, torch.stack([z >= border for border in borders]).sum(dim=0))
+            cell = x_terms.index_select(0, _edges_below(x, x_bounds))
+            cell += y_terms.index_select(0, _edges_below(y, y_bounds))
+            cell += z_terms.index_select(0, _borders_below(z, borders))
             return cell.clamp_(min=-1)
 
         # In parts that stay in the processor's cache; a GPU takes all at once.
@@ -154,7 +163,7 @@ class BevGrid:
 
 
 def bin_of(values: Tensor, edges: Tensor) -> Tensor:
-    """Index of the half-open bin [edges[i], edges[i + 1]) of each value: the one place where this is decided.
+    """Index of the half-open bin [edges[i], edges[i + 1]) of each value.
 
     The edges are compared with, not divided by, so that no rounding moves a point over a border.
 
@@ -173,26 +182,35 @@ def bin_of(values: Tensor, edges: Tensor) -> Tensor:
     return index.where(index < len(edges) - 1, -1)
 
 
-def _edges_below(values: Tensor, edges: Tensor) -> Tensor:
-    """How many of the edges are not above each value, for edges at equal distances: what `torch.bucketize` gives.
+def _edges_below(values: Tensor, bounds: Tensor) -> Tensor:
+    """How many edges at equal distances are not above each value: what `torch.bucketize` gives, sooner.
 
     Divided by their distance first, then compared with, as in `bin_of`.
+
+    Args:
+        values: (N,) float64.
+        bounds: (B + 3,) float64 edges between two NaN, which are never less, nor more.
     """
-    low, high, cells = float(edges[0]), float(edges[-1]), len(edges) - 1
-    edges = edges.to(values.device)
-    if high - low <= FINEST * cells * max(abs(low), abs(high)):  # the quotient would be off by more than one
-        return torch.bucketize(values.contiguous(), edges, right=True)
+    low, high, cells = float(bounds[1]), float(bounds[-2]), len(bounds) - 3
+    fine = high - low <= FINEST * cells * max(abs(low), abs(high))  # the quotient would be off by more than one
+    if fine or not math.isfinite(cells / (high - low)):
+        return torch.bucketize(values.contiguous(), bounds[1:-1], right=True)
     below = values.sub(low).mul_(cells / (high - low)).add_(1.0).clamp_(0, cells + 1).nan_to_num_().long()
-    nothing = edges.new_tensor([math.nan])  # is never less, nor more
-    bounds = torch.cat([nothing, edges, nothing])
     too_few, too_many = values >= bounds.index_select(0, below + 1), values < bounds.index_select(0, below)
     return below.add_(too_few).sub_(too_many.long())
 
 
-def _with_outside(terms: Tensor) -> Tensor:
-    """What each bin adds to a cell's number, and what is below the first one and above the last."""
-    outside = torch.tensor([OUTSIDE])
-    return torch.cat([outside, terms, outside])
+def _borders_below(values: Tensor, borders: Sequence[float]) -> Tensor:
+    """The same for borders at any distances; a few are sooner compared with than searched."""
+    if len(borders) > FEW_BORDERS:
+        return torch.bucketize(values.contiguous(), values.new_tensor(borders), right=True)
+    return torch.stack([values >= border for border in borders]).sum(dim=0)
+
+
+def _with_ends(values: Tensor, end: float) -> Tensor:
+    """The values between two ends."""
+    ends = values.new_tensor([end])
+    return torch.cat([ends, values, ends])
 
 
 def _check_bounds(name: str, bounds: tuple[float, float]) -> None:

@@ -7,8 +7,6 @@ from numpy.typing import NDArray
 
 from torchcover.simulation.shapes import Mesh
 
-FaceNumbers = NDArray[np.int64] | slice
-
 # An origin lies on a face if it is no farther from its plane than this many times what rounding makes of that.
 CONTACT_ROUNDINGS = 4
 # Origins are rounded too, before they come here: in float64, as a share of the largest coordinate.
@@ -18,7 +16,8 @@ LEAST_CONTACT = 1e-12
 class Faces:
     """The faces of all bodies, one after the other, and how far from each a place counts as on it.
 
-    `contact_m` (F,) bounds the distance from its plane at which float32 may find a place that lies on it.
+    `contact_m` (F,) bounds the distance from its plane at which float32 may find a place that lies on it, unless it is
+    a sliver.
     """
 
     def __init__(self, bodies: Sequence[Mesh], reach_m: float) -> None:
@@ -29,8 +28,10 @@ class Faces:
         length[length == 0] = np.inf  # Embree does not hit a face without an area
         # To first order, the roundings of n . x, where n = a x b, are the sum of all its products.
         products = np.stack([ay * bz + az * by, az * bx + ax * bz, ax * by + ay * bx])
-        rounding_m = (products * np.abs([first, second, third]).max(axis=0)).sum(axis=0) / length
-        rounding_m = np.clip(rounding_m * np.finfo(np.float32).eps, None, np.finfo(np.float32).eps * reach_m)
+        largest = np.abs([first, second, third]).max(axis=0)
+        rounding_m = (products * largest).sum(axis=0) / length
+        # The plane of a sliver is anybody's guess, but the sliver is not far from where it is.
+        rounding_m = np.minimum(rounding_m, largest.max(axis=0)) * np.finfo(np.float32).eps
         self.contact_m = np.maximum(CONTACT_ROUNDINGS * rounding_m, LEAST_CONTACT * reach_m)
         self._normals = across / length
         self._corner_m = first
@@ -46,8 +47,8 @@ class Faces:
             near = near[(self._lower_m[axis, near] <= coordinate_m) & (coordinate_m <= self._upper_m[axis, near])]
         return bool((self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]).any())
 
-    def from_plane_m(self, place_m: NDArray[np.floating], faces: FaceNumbers = slice(None)) -> NDArray[np.float64]:
-        """Distance of a (3,) place from the planes of some or all of them."""
+    def from_plane_m(self, place_m: NDArray[np.floating], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Distance of a (3,) place from the planes of some of them."""
         along_normal = (place_m[:, None] - self._corner_m[:, faces]) * self._normals[:, faces]
         distance_m: NDArray[np.float64] = np.abs(along_normal.sum(axis=0))
         return distance_m

@@ -1,4 +1,4 @@
-"""Ray casting with Embree. Everything that one must know about embreex stays in this file.
+"""Ray casting with Embree. Everything that one must know about embreex is written here.
 
 embreex computes in float32, so a scene is given in coordinates near the vehicle; it does not check that origins and
 directions are equal in number; it writes into the distances it is given, and answers a miss with them; it releases the
@@ -106,8 +106,13 @@ class RayCaster:
         faces: NDArray[np.int64],
     ) -> None:
         """Let the rays go on that hit a face whose plane they start on: by rounding alone, as they leave it."""
-        on_plane = self._faces.from_plane_m(origin_m) <= self._faces.contact_m
-        rays, travelled_m = np.flatnonzero((hits.body >= 0) & on_plane[faces]), 0.0
+
+        def starts_on_plane(faces: NDArray[np.int64]) -> NDArray[np.bool_]:
+            near: NDArray[np.bool_] = self._faces.from_plane_m(origin_m, faces) <= self._faces.contact_m[faces]
+            return near
+
+        rays, travelled_m = np.flatnonzero(hits.body >= 0), 0.0
+        rays = rays[starts_on_plane(faces[rays])]
         range_m, faces = hits.range_m[rays], faces[rays]
         for beyond in CONTACTS_BEYOND:
             if len(rays) == 0:
@@ -120,7 +125,7 @@ class RayCaster:
             hit, range_m, faces = answer["geomID"] >= 0, answer["tfar"], self._numbers(answer)
             hits.range_m[rays] = np.where(hit, travelled_m + range_m, limit_m[rays])
             hits.body[rays] = answer["geomID"]
-            again = hit & on_plane[faces]
+            again = hit & starts_on_plane(faces)
             rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
 
     def back_faces(self, origin_m: NDArray[np.floating], directions: Float32) -> NDArray[np.bool_]:

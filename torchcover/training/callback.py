@@ -9,7 +9,7 @@ try:
     from lightning.pytorch import Callback, LightningModule, Trainer
 except ImportError as error:
     raise ImportError("CoverageCallback needs Lightning: pip install 'torchcover[lightning]'") from error
-from lightning.pytorch.utilities import rank_zero_warn
+from lightning.pytorch.utilities import CombinedLoader, rank_zero_warn
 
 from torchcover.coverage import Coverage, CoverageMetric, Region
 from torchcover.data import FrameBatch
@@ -34,14 +34,15 @@ class CoverageCallback(Callback):
     nothing. The sanity check before training is not measured.
 
     Args:
-        metric: What to measure. The callback resets it at the start of each epoch and moves it to the model's device.
+        metric: What to measure. The callback resets it at the start of each epoch, or of each fit with `fixed_frames`,
+            and moves it to the model's device.
         regions: Regions to log; those of the paper that fit the grid if not given.
         stage: `"validation"` or `"train"`: whose batches to measure.
         every_n_epochs: Measure the last of every n epochs. The others cost nothing.
         every_n_steps: With `stage="train"`: also log the coverage of the epoch so far after every n batches.
         fixed_frames: With `stage="validation"`: say that the frames are the same at every epoch. Each is then measured
             when it first comes in a fit, later epochs log the numbers again, and maps are logged where frames were
-            added. With several processes, the sampler must not shuffle.
+            added; a warning says so. With several processes, the sampler must not shuffle.
         maps: Whether to log maps.
         rig: Which of several rigs in a frame; part of the tags if given.
         frames_of: Gives the frames of a batch: a `FrameBatch` or a sequence of `Frame`, one for each sample, in order.
@@ -88,8 +89,8 @@ class CoverageCallback(Callback):
         self.coverage: Coverage | None = None
         self._epoch: int | None = None  # being measured; the same on every process, as collective calls need it
         self._once = CountOnce()
-        self._holds_fit = False  # whether the sums are of this fit
-        self._drawn: dict[str, int] | None = None  # the counts of the last maps of this fit
+        self._logged: dict[str, float] = {}  # the last numbers of this fit
+        self._added = False  # whether there are frames that are not in them
         self._warned: set[str] = set()
 
     @property
@@ -100,36 +101,39 @@ class CoverageCallback(Callback):
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Forget what came before; a checkpoint is restored after this."""
         self._epoch = None
-        self._holds_fit = False
-        self._drawn = None
+        self._logged = {}
 
-    def _start(self, trainer: Trainer) -> None:
+    def _start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        # The sums live where the processes can exchange them; Apple's GPUs have no float64.
+        with torch.inference_mode(False):
+            self.metric.to("cpu" if pl_module.device.type == "mps" else pl_module.device)
         if self._epoch == trainer.current_epoch:
             return
         due = trainer.state.fn != "fit" or (trainer.current_epoch + 1) % self.every_n_epochs == 0
         self._epoch = trainer.current_epoch if due and not trainer.sanity_checking else None
         if self._epoch is None:
             return
-        if self.fixed_frames and self._holds_fit:
+        if self.fixed_frames and self._logged:
             self._once.start_epoch(forget=False)
         else:
             self._once.start_epoch()
-            self._holds_fit = True
+            self._logged, self._added = {}, True
             with torch.inference_mode(False):  # or the sums could not be added to outside a validation
                 self.metric.reset()
 
     def _add(self, trainer: Trainer, pl_module: LightningModule, batch: object, loader_index: int) -> None:
-        self._start(trainer)  # after a checkpoint at the last batch of an epoch, Lightning leaves out the hook for it
+        self._start(
+            trainer, pl_module
+        )  # after a checkpoint at the last batch of an epoch, Lightning leaves out the hook for it
         if self._epoch is None:
             return
         frames = frames_in(batch if self.frames_of is None else self.frames_of(batch))
         new = FrameBatch(tuple(self._once.new(frames, self._shard(trainer, loader_index), loader_index)))
         if not new.frames:
             return
+        self._added = True
         indices = [frame.index for frame in new.frames]
         with torch.inference_mode(False):
-            # The sums live where the processes can exchange them; Apple's GPUs have no float64.
-            self.metric.to("cpu" if pl_module.device.type == "mps" else pl_module.device)
             self.metric.update(
                 [sensor_of(frame, self.rig) for frame in new.frames],
                 new.reference,
@@ -139,26 +143,29 @@ class CoverageCallback(Callback):
 
     def _shard(self, trainer: Trainer, loader_index: int) -> Shard | None:
         loaders: Any = trainer.train_dataloader if self.stage == "train" else trainer.val_dataloaders
-        several = list(loaders.values()) if isinstance(loaders, dict) else loaders
-        loader = several[loader_index] if isinstance(several, list | tuple) else loaders
-        shard = shard_of(loader)
+        flat = CombinedLoader(loaders, "sequential").flattened
+        # A batch of several training loaders side by side does not say which frame came from which.
+        shard = None if self.stage == "train" and len(flat) > 1 else shard_of(flat[loader_index])
         if shard is None and trainer.world_size > 1:
             self._warn_once(
-                "the loader has no DistributedSampler: a frame that several processes get is counted several times"
+                "not one loader with a DistributedSampler: a frame that several processes get is counted several times"
             )
         return shard
 
     def _finish(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self._epoch is None:
             return
-        coverage = self._compute()
         self._epoch = None
+        # Whether there is something new has the same answer on all processes, as collective calls need it.
+        if not self.fixed_frames or trainer.strategy.reduce_boolean_decision(self._added, all=False):
+            if self.fixed_frames and self._logged:
+                self._warn_once("fixed_frames: an epoch had frames that were not there before; they are added")
+            coverage = self._compute()
+            self._logged, self._added = self._scalars(coverage), False
+            self._log_maps(trainer, coverage)
         # All processes log the same values, so that their maximum is the value, not rounded; Lightning wants some
         # reduction to be named.
-        pl_module.log_dict(self._scalars(coverage), on_step=False, on_epoch=True, sync_dist=True, reduce_fx="max")
-        if not (self.fixed_frames and coverage.counts == self._drawn):
-            self._log_maps(trainer, coverage)
-            self._drawn = coverage.counts
+        pl_module.log_dict(self._logged, on_step=False, on_epoch=True, sync_dist=True, reduce_fx="max")
 
     def _compute(self) -> Coverage:
         with torch.inference_mode(False):
@@ -196,7 +203,7 @@ class CoverageCallback(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Go on within an epoch: rank zero takes over the sums, the others start from nothing."""
-        self._epoch = state_dict["epoch"]
+        self._epoch, self._added = state_dict["epoch"], True
         self._once.load_state_dict(state_dict["frames"])
         self.metric.reset()
         if not is_distributed() or torch.distributed.get_rank() == 0:
@@ -204,9 +211,9 @@ class CoverageCallback(Callback):
             self.metric.merge_state(sums)
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start from nothing."""
+        """Start from nothing, or go on with fixed frames."""
         if self.stage == "validation":
-            self._start(trainer)
+            self._start(trainer, pl_module)
 
     def on_validation_batch_end(
         self,
@@ -229,7 +236,7 @@ class CoverageCallback(Callback):
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Start from nothing, unless the epoch was resumed."""
         if self.stage == "train":
-            self._start(trainer)
+            self._start(trainer, pl_module)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int

@@ -33,11 +33,11 @@ class CountOnce:
     Lightning and OpenPCDet put in. It needs batches in order (`DataLoader(in_order=True)`, the default) with one frame
     for each sample.
 
-    Within a process a frame that comes again in the same epoch is recognised by its index, name and numbers of points,
-    and counted once. That covers samplers that repeat samples on purpose, and epochs that were resumed. A frame that a
-    sampler of another kind gives to two processes is counted twice.
+    Within a process a frame that comes again before all are forgotten is recognised by its index, name and numbers of
+    points, and counted once. That covers samplers that repeat samples on purpose, and epochs that were resumed. A frame
+    that a sampler of another kind gives to two processes is counted twice.
 
-    The memory is one number for each frame of an epoch.
+    The memory is one number for each frame that was counted.
 
     Example:
         >>> import torch
