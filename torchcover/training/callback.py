@@ -122,9 +122,8 @@ class CoverageCallback(Callback):
                 self.metric.reset()
 
     def _add(self, trainer: Trainer, pl_module: LightningModule, batch: object, loader_index: int) -> None:
-        self._start(
-            trainer, pl_module
-        )  # after a checkpoint at the last batch of an epoch, Lightning leaves out the hook for it
+        # After a checkpoint at the last batch of an epoch, Lightning leaves out the hook for its start.
+        self._start(trainer, pl_module)
         if self._epoch is None:
             return
         frames = frames_in(batch if self.frames_of is None else self.frames_of(batch))
