@@ -151,6 +151,20 @@ def from_a_surface(caster):
     return sum(int((~(np.abs(range_m - expected) < 1e-3 * expected)).sum()) for range_m in found)
 
 
+def along_a_surface(caster):
+    """Rays that leave a plane in general position at slopes of 0.1 to 1e-5, and hit it."""
+    generator, found = np.random.default_rng(5), 0
+    for _ in range(100):
+        floor_T = rigid(rotation_from_euler(*generator.uniform(-60, 60, 3)), generator.uniform(-50, 50, 3))
+        place = transform(floor_T, np.append(generator.uniform(-90, 90, 2), 0.0)[None])[0]
+        slope, azimuth = np.geomspace(0.1, 1e-5, 100), generator.uniform(0, 2 * np.pi, 100)
+        flat = np.sqrt(1 - slope**2)
+        towards = floor_T[:3, :3] @ np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), slope])
+        range_m = caster([plane(200.0, 200.0).moved(floor_T)], place, towards.astype(np.float32))
+        found += int(np.isfinite(range_m).sum())
+    return found
+
+
 def coincident(caster):
     """Two boxes with a wall in one plane, one inside the outline of the other."""
     boxes = box(1.0, 1.0, 1.0).moved(at(5.0, 0.0, -0.5)), box(1.0, 3.0, 3.0).moved(at(5.0, 0.0, -1.5))
@@ -236,6 +250,8 @@ CASES = [
          FORMULA + ", epsilon 1e-6", partial(grazing, moeller_trumbore), naive_fails=False),
     Case("rays from a surface", "closed form", "of 10,000 wrong", 0, partial(from_a_surface, ours),
          "Embree as it comes", partial(from_a_surface, bare_embree)),
+    Case("rays along a surface they start on", "closed form", "of 10,000 wrong", 0, partial(along_a_surface, ours),
+         "Embree as it comes", partial(along_a_surface, bare_embree)),
     Case("coincident surfaces of two bodies", "closed form", "m", 2e-6, partial(coincident, ours),
          FORMULA, partial(coincident, formula), naive_fails=False),
     Case("a cone of rays 1e-9 rad wide", "closed form", "relative", 1e-6, partial(narrow, 1e-9),
