@@ -10,7 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchcover import BevGrid
-from torchcover.coverage.grid import bin_of
 
 ONE_BAND = {"all": (-1.0, 1.0)}
 
@@ -161,14 +160,6 @@ def test_cells_are_those_of_a_search_among_the_borders(x, cell, monkeypatch):
 def test_no_points_have_no_cells():
     cells = BevGrid(x=(0, 1), y=(0, 1), cell=0.1).cell_of(torch.zeros(0, 3))
     assert (cells.shape, cells.dtype) == ((0,), torch.int64)
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.lists(st.integers(-5, 5), min_size=2, max_size=6).map(sorted), st.floats(-6, 6))
-def test_bin_of_is_the_definition(edges, value):
-    found = bin_of(torch.tensor([value], dtype=torch.float64), torch.tensor(edges, dtype=torch.float64)).item()
-    bins = [i for i in range(len(edges) - 1) if edges[i] <= value < edges[i + 1]]
-    assert found == (bins[0] if bins else -1)
 
 
 # What a grid says of itself

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.coverage.quantiles import histogram_quantiles
+from torchcover.coverage.quantiles import bin_of, histogram_quantiles
 
 GRID = BevGrid(x=(-1.0, 20.0), y=(-5.0, 5.0), cell=0.5)
 COUNTS = dict.fromkeys(Coverage.COUNTS, 3)
@@ -250,6 +250,14 @@ def test_a_newer_format_is_refused_by_its_number(saved):
 
 
 # Quantiles from a histogram
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.integers(-5, 5), min_size=2, max_size=6).map(sorted), st.floats(-6, 6))
+def test_bin_of_is_the_definition(edges, value):
+    found = bin_of(torch.tensor([value], dtype=torch.float64), torch.tensor(edges, dtype=torch.float64)).item()
+    bins = [i for i in range(len(edges) - 1) if edges[i] <= value < edges[i + 1]]
+    assert found == (bins[0] if bins else -1)
 
 
 @settings(max_examples=60, deadline=None)

@@ -104,10 +104,17 @@ def test_a_frame_in_which_nobody_looked_for_objects_is_an_error_that_says_what_t
         box_visibility(torch.rand(5, 3), torch.rand(5, 3), None)
 
 
-@pytest.mark.parametrize("reference", [None, torch.empty(0, 3)])
-def test_a_frame_without_reference_is_an_error_that_says_what_to_do(reference):
+def test_a_frame_without_a_reference_is_an_error_that_says_what_to_do():
     with pytest.raises(ValueError, match="reference: the frame has none, and visibility is measured against it; use"):
-        box_visibility(torch.rand(5, 3), reference, TWO)
+        box_visibility(torch.rand(5, 3), None, TWO)
+
+
+def test_without_a_reference_point_every_box_is_unknown_and_the_points_of_the_rig_count():
+    seen = box_visibility(TWO.centre_m[:1].repeat(5, 1), torch.empty(0, 3), TWO)
+    assert seen.share.isnan().all()
+    assert seen.mean_radius_m.isnan().all()
+    assert seen.reference_points.tolist() == [0] * len(TWO)
+    assert seen.sensor_points[0] == 5
 
 
 @pytest.mark.parametrize(

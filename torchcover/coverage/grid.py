@@ -162,30 +162,10 @@ class BevGrid:
         return torch.cat([cells_of(some) for some in torch.split(points, part)])
 
 
-def bin_of(values: Tensor, edges: Tensor) -> Tensor:
-    """Index of the half-open bin [edges[i], edges[i + 1]) of each value.
-
-    The edges are compared with, not divided by, so that no rounding moves a point over a border.
-
-    Args:
-        values: (N,) float64.
-        edges: (B + 1,) float64, ascending; a bin between equal edges is empty.
-
-    Returns:
-        (N,) int64 bin indices in [0, B), -1 outside.
-
-    Example:
-        >>> bin_of(torch.tensor([-0.1, 0.0, 0.9, 2.0]).double(), torch.tensor([0.0, 1.0, 2.0]).double())
-        tensor([-1,  0,  0, -1])
-    """
-    index = torch.bucketize(values, edges.to(values.device), right=True) - 1
-    return index.where(index < len(edges) - 1, -1)
-
-
 def _edges_below(values: Tensor, bounds: Tensor) -> Tensor:
     """How many edges at equal distances are not above each value: what `torch.bucketize` gives, sooner.
 
-    Divided by their distance first, then compared with, as in `bin_of`.
+    Divided by their distance first, then compared with, so that no rounding moves a point over a border.
 
     Args:
         values: (N,) float64.

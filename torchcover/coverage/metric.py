@@ -12,8 +12,8 @@ from torchmetrics.utilities.distributed import gather_all_tensors
 
 from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.blocks import Blocks, check_blocks, pair_up
-from torchcover.coverage.grid import BevGrid, bin_of
-from torchcover.coverage.quantiles import QUANTILE_EDGES_M, histogram_quantiles
+from torchcover.coverage.grid import BevGrid
+from torchcover.coverage.quantiles import QUANTILE_EDGES_M, bin_of, histogram_quantiles
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.steps import Clouds, Step, as_list, check_parameters, checked_steps
 from torchcover.neighbors import nearest

@@ -10,6 +10,24 @@ from torch import Tensor
 QUANTILE_EDGES_M = torch.cat([torch.tensor([0.0]), torch.logspace(-2, 2, 81), torch.tensor([math.inf])]).double()
 
 
+def bin_of(values: Tensor, edges: Tensor) -> Tensor:
+    """Index of the half-open bin [edges[i], edges[i + 1]) of each value.
+
+    Args:
+        values: (N,) float64.
+        edges: (B + 1,) float64, ascending; a bin between equal edges is empty.
+
+    Returns:
+        (N,) int64 bin indices in [0, B), -1 outside.
+
+    Example:
+        >>> bin_of(torch.tensor([-0.1, 0.0, 0.9, 2.0]).double(), torch.tensor([0.0, 1.0, 2.0]).double())
+        tensor([-1,  0,  0, -1])
+    """
+    index = torch.bucketize(values, edges.to(values.device), right=True) - 1
+    return index.where(index < len(edges) - 1, -1)
+
+
 def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float]) -> Tensor:
     """Quantiles from weights in bins, linear within a bin.
 

@@ -67,7 +67,7 @@ def box_visibility(
     Args:
         sensor: (N, 3) points of the rig in the vehicle frame in metres, all of them. N = 0: nothing was seen, so the
             radius is infinite and the share 0.
-        reference: (M, 3) points of the reference sensor in the same frame.
+        reference: (M, 3) points of the reference sensor in the same frame. M = 0: every box is unknown.
         boxes: K objects of the same instant; K = 0 gives an empty result.
         threshold: Radius in metres up to which a point counts as seen.
         reference_weights: (M,) weight of each reference point, positive; of its area, say.
@@ -110,7 +110,7 @@ def box_visibility(
 
 
 def _check(sensor: Tensor, reference: Tensor, threshold: float, weights: Tensor | None) -> None:
-    if reference is None or (isinstance(reference, Tensor) and reference.shape == (0, 3)):
+    if reference is None:
         raise ValueError(
             "reference: the frame has none, and visibility is measured against it; use frames of SimulatedFrames, or a "
             "recording with a reference cloud"
