@@ -51,11 +51,11 @@ def estimates(job):
     torch.set_num_threads(1)
     reference = EvenReference(areas=tuple((region.x, region.y) for region in REGIONS), rays=rays)
     rigs = {rig: rig for rig in (RIG, OTHER)}
-    frames = SimulatedFrames("urban", rigs=rigs, steps=steps, seed=seed, every_s=every_s, reference=reference)
+    frames = SimulatedFrames("urban", rigs=rigs, steps=steps, seed=seed, every_s=every_s, reference_sensor=reference)
     metrics = {rig: CoverageMetric(GRID, max_radius=GRID.diagonal_m, blocks=16) for rig in rigs}
     for frame in (frames[index] for index in range(steps)):
         for rig, metric in metrics.items():
-            metric.update(frame.sensors[rig], frame.reference, weights=frame.reference_weights, index=frame.index)
+            metric.update(frame.clouds[rig], frame.reference, weights=frame.reference_weights, index=frame.index)
     coverages = {rig: metric.compute() for rig, metric in metrics.items()}
     subjects = {RIG: [], f"{OTHER} - {RIG}": []}
     for estimator, region, height in product(ESTIMATORS, REGIONS, GRID.heights):

@@ -19,7 +19,7 @@ from kornia.geometry.camera.distortion_kannala_brandt import undistort_points_ka
 
 from torchcover.cameras import Camera
 
-MOST_PIXELS = 1 << 20
+MAX_PIXELS = 1 << 20
 ORDER = {
     "brown_conrady": ["k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"],
     "kannala_brandt": ["k1", "k2", "k3", "k4"],
@@ -58,7 +58,7 @@ def load(path):
 
 def sample(camera):
     """All pixels, or every second, third, ... row and column of a large image."""
-    stride = int(np.ceil(np.sqrt(camera.width * camera.height / MOST_PIXELS)))
+    stride = int(np.ceil(np.sqrt(camera.width * camera.height / MAX_PIXELS)))
     y, x = torch.meshgrid(torch.arange(0, camera.height, stride), torch.arange(0, camera.width, stride), indexing="ij")
     return torch.stack((x, y), dim=-1).reshape(-1, 2).double()
 

@@ -5,13 +5,13 @@ import torch
 from benchmarks.timing import table
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import EvenReference, ReferenceSensor
+from torchcover.simulation import EvenReference, PaperReference
 
 STEPS = 192
 GRID = BevGrid(x=(-40.0, 80.0), y=(-20.0, 20.0), cell=1.0)
 REGION = Region("all", GRID.x, GRID.y)
 # Cells that both know well: those that hardly any step saw differ by chance.
-FEWEST_FRAMES = 8
+MIN_FRAMES = 8
 
 
 def measured(frames, weighted):
@@ -25,14 +25,14 @@ def measured(frames, weighted):
 
 def main():
     """Print the mean radius and detection over the cells that all three know."""
-    paper = SimulatedFrames("courtyard", "front_roof_128", steps=STEPS, reference=ReferenceSensor(512, 512))
-    even = paper.with_reference(EvenReference((((0.0, 20.0), (-5.0, 5.0)), (GRID.x, GRID.y)), rays=65_536))
+    paper = SimulatedFrames("courtyard", "front_roof_128", steps=STEPS, reference_sensor=PaperReference(512, 512))
+    even = paper.with_reference_sensor(EvenReference((((0.0, 20.0), (-5.0, 5.0)), (GRID.x, GRID.y)), rays=65_536))
     runs = {
         "the paper's 512 x 512": measured(paper, weighted=False),
         "65,536 even, weighted": measured(even, weighted=True),
         "65,536 even, unweighted": measured(even, weighted=False),
     }
-    known = torch.stack([run.frames >= FEWEST_FRAMES for run in runs.values()]).all(dim=0)
+    known = torch.stack([run.probed_steps >= MIN_FRAMES for run in runs.values()]).all(dim=0)
     rows = []
     for name, run in runs.items():
         numbers = [mean for band, mask in enumerate(known) for mean in _means(run, band, mask)]

@@ -9,23 +9,23 @@ from collections.abc import Iterator
 import torch
 
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import EvenReference, ReferenceSensor
-from torchcover.training import box_visibility
+from torchcover.detection import box_visibility
+from torchcover.simulation import EvenReference, PaperReference
 
 WITHIN_M = 60.0
 INSTANTS = 15
 REFERENCES = {
-    "the paper's, 1024 x 1024": ReferenceSensor(),
-    "the paper's, 512 x 512": ReferenceSensor(rows=512, columns=512),
-    "512 x 512, level": ReferenceSensor(rows=512, columns=512, max_tilt_deg=0.0),
+    "the paper's, 1024 x 1024": PaperReference(),
+    "the paper's, 512 x 512": PaperReference(rows=512, columns=512),
+    "512 x 512, level": PaperReference(rows=512, columns=512, max_tilt_deg=0.0),
     "even, 65536 rays within 60 m": EvenReference(((((-60.0, 60.0), (-60.0, 60.0))),), rays=65_536),
 }
 
 
-def measure(scenario: str, reference: ReferenceSensor | EvenReference) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+def measure(scenario: str, reference: PaperReference | EvenReference) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
     """Reference points and hits of the near boxes, instant by instant."""
     frames = SimulatedFrames(
-        scenario, "front_roof_128", steps=INSTANTS, seed=0, every_s=2.0, reference=reference, boxes=True
+        scenario, "front_roof_128", steps=INSTANTS, seed=0, every_s=2.0, reference_sensor=reference, boxes=True
     )
     for index in range(INSTANTS):
         frame = frames[index]

@@ -5,7 +5,7 @@ import torch
 from benchmarks.timing import compare, table
 from torchcover import BevGrid, CoverageMetric
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import ReferenceSensor
+from torchcover.simulation import PaperReference
 
 GRID = BevGrid(x=(0.0, 80.0), y=(-20.0, 20.0), cell=0.25)
 # As large as everything that the reference can hit.
@@ -15,7 +15,7 @@ EVERYWHERE = BevGrid(x=(-260.0, 260.0), y=(-260.0, 260.0), cell=0.25, heights={"
 def main():
     """Print the time of an update with more and with less to do."""
     torch.manual_seed(0)
-    frame = SimulatedFrames("urban", "front_roof_128", steps=1, reference=ReferenceSensor(512, 512))[0]
+    frame = SimulatedFrames("urban", "front_roof_128", steps=1, reference_sensor=PaperReference(512, 512))[0]
 
     def update(grid=GRID, **options):
         metric = CoverageMetric(grid, (0.4,), **options)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.timing import compare, table
-from torchcover.simulation import ReferenceSensor, Rig, Scenario
+from torchcover.simulation import PaperReference, Rig, Scenario
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
@@ -16,7 +16,7 @@ RANGE_M = 250.0
 STEPS = (100, 110, 120, 130)
 NEAR, FAR = 60, 1000
 FAR_M = 10_000.0
-REFERENCE = ReferenceSensor(rows=256, columns=256, max_range_m=RANGE_M)
+REFERENCE = PaperReference(rows=256, columns=256, max_range_m=RANGE_M)
 
 
 def main():

@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.timing import compare, table
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import ReferenceSensor, Rig, Scenario
+from torchcover.simulation import PaperReference, Rig, Scenario
 from torchcover.simulation.instant import Scan, cast_from, rotate
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles
@@ -52,7 +52,7 @@ def bodies_out_of_range(scene, sensor):
 
 def rays_that_pass_by(scene):
     """65,536 reference rays: without this, each is cast at each body in range."""
-    reference, instant = ReferenceSensor(rows=256, columns=256), scene.at(STEP, within_m=RANGE_M)
+    reference, instant = PaperReference(rows=256, columns=256), scene.at(STEP, within_m=RANGE_M)
     generator = np.random.default_rng(0)
     pose = reference.vehicle_T_reference(scene.ego_box, generator)
     tiles = reference.tiles(pose, generator)
@@ -116,7 +116,7 @@ def totals():
     rows = []
     for scenario, rig in (("urban", "front_roof_128"), ("urban", "kitti"), ("courtyard", "front_roof_128")):
         frames = SimulatedFrames(
-            scenario, rig, steps=10, seed=0, every_s=1.0, reference=ReferenceSensor(rows=256, columns=256)
+            scenario, rig, steps=10, seed=0, every_s=1.0, reference_sensor=PaperReference(rows=256, columns=256)
         )
         counts = Counter()
         for index in range(len(frames)):

@@ -10,7 +10,7 @@ from benchmarks.raycasting import THREADS, bare_rays, bare_scene
 from benchmarks.timing import compare, table
 from torchcover import BevGrid, CoverageMetric, Rig, Scenario
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import ReferenceSensor
+from torchcover.simulation import PaperReference
 
 
 def main():
@@ -19,7 +19,7 @@ def main():
     grid = BevGrid(x=(-40.0, 160.0), y=(-40.0, 40.0), cell=0.25)
     metric = CoverageMetric(grid, max_radius=grid.diagonal_m)
     bare = bare_scene(Scenario.load("courtyard").world())
-    lidar, sensor = Rig.load("front_roof_128").sensors[0], ReferenceSensor()
+    lidar, sensor = Rig.load("front_roof_128").sensors[0], PaperReference()
     rows = []
     with ThreadPoolExecutor(THREADS) as pool:
         for step in (0, 1, 2):

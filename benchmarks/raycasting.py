@@ -8,7 +8,7 @@ from embreex.rtcore_scene import EmbreeScene
 
 from benchmarks.timing import compare, table
 from torchcover import Scenario
-from torchcover.simulation import ReferenceSensor
+from torchcover.simulation import PaperReference
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
 
@@ -36,7 +36,7 @@ def main():
     """Print the ratio for the paper's reference sensor at four poses in the courtyard."""
     world = Scenario.load("courtyard").world()
     scene, bare = Scene(world), bare_scene(world)
-    sensor = ReferenceSensor()
+    sensor = PaperReference()
     tiles = into_tiles(sensor.directions())
     instant = scene.at(0)
     rows = []

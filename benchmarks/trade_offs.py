@@ -15,7 +15,7 @@ from tests.stability.rays import bare_embree, far_room, from_mid_room
 from torchcover import BevGrid, CoverageMetric, Scenario, forward_regions, nearest
 from torchcover.cameras import Camera, inverse
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import ReferenceSensor
+from torchcover.simulation import PaperReference
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Mesh
 
@@ -129,7 +129,7 @@ def lenses():
 def casting():
     world = Scenario.load("courtyard").world()
     bodies = (world.ego.mesh, *world.static)
-    sensor = ReferenceSensor()
+    sensor = PaperReference()
     pose = sensor.vehicle_T_reference(Scene(world).ego_box, np.random.default_rng(0))
     origin, towards = pose[:3, 3], np.concatenate([part[1] for part in bare_rays(sensor, pose)]).T
 
@@ -215,7 +215,7 @@ def sums():
 
 def cell_sizes(steps=24):
     frames = SimulatedFrames(
-        "courtyard", "front_roof_128", steps=steps, reference=ReferenceSensor(rows=512, columns=512)
+        "courtyard", "front_roof_128", steps=steps, reference_sensor=PaperReference(rows=512, columns=512)
     )
     kept = [frames[index] for index in range(steps)]
     rows = []

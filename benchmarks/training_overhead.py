@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 from benchmarks.timing import table
 from torchcover import BevGrid, CoverageMetric, forward_regions
 from torchcover.data import SimulatedFrames, collate_frames
-from torchcover.simulation import ReferenceSensor
+from torchcover.simulation import PaperReference
 from torchcover.training import CoverageCallback
 
 GRID = BevGrid(x=(0.0, 80.0), y=(-20.0, 20.0), cell=0.5)
@@ -115,7 +115,7 @@ def main():
         "courtyard",
         "front_roof_32",
         steps=TRAIN_FRAMES + VALIDATION_FRAMES,
-        reference=ReferenceSensor(rows=128, columns=128),
+        reference_sensor=PaperReference(rows=128, columns=128),
     )
     frames = [dataset[index] for index in range(len(dataset))]
     epoch, inside, drawing = measure(frames)

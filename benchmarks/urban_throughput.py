@@ -11,7 +11,7 @@ from benchmarks.timing import table
 from torchcover import BevGrid, CoverageMetric, forward_regions
 from torchcover.coverage import metric as metric_module
 from torchcover.data import SimulatedFrames, collate_frames
-from torchcover.simulation import EvenReference, ReferenceSensor
+from torchcover.simulation import EvenReference, PaperReference
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.scene import Scene
@@ -29,7 +29,7 @@ STAGES = {
     (Instant, "scan"): "rays of the reference",
     (EvenReference, "tiles"): "rays of the reference",
     (EvenReference, "weights"): "rays of the reference",
-    (ReferenceSensor, "tiles"): "rays of the reference",
+    (PaperReference, "tiles"): "rays of the reference",
     (metric_module, "nearest"): "search",
     (CoverageMetric, "update"): "binning",
 }
@@ -39,12 +39,12 @@ def main():
     """Print both tables, for the paper's pattern of reference rays and for one spread evenly."""
     areas = tuple((region.x, region.y) for region in forward_regions())
     references = {
-        "256 x 256, the paper's": ReferenceSensor(rows=256, columns=256),
+        "256 x 256, the paper's": PaperReference(rows=256, columns=256),
         "65,536 spread evenly": EvenReference(areas, rays=65_536),
     }
     rates, divided = [], []
     for name, reference in references.items():
-        frames = SimulatedFrames("urban", RIG, steps=LAST, seed=0, reference=reference)
+        frames = SimulatedFrames("urban", RIG, steps=LAST, seed=0, reference_sensor=reference)
         rates.append((name, steps_a_second(frames)))
         start = time.perf_counter()
         frames.scene_of(0)

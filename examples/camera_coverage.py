@@ -19,7 +19,7 @@ from rich.progress import track
 from torchcover import BevGrid, CoverageMetric, Region, Rig
 from torchcover.data import SimulatedFrames
 from torchcover.report import comparison_tables, draw_comparison
-from torchcover.simulation import CameraSensor, ReferenceSensor
+from torchcover.simulation import CameraSensor, PaperReference
 
 GOPRO = {
     "id": "gopro_hero4_session_4by3",
@@ -86,13 +86,13 @@ def main():
         "pinhole": rig_of("pinhole", calibration, "pinhole"),
     }
     frames = SimulatedFrames(
-        "courtyard", rigs=rigs, steps=options.steps, seed=0, reference=ReferenceSensor(rows=512, columns=512)
+        "courtyard", rigs=rigs, steps=options.steps, seed=0, reference_sensor=PaperReference(rows=512, columns=512)
     )
     metrics = {name: CoverageMetric(GRID, max_radius=GRID.diagonal_m) for name in rigs}
     for index in track(range(len(frames)), description="steps"):
         frame = frames[index]
         for name, metric in metrics.items():
-            metric.update(frame.sensors[name], frame.reference)
+            metric.update(frame.clouds[name], frame.reference)
     coverages = {name: metric.compute() for name, metric in metrics.items()}
     console = Console()
     for table in comparison_tables(coverages, REGIONS):

@@ -29,8 +29,9 @@ from torch.utils.data import DataLoader
 
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.data import Augmentation, SimulatedFrames, collate_frames
-from torchcover.simulation import EvenReference, ReferenceSensor
-from torchcover.training import CoverageCallback, RecallByVisibility, box_visibility, match
+from torchcover.detection import RecallByVisibility, box_visibility, match
+from torchcover.simulation import EvenReference, PaperReference
+from torchcover.training import CoverageCallback
 
 RIGS = ("front_roof_128", "front_roof_32")
 X_M, Y_M, Z_M = (0.0, 51.2), (-25.6, 25.6), (-1.0, 3.0)
@@ -40,7 +41,7 @@ PILLARS, CELLS = 128, 64
 VOXEL_M = 0.1
 REGIONS = (Region("0-25m", (0.0, 25.6), (-12.8, 12.8)), Region("0-51m", X_M, Y_M))
 # A car that the rig hardly touched teaches nothing; in the evaluation it counts.
-LEAST_HITS = 3
+MIN_HITS = 3
 SCORES = tuple(np.linspace(0.05, 0.95, 46).round(3).tolist())
 # The one of SCORES at which recall is shown.
 OPERATING_SCORE = 0.31
@@ -68,14 +69,20 @@ def thinned(cloud):
 def simulate(steps, seed, reference, name, keep_clouds):
     """Frames with both rigs, 4 from each drive of a minute; `network RIG` is what the detector is fed."""
     frames = SimulatedFrames(
-        "urban", rigs={rig: rig for rig in RIGS}, steps=steps, seed=seed, every_s=15.0, reference=reference, boxes=True
+        "urban",
+        rigs={rig: rig for rig in RIGS},
+        steps=steps,
+        seed=seed,
+        every_s=15.0,
+        reference_sensor=reference,
+        boxes=True,
     )
     kept = []
     for index in track(range(steps), description=f"simulating {name}"):
         frame = frames[index]
-        fed = {f"network {rig}": thinned(cloud) for rig, cloud in frame.sensors.items()}
-        clouds = {**frame.sensors, **fed} if keep_clouds else fed
-        kept.append(replace(frame, sensors=clouds, boxes=in_region(frame.boxes)))
+        fed = {f"network {rig}": thinned(cloud) for rig, cloud in frame.clouds.items()}
+        clouds = {**frame.clouds, **fed} if keep_clouds else fed
+        kept.append(replace(frame, clouds=clouds, boxes=in_region(frame.boxes)))
     return kept
 
 
@@ -206,8 +213,8 @@ class Training(lightning.LightningModule):
     def training_step(self, batch, _):
         """The loss of augmented frames."""
         frames = [self.augment(frame, self.current_epoch) for frame in batch.frames]
-        heat, boxes = self.detector([frame.sensors[f"network {self.rig}"] for frame in frames])
-        truth = [frame.boxes.select(frame.boxes.hits[self.rig] >= LEAST_HITS).rows for frame in frames]
+        heat, boxes = self.detector([frame.clouds[f"network {self.rig}"] for frame in frames])
+        truth = [frame.boxes.select(frame.boxes.hits[self.rig] >= MIN_HITS).rows for frame in frames]
         loss = loss_of(heat, boxes, truth)
         self.log("loss", loss, batch_size=len(batch), prog_bar=True)
         return loss
@@ -218,7 +225,7 @@ class Training(lightning.LightningModule):
 
     def validation_step(self, batch, _):
         """Count what was found, of what was visible."""
-        heat, boxes = self.detector(batch.sensors(f"network {self.rig}"))
+        heat, boxes = self.detector(batch.clouds_of(f"network {self.rig}"))
         for frame, frame_heat, frame_boxes in zip(batch.frames, heat, boxes, strict=True):
             rows, scores = decode(frame_heat, frame_boxes)
             seen = self.visibility[frame.index]
@@ -384,14 +391,14 @@ def main():
     options.out.mkdir(parents=True, exist_ok=True)
 
     console = Console()
-    unused = ReferenceSensor(rows=1, columns=1)
+    unused = PaperReference(rows=1, columns=1)
     even = EvenReference((((X_M[0], X_M[1]), (Y_M[0], Y_M[1])),), rays=65_536)
     training_frames = simulate(options.train, options.seed, unused, "training frames", keep_clouds=False)
     validation_frames = simulate(options.validate, options.seed + 1, even, "validation frames", keep_clouds=True)
     results = {}
     for rig in RIGS:
         visibility = {
-            frame.index: box_visibility(frame.sensors[rig], frame.reference, frame.boxes) for frame in validation_frames
+            frame.index: box_visibility(frame.clouds[rig], frame.reference, frame.boxes) for frame in validation_frames
         }
         results[rig] = train(rig, training_frames, validation_frames, visibility, options, console)
     report(results, console)

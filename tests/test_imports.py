@@ -46,12 +46,13 @@ def test_every_public_name_is_there(name):
 
 def test_the_public_names_are_those_of_the_contract():
     assert set(torchcover.__all__) == {
-        "BevGrid", "Camera", "Coverage", "CoverageMetric", "Region", "Rig", "Scenario", "blind_spot_radius", "data",
-        "forward_regions", "nearest",
+        "BevGrid", "Camera", "Coverage", "CoverageMetric", "Region", "Rig", "Scenario", "blind_spot_radius", "cameras",
+        "coverage", "data", "detection", "evaluation", "forward_regions", "geometry", "metrics", "nearest", "neighbors",
+        "report", "simulation", "training",
     }  # fmt: skip
     assert torchcover.__all__ == sorted(torchcover.__all__)
 
 
 def test_an_unknown_name_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="module 'torchcover' has no attribute 'coverage_metric'"):
+    with pytest.raises(AttributeError, match="coverage_metric"):
         _ = torchcover.coverage_metric

@@ -6,7 +6,7 @@ import torch
 
 from torchcover import BevGrid, CoverageMetric, Region, Rig, Scenario
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import ReferenceSensor
+from torchcover.simulation import PaperReference
 
 RIGS = ("front_grille_128", "front_roof_128", "front_roof_64", "front_roof_32")
 LEADER_X_M = 13.0
@@ -37,13 +37,13 @@ ROAD = Scenario.model_validate(
 
 @pytest.fixture(scope="module")
 def coverage():
-    reference = ReferenceSensor(rows=256, columns=256)
-    frames = SimulatedFrames(ROAD, rigs={name: name for name in RIGS}, steps=16, seed=0, reference=reference)
+    reference = PaperReference(rows=256, columns=256)
+    frames = SimulatedFrames(ROAD, rigs={name: name for name in RIGS}, steps=16, seed=0, reference_sensor=reference)
     metrics = {name: CoverageMetric(GRID, max_radius=GRID.diagonal_m) for name in RIGS}
     for index in range(len(frames)):
         frame = frames[index]
         for name, metric in metrics.items():
-            metric.update(frame.sensors[name], frame.reference)
+            metric.update(frame.clouds[name], frame.reference)
     return {name: metric.compute() for name, metric in metrics.items()}
 
 
@@ -56,7 +56,7 @@ def row(coverage, rig, x, y=(-8.0, 8.0), height="ground"):
 
 def test_the_hood_hides_the_ground_in_front_of_the_car_from_the_roof(coverage):
     lidar = Rig.load("front_roof_128").sensors[0]
-    seen = SimulatedFrames(ROAD, "front_roof_128", steps=1, reference=ReferenceSensor(8, 8))[0]
+    seen = SimulatedFrames(ROAD, "front_roof_128", steps=1, reference_sensor=PaperReference(8, 8))[0]
     assert seen.counts["sensor_self_hits"] > 0.005 * seen.counts["sensor_rays"]
     # Without a body the lowest row would reach the ground here; with it, rows end on the hood.
     first_m = lidar.mount.x_m + lidar.mount.z_m / np.tan(np.deg2rad(25.0))

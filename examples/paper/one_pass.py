@@ -11,7 +11,7 @@ from torchcover import BevGrid, Coverage, CoverageMetric
 from torchcover.cli.run import outline_m, sensor_marks
 from torchcover.data import SimulatedFrames
 from torchcover.report import SensorMark
-from torchcover.simulation import EvenReference, ReferenceSensor
+from torchcover.simulation import EvenReference, PaperReference
 
 BLOCKS = 16  # for standard errors
 # One band that holds every point of a rig.
@@ -46,7 +46,7 @@ def one_pass(measured, counted, regions, options):
         steps=options.steps,
         seed=options.seed,
         every_s=options.every,
-        reference=reference_of(regions, options),
+        reference_sensor=reference_of(regions, options),
     )
     metrics = {(rig, grid): CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=BLOCKS) for rig, grid in measured}
     points = {(rig, grid): torch.zeros(grid.shape[1:], dtype=torch.int64) for rig, grid in counted}
@@ -54,9 +54,9 @@ def one_pass(measured, counted, regions, options):
     for index in track(range(len(frames)), description=" ".join(rigs)):
         frame = frames[index]
         for (rig, _), metric in metrics.items():
-            metric.update(frame.sensors[rig], frame.reference, weights=frame.reference_weights, index=index)
+            metric.update(frame.clouds[rig], frame.reference, weights=frame.reference_weights, index=index)
         for rig, grid in counted:
-            points[rig, grid] += points_in_cells(frame.sensors[rig], grid)
+            points[rig, grid] += points_in_cells(frame.clouds[rig], grid)
     return OnePass(
         coverages={key: metric.compute() for key, metric in metrics.items()},
         points=points,
@@ -70,7 +70,7 @@ def reference_of(regions, options):
     """The paper's reference sensor, or one whose rays are even over each of the regions."""
     if options.reference == "paper":
         side = round(options.rays**0.5)
-        return ReferenceSensor(rows=side, columns=side)
+        return PaperReference(rows=side, columns=side)
     return EvenReference(tuple(dict.fromkeys((region.x, region.y) for region in regions)), rays=options.rays)
 
 

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from torchcover.cameras import Camera, inverse
-from torchcover.cameras.region import find_region
 from torchcover.cameras.start import make_start_table
+from torchcover.cameras.valid_region import find_region
 
 
 def grid(camera):

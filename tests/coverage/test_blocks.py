@@ -62,7 +62,7 @@ def slow_blocks(steps, blocks: int, *, weighted: bool = False) -> dict[str, np.n
     length = 1
     while last // length >= blocks:
         length *= 2
-    sums = {name: np.zeros((blocks, CELLS)) for name in ("frames", "radius", "detection")}
+    sums = {name: np.zeros((blocks, CELLS)) for name in ("probed_steps", "radius", "detection")}
     sums["steps"] = np.zeros(blocks)
     for step in steps:
         block = step["more"]["index"] // length
@@ -70,7 +70,7 @@ def slow_blocks(steps, blocks: int, *, weighted: bool = False) -> dict[str, np.n
         for cell, own in step["radii"].items():
             weights = step["weights"][cell] if weighted else [1.0] * len(own)
             radii = np.float32(own).astype(float)
-            sums["frames"][block, cell] += 1
+            sums["probed_steps"][block, cell] += 1
             sums["radius"][block, cell] += np.average(radii, weights=weights)
             sums["detection"][block, cell] += np.average(radii <= THRESHOLD, weights=weights)
     return sums
@@ -89,7 +89,7 @@ def slow_jackknife(left_out: list[float], whole: float, sizes: list[float]) -> f
 
 def slow_region_error(sums: dict[str, np.ndarray], name: str) -> float:
     def mean(kept) -> float:
-        frames, total = sums["frames"][kept].sum(axis=0), sums[name][kept].sum(axis=0)
+        frames, total = sums["probed_steps"][kept].sum(axis=0), sums[name][kept].sum(axis=0)
         return float(np.mean([total[cell] / frames[cell] for cell in range(CELLS) if frames[cell]]))
 
     used = [block for block in range(len(sums["steps"])) if sums["steps"][block]]
@@ -144,7 +144,7 @@ def test_sums_and_errors_are_those_of_plain_loops(count):
     steps = random_steps(count, seed=count)
     coverage, sums = metric_over(steps).compute(), slow_blocks(steps, 16)
     np.testing.assert_array_equal(coverage.blocks.steps, sums["steps"])
-    np.testing.assert_array_equal(coverage.blocks.frames.flatten(1), sums["frames"])
+    np.testing.assert_array_equal(coverage.blocks.probed_steps.flatten(1), sums["probed_steps"])
     np.testing.assert_allclose(coverage.blocks.radius_sum.flatten(1), sums["radius"], rtol=1e-12)
     np.testing.assert_allclose(coverage.blocks.detection_sum.flatten(1), sums["detection"], rtol=1e-12)
     (row,) = coverage.summary([EVERYWHERE])
@@ -157,7 +157,7 @@ def test_the_error_in_a_cell_is_that_of_a_ratio_of_sums():
     coverage, sums = metric_over(steps).compute(), slow_blocks(steps, 16)
     for name, found in (("radius", coverage.radius_error), ("detection", coverage.detection_error)):
         for cell in range(CELLS):
-            n, s = sums["frames"][:, cell], sums[name][:, cell]
+            n, s = sums["probed_steps"][:, cell], sums[name][:, cell]
             residual = [s[j] - s.sum() / n.sum() * n[j] for j in range(16) if n[j]]
             k = len(residual)
             expected = math.sqrt(k / (k - 1) * sum(r * r for r in residual)) / n.sum()
@@ -261,7 +261,7 @@ def test_steps_without_a_number_are_counted_on(forward):
 def test_doubling_the_blocks_keeps_every_sum(count):
     steps = random_steps(count, dyadic=True)
     blocked, plain = metric_over(steps), metric_over(steps, blocks=1)
-    for name in ("frames", "radius_sum", "detection_sum", "block_steps"):
+    for name in ("probed_steps", "radius_sum", "detection_sum", "block_steps"):
         assert torch.equal(blocked.metric_state[name].sum(dim=0), plain.metric_state[name][0]), name
     assert torch.equal(blocked.points, plain.points)
     assert int(blocked.block_length) == 2 ** math.ceil(math.log2(count / 16))
@@ -274,7 +274,13 @@ def test_doubling_the_blocks_keeps_every_sum(count):
 def test_blocks_change_no_number(options):
     steps = random_steps(40, weighted=True)
     blocked, plain = (metric_over(steps, blocks=blocks, **options).compute() for blocks in (16, 1))
-    for name in ("frames", "points", "radius", "detection", *(("maximum", "pooled", "quantiles") if options else ())):
+    for name in (
+        "probed_steps",
+        "points",
+        "radius",
+        "detection",
+        *(("maximum", "pooled", "quantiles") if options else ()),
+    ):
         torch.testing.assert_close(getattr(blocked, name), getattr(plain, name), rtol=1e-12, atol=0, equal_nan=True)
 
 
@@ -329,7 +335,7 @@ def test_two_ranks_with_different_numbers_of_steps_equal_one_process(tmp_path):
 def test_weighted_means_are_those_of_plain_loops():
     steps = random_steps(30, seed=5, weighted=True)
     coverage, sums = metric_over(steps, pooled=True).compute(), slow_blocks(steps, 16, weighted=True)
-    frames = sums["frames"].sum(axis=0)
+    frames = sums["probed_steps"].sum(axis=0)
     np.testing.assert_allclose(coverage.radius.flatten(), sums["radius"].sum(axis=0) / frames, rtol=1e-12)
     np.testing.assert_allclose(coverage.detection.flatten(), sums["detection"].sum(axis=0) / frames, rtol=1e-12)
     for cell in range(CELLS):
@@ -429,12 +435,12 @@ def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
         grid=GRID,
         thresholds=(THRESHOLD,),
         max_radius=math.inf,
-        frames=frames.sum(dim=0),
+        probed_steps=frames.sum(dim=0),
         points=frames.sum(dim=0),
         radius=means[0],
         detection=means[1:],
         counts=counts,
-        blocks=Blocks(steps=steps, frames=frames, radius_sum=sums[0], detection_sum=sums[1, :, None]),
+        blocks=Blocks(steps=steps, probed_steps=frames, radius_sum=sums[0], detection_sum=sums[1, :, None]),
     )
 
 

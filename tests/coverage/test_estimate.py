@@ -104,7 +104,7 @@ def test_the_summary_has_both_with_their_errors():
     coverage = metric_over(steps_of(64, points=6), blocks=16).compute()
     row = coverage.summary([PART])[0]
     completed = coverage.estimate(PART, "low", "completed")
-    assert row.unseen_cells == unseen_cells(coverage.frames[0][PART.mask(GRID)])
+    assert row.unseen_cells == unseen_cells(coverage.probed_steps[0][PART.mask(GRID)])
     assert row.completed.radius_m == completed.value[0]
     assert row.completed.detection_error == dict(zip((0.4, 0.8), completed.error[1:].tolist(), strict=True))
     assert row.radius_error_m == coverage.estimate(PART, "low").error[0]

@@ -72,14 +72,14 @@ def test_a_mean_of_means_not_a_pooled_mean():
     assert result.radius.item() == 0.5
     assert result.detection.item() == 0.5
     assert result.pooled.item() == (1000 * 0.125 + 0.875) / 1001
-    assert (result.frames.item(), result.points.item()) == (2, 1001)
+    assert (result.probed_steps.item(), result.points.item()) == (2, 1001)
 
 
 def test_a_step_without_a_point_in_the_cell_does_not_count_there():
     grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
     result = coverage([(ORIGIN, points_at(0.5)), (ORIGIN, cloud([1, 0, 0])), (ORIGIN, points_at(0.25))], grid)
     assert result.radius.flatten().tolist() == [0.375, 1.0]
-    assert result.frames.flatten().tolist() == [2, 1]
+    assert result.probed_steps.flatten().tolist() == [2, 1]
 
 
 def test_the_nearest_sensor_point_may_lie_outside_the_grid():
@@ -103,7 +103,7 @@ def test_unknown_cells_are_nan_with_count_zero():
     for values in (result.radius, result.detection, result.maximum, result.pooled, result.quantiles):
         assert values[..., 1].isnan().all()
         assert not values[..., 0].isnan().any()
-    assert (result.frames[..., 1].item(), result.points[..., 1].item()) == (0, 0)
+    assert (result.probed_steps[..., 1].item(), result.points[..., 1].item()) == (0, 0)
 
 
 # Thresholds
@@ -136,7 +136,7 @@ def test_no_thresholds_give_no_detection():
 def test_a_step_in_which_the_rig_saw_nothing_is_blind_not_missing():
     result = coverage([(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.5))], ONE_CELL, (0.75,), maximum=True)
     assert (result.radius.item(), result.maximum.item()) == (math.inf, math.inf)
-    assert (result.detection.item(), result.frames.item()) == (0.5, 2)
+    assert (result.detection.item(), result.probed_steps.item()) == (0.5, 2)
     assert result.counts["empty_sensor_steps"] == 1
 
 
@@ -154,7 +154,7 @@ def test_a_blind_step_detects_nothing_even_at_a_threshold_of_max_radius():
 
 def test_an_empty_reference_cloud_says_nothing():
     result = coverage([(ORIGIN, NOTHING), (ORIGIN, points_at(0.5)), (NOTHING, NOTHING)], quantiles=(0.5,), **OPTIONS)
-    assert (result.radius.item(), result.frames.item()) == (0.5, 1)
+    assert (result.radius.item(), result.probed_steps.item()) == (0.5, 1)
     assert (result.counts["steps"], result.counts["empty_reference_steps"]) == (3, 2)
     assert result.counts["empty_sensor_steps"] == 1
 
@@ -189,7 +189,7 @@ def test_a_search_bounded_by_the_threshold_detects_the_same_to_the_last_bit():
     steps = random_steps(11, steps=6)
     whole, bounded = (coverage(steps, GRID, (0.25, 0.5), max_radius=limit) for limit in (math.inf, 0.5))
     assert torch.equal(whole.detection.nan_to_num(-1), bounded.detection.nan_to_num(-1))
-    assert (bounded.radius[bounded.frames > 0] <= 0.5).all()
+    assert (bounded.radius[bounded.probed_steps > 0] <= 0.5).all()
 
 
 # Against plain loops
@@ -222,7 +222,7 @@ def test_shorter_types_give_what_their_rounded_coordinates_give(slow_coverage, d
 
 def assert_same(one, other):
     assert one.counts == other.counts
-    for name in ("frames", "points", "radius", "detection", "maximum", "pooled", "quantiles"):
+    for name in ("probed_steps", "points", "radius", "detection", "maximum", "pooled", "quantiles"):
         torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-12, atol=0, equal_nan=True)
 
 
@@ -252,7 +252,7 @@ def test_more_sensor_points_never_make_it_worse(seed):
     steps = random_steps(seed, empty=False)
     more = [(torch.cat([sensor, sensor + 0.5]), reference) for sensor, reference in steps]
     before, after = coverage(steps, GRID, **OPTIONS), coverage(more, GRID, **OPTIONS)
-    known = before.frames > 0
+    known = before.probed_steps > 0
     assert (after.radius <= before.radius + 1e-12)[known].all()
     assert (after.detection >= before.detection - 1e-12)[:, known].all()
     assert (before.maximum >= before.radius - 1e-12)[known].all()

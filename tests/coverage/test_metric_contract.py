@@ -22,7 +22,7 @@ from torchcover.coverage import Coverage
 SHAPE = {"x": (-2.0, 2.0), "y": (-1.0, 1.0), "cell": 0.5, "heights": {"all": (-2.0, 2.0)}}
 GRID = BevGrid(**SHAPE)
 OPTIONS = {"thresholds": (0.4, 0.8), "max_radius": 3.0, "maximum": True, "pooled": True, "quantiles": (0.5,)}
-MAPS = ("frames", "points", "radius", "detection", "maximum", "pooled", "quantiles")
+MAPS = ("probed_steps", "points", "radius", "detection", "maximum", "pooled", "quantiles")
 
 
 def make_step(seed, points=60):
@@ -61,7 +61,7 @@ def test_before_any_step_everything_is_unknown():
         result = metric.compute()
     for name in ("radius", "detection", "maximum", "pooled", "quantiles"):
         assert getattr(result, name).isnan().all()
-    assert not result.frames.any()
+    assert not result.probed_steps.any()
     assert set(result.counts.values()) == {0}
 
 
@@ -84,7 +84,7 @@ def test_compute_changes_nothing_and_sees_later_steps():
     metric.update(*make_step(1))
     assert_same(metric.compute(), metric_over([make_step(0), make_step(1)]).compute())
     assert torch.equal(first.radius.nan_to_num(-1), kept.nan_to_num(-1))
-    assert int(first.frames.sum()) == int(before["frames"].sum())
+    assert int(first.probed_steps.sum()) == int(before["probed_steps"].sum())
 
 
 def test_the_inputs_are_bit_equal_afterwards():
@@ -131,7 +131,7 @@ def test_sums_over_very_many_steps_do_not_drift():
     metric.load_state_dict(after_many)
     for _ in range(3):
         metric.update(*step)
-    for name in ("frames", "points", "radius_sum", "detection_sum", "pooled_sum", "steps"):
+    for name in ("probed_steps", "points", "radius_sum", "detection_sum", "pooled_sum", "steps"):
         assert metric.metric_state[name].sum().item() == 2**25 + 3, name
     assert metric.histogram.sum().item() == 2**25 + 3
 

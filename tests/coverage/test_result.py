@@ -30,7 +30,7 @@ def a_coverage(seed=0, thresholds=(0.4, 0.8), grid=GRID, **more):
         grid=grid,
         thresholds=thresholds,
         max_radius=30.0,
-        frames=frames,
+        probed_steps=frames,
         points=5 * frames,
         radius=values(),
         detection=values(len(thresholds)),
@@ -54,7 +54,7 @@ def test_a_regions_number_is_the_unweighted_mean_over_its_known_cells(region):
             for x, centre_x in enumerate(np.arange(-0.75, 20, 0.5))
             if region.x[0] <= centre_x < region.x[1] and region.y[0] <= centre_y < region.y[1]
         ]
-        known = [cell for cell in inside if result.frames[(band, *cell)] > 0]
+        known = [cell for cell in inside if result.probed_steps[(band, *cell)] > 0]
         assert 0 < len(known) < len(inside)
         assert (row.cells, row.known_cells) == (len(inside), len(known))
         assert row.known_share == len(known) / len(inside)
@@ -66,7 +66,7 @@ def test_a_regions_number_is_the_unweighted_mean_over_its_known_cells(region):
 
 def test_a_region_of_which_nothing_is_known_is_unknown():
     result = a_coverage()
-    result.frames.zero_()
+    result.probed_steps.zero_()
     row = result.summary([Region("r", (0.0, 2.0), (-1.0, 1.0))])[0]
     assert (row.known_cells, row.known_share) == (0, 0.0)
     assert math.isnan(row.radius_m)
@@ -75,7 +75,7 @@ def test_a_region_of_which_nothing_is_known_is_unknown():
 
 def test_a_cell_that_is_blind_without_end_makes_its_region_so():
     result = a_coverage()
-    result.radius[0, 10, 10], result.frames[0, 10, 10] = math.inf, 1
+    result.radius[0, 10, 10], result.probed_steps[0, 10, 10] = math.inf, 1
     assert result.summary([Region("all", GRID.x, GRID.y)])[0].radius_m == math.inf
 
 
@@ -121,7 +121,7 @@ def test_scalars_are_the_summary_laid_flat():
 def test_the_share_of_known_cells_is_in_the_repr():
     grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=0.5, heights={"all": (0.0, 1.0)})
     result = a_coverage(grid=grid)
-    result.frames[:] = torch.tensor([[[1, 0], [0, 0]]])
+    result.probed_steps[:] = torch.tensor([[[1, 0], [0, 0]]])
     assert repr(result) == "Coverage((1, 2, 2) cells, 3 steps, 25.0% of the cells known)"
 
 
@@ -133,7 +133,7 @@ def assert_same(one, other):
     assert list(one.grid.heights) == list(other.grid.heights)
     for name in ("thresholds", "max_radius", "quantile_levels", "counts"):
         assert getattr(one, name) == getattr(other, name), name
-    for name in ("frames", "points", "radius", "detection", "maximum", "pooled", "quantiles"):
+    for name in ("probed_steps", "points", "radius", "detection", "maximum", "pooled", "quantiles"):
         a, b = getattr(one, name), getattr(other, name)
         assert (a is None) == (b is None), name
         if a is not None:

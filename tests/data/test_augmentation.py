@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from torchcover import blind_spot_radius
-from torchcover.data import Augmentation, Boxes, Frame, flip, points_in_boxes, rotate, scale
-from torchcover.training import bev_iou, box_visibility
+from torchcover.data import Augmentation, Frame, flip, rotate, scale
+from torchcover.detection import Boxes, bev_iou, box_visibility, points_in_boxes
 
 
 def make_frame(seed=0, index=0):
@@ -34,8 +34,8 @@ def test_radii_stay_and_scale_with_a_scaling(move, factor):
     frame = make_frame()
     moved = move(frame)
     for rig in ("a", "b"):
-        before = blind_spot_radius(frame.reference, frame.sensors[rig])
-        after = blind_spot_radius(moved.reference, moved.sensors[rig])
+        before = blind_spot_radius(frame.reference, frame.clouds[rig])
+        after = blind_spot_radius(moved.reference, moved.clouds[rig])
         torch.testing.assert_close(after, factor * before, atol=1e-5, rtol=1e-5)
 
 
@@ -46,10 +46,10 @@ def test_points_stay_in_their_boxes(move, factor):
     clear = torch.ones(900, dtype=torch.bool)
     for change in (-0.03, 0.03):
         grown = replace(frame.boxes, size_m=frame.boxes.size_m + change)
-        clear[points_in_boxes(frame.sensors["a"], grown).point] ^= True
-    frame = replace(frame, sensors={"a": frame.sensors["a"][clear]})
+        clear[points_in_boxes(frame.clouds["a"], grown).point] ^= True
+    frame = replace(frame, clouds={"a": frame.clouds["a"][clear]})
     moved = move(frame)
-    before, after = (points_in_boxes(f.sensors["a"], f.boxes) for f in (frame, moved))
+    before, after = (points_in_boxes(f.clouds["a"], f.boxes) for f in (frame, moved))
     pairs = [sorted(zip(i.box.tolist(), i.point.tolist(), strict=True)) for i in (before, after)]
     assert pairs[0] == pairs[1]
     assert len(pairs[0]) > 100
@@ -77,11 +77,11 @@ def test_overlap_of_boxes_stays_under_all_of_them():
 
 def test_visibility_stays_under_flip_and_rotation():
     frame = make_frame()
-    frame = replace(frame, reference=frame.sensors["a"] + 0.3 * torch.randn(900, 3))
-    before = box_visibility(frame.sensors["b"], frame.reference, frame.boxes, threshold=3.0)
+    frame = replace(frame, reference=frame.clouds["a"] + 0.3 * torch.randn(900, 3))
+    before = box_visibility(frame.clouds["b"], frame.reference, frame.boxes, threshold=3.0)
     for move in (flip, MOVES["rotate"][0]):
         moved = move(frame)
-        after = box_visibility(moved.sensors["b"], moved.reference, moved.boxes, threshold=3.0)
+        after = box_visibility(moved.clouds["b"], moved.reference, moved.boxes, threshold=3.0)
         # A point on a border may change sides by rounding.
         assert (after.reference_points - before.reference_points).abs().max() <= 1
         torch.testing.assert_close(after.mean_radius_m, before.mean_radius_m, atol=0.05, rtol=0, equal_nan=True)
@@ -119,16 +119,16 @@ def test_a_frame_without_boxes_keeps_none():
 
 def test_an_augmentation_depends_on_seed_epoch_and_index_only():
     augment = Augmentation(seed=3)
-    first = augment(make_frame(index=5), epoch=1).sensors["a"]
+    first = augment(make_frame(index=5), epoch=1).clouds["a"]
     augment(make_frame(index=6), epoch=2)
     torch.manual_seed(99)
-    assert torch.equal(first, Augmentation(seed=3)(make_frame(index=5), epoch=1).sensors["a"])
+    assert torch.equal(first, Augmentation(seed=3)(make_frame(index=5), epoch=1).clouds["a"])
     others = [
         Augmentation(seed=4)(make_frame(index=5), epoch=1),
         augment(make_frame(index=5), epoch=2),
         augment(make_frame(index=6), epoch=1),
     ]
-    assert not any(torch.equal(first, other.sensors["a"]) for other in others)
+    assert not any(torch.equal(first, other.clouds["a"]) for other in others)
 
 
 def test_draws_stay_within_their_bounds_and_reach_them():

@@ -6,7 +6,7 @@ import torch
 
 from torchcover import Rig, Scenario
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import ReferenceSensor
+from torchcover.simulation import PaperReference
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.scene import Scene
 
@@ -19,8 +19,8 @@ def rig(max_range_m=60.0, **keys):
 
 
 def frames(scenario, keys=None, max_range_m=60.0):
-    reference = ReferenceSensor(rows=24, columns=32, max_range_m=max_range_m)
-    return SimulatedFrames(scenario, rig(max_range_m, **(keys or {})), steps=30, seed=1, reference=reference)
+    reference = PaperReference(rows=24, columns=32, max_range_m=max_range_m)
+    return SimulatedFrames(scenario, rig(max_range_m, **(keys or {})), steps=30, seed=1, reference_sensor=reference)
 
 
 def test_counts_say_what_was_left_out_in_traffic():
@@ -93,7 +93,7 @@ def test_a_range_starts_at_the_sensor_not_at_the_vehicle(tmp_path):
     mover = {"name": "mover", "category": "car", "shape": box, "trajectory": tmp_path / "t.csv"}
     ground = {"name": "ground", "shape": {"type": "plane", "size_m": [100, 100]}}
     scenario = Scenario.model_validate({"name": "s", "ego": {"shape": box}, "bodies": [ground], "actors": [mover]})
-    reference = ReferenceSensor(rows=8, columns=8, max_range_m=30.0)
+    reference = PaperReference(rows=8, columns=8, max_range_m=30.0)
     lidar = rig(30.0, mount={"x_m": 3.0, "z_m": 1.0}, vertical_fov_deg=[-1, 1], columns=720)
-    frame = SimulatedFrames(scenario, lidar, steps=1, reference=reference)[0]
+    frame = SimulatedFrames(scenario, lidar, steps=1, reference_sensor=reference)[0]
     assert frame.sensor[:, 0].max() == pytest.approx(32.0, abs=1e-3)

@@ -8,13 +8,13 @@ from torch.utils.data import DataLoader
 
 from torchcover import Rig, Scenario
 from torchcover.data import SimulatedFrames, collate_frames
-from torchcover.simulation import ReferenceSensor
+from torchcover.simulation import PaperReference
 
-SMALL = ReferenceSensor(rows=48, columns=64)
+SMALL = PaperReference(rows=48, columns=64)
 
 
 def frames(seed=3, steps=6, rig="front_grille_128"):
-    return SimulatedFrames("courtyard", rig, steps=steps, seed=seed, reference=SMALL)
+    return SimulatedFrames("courtyard", rig, steps=steps, seed=seed, reference_sensor=SMALL)
 
 
 def same(a, b):
@@ -126,10 +126,10 @@ def lidar(**changes):
 
 def test_several_rigs_see_the_same_instant_and_share_the_reference():
     names = ("front_grille_128", "front_roof_128")
-    both = SimulatedFrames("courtyard", rigs={name: name for name in names}, steps=2, seed=3, reference=SMALL)[1]
+    both = SimulatedFrames("courtyard", rigs={name: name for name in names}, steps=2, seed=3, reference_sensor=SMALL)[1]
     for name in names:
         alone = frames(rig=name)[1]
-        assert torch.equal(both.sensors[name], alone.sensor)
+        assert torch.equal(both.clouds[name], alone.sensor)
         assert torch.equal(both.reference, alone.reference)
     with pytest.raises(ValueError, match=r"clouds of 2 rigs \(front_grille_128, front_roof_128\): say which"):
         _ = both.sensor
@@ -142,8 +142,8 @@ def test_one_rig_or_several_are_needed(given):
 
 
 def test_range_noise_is_along_the_ray_and_has_its_standard_deviation():
-    exact = SimulatedFrames(scenario(), lidar(), steps=1, reference=SMALL)[0].sensor.double()
-    noisy = SimulatedFrames(scenario(), lidar(range_noise_m=0.05), steps=1, reference=SMALL)[0].sensor.double()
+    exact = SimulatedFrames(scenario(), lidar(), steps=1, reference_sensor=SMALL)[0].sensor.double()
+    noisy = SimulatedFrames(scenario(), lidar(range_noise_m=0.05), steps=1, reference_sensor=SMALL)[0].sensor.double()
     origin = torch.tensor([0.0, 0.0, 1.8]).double()
     ray = (exact - origin) / (exact - origin).norm(dim=1, keepdim=True)
     along = ((noisy - exact) * ray).sum(dim=1)
@@ -153,8 +153,8 @@ def test_range_noise_is_along_the_ray_and_has_its_standard_deviation():
 
 
 def test_dropout_takes_its_share_of_the_points():
-    exact = SimulatedFrames(scenario(), lidar(), steps=2, reference=SMALL)
-    thinned = SimulatedFrames(scenario(), lidar(dropout=0.3), steps=2, reference=SMALL)
+    exact = SimulatedFrames(scenario(), lidar(), steps=2, reference_sensor=SMALL)
+    thinned = SimulatedFrames(scenario(), lidar(dropout=0.3), steps=2, reference_sensor=SMALL)
     count, kept = len(exact[0].sensor), len(thinned[0].sensor)
     assert abs(kept / count - 0.7) < 4 * (0.21 / count) ** 0.5
     assert set(map(tuple, thinned[0].sensor.tolist())) <= set(map(tuple, exact[0].sensor.tolist()))
@@ -167,8 +167,8 @@ def test_a_sensor_inside_the_ego_is_named():
 
 
 def test_a_reference_pose_inside_a_wall_is_drawn_again_and_counted():
-    close = SimulatedFrames(scenario(wall_x=4.05), lidar(), steps=40, reference=SMALL)
-    wide = SimulatedFrames(scenario(wall_x=50.0), lidar(), steps=40, reference=SMALL)
+    close = SimulatedFrames(scenario(wall_x=4.05), lidar(), steps=40, reference_sensor=SMALL)
+    wide = SimulatedFrames(scenario(wall_x=50.0), lidar(), steps=40, reference_sensor=SMALL)
     assert sum(close[index].counts["reference_poses_redrawn"] for index in range(40)) > 0
     assert sum(wide[index].counts["reference_poses_redrawn"] for index in range(40)) == 0
     for index in range(40):
@@ -179,25 +179,25 @@ def test_a_reference_pose_inside_a_wall_is_drawn_again_and_counted():
 
 def test_an_ego_below_the_ground_is_an_error():
     with pytest.raises(ValueError, match="100 places beside and above the ego lie inside other bodies"):
-        SimulatedFrames(scenario(ego_z=-9.0), lidar(), steps=1, reference=SMALL)[0]
+        SimulatedFrames(scenario(ego_z=-9.0), lidar(), steps=1, reference_sensor=SMALL)[0]
 
 
 @pytest.mark.parametrize("name", ["urban", "highway", "parking"])
 def test_traffic_plays_the_same_in_any_order_and_starts_anew_at_its_end(name):
     short = Scenario.model_validate({"name": name, "traffic": {"type": name, "duration_s": 1.0, "time_step_s": 0.5}})
-    made = SimulatedFrames(short, lidar(), steps=7, seed=1, reference=SMALL)
+    made = SimulatedFrames(short, lidar(), steps=7, seed=1, reference_sensor=SMALL)
     in_order = [made[index] for index in range(7)]
-    again = SimulatedFrames(short, lidar(), steps=7, seed=1, reference=SMALL)
+    again = SimulatedFrames(short, lidar(), steps=7, seed=1, reference_sensor=SMALL)
     assert all(same(in_order[index], again[index]) for index in (6, 2, 5, 0))
     assert not torch.equal(in_order[0].sensor, in_order[3].sensor)
-    other = SimulatedFrames(short, lidar(), steps=1, seed=2, reference=SMALL)[0]
+    other = SimulatedFrames(short, lidar(), steps=1, seed=2, reference_sensor=SMALL)[0]
     assert not torch.equal(in_order[0].sensor, other.sensor)
 
 
 def test_a_longer_time_between_frames_shows_the_same_world_later():
-    few = ReferenceSensor(rows=2, columns=2)
-    each = SimulatedFrames("parking", "front_roof_32", steps=1301, seed=1, reference=few)
-    spread = SimulatedFrames("parking", "front_roof_32", steps=3, seed=1, reference=few, every_s=65.0)
+    few = PaperReference(rows=2, columns=2)
+    each = SimulatedFrames("parking", "front_roof_32", steps=1301, seed=1, reference_sensor=few)
+    spread = SimulatedFrames("parking", "front_roof_32", steps=3, seed=1, reference_sensor=few, every_s=65.0)
     assert (each.every_s, spread.every_s) == (0.1, 65.0)
     for index in range(3):  # the last one plays in another world
         assert torch.equal(spread[index].sensor, each[650 * index].sensor)
@@ -210,8 +210,8 @@ def test_a_time_between_frames_that_is_no_multiple_of_the_time_step_is_refused(e
 
 
 def test_another_reference_sees_the_same_instants_and_builds_nothing_again():
-    base = SimulatedFrames("courtyard", "front_roof_32", steps=2, reference=ReferenceSensor(rows=8, columns=8))
-    other = base.with_reference(ReferenceSensor(rows=16, columns=16))
+    base = SimulatedFrames("courtyard", "front_roof_32", steps=2, reference_sensor=PaperReference(rows=8, columns=8))
+    other = base.with_reference_sensor(PaperReference(rows=16, columns=16))
     assert other.scene is base.scene
     assert torch.equal(other[1].sensor, base[1].sensor)
     assert len(other[1].reference) > len(base[1].reference)

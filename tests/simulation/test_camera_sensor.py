@@ -6,7 +6,7 @@ import torch
 
 from torchcover import Rig
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import CameraSensor, Pose, ReferenceSensor, Scenario
+from torchcover.simulation import CameraSensor, PaperReference, Pose, Scenario
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
 
@@ -74,7 +74,9 @@ def test_pixels_without_a_ray_give_no_point_and_are_no_rays():
     folded = camera("brown_conrady", coefficients=[-0.35, 0.0, 0.0, 0.0])
     missing = int(np.isnan(folded.directions()[0]).sum())
     assert 0 < missing < 160 * 120
-    frames = SimulatedFrames("courtyard", Rig(name="r", sensors=(folded,)), steps=1, reference=ReferenceSensor(8, 8))
+    frames = SimulatedFrames(
+        "courtyard", Rig(name="r", sensors=(folded,)), steps=1, reference_sensor=PaperReference(8, 8)
+    )
     assert frames[0].counts["sensor_rays"] == 160 * 120 - missing
     assert frames[0].sensor.isfinite().all()
     image = frames.scene.at(0).range_image(np.eye(4) @ folded.mount.matrix(), folded.directions())
@@ -84,9 +86,11 @@ def test_pixels_without_a_ray_give_no_point_and_are_no_rays():
 def test_cameras_and_lidars_fuse_into_one_cloud():
     lidar = Rig.load("front_grille_128").sensors[0]
     both = SimulatedFrames(
-        "courtyard", Rig(name="b", sensors=(camera(), lidar)), steps=1, reference=ReferenceSensor(8, 8)
+        "courtyard", Rig(name="b", sensors=(camera(), lidar)), steps=1, reference_sensor=PaperReference(8, 8)
     )
-    alone = SimulatedFrames("courtyard", Rig(name="a", sensors=(camera(),)), steps=1, reference=ReferenceSensor(8, 8))
+    alone = SimulatedFrames(
+        "courtyard", Rig(name="a", sensors=(camera(),)), steps=1, reference_sensor=PaperReference(8, 8)
+    )
     assert torch.equal(both[0].sensor[: len(alone[0].sensor)], alone[0].sensor)
     assert both[0].counts["sensor_rays"] == 160 * 120 + 128 * 1800
 

@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from torchcover.geometry import Box, rigid, rotation_from_euler
-from torchcover.simulation import EvenReference, Lidar, Pose, ReferenceSensor, Scenario
+from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
+from torchcover.simulation import EvenReference, Lidar, PaperReference, Pose, Scenario
 from torchcover.simulation.culling import blocks_towards, boxes_in_cone, outlines, rays_towards
 from torchcover.simulation.instant import cast_from, rotate
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles, unit_directions
 from torchcover.simulation.scene import Scene
 
-EGO = Box((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
+EGO = BoundingBox((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
 SPHERE = into_tiles(unit_directions(np.linspace(-89, 89, 60)[:, None], np.linspace(-180, 179, 120)[None]))
 ROOF = Pose(x_m=0.45, z_m=1.73).matrix()
 
@@ -51,7 +51,7 @@ def test_a_scan_is_that_of_every_ray_cast_at_every_body(scene, step, sensor):
     instant, generator = scene.at(step, within_m=150.0), np.random.default_rng(step)
     if sensor in ("paper", "even"):
         areas = (((0.0, 20.0), (-5.0, 5.0)), ((0.0, 80.0), (-20.0, 20.0)))
-        reference = ReferenceSensor(rows=60, columns=90) if sensor == "paper" else EvenReference(areas, rays=5000)
+        reference = PaperReference(rows=60, columns=90) if sensor == "paper" else EvenReference(areas, rays=5000)
         pose = reference.vehicle_T_reference(EGO, generator)
         tiles = reference.tiles(pose, generator)
     else:
@@ -76,7 +76,7 @@ def test_a_mounted_sensor_sees_the_same_without_casting_at_the_ego_again(scene, 
 
 def boxes_around(generator, count):
     """(count, 8, 3) corners of boxes of all forms and orientations, some around the origin, and their poses."""
-    corners = Box((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).corners_m
+    corners = BoundingBox((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).corners_m
     sizes = generator.uniform(0.05, 1.0, size=(count, 3)) * 10 ** generator.uniform(-1, 1.3, size=(count, 1))
     places = generator.normal(size=(count, 3)) * 10 ** generator.uniform(-1, 1.5, size=(count, 1))
     poses = [rigid(rotation_from_euler(*generator.uniform(-180, 180, 3)), place) for place in places]
@@ -92,7 +92,10 @@ def test_no_ray_that_meets_a_box_is_left_out():
     turned = rotation_from_euler(30, 20, 10)
     close = 0
     for k, (size, pose) in enumerate(zip(sizes, poses, strict=True)):
-        inside = np.vstack([generator.uniform(-0.5, 0.5, size=(92, 3)), Box((-0.5,) * 3, (0.5,) * 3).corners_m]) * size
+        inside = (
+            np.vstack([generator.uniform(-0.5, 0.5, size=(92, 3)), BoundingBox((-0.5,) * 3, (0.5,) * 3).corners_m])
+            * size
+        )
         way_m = inside @ pose[:3, :3].T + pose[:3, 3] - origin_m
         range_m = np.linalg.norm(way_m, axis=1)
         directions = (way_m / range_m[:, None]).T
@@ -110,7 +113,7 @@ def test_no_ray_that_meets_a_box_is_left_out():
 
 
 def test_rays_that_miss_a_box_by_far_or_end_before_it_are_left_out():
-    box = Box((10.0, -1.0, 0.0), (14.0, 1.0, 1.5))
+    box = BoundingBox((10.0, -1.0, 0.0), (14.0, 1.0, 1.5))
     seen = outlines(box.corners_m[None], np.zeros(3))
     (tile,) = into_tiles(unit_directions(np.linspace(-40, 40, 81)[:, None], np.linspace(-90, 90, 181)[None]),
                          tile_columns=181)  # fmt: skip

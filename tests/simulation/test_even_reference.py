@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from torchcover.data import SimulatedFrames
-from torchcover.geometry import Box
-from torchcover.simulation import EvenReference, ReferenceSensor
+from torchcover.geometry import BoundingBox
+from torchcover.simulation import EvenReference, PaperReference
 from torchcover.simulation.even_reference import paper_density
 from torchcover.simulation.rays import into_tiles
 
-EGO = Box((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
+EGO = BoundingBox((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
 NEAR, FAR = ((0.0, 20.0), (-5.0, 5.0)), ((0.0, 160.0), (-40.0, 40.0))
 
 
@@ -82,7 +82,7 @@ def test_the_papers_density_is_one_over_the_sphere_and_that_of_its_rays():
     whole = 2 * np.pi * np.trapezoid(paper_density() * np.cos(elevation), elevation)
     assert whole == pytest.approx(1.0, abs=0.01)
 
-    paper, generator = ReferenceSensor(rows=64, columns=64), np.random.default_rng(0)
+    paper, generator = PaperReference(rows=64, columns=64), np.random.default_rng(0)
     poses = [paper.vehicle_T_reference(EGO, generator)[:3, :3] for _ in range(400)]
     z = np.concatenate([(pose @ paper.directions().reshape(3, -1))[2] for pose in poses])
     for low, high in [(-90, -60), (-60, -30), (-30, -10), (-10, 0), (0, 20)]:
@@ -104,14 +104,16 @@ def test_weights_are_positive_and_finite_at_every_border():
 
 def test_frames_carry_a_weight_for_each_point():
     sensor = EvenReference((NEAR,), rays=1024)
-    frames = SimulatedFrames("courtyard", "front_roof_32", steps=2, reference=sensor)
+    frames = SimulatedFrames("courtyard", "front_roof_32", steps=2, reference_sensor=sensor)
     frame = frames[1]
     assert frame.reference_weights.shape == (len(frame.reference),)
     assert (
-        SimulatedFrames("courtyard", "front_roof_32", steps=1, reference=ReferenceSensor(4, 4))[0].reference_weights
+        SimulatedFrames("courtyard", "front_roof_32", steps=1, reference_sensor=PaperReference(4, 4))[
+            0
+        ].reference_weights
         is None
     )
-    again = SimulatedFrames("courtyard", "front_roof_32", steps=2, reference=sensor)[1]
+    again = SimulatedFrames("courtyard", "front_roof_32", steps=2, reference_sensor=sensor)[1]
     assert bool((again.reference == frame.reference).all())
     assert bool((again.reference_weights == frame.reference_weights).all())
 

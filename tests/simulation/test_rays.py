@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation import ReferenceSensor
+from torchcover.simulation import PaperReference
 from torchcover.simulation.rays import into_tiles, unit_directions
 
 
@@ -18,7 +18,7 @@ def test_every_ray_is_in_one_tile(rows, columns):
 
 @pytest.mark.parametrize("rows", [2, 64, 300])
 def test_every_ray_lies_in_the_cone_of_its_tile(rows):
-    for tile in into_tiles(ReferenceSensor(rows=rows, columns=400).directions()):
+    for tile in into_tiles(PaperReference(rows=rows, columns=400).directions()):
         assert np.linalg.norm(tile.axis) == pytest.approx(1.0)
         angles = np.arccos(np.clip(tile.axis @ tile.directions.astype(np.float64), -1, 1))
         assert angles.max() <= tile.half_angle + 1e-6

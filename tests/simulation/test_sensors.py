@@ -5,10 +5,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchcover.geometry import Box
-from torchcover.simulation import Lidar, ReferenceSensor
+from torchcover.geometry import BoundingBox
+from torchcover.simulation import Lidar, PaperReference
 
-EGO = Box((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
+EGO = BoundingBox((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
 
 
 def lidar(**changes):
@@ -57,18 +57,18 @@ def test_directions_have_length_one(channels, columns, fov):
 
 
 def test_the_reference_sensor_covers_the_lower_hemisphere_evenly_in_angle():
-    elevation, azimuth = angles(ReferenceSensor(rows=91, columns=36).directions())
+    elevation, azimuth = angles(PaperReference(rows=91, columns=36).directions())
     np.testing.assert_allclose(elevation.reshape(91, 36)[:, 3], np.arange(0, -91, -1), atol=1e-6)
     np.testing.assert_allclose(np.sort(azimuth.reshape(91, 36)[0] % 360), np.arange(0, 360, 10), atol=1e-12)
 
 
 def test_the_default_is_the_papers():
-    sensor = ReferenceSensor()
+    sensor = PaperReference()
     assert (sensor.rows, sensor.columns, sensor.shell_m, sensor.max_tilt_deg) == (1024, 1024, 0.5, 45.0)
 
 
 def poses(count):
-    sensor = ReferenceSensor(rows=1, columns=1)
+    sensor = PaperReference(rows=1, columns=1)
     generator = np.random.default_rng(7)
     return np.stack([sensor.vehicle_T_reference(EGO, generator) for _ in range(count)])
 
@@ -114,4 +114,4 @@ def test_yaw_pitch_and_roll_are_uniform_in_their_ranges():
 )
 def test_an_impossible_reference_sensor_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
-        ReferenceSensor(**changes)
+        PaperReference(**changes)

@@ -64,7 +64,7 @@ def seen_once(search):
     for _ in range(45):
         once.merge_state(metric)
     found = once.compute()
-    right = found.frames.flatten().tolist() == [4096, 1]
+    right = found.probed_steps.flatten().tolist() == [4096, 1]
     return most(found.radius.flatten().cpu().numpy() - [0.25, 0.75]) if right else np.inf
 
 

@@ -9,7 +9,7 @@ import torch
 from .case import Case, longdouble_distance, most, ulps
 
 HALF_ULP = 0.5 + 1e-6  # float32: the distance is rounded once, from float64
-FEW_ULPS = 4.0  # float64: three squares, two sums, a root
+MAX_ULPS = 4.0  # float64: three squares, two sums, a root
 THRESHOLDS_M = [step / 20 for step in range(1, 41)]
 
 
@@ -207,7 +207,7 @@ CASES = [
     Case("1e7 m from the origin, float64", SAME, "m", 1e-15, partial(offset, 1e7),
          "float32 coordinates", partial(offset_in_float32, 1e7)),
     Case("the two clouds equal", "0", "m", 0.0, equal, PRODUCTS, equal_by_products),
-    shape("1e-6 m apart, float64", "micrometre", "cdist by matrix products, float64", matrix_product, bound=FEW_ULPS),
+    shape("1e-6 m apart, float64", "micrometre", "cdist by matrix products, float64", matrix_product, bound=MAX_ULPS),
     shape("1e5 m apart", "apart", PRODUCTS, matrix_product),
     shape("a single sensor point", "single", PRODUCTS, matrix_product),
     shape("one point each", "one and one", PRODUCTS, matrix_product),
@@ -222,8 +222,8 @@ CASES = [
          "float32 squares", threshold_by_squares),
     shape("coordinates of 1e-40, subnormal", "1e-41", "float32 squares", differences),
     shape("coordinates of 1e32", "1e30", "float32 squares", differences),
-    shape("coordinates of 1e-308, subnormal, float64", "1e-310", "float64 squares", differences, bound=FEW_ULPS),
-    shape("coordinates of 1e302, float64", "1e300", "float64 squares", differences, bound=FEW_ULPS),
+    shape("coordinates of 1e-308, subnormal, float64", "1e-310", "float64 squares", differences, bound=MAX_ULPS),
+    shape("coordinates of 1e302, float64", "1e300", "float64 squares", differences, bound=MAX_ULPS),
     shape("float16 clouds", "float16", "float16 arithmetic", in_own_type, "longdouble of the same numbers"),
     shape("bfloat16 clouds", "bfloat16", "bfloat16 arithmetic", in_own_type, "longdouble of the same numbers"),
     Case("TF32, bfloat16 products and autocast on", "longdouble, brute force", "ulp", HALF_ULP,

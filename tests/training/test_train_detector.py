@@ -11,8 +11,8 @@ import torch
 from scipy.stats import spearmanr
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from torchcover.data import Boxes, Frame, points_in_boxes
-from torchcover.training import RecallByVisibility
+from torchcover.data import Frame
+from torchcover.detection import Boxes, RecallByVisibility, points_in_boxes
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "train_detector.py"
 

@@ -15,8 +15,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from torchcover.cameras.lens import Array, Distortion, Linear
-from torchcover.cameras.region import Region
 from torchcover.cameras.start import StartTable, nearest_seeds
+from torchcover.cameras.valid_region import ValidRegion
 
 # What became of a pixel.
 ANSWERED, OUTSIDE, UNCONVERGED = 0, 1, 2
@@ -42,7 +42,14 @@ class _Search:
     """
 
     def __init__(
-        self, distortion: Distortion, region: Region, focal: tuple[float, float], u: Array, v: Array, a: Array, b: Array
+        self,
+        distortion: Distortion,
+        region: ValidRegion,
+        focal: tuple[float, float],
+        u: Array,
+        v: Array,
+        a: Array,
+        b: Array,
     ) -> None:
         self.distortion, self.region, self.focal = distortion, region, focal
         self.u, self.v, self.a, self.b = u, v, a, b
@@ -98,7 +105,7 @@ def _solve_linear(at: Linear, determinant: Array, du: Array, dv: Array) -> tuple
 
 
 def solve(
-    distortion: Distortion, region: Region, table: StartTable, u: Array, v: Array, focal: tuple[float, float]
+    distortion: Distortion, region: ValidRegion, table: StartTable, u: Array, v: Array, focal: tuple[float, float]
 ) -> tuple[Array, Array, Status]:
     """Find the points of the valid region whose distorted images are (u, v), on as many threads as torch may use.
 
@@ -162,7 +169,7 @@ def _scatter(count: int, reached: NDArray[np.intp], found: tuple[Array, ...]) ->
     return result
 
 
-def _status(region: Region, a: Array, b: Array, error: Array) -> Status:
+def _status(region: ValidRegion, a: Array, b: Array, error: Array) -> Status:
     status = np.full(error.shape, ANSWERED, np.uint8)
     failed = np.flatnonzero(~(error <= ACCEPT_PX))
     # Stuck at the edge of the region: the image lies behind the fold.
@@ -171,7 +178,7 @@ def _status(region: Region, a: Array, b: Array, error: Array) -> Status:
     return status
 
 
-def _first_guess(region: Region, table: StartTable, u: Array, v: Array, distorted: Array) -> tuple[Array, Array]:
+def _first_guess(region: ValidRegion, table: StartTable, u: Array, v: Array, distorted: Array) -> tuple[Array, Array]:
     """The answer of the radial part alone, pulled inside the region."""
     radius = table(distorted)
     if not (radius <= 0.999 * region.edge.least).all():

@@ -10,8 +10,8 @@ from torchcover.cameras import inverse
 from torchcover.cameras.inverse import ANSWERED, OUTSIDE
 from torchcover.cameras.lens import Array, Distortion
 from torchcover.cameras.models import build_lens
-from torchcover.cameras.region import HORIZON, Region, find_region
 from torchcover.cameras.start import StartTable, make_start_table
+from torchcover.cameras.valid_region import HORIZON, ValidRegion, find_region
 
 
 class Optics:
@@ -30,7 +30,7 @@ class Optics:
         self._solver = build_lens(model, coefficients.tolist(), trainable=trainable)
         self._lens = build_lens(model, coefficients.unbind(), trainable=True) if trainable else self._solver
         self.differentiable = trainable or intrinsics.requires_grad
-        self._found_region: Region | None = None
+        self._found_region: ValidRegion | None = None
         self._start_tables: dict[int, StartTable] = {}
 
     def directions(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
@@ -73,7 +73,7 @@ class Optics:
         a, b, status = (torch.from_numpy(values).to(u.device) for values in solution)
         return a, b, status
 
-    def _region(self, solver: Distortion) -> Region:
+    def _region(self, solver: Distortion) -> ValidRegion:
         if self._found_region is None:
             self._found_region = find_region(solver, self._solver.chart.limit)
         return self._found_region

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from torchcover.cameras.lens import Array, Distortion
-from torchcover.cameras.region import HORIZON, Region
+from torchcover.cameras.valid_region import HORIZON, ValidRegion
 
 _ENTRIES = 4096
 # Seeds stop a tenth of a degree short of the horizon of the plane z = 1.
@@ -72,7 +72,7 @@ def _radius_for(distortion: Distortion, distorted: float) -> float:
     return radius
 
 
-def nearest_seeds(distortion: Distortion, region: Region, u: Array, v: Array) -> tuple[Array, Array]:
+def nearest_seeds(distortion: Distortion, region: ValidRegion, u: Array, v: Array) -> tuple[Array, Array]:
     """The second try: of points spread over the valid region, those whose images lie nearest.
 
     Strong tangential terms bend the region so far from round that Newton's method, coming from the radial part's

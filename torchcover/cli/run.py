@@ -20,7 +20,7 @@ from torch.utils.data import DataLoader, Dataset
 from torchcover.cli.stopping import TargetWatch
 from torchcover.coverage import BevGrid, CoverageMetric
 from torchcover.data import BadFrameError, Frame, FrameBatch, collate_frames
-from torchcover.geometry import Box, euler_from_rotation
+from torchcover.geometry import BoundingBox, euler_from_rotation
 from torchcover.report import SensorMark
 from torchcover.simulation import Rig
 
@@ -134,7 +134,7 @@ def accumulate(
             for batch in _batches(frames, workers, skip_bad_frames, progression):
                 (frame,) = batch.to(device).frames
                 with _to_the_end():
-                    for metric, sensor in zip(metrics, frame.sensors.values(), strict=True):
+                    for metric, sensor in zip(metrics, frame.clouds.values(), strict=True):
                         metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.index)
                     progression.counts.update(frame.counts)
                 _advance(bar, task)
@@ -152,7 +152,7 @@ def accumulate(
     return progression
 
 
-def outline_m(box: Box) -> NDArray[np.float64]:
+def outline_m(box: BoundingBox) -> NDArray[np.float64]:
     """(4, 2) corners x, y of a box seen from above, counter-clockwise."""
     (x0, y0, _), (x1, y1, _) = box.lower_m, box.upper_m
     return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])

@@ -13,7 +13,7 @@ from torchcover.cli.run import GRID_X_M, GRID_Y_M, Progression
 from torchcover.cli.stopping import TargetError
 from torchcover.coverage import forward_regions
 from torchcover.data import Frame, SimulatedFrames
-from torchcover.simulation import EvenReference, ReferenceSensor, Rig, Scenario
+from torchcover.simulation import EvenReference, PaperReference, Rig, Scenario
 
 DEFAULT_REFERENCE = "even"
 # The best of those tried for runs of seconds to a minute: `torchcover study`, docs/accuracy.md.
@@ -22,7 +22,7 @@ DEFAULT_STEPS = 64
 # A world is built once a minute of traffic, for about the price of eight steps: docs/accuracy.md has the trade.
 EVERY_S_IN_TRAFFIC = 10.0
 # As many as the paper averages.
-MOST_STEPS = 4096
+MAX_STEPS = 4096
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Settings:
     @property
     def simulated_steps(self) -> int:
         """Steps of a simulation, at most."""
-        return self.steps or (DEFAULT_STEPS if self.target is None else MOST_STEPS)
+        return self.steps or (DEFAULT_STEPS if self.target is None else MAX_STEPS)
 
 
 def simulated_frames(
@@ -61,7 +61,7 @@ def simulated_frames(
         steps=settings.simulated_steps,
         seed=settings.seed,
         every_s=every_s_of(world, settings.every_s),
-        reference=reference_called(settings.reference, settings.rays),
+        reference_sensor=reference_called(settings.reference, settings.rays),
     )
 
 
@@ -70,7 +70,7 @@ def every_s_of(scenario: Scenario, given_s: float | None) -> float | None:
     return EVERY_S_IN_TRAFFIC if given_s is None and scenario.traffic is not None else given_s
 
 
-def reference_called(name: str | None, rays: int | None) -> ReferenceSensor | EvenReference:
+def reference_called(name: str | None, rays: int | None) -> PaperReference | EvenReference:
     """The reference sensor of `--reference` and `--rays`.
 
     Args:
@@ -85,7 +85,7 @@ def reference_called(name: str | None, rays: int | None) -> ReferenceSensor | Ev
         return EvenReference(areas, rays=rays or DEFAULT_EVEN_RAYS)
     if name == "paper":
         side = 1024 if rays is None else max(1, round(math.sqrt(rays)))
-        return ReferenceSensor(rows=side, columns=side)
+        return PaperReference(rows=side, columns=side)
     raise ValueError(f"--reference {name}: `even` or `paper` is needed")
 
 

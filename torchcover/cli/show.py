@@ -11,17 +11,17 @@ from rich.console import Console
 
 from torchcover.cli.run import DEFAULT_SCENARIO, GRID_X_M, GRID_Y_M, outline_m
 from torchcover.data import SimulatedFrames
-from torchcover.geometry import Box, invert, transform
+from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
 from torchcover.report import ActorMark, SensorView, draw_depths, draw_rig, draw_scene
-from torchcover.simulation import CameraSensor, ReferenceSensor, Rig, Scenario, builtin_names
+from torchcover.simulation import CameraSensor, PaperReference, Rig, Scenario, builtin_names
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.rig import Sensor
 from torchcover.simulation.world import Actor, World
 
 DEFAULT_RIG = "front_roof_128"
 # A picture needs fewer points than a measurement.
-REFERENCE = ReferenceSensor(rows=256, columns=512)
+REFERENCE = PaperReference(rows=256, columns=512)
 
 
 def run(name: str, *, scenario: str | None, rig: str | None, step: int | None, seed: int | None, out: Path) -> None:
@@ -79,10 +79,10 @@ def _cameras(rig: Rig) -> list[CameraSensor]:
 
 def _draw_rig(rig: Rig, scenario: Scenario, step: int, seed: int) -> dict[str, Figure]:
     """The rig on its vehicle, and the depth images if it has cameras, by the suffix of the file name."""
-    frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference=REFERENCE)
+    frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference_sensor=REFERENCE)
     scene, step_of_world = frames.scene_of(step)
     ego = scene.world.ego.mesh
-    length, width, height = Box.around(ego.vertices_m).size_m
+    length, width, height = BoundingBox.around(ego.vertices_m).size_m
     subtitle = f"on the ego of {scenario.name}, {length:.2f} x {width:.2f} x {height:.2f} m"
     sensors = [_sensor_view(sensor) for sensor in rig.sensors]
     figures = {"": draw_rig(ego.vertices_m, ego.faces, sensors, title=rig.name, subtitle=subtitle)}
@@ -112,7 +112,7 @@ def _sensor_view(sensor: Sensor) -> SensorView:
 
 
 def _draw_scenario(scenario: Scenario, rig: Rig, step: int, seed: int) -> Figure:
-    frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference=REFERENCE)
+    frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference_sensor=REFERENCE)
     frame = frames[step]
     scene, step_of_world = frames.scene_of(step)
     world = scene.world
@@ -120,7 +120,7 @@ def _draw_scenario(scenario: Scenario, rig: Rig, step: int, seed: int) -> Figure
     return draw_scene(
         GRID_X_M,
         GRID_Y_M,
-        ego_outline_m=outline_m(Box.around(world.ego.mesh.vertices_m)),
+        ego_outline_m=outline_m(BoundingBox.around(world.ego.mesh.vertices_m)),
         actors=_actor_marks(world, time_s),
         sensor=frame.sensor.numpy(),
         reference=frame.reference.numpy(),
@@ -136,6 +136,6 @@ def _actor_marks(world: World, time_s: float) -> list[ActorMark]:
 
 
 def _footprint_m(actor: Actor, vehicle_T_world: Matrix, time_s: float) -> Matrix:
-    corners = outline_m(Box.around(actor.mesh.vertices_m))
+    corners = outline_m(BoundingBox.around(actor.mesh.vertices_m))
     on_ground = np.column_stack([corners, np.zeros(len(corners))])
     return transform(vehicle_T_world @ actor.trajectory.at(time_s), on_ground)[:, :2]

@@ -12,10 +12,10 @@ from torchcover.report.quantity import quantities_of
 from torchcover.report.records import json_record
 
 # An error from fewer steps is not believed, though they may fill enough blocks.
-FEWEST_STEPS = 32
+MIN_STEPS = 32
 # Errors are looked at when they should have become small enough, but after 10 to 50 % more steps: some 20 times in
 # 4096 steps.
-LEAST_GROWTH, MOST_GROWTH = 1.1, 1.5
+MIN_GROWTH, MAX_GROWTH = 1.1, 1.5
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Standing:
     @property
     def reached(self) -> bool:
         """Whether it is good enough, and known well enough to say so."""
-        return self.steps >= FEWEST_STEPS and self.error <= self.target
+        return self.steps >= MIN_STEPS and self.error <= self.target
 
     @property
     def excess(self) -> float:
@@ -97,7 +97,7 @@ class Standing:
         """Steps after which it should be good enough, for errors fall as 1 / sqrt(steps); None if there is no error."""
         if math.isinf(self.excess):
             return None
-        return max(FEWEST_STEPS, self.steps if self.reached else math.ceil(self.steps * self.excess**2))
+        return max(MIN_STEPS, self.steps if self.reached else math.ceil(self.steps * self.excess**2))
 
     @property
     def words(self) -> str:
@@ -147,7 +147,7 @@ class TargetWatch:
         self.target = target
         self.metrics = metrics
         self.regions = regions
-        self.next_look = FEWEST_STEPS
+        self.next_look = MIN_STEPS
         self.worst: Standing | None = None
 
     def is_reached(self, steps: int) -> bool:
@@ -160,7 +160,7 @@ class TargetWatch:
         if self.worst is not None and self.worst.reached:
             return True
         needed = math.inf if self.worst is None else self.worst.steps_needed or math.inf
-        self.next_look = math.ceil(min(max(needed, LEAST_GROWTH * steps), MOST_GROWTH * steps))
+        self.next_look = math.ceil(min(max(needed, MIN_GROWTH * steps), MAX_GROWTH * steps))
         return False
 
     def expected_steps(self, most: int) -> int:

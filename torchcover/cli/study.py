@@ -35,7 +35,7 @@ from torchcover.simulation import Scenario
 # Rays in a step of the long run: no fewer than any setting has, for fewer never see some cells of some steps.
 LONG_RUN_RAYS = 1_048_576
 # The other backend of the search is tried up to here; beyond, it takes minutes.
-MOST_RAYS_BY_BRUTE_FORCE = 4096
+MAX_RAYS_BY_BRUTE_FORCE = 4096
 # Seeds of the runs are next to each other; the long run's is far away.
 LONG_RUN_SEED = 1_000_003
 # Detection errors that a setting is recommended for.
@@ -110,7 +110,7 @@ def run(request: Request) -> None:
 def _long_run(request: Request, bar: Progress) -> Truth:
     metric = _metric(request, blocks=BLOCKS)
     base = _frames(request, LONG_RUN_SEED + request.seed, request.long_run_steps)
-    frames = base.with_reference(reference_called("even", LONG_RUN_RAYS))
+    frames = base.with_reference_sensor(reference_called("even", LONG_RUN_RAYS))
     for index in bar.track(range(request.long_run_steps), description="long run"):
         frame = frames[index]
         metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, index=index)
@@ -145,7 +145,7 @@ def _one_run(
 def _settings(request: Request, seed: int) -> list[Setting]:
     base = _frames(request, seed, request.steps)
     return [
-        Setting(name, rays, base.with_reference(reference_called(name, rays)), _metric(request, blocks=1))
+        Setting(name, rays, base.with_reference_sensor(reference_called(name, rays)), _metric(request, blocks=1))
         for rays in request.rays
         for name in ("even", "paper")
     ]
@@ -222,7 +222,7 @@ def _one_step(setting: Setting, index: int) -> tuple[float, float, float, float]
     nearest(frame.reference[inside], frame.sensor, max_distance=setting.metric.max_radius)
     searched = time.perf_counter()
     search_s, brute_force_s = searched - searching, math.nan
-    if setting.rays <= MOST_RAYS_BY_BRUTE_FORCE:
+    if setting.rays <= MAX_RAYS_BY_BRUTE_FORCE:
         nearest(frame.reference[inside], frame.sensor, max_distance=setting.metric.max_radius, backend="cdist")
         brute_force_s = time.perf_counter() - searched
     return cast - start, search_s, max(0.0, updated - cast - search_s), brute_force_s

@@ -6,9 +6,9 @@ from typing import Any
 from torch import Tensor
 
 # With fewer, the error itself is off by more than a quarter: 1 / sqrt(2 (blocks - 1)).
-FEWEST_BLOCKS = 8
+MIN_BLOCKS = 8
 # The states that have a row for each block.
-PER_BLOCK = ("frames", "radius_sum", "detection_sum", "block_steps")
+PER_BLOCK = ("probed_steps", "radius_sum", "detection_sum", "block_steps")
 
 
 @dataclass(frozen=True)
@@ -17,13 +17,13 @@ class Blocks:
 
     Args:
         steps: (B,) int64 steps in each block; 0 in the blocks that are not in use.
-        frames: (B, H, Y, X) int64 steps of the block that had a reference point in the cell.
+        probed_steps: (B, H, Y, X) int64 steps of the block that had a reference point in the cell.
         radius_sum: (B, H, Y, X) float64 sums over these steps of the cell's mean radius in metres.
         detection_sum: (B, T, H, Y, X) float64 sums of the cell's share of points within each threshold.
     """
 
     steps: Tensor
-    frames: Tensor
+    probed_steps: Tensor
     radius_sum: Tensor
     detection_sum: Tensor
 
@@ -34,8 +34,8 @@ def check_blocks(blocks: int) -> None:
     Raises:
         ValueError: Neither 1 nor an even number from 8 on.
     """
-    if blocks != 1 and (blocks < FEWEST_BLOCKS or blocks % 2):
-        raise ValueError(f"blocks: 1, or an even number from {FEWEST_BLOCKS} on, is needed; got {blocks}")
+    if blocks != 1 and (blocks < MIN_BLOCKS or blocks % 2):
+        raise ValueError(f"blocks: 1, or an even number from {MIN_BLOCKS} on, is needed; got {blocks}")
 
 
 def pair_up(state: dict[str, Any]) -> None:

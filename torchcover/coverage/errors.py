@@ -5,10 +5,10 @@ import math
 import torch
 from torch import Tensor
 
-from torchcover.coverage.blocks import FEWEST_BLOCKS, Blocks
+from torchcover.coverage.blocks import MIN_BLOCKS, Blocks
 
 # A cell has an error if it was probed in at least as many blocks.
-FEWEST_BLOCKS_OF_A_CELL = 4
+MIN_BLOCKS_OF_A_CELL = 4
 
 
 def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor) -> Tensor:
@@ -35,7 +35,7 @@ def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor) -> Tensor:
         tensor(True)
     """
     blocks = len(steps)
-    if blocks < FEWEST_BLOCKS:
+    if blocks < MIN_BLOCKS:
         return torch.full_like(whole, math.nan)
     ratio = (steps.sum() / steps.double()).view(-1, *[1] * whole.dim())
     pseudo = ratio * whole - (ratio - 1) * left_out
@@ -57,9 +57,9 @@ def cell_errors(sums: Tensor, blocks: Blocks) -> Tensor:
     Returns:
         (H, Y, X) standard errors; NaN in cells that were probed in fewer than 4 blocks.
     """
-    frames = blocks.frames.double()
-    steps = frames.sum(dim=0)
-    residual = sums - sums.sum(dim=0) / steps.clamp(min=1) * frames
-    probed = (blocks.frames > 0).sum(dim=0)
+    probed_steps = blocks.probed_steps.double()
+    steps = probed_steps.sum(dim=0)
+    residual = sums - sums.sum(dim=0) / steps.clamp(min=1) * probed_steps
+    probed = (blocks.probed_steps > 0).sum(dim=0)
     variance = residual.square().sum(dim=0) * probed / (probed - 1).clamp(min=1) / steps.clamp(min=1) ** 2
-    return variance.sqrt().where((probed >= FEWEST_BLOCKS_OF_A_CELL) & variance.isfinite(), math.nan)
+    return variance.sqrt().where((probed >= MIN_BLOCKS_OF_A_CELL) & variance.isfinite(), math.nan)

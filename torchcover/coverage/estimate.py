@@ -37,12 +37,12 @@ class RegionEstimate(NamedTuple):
 
 
 def estimate_region(
-    frames: Tensor, sums: Tensor, blocks: Blocks | None, band: int, cells: Tensor, estimator: Estimator
+    probed: Tensor, sums: Tensor, blocks: Blocks | None, band: int, cells: Tensor, estimator: Estimator
 ) -> RegionEstimate:
     """Estimate the numbers of a region, and what they become without each block.
 
     Args:
-        frames: (K,) steps that had a reference point in each cell of the region.
+        probed: (K,) steps that had a reference point in each cell of the region.
         sums: (Q, K) sums over these steps of the radius and of the detection at each threshold.
         blocks: The same in blocks, over the whole grid, if there are any.
         band: Number of the height band.
@@ -50,29 +50,29 @@ def estimate_region(
         estimator: "known" for the unweighted mean over the known cells, "completed" for `completed_mean`.
     """
     mean = ESTIMATORS[estimator]
-    whole = mean(frames, sums)
+    whole = mean(probed, sums)
     if blocks is None:
         return RegionEstimate(whole, whole.new_empty((0, len(whole))), whole.new_empty(0))
     left_out = []
     used = blocks.steps.nonzero().flatten().tolist()
     for block in used:
         own = torch.cat([blocks.radius_sum[block, None, band], blocks.detection_sum[block, :, band]])[:, cells]
-        left_out.append(mean(frames - blocks.frames[block, band][cells], sums - own))
+        left_out.append(mean(probed - blocks.probed_steps[block, band][cells], sums - own))
     return RegionEstimate(whole, torch.stack(left_out) if left_out else whole[None][:0], blocks.steps[used])
 
 
-def known_mean(frames: Tensor, sums: Tensor) -> Tensor:
+def known_mean(probed: Tensor, sums: Tensor) -> Tensor:
     """(Q,) unweighted means over the known cells; NaN if none is known.
 
     Args:
-        frames: (K,) steps that had a reference point in each cell.
+        probed: (K,) steps that had a reference point in each cell.
         sums: (Q, K) sums over these steps.
     """
-    known = frames > 0
-    return (sums[:, known] / frames[known]).mean(dim=1)
+    known = probed > 0
+    return (sums[:, known] / probed[known]).mean(dim=1)
 
 
-def completed_mean(frames: Tensor, sums: Tensor) -> Tensor:
+def completed_mean(probed: Tensor, sums: Tensor) -> Tensor:
     """Means over the known cells and those that more steps would make known, which are thought to be like the rarest.
 
     As long as cells that can be seen are unknown, the known ones are the easy ones. How many are missing is the
@@ -81,30 +81,30 @@ def completed_mean(frames: Tensor, sums: Tensor) -> Tensor:
     steps. They are given the mean of the cells that were seen in one step only, which are the likest to them.
 
     Args:
-        frames: (K,) steps that had a reference point in each cell.
+        probed: (K,) steps that had a reference point in each cell.
         sums: (Q, K) sums over these steps.
 
     Returns:
         (Q,) means; NaN if no cell is known.
 
     Example:
-        >>> frames = torch.tensor([9, 9, 1, 1, 1, 1, 2, 0, 0, 0])       # 12 / 4 = 3 more cells are like the singles
-        >>> radius = torch.where(frames == 1, 1.0, 0.0)
-        >>> completed_mean(frames, (radius * frames)[None]), known_mean(frames, (radius * frames)[None])
+        >>> probed = torch.tensor([9, 9, 1, 1, 1, 1, 2, 0, 0, 0])  # 12 / 4 = 3 more cells are like the singles
+        >>> radius = torch.where(probed == 1, 1.0, 0.0)
+        >>> completed_mean(probed, (radius * probed)[None]), known_mean(probed, (radius * probed)[None])
         (tensor([0.7000]), tensor([0.5714]))
     """
-    known, single = frames > 0, frames == 1
-    unseen = unseen_cells(frames)
+    known, single = probed > 0, probed == 1
+    unseen = unseen_cells(probed)
     if unseen == 0:
-        return known_mean(frames, sums)
-    total = (sums[:, known] / frames[known]).sum(dim=1) + unseen * sums[:, single].mean(dim=1)
+        return known_mean(probed, sums)
+    total = (sums[:, known] / probed[known]).sum(dim=1) + unseen * sums[:, single].mean(dim=1)
     return total / (known.sum() + unseen)
 
 
-def unseen_cells(frames: Tensor) -> float:
+def unseen_cells(probed: Tensor) -> float:
     """About how many cells would become known with more steps; at most those that are unknown."""
-    once, twice = int((frames == 1).sum()), int((frames == 2).sum())
-    return min(once * (once - 1) / (2 * (twice + 1)), int((frames == 0).sum()))
+    once, twice = int((probed == 1).sum()), int((probed == 2).sum())
+    return min(once * (once - 1) / (2 * (twice + 1)), int((probed == 0).sum()))
 
 
 ESTIMATORS: Mapping[str, Callable[[Tensor, Tensor], Tensor]] = MappingProxyType(

@@ -16,14 +16,14 @@ PAPER_HEIGHTS: Mapping[str, tuple[float, float]] = MappingProxyType({"ground": (
 MULTIPLE_TOLERANCE = 1e-6  # of the extent,
 MULTIPLE_TOLERANCE_CELLS = 1e-3  # and never more than this share of a cell
 # An int64 count and three float64 sums for every cell: 3 GB.
-MOST_CELLS = 100_000_000
+MAX_CELLS = 100_000_000
 
 # Points that are looked at together on a CPU.
 PART = 32_768
 # A cell that is smaller than this share of the coordinates is not found by a division.
-FINEST = 1e-14
+MIN_CELL_SHARE = 1e-14
 # More borders than this are searched.
-FEW_BORDERS = 32
+MAX_BORDERS_COMPARED = 32
 # A sum with it is negative, whatever the other terms.
 OUTSIDE = -(2**40)
 
@@ -65,8 +65,8 @@ class BevGrid:
             _check_bounds(axis, bounds)
             _check_multiple(axis, bounds, self.cell)
         _check_heights(self.heights)
-        if math.prod(self.shape) > MOST_CELLS:
-            raise ValueError(f"the grid has {math.prod(self.shape):,} cells, over {MOST_CELLS:,}: use larger cells")
+        if math.prod(self.shape) > MAX_CELLS:
+            raise ValueError(f"the grid has {math.prod(self.shape):,} cells, over {MAX_CELLS:,}: use larger cells")
         self._normalise()
 
     def _normalise(self) -> None:
@@ -172,7 +172,7 @@ def _edges_below(values: Tensor, bounds: Tensor) -> Tensor:
         bounds: (B + 3,) float64 edges between two NaN, which are never less, nor more.
     """
     low, high, cells = float(bounds[1]), float(bounds[-2]), len(bounds) - 3
-    fine = high - low <= FINEST * cells * max(abs(low), abs(high))  # the quotient would be off by more than one
+    fine = high - low <= MIN_CELL_SHARE * cells * max(abs(low), abs(high))  # the quotient would be off by more than one
     if fine or not math.isfinite(cells / (high - low)):
         return torch.bucketize(values.contiguous(), bounds[1:-1], right=True)
     below = values.sub(low).mul_(cells / (high - low)).add_(1.0).clamp_(0, cells + 1).nan_to_num_().long()
@@ -182,7 +182,7 @@ def _edges_below(values: Tensor, bounds: Tensor) -> Tensor:
 
 def _borders_below(values: Tensor, borders: Sequence[float]) -> Tensor:
     """The same for borders at any distances; a few are sooner compared with than searched."""
-    if len(borders) > FEW_BORDERS:
+    if len(borders) > MAX_BORDERS_COMPARED:
         return torch.bucketize(values.contiguous(), values.new_tensor(borders), right=True)
     return torch.stack([values >= border for border in borders]).sum(dim=0)
 

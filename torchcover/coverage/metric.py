@@ -68,7 +68,7 @@ class CoverageMetric(Metric):
     higher_is_better = None
     full_state_update = False
 
-    frames: Tensor
+    probed_steps: Tensor
     points: Tensor
     radius_sum: Tensor
     detection_sum: Tensor
@@ -117,7 +117,7 @@ class CoverageMetric(Metric):
         def add_sum(name: str, shape: tuple[int, ...], dtype: torch.dtype) -> None:
             self.add_state(name, torch.zeros(shape, dtype=dtype), dist_reduce_fx="sum", persistent=True)
 
-        add_sum("frames", (self.blocks, cells), torch.int64)
+        add_sum("probed_steps", (self.blocks, cells), torch.int64)
         add_sum("points", (cells,), torch.int64)
         add_sum("radius_sum", (self.blocks, cells), torch.float64)
         add_sum("detection_sum", (self.blocks, len(self.thresholds), cells), torch.float64)
@@ -198,7 +198,7 @@ class CoverageMetric(Metric):
             backend=self.backend,
             memory_mb=self.memory_mb,
         ).distance
-        device = self.frames.device
+        device = self.probed_steps.device
         weights = None if weights is None else weights.to(reference.device)[inside].to(device)
         block = self._block_of(index)
         self._accumulate(block, cell[inside].to(device), distance.to(device), weights)
@@ -223,7 +223,7 @@ class CoverageMetric(Metric):
         radius = distance.clamp(max=distance.new_tensor(self.max_radius))
         values = torch.stack([radius.double(), *(row.double() for row in detected)])
         step = mean_per_cell(cell, values, self.grid.cells, weights)
-        self.frames[block, step.cell] += 1
+        self.probed_steps[block, step.cell] += 1
         self.points[step.cell] += step.points
         self.radius_sum[block, step.cell] += step.mean[0]
         self.detection_sum[block][:, step.cell] += step.mean[1:]
@@ -241,14 +241,14 @@ class CoverageMetric(Metric):
     def compute(self) -> Coverage:
         """The coverage so far. Cells that no reference point ever probed are NaN with count 0."""
         shape = self.grid.shape
-        frames = self.frames.sum(dim=0)
-        known = frames > 0
-        steps = frames.double().where(known, math.nan)
+        probed_steps = self.probed_steps.sum(dim=0)
+        known = probed_steps > 0
+        steps = probed_steps.double().where(known, math.nan)
         return Coverage(
             grid=self.grid,
             thresholds=self.thresholds,
             max_radius=self.max_radius,
-            frames=frames.view(shape),
+            probed_steps=probed_steps.view(shape),
             points=self.points.view(shape).clone(),
             radius=(self.radius_sum.sum(dim=0) / steps).view(shape),
             detection=(self.detection_sum.sum(dim=0) / steps).view(-1, *shape),
@@ -264,7 +264,7 @@ class CoverageMetric(Metric):
         shape = self.grid.shape
         return Blocks(
             steps=self.block_steps.clone(),
-            frames=self.frames.view(-1, *shape).clone(),
+            probed_steps=self.probed_steps.view(-1, *shape).clone(),
             radius_sum=self.radius_sum.view(-1, *shape).clone(),
             detection_sum=self.detection_sum.view(self.blocks, -1, *shape).clone(),
         )

@@ -29,7 +29,7 @@ class Coverage:
         grid: Cells and height bands.
         thresholds: Detection thresholds in metres.
         max_radius: Saturation of the radius in metres.
-        frames: (H, Y, X) int64 steps that had a reference point in the cell.
+        probed_steps: (H, Y, X) int64 steps that had a reference point in the cell.
         points: (H, Y, X) int64 reference points in the cell.
         radius: (H, Y, X) float64 mean blind spot radius in metres.
         detection: (T, H, Y, X) float64 detection probability at each threshold.
@@ -52,7 +52,7 @@ class Coverage:
         "outside_points",
     )
     _ARRAYS: ClassVar[tuple[str, ...]] = (
-        "frames",
+        "probed_steps",
         "points",
         "radius",
         "detection",
@@ -69,7 +69,7 @@ class Coverage:
         grid: BevGrid,
         thresholds: Sequence[float],
         max_radius: float,
-        frames: Tensor,
+        probed_steps: Tensor,
         points: Tensor,
         radius: Tensor,
         detection: Tensor,
@@ -85,7 +85,7 @@ class Coverage:
         self.grid = grid
         self.thresholds = tuple(thresholds)
         self.max_radius = max_radius
-        self.frames = frames
+        self.probed_steps = probed_steps
         self.points = points
         self.radius = radius
         self.detection = detection
@@ -99,7 +99,7 @@ class Coverage:
         self._estimates: dict[tuple[Region, str, Estimator], RegionEstimate] = {}
 
     def __repr__(self) -> str:
-        known = float((self.frames > 0).double().mean())
+        known = float((self.probed_steps > 0).double().mean())
         return f"Coverage({self.grid.shape} cells, {self.counts['steps']} steps, {known:.1%} of the cells known)"
 
     @cached_property
@@ -152,10 +152,10 @@ class Coverage:
         if height not in self.grid.heights:
             raise ValueError(f"height {height!r}: the grid has {', '.join(self.grid.heights)}")
         band = list(self.grid.heights).index(height)
-        frames = self.frames[band][cells]
+        probed_steps = self.probed_steps[band][cells]
         means = torch.cat([self.radius[None, band], self.detection[:, band]])[:, cells]
-        sums = (means * frames).where(frames > 0, 0.0)
-        return estimate_region(frames, sums, self.blocks, band, cells, estimator)
+        sums = (means * probed_steps).where(probed_steps > 0, 0.0)
+        return estimate_region(probed_steps, sums, self.blocks, band, cells, estimator)
 
     def scalars(self, regions: Sequence[Region] | None = None) -> dict[str, float]:
         """The summary as a flat dict for a logger.
@@ -232,13 +232,13 @@ class Coverage:
 
     def _summarise(self, region: Region, height: str) -> RegionSummary:
         known, completed = self.estimate(region, height), self.estimate(region, height, "completed")
-        frames = self.frames[list(self.grid.heights).index(height)].cpu()[region.mask(self.grid)]
+        probed_steps = self.probed_steps[list(self.grid.heights).index(height)].cpu()[region.mask(self.grid)]
         return RegionSummary(
             region=region.name,
             height=height,
-            cells=len(frames),
-            known_cells=int((frames > 0).sum()),
-            unseen_cells=unseen_cells(frames),
+            cells=len(probed_steps),
+            known_cells=int((probed_steps > 0).sum()),
+            unseen_cells=unseen_cells(probed_steps),
             **self._numbers(known),
             completed=RegionNumbers(**self._numbers(completed)),
         )

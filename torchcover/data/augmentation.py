@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.data.boxes import Boxes
 from torchcover.data.frame import Frame
+from torchcover.detection.boxes import Boxes
 
 
 def flip(frame: Frame) -> Frame:
@@ -109,7 +109,7 @@ def _moved(frame: Frame, similarity: Tensor) -> Frame:
     """Apply a (3, 3) float64 matrix that keeps shapes and z upright: a rotation about z, a mirror, a scale."""
     return replace(
         frame,
-        sensors={name: _times(similarity, cloud) for name, cloud in frame.sensors.items()},
+        clouds={name: _times(similarity, cloud) for name, cloud in frame.clouds.items()},
         reference=_times(similarity, frame.reference),
         boxes=None if frame.boxes is None else _moved_boxes(frame.boxes, similarity),
     )

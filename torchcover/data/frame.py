@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
-from torchcover.data.boxes import Boxes
+from torchcover.detection.boxes import Boxes
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class Frame:
     """The clouds of one time step, in the vehicle frame (x forward, y left, z up, metres).
 
     Args:
-        sensors: Name of each rig -> (N, 3) float32 points of all its sensors; one rig, unless several were simulated
+        clouds: Name of each rig -> (N, 3) float32 points of all its sensors; one rig, unless several were simulated
             side by side.
         reference: (M, 3) float32 points of the reference sensor.
         index: Position in its dataset.
@@ -24,7 +24,7 @@ class Frame:
         boxes: The objects of that instant; None if nobody looked for them, which is not the same as none being there.
     """
 
-    sensors: Mapping[str, Tensor]
+    clouds: Mapping[str, Tensor]
     reference: Tensor
     index: int
     name: str
@@ -37,11 +37,11 @@ class Frame:
         """(N, 3) points of the only rig.
 
         Raises:
-            ValueError: There are several rigs: say which, `frame.sensors[name]`.
+            ValueError: There are several rigs: say which, `frame.clouds[name]`.
         """
-        if len(self.sensors) != 1:
-            raise ValueError(f"the frame has clouds of {len(self.sensors)} rigs ({', '.join(self.sensors)}): say which")
-        return next(iter(self.sensors.values()))
+        if len(self.clouds) != 1:
+            raise ValueError(f"the frame has clouds of {len(self.clouds)} rigs ({', '.join(self.clouds)}): say which")
+        return next(iter(self.clouds.values()))
 
     def pin_memory(self) -> "Frame":
         """A copy in page-locked memory; DataLoader calls it when `pin_memory=True`."""
@@ -52,9 +52,9 @@ class Frame:
         return self._each(lambda cloud: cloud.to(device), None if self.boxes is None else self.boxes.to(device))
 
     def _each(self, change: Callable[[Tensor], Tensor], boxes: Boxes | None) -> "Frame":
-        sensors = {name: change(cloud) for name, cloud in self.sensors.items()}
+        clouds = {name: change(cloud) for name, cloud in self.clouds.items()}
         weights = None if self.reference_weights is None else change(self.reference_weights)
-        return replace(self, sensors=sensors, reference=change(self.reference), reference_weights=weights, boxes=boxes)
+        return replace(self, clouds=clouds, reference=change(self.reference), reference_weights=weights, boxes=boxes)
 
 
 @dataclass(frozen=True)
@@ -74,9 +74,9 @@ class FrameBatch:
         """One (N, 3) cloud a frame, of the only rig; N differs."""
         return [frame.sensor for frame in self.frames]
 
-    def sensors(self, rig: str) -> list[Tensor]:
+    def clouds_of(self, rig: str) -> list[Tensor]:
         """One (N, 3) cloud a frame, of one of several rigs."""
-        return [frame.sensors[rig] for frame in self.frames]
+        return [frame.clouds[rig] for frame in self.frames]
 
     @property
     def reference(self) -> list[Tensor]:
@@ -138,7 +138,7 @@ class FrameBatch:
         Returns:
             (points of all frames, 4): number of the frame in the batch, x, y, z.
         """
-        clouds = self.sensor if rig is None else self.sensors(rig)
+        clouds = self.sensor if rig is None else self.clouds_of(rig)
         numbered = [torch.nn.functional.pad(cloud, (1, 0), value=number) for number, cloud in enumerate(clouds)]
         return torch.cat(numbered)
 

@@ -10,11 +10,11 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from torchcover.data.boxes import Boxes, points_in_boxes
 from torchcover.data.frame import Frame
-from torchcover.geometry import Box
+from torchcover.detection.boxes import Boxes, points_in_boxes
+from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix
-from torchcover.simulation import EvenReference, ReferenceSensor, Rig, Scenario
+from torchcover.simulation import EvenReference, PaperReference, Rig, Scenario
 from torchcover.simulation.disturbance import disturb
 from torchcover.simulation.instant import Instant, Scan
 from torchcover.simulation.labels import Label, labels
@@ -23,7 +23,7 @@ from torchcover.simulation.rays import Tile, into_tiles
 from torchcover.simulation.scene import Scene
 
 # A reference pose inside a body is drawn again, at most this often.
-MOST_DRAWS = 100
+MAX_DRAWS = 100
 
 
 class SimulatedFrames(Dataset[Frame]):
@@ -38,10 +38,10 @@ class SimulatedFrames(Dataset[Frame]):
     Args:
         scenario: The world, the name of a built-in one, or the path of a YAML file.
         rig: The sensors, the name of a built-in rig, or the path of a YAML file.
-        rigs: Several rigs instead, by the name under which `Frame.sensors` has their clouds.
+        rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds.
         steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers.
         seed: Seed of the traffic and of the reference sensor's poses.
-        reference: The reference sensor, the paper's or an even one; the paper's if not given.
+        reference_sensor: The reference sensor, the paper's or an even one; the paper's if not given.
         every_s: Time between one frame and the next, a multiple of the scenario's time step; that step if not given.
             Steps that follow each other are alike: with the same number of frames, a longer time shows more, and in
             traffic, which starts anew, the frames are spread over more cities.
@@ -56,7 +56,7 @@ class SimulatedFrames(Dataset[Frame]):
 
     Example:
         >>> frames = SimulatedFrames(
-        ...     "courtyard", "front_roof_128", steps=2, seed=0, reference=ReferenceSensor(rows=16, columns=16)
+        ...     "courtyard", "front_roof_128", steps=2, seed=0, reference_sensor=PaperReference(rows=16, columns=16)
         ... )
         >>> len(frames), frames[0].sensor.shape[1], frames[0].reference.dtype
         (2, 3, torch.float32)
@@ -70,7 +70,7 @@ class SimulatedFrames(Dataset[Frame]):
         rigs: Mapping[str, Rig | str | Path] | None = None,
         steps: int,
         seed: int = 0,
-        reference: ReferenceSensor | EvenReference | None = None,
+        reference_sensor: PaperReference | EvenReference | None = None,
         every_s: float | None = None,
         boxes: bool = False,
     ) -> None:
@@ -88,7 +88,7 @@ class SimulatedFrames(Dataset[Frame]):
             self.rigs = {name: _load(given) for name, given in (rigs or {}).items()}
         self.steps = steps
         self.seed = seed
-        self.reference = reference or ReferenceSensor()
+        self.reference_sensor = reference_sensor or PaperReference()
         self._every_steps = 1 if every_s is None else self.scenario.steps_in(every_s)
         self.boxes = boxes
         # The geometry of one episode and the sensors in it, by its number.
@@ -113,11 +113,11 @@ class SimulatedFrames(Dataset[Frame]):
         scene, _, step = self._stage(index)
         return scene, step
 
-    def with_reference(self, reference: ReferenceSensor | EvenReference) -> "SimulatedFrames":
+    def with_reference_sensor(self, reference_sensor: PaperReference | EvenReference) -> "SimulatedFrames":
         """The same instants as another reference sensor sees them; the geometry is built once for both."""
         other = object.__new__(type(self))
         other.__dict__ |= self.__dict__  # copy.copy would leave the geometry behind, as pickling does
-        other.reference = reference
+        other.reference_sensor = reference_sensor
         return other
 
     def _stage(self, index: int) -> tuple[Scene, Mapping[str, Sequence[MountedSensor]], int]:
@@ -158,9 +158,9 @@ class SimulatedFrames(Dataset[Frame]):
         instant = scene.at(step, within_m=self._reach_m(scene.ego_box))
         scans = {name: self._scan_rig(sensors, instant, index) for name, sensors in mounted.items()}
         reference, weights, redrawn = self._scan_reference(scene, instant, index)
-        sensors = {name: torch.from_numpy(_fuse(rig_scans)) for name, rig_scans in scans.items()}
+        clouds = {name: torch.from_numpy(_fuse(rig_scans)) for name, rig_scans in scans.items()}
         return Frame(
-            sensors=sensors,
+            clouds=clouds,
             reference=torch.from_numpy(reference.points),
             reference_weights=None if weights is None else torch.from_numpy(weights),
             index=index,
@@ -171,18 +171,18 @@ class SimulatedFrames(Dataset[Frame]):
                 "reference_poses_redrawn": redrawn,
                 **_left_out(scene, instant, [scan for rig_scans in scans.values() for scan in rig_scans], reference),
             },
-            boxes=_boxes(labels(scene.world, step, self.reference.max_range_m), sensors) if self.boxes else None,
+            boxes=_boxes(labels(scene.world, step, self.reference_sensor.max_range_m), clouds) if self.boxes else None,
         )
 
-    def _reach_m(self, ego: Box) -> float:
+    def _reach_m(self, ego: BoundingBox) -> float:
         """How far from the origin of the vehicle frame a sensor can see: its range starts where it is mounted."""
-        farthest_m = np.abs(ego.corners_m).max(axis=0) + self.reference.shell_m
+        farthest_m = np.abs(ego.corners_m).max(axis=0) + self.reference_sensor.shell_m
         reaches = [
             float(np.linalg.norm(sensor.mount.matrix()[:3, 3])) + sensor.max_range_m
             for rig in self.rigs.values()
             for sensor in rig.sensors
         ]
-        return max(float(np.linalg.norm(farthest_m)) + self.reference.max_range_m, *reaches)
+        return max(float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches)
 
     def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[Scan]:
         scans = []
@@ -198,21 +198,21 @@ class SimulatedFrames(Dataset[Frame]):
     ) -> tuple[Scan, NDArray[np.float32] | None, int]:
         generator = np.random.default_rng([self.seed, index])
         vehicle_T_reference, redrawn = self._draw_reference_pose(scene, instant, index, generator)
-        tiles = self.reference.tiles(vehicle_T_reference, generator)
+        tiles = self.reference_sensor.tiles(vehicle_T_reference, generator)
         scan = instant.scan(
-            vehicle_T_reference, tiles, max_range_m=self.reference.max_range_m, threads=torch.get_num_threads()
+            vehicle_T_reference, tiles, max_range_m=self.reference_sensor.max_range_m, threads=torch.get_num_threads()
         )
-        return scan, self.reference.weights(vehicle_T_reference, tiles, scan.ray), redrawn
+        return scan, self.reference_sensor.weights(vehicle_T_reference, tiles, scan.ray), redrawn
 
     def _draw_reference_pose(
         self, scene: Scene, instant: Instant, index: int, generator: np.random.Generator
     ) -> tuple[Matrix, int]:
-        for redrawn in range(MOST_DRAWS):
-            vehicle_T_reference = self.reference.vehicle_T_reference(scene.ego_box, generator)
+        for redrawn in range(MAX_DRAWS):
+            vehicle_T_reference = self.reference_sensor.vehicle_T_reference(scene.ego_box, generator)
             if not instant.buried(vehicle_T_reference[:3, 3]):
                 return vehicle_T_reference, redrawn
         raise ValueError(
-            f"{self.scenario.name} step {index}: {MOST_DRAWS} places beside and above the ego lie inside other bodies "
+            f"{self.scenario.name} step {index}: {MAX_DRAWS} places beside and above the ego lie inside other bodies "
             "or below the ground; does the ego stand on the ground, and do faces point outwards?"
         )
 
@@ -225,7 +225,7 @@ def _load(rig: Rig | str | Path) -> Rig:
     return rig if isinstance(rig, Rig) else Rig.load(rig)
 
 
-def _boxes(found: Sequence[Label], sensors: Mapping[str, torch.Tensor]) -> Boxes:
+def _boxes(found: Sequence[Label], clouds: Mapping[str, torch.Tensor]) -> Boxes:
     rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
     boxes = Boxes.from_rows(
         torch.tensor(rows, dtype=torch.float32).view(-1, 7),
@@ -233,7 +233,7 @@ def _boxes(found: Sequence[Label], sensors: Mapping[str, torch.Tensor]) -> Boxes
         ids=tuple(label.name for label in found),
         categories=tuple(label.category for label in found),
     )
-    inside = {name: points_in_boxes(cloud, boxes).box for name, cloud in sensors.items()}
+    inside = {name: points_in_boxes(cloud, boxes).box for name, cloud in clouds.items()}
     return replace(boxes, hits={name: torch.bincount(box, minlength=len(boxes)) for name, box in inside.items()})
 
 

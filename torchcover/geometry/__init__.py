@@ -1,6 +1,6 @@
 """Rigid transforms and boxes. Knows no other part of the house."""
 
-from torchcover.geometry.boxes import Box, overlap
+from torchcover.geometry.bounding_box import BoundingBox, overlap
 from torchcover.geometry.rigid import (
     check_rigid,
     euler_from_rotation,
@@ -12,7 +12,7 @@ from torchcover.geometry.rigid import (
 )
 
 __all__ = [
-    "Box",
+    "BoundingBox",
     "check_rigid",
     "euler_from_rotation",
     "invert",

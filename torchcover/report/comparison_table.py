@@ -20,7 +20,7 @@ from torchcover.report.wording import percent
 BEST = "*"
 SIGNIFICANT = "!"
 # More characters than any table has in a line.
-WIDEST = 10_000
+MAX_LINE_CHARS = 10_000
 
 
 def comparison_tables(
@@ -57,7 +57,7 @@ def comparison_tables(
 
 def narrowest_width(tables: Sequence[Table], rigs: Sequence[str]) -> int:
     """Characters in a line that the tables need at least, with the names folded and the numbers whole."""
-    console = Console(width=WIDEST)
+    console = Console(width=MAX_LINE_CHARS)
     natural = max(Measurement.get(console, console.options, table).maximum for table in tables)
     numbers = max(column.min_width or 0 for table in tables for column in table.columns)
     return natural - sum(max(0, cell_len(name) - numbers) for name in rigs)

@@ -29,7 +29,7 @@ Image = NDArray[np.floating]
 
 IMAGE_HEIGHT_IN = 2.4
 SKY = "#dfe9f2"
-LARGEST_ROW_IN = 13.5
+MAX_ROW_IN = 13.5
 # The colours leave out this share of the pixels at either end: a bumper, and a few walls at the horizon.
 ROBUST_PERCENTILES = (0.5, 99.5)
 FALLBACK_SCALE_M = (1.0, 100.0)
@@ -124,7 +124,7 @@ def _paper(arrays: list[NDArray[np.float64]]) -> Figure:
 def _rows(widths_in: list[float]) -> list[list[float]]:
     rows = [[widths_in[0]]]
     for width_in in widths_in[1:]:
-        if sum(rows[-1]) + width_in + GAP_IN * len(rows[-1]) > LARGEST_ROW_IN:
+        if sum(rows[-1]) + width_in + GAP_IN * len(rows[-1]) > MAX_ROW_IN:
             rows.append([])
         rows[-1].append(width_in)
     return rows

@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 
-LONGEST_FILE_NAME = 48
+MAX_FILE_NAME = 48
 
 
 def file_stems(names: Sequence[str]) -> list[str]:
@@ -15,7 +15,7 @@ def file_stems(names: Sequence[str]) -> list[str]:
     """
     stems: list[str] = []
     for number, name in enumerate(names):
-        stem = re.sub(r"[^\w.-]+", "_", name)[:LONGEST_FILE_NAME]
+        stem = re.sub(r"[^\w.-]+", "_", name)[:MAX_FILE_NAME]
         while stem.lower() in (other.lower() for other in stems):
             stem += f"_{number}"
         stems.append(stem)

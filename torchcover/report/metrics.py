@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import Coverage
-from torchcover.coverage.errors import FEWEST_BLOCKS_OF_A_CELL
+from torchcover.coverage.errors import MIN_BLOCKS_OF_A_CELL
 from torchcover.report.cells import NEVER_PROBED
 from torchcover.report.scale import ColourScale, detection_scale, radius_scale
 
@@ -65,7 +65,7 @@ def error_metrics_of(coverages: Sequence[Coverage]) -> Iterator[Metric]:
     Args:
         coverages: As in `metrics_of`.
     """
-    unknown = f"probed in fewer than {FEWEST_BLOCKS_OF_A_CELL} blocks of steps"
+    unknown = f"probed in fewer than {MIN_BLOCKS_OF_A_CELL} blocks of steps"
     if radii := _of_all([coverage.radius_error for coverage in coverages]):
         quantity = "standard error of the mean blind spot radius"
         yield replace(_radius("radius_error", quantity, radii), unknown=unknown)

@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 
 from torchcover.coverage import BevGrid
 
-LARGEST_MAP_IN = (9.0, 6.0)
-LARGEST_PAPER_IN = (14.0, 8.75)
+MAX_MAP_IN = (9.0, 6.0)
+MAX_PAPER_IN = (14.0, 8.75)
 # Between maps on one paper, with room for the outer labels of two axes; below, for a heading.
 BESIDE_IN = 0.6
 BELOW_IN = 0.4
 DOTS_PER_INCH = 150
 # Beyond this, cells are smaller than pixels and are averaged.
-MOST_DOTS_PER_INCH = 300
+MAX_DOTS_PER_INCH = 300
 COLOUR_BAR_IN = 0.16
 # The label of the colour bar needs this much.
-SHORTEST_COLOUR_BAR_IN = 2.4
+MIN_COLOUR_BAR_IN = 2.4
 GAP_IN = 0.15
 X_LABEL_IN = 0.55
 LEGEND_COLUMN_IN = 3.0
@@ -66,7 +66,7 @@ def lay_out(grid: BevGrid, maps: int = 1, *, across: int | None = None) -> list[
     _, rows, columns = grid.shape
     bar_for_all = across is None
     across, inches_per_cell = _arrange(grid, maps, across)
-    dpi = min(math.ceil(DOTS_PER_INCH * inches_per_cell) / inches_per_cell, MOST_DOTS_PER_INCH)
+    dpi = min(math.ceil(DOTS_PER_INCH * inches_per_cell) / inches_per_cell, MAX_DOTS_PER_INCH)
     map_in = inches_per_cell * np.array([columns, rows])
     # Gaps of whole pixels, so that every cell of every map is whole pixels.
     step_in = map_in + np.round(np.array([BESIDE_IN, BELOW_IN]) * dpi) / dpi
@@ -82,7 +82,7 @@ def lay_out(grid: BevGrid, maps: int = 1, *, across: int | None = None) -> list[
         left_in, top_in = (step_in * [at % across, at // across]).tolist()
         views.append(figure.add_axes(place(left_in, top_in, map_in), xlim=grid.x, ylim=grid.y))
         _label(views[-1], left=at % across == 0, lowest=at + across >= maps)
-    bar_in = np.array([COLOUR_BAR_IN, max(paper_in[1] if bar_for_all else map_in[1], SHORTEST_COLOUR_BAR_IN)])
+    bar_in = np.array([COLOUR_BAR_IN, max(paper_in[1] if bar_for_all else map_in[1], MIN_COLOUR_BAR_IN)])
     gap_in = GAP_IN if maps == 1 else BESIDE_IN  # the axis of a map above the last row has labels beside the bar
     tops_in = [0.0] if bar_for_all else [step_in[1] * row for row in range(math.ceil(maps / across))]
     bars = [figure.add_axes(place(paper_in[0] + gap_in, top_in, bar_in)) for top_in in tops_in]
@@ -95,7 +95,7 @@ def lay_out(grid: BevGrid, maps: int = 1, *, across: int | None = None) -> list[
 def _arrange(grid: BevGrid, maps: int, across: int | None) -> tuple[int, float]:
     """How many maps beside each other, and inches for each cell: the most that the paper allows."""
     _, rows, columns = grid.shape
-    width_in, height_in = LARGEST_MAP_IN if maps == 1 else LARGEST_PAPER_IN
+    width_in, height_in = MAX_MAP_IN if maps == 1 else MAX_PAPER_IN
 
     def inches_per_cell(across: int) -> float:
         return min(width_in / (across * columns), height_in / (math.ceil(maps / across) * rows))

@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 from torchcover.coverage import Coverage, Region, RegionSummary
-from torchcover.coverage.blocks import FEWEST_BLOCKS
+from torchcover.coverage.blocks import MIN_BLOCKS
 from torchcover.report.records import columns_of, conditions_of, json_record, records_of, write_records
 from torchcover.report.wording import blocks_of_steps, metres, percent, span, steps_and_cell
 
@@ -93,8 +93,8 @@ def _on_errors(coverage: Coverage, rows: Sequence[RegionSummary]) -> list[str]:
     blocks, steps = blocks_of_steps(coverage)
     if blocks is None:
         return []
-    if blocks < FEWEST_BLOCKS:
-        return [f"Not enough steps for errors: {blocks} block{'s' * (blocks != 1)}, {FEWEST_BLOCKS} are needed."]
+    if blocks < MIN_BLOCKS:
+        return [f"Not enough steps for errors: {blocks} block{'s' * (blocks != 1)}, {MIN_BLOCKS} are needed."]
     notes = [f"± is one standard error, from {blocks} blocks of up to {steps:,} steps in a row."]
     if any(math.isfinite(row.radius_m) and math.isnan(row.radius_error_m) for row in rows):
         notes.append("No ± where one block alone has probed the region.")

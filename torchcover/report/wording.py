@@ -5,8 +5,8 @@ import math
 from torchcover.coverage import BevGrid, Coverage
 
 # A number has no more digits than anybody can use, however small its error.
-MOST_DECIMALS_M = 4
-MOST_DECIMALS_PERCENT = 3
+MAX_DECIMALS_M = 4
+MAX_DECIMALS_PERCENT = 3
 # Errors below come from rounding in sums of float64: the estimate is the same whichever block is left out.
 ROUND_OFF = 1e-12
 
@@ -30,7 +30,7 @@ def percent(share: float, error: float = math.nan) -> str:
     if math.isnan(share):
         return "unknown"
     if not math.isnan(error) and error > ROUND_OFF:
-        return _with_error(100 * share, 100 * error, MOST_DECIMALS_PERCENT, highest=100.0)
+        return _with_error(100 * share, 100 * error, MAX_DECIMALS_PERCENT, highest=100.0)
     words = f"{100 * share:.1f}"
     if share in (0.0, 1.0):
         words = f"{share:.0%}".rstrip("%")
@@ -62,7 +62,7 @@ def metres(length_m: float, error_m: float = math.nan) -> str:
     if math.isinf(length_m):
         return "infinite"
     if not math.isnan(error_m) and error_m > ROUND_OFF:
-        return _with_error(length_m, error_m, MOST_DECIMALS_M)
+        return _with_error(length_m, error_m, MAX_DECIMALS_M)
     return f"{length_m:.2f}" if math.isnan(error_m) else f"{length_m:.2f} ± 0"
 
 
@@ -73,7 +73,7 @@ def metres_more(difference_m: float, error_m: float = math.nan) -> str:
         >>> metres_more(0.0213, 0.0041), metres_more(-0.5), metres_more(0.0, 0.0), metres_more(float("-inf"))
         ('+0.0213 ± 0.0041', '-0.50', '0 ± 0', '-infinite')
     """
-    return _more(difference_m, error_m, usual=2, most=MOST_DECIMALS_M)
+    return _more(difference_m, error_m, usual=2, most=MAX_DECIMALS_M)
 
 
 def points_more(difference: float, error: float = math.nan) -> str:
@@ -83,7 +83,7 @@ def points_more(difference: float, error: float = math.nan) -> str:
         >>> points_more(-0.0213, 0.0041), points_more(0.0213), points_more(float("nan"))
         ('-2.13 ± 0.41', '+2.1', 'unknown')
     """
-    return _more(100 * difference, 100 * error, usual=1, most=MOST_DECIMALS_PERCENT)
+    return _more(100 * difference, 100 * error, usual=1, most=MAX_DECIMALS_PERCENT)
 
 
 def decimals_of(error: float, most: int) -> int:

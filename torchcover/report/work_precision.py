@@ -14,7 +14,7 @@ from torchcover.report.records import json_record
 
 MARKERS = "osD^vP*X"
 COLOURS = {"even": "viridis", "paper": "autumn"}
-LIGHTEST = 0.85
+MAX_LIGHTNESS = 0.85
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ def _draw_lines(axes: Axes, points: Sequence[WorkPoint], error: str, factor: flo
                 markersize=5,
                 linewidth=1.2,
                 linestyle="-" if reference == "even" else "--",
-                color=colormaps[COLOURS.get(reference, "winter")](LIGHTEST * at / max(len(rays) - 1, 1)),
+                color=colormaps[COLOURS.get(reference, "winter")](MAX_LIGHTNESS * at / max(len(rays) - 1, 1)),
                 label=f"{reference} {count:,}",
             )
 

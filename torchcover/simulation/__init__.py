@@ -4,7 +4,7 @@ from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.documents import Pose, builtin_names
 from torchcover.simulation.even_reference import EvenReference
 from torchcover.simulation.lidar import Lidar, LidarModel
-from torchcover.simulation.reference import ReferenceSensor
+from torchcover.simulation.reference import PaperReference
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 
@@ -13,8 +13,8 @@ __all__ = [
     "EvenReference",
     "Lidar",
     "LidarModel",
+    "PaperReference",
     "Pose",
-    "ReferenceSensor",
     "Rig",
     "Scenario",
     "builtin_names",

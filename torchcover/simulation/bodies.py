@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from torchcover.geometry import Box, rigid
+from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import shapes
 from torchcover.simulation.documents import Document, Pose, load_document
 from torchcover.simulation.shapes import Mesh
@@ -72,7 +72,7 @@ class Vehicle(Document):
 
 def in_vehicle_frame(mesh: Mesh) -> Mesh:
     """Move a mesh so that the origin lies on the ground under the centre of its bounding box."""
-    box = Box.around(mesh.vertices_m)
+    box = BoundingBox.around(mesh.vertices_m)
     (x0, y0, z0), (x1, y1, _) = box.lower_m, box.upper_m
     return mesh.moved(rigid(np.eye(3), [-(x0 + x1) / 2, -(y0 + y1) / 2, -z0]))
 

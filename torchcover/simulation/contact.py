@@ -10,7 +10,7 @@ from torchcover.simulation.shapes import Mesh
 # An origin lies on a face if it is no farther from its plane than this many times what rounding makes of that.
 CONTACT_ROUNDINGS = 4
 # Origins are rounded too, before they come here: in float64, as a share of the largest coordinate.
-LEAST_CONTACT = 1e-12
+MIN_CONTACT = 1e-12
 
 
 class Faces:
@@ -32,7 +32,7 @@ class Faces:
         rounding_m = (products * largest).sum(axis=0) / length
         # The plane of a sliver is anybody's guess, but the sliver is not far from where it is.
         rounding_m = np.minimum(rounding_m, largest.max(axis=0)) * np.finfo(np.float32).eps
-        self.contact_m = np.maximum(CONTACT_ROUNDINGS * rounding_m, LEAST_CONTACT * reach_m)
+        self.contact_m = np.maximum(CONTACT_ROUNDINGS * rounding_m, MIN_CONTACT * reach_m)
         self._normals = across / length
         self._corner_m = first
         self._lower_m = np.min([first, second, third], axis=0) - 2 * self.contact_m

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import Box, rigid
+from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation.rays import Tile, into_tiles
 from torchcover.simulation.reference import MAX_TILT_DEG, position_in_shell
 
@@ -47,7 +47,7 @@ class EvenReference:
 
     Example:
         >>> sensor = EvenReference(areas=(((0.0, 20.0), (-5.0, 5.0)),), rays=1024)
-        >>> pose = sensor.vehicle_T_reference(Box((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6)), np.random.default_rng(0))
+        >>> pose = sensor.vehicle_T_reference(BoundingBox((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6)), np.random.default_rng(0))
         >>> tiles = sensor.tiles(pose, np.random.default_rng(0))
         >>> sum(tile.directions.shape[1] for tile in tiles)
         1024
@@ -71,7 +71,7 @@ class EvenReference:
         if not self.max_range_m > 0:
             raise ValueError(f"max_range_m: a positive distance in metres is needed; got {self.max_range_m}")
 
-    def vehicle_T_reference(self, ego: Box, generator: np.random.Generator) -> Float64:
+    def vehicle_T_reference(self, ego: BoundingBox, generator: np.random.Generator) -> Float64:
         """Draw the pose of one step: its place is the paper's; its axes are those of the vehicle.
 
         Args:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import Box, euler_from_rotation, invert, transform
+from torchcover.geometry import BoundingBox, euler_from_rotation, invert, transform
 from torchcover.simulation.world import Actor, World
 
 Matrix = NDArray[np.float64]
@@ -48,7 +48,7 @@ def labels(world: World, step: int, within_m: float) -> list[Label]:
 
 def _label(actor: Actor, vehicle_T_world: Matrix, time_s: float) -> Label:
     vehicle_T_actor = vehicle_T_world @ actor.trajectory.at(time_s)
-    box = Box.around(actor.mesh.vertices_m)
+    box = BoundingBox.around(actor.mesh.vertices_m)
     middle_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
     return Label(
         actor.name,

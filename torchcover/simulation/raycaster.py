@@ -19,7 +19,7 @@ from torchcover.simulation.shapes import Mesh
 Float32 = NDArray[np.float32]
 
 # Farther from the origin float32 resolves no better than 64 m, and at 2e18 Embree drops faces without a word.
-MOST_M = 1e9
+MAX_M = 1e9
 # How far beyond a face that it leaves a ray goes on, in contact distances; farther each time that it hits one again.
 CONTACTS_BEYOND = 2.0 ** np.arange(1, 13)
 
@@ -46,9 +46,9 @@ class RayCaster:
         if not bodies:
             raise ValueError("a scene needs at least one body")
         reach_m = float(np.max([np.abs(body.vertices_m).max(initial=0.0) for body in bodies]))  # NaN if one is
-        if not reach_m <= MOST_M:
+        if not reach_m <= MAX_M:
             raise ValueError(
-                f"bodies within {MOST_M:g} m of the origin are needed; a vertex has the coordinate {reach_m}"
+                f"bodies within {MAX_M:g} m of the origin are needed; a vertex has the coordinate {reach_m}"
             )
         self._faces = Faces(bodies, reach_m)
         self._first_face = np.cumsum([0] + [len(body.faces) for body in bodies])

@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import Box, rigid, rotation_from_euler
+from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.simulation.rays import Tile, into_tiles, unit_directions
 
 # Pitch and roll of the paper's sensor are uniform between minus this and this.
@@ -14,7 +14,7 @@ MAX_TILT_DEG = 45.0
 
 
 @dataclass(frozen=True)
-class ReferenceSensor:
+class PaperReference:
     """The paper's reference sensor: rays over the lower hemisphere, from a new pose at every step.
 
     The position is uniform in the shell between the ego's bounding box and that box grown sideways and upwards, yaw
@@ -33,8 +33,8 @@ class ReferenceSensor:
             a range that is not positive.
 
     Example:
-        >>> sensor = ReferenceSensor(rows=4, columns=8)
-        >>> ego = Box((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6))
+        >>> sensor = PaperReference(rows=4, columns=8)
+        >>> ego = BoundingBox((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6))
         >>> sensor.vehicle_T_reference(ego, np.random.default_rng(0)).shape
         (4, 4)
     """
@@ -70,7 +70,7 @@ class ReferenceSensor:
     ) -> None:
         """None: the points of this sensor weigh the same."""
 
-    def vehicle_T_reference(self, ego: Box, generator: np.random.Generator) -> NDArray[np.float64]:
+    def vehicle_T_reference(self, ego: BoundingBox, generator: np.random.Generator) -> NDArray[np.float64]:
         """Draw the pose of one step.
 
         Args:
@@ -85,7 +85,7 @@ class ReferenceSensor:
         return rigid(rotation_from_euler(yaw, pitch, roll), position_in_shell(ego, self.shell_m, generator))
 
 
-def position_in_shell(ego: Box, shell_m: float, generator: np.random.Generator) -> NDArray[np.float64]:
+def position_in_shell(ego: BoundingBox, shell_m: float, generator: np.random.Generator) -> NDArray[np.float64]:
     """(3,) place in metres, uniform between the ego's bounding box and that box grown sideways and upwards.
 
     Args:
@@ -103,5 +103,5 @@ def position_in_shell(ego: Box, shell_m: float, generator: np.random.Generator) 
 
 # Kept for the process, not with the sensor, which travels to DataLoader workers.
 @lru_cache(maxsize=2)
-def _tiles_of(sensor: ReferenceSensor) -> tuple[Tile, ...]:
+def _tiles_of(sensor: PaperReference) -> tuple[Tile, ...]:
     return into_tiles(sensor.directions())

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import Box, invert, overlap, transform
+from torchcover.geometry import BoundingBox, invert, overlap, transform
 from torchcover.simulation.culling import SLACK_M, SLACK_SHARE
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant, Part, rotate
 from torchcover.simulation.raycaster import RayCaster
@@ -26,7 +26,7 @@ class Solid(NamedTuple):
     """
 
     caster: RayCaster
-    box: Box
+    box: BoundingBox
     outline_m: Matrix
     radius_m: float
 
@@ -49,7 +49,7 @@ class Scene:
 
     def __init__(self, world: World) -> None:
         self.world = world
-        self.ego_box = Box.around(world.ego.mesh.vertices_m)
+        self.ego_box = BoundingBox.around(world.ego.mesh.vertices_m)
         bodies = (world.ego, *world.actors)
         self._resting = [actor for actor in bodies if not actor.trajectory.moves]
         self._moving = [actor for actor in bodies if actor.trajectory.moves]
@@ -162,7 +162,7 @@ class Scene:
 
 
 def _solid(mesh: Mesh) -> Solid:
-    box = Box.around(mesh.vertices_m)
+    box = BoundingBox.around(mesh.vertices_m)
     centre_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
     radius_m = float(np.linalg.norm(mesh.vertices_m - centre_m, axis=1).max())
     # Of the corners as they are cast: in float32.

@@ -14,7 +14,7 @@ from torchcover.simulation.documents import Document, beside
 CYLINDER_SIDES = 24
 ELLIPSOID_SIDES = 12  # around the z axis; half as many bands from pole to pole
 # Nothing on a road is longer; no building, and no terrain within a sensor's range, is higher.
-LONGEST_VEHICLE_M = 100.0
+MAX_VEHICLE_LENGTH_M = 100.0
 TALLEST_SCENERY_M = 1000.0
 
 Length = PositiveFloat
@@ -183,7 +183,7 @@ def warn_of_units(owner: str, mesh: Mesh, *, moves: bool) -> None:
             then all three extents must be above 1,000 m.
     """
     size_m = np.ptp(mesh.vertices_m, axis=0).tolist()
-    extent_m, most_m = (max(size_m), LONGEST_VEHICLE_M) if moves else (min(size_m), TALLEST_SCENERY_M)
+    extent_m, most_m = (max(size_m), MAX_VEHICLE_LENGTH_M) if moves else (min(size_m), TALLEST_SCENERY_M)
     if extent_m > most_m:
         x, y, z = size_m
         warnings.warn(

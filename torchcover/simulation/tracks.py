@@ -15,7 +15,7 @@ from torchcover.simulation.world import Actor
 TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")
 BOX_COLUMNS = ("t", "id", "category", "x", "y", "z", "length", "width", "height", "yaw")
 # A step this many times longer than the usual one means that poses are missing.
-LONGEST_STEP = 5.0
+MAX_STEP = 5.0
 
 
 def read_trajectory(path: Path) -> Trajectory:
@@ -113,7 +113,7 @@ def _numbers(rows: Sequence[dict[str, str]], columns: Sequence[str]) -> NDArray[
 
 def _check_gaps(times_s: NDArray[np.float64]) -> None:
     steps = np.diff(times_s)
-    if len(steps) and steps.max() > LONGEST_STEP * np.median(steps):
+    if len(steps) and steps.max() > MAX_STEP * np.median(steps):
         at = int(steps.argmax())
         raise ValueError(
             f"a gap of {steps[at]:g} s after t = {times_s[at]:g} s, where the usual step is {np.median(steps):g} s; "

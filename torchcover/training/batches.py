@@ -40,9 +40,9 @@ def sensor_of(frame: Frame, rig: str | None = None) -> Tensor:
     """
     if rig is None:
         return frame.sensor
-    if rig not in frame.sensors:
-        raise ValueError(f"frame {frame.name!r} has no rig {rig!r}; it has {', '.join(frame.sensors)}")
-    return frame.sensors[rig]
+    if rig not in frame.clouds:
+        raise ValueError(f"frame {frame.name!r} has no rig {rig!r}; it has {', '.join(frame.clouds)}")
+    return frame.clouds[rig]
 
 
 def frames_of_batch_dict(

@@ -171,12 +171,12 @@ class CoverageCallback(Callback):
             self.metric.update([], [])  # a process that was dealt nothing but padding has not updated yet
             coverage: Coverage = self.metric.compute()
         self.coverage = coverage
-        if not bool((coverage.frames > 0).any()):
+        if not bool((coverage.probed_steps > 0).any()):
             self._warn_once("no reference point lies in the grid: the coverage of these frames is unknown (NaN)")
         return coverage
 
     def _scalars(self, coverage: Coverage) -> dict[str, float]:
-        scalars = {**coverage.scalars(self.regions), "frames": float(coverage.counts["steps"])}
+        scalars = {**coverage.scalars(self.regions), "steps": float(coverage.counts["steps"])}
         return {f"{self.tag}/{name}": value for name, value in scalars.items()}
 
     def _log_maps(self, trainer: Trainer, coverage: Coverage) -> None:

@@ -131,6 +131,6 @@ def is_distributed() -> bool:
 def _identity(frame: Frame, loader: int) -> int:
     # Two datasets side by side have frames of the same index, and of the same name if only their seed differs. Flips
     # and rotations change coordinates, but no number of points.
-    sizes = [len(frame.reference), *(len(cloud) for cloud in frame.sensors.values())]
+    sizes = [len(frame.reference), *(len(cloud) for cloud in frame.clouds.values())]
     text = repr((loader, frame.index, frame.name, sizes))
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=7).digest(), "big")

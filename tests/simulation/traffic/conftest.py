@@ -4,7 +4,7 @@ from functools import cache
 
 import pytest
 
-from torchcover.geometry import Box
+from torchcover.geometry import BoundingBox
 from torchcover.simulation import shapes
 from torchcover.simulation.traffic import Highway, Parking, Urban
 from torchcover.simulation.traffic.fleet import load_bodies
@@ -14,7 +14,7 @@ KINDS = {"urban": Urban(), "narrow": Urban(lanes=2), "highway": Highway(), "park
 
 @cache
 def boxes():
-    sizes = {kind: Box.around(mesh.vertices_m).size_m for kind, mesh in load_bodies().items()}
+    sizes = {kind: BoundingBox.around(mesh.vertices_m).size_m for kind, mesh in load_bodies().items()}
     return {kind: shapes.Box(type="box", size_m=size).mesh() for kind, size in sizes.items()}
 
 

@@ -9,7 +9,7 @@ Numbers = NDArray[np.float64]
 PITCH_DEG_PER_MPS2 = 0.3
 ROLL_DEG_PER_MPS2 = 0.4
 # The springs do not go farther, and bumpers sit on the axles behind them.
-LARGEST_SPRING_PITCH_DEG, LARGEST_SPRING_ROLL_DEG = 1.5, 1.1
+MAX_SPRING_PITCH_DEG, MAX_SPRING_ROLL_DEG = 1.5, 1.1
 SPRING_TIME_S = 0.35
 # Unevenness of a road: shares of one bump's angle at wavelengths from a patch to a long swell.
 WAVELENGTHS_M = np.array([9.0, 17.0, 37.0, 71.0])
@@ -38,8 +38,8 @@ def attitude(
     """
     forward = np.gradient(speed_mps, times_s)
     leftward = speed_mps * np.gradient(np.unwrap(np.deg2rad(yaw_deg)), times_s)
-    pitch = _limit(-PITCH_DEG_PER_MPS2 * forward, LARGEST_SPRING_PITCH_DEG)
-    roll = _limit(ROLL_DEG_PER_MPS2 * leftward, LARGEST_SPRING_ROLL_DEG)
+    pitch = _limit(-PITCH_DEG_PER_MPS2 * forward, MAX_SPRING_PITCH_DEG)
+    roll = _limit(ROLL_DEG_PER_MPS2 * leftward, MAX_SPRING_ROLL_DEG)
     pitch = _settle(times_s, pitch) + _unevenness(way_m, PITCH_WAVES_DEG, generator)
     roll = _settle(times_s, roll) + _unevenness(way_m, ROLL_WAVES_DEG, generator)
     return np.stack([yaw_deg, pitch, roll], axis=1)

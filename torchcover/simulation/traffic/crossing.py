@@ -12,7 +12,7 @@ Flags = NDArray[np.bool_]
 
 # Probability to take the first chance after a stay, instead of waiting for another.
 EAGERNESS = 0.8
-LONGEST_STAY_S = 12.0
+MAX_STAY_S = 12.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +95,7 @@ def _stroll(may_go: Flags, crossing_s: float, step_s: float, generator: np.rando
     share, faces_start = np.full(count, float(back)), np.full(count, back)
     now = 0
     while True:
-        now += round(generator.uniform(0.0, LONGEST_STAY_S) / step_s)
+        now += round(generator.uniform(0.0, MAX_STAY_S) / step_s)
         ahead = chances[np.searchsorted(chances, now) :]
         if len(ahead) == 0:
             return share, faces_start

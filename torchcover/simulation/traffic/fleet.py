@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from torchcover.geometry import Box
+from torchcover.geometry import BoundingBox
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.documents import load_document
 from torchcover.simulation.shapes import Mesh
@@ -59,7 +59,7 @@ class Fleet:
         if missing:
             raise ValueError(f"traffic needs a body for each kind; there is none for {', '.join(missing)}")
         self.meshes = {EGO: bodies["suv"] if ego is None else ego, **{kind: bodies[kind] for kind in CATEGORIES}}
-        self._sizes = {kind: Box.around(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
+        self._sizes = {kind: BoundingBox.around(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
         self._generator = generator
         self.parked: list[Actor] = []
 

@@ -20,7 +20,7 @@ from torchcover.simulation.traffic.signals import Signals
 
 Numbers = NDArray[np.float64]
 
-LARGEST_STEP_S = 0.1
+MAX_STEP_S = 0.1
 # Harder than comfortable, softer than an emergency: who would have to brake harder for a light goes on.
 BRAKING_FOR_A_LIGHT_MPS2 = 2.5
 STOP_BEFORE_LINE_M = 0.5
@@ -99,7 +99,7 @@ class Simulation:
         return Flow(np.stack(place), np.stack(speed), np.stack(occupied))
 
     def _drive(self, start_s: float, duration_s: float) -> tuple[Numbers, Numbers, NDArray[np.bool_]]:
-        steps = int(np.ceil(duration_s / LARGEST_STEP_S - 1e-9))
+        steps = int(np.ceil(duration_s / MAX_STEP_S - 1e-9))
         for step in range(steps):
             self._step(start_s + step * duration_s / steps, duration_s / steps)
         return self.place_m, self.speed_mps, self._occupied(self._gate())

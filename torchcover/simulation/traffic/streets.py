@@ -17,7 +17,7 @@ BICYCLE_LANE_M = 1.8
 PARKING_BAY_M = 2.3
 GUTTER_M = 0.5
 SIDEWALK_M = 3.2
-SHORTEST_BLOCK_M, LONGEST_BLOCK_M = 80.0, 130.0
+MIN_BLOCK_M, MAX_BLOCK_M = 80.0, 130.0
 
 # Along the way of whoever drives: stop line, crossing, carriageway of the other street, crossing.
 CROSSING_STARTS_M, CROSSING_ENDS_M = 1.0, 4.0
@@ -126,12 +126,12 @@ def plan(lanes_each_way: int, span_m: tuple[float, float], reach_m: float, gener
         reach_m: How far from the origin lanes begin and end.
         generator: Draws blocks, widths and lights.
     """
-    middle = generator.uniform(SHORTEST_BLOCK_M, LONGEST_BLOCK_M) / 2
+    middle = generator.uniform(MIN_BLOCK_M, MAX_BLOCK_M) / 2
     east, west = [middle], [-middle]
     while east[-1] < span_m[1]:
-        east.append(east[-1] + generator.uniform(SHORTEST_BLOCK_M, LONGEST_BLOCK_M))
+        east.append(east[-1] + generator.uniform(MIN_BLOCK_M, MAX_BLOCK_M))
     while west[-1] > span_m[0]:
-        west.append(west[-1] - generator.uniform(SHORTEST_BLOCK_M, LONGEST_BLOCK_M))
+        west.append(west[-1] - generator.uniform(MIN_BLOCK_M, MAX_BLOCK_M))
     junctions = np.array(west[::-1] + east)
     # Two-lane and four-lane streets in turn.
     cross_lanes = 1 + (np.arange(len(junctions)) + generator.integers(2)) % 2

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 
 @dataclass(frozen=True)
-class Box:
+class BoundingBox:
     """An axis-aligned box.
 
     Args:
@@ -16,7 +16,7 @@ class Box:
         upper_m: Largest x, y, z in metres.
 
     Example:
-        >>> Box((-1.0, -1.0, 0.0), (1.0, 1.0, 2.0)).size_m
+        >>> BoundingBox((-1.0, -1.0, 0.0), (1.0, 1.0, 2.0)).size_m
         (2.0, 2.0, 2.0)
     """
 
@@ -30,7 +30,7 @@ class Box:
             raise ValueError(f"a box needs lower < upper on every axis; got {self.lower_m} and {self.upper_m}")
 
     @classmethod
-    def around(cls, points_m: NDArray[np.floating]) -> "Box":
+    def around(cls, points_m: NDArray[np.floating]) -> "BoundingBox":
         """The smallest box that holds all (N, 3) points."""
         lower, upper = points_m.min(axis=0), points_m.max(axis=0)
         return cls(
@@ -49,7 +49,7 @@ class Box:
         return (x1 - x0, y1 - y0, z1 - z0)
 
 
-def overlap(a: Box, a_T_b: NDArray[np.float64], b: Box) -> bool:
+def overlap(a: BoundingBox, a_T_b: NDArray[np.float64], b: BoundingBox) -> bool:
     """Whether two boxes that stand on about the same ground share space; touching is not sharing.
 
     Args:
@@ -61,7 +61,7 @@ def overlap(a: Box, a_T_b: NDArray[np.float64], b: Box) -> bool:
         True if their heights overlap, and so do their outlines seen from above (separating axes).
 
     Example:
-        >>> car, away = Box((-2, -1, 0), (2, 1, 1.5)), np.eye(4)
+        >>> car, away = BoundingBox((-2, -1, 0), (2, 1, 1.5)), np.eye(4)
         >>> away[:3, 3] = [3.0, 2.1, 0.0]
         >>> overlap(car, np.eye(4), car), overlap(car, away, car)
         (True, False)

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchcover.data import Boxes, points_in_boxes
-from torchcover.data.boxes import check_boxes
+from torchcover.detection.boxes import Boxes, check_boxes, points_in_boxes
 from torchcover.neighbors import blind_spot_radius, check_cloud
 
 

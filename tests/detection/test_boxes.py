@@ -10,11 +10,12 @@ import torch
 from torch.utils.data import DataLoader
 
 from torchcover import Scenario
-from torchcover.data import Boxes, Frame, SimulatedFrames, collate_frames, points_in_boxes
-from torchcover.data.boxes import SKIN_M
-from torchcover.simulation import ReferenceSensor, Rig
+from torchcover.data import Frame, SimulatedFrames, collate_frames
+from torchcover.detection import Boxes, points_in_boxes
+from torchcover.detection.boxes import SKIN_M
+from torchcover.simulation import PaperReference, Rig
 
-SMALL = ReferenceSensor(rows=96, columns=128)
+SMALL = PaperReference(rows=96, columns=128)
 NONE = Boxes.from_rows(torch.empty(0, 7))
 
 
@@ -172,7 +173,7 @@ LIDAR = {
 @pytest.fixture(scope="module")
 def frames():
     rig = Rig.model_validate({"name": "r", "sensors": [LIDAR]})
-    return SimulatedFrames(Scenario.model_validate(TRAFFIC), rig, steps=8, seed=2, reference=SMALL, boxes=True)
+    return SimulatedFrames(Scenario.model_validate(TRAFFIC), rig, steps=8, seed=2, reference_sensor=SMALL, boxes=True)
 
 
 def same(a, b):
@@ -186,7 +187,7 @@ def test_boxes_do_not_depend_on_order_or_workers_and_leave_the_clouds_alone(fram
     there = [f for b in DataLoader(frames, batch_size=3, num_workers=2, collate_fn=collate_frames) for f in b.frames]
     assert all(same(frames[index].boxes, there[index].boxes) for index in range(8))
     assert same(late_first.boxes, frames[6].boxes)
-    without = SimulatedFrames(frames.scenario, frames.rigs["r"], steps=8, seed=2, reference=SMALL)[6]
+    without = SimulatedFrames(frames.scenario, frames.rigs["r"], steps=8, seed=2, reference_sensor=SMALL)[6]
     assert without.boxes is None
     assert torch.equal(without.sensor, late_first.sensor)
     assert torch.equal(without.reference, late_first.reference)
@@ -256,7 +257,7 @@ def test_frames_without_objects_pad_to_nothing_and_frames_without_boxes_say_what
 
 
 def test_a_world_without_objects_has_no_boxes_which_is_not_the_same_as_none():
-    frame = SimulatedFrames("courtyard", "front_roof_32", steps=1, reference=SMALL, boxes=True)[0]
+    frame = SimulatedFrames("courtyard", "front_roof_32", steps=1, reference_sensor=SMALL, boxes=True)[0]
     assert len(frame.boxes) == 0
     assert frame.boxes.hits["front_roof_32"].shape == (0,)
 

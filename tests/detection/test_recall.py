@@ -11,9 +11,8 @@ import pytest
 import torch
 from scipy.stats import binomtest
 
-from torchcover.data import Boxes
-from torchcover.training import RecallByVisibility, bev_iou, match
-from torchcover.training.recall_curve import Ratio
+from torchcover.detection import Boxes, RecallByVisibility, bev_iou, match
+from torchcover.detection.recall_curve import Ratio
 
 VISIBILITY, DISTANCE = (0.2, 0.4, 0.6, 0.8), (20.0, 40.0, 60.0)
 

@@ -9,11 +9,11 @@ import torch
 from torch import Tensor
 from torchmetrics import Metric
 
-from torchcover.data import Boxes
-from torchcover.training.detected_frame import DetectedFrame
-from torchcover.training.matching import MatchBy, match
-from torchcover.training.recall_curve import DetectionCounts
-from torchcover.training.visibility import BoxVisibility
+from torchcover.detection.boxes import Boxes
+from torchcover.detection.detected_frame import DetectedFrame
+from torchcover.detection.matching import MatchBy, match
+from torchcover.detection.recall_curve import DetectionCounts
+from torchcover.detection.visibility import BoxVisibility
 
 T = TypeVar("T")
 
@@ -21,7 +21,7 @@ T = TypeVar("T")
 class RecallByVisibility(Metric):
     """Recall and precision in bins of visibility and of distance, so that a miss and a blind spot can be told apart.
 
-    Detections are matched to objects by `torchcover.training.match`. An object's visibility is its share from
+    Detections are matched to objects by `torchcover.detection.match`. An object's visibility is its share from
     `box_visibility`, and its distance that of its centre from the vehicle's origin, over ground. Bins are half-open
     [lo, hi), the last ones closed by 1 and open to infinity; objects of unknown visibility have a bin of their own.
 

@@ -16,7 +16,7 @@ BACKENDS = {
 
 # On the CPU brute force beats the tree only for few queries against many points, where building it does not pay
 # (docs/performance.md, crossover).
-FEW_QUERIES = 16
+MAX_QUERIES_COMPARED = 16
 MANY_POINTS = 10_000
 # Queries that are measured together on a CPU.
 PART = 32_768
@@ -165,7 +165,7 @@ def _check_together(query: Tensor, points: Tensor, max_distance: float, memory_m
 def _choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
     on_cpu = query.device.type == "cpu"
     if backend == "auto":
-        tree_pays = len(query) > FEW_QUERIES or len(points) < MANY_POINTS
+        tree_pays = len(query) > MAX_QUERIES_COMPARED or len(points) < MANY_POINTS
         backend = "kdtree" if on_cpu and tree_pays else "cdist"
     if backend not in BACKENDS:
         raise ValueError(f"backend: one of {', '.join(['auto', *BACKENDS])} is needed; got {backend!r}")

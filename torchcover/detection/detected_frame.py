@@ -5,9 +5,8 @@ import math
 import torch
 from torch import Tensor
 
-from torchcover.data import Boxes
-from torchcover.data.boxes import check_boxes
-from torchcover.training.visibility import BoxVisibility
+from torchcover.detection.boxes import Boxes, check_boxes
+from torchcover.detection.visibility import BoxVisibility
 
 
 class DetectedFrame:

@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 
-from torchcover.data import Boxes, SimulatedFrames
-from torchcover.simulation import ReferenceSensor
-from torchcover.training import box_visibility
+from torchcover.data import SimulatedFrames
+from torchcover.detection import Boxes, box_visibility
+from torchcover.simulation import PaperReference
 
 TWO = Boxes.from_rows(torch.tensor([[10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0], [30.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.6]]))
 
@@ -137,8 +137,8 @@ def test_bad_input_is_refused(changes, message):
 
 def test_in_a_simulated_frame_what_lies_behind_the_rig_is_blind_and_what_is_seen_holds_points():
     # Level, it sees all around.
-    reference = ReferenceSensor(rows=512, columns=512, max_tilt_deg=0.0)
-    frame = SimulatedFrames("highway", "front_roof_128", steps=1, seed=1, reference=reference, boxes=True)[0]
+    reference = PaperReference(rows=512, columns=512, max_tilt_deg=0.0)
+    frame = SimulatedFrames("highway", "front_roof_128", steps=1, seed=1, reference_sensor=reference, boxes=True)[0]
     seen = box_visibility(frame.sensor, frame.reference, frame.boxes)
     known = seen.known
     assert known.sum() >= 5

@@ -51,7 +51,7 @@ class Polar:
 
 
 @dataclass(frozen=True)
-class Region:
+class ValidRegion:
     """The valid region of a distortion.
 
     Args:
@@ -70,7 +70,7 @@ class Region:
         return (determinant > 0.0) & self.guard.holds(np.sqrt(a * a + b * b), a, b)
 
 
-def find_region(distortion: Distortion, limit: float) -> Region:
+def find_region(distortion: Distortion, limit: float) -> ValidRegion:
     """Find the valid region.
 
     Args:
@@ -94,7 +94,7 @@ def find_region(distortion: Distortion, limit: float) -> Region:
     again = good & (radii > edge[:, None])
     next_good = np.where(again.any(axis=1), radii[again.argmax(axis=1)], 2.0 * limit)
     guard = ((edge + next_good) / 2.0).clip(max=limit)
-    return Region(Polar(edge), Polar(guard), Polar(_reach(distortion, edge * cosine, edge * sine)))
+    return ValidRegion(Polar(edge), Polar(guard), Polar(_reach(distortion, edge * cosine, edge * sine)))
 
 
 def _radii(distortion: Distortion, limit: float) -> Array:

@@ -7,8 +7,7 @@ from pathlib import Path
 import torch
 import torch.distributed as dist
 
-from torchcover.data import Boxes
-from torchcover.training import RecallByVisibility
+from torchcover.detection import Boxes, RecallByVisibility
 
 rank, folder = int(sys.argv[1]), Path(sys.argv[2])
 dist.init_process_group(

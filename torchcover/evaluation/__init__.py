@@ -1,0 +1,1 @@
+"""The pipeline: frames in, observers fed from them, results out."""

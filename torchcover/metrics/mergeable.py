@@ -1,0 +1,156 @@
+"""A torchmetrics metric whose state is sums with a meaning: merged, loaded and synchronised exactly, or refused."""
+
+import hashlib
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities.distributed import gather_all_tensors
+
+
+class MergeableMetric(Metric):
+    """Base of the metrics: fixed-size sums over steps, and the parameters that say what they are sums of.
+
+    * Two metrics over different steps merge exactly: `merge_state`, or over ranks when `compute` is called.
+    * Sums that mean different things are never added: a fingerprint of class and parameters is part of the state. It
+      is compared in `merge_state`, `load_state_dict` and the synchronisation of ranks, and it keeps a
+      `MetricCollection` from sharing the sums of metrics that happen to agree after the first step.
+    * States are copies: nothing that is loaded or merged is written to later.
+    * `.to(torch.float16)` moves the sums but does not round them.
+
+    A metric passes its parameters to `__init__`, adds its states with `add_sum` and `add_maximum`, and counts `steps`.
+
+    Args:
+        meaning: What the sums depend on, by the name of the parameter; compared by `==` and `repr`.
+        kwargs: For `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
+
+    Example:
+        >>> class Points(MergeableMetric):
+        ...     def __init__(self, above_m: float) -> None:
+        ...         super().__init__({"above_m": above_m})
+        ...         self.add_sum("points", (), torch.int64)
+        ...     def update(self, cloud):
+        ...         self.points += (cloud[:, 2] > self.meaning["above_m"]).sum()
+        ...         self.steps += 1
+        ...     def compute(self):
+        ...         return int(self.points)
+        >>> low, high = Points(0.0), Points(1.0)
+        >>> low.update(torch.ones(5, 3))
+        >>> low.compute()
+        5
+        >>> high.merge_state(low)
+        Traceback (most recent call last):
+        ValueError: cannot merge metrics with different above_m: 1.0 and 0.0
+    """
+
+    is_differentiable = False
+    higher_is_better = None
+    full_state_update = False
+
+    fingerprint: Tensor
+    steps: Tensor
+
+    def __init__(self, meaning: Mapping[str, object], **kwargs: Any) -> None:  # noqa: ANN401  (whatever torchmetrics takes)
+        super().__init__(**kwargs)
+        self.meaning = dict(meaning)
+        self.add_state("fingerprint", self._fingerprint(), dist_reduce_fx="max", persistent=True)
+        self.add_sum("steps", (), torch.int64)
+
+    def _fingerprint(self) -> Tensor:
+        """(32,) int64 numbers in [0, 256), equal for two metrics exactly if their sums mean the same."""
+        meaning = repr((type(self).__name__, sorted(self.meaning.items())))
+        return torch.tensor(list(hashlib.sha256(meaning.encode()).digest()))
+
+    def add_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:
+        """Add a state that starts at zero and adds up; float64 or int64, for sums grow."""
+        self.add_state(name, torch.zeros(shape, dtype=dtype), dist_reduce_fx="sum", persistent=True)
+
+    def add_maximum(self, name: str, shape: tuple[int, ...]) -> None:
+        """Add a float64 state that starts at minus infinity and keeps the largest."""
+        lowest = torch.full(shape, -math.inf, dtype=torch.float64)
+        self.add_state(name, lowest, dist_reduce_fx="max", persistent=True)
+
+    def merge_state(self, incoming_state: "dict[str, Any] | Metric") -> None:
+        """Add the steps of another metric with the same parameters, which is left as it was.
+
+        Args:
+            incoming_state: Such a metric, or its `metric_state`.
+
+        Raises:
+            ValueError: Another kind of metric, or other parameters.
+        """
+        if isinstance(incoming_state, MergeableMetric) and type(incoming_state) is type(self):
+            for name, mine in self.meaning.items():
+                other = incoming_state.meaning.get(name)
+                if mine != other:
+                    raise ValueError(f"cannot merge metrics with different {name}: {mine} and {other}")
+        elif isinstance(incoming_state, Metric):
+            raise ValueError(f"cannot merge a {type(incoming_state).__name__} into a {type(self).__name__}")
+        else:
+            self._check_fingerprint(incoming_state.get("fingerprint"))
+        super().merge_state(incoming_state)
+        self._follow_steps()
+
+    def _reduce_states(self, incoming_state: dict[str, Any]) -> None:
+        incoming = {name: value.clone() for name, value in incoming_state.items()}
+        self._align_with(incoming)
+        super()._reduce_states(incoming)
+
+    def _align_with(self, incoming: dict[str, Any]) -> None:
+        """Bring this state and another one, a copy, into a form in which they can be added up."""
+
+    def _sync_dist(self, dist_sync_fn: Callable[..., Any] = gather_all_tensors, process_group: Any = None) -> None:  # noqa: ANN401
+        # Every rank sees the fingerprints of all, so that all of them raise and none waits for the others.
+        first, *others = dist_sync_fn(self.fingerprint, group=process_group or self.process_group)
+        for rank, other in enumerate(others, 1):
+            if not torch.equal(other, first):
+                raise ValueError(
+                    f"{type(self).__name__} has other parameters on rank {rank} than on rank 0: their sums do not mean "
+                    "the same; make it with the same arguments on every rank"
+                )
+        self._align_ranks(dist_sync_fn, process_group)
+        super()._sync_dist(dist_sync_fn, process_group)
+
+    def _align_ranks(self, dist_sync_fn: Callable[..., Any], process_group: Any) -> None:  # noqa: ANN401
+        """Bring the states of all ranks into a form in which they can be added up."""
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:  # noqa: ANN401
+        # torchmetrics keeps the very tensors it is given, of any shape, and `update` adds into them in place.
+        for name in self._defaults:
+            if (loaded := state_dict.get(prefix + name)) is not None:
+                mine = getattr(self, name)
+                if loaded.shape != mine.shape:
+                    raise ValueError(
+                        f"state {name!r} has shape {tuple(loaded.shape)}; this metric's parameters need "
+                        f"{tuple(mine.shape)}"
+                    )
+                state_dict[prefix + name] = loaded.to(device=mine.device, dtype=mine.dtype, copy=True)
+        if prefix + "fingerprint" in state_dict:
+            self._check_fingerprint(state_dict[prefix + "fingerprint"])
+        super()._load_from_state_dict(state_dict, prefix, *args)
+        self._follow_steps()
+
+    def _check_fingerprint(self, other: Tensor | None) -> None:
+        if other is None or not torch.equal(other.to(self.fingerprint), self.fingerprint):
+            names = ", ".join(self.meaning)
+            raise ValueError(
+                f"the state was made by another metric than this {type(self).__name__}, or with other {names}"
+            )
+
+    def _follow_steps(self) -> None:
+        # torchmetrics would go on answering from the result it had cached.
+        self._computed = None
+        self._update_count = int(self.steps)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], *args: Any, **kwargs: Any) -> "MergeableMetric":  # noqa: ANN401
+        """Move the state to another device, but leave its type."""
+
+        def moved(state: Tensor) -> Tensor:
+            converted = fn(state)
+            return converted if converted.dtype == state.dtype else state.to(converted.device)
+
+        super()._apply(moved, *args, **kwargs)
+        return self
