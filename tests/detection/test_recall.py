@@ -232,7 +232,7 @@ def test_lists_are_the_same_as_frame_by_frame_and_halves_merge():
     first.compute()
     first.merge_state(second)
     assert counts_of(first) == counts_of(whole)
-    assert first.compute().frames == 40
+    assert first.compute().steps == 40
 
 
 def test_states_are_sums_of_fixed_size_and_survive_a_checkpoint():
@@ -246,7 +246,7 @@ def test_states_are_sums_of_fixed_size_and_survive_a_checkpoint():
     )
     again = RecallByVisibility(score_thresholds=(0.0, 0.5))
     again.load_state_dict(many.state_dict())
-    for name in (*NAMES, "frames"):
+    for name in (*NAMES, "steps"):
         assert torch.equal(getattr(again, name), getattr(many, name))
     many.reset()
     assert not any(value.any() for value in many.metric_state.values())
@@ -338,7 +338,7 @@ def test_frames_without_objects_or_detections_are_counted_and_break_nothing(coun
     none = Boxes.from_rows(torch.empty(0, 7))
     metric.update(torch.rand(count, 7), none, torch.empty(0), torch.rand(count))
     result = metric.compute()
-    assert result.frames == 1
+    assert result.steps == 1
     assert result.overall().recall.value.isnan().all()
     assert result.overall().precision.trials.item() == count
 
@@ -409,7 +409,7 @@ def test_bad_frames_are_refused_and_leave_the_state_alone(changes, message):
     }
     with pytest.raises(ValueError, match=message):
         metric.update(**{**good, **changes})
-    assert int(metric.frames) == 0
+    assert int(metric.steps) == 0
 
 
 def test_a_frame_in_which_nobody_looked_for_objects_is_refused():
