@@ -2,10 +2,6 @@
 
 import copy
 import math
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -298,35 +294,6 @@ def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
 def test_numbers_of_steps_that_make_no_sense_are_refused(index, message):
     with pytest.raises(ValueError, match=message):
         CoverageMetric(GRID, blocks=16).update(*clouds_of({0: [0.5]}), index=index)
-
-
-def test_two_ranks_with_different_numbers_of_steps_equal_one_process(tmp_path):
-    steps = random_steps(75, dyadic=True)
-    shares = [steps[:20:2], [step for at, step in enumerate(steps) if at >= 20 or at % 2]]
-    job = {"grid": SHAPE, "options": {"thresholds": (THRESHOLD,), "blocks": 16}}
-    job["shares"] = [[(step["clouds"], step["more"]) for step in share] for share in shares]
-    torch.save(job, tmp_path / "job.pt")
-    environment = {**os.environ, "GLOO_SOCKET_IFNAME": "lo0" if sys.platform == "darwin" else "lo"}
-    environment.update(OMP_NUM_THREADS="1", PYTHONPATH=os.pathsep.join(p for p in sys.path if p))
-    script = str(Path(__file__).with_name("one_rank_in_blocks.py"))
-    ranks = [
-        subprocess.Popen(
-            [sys.executable, script, str(rank), str(tmp_path)], env=environment, stderr=subprocess.PIPE, text=True
-        )
-        for rank in range(2)
-    ]
-    try:
-        errors = [process.communicate(timeout=280)[1] for process in ranks]
-    finally:
-        for process in ranks:
-            process.kill()
-    assert [process.returncode for process in ranks] == [0, 0], errors
-    expected = metric_over(steps).compute().blocks
-    found = [torch.load(tmp_path / f"{rank}.pt") for rank in range(2)]
-    assert [blocks["own_length"] for blocks in found] == [2, 8]
-    for blocks in found:
-        for name, value in vars(expected).items():
-            assert torch.equal(blocks[name], value), name
 
 
 # Weights
