@@ -469,21 +469,25 @@ def test_a_checkpoint_between_epochs_holds_no_sums_and_one_within_an_epoch_does(
 
 
 def test_memory_does_not_grow_over_epochs(tmp_path):
-    counts = []
+    counts, counted = [], []
 
     class Count(pl.Callback):
+        def on_train_batch_end(self, *arguments):
+            counted.append(len(callback.state_dict()["frames"]["counted"]))
+
         def on_train_epoch_end(self, trainer, pl_module):
             gc.collect()
             # `type`, as `isinstance` asks deprecated objects of torch for their class.
             tensors = [thing for thing in gc.get_objects() if issubclass(type(thing), torch.Tensor)]
             size = sum(tensor.numel() * tensor.element_size() for tensor in tensors)
-            counts.append((len(tensors), size, len(callback._once._counted)))
+            counts.append((len(tensors), size))
 
     callback = CoverageCallback(make_metric(), stage="train")
     logger = TensorBoardLogger(tmp_path, name="", version="run")
     trainer = make_trainer(tmp_path, callback, Count(), logger=logger, max_epochs=4)
     trainer.fit(Model(), loader(6))
     assert counts[1:] == [counts[1]] * 3
+    assert counted == [2, 4, 6] * 4
 
 
 @pytest.mark.parametrize(
