@@ -14,6 +14,7 @@ from torch.utils.data import BatchSampler, DataLoader, DistributedSampler
 from torchcover import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.data import Frame, collate_frames
 from torchcover.training import CountOnce, frames_of_batch_dict, shard_of
+from torchcover.training.counting import Shard
 
 GRID = {"x": (0.0, 8.0), "y": (-2.0, 2.0), "cell": 1.0}
 REGION = Region("all", x=GRID["x"], y=GRID["y"])
@@ -106,7 +107,7 @@ def test_a_number_of_samples_that_is_told_at_the_end_gives_the_same(samples, pro
         )
         known, told_late = CountOnce(), CountOnce()
         expected = [frame for batch in loader for frame in known.new(batch.frames, shard_of(loader))]
-        unknown = shard_of(loader)._replace(samples=None)
+        unknown = Shard(rank, processes, None)
         counted = [frame for batch in loader for frame in told_late.new(batch.frames, unknown)]
         counted += told_late.new([], shard_of(loader))
         assert [frame.index for frame in counted] == [frame.index for frame in expected]
