@@ -80,6 +80,9 @@ class EvenReference:
         Args:
             areas: As above.
             rays: About how many rays; 262,144 if not given.
+
+        Raises:
+            ValueError: As for the class.
         """
         return cls(areas, DEFAULT_RAYS if rays is None else rays)
 

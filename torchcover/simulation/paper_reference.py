@@ -73,10 +73,15 @@ class PaperReference:
         Args:
             areas: Not used.
             rays: About how many rays; 1024 x 1024 if not given.
+
+        Raises:
+            ValueError: Fewer than 1 ray.
         """
         if rays is None:
             return cls()
-        side = max(1, round(math.sqrt(rays)))
+        if rays < 1:
+            raise ValueError(f"rays: at least 1 is needed; got {rays}")
+        side = round(math.sqrt(rays))
         return cls(rows=side, columns=side)
 
     def directions(self) -> Float64:

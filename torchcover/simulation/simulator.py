@@ -88,7 +88,8 @@ class Simulator:
 
         Raises:
             FileNotFoundError: A mesh, vehicle or trajectory file is missing.
-            ValueError: A sensor inside the ego's body, an actor that overlaps the ego, an ego below the ground.
+            ValueError: A negative index, a sensor inside the ego's body, an actor that overlaps the ego, an ego below
+                the ground.
         """
         stage, step = self._stage(index)
         instant = stage.scene.at(step, within_m=self._reach_m(stage.scene.ego_box))
@@ -116,6 +117,8 @@ class Simulator:
         return stage.scene, step
 
     def _stage(self, index: int) -> tuple[Stage, int]:
+        if index < 0:
+            raise ValueError(f"index: a number >= 0 is needed; got {index}")
         run, step = self.scenario.locate(index * self._every_steps)
         return self._stages.of_run(run), step
 
@@ -127,7 +130,7 @@ class Simulator:
             for rig in self.rigs.values()
             for sensor in rig.sensors
         ]
-        return max(float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches)
+        return max([float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches])
 
     def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[Scan]:
         scans = []
