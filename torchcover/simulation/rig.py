@@ -12,7 +12,7 @@ from torchcover.simulation.sensor import Sensor
 
 def _sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whatever stood in the file, or a sensor)
     """A sensor of the kind that its `type` names."""
-    kind = content.get("type", "lidar") if isinstance(content, dict) else getattr(content, "type", None)
+    kind = content.get("type", "lidar") if isinstance(content, dict) else getattr(content, "type", type(content))
     if not isinstance(kind, str) or kind not in SENSORS:
         raise ValueError(f"type: a sensor is a {' or a '.join(map(repr, SENSORS))}; got {kind!r}")
     return TypeAdapter(SENSORS[kind]).validate_python(content, context=info.context)
