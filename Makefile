@@ -1,4 +1,4 @@
-# `make demo` and `make test` need Python >= 3.10, git and make, nothing else: the environment is built on first use.
+# `make demo` and `make test` need Python >= 3.11, git and make, nothing else: the environment is built on first use.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
