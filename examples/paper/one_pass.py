@@ -8,7 +8,7 @@ import torch
 from rich.progress import track
 
 from torchcover import BevGrid, Coverage, CoverageMetric
-from torchcover.cli.run import outline_m, sensor_marks
+from torchcover.cli.run import sensor_marks
 from torchcover.data import SimulatedFrames
 from torchcover.report import SensorMark
 from torchcover.simulation import EvenReference, PaperReference
@@ -60,7 +60,7 @@ def one_pass(measured, counted, regions, options):
     return OnePass(
         coverages={key: metric.compute() for key, metric in metrics.items()},
         points=points,
-        ego_outline_m=outline_m(frames.scene.ego_box),
+        ego_outline_m=frames.scenario.ego_box().outline_m,
         marks={name: sensor_marks(rig) for name, rig in frames.rigs.items()},
         seconds=time.perf_counter() - start,
     )

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from torchcover.cli.explain import explanation, left_out
-from torchcover.cli.run import Progression, accumulate, check_out, device_called, new_metric, outline_m, sensor_marks
+from torchcover.cli.run import Progression, accumulate, check_out, device_called, new_metric, sensor_marks
 from torchcover.cli.settings import Settings, reference_note, reference_record, run_record, simulated_frames
 from torchcover.cli.stopping import TargetWatch, outcome
 from torchcover.coverage import Coverage, forward_regions
@@ -98,7 +98,7 @@ def _write(
     maps = draw_comparison(
         coverages,
         settings.out / "maps",
-        ego_outline_m=outline_m(frames.scene.ego_box),
+        ego_outline_m=frames.scenario.ego_box().outline_m,
         sensors={name: sensor_marks(rig) for name, rig in frames.rigs.items()},
         errors=settings.error_maps,
     )

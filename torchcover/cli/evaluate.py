@@ -18,7 +18,6 @@ from torchcover.cli.run import (
     check_out,
     device_called,
     new_metric,
-    outline_m,
     sensor_marks,
 )
 from torchcover.cli.settings import Settings, reference_note, reference_record, run_record, simulated_frames
@@ -130,4 +129,4 @@ def _run_record(request: Request, progression: Progression, frames: Dataset[Fram
 
 
 def _ego_outline(frames: Dataset[Frame]) -> NDArray[np.float64] | None:
-    return outline_m(frames.scene.ego_box) if isinstance(frames, SimulatedFrames) else None
+    return frames.scenario.ego_box().outline_m if isinstance(frames, SimulatedFrames) else None

@@ -10,9 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from torch.utils.data import DataLoader, Dataset
@@ -20,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from torchcover.cli.stopping import TargetWatch
 from torchcover.coverage import BevGrid, CoverageMetric
 from torchcover.data import BadFrameError, Frame, FrameBatch, collate_frames
-from torchcover.geometry import BoundingBox, euler_from_rotation
+from torchcover.geometry import euler_from_rotation
 from torchcover.report import SensorMark
 from torchcover.simulation import Rig
 
@@ -150,12 +148,6 @@ def accumulate(
     if not int(metrics[0].steps):
         raise progression.failure or ValueError("no frame could be used; nothing is written")
     return progression
-
-
-def outline_m(box: BoundingBox) -> NDArray[np.float64]:
-    """(4, 2) corners x, y of a box seen from above, counter-clockwise."""
-    (x0, y0, _), (x1, y1, _) = box.lower_m, box.upper_m
-    return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
 
 
 def sensor_marks(rig: Rig) -> list[SensorMark]:

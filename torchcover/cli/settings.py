@@ -1,6 +1,5 @@
 """What `evaluate` and `compare` let the user set in the same way, and what they make of it."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +12,9 @@ from torchcover.cli.run import GRID_X_M, GRID_Y_M, Progression
 from torchcover.cli.stopping import TargetError
 from torchcover.coverage import forward_regions
 from torchcover.data import Frame, SimulatedFrames
-from torchcover.simulation import EvenReference, PaperReference, Rig, Scenario
+from torchcover.simulation import REFERENCE_SENSORS, ReferenceSensor, Rig, Scenario
 
 DEFAULT_REFERENCE = "even"
-# The best of those tried for runs of seconds to a minute: `torchcover study`, docs/accuracy.md.
-DEFAULT_EVEN_RAYS = 262_144
 DEFAULT_STEPS = 64
 # A world is built once a minute of traffic, for about the price of eight steps: docs/accuracy.md has the trade.
 EVERY_S_IN_TRAFFIC = 10.0
@@ -70,23 +67,22 @@ def every_s_of(scenario: Scenario, given_s: float | None) -> float | None:
     return EVERY_S_IN_TRAFFIC if given_s is None and scenario.traffic is not None else given_s
 
 
-def reference_called(name: str | None, rays: int | None) -> PaperReference | EvenReference:
+def reference_called(name: str | None, rays: int | None) -> ReferenceSensor:
     """The reference sensor of `--reference` and `--rays`.
 
     Args:
-        name: "even", spread over the paper's regions and the whole grid, or "paper"; None for the default.
-        rays: Rays at each step, for the paper's rounded to a square; None for the sensor's own.
+        name: One of `REFERENCE_SENSORS`, which is asked about the paper's regions and the grid; None for the default.
+        rays: About how many rays at each step; None for the sensor's own number.
 
     Raises:
         ValueError: Another name, or too few rays.
     """
-    if (name or DEFAULT_REFERENCE) == "even":
-        areas = (*((region.x, region.y) for region in forward_regions()), (GRID_X_M, GRID_Y_M))
-        return EvenReference(areas, rays=rays or DEFAULT_EVEN_RAYS)
-    if name == "paper":
-        side = 1024 if rays is None else max(1, round(math.sqrt(rays)))
-        return PaperReference(rows=side, columns=side)
-    raise ValueError(f"--reference {name}: `even` or `paper` is needed")
+    kind = REFERENCE_SENSORS.get(name or DEFAULT_REFERENCE)
+    if kind is None:
+        known = " or ".join(f"`{name}`" for name in REFERENCE_SENSORS)
+        raise ValueError(f"--reference {name}: {known} is needed")
+    areas = (*((region.x, region.y) for region in forward_regions()), (GRID_X_M, GRID_Y_M))
+    return kind.from_rays(areas, rays)
 
 
 def reference_record(

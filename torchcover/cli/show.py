@@ -9,14 +9,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 
-from torchcover.cli.run import DEFAULT_SCENARIO, GRID_X_M, GRID_Y_M, outline_m
+from torchcover.cli.run import DEFAULT_SCENARIO, GRID_X_M, GRID_Y_M
 from torchcover.data import SimulatedFrames
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
 from torchcover.report import ActorMark, SensorView, draw_depths, draw_rig, draw_scene
-from torchcover.simulation import CameraSensor, PaperReference, Rig, Scenario, builtin_names
+from torchcover.simulation import CameraSensor, PaperReference, Rig, Scenario, Sensor, builtin_names, vertical_fov_deg
 from torchcover.simulation.instant import Instant
-from torchcover.simulation.rig import Sensor
 from torchcover.simulation.world import Actor, World
 
 DEFAULT_RIG = "front_roof_128"
@@ -80,9 +79,9 @@ def _cameras(rig: Rig) -> list[CameraSensor]:
 def _draw_rig(rig: Rig, scenario: Scenario, step: int, seed: int) -> dict[str, Figure]:
     """The rig on its vehicle, and the depth images if it has cameras, by the suffix of the file name."""
     frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference_sensor=REFERENCE)
-    scene, step_of_world = frames.scene_of(step)
+    scene, step_of_world = frames.simulator.scene_of(step)
     ego = scene.world.ego.mesh
-    length, width, height = BoundingBox.around(ego.vertices_m).size_m
+    length, width, height = scene.ego_box.size_m
     subtitle = f"on the ego of {scenario.name}, {length:.2f} x {width:.2f} x {height:.2f} m"
     sensors = [_sensor_view(sensor) for sensor in rig.sensors]
     figures = {"": draw_rig(ego.vertices_m, ego.faces, sensors, title=rig.name, subtitle=subtitle)}
@@ -99,14 +98,11 @@ def _depth_image(camera: CameraSensor, instant: Instant) -> NDArray[np.float32]:
 
 
 def _sensor_view(sensor: Sensor) -> SensorView:
-    x, y, z = sensor.directions()
-    middle = x.shape[1] // 2
-    elevation_deg = np.rad2deg(np.arctan2(z, np.hypot(x, y)))[:, middle]
     return SensorView(
         name=sensor.name,
         vehicle_T_sensor=sensor.mount.matrix(),
         horizontal_fov_deg=sensor.horizontal_fov_deg,
-        vertical_fov_deg=(float(np.nanmin(elevation_deg)), float(np.nanmax(elevation_deg))),
+        vertical_fov_deg=vertical_fov_deg(sensor),
         range_m=sensor.max_range_m,
     )
 
@@ -114,13 +110,13 @@ def _sensor_view(sensor: Sensor) -> SensorView:
 def _draw_scenario(scenario: Scenario, rig: Rig, step: int, seed: int) -> Figure:
     frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference_sensor=REFERENCE)
     frame = frames[step]
-    scene, step_of_world = frames.scene_of(step)
+    scene, step_of_world = frames.simulator.scene_of(step)
     world = scene.world
     time_s = step_of_world * world.time_step_s
     return draw_scene(
         GRID_X_M,
         GRID_Y_M,
-        ego_outline_m=outline_m(BoundingBox.around(world.ego.mesh.vertices_m)),
+        ego_outline_m=scene.ego_box.outline_m,
         actors=_actor_marks(world, time_s),
         sensor=frame.sensor.numpy(),
         reference=frame.reference.numpy(),
@@ -136,6 +132,6 @@ def _actor_marks(world: World, time_s: float) -> list[ActorMark]:
 
 
 def _footprint_m(actor: Actor, vehicle_T_world: Matrix, time_s: float) -> Matrix:
-    corners = outline_m(BoundingBox.around(actor.mesh.vertices_m))
+    corners = BoundingBox.around(actor.mesh.vertices_m).outline_m
     on_ground = np.column_stack([corners, np.zeros(len(corners))])
     return transform(vehicle_T_world @ actor.trajectory.at(time_s), on_ground)[:, :2]

@@ -132,7 +132,7 @@ def _one_run(
     stops = {max(1, request.steps >> halvings) for halvings in range(6)}
     for index in bar.track(range(request.steps), description=f"seed {seed}"):
         start = time.perf_counter()
-        settings[0].frames.scene_of(index)  # each of them would have built it alone
+        settings[0].frames.simulator.scene_of(index)  # each of them would have built it alone
         world_seconds = time.perf_counter() - start
         for setting in settings:
             setting.seconds += world_seconds
@@ -211,7 +211,7 @@ def _stages(request: Request) -> list[dict[str, Any]]:
 
 
 def _one_step(setting: Setting, index: int) -> tuple[float, float, float, float]:
-    setting.frames.scene_of(index)  # not counted: it comes once for many steps
+    setting.frames.simulator.scene_of(index)  # not counted: it comes once for many steps
     start = time.perf_counter()
     frame = setting.frames[index]
     cast = time.perf_counter()
