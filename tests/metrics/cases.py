@@ -9,6 +9,7 @@ import torch
 from torchmetrics import Metric
 
 from torchcover import BevGrid, CoverageMetric
+from torchcover.coverage import Maximum, PooledMean, Quantiles, StepQuantiles
 from torchcover.detection import Boxes, RecallByVisibility
 
 Step = Mapping[str, Any]
@@ -53,6 +54,8 @@ def flat(value: object, path: str = "") -> dict[str, object]:
     """Every tensor and every plain value that a result holds, by where it is."""
     if isinstance(value, Mapping):
         parts = value
+    elif isinstance(value, tuple | list):
+        parts = dict(enumerate(value))
     elif hasattr(value, "__dict__") and not isinstance(value, torch.Tensor):
         parts = vars(value)
     else:
@@ -65,7 +68,7 @@ def flat(value: object, path: str = "") -> dict[str, object]:
 SHAPE = {"x": (-2.0, 2.0), "y": (-1.0, 1.0), "cell": 0.5}
 BANDS = {"low": (-2.0, 0.0), "high": (0.0, 2.0)}
 COVERAGE = {"grid": BevGrid(**SHAPE, heights=BANDS), "thresholds": (0.4, 0.8), "max_radius": 3.0}
-EVERYTHING = {"blocks": 8, "maximum": True, "pooled": True, "quantiles": (0.5,)}
+ALL = (Maximum(), PooledMean(), Quantiles((0.5,)), StepQuantiles((0.5,)))
 
 
 def coverage_step(index: int) -> Step:
@@ -115,7 +118,14 @@ def detection_step(seed: int) -> Step:
 CASES = {
     "coverage": coverage(12, {}),
     "coverage, everything": coverage(
-        40, {"maximum": {"maximum": False}, "pooled": {"pooled": False}, "quantiles": {"quantiles": ()}}, **EVERYTHING
+        40,
+        {
+            "aggregations, one less": {"aggregations": ALL[1:]},
+            "aggregations in another order": {"aggregations": ALL[::-1]},
+            "aggregations, other levels": {"aggregations": (*ALL[:3], StepQuantiles((0.9,)))},
+        },
+        blocks=8,
+        aggregations=ALL,
     ),
     "recall": Case(
         lambda **changed: RecallByVisibility(**{"score_thresholds": (0.0, 0.5), **changed}),
