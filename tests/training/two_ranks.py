@@ -98,7 +98,7 @@ def fit(name, *callbacks, ckpt_path=None):
     blocks = {}
     for stage, callback in (("train", train), ("val", validation)):
         callback.coverage.save(folder / f"{name}_{stage}_{trainer.global_rank}.npz")
-        blocks[stage] = callback.coverage.blocks.radius_sum
+        blocks[stage] = callback.coverage.blocks.sums
     logged = {tag: float(value) for tag, value in trainer.callback_metrics.items()}
     result = {"logged": logged, "images": logger.images, "blocks": blocks}
     torch.save(result, folder / f"{name}_{trainer.global_rank}.pt")
@@ -116,7 +116,7 @@ def two_processes():
 
 
 if __name__ == "__main__":
-    figures.map_figures = lambda coverage: [("radius", Figure((1, 1))), ("detection", Figure((1, 1)))]
+    figures.band_figures = lambda coverage: [("radius", Figure((1, 1))), ("detection", Figure((1, 1)))]
     child = two_processes()
     fit("whole", SaveWithinEpoch())
     fit("resumed", ckpt_path=folder / "within.ckpt")
