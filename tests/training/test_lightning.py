@@ -329,7 +329,7 @@ def test_tensorboard_holds_the_tags_values_and_maps(tmp_path):
         last = events.Scalars(f"coverage/val/{name}")
         assert [event.value for event in last] == pytest.approx([value], rel=1e-6)
         assert [event.step for event in last] == [1]
-    maps = {f"coverage/val/{name}" for name in ("radius", "detection_0.4m", "detection_0.8m")}
+    maps = {f"coverage/val/{name}" for name in ("radius_m", "detection_0.4m", "detection_0.8m")}
     assert set(events.Tags()["images"]) == maps
     for tag in maps:
         images = events.Images(tag)
@@ -341,7 +341,7 @@ def test_tensorboard_holds_the_tags_values_and_maps(tmp_path):
 def test_a_logger_that_takes_images_gets_pixels(tmp_path):
     logger = TakesImages()
     make_trainer(tmp_path, CoverageCallback(make_metric()), logger=logger).fit(Validated(), loader(2), loader(3))
-    assert [key for key, _, _ in logger.images] == ["coverage/val/radius", "coverage/val/detection_0.4m"]
+    assert [key for key, _, _ in logger.images] == ["coverage/val/radius_m", "coverage/val/detection_0.4m"]
     for _, _, image in logger.images:
         assert image.dtype == np.uint8
         assert image.shape[2] == 3
