@@ -145,17 +145,17 @@ def test_ctrl_c_between_two_rigs_leaves_a_paired_result(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "Missing argument"),
+        ([], "which rig?"),
         (["front_roof_128"], "at least two rigs; got 'front_roof_128' only"),
         (["front_roof_128", "no_such_rig"], "neither a .yaml file nor one of the built-in rigs: argoverse2,"),
         (["front_roof_128", "none.yaml"], "none.yaml: no such file"),
         (["kitti", "nuscenes", "--scenario", "moon"], "one of the built-in scenarios: courtyard"),
         (["kitti", "nuscenes", "--cell", "0.3"], "not a multiple of the cell"),
         (["kitti", "nuscenes", "--threshold", "-1"], "thresholds: distances >= 0"),
-        (["kitti", "nuscenes", "--device", "abacus"], "--device abacus: cannot be used here"),
+        (["kitti", "nuscenes", "--device", "abacus"], "device abacus: cannot be used here"),
         (["kitti", "nuscenes", "--steps", "0"], "--steps"),
-        (["kitti", "nuscenes", "--target-error", "10cm"], "--target-error 10cm: a positive number with its unit"),
-        (["kitti", "nuscenes", "--reference", "best"], "--reference best: `even` or `paper` is needed"),
+        (["kitti", "nuscenes", "--target-error", "10cm"], "target error 10cm: a positive number with its unit"),
+        (["kitti", "nuscenes", "--reference", "best"], "reference best: `even` or `paper` is needed"),
         (["kitti", "nuscenes", "--rays", "7"], "rays: at least 2 for each of 4 areas are needed; got 7"),
     ],
 )

@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from torchcover.data.frame import collate_frames
-from torchcover.data.recorded import BadFrameError, RecordedFrames
+from torchcover.data import BadFrameError, RecordedFrames, collate_frames
 from torchcover.geometry.rigid import rigid, rotation_from_euler, transform
 
 CLOUD = np.array([[1.0, 2.0, 3.0], [-4.0, 5.0, 0.5]], dtype=np.float32)
@@ -112,7 +111,7 @@ def test_indices_count_from_both_ends_and_stop_there(tmp_path):
 
 
 def test_missing_folders_and_empty_ones(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"gone: no such folder; a recording holds sensor/ and reference/"):
+    with pytest.raises(FileNotFoundError, match=r"gone: no such folder; a recording holds sensor/FRAME"):
         RecordedFrames(tmp_path / "gone")
     with pytest.raises(FileNotFoundError, match=r"sensor: no such folder"):
         RecordedFrames(tmp_path)
@@ -120,7 +119,7 @@ def test_missing_folders_and_empty_ones(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"reference: no such folder"):
         RecordedFrames(tmp_path)
     (tmp_path / "reference").mkdir()
-    with pytest.raises(ValueError, match=r"no frames; both sensor/ and reference/ are empty"):
+    with pytest.raises(ValueError, match=r"no frames; sensor/ and reference/ are empty"):
         RecordedFrames(tmp_path)
 
 
@@ -129,7 +128,9 @@ def test_names_on_one_side_only_are_counted_and_the_first_listed(tmp_path):
     for number in (1, 2, 10, 3, 4, 5, 6):
         np.save(tmp_path / "sensor" / f"s{number}.npy", CLOUD)
     np.save(tmp_path / "reference" / "r.npy", CLOUD)
-    message = r"both sides; 7 only in sensor/ \(s1, s2, s3, s4, s5, \.\.\.\) and 1 only in reference/ \(r\)$"
+    message = (
+        r"sensor/ and reference/; 1 missing in sensor/ \(r\) and 7 missing in reference/ \(s1, s2, s3, s4, s5, \.+\)$"
+    )
     with pytest.raises(ValueError, match=message):
         RecordedFrames(tmp_path)
 
@@ -155,7 +156,7 @@ MATRIX = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", r"got NoneType, not a mapping; allowed are sensor and reference"),
+        ("", r"got NoneType, not a mapping; allowed are sensor, or rigs"),
         ("- 1", r"got list, not a mapping"),
         ("sensor: {", r"not a YAML file \(.*line 1"),
         ("\x00", r"not a YAML file"),

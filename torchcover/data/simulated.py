@@ -15,11 +15,13 @@ from torchcover.detection.boxes import Boxes, points_in_boxes
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix
 from torchcover.simulation import EvenReference, PaperReference, Rig, Scenario
+from torchcover.simulation.bodies import VehicleShape, mover_mesh
 from torchcover.simulation.disturbance import disturb
 from torchcover.simulation.instant import Instant, Scan
 from torchcover.simulation.labels import Label, labels
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import Tile, into_tiles
+from torchcover.simulation.rig import Sensor
 from torchcover.simulation.scene import Scene
 
 # A reference pose inside a body is drawn again, at most this often.
@@ -112,6 +114,28 @@ class SimulatedFrames(Dataset[Frame]):
         """
         scene, _, step = self._stage(index)
         return scene, step
+
+    @property
+    def sensors(self) -> Mapping[str, Sequence[Sensor]]:
+        """The sensors of each rig."""
+        return {name: rig.sensors for name, rig in self.rigs.items()}
+
+    @property
+    def ego_outline_m(self) -> NDArray[np.float64]:
+        """(4, 2) corners x, y of the ego as seen from above, counter-clockwise; no world is built for it."""
+        shape = self.scenario.ego.shape if self.scenario.ego else VehicleShape(type="vehicle", vehicle="suv")
+        return BoundingBox.around(mover_mesh("ego", shape).vertices_m).outline_m
+
+    @property
+    def description(self) -> Mapping[str, object]:
+        """The scenario's name and the seed."""
+        return {"scenario": self.scenario.name, "frames": None, "seed": self.seed}
+
+    @property
+    def reference(self) -> Mapping[str, object]:
+        """The pattern of the reference sensor and the time between two frames."""
+        pattern = type(self.reference_sensor).__name__.removesuffix("Reference").lower()
+        return {"sensor": pattern, "every_s": self.every_s}
 
     def with_reference_sensor(self, reference_sensor: PaperReference | EvenReference) -> "SimulatedFrames":
         """The same instants as another reference sensor sees them; the geometry is built once for both."""

@@ -43,6 +43,12 @@ class BoundingBox:
         return np.array(list(product(*zip(self.lower_m, self.upper_m, strict=True))))
 
     @property
+    def outline_m(self) -> NDArray[np.float64]:
+        """(4, 2) corners x, y as seen from above, counter-clockwise."""
+        (x0, y0, _), (x1, y1, _) = self.lower_m, self.upper_m
+        return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
+
+    @property
     def size_m(self) -> tuple[float, float, float]:
         """Extent along x, y, z in metres."""
         (x0, y0, z0), (x1, y1, z1) = self.lower_m, self.upper_m

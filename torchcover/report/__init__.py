@@ -1,11 +1,11 @@
 """What a run shows: tables, summaries and maps of a `Coverage`. Imports matplotlib and rich, so import it late."""
 
-from torchcover.report.comparison import draw_comparison, draw_side_by_side
+from torchcover.report.comparison import comparison_maps, draw_comparison, draw_side_by_side
 from torchcover.report.comparison_records import comparison_dict, write_comparison
 from torchcover.report.comparison_table import comparison_tables, narrowest_width
 from torchcover.report.depth_view import draw_depths
 from torchcover.report.four_views import draw_four_views
-from torchcover.report.maps import draw_map, draw_maps
+from torchcover.report.maps import coverage_maps, draw_map, draw_maps
 from torchcover.report.overlay import SensorMark
 from torchcover.report.rig_view import SensorView, draw_rig
 from torchcover.report.scale import ColourScale, detection_scale, difference_scale, radius_scale
@@ -21,7 +21,9 @@ __all__ = [
     "WorkPoint",
     "cheapest",
     "comparison_dict",
+    "comparison_maps",
     "comparison_tables",
+    "coverage_maps",
     "coverage_table",
     "detection_scale",
     "difference_scale",

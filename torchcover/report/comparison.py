@@ -1,7 +1,6 @@
 """Maps of several rigs: side by side on one colour scale, and as differences to the first."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -59,22 +58,31 @@ def draw_comparison(
     Raises:
         ValueError: As `check_paired`, or an outline of another shape.
     """
-    check_paired(coverages)
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    rigs, grid = list(coverages), next(iter(coverages.values())).grid
-    conditions = steps_and_cell(next(iter(coverages.values())).counts["steps"], grid)
-    pictures: list[Iterator[tuple[str, Figure]]] = []
-    for metric in metrics_of(list(coverages.values())):
-        pictures.append(_side_by_side(metric, rigs, grid, conditions, ego_outline_m, sensors or {}))
-        pictures.append(_differences(metric, rigs, grid, conditions, ego_outline_m))
-    for metric in error_metrics_of(list(coverages.values())) if errors else ():
-        pictures.append(_side_by_side(metric, rigs, grid, conditions, ego_outline_m, sensors or {}))
     paths = []
-    for stem, figure in chain.from_iterable(pictures):
+    for stem, figure in comparison_maps(coverages, ego_outline_m=ego_outline_m, sensors=sensors, errors=errors):
         paths.append(folder / f"{stem}.png")
         figure.savefig(paths[-1], dpi=figure.dpi)
     return paths
+
+
+def comparison_maps(
+    coverages: Mapping[str, Coverage],
+    *,
+    ego_outline_m: Outline | None = None,
+    sensors: Mapping[str, Sequence[SensorMark]] | None = None,
+    errors: bool = False,
+) -> Iterator[tuple[str, Figure]]:
+    """The maps of `draw_comparison`, one by one: stem of the file name, and figure."""
+    check_paired(coverages)
+    rigs, grid = list(coverages), next(iter(coverages.values())).grid
+    conditions = steps_and_cell(next(iter(coverages.values())).counts["steps"], grid)
+    for metric in metrics_of(list(coverages.values())):
+        yield from _side_by_side(metric, rigs, grid, conditions, ego_outline_m, sensors or {})
+        yield from _differences(metric, rigs, grid, conditions, ego_outline_m)
+    for metric in error_metrics_of(list(coverages.values())) if errors else ():
+        yield from _side_by_side(metric, rigs, grid, conditions, ego_outline_m, sensors or {})
 
 
 def draw_side_by_side(

@@ -1,6 +1,6 @@
 """Maps: one picture for each metric and height band, seen from above."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -45,10 +45,24 @@ def draw_maps(
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for stem, figure in coverage_maps(coverage, ego_outline_m=ego_outline_m, sensors=sensors, errors=errors):
+        paths.append(folder / f"{stem}.png")
+        figure.savefig(paths[-1], dpi=figure.dpi)
+    return paths
+
+
+def coverage_maps(
+    coverage: Coverage,
+    *,
+    ego_outline_m: NDArray[np.floating] | None = None,
+    sensors: Sequence[SensorMark] = (),
+    errors: bool = False,
+) -> Iterator[tuple[str, Figure]]:
+    """The maps of `draw_maps`, one by one: stem of the file name, and figure."""
     heights = coverage.grid.heights
     stems = file_stems(list(heights))
     conditions = steps_and_cell(coverage.counts["steps"], coverage.grid)
-    paths = []
     for metric in (*metrics_of([coverage]), *(error_metrics_of([coverage]) if errors else ())):
         for values, stem, (name, band) in zip(metric.values[0], stems, heights.items(), strict=True):
             figure = draw_map(
@@ -61,9 +75,7 @@ def draw_maps(
                 sensors=sensors,
                 unknown=metric.unknown,
             )
-            paths.append(folder / f"{metric.stem}_{stem}.png")
-            figure.savefig(paths[-1], dpi=figure.dpi)
-    return paths
+            yield f"{metric.stem}_{stem}", figure
 
 
 def draw_map(

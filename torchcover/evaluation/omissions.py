@@ -1,10 +1,7 @@
-"""What a run left out because its scene did not need it: for `--explain` and `summary.json`."""
+"""What a run left out because its scene did not need it."""
 
 import sys
 from collections.abc import Mapping, Sequence
-
-from rich.table import Table
-from rich.text import Text
 
 from torchcover.coverage import Coverage
 
@@ -58,17 +55,3 @@ def left_out(frame_counts: Mapping[str, int], coverages: Sequence[Coverage]) -> 
         if package not in sys.modules
     ]
     return records
-
-
-def explanation(records: Sequence[Omission]) -> Table:
-    """The records as a table for the terminal."""
-    table = Table(title="Left out, for this run did not need it", title_justify="left")
-    table.add_column("what")
-    for column in ("count", "of", "share"):
-        table.add_column(column, justify="right")
-    for record in records:
-        count, of = record["count"], record["of"]
-        counted = isinstance(count, int) and isinstance(of, int)
-        numbers = (f"{count:,}", f"{of:,}", f"{count / of:.1%}") if counted else ("", "", "")  # type: ignore[operator]
-        table.add_row(Text(str(record["what"])), *numbers)
-    return table

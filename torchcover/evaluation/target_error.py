@@ -1,15 +1,13 @@
-"""`--target-error`: a run ends as soon as its numbers are good enough, or says how many steps they would need."""
+"""A run ends as soon as its numbers are good enough: target errors, and how far each number is from them."""
 
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from itertools import groupby
-from typing import Any
+from dataclasses import dataclass
 
-from torchcover.coverage import Coverage, CoverageMetric, Region
+from torchcover.coverage import Coverage, Region
+from torchcover.evaluation.observers import Observer
 from torchcover.report.quantity import quantities_of
-from torchcover.report.records import json_record
 
 # An error from fewer steps is not believed, though they may fill enough blocks.
 MIN_STEPS = 32
@@ -32,7 +30,7 @@ class TargetError:
 
     @classmethod
     def parse(cls, words: Sequence[str]) -> "TargetError | None":
-        """Read what `--target-error` was given; None for nothing.
+        """Read numbers with their units; None for no words.
 
         Raises:
             ValueError: Not a positive number with % or m, or two with the same unit.
@@ -50,12 +48,12 @@ class TargetError:
                 size = math.nan
             if not parts or not 0 < size < math.inf:
                 raise ValueError(
-                    f"--target-error {word}: a positive number with its unit is needed, 0.1% for the detection or "
+                    f"target error {word}: a positive number with its unit is needed, 0.1% for the detection or "
                     "0.02m for the radius"
                 )
             name, size = ("radius_m", size) if parts[2] == "m" else ("detection", size / 100)
             if name in found:
-                raise ValueError(f"--target-error {word}: another number in {parts[2]} was given before; give one")
+                raise ValueError(f"target error {word}: another number in {parts[2]} was given before; give one")
             found[name] = size
         return cls(**found) if found else None
 
@@ -135,17 +133,19 @@ def standings(target: TargetError, coverages: Mapping[str, Coverage], regions: S
 
 
 class TargetWatch:
-    """Looks at the errors of a run now and then.
+    """Looks at the errors of a run now and then: what `observe` takes as `until`.
 
     Args:
         target: What is good enough.
-        metrics: The metrics of the run, by the name of the rig.
+        observers: Those whose coverage it is, by the name of the rig.
         regions: Regions within their grid.
     """
 
-    def __init__(self, target: TargetError, metrics: Mapping[str, CoverageMetric], regions: Sequence[Region]) -> None:
+    def __init__(
+        self, target: TargetError, observers: Mapping[str, Observer[Coverage]], regions: Sequence[Region]
+    ) -> None:
         self.target = target
-        self.metrics = metrics
+        self.observers = observers
         self.regions = regions
         self.next_look = MIN_STEPS
         self.worst: Standing | None = None
@@ -154,7 +154,7 @@ class TargetWatch:
         """Whether the run may end after so many steps. Between two looks: no."""
         if steps < self.next_look:
             return False
-        coverages = {name: metric.compute() for name, metric in self.metrics.items()}
+        coverages = {name: observer.compute() for name, observer in self.observers.items()}
         found = standings(self.target, coverages, self.regions)
         self.worst = max(found, key=lambda standing: standing.excess, default=None)
         if self.worst is not None and self.worst.reached:
@@ -169,68 +169,11 @@ class TargetWatch:
             return most
         return min(most, max(self.worst.steps_needed, self.next_look))
 
-
-def outcome(
-    target: TargetError | None, coverages: Mapping[str, Coverage], regions: Sequence[Region]
-) -> tuple[dict[str, Any] | None, list[str]]:
-    """What was aimed at and what was reached at the end of a run.
-
-    Args:
-        target: What is good enough; None if nothing was aimed at.
-        coverages: As in `standings`.
-        regions: Regions within the grid.
-
-    Returns:
-        A record for `summary.json`, with errors in metres or as shares, and lines for the terminal.
-    """
-    if target is None:
-        return None, []
-    found, first = standings(target, coverages, regions), next(iter(coverages.values()))
-    blank = [f"{row.region} {row.height}" for row in first.summary(regions) if not row.known_cells]
-    lines = _lines(found, first.counts["steps"])
-    if blank:
-        lines.append(f"Not waited for, as no cell of it is known: {', '.join(blank)}.")
-    return _record(target, found) | {"unknown": blank}, lines
-
-
-def _record(target: TargetError, found: Sequence[Standing]) -> dict[str, Any]:
-    needed = [standing.steps_needed for standing in found]
-    known = [steps for steps in needed if steps is not None]
-    numbers = []
-    for standing, steps in zip(found, needed, strict=True):
-        record = {name: value for name, value in asdict(standing).items() if name != "steps"}
-        numbers.append(json_record({**record, "reached": standing.reached, "steps_needed": steps}))
-    return {
-        **asdict(target),
-        "reached": bool(found) and all(standing.reached for standing in found),
-        "steps_needed": max(known) if known and len(known) == len(needed) else None,
-        "numbers": numbers,
-    }
-
-
-def _lines(found: Sequence[Standing], steps: int) -> list[str]:
-    """That it was reached, or the worst number of each region and band and what it would take."""
-    if not found:
-        return ["Target error not reached: no region has a known cell."]
-    if all(standing.reached for standing in found):
-        return [f"Target error reached after {steps:,} steps."]
-    lines = [f"Target error not reached in {steps:,} step{'s' * (steps != 1)}; the largest of each region:"]
-    for (region, height), group in groupby(found, key=lambda standing: (standing.region, standing.height)):
-        worst = max(group, key=lambda standing: standing.excess)
-        where = f"  {region} {height}, {worst.quantity} of {worst.rig}"
-        if worst.steps_needed is None:
-            lines.append(f"{where}: not enough steps for an error")
-        elif worst.reached:
-            lines.append(f"{where}: {worst.words}, reached")
-        else:
-            lines.append(f"{where}: {worst.words}, about {_two_digits(worst.steps_needed):,} steps are needed")
-    return lines
+    @property
+    def words(self) -> str:
+        """The worst error and its target."""
+        return self.worst.words if self.worst else ""
 
 
 def _measure(error: float, quantity: str) -> str:
     return f"{error:.2g} m" if quantity == "radius_m" else f"{100 * error:.2g} %"
-
-
-def _two_digits(steps: int) -> int:
-    unit: int = 10 ** max(0, len(str(steps)) - 2)
-    return -(-steps // unit) * unit

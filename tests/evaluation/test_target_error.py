@@ -1,4 +1,4 @@
-"""`--target-error`: what it may be, when a run stops, and what it says if it could not."""
+"""Target errors: what they may be, when a run stops, and what it says if it could not."""
 
 import json
 import math
@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.cli.stopping import Standing, TargetError, TargetWatch, outcome, standings
+from torchcover import BevGrid, CoverageMetric, Region
+from torchcover.evaluation import CoverageObserver, Standing, TargetError, TargetWatch, outcome, standings
 
 GRID = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-0.5, 0.5), "above": (0.5, 1.0)})
 REGIONS = (Region("near", (0.0, 1.0), (0.0, 1.0)), Region("far", (1.0, 2.0), (0.0, 1.0)))
@@ -44,12 +44,12 @@ def test_a_target_is_a_number_with_its_unit():
     ["0", "5", "0%", "-1m", "abc", "10cm", "nan%", "inf m", "1e999m", "1..2m", ".m", "%", "", "1 m 2%", "1,5m", "٣m"],
 )
 def test_rubbish_is_refused_by_its_name(word):
-    with pytest.raises(ValueError, match=f"--target-error {re.escape(word)}: a positive number with its unit"):
+    with pytest.raises(ValueError, match=f"target error {re.escape(word)}: a positive number with its unit"):
         TargetError.parse(["0.1%" if word != "%" else "1m", word])
 
 
 def test_two_targets_in_one_unit_are_refused():
-    with pytest.raises(ValueError, match="--target-error 2%: another number in % was given before"):
+    with pytest.raises(ValueError, match="target error 2%: another number in % was given before"):
         TargetError.parse(["1%", "1m", "2%"])
 
 
@@ -88,7 +88,7 @@ def test_errors_fall_with_the_root_of_the_steps():
 def test_a_run_stops_at_the_first_look_at_which_every_error_is_small_enough():
     target = TargetError(radius_m=0.025)
     metric = a_metric()
-    watch = TargetWatch(target, {"a": metric}, REGIONS)
+    watch = TargetWatch(target, {"a": CoverageObserver(metric)}, REGIONS)
     looks, most = [], 4096
     for index in range(most):
         add(metric, index)
@@ -118,7 +118,7 @@ def test_a_run_stops_at_the_first_look_at_which_every_error_is_small_enough():
 
 @pytest.mark.parametrize("steps", [5, 31])
 def test_however_good_it_looks_no_run_ends_before_32_steps(steps):
-    watch = TargetWatch(TargetError(radius_m=1e6), {"a": filled(steps)}, REGIONS)
+    watch = TargetWatch(TargetError(radius_m=1e6), {"a": CoverageObserver(filled(steps))}, REGIONS)
     assert not watch.is_reached(steps)
     record, (first, *_) = outcome(watch.target, {"a": filled(steps).compute()}, REGIONS)
     assert record["reached"] is False
@@ -129,7 +129,7 @@ def test_nothing_known_is_not_good_enough():
     metric = a_metric()
     for index in range(40):
         metric.update(torch.zeros(1, 3), torch.tensor([[-9.0, 0.0, 0.0]]), index=index)
-    watch = TargetWatch(TargetError(radius_m=1.0), {"a": metric}, REGIONS)
+    watch = TargetWatch(TargetError(radius_m=1.0), {"a": CoverageObserver(metric)}, REGIONS)
     assert not watch.is_reached(40)
     assert watch.expected_steps(100) == 100
     record, lines = outcome(watch.target, {"a": metric.compute()}, REGIONS)
@@ -160,71 +160,3 @@ def test_without_an_error_no_number_of_steps_is_made_up():
 
 def test_without_a_target_nothing_is_said():
     assert outcome(None, {"a": filled(5).compute()}, REGIONS) == (None, [])
-
-
-# On the command line
-
-
-@pytest.fixture
-def long_recording(tmp_path):
-    """200 frames of two reference points in every step, with random radii."""
-    folder = tmp_path / "recording"
-    random = np.random.default_rng(0)
-    for source in ("sensor", "reference"):
-        (folder / source).mkdir(parents=True)
-    reference = np.array([[2.0, 0.1, 0.0], [30.0, 0.1, 0.0]], dtype=np.float32)
-    for frame in range(200):
-        below = np.array([0.0, 0.0, random.random()], dtype=np.float32)
-        np.save(folder / "sensor" / f"f{frame:03}.npy", reference - below)
-        np.save(folder / "reference" / f"f{frame:03}.npy", reference)
-    return folder
-
-
-@pytest.mark.parametrize("workers", [0, 2])
-def test_evaluate_stops_when_it_is_good_enough(torchcover, long_recording, tmp_path, workers):
-    arguments = ["--frames", long_recording, "--cell", 4, "--out", tmp_path / "out", "--workers", workers]
-    code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "0.05m", "--target-error", "20%")
-    assert code == 0
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    steps = summary["counts"]["steps"]
-    assert 32 <= steps < 150
-    assert f"Target error reached after {steps} steps." in printed
-    assert (summary["complete"], summary["target_error"]["reached"]) == (True, True)
-    assert all(row["radius_error_m"] <= 0.05 for row in summary["rows"] if row["known_cells"])
-    assert re.search(r"0\.\d+ ± 0\.0\d+", printed)
-
-
-def test_a_target_beyond_the_steps_ends_the_run_as_ever_and_says_what_it_would_take(
-    torchcover, long_recording, tmp_path
-):
-    arguments = ["--frames", long_recording, "--cell", 4, "--out", tmp_path / "out", "--steps", 40]
-    code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "1e-3m")
-    assert code == 0
-    assert "Target error not reached in 40 steps" in printed
-    assert "20m ground, radius_m of" in printed
-    target = json.loads((tmp_path / "out" / "summary.json").read_text())["target_error"]
-    assert target["reached"] is False
-    assert 1_000 < target["steps_needed"] < 1_000_000
-    assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["steps"] == 40
-
-
-def test_compare_stops_when_rigs_and_differences_are_good_enough(torchcover, worlds):
-    options = [
-        "--scenario",
-        worlds / "yard.yaml",
-        "--cell",
-        4,
-        "--threshold",
-        2,
-        "--rays",
-        512,
-        "--out",
-        worlds / "out",
-    ]
-    rigs = [worlds / "low.yaml", worlds / "both.yaml"]
-    code, printed, _ = torchcover("compare", *rigs, *options, "--target-error", "50m")
-    assert code == 0
-    assert "Target error reached after 32 steps." in printed
-    assert "Difference to low: mean blind spot radius (m)" in printed
-    target = json.loads((worlds / "out" / "summary.json").read_text())["target_error"]
-    assert {number["rig"] for number in target["numbers"]} == {"low", "both", "both minus low"}
