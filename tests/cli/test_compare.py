@@ -142,6 +142,52 @@ def test_ctrl_c_between_two_rigs_leaves_a_paired_result(
     assert signal.getsignal(signal.SIGINT) is action
 
 
+@pytest.fixture
+def recording(tmp_path):
+    """Three frames of the rigs `far`, `kitti` and `near` against one reference point."""
+    folder = tmp_path / "recording"
+    for place, x in (("rigs/near", 5.0), ("rigs/kitti", 3.0), ("rigs/far", 1.0), ("reference", 6.0)):
+        (folder / place).mkdir(parents=True)
+        for frame in range(3):
+            np.save(folder / place / f"f{frame}.npy", np.array([[x, 0.1, 0.0]], dtype=np.float32))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("rigs", "radii"),
+    [
+        ([], {"far": 5.0, "kitti": 3.0, "near": 1.0}),
+        (["near", "far"], {"near": 1.0, "far": 5.0}),
+        (["kitti", "near"], {"kitti": 3.0, "near": 1.0}),
+    ],
+)
+def test_the_rigs_of_a_recording_are_compared(torchcover, recording, tmp_path, rigs, radii):
+    out = tmp_path / "out"
+    arguments = ["--frames", recording, "--format", "folder", "--cell", 4, "--out", out]
+    code, _, complaints = torchcover("compare", *rigs, *arguments)
+    assert code == 0, complaints
+    summary = json.loads((out / "summary.json").read_text())
+    assert list(summary["rigs"]) == list(radii)
+    assert (summary["frames"], summary["reference"], summary["complete"]) == (str(recording), None, True)
+    found = {row["rig"]: row["radius_m"] for row in summary["rows"] if row["region"] == "20m" and row["known_cells"]}
+    assert found == pytest.approx(radii)
+
+
+def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, tmp_path):
+    arguments = ["--frames", recording, "--out", tmp_path / "out"]
+    for command, rigs, message in (
+        ("compare", ["near", "middle"], "no clouds of the rig middle; the frames have far, kitti, near"),
+        ("evaluate", [], "holds the rigs far, kitti, near: say which, or compare them"),
+        ("compare", ["near", "far", "--format", "bag"], "format 'bag': no such format of recordings; there are folder"),
+        ("compare", ["near", "far", "--scenario", "urban"], "exclude each other"),
+    ):
+        code, _, error = torchcover(command, *rigs, *arguments)
+        assert (code, message in error, error.count("\n")) == (2, True, 1), error
+    assert torchcover("evaluate", "near", *arguments)[0] == 0
+    code, _, error = torchcover("evaluate", "kitti", "--format", "folder")
+    assert (code, "--format: for a recording" in error) == (2, True)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -21,6 +21,17 @@ def record(folder, frames, **sources):
     return folder
 
 
+def record_rigs(folder, **rigs):
+    """A recording of two frames of several rigs."""
+    record(folder, ["f2", "f10"])
+    (folder / "sensor").rename(folder / "aside")
+    for rig, cloud in rigs.items():
+        (folder / "rigs" / rig).mkdir(parents=True)
+        for name in ("f2", "f10"):
+            np.save(folder / "rigs" / rig / f"{name}.npy", cloud)
+    return folder
+
+
 def write_poses(folder, **vehicle_T):
     lines = [f"{source}:\n  vehicle_T_sensor: {matrix.tolist()}\n" for source, matrix in vehicle_T.items()]
     (folder / "frames.yaml").write_text("".join(lines))
@@ -237,3 +248,43 @@ def test_a_caller_skips_bad_frames_with_and_without_workers(tmp_path, workers):
     assert [(error.name, error.index) for error in skipped] == [("f2", 2), ("f4", 4)]
     assert [str(error).splitlines()[0].split(":")[0] for error in skipped] == ["f2 (frame 2)", "f4 (frame 4)"]
     assert str(skipped[0]).endswith("12 bytes follow it")
+
+
+def test_several_rigs_share_a_reference_and_have_a_pose_each(tmp_path):
+    nowhere = np.array([[np.nan, 0, 0], [1.0, 2.0, 3.0]])
+    frames = RecordedFrames(record_rigs(tmp_path, rig10=CLOUD, rig2=nowhere))
+    assert frames.rigs == ("rig2", "rig10")
+    assert frames.names == ("f2", "f10")
+    assert frames[0].clouds["rig10"].tolist() == CLOUD.tolist()
+    assert frames[1].counts == {"sensor_nonfinite": 1, "reference_nonfinite": 0}
+    turned = rigid(rotation_from_euler(90.0, 0.0, 0.0), [1.0, 0.0, 0.0])
+    (tmp_path / "frames.yaml").write_text(f"rigs: {{rig2: {{vehicle_T_sensor: {turned.tolist()}}}}}")
+    frame = RecordedFrames(tmp_path)[0]
+    np.testing.assert_allclose(frame.clouds["rig2"], [[-1.0, 1.0, 3.0]], atol=1e-6)
+    assert frame.clouds["rig10"].tolist() == frame.reference.tolist() == CLOUD.tolist()
+
+
+def test_what_is_wrong_with_several_rigs_is_named(tmp_path):
+    folder = record_rigs(tmp_path, a=CLOUD, b=CLOUD)
+    (folder / "frames.yaml").write_text(f"rigs: {{c: {{vehicle_T_sensor: {MATRIX}}}}}")
+    with pytest.raises(ValueError, match=r"frames\.yaml: rigs\.c: there is no rigs/c/ beside it"):
+        RecordedFrames(folder)
+    (folder / "frames.yaml").write_text(f"rigs: {{b: {{vehicle_T_sensor: {MATRIX[:3]}}}}}")
+    with pytest.raises(ValueError, match=r"frames\.yaml: rigs\.b\.vehicle_T_sensor: a 4x4 matrix is needed"):
+        RecordedFrames(folder)
+    (folder / "frames.yaml").unlink()
+    (folder / "rigs" / "b" / "f2.npy").write_bytes(b"rubbish")
+    with pytest.raises(BadFrameError, match=r"^f2 \(frame 0\): .*f2\.npy"):
+        RecordedFrames(folder)[0]
+    (folder / "rigs" / "b" / "f2.npy").unlink()
+    with pytest.raises(ValueError, match=r"file in rigs/a/ and rigs/b/ and reference/; 1 missing in rigs/b/ \(f2\)$"):
+        RecordedFrames(folder)
+    (folder / "sensor").mkdir()
+    with pytest.raises(ValueError, match=r"both sensor/ and rigs/; sensor/ is for one rig, rigs/NAME/ for several"):
+        RecordedFrames(folder)
+
+
+def test_a_folder_of_rigs_without_any_is_an_error(tmp_path):
+    (tmp_path / "rigs").mkdir()
+    with pytest.raises(ValueError, match=r"rigs: no rig; each has a folder rigs/NAME/ of its own"):
+        RecordedFrames(tmp_path)

@@ -196,7 +196,7 @@ class Result:
 
     def __repr__(self) -> str:
         tables, buffer = self.tables(), io.StringIO()
-        console = Console(file=buffer, width=narrowest_width(tables, list(self.coverages)))
+        console = Console(file=buffer, width=narrowest_width(tables, ()))
         cut_short = "" if self.run.complete else ", cut short"
         console.print(f"Result of {', '.join(self.coverages)}: {self.run.steps} steps{cut_short}", soft_wrap=True)
         for table in tables:
