@@ -8,7 +8,7 @@ import torch
 from torchcover import BevGrid, Coverage, CoverageMetric
 from torchcover.data import SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe
-from torchcover.evaluation.sensor_views import sensor_marks
+from torchcover.evaluation.sensor_drawings import sensor_marks
 from torchcover.report import SensorMark
 from torchcover.simulation import EvenReference, PaperReference
 

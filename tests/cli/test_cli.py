@@ -233,6 +233,12 @@ def test_version_and_help(torchcover):
     assert "--skip-bad-frames" in printed
 
 
+def test_it_is_a_module_too():
+    command = [sys.executable, "-m", "torchcover", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "0.1.0"
+
+
 def test_help_loads_none_of_the_heavy_libraries():
     program = (
         "import sys; sys.argv = ['torchcover', '--help']\n"

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from torchcover.evaluation import Result, Study, StudyPlan
+from torchcover.evaluation import Omission, Result, Study, StudyPlan
 from torchcover.report import WorkPoint, narrowest_width, study_table
 
 
@@ -60,16 +60,15 @@ def _print_wide(tables: Sequence[Table], names: Sequence[str]) -> None:
         console.print(table)
 
 
-def _explanation(records: Sequence[Mapping[str, object]]) -> Table:
+def _explanation(omissions: Sequence[Omission]) -> Table:
     table = Table(title="Left out, for this run did not need it", title_justify="left")
     table.add_column("what")
     for column in ("count", "of", "share"):
         table.add_column(column, justify="right")
-    for record in records:
-        count, of = record["count"], record["of"]
-        counted = isinstance(count, int) and isinstance(of, int)
-        numbers = (f"{count:,}", f"{of:,}", f"{count / of:.1%}") if counted else ("", "", "")  # type: ignore[operator]
-        table.add_row(Text(str(record["what"])), *numbers)
+    for omission in omissions:
+        count, of = omission.count, omission.of
+        numbers = ("", "", "") if count is None or of is None else (f"{count:,}", f"{of:,}", f"{count / of:.1%}")
+        table.add_row(Text(omission.what), *numbers)
     return table
 
 

@@ -8,7 +8,7 @@ import yaml
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from torchcover.evaluation import rig_pictures, scenario_picture
+from torchcover.evaluation import cameras_of, rig_pictures, scenario_picture
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
 from torchcover.simulation import Rig, Scenario, builtin_names
 
@@ -26,7 +26,7 @@ def run(name: str, *, scenario: str | None, rig: str | None, step: int | None, s
     if _is_rig(name):
         _refuse("a scenario", {"--rig": rig}, f"{name!r} is a rig")
         shown = Rig.load(name)
-        if not any(sensor.type == "camera" for sensor in shown.sensors):
+        if not cameras_of(shown):
             _refuse("a scenario or cameras", {"--step": step, "--seed": seed}, f"{name!r} is a rig without cameras")
         world = Scenario.load(scenario or DEFAULT_SCENARIO)
         figures = rig_pictures(shown, world, step=step or 0, seed=seed or 0)

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 from torchcover.coverage import Coverage
 
@@ -15,7 +16,20 @@ COUNTED = (
 # Packages that take long to import, and what would have needed them.
 HEAVY = {"kornia": "lenses with distortion", "lightning": "training", "pypcd4": "binary PCD files"}
 
-Omission = dict[str, object]
+
+@dataclass(frozen=True)
+class Omission:
+    """Something that a run left out.
+
+    Args:
+        what: What it is, and why it could be left out.
+        count: How often; None where there is nothing to count.
+        of: Of how many; likewise.
+    """
+
+    what: str
+    count: int | None = None
+    of: int | None = None
 
 
 def left_out(frame_counts: Mapping[str, int], coverages: Sequence[Coverage]) -> list[Omission]:
@@ -24,34 +38,21 @@ def left_out(frame_counts: Mapping[str, int], coverages: Sequence[Coverage]) -> 
     Args:
         frame_counts: Sums of `Frame.counts`.
         coverages: What the metrics gave, one for each rig.
-
-    Returns:
-        Records with `what`, `count` and `of`; the two are None where there is nothing to count.
     """
-    records: list[Omission] = [
-        {"what": what, "count": frame_counts[count], "of": frame_counts[of]}
-        for what, count, of in COUNTED
-        if frame_counts.get(count)
+    found = [
+        Omission(what, frame_counts[count], frame_counts[of]) for what, count, of in COUNTED if frame_counts.get(count)
     ]
     outside = sum(coverage.counts["outside_points"] for coverage in coverages)
     inside = sum(int(coverage.points.sum()) for coverage in coverages)
     if outside:
-        what = "reference points outside every cell: not searched for"
-        records.append({"what": what, "count": outside, "of": inside + outside})
-    not_kept = [
-        name
-        for name, kept in (
-            ("maxima", coverages[0].maximum),
-            ("quantiles", coverages[0].quantiles),
-            ("pooled means", coverages[0].pooled),
-        )
-        if kept is None
-    ]
+        found.append(Omission("reference points outside every cell: not searched for", outside, inside + outside))
+    aggregations = {
+        "maxima": coverages[0].maximum,
+        "quantiles": coverages[0].quantiles,
+        "pooled means": coverages[0].pooled,
+    }
+    not_kept = [name for name, kept in aggregations.items() if kept is None]
     if not_kept:
-        records.append({"what": f"{', '.join(not_kept)}: not asked for, not kept", "count": None, "of": None})
-    records += [
-        {"what": f"{package}, for {use}: not imported", "count": None, "of": None}
-        for package, use in HEAVY.items()
-        if package not in sys.modules
-    ]
-    return records
+        found.append(Omission(f"{', '.join(not_kept)}: not asked for, not kept"))
+    unused = [package for package in HEAVY if package not in sys.modules]
+    return found + [Omission(f"{package}, for {HEAVY[package]}: not imported") for package in unused]

@@ -3,7 +3,7 @@
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from torchcover import __version__
 from torchcover.coverage import Coverage, Region
 from torchcover.evaluation.omissions import Omission, left_out
 from torchcover.evaluation.pipeline import Run
-from torchcover.evaluation.sensor_views import sensor_marks
+from torchcover.evaluation.sensor_drawings import sensor_marks
 from torchcover.evaluation.target_error import TargetError
 from torchcover.evaluation.target_outcome import outcome
 from torchcover.report import (
@@ -117,7 +117,7 @@ class Result:
             "frame_counts": dict(self.run.counts),
             "skipped_frames": self.run.skipped,
             "target_error": outcome(self.target_error, self.coverages, self.regions)[0],
-            "left_out": self.left_out,
+            "left_out": [asdict(omission) for omission in self.left_out],
             **self.numbers,
         }
 

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchcover.data import SimulatedFrames
-from torchcover.evaluation.sensor_views import sensor_views
+from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.evaluation.settings import GRID_X_M, GRID_Y_M
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
