@@ -1,4 +1,4 @@
-# `make demo` and `make test` need Python >= 3.10, git and make, nothing else: the environment is built on first use.
+# `make demo` and `make test` need Python >= 3.11, git and make, nothing else: the environment is built on first use.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
@@ -10,8 +10,9 @@ demo: STEPS ?= 24
 demo: $(VENV)/.ready  ## evaluate a built-in rig in the built-in courtyard; writes to out/demo
 	$(BIN)/torchcover evaluate front_roof_128 --scenario courtyard --steps $(STEPS) --out out/demo
 
+# One thread in each process: the tests are dealt out to as many processes as there are cores.
 test: $(VENV)/.ready  ## every test
-	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(BIN)/python -m pytest --numprocesses auto --dist worksteal
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import venv
 
-MINIMUM = (3, 10)
+MINIMUM = (3, 11)
 
 
 def main(folder: str) -> None:

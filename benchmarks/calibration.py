@@ -67,7 +67,7 @@ def estimates(job):
 
 
 def report(runs):
-    """The table of docs/accuracy.md: spread over the runs, root mean square of the errors, and their ratio."""
+    """The tables of docs/measured/error_bars.md: spread over the runs, root mean square of the errors, their ratio."""
     print("| estimator | region | height | quantity | mean | spread | reported error | spread / error |")
     print("|---|---|---|---|---|---|---|---|")
     names = product(ESTIMATORS, [region.name for region in REGIONS], GRID.heights, ["radius (m)", "detection"])

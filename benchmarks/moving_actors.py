@@ -76,7 +76,7 @@ def far_away(kinds, moving):
         start = np.array([FAR_M + 20.0 * (number // side), FAR_M + 20.0 * (number % side), 0.0])
         kind = kinds[number % len(kinds)]
         ends = start + np.array([[0.0, 0.0, 0.0], [300.0 * moving, 0.0, 0.0]])
-        drive = Trajectory.of([0.0, 60.0], ends, np.zeros((2, 3)))
+        drive = Trajectory.from_arrays([0.0, 60.0], ends, np.zeros((2, 3)))
         actors.append(Actor(f"far {number}", kind.category, kind.mesh, drive))
     return tuple(actors)
 

@@ -24,7 +24,7 @@ def main():
     with ThreadPoolExecutor(THREADS) as pool:
         for step in (0, 1, 2):
             frame = frames[step]
-            pose = sensor.vehicle_T_reference(frames.scene.ego_box, np.random.default_rng([0, step]))
+            pose = sensor.vehicle_T_reference(frames.scenario.ego_box(), np.random.default_rng([0, step]))
             rays = bare_rays(sensor, pose), bare_rays(lidar, lidar.mount.matrix())
 
             def whole(step=step):

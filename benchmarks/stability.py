@@ -1,4 +1,4 @@
-"""The stability cases, as the tables of docs/accuracy.md: our error, its bound, and the error of the naive way."""
+"""The stability cases, as docs/measured/stability.md has them: our error, its bound, and the error of the naive way."""
 
 import subprocess
 import sys

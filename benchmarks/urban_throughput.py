@@ -47,7 +47,7 @@ def main():
         frames = SimulatedFrames("urban", RIG, steps=LAST, seed=0, reference_sensor=reference)
         rates.append((name, steps_a_second(frames)))
         start = time.perf_counter()
-        frames.scene_of(0)
+        frames.simulator.scene_of(0)
         built_s = time.perf_counter() - start
         stages = time_of_stages(frames)
         total_s = sum(stages.values())

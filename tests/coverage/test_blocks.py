@@ -2,17 +2,13 @@
 
 import copy
 import math
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from torchcover import BevGrid, CoverageMetric, Region
-from torchcover.coverage import Coverage
+from torchcover.coverage import Coverage, Layer, Maximum, MeanOfMeans, PooledMean, Quantiles
 from torchcover.coverage.blocks import Blocks
 from torchcover.coverage.errors import jackknife_error
 
@@ -125,8 +121,8 @@ def test_unequal_blocks_are_weighed_as_in_plain_loops(seed):
 def test_blocks_that_all_say_the_same_have_no_error():
     coverage = metric_over([{"clouds": clouds_of({0: [0.25]}), "more": {"index": at}} for at in range(40)]).compute()
     (row,) = coverage.summary([EVERYWHERE])
-    assert row.radius_error_m == pytest.approx(0.0, abs=1e-12)
-    assert row.detection_error[THRESHOLD] == pytest.approx(0.0, abs=1e-12)
+    assert row.numbers["radius_m"].error == pytest.approx(0.0, abs=1e-12)
+    assert row.numbers["detection_0.5m"].error == pytest.approx(0.0, abs=1e-12)
     assert float(coverage.radius_error.flatten()[0]) == pytest.approx(0.0, abs=1e-12)
 
 
@@ -135,7 +131,7 @@ def test_one_step_a_block_gives_the_textbook_error_in_a_cell_and_in_its_region()
     steps = [{"clouds": clouds_of({2: [float(radius)]}), "more": {"index": at}} for at, radius in enumerate(radii)]
     coverage = metric_over(steps).compute()
     expected = radii.astype(float).std(ddof=1) / 4
-    assert coverage.summary([EVERYWHERE])[0].radius_error_m == pytest.approx(expected)
+    assert coverage.summary([EVERYWHERE])[0].numbers["radius_m"].error == pytest.approx(expected)
     assert float(coverage.radius_error.flatten()[2]) == pytest.approx(expected)
 
 
@@ -145,11 +141,11 @@ def test_sums_and_errors_are_those_of_plain_loops(count):
     coverage, sums = metric_over(steps).compute(), slow_blocks(steps, 16)
     np.testing.assert_array_equal(coverage.blocks.steps, sums["steps"])
     np.testing.assert_array_equal(coverage.blocks.probed_steps.flatten(1), sums["probed_steps"])
-    np.testing.assert_allclose(coverage.blocks.radius_sum.flatten(1), sums["radius"], rtol=1e-12)
-    np.testing.assert_allclose(coverage.blocks.detection_sum.flatten(1), sums["detection"], rtol=1e-12)
+    np.testing.assert_allclose(coverage.blocks.sums[:, 0].flatten(1), sums["radius"], rtol=1e-12)
+    np.testing.assert_allclose(coverage.blocks.sums[:, 1].flatten(1), sums["detection"], rtol=1e-12)
     (row,) = coverage.summary([EVERYWHERE])
-    assert row.radius_error_m == pytest.approx(slow_region_error(sums, "radius"), rel=1e-9)
-    assert row.detection_error[THRESHOLD] == pytest.approx(slow_region_error(sums, "detection"), rel=1e-9)
+    assert row.numbers["radius_m"].error == pytest.approx(slow_region_error(sums, "radius"), rel=1e-9)
+    assert row.numbers["detection_0.5m"].error == pytest.approx(slow_region_error(sums, "detection"), rel=1e-9)
 
 
 def test_the_error_in_a_cell_is_that_of_a_ratio_of_sums():
@@ -168,9 +164,9 @@ def test_no_error_is_told_from_fewer_than_8_blocks_nor_in_a_cell_that_fewer_than
     steps = [{"clouds": clouds_of({0: [at / 32], **({1: [0.1]} if at < 3 else {})}), "more": {"index": at}}
              for at in range(8)]  # fmt: skip
     (few,), (enough,) = (metric_over(steps[:count]).compute().summary([EVERYWHERE]) for count in (7, 8))
-    assert math.isnan(few.radius_error_m)
-    assert math.isnan(few.detection_error[THRESHOLD])
-    assert enough.radius_error_m > 0
+    assert math.isnan(few.numbers["radius_m"].error)
+    assert math.isnan(few.numbers["detection_0.5m"].error)
+    assert enough.numbers["radius_m"].error > 0
     coverage = metric_over(steps).compute()
     assert coverage.radius_error.isnan().flatten().tolist() == [False, True, True, True]
     assert coverage.detection_error.isnan().flatten().tolist() == [False, True, True, True]
@@ -179,7 +175,7 @@ def test_no_error_is_told_from_fewer_than_8_blocks_nor_in_a_cell_that_fewer_than
 def test_without_blocks_there_are_no_errors():
     coverage = metric_over(random_steps(20), blocks=1).compute()
     assert (coverage.blocks, coverage.radius_error, coverage.detection_error) == (None, None, None)
-    assert math.isnan(coverage.summary([EVERYWHERE])[0].radius_error_m)
+    assert math.isnan(coverage.summary([EVERYWHERE])[0].numbers["radius_m"].error)
 
 
 def test_the_error_of_a_difference_is_that_of_the_paired_values():
@@ -261,7 +257,7 @@ def test_steps_without_a_number_are_counted_on(forward):
 def test_doubling_the_blocks_keeps_every_sum(count):
     steps = random_steps(count, dyadic=True)
     blocked, plain = metric_over(steps), metric_over(steps, blocks=1)
-    for name in ("probed_steps", "radius_sum", "detection_sum", "block_steps"):
+    for name in ("probed_steps", "mean_sums", "block_steps"):
         assert torch.equal(blocked.metric_state[name].sum(dim=0), plain.metric_state[name][0]), name
     assert torch.equal(blocked.points, plain.points)
     assert int(blocked.block_length) == 2 ** math.ceil(math.log2(count / 16))
@@ -270,18 +266,14 @@ def test_doubling_the_blocks_keeps_every_sum(count):
     assert (used[:-1] == blocked.block_length).all()
 
 
-@pytest.mark.parametrize("options", [{}, {"maximum": True, "pooled": True, "quantiles": (0.5,)}])
-def test_blocks_change_no_number(options):
+@pytest.mark.parametrize("aggregations", [(), (Maximum(), PooledMean(), Quantiles((0.5,)))])
+def test_blocks_change_no_number(aggregations):
     steps = random_steps(40, weighted=True)
-    blocked, plain = (metric_over(steps, blocks=blocks, **options).compute() for blocks in (16, 1))
-    for name in (
-        "probed_steps",
-        "points",
-        "radius",
-        "detection",
-        *(("maximum", "pooled", "quantiles") if options else ()),
-    ):
-        torch.testing.assert_close(getattr(blocked, name), getattr(plain, name), rtol=1e-12, atol=0, equal_nan=True)
+    blocked, plain = (metric_over(steps, blocks=blocks, aggregations=aggregations).compute() for blocks in (16, 1))
+    assert torch.equal(blocked.probed_steps, plain.probed_steps)
+    assert torch.equal(blocked.points, plain.points)
+    for key, layer in plain.layers.items():
+        torch.testing.assert_close(blocked.layers[key].values, layer.values, rtol=1e-12, atol=0, equal_nan=True)
 
 
 def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
@@ -289,7 +281,7 @@ def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
     steps[2]["more"]["index"] = 1_000_000
     coverage = metric_over(steps).compute()
     assert coverage.blocks.steps.tolist() == [2] + [0] * 14 + [1]
-    assert math.isnan(coverage.summary([EVERYWHERE])[0].radius_error_m)
+    assert math.isnan(coverage.summary([EVERYWHERE])[0].numbers["radius_m"].error)
 
 
 @pytest.mark.parametrize(
@@ -300,41 +292,12 @@ def test_numbers_of_steps_that_make_no_sense_are_refused(index, message):
         CoverageMetric(GRID, blocks=16).update(*clouds_of({0: [0.5]}), index=index)
 
 
-def test_two_ranks_with_different_numbers_of_steps_equal_one_process(tmp_path):
-    steps = random_steps(75, dyadic=True)
-    shares = [steps[:20:2], [step for at, step in enumerate(steps) if at >= 20 or at % 2]]
-    job = {"grid": SHAPE, "options": {"thresholds": (THRESHOLD,), "blocks": 16}}
-    job["shares"] = [[(step["clouds"], step["more"]) for step in share] for share in shares]
-    torch.save(job, tmp_path / "job.pt")
-    environment = {**os.environ, "GLOO_SOCKET_IFNAME": "lo0" if sys.platform == "darwin" else "lo"}
-    environment.update(OMP_NUM_THREADS="1", PYTHONPATH=os.pathsep.join(p for p in sys.path if p))
-    script = str(Path(__file__).with_name("one_rank_in_blocks.py"))
-    ranks = [
-        subprocess.Popen(
-            [sys.executable, script, str(rank), str(tmp_path)], env=environment, stderr=subprocess.PIPE, text=True
-        )
-        for rank in range(2)
-    ]
-    try:
-        errors = [process.communicate(timeout=280)[1] for process in ranks]
-    finally:
-        for process in ranks:
-            process.kill()
-    assert [process.returncode for process in ranks] == [0, 0], errors
-    expected = metric_over(steps).compute().blocks
-    found = [torch.load(tmp_path / f"{rank}.pt") for rank in range(2)]
-    assert [blocks["own_length"] for blocks in found] == [2, 8]
-    for blocks in found:
-        for name, value in vars(expected).items():
-            assert torch.equal(blocks[name], value), name
-
-
 # Weights
 
 
 def test_weighted_means_are_those_of_plain_loops():
     steps = random_steps(30, seed=5, weighted=True)
-    coverage, sums = metric_over(steps, pooled=True).compute(), slow_blocks(steps, 16, weighted=True)
+    coverage, sums = metric_over(steps, aggregations=[PooledMean()]).compute(), slow_blocks(steps, 16, weighted=True)
     frames = sums["probed_steps"].sum(axis=0)
     np.testing.assert_allclose(coverage.radius.flatten(), sums["radius"].sum(axis=0) / frames, rtol=1e-12)
     np.testing.assert_allclose(coverage.detection.flatten(), sums["detection"].sum(axis=0) / frames, rtol=1e-12)
@@ -342,12 +305,12 @@ def test_weighted_means_are_those_of_plain_loops():
         radii = np.float32([r for step in steps for r in step["radii"].get(cell, [])])
         weights = [w for step in steps for w in step["weights"].get(cell, [])]
         pooled = np.average(radii.astype(float), weights=weights)
-        assert float(coverage.pooled.flatten()[cell]) == pytest.approx(pooled, rel=1e-12)
+        assert float(coverage.layers["radius_pooled_m"].values.flatten()[cell]) == pytest.approx(pooled, rel=1e-12)
 
 
 def test_equal_weights_change_nothing_and_their_scale_in_a_step_neither():
     steps = random_steps(20, seed=6, weighted=True)
-    options = {"maximum": True, "quantiles": (0.1, 0.5)}
+    options = {"aggregations": [Maximum(), Quantiles((0.1, 0.5))]}
     plain = [{**step, "more": {"index": step["more"]["index"]}} for step in steps]
     factors = [2.0 ** (at % 5) for at in range(20)]
 
@@ -361,8 +324,10 @@ def test_equal_weights_change_nothing_and_their_scale_in_a_step_neither():
         (equal, metric_over(plain, **options).compute()),
         (scaled, metric_over(steps, **options).compute()),
     ):
-        for name in ("radius", "detection", "maximum", "quantiles", "radius_error"):
-            torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-6, atol=1e-9, equal_nan=True)
+        torch.testing.assert_close(one.radius_error, other.radius_error, rtol=1e-6, atol=1e-9, equal_nan=True)
+        for key, layer in one.layers.items():
+            expected = other.layers[key].values
+            torch.testing.assert_close(layer.values, expected, rtol=1e-6, atol=1e-9, equal_nan=True)
 
 
 def test_weights_of_points_outside_the_grid_are_left_out_with_them():
@@ -375,9 +340,9 @@ def test_weights_of_points_outside_the_grid_are_left_out_with_them():
 
 
 def test_a_quantile_counts_weights_not_points():
-    metric = CoverageMetric(GRID, quantiles=(0.2, 0.3))
+    metric = CoverageMetric(GRID, aggregations=[Quantiles((0.2, 0.3))])
     metric.update(*clouds_of({0: [0.1, 0.9]}), weights=torch.tensor([1.0, 3.0]))
-    low, high = metric.compute().quantiles[:, 0, 0, 0].tolist()
+    low, high = (metric.compute().layers[f"radius_q{level}_m"].values[0, 0, 0].item() for level in (0.2, 0.3))
     assert low == pytest.approx(0.1, rel=0.13)
     assert high == pytest.approx(0.9, rel=0.13)
 
@@ -437,10 +402,9 @@ def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
         max_radius=math.inf,
         probed_steps=frames.sum(dim=0),
         points=frames.sum(dim=0),
-        radius=means[0],
-        detection=means[1:],
+        layers=map(Layer, MeanOfMeans((THRESHOLD,)).quantities, means),
         counts=counts,
-        blocks=Blocks(steps=steps, probed_steps=frames, radius_sum=sums[0], detection_sum=sums[1, :, None]),
+        blocks=Blocks(steps=steps, probed_steps=frames, sums=sums.movedim(0, 1)),
     )
 
 

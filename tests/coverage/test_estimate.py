@@ -105,10 +105,10 @@ def test_the_summary_has_both_with_their_errors():
     row = coverage.summary([PART])[0]
     completed = coverage.estimate(PART, "low", "completed")
     assert row.unseen_cells == unseen_cells(coverage.probed_steps[0][PART.mask(GRID)])
-    assert row.completed.radius_m == completed.value[0]
-    assert row.completed.detection_error == dict(zip((0.4, 0.8), completed.error[1:].tolist(), strict=True))
-    assert row.radius_error_m == coverage.estimate(PART, "low").error[0]
-    assert not math.isnan(row.radius_error_m)
+    assert row.completed["radius_m"].value == completed.value[0]
+    assert [row.completed[f"detection_{at}m"].error for at in (0.4, 0.8)] == completed.error[1:].tolist()
+    assert row.numbers["radius_m"].error == coverage.estimate(PART, "low").error[0]
+    assert not math.isnan(row.numbers["radius_m"].error)
 
 
 def test_no_such_band_is_said():

@@ -9,11 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchcover import BevGrid, CoverageMetric
+from torchcover.coverage import Maximum, PooledMean, Quantiles, StepQuantiles
 
 GRID = BevGrid(x=(-2.0, 3.0), y=(-1.5, 1.0), cell=0.5, heights={"high": (1.0, 2.0), "low": (-1.0, 0.5)})
 ONE_CELL = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
 NOTHING = torch.zeros(0, 3)
-OPTIONS = {"maximum": True, "pooled": True}
+EVERY_AGGREGATION = (Maximum(), PooledMean(), Quantiles((0.25, 0.9)), StepQuantiles((0.5,)))
+OPTIONS = {"aggregations": EVERY_AGGREGATION}
 
 
 def cloud(*rows, dtype=torch.float32):
@@ -33,6 +35,11 @@ def coverage(steps, grid=ONE_CELL, *args, **kwargs):
     for sensor, reference in steps:
         metric.update(sensor, reference)
     return metric.compute()
+
+
+def map_of(result, name):
+    """A map by its key, or by the name of an attribute."""
+    return result.layers[name].values if name in result.layers else getattr(result, name)
 
 
 def random_steps(seed, steps=3, dyadic=True, empty=True):
@@ -68,10 +75,10 @@ def test_one_sensor_point_over_a_plane_of_reference_points(backend):
 
 def test_a_mean_of_means_not_a_pooled_mean():
     """Trap 4: a step with 1 point in a cell weighs as much as a step with 1000."""
-    result = coverage([(ORIGIN, points_at(*[0.125] * 1000)), (ORIGIN, points_at(0.875))], pooled=True)
+    result = coverage([(ORIGIN, points_at(*[0.125] * 1000)), (ORIGIN, points_at(0.875))], aggregations=[PooledMean()])
     assert result.radius.item() == 0.5
     assert result.detection.item() == 0.5
-    assert result.pooled.item() == (1000 * 0.125 + 0.875) / 1001
+    assert map_of(result, "radius_pooled_m").item() == (1000 * 0.125 + 0.875) / 1001
     assert (result.probed_steps.item(), result.points.item()) == (2, 1001)
 
 
@@ -99,8 +106,8 @@ def test_reference_points_outside_the_grid_change_nothing_but_their_count():
 
 def test_unknown_cells_are_nan_with_count_zero():
     grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
-    result = coverage([(ORIGIN, points_at(0.5))], grid, (0.4, 0.6), quantiles=(0.5,), **OPTIONS)
-    for values in (result.radius, result.detection, result.maximum, result.pooled, result.quantiles):
+    result = coverage([(ORIGIN, points_at(0.5))], grid, (0.4, 0.6), **OPTIONS)
+    for values in (result.detection, *(layer.values for layer in result.layers.values())):
         assert values[..., 1].isnan().all()
         assert not values[..., 0].isnan().any()
     assert (result.probed_steps[..., 1].item(), result.points[..., 1].item()) == (0, 0)
@@ -134,8 +141,10 @@ def test_no_thresholds_give_no_detection():
 
 
 def test_a_step_in_which_the_rig_saw_nothing_is_blind_not_missing():
-    result = coverage([(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.5))], ONE_CELL, (0.75,), maximum=True)
-    assert (result.radius.item(), result.maximum.item()) == (math.inf, math.inf)
+    result = coverage(
+        [(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.5))], ONE_CELL, (0.75,), aggregations=[Maximum()]
+    )
+    assert (result.radius.item(), map_of(result, "radius_maximum_m").item()) == (math.inf, math.inf)
     assert (result.detection.item(), result.probed_steps.item()) == (0.5, 2)
     assert result.counts["empty_sensor_steps"] == 1
 
@@ -153,7 +162,7 @@ def test_a_blind_step_detects_nothing_even_at_a_threshold_of_max_radius():
 
 
 def test_an_empty_reference_cloud_says_nothing():
-    result = coverage([(ORIGIN, NOTHING), (ORIGIN, points_at(0.5)), (NOTHING, NOTHING)], quantiles=(0.5,), **OPTIONS)
+    result = coverage([(ORIGIN, NOTHING), (ORIGIN, points_at(0.5)), (NOTHING, NOTHING)], **OPTIONS)
     assert (result.radius.item(), result.probed_steps.item()) == (0.5, 1)
     assert (result.counts["steps"], result.counts["empty_reference_steps"]) == (3, 2)
     assert result.counts["empty_sensor_steps"] == 1
@@ -178,10 +187,10 @@ def test_everything_that_happened_is_counted():
 @pytest.mark.parametrize("max_radius", [0.5, 1e39, 1e300])
 def test_max_radius_saturates_every_number(max_radius):
     steps = [(ORIGIN, points_at(0.25, 0.75))]
-    result = coverage(steps, ONE_CELL, (0.4,), max_radius=max_radius, quantiles=(1.0,), **OPTIONS)
-    assert result.maximum.item() == min(0.75, max_radius)
-    assert result.radius.item() == result.pooled.item() == (0.25 + min(0.75, max_radius)) / 2
-    assert result.quantiles.item() <= max_radius
+    result = coverage(steps, ONE_CELL, (0.4,), max_radius=max_radius, **OPTIONS)
+    assert map_of(result, "radius_maximum_m").item() == min(0.75, max_radius)
+    assert result.radius.item() == map_of(result, "radius_pooled_m").item() == (0.25 + min(0.75, max_radius)) / 2
+    assert map_of(result, "radius_q0.9_m").item() <= max_radius
 
 
 def test_a_search_bounded_by_the_threshold_detects_the_same_to_the_last_bit():
@@ -204,7 +213,7 @@ def test_random_clouds_give_what_plain_loops_give(slow_coverage, seed, dyadic, m
     for backend in ("cdist", "kdtree"):
         result = coverage(steps, GRID, thresholds, max_radius=max_radius, backend=backend, **OPTIONS)
         for name, values in expected.items():
-            np.testing.assert_allclose(getattr(result, name).numpy(), values, rtol=1e-12, err_msg=name)
+            np.testing.assert_allclose(map_of(result, name).numpy(), values, rtol=1e-12, err_msg=name)
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32])
@@ -222,8 +231,9 @@ def test_shorter_types_give_what_their_rounded_coordinates_give(slow_coverage, d
 
 def assert_same(one, other):
     assert one.counts == other.counts
-    for name in ("probed_steps", "points", "radius", "detection", "maximum", "pooled", "quantiles"):
-        torch.testing.assert_close(getattr(one, name), getattr(other, name), rtol=1e-12, atol=0, equal_nan=True)
+    assert one.layers.keys() == other.layers.keys()
+    for name in ("probed_steps", "points", *one.layers):
+        torch.testing.assert_close(map_of(one, name), map_of(other, name), rtol=1e-12, atol=0, equal_nan=True)
 
 
 @settings(max_examples=12, deadline=None)
@@ -232,7 +242,7 @@ def test_neither_the_order_of_points_nor_of_steps_matters(seed):
     steps = random_steps(seed)
     generator = torch.Generator().manual_seed(seed)
     shuffled = [[c[torch.randperm(len(c), generator=generator)] for c in step] for step in reversed(steps)]
-    options = {"quantiles": (0.25, 0.9), "max_radius": 3.0, **OPTIONS}
+    options = {"max_radius": 3.0, "aggregations": EVERY_AGGREGATION}
     assert_same(coverage(steps, GRID, **options), coverage(shuffled, GRID, **options))
 
 
@@ -240,10 +250,9 @@ def test_neither_the_order_of_points_nor_of_steps_matters(seed):
 @given(seed=st.integers(0, 2**32))
 def test_a_list_of_steps_is_the_steps_one_by_one(seed):
     steps = random_steps(seed, steps=4)
-    options = {"quantiles": (0.5,), **OPTIONS}
-    metric = CoverageMetric(GRID, **options)
+    metric = CoverageMetric(GRID, **OPTIONS)
     metric.update([sensor for sensor, _ in steps], tuple(reference for _, reference in steps))
-    assert_same(metric.compute(), coverage(steps, GRID, **options))
+    assert_same(metric.compute(), coverage(steps, GRID, **OPTIONS))
 
 
 @settings(max_examples=12, deadline=None)
@@ -255,7 +264,7 @@ def test_more_sensor_points_never_make_it_worse(seed):
     known = before.probed_steps > 0
     assert (after.radius <= before.radius + 1e-12)[known].all()
     assert (after.detection >= before.detection - 1e-12)[:, known].all()
-    assert (before.maximum >= before.radius - 1e-12)[known].all()
+    assert (map_of(before, "radius_maximum_m") >= before.radius - 1e-12)[known].all()
 
 
 def test_a_step_split_in_two_is_another_number():
@@ -265,39 +274,6 @@ def test_a_step_split_in_two_is_another_number():
     assert whole.points.item() == parts.points.item()
     assert whole.radius.item() == 0.5
     assert parts.radius.item() == (0.125 + 0.6875) / 2
-
-
-# Quantiles
-
-
-@pytest.mark.parametrize("level", [0.0, 0.1, 0.5, 0.9, 1.0])
-def test_quantiles_are_right_within_a_bin(level):
-    """A bin is 12 % wide, or 1 cm."""
-    grid = BevGrid(x=(0.0, 64.0), y=(0.0, 64.0), cell=64.0, heights={"all": (-1.0, 1.0)})
-    random = np.random.default_rng(0)
-    distances = np.concatenate([10 ** random.uniform(-4, 1.7, 801)])
-    result = coverage([(ORIGIN, points_at(*distances))], grid, quantiles=(level,))
-    expected = np.quantile(distances, level, method="inverted_cdf")
-    assert abs(result.quantiles.item() - expected) <= max(0.123 * expected, 0.01)
-
-
-def test_steps_weigh_the_same_in_a_quantile():
-    steps = [(ORIGIN, points_at(*[0.1] * 500)), (ORIGIN, points_at(0.8)), (ORIGIN, points_at(0.8))]
-    assert coverage(steps, quantiles=(0.5,)).quantiles.item() == pytest.approx(0.8, rel=0.13)
-
-
-def test_quantiles_beyond_the_histogram_are_max_radius():
-    grid = BevGrid(x=(0.0, 512.0), y=(0.0, 512.0), cell=512.0, heights={"all": (-1.0, 1.0)})
-    steps = [(ORIGIN, points_at(1.0, 200.0, 300.0))]
-    assert coverage(steps, grid, quantiles=(0.9,), max_radius=250.0).quantiles.item() == 250.0
-    assert coverage(steps, grid, quantiles=(0.9,)).quantiles.item() == math.inf
-    assert coverage([(NOTHING, points_at(0.5))], quantiles=(0.5,)).quantiles.item() == math.inf
-
-
-def test_the_least_value_is_not_zero_unless_a_value_is():
-    least = coverage([(ORIGIN, points_at(0.5, 0.75))], quantiles=(0.0,)).quantiles.item()
-    assert least == pytest.approx(0.5, rel=0.13)
-    assert coverage([(ORIGIN, points_at(0.0, 0.75))], quantiles=(0.0,)).quantiles.item() == 0
 
 
 # What is refused
@@ -313,8 +289,7 @@ def test_the_least_value_is_not_zero_unless_a_value_is():
         ({"max_radius": 0.0}, "max_radius: a positive distance in metres is needed; got 0.0"),
         ({"max_radius": -1.0}, "max_radius: a positive distance"),
         ({"max_radius": math.nan}, "max_radius: a positive distance"),
-        ({"quantiles": (0.5, 1.1)}, r"quantiles: numbers in \[0, 1\] are needed; got \(0.5, 1.1\)"),
-        ({"quantiles": (math.nan,)}, "quantiles: numbers in"),
+        ({"aggregations": [Maximum(), Maximum()]}, "aggregations: one of each kind.*got maximum, maximum"),
     ],
 )
 def test_parameters_that_make_no_sense_are_refused(options, message):

@@ -212,7 +212,7 @@ def test_a_time_between_frames_that_is_no_multiple_of_the_time_step_is_refused(e
 def test_another_reference_sees_the_same_instants_and_builds_nothing_again():
     base = SimulatedFrames("courtyard", "front_roof_32", steps=2, reference_sensor=PaperReference(rows=8, columns=8))
     other = base.with_reference_sensor(PaperReference(rows=16, columns=16))
-    assert other.scene is base.scene
+    assert other.simulator.scene_of(1)[0] is base.simulator.scene_of(0)[0]
     assert torch.equal(other[1].sensor, base[1].sensor)
     assert len(other[1].reference) > len(base[1].reference)
-    assert base.reference.rows == 8
+    assert base.reference_sensor.rows == 8

@@ -196,7 +196,7 @@ def test_boxes_do_not_depend_on_order_or_workers_and_leave_the_clouds_alone(fram
 
 def test_an_object_keeps_its_name_and_moves_as_its_velocity_says(frames):
     first, second = frames[2].boxes, frames[3].boxes
-    world = frames.scene.world
+    world = frames.simulator.scene_of(0)[0].world
     poses = [world.ego.trajectory.at(0.5 * step) for step in (2, 3)]
     moved = 0
     for k, name in enumerate(first.ids):

@@ -1,10 +1,6 @@
 """Matching, and recall and precision over visibility and distance."""
 
 import math
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -223,35 +219,6 @@ def test_a_lower_threshold_only_adds_so_matching_once_is_enough():
         assert torch.equal(getattr(both, name)[1], getattr(high, name)[0])
 
 
-def test_lists_are_the_same_as_frame_by_frame_and_halves_merge():
-    whole = filled(FRAMES)
-    at_once = RecallByVisibility(score_thresholds=(0.0, 0.5))
-    at_once.update(*(list(column) for column in zip(*FRAMES, strict=True)))
-    assert counts_of(at_once) == counts_of(whole)
-    first, second = filled(FRAMES[:13]), filled(FRAMES[13:])
-    first.compute()
-    first.merge_state(second)
-    assert counts_of(first) == counts_of(whole)
-    assert first.compute().frames == 40
-
-
-def test_states_are_sums_of_fixed_size_and_survive_a_checkpoint():
-    """What makes it right under DDP: torchmetrics adds up sums of equal shape."""
-    few, many = filled(FRAMES[:2]), filled(FRAMES)
-    assert {name: value.shape for name, value in few.metric_state.items()} == {
-        name: value.shape for name, value in many.metric_state.items()
-    }
-    assert all(
-        reduction is torch.sum or reduction.__name__ == "dim_zero_sum" for reduction in many._reductions.values()
-    )
-    again = RecallByVisibility(score_thresholds=(0.0, 0.5))
-    again.load_state_dict(many.state_dict())
-    for name in (*NAMES, "frames"):
-        assert torch.equal(getattr(again, name), getattr(many, name))
-    many.reset()
-    assert not any(value.any() for value in many.metric_state.values())
-
-
 def test_a_reset_under_inference_mode_as_in_lightning_s_validation_does_no_harm():
     metric = filled(FRAMES[:3])
     with torch.inference_mode():
@@ -259,22 +226,6 @@ def test_a_reset_under_inference_mode_as_in_lightning_s_validation_does_no_harm(
         metric.update(*FRAMES[4])
     metric.update(*FRAMES[5])
     assert counts_of(metric) == counts_of(filled(FRAMES[4:6]))
-
-
-def test_two_processes_count_as_one(tmp_path):
-    torch.save([(d, boxes.rows, share, s, own) for d, boxes, share, s, own in FRAMES], tmp_path / "frames.pt")
-    script = str(Path(__file__).with_name("one_recall_rank.py"))
-    interface = "lo0" if sys.platform == "darwin" else "lo"
-    environment = {**os.environ, "GLOO_SOCKET_IFNAME": interface, "OMP_NUM_THREADS": "1"}
-    environment["PYTHONPATH"] = os.pathsep.join(path for path in sys.path if path)
-    ranks = [subprocess.Popen([sys.executable, script, str(rank), str(tmp_path)], env=environment) for rank in range(2)]
-    try:
-        assert [rank.wait(timeout=100) for rank in ranks] == [0, 0]
-    finally:
-        for rank in ranks:
-            rank.kill()
-    for rank in range(2):
-        assert [count.tolist() for count in torch.load(tmp_path / f"{rank}.pt")] == counts_of(filled(FRAMES))
 
 
 def test_recall_and_precision_are_quotients_of_the_counts_with_nan_where_there_are_none():
@@ -338,7 +289,7 @@ def test_frames_without_objects_or_detections_are_counted_and_break_nothing(coun
     none = Boxes.from_rows(torch.empty(0, 7))
     metric.update(torch.rand(count, 7), none, torch.empty(0), torch.rand(count))
     result = metric.compute()
-    assert result.frames == 1
+    assert result.steps == 1
     assert result.overall().recall.value.isnan().all()
     assert result.overall().precision.trials.item() == count
 
@@ -409,14 +360,9 @@ def test_bad_frames_are_refused_and_leave_the_state_alone(changes, message):
     }
     with pytest.raises(ValueError, match=message):
         metric.update(**{**good, **changes})
-    assert int(metric.frames) == 0
+    assert int(metric.steps) == 0
 
 
 def test_a_frame_in_which_nobody_looked_for_objects_is_refused():
     with pytest.raises(TypeError, match=r"boxes: Boxes are needed, .* got NoneType"):
         RecallByVisibility().update(torch.empty(0, 7), None, torch.empty(0))
-
-
-def test_metrics_with_different_bins_do_not_merge():
-    with pytest.raises(ValueError, match="cannot merge metrics with different distance_borders"):
-        RecallByVisibility().merge_state(RecallByVisibility(distance_borders=(10.0, 20.0, 30.0)))

@@ -11,6 +11,13 @@ def test_a_box_around_points_touches_them():
     assert all(type(bound) is float for bound in (*box.lower_m, *box.upper_m))
 
 
+def test_the_outline_goes_counter_clockwise_around_the_box_seen_from_above():
+    outline_m = BoundingBox((-1.0, -2.0, 0.5), (3.0, 4.0, 9.0)).outline_m
+    np.testing.assert_array_equal(outline_m, [[-1, -2], [3, -2], [3, 4], [-1, 4]])
+    x, y = outline_m.T
+    assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2 == 4 * 6  # the signed area: positive if so
+
+
 @pytest.mark.parametrize(
     ("lower", "upper"), [((0, 0, 0), (1, 1, 0)), ((0, 2, 0), (1, 1, 1)), ((0, 0, float("nan")), (1, 1, 1))]
 )

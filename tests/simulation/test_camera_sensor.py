@@ -79,7 +79,7 @@ def test_pixels_without_a_ray_give_no_point_and_are_no_rays():
     )
     assert frames[0].counts["sensor_rays"] == 160 * 120 - missing
     assert frames[0].sensor.isfinite().all()
-    image = frames.scene.at(0).range_image(np.eye(4) @ folded.mount.matrix(), folded.directions())
+    image = frames.simulator.scene_of(0)[0].at(0).range_image(np.eye(4) @ folded.mount.matrix(), folded.directions())
     assert np.isnan(image).sum() == missing
 
 

@@ -8,7 +8,7 @@ import pytest
 from torchcover.data import SimulatedFrames
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import EvenReference, PaperReference
-from torchcover.simulation.even_reference import paper_density
+from torchcover.simulation.paper_reference import paper_density
 from torchcover.simulation.rays import into_tiles
 
 EGO = BoundingBox((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
@@ -131,4 +131,4 @@ def test_frames_carry_a_weight_for_each_point():
 )
 def test_what_makes_no_sense_is_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        EvenReference(**options)
+        EvenReference(**{"rays": 64, **options})

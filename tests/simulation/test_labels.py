@@ -15,7 +15,7 @@ UTM_M = np.array([5.6e5, 5.9e6, 80.0])
 def driving(speed_mps, yaw_deg, start_m, seconds=10.0):
     heading = np.array([np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg)), 0.0])
     start = np.asarray(start_m, dtype=float)
-    return Trajectory.of([0.0, seconds], [start, start + seconds * speed_mps * heading], [[yaw_deg, 0, 0]] * 2)
+    return Trajectory.from_arrays([0.0, seconds], [start, start + seconds * speed_mps * heading], [[yaw_deg, 0, 0]] * 2)
 
 
 def world(ego, actors, parked=()):
@@ -52,7 +52,7 @@ def test_parked_objects_have_labels_too():
 
 
 def test_velocity_is_that_of_the_segment_their_mean_at_a_corner_and_zero_at_rest():
-    track = Trajectory.of([1.0, 2.0, 4.0], [[0, 0, 0], [10, 0, 0], [10, 8, 0]], np.zeros((3, 3)))
+    track = Trajectory.from_arrays([1.0, 2.0, 4.0], [[0, 0, 0], [10, 0, 0], [10, 8, 0]], np.zeros((3, 3)))
     for time_s, expected in {
         0.5: [0, 0, 0], 1.0: [10, 0, 0], 1.5: [10, 0, 0], 2.0: [5, 2, 0], 3.0: [0, 4, 0], 4.0: [0, 4, 0], 4.5: [0, 0, 0]
     }.items():  # fmt: skip
@@ -63,7 +63,7 @@ def test_velocity_is_that_of_the_segment_their_mean_at_a_corner_and_zero_at_rest
 def test_velocity_is_the_slope_of_the_positions():
     generator = np.random.default_rng(0)
     times_s = np.cumsum(generator.uniform(0.1, 0.5, 20))
-    track = Trajectory.of(times_s, generator.normal(size=(20, 3)), np.zeros((20, 3)))
+    track = Trajectory.from_arrays(times_s, generator.normal(size=(20, 3)), np.zeros((20, 3)))
     for time_s in generator.uniform(times_s[0] + 0.01, times_s[-1] - 0.01, 30):
         if np.abs(times_s - time_s).min() > 1e-4:
             slope = (track.at(time_s + 1e-5)[:3, 3] - track.at(time_s - 1e-5)[:3, 3]) / 2e-5

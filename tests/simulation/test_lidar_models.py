@@ -140,13 +140,13 @@ def test_a_model_can_be_a_file_beside_the_rig(tmp_path):
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ("model: vlp16", r"sensors\.0\.lidar: model: 'vlp16' is neither .* built-in lidars: .*velodyne_vlp16"),
-        ("model: none.yaml", r"sensors\.0\.lidar: model: .*none\.yaml: no such file"),
-        ("model: 16", r"sensors\.0\.lidar\.model: .*string \(got 16\)"),
-        ("model: hesai_pandar64, channels: 8", r"sensors\.0\.lidar: the rows are missing"),
+        ("model: vlp16", r"sensors\.0: model: 'vlp16' is neither .* built-in lidars: .*velodyne_vlp16"),
+        ("model: none.yaml", r"sensors\.0: model: .*none\.yaml: no such file"),
+        ("model: 16", r"sensors\.0\.model: .*string \(got 16\)"),
+        ("model: hesai_pandar64, channels: 8", r"sensors\.0: the rows are missing"),
         ("model: hesai_pandar64, azimuth_offsets_deg: [1]", "one for each of the 64 rows is needed; got 1"),
         ("model: velodyne_vlp16, max_range_m: 0.2", r"min_range_m \(0\.4\) must be below"),
-        ("model: velodyne_vlp16, colums: 9", r"sensors\.0\.lidar\.colums: Extra inputs"),
+        ("model: velodyne_vlp16, colums: 9", r"sensors\.0\.colums: Extra inputs"),
         ("model: velodyne_vlp16, dropout: 1.1", r"dropout: .*less than or equal to 1 \(got 1\.1\)"),
         ("model: velodyne_vlp16, dropout: -0.1", r"dropout: .*greater than or equal to 0"),
         ("model: velodyne_vlp16, range_noise_m: -1", r"range_noise_m: .*greater than or equal to 0"),
@@ -161,9 +161,7 @@ def test_a_wrong_sensor_is_named(tmp_path, keys, message):
 
 def test_a_wrong_model_file_is_named(tmp_path):
     (tmp_path / "own.yaml").write_text("{name: own, elevations_deg: [95], horizontal_fov_deg: 90, columns: 4}")
-    with pytest.raises(
-        ValueError, match=r"sensors\.0\.lidar: .*own\.yaml: elevations_deg\.0: .*90.*; max_range_m: Field req"
-    ):
+    with pytest.raises(ValueError, match=r"sensors\.0: .*own\.yaml: elevations_deg\.0: .*90.*; max_range_m: Field req"):
         read(tmp_path, "model: own.yaml")
 
 

@@ -29,7 +29,7 @@ def box(*size_m):
 
 def driving(start, way, yaw_deg=0.0):
     ends_m = np.array([start, np.add(start, way)], dtype=float)
-    return Trajectory.of([0.0, 10.0], ends_m, [[yaw_deg, 0, 0]] * 2)
+    return Trajectory.from_arrays([0.0, 10.0], ends_m, [[yaw_deg, 0, 0]] * 2)
 
 
 def world(ego_moves=True, actor_moves=True, origin_m=(0.0, 0.0, 0.0)):

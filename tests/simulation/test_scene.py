@@ -41,7 +41,7 @@ def world(origin_m=(0, 0, 0), yaw_deg=0.0, moving=True, ego_moves=False):
 
     def along(start, way):
         ends = np.array([start, np.add(start, way)], dtype=float)
-        return Trajectory.of([0.0, 10.0], ends @ place[:3, :3].T + place[:3, 3], [[yaw_deg, 0, 0]] * 2)
+        return Trajectory.from_arrays([0.0, 10.0], ends @ place[:3, :3].T + place[:3, 3], [[yaw_deg, 0, 0]] * 2)
 
     static = (
         box(1, 20, 4).moved(place @ Pose(x_m=10).matrix()),
@@ -154,7 +154,7 @@ def test_a_scenario_places_its_ego_and_bodies():
 
 def test_an_actor_in_the_ego_is_an_error_that_names_actor_and_time():
     made = world(ego_moves=True)
-    crossing = Trajectory.of([0.0, 10.0], [[5, -25, 0], [5, 25, 0]], [[90, 0, 0]] * 2)
+    crossing = Trajectory.from_arrays([0.0, 10.0], [[5, -25, 0], [5, 25, 0]], [[90, 0, 0]] * 2)
     scene = Scene(World(made.static, made.ego, (Actor("truck", "truck", box(8, 2, 3), crossing),), 1.0, 10.0))
     scene.at(3)
     with pytest.raises(ValueError, match=r"actor 'truck' overlaps the ego at t = 5 s"):

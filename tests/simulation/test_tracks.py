@@ -22,7 +22,7 @@ def write(folder, content, name="track.csv"):
 
 
 def test_between_poses_a_body_moves_straight_and_turns_the_shorter_way():
-    turn = Trajectory.of(
+    turn = Trajectory.from_arrays(
         [0.0, 2.0, 3.0], [[0, 0, 0], [4, 0, 0], [4, 2, 0]], [[170, 0, 0], [-170, 10, 0], [-170, 10, -6]]
     )
     np.testing.assert_allclose(turn.at(1.0)[:3, 3], [2, 0, 0])
@@ -32,7 +32,7 @@ def test_between_poses_a_body_moves_straight_and_turns_the_shorter_way():
 
 
 def test_outside_its_times_a_body_rests_or_is_not_there():
-    resting = Trajectory.of([1.0, 2.0], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0]] * 2)
+    resting = Trajectory.from_arrays([1.0, 2.0], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0]] * 2)
     np.testing.assert_array_equal(resting.at(-5.0), resting.at(1.0))
     np.testing.assert_array_equal(resting.at(9.0), resting.at(2.0))
     transient = Trajectory(resting.times_s, resting.positions_m, resting.angles_deg, transient=True)
@@ -43,7 +43,9 @@ def test_outside_its_times_a_body_rests_or_is_not_there():
 
 def test_positions_at_many_times_are_those_of_the_poses():
     generator = np.random.default_rng(0)
-    track = Trajectory.of(np.sort(generator.uniform(0, 9, 20)), generator.normal(size=(20, 3)), np.zeros((20, 3)))
+    track = Trajectory.from_arrays(
+        np.sort(generator.uniform(0, 9, 20)), generator.normal(size=(20, 3)), np.zeros((20, 3))
+    )
     times = generator.uniform(-1, 10, 50)
     np.testing.assert_allclose(track.positions_at(times), [track.at(time)[:3, 3] for time in times], atol=1e-12)
 

@@ -197,7 +197,9 @@ def narrow_by_arccos(angle_rad):
 def small_and_far():
     """A box of 0.2 m at 250 m that moves, and rays that end 0.1 mm to 20 mm inside its corners."""
     mesh, place = box(0.2, 0.2, 0.2), np.array([200.0, 150.0, 0.0])
-    track = Trajectory.of([0.0, 1.0], np.stack([place, place + np.array([0.0, 0.0, 1.0])]), [[0.0, 0.0, 0.0]] * 2)
+    track = Trajectory.from_arrays(
+        [0.0, 1.0], np.stack([place, place + np.array([0.0, 0.0, 1.0])]), [[0.0, 0.0, 0.0]] * 2
+    )
     ego = Actor("ego", "car", box(0.1, 0.1, 0.1), Trajectory.resting([0.0, 0.0, 0.0]))
     inwards = np.geomspace(1e-3, 0.2, 200)[:, None, None]
     ends = mesh.vertices_m * (1 - inwards) + mesh.vertices_m.mean(axis=0) * inwards + place - [0.0, 0.0, 1.0]

@@ -1,4 +1,4 @@
-"""Every case of the stability table of docs/accuracy.md stays within its bound, with every backend of the search."""
+"""Every case of docs/measured/stability.md stays within its bound, with every backend of the search."""
 
 import numpy as np
 import pytest

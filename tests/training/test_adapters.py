@@ -198,7 +198,7 @@ class Hidden:
 sys.meta_path.insert(0, Hidden())
 import torchcover.training
 assert not {{"lightning", "mmengine", "tensorboard", "matplotlib"}} & set(sys.modules)
-torchcover.training.frames_of_batch_dict, torchcover.training.CountOnce
+torchcover.training.frames_of_batch_dict, torchcover.training.frames_of_data_batch, torchcover.training.CountOnce
 assert not {{"lightning", "mmengine", "tensorboard", "matplotlib"}} & set(sys.modules)
 try:
     from torchcover.training import {name}

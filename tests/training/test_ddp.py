@@ -13,7 +13,8 @@ from torch.utils.data import BatchSampler, DataLoader, DistributedSampler
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.data import Frame, collate_frames
-from torchcover.training import CountOnce, shard_of
+from torchcover.training import CountOnce, frames_of_batch_dict, shard_of
+from torchcover.training.counting import Shard
 
 GRID = {"x": (0.0, 8.0), "y": (-2.0, 2.0), "cell": 1.0}
 REGION = Region("all", x=GRID["x"], y=GRID["y"])
@@ -55,7 +56,7 @@ def test_two_processes_give_the_numbers_of_one(tmp_path):
             job = torch.load(tmp_path / f"{name}_{rank}.pt")
             for stage in ("train", "val"):
                 assert_same(Coverage.load(tmp_path / f"{name}_{stage}_{rank}.npz"), truth)
-                np.testing.assert_allclose(job["blocks"][stage], truth.blocks.radius_sum, rtol=1e-12)
+                np.testing.assert_allclose(job["blocks"][stage], truth.blocks.sums, rtol=1e-12)
                 assert job["logged"][f"coverage/{stage}/steps"] == 7
                 for tag, value in truth.scalars([REGION]).items():
                     assert job["logged"][f"coverage/{stage}/{tag}"] == pytest.approx(value, rel=1e-6, nan_ok=True)
@@ -94,6 +95,30 @@ def test_every_frame_is_counted_by_one_process(samples, processes, shuffle, drop
             dealt += [frame.index for frame in batch.frames]
             counted += [frame.index for frame in once.new(batch.frames, shard_of(loader))]
     assert sorted(counted) == sorted(set(dealt))
+
+
+@pytest.mark.parametrize("batch_size", [1, 2, 5])
+@pytest.mark.parametrize(("samples", "processes"), [(1, 1), (1, 4), (3, 8), (4, 4), (5, 4), (7, 2), (8, 3), (10, 4)])
+def test_a_number_of_samples_that_is_told_at_the_end_gives_the_same(samples, processes, batch_size):
+    dataset = Clouds(samples)
+    for rank in range(processes):
+        loader = DataLoader(
+            dataset, batch_size, sampler=DistributedSampler(dataset, processes, rank), collate_fn=collate_frames
+        )
+        known, told_late = CountOnce(), CountOnce()
+        expected = [frame for batch in loader for frame in known.new(batch.frames, shard_of(loader))]
+        unknown = Shard(rank, processes, None)
+        counted = [frame for batch in loader for frame in told_late.new(batch.frames, unknown)]
+        counted += told_late.new([], shard_of(loader))
+        assert [frame.index for frame in counted] == [frame.index for frame in expected]
+
+
+def test_frames_that_have_neither_index_nor_name_are_all_new():
+    """Batches of OpenPCDet without `frame_id`, of clouds that were sampled to one number of points."""
+    points = torch.zeros(64, 5)
+    batch = frames_of_batch_dict({"points": points, "reference_points": points, "batch_size": 1})
+    once = CountOnce()
+    assert [len(once.new(batch.frames)) for _ in range(3)] == [1, 1, 1]
 
 
 def test_a_batch_sampler_is_looked_through():

@@ -164,10 +164,10 @@ def random_frames(steps, seed, reference, name, keep_clouds):
 
 
 def test_a_small_run_trains_both_rigs_logs_every_epoch_and_ends_with_table_and_figure(
-    example, tmp_path, monkeypatch, capsys
+    example, tmp_path, monkeypatch, capsys, blank_maps
 ):
     monkeypatch.setattr(example, "simulate", random_frames)
-    options = {"--train": 16, "--validate": 32, "--epochs": 2, "--out": tmp_path}
+    options = {"--train": 8, "--validate": 16, "--epochs": 2, "--out": tmp_path}
     monkeypatch.setattr(sys, "argv", ["train_detector.py", *(str(word) for pair in options.items() for word in pair)])
     monkeypatch.setenv("COLUMNS", "200")
     example.main()

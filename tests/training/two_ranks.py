@@ -1,16 +1,19 @@
 """A Lightning run in two processes: `python two_ranks.py FOLDER`, on the frames in FOLDER/frames.pt."""
 
+import os
+import socket
 import sys
 import warnings
 from pathlib import Path
 
 import lightning.pytorch as pl
 import torch
+from matplotlib.figure import Figure
 from torch.utils.data import DataLoader
 
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.data import Frame, collate_frames
-from torchcover.training import CoverageCallback
+from torchcover.training import CoverageCallback, figures
 
 warnings.simplefilter("error")
 warnings.filterwarnings("ignore", ".*isinstance.treespec, LeafSpec.. is deprecated", FutureWarning)
@@ -95,12 +98,27 @@ def fit(name, *callbacks, ckpt_path=None):
     blocks = {}
     for stage, callback in (("train", train), ("val", validation)):
         callback.coverage.save(folder / f"{name}_{stage}_{trainer.global_rank}.npz")
-        blocks[stage] = callback.coverage.blocks.radius_sum
+        blocks[stage] = callback.coverage.blocks.sums
     logged = {tag: float(value) for tag, value in trainer.callback_metrics.items()}
     result = {"logged": logged, "images": logger.images, "blocks": blocks}
     torch.save(result, folder / f"{name}_{trainer.global_rank}.pt")
 
 
+def two_processes():
+    """Fork once everything is imported; the environment tells Lightning not to start processes itself."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    os.environ.update(MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port), WORLD_SIZE="2", NODE_RANK="0")
+    child = os.fork()
+    os.environ["LOCAL_RANK"] = "0" if child else "1"
+    return child
+
+
 if __name__ == "__main__":
+    figures.band_figures = lambda coverage: [("radius", Figure((1, 1))), ("detection", Figure((1, 1)))]
+    child = two_processes()
     fit("whole", SaveWithinEpoch())
     fit("resumed", ckpt_path=folder / "within.ckpt")
+    if child:
+        sys.exit(os.waitpid(child, 0)[1])

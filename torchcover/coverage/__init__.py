@@ -1,9 +1,41 @@
-"""Grid, binning, metric, result and regions: from clouds to coverage numbers."""
+"""Grid, aggregations, metric, result, regions and paired differences: from clouds to coverage numbers."""
 
+from torchcover.coverage.aggregations import (
+    AGGREGATIONS,
+    Aggregation,
+    Maximum,
+    MeanOfMeans,
+    PooledMean,
+    Quantiles,
+    StepQuantiles,
+)
 from torchcover.coverage.grid import BevGrid
+from torchcover.coverage.layer import Layer
 from torchcover.coverage.metric import CoverageMetric
+from torchcover.coverage.paired import Difference, check_paired, differences
+from torchcover.coverage.quantity import Quantity
 from torchcover.coverage.regions import Region, forward_regions
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.summary import RegionNumbers, RegionSummary
+from torchcover.coverage.summary import Number, RegionSummary
 
-__all__ = ["BevGrid", "Coverage", "CoverageMetric", "Region", "RegionNumbers", "RegionSummary", "forward_regions"]
+__all__ = [
+    "AGGREGATIONS",
+    "Aggregation",
+    "BevGrid",
+    "Coverage",
+    "CoverageMetric",
+    "Difference",
+    "Layer",
+    "Maximum",
+    "MeanOfMeans",
+    "Number",
+    "PooledMean",
+    "Quantiles",
+    "Quantity",
+    "Region",
+    "RegionSummary",
+    "StepQuantiles",
+    "check_paired",
+    "differences",
+    "forward_regions",
+]

@@ -1,5 +1,6 @@
 """Blocks of contiguous steps: what standard errors are estimated from."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -7,8 +8,6 @@ from torch import Tensor
 
 # With fewer, the error itself is off by more than a quarter: 1 / sqrt(2 (blocks - 1)).
 MIN_BLOCKS = 8
-# The states that have a row for each block.
-PER_BLOCK = ("probed_steps", "radius_sum", "detection_sum", "block_steps")
 
 
 @dataclass(frozen=True)
@@ -18,14 +17,13 @@ class Blocks:
     Args:
         steps: (B,) int64 steps in each block; 0 in the blocks that are not in use.
         probed_steps: (B, H, Y, X) int64 steps of the block that had a reference point in the cell.
-        radius_sum: (B, H, Y, X) float64 sums over these steps of the cell's mean radius in metres.
-        detection_sum: (B, T, H, Y, X) float64 sums of the cell's share of points within each threshold.
+        sums: (B, Q, H, Y, X) float64 sums over these steps of the cell's means: the radius in metres, then the share of
+            points within each threshold.
     """
 
     steps: Tensor
     probed_steps: Tensor
-    radius_sum: Tensor
-    detection_sum: Tensor
+    sums: Tensor
 
 
 def check_blocks(blocks: int) -> None:
@@ -38,13 +36,14 @@ def check_blocks(blocks: int) -> None:
         raise ValueError(f"blocks: 1, or an even number from {MIN_BLOCKS} on, is needed; got {blocks}")
 
 
-def pair_up(state: dict[str, Any]) -> None:
+def pair_up(state: dict[str, Any], in_blocks: Sequence[str]) -> None:
     """Add up neighbouring blocks in place: half as many of twice the length, and room for as many again.
 
     Args:
-        state: The states of a `CoverageMetric`, `block_length` and those of `PER_BLOCK`.
+        state: The states of a `CoverageMetric`, `block_length` among them.
+        in_blocks: Names of those whose first dimension is the blocks.
     """
-    for name in PER_BLOCK:
+    for name in in_blocks:
         sums = state[name]
         half = len(sums) // 2
         sums[:half] = sums[0::2] + sums[1::2]

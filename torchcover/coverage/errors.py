@@ -7,6 +7,8 @@ from torch import Tensor
 
 from torchcover.coverage.blocks import MIN_BLOCKS, Blocks
 
+# Errors below come from rounding in sums of float64: the estimate is the same whichever block is left out.
+ROUND_OFF = 1e-12
 # A cell has an error if it was probed in at least as many blocks.
 MIN_BLOCKS_OF_A_CELL = 4
 

@@ -56,7 +56,7 @@ def estimate_region(
     left_out = []
     used = blocks.steps.nonzero().flatten().tolist()
     for block in used:
-        own = torch.cat([blocks.radius_sum[block, None, band], blocks.detection_sum[block, :, band]])[:, cells]
+        own = blocks.sums[block, :, band][:, cells]
         left_out.append(mean(probed - blocks.probed_steps[block, band][cells], sums - own))
     return RegionEstimate(whole, torch.stack(left_out) if left_out else whole[None][:0], blocks.steps[used])
 

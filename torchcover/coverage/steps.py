@@ -5,6 +5,7 @@ from typing import NamedTuple, TypeAlias
 
 from torch import Tensor
 
+from torchcover.coverage.aggregations import Aggregation
 from torchcover.neighbors import check_cloud
 
 # One step, or a list with an entry for each.
@@ -20,12 +21,12 @@ class Step(NamedTuple):
     number: int
 
 
-def check_parameters(thresholds: Sequence[float], max_radius: float, quantiles: Sequence[float]) -> None:
+def check_parameters(thresholds: Sequence[float], max_radius: float, aggregations: Sequence[Aggregation]) -> None:
     """Refuse parameters of a metric that make no sense.
 
     Raises:
         ValueError: A threshold that is negative, NaN, over `max_radius`, or given twice; a `max_radius` that is not
-            positive; a quantile outside [0, 1].
+            positive; two aggregations of one kind.
     """
     if not all(threshold >= 0 for threshold in thresholds):
         raise ValueError(f"thresholds: distances >= 0 in metres are needed; got {tuple(thresholds)}")
@@ -37,8 +38,11 @@ def check_parameters(thresholds: Sequence[float], max_radius: float, quantiles: 
         raise ValueError(
             f"thresholds: at most max_radius = {max_radius} m, where r saturates, is possible; got {tuple(thresholds)}"
         )
-    if not all(0 <= quantile <= 1 for quantile in quantiles):
-        raise ValueError(f"quantiles: numbers in [0, 1] are needed; got {tuple(quantiles)}")
+    kinds = [aggregation.name for aggregation in aggregations]
+    if len(set(kinds)) != len(kinds):
+        raise ValueError(
+            f"aggregations: one of each kind is possible, with several levels in it; got {', '.join(kinds)}"
+        )
 
 
 def checked_steps(

@@ -2,28 +2,19 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
+
+
+class Number(NamedTuple):
+    """A number in the unit of its quantity, and its standard error; NaN where it is not known."""
+
+    value: float
+    error: float
 
 
 @dataclass(frozen=True)
-class RegionNumbers:
-    """Means over the cells of one region in one height band, every cell weighing the same.
-
-    Args:
-        radius_m: Mean blind spot radius in metres; NaN if no cell is known.
-        detection: Threshold in metres -> mean detection probability.
-        radius_error_m: Standard error of `radius_m`; NaN if it was not asked for, or if there are not enough steps.
-        detection_error: Threshold -> standard error of `detection`.
-    """
-
-    radius_m: float
-    detection: Mapping[float, float]
-    radius_error_m: float
-    detection_error: Mapping[float, float]
-
-
-@dataclass(frozen=True)
-class RegionSummary(RegionNumbers):
-    """The numbers of one region in one height band, over its known cells.
+class RegionSummary:
+    """The numbers of one region in one height band, over its known cells, every cell weighing the same.
 
     Args:
         region: Name of the region.
@@ -31,7 +22,9 @@ class RegionSummary(RegionNumbers):
         cells: Number of cells in the region.
         known_cells: How many of them a reference point has probed.
         unseen_cells: About how many more would become known with more steps.
-        completed: The numbers with these cells, as far as can be told; less biased as long as there are many. See
+        numbers: Key of the quantity, such as `"radius_m"` or `"detection_0.4m"` -> its number; the error is NaN if it
+            was not asked for, or if there are not enough steps.
+        completed: The numbers with the unseen cells, as far as can be told; less biased as long as there are many. See
             `torchcover.coverage.estimate.completed_mean`.
     """
 
@@ -40,7 +33,8 @@ class RegionSummary(RegionNumbers):
     cells: int
     known_cells: int
     unseen_cells: float
-    completed: RegionNumbers
+    numbers: Mapping[str, Number]
+    completed: Mapping[str, Number]
 
     @property
     def known_share(self) -> float:

@@ -18,7 +18,7 @@ from torchcover.data.formats.arrays import Points
 from torchcover.data.frame import Frame
 from torchcover.data.poses import read_poses
 from torchcover.geometry.rigid import Matrix, transform
-from torchcover.simulation.rig import Sensor
+from torchcover.simulation import Sensor
 
 POSES_FILE = "frames.yaml"
 # What the clouds of the only rig are called.

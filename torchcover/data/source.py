@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.data.frame import Frame
-from torchcover.simulation.rig import Sensor
+from torchcover.simulation import Sensor
 
 
 class FrameSource(Protocol):

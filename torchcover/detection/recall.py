@@ -7,18 +7,18 @@ from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
-from torchmetrics import Metric
 
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.detected_frame import DetectedFrame
 from torchcover.detection.matching import MatchBy, match
 from torchcover.detection.recall_curve import DetectionCounts
 from torchcover.detection.visibility import BoxVisibility
+from torchcover.metrics import MergeableMetric
 
 T = TypeVar("T")
 
 
-class RecallByVisibility(Metric):
+class RecallByVisibility(MergeableMetric):
     """Recall and precision in bins of visibility and of distance, so that a miss and a blind spot can be told apart.
 
     Detections are matched to objects by `torchcover.detection.match`. An object's visibility is its share from
@@ -29,7 +29,8 @@ class RecallByVisibility(Metric):
     `update`. All objects and detections count, whatever their category: give one category at a time for figures by
     category.
 
-    The state is a few counts, whatever the number of frames; ranks are added up when `compute` is called.
+    The state is a few counts, whatever the number of frames, which is `steps`; as every `MergeableMetric`, metrics with
+    the same parameters merge, and ranks are added up when `compute` is called.
 
     Args:
         by: "distance" of the centres over ground, or "iou", the overlap seen from above.
@@ -51,15 +52,10 @@ class RecallByVisibility(Metric):
         (('0-0.5', '0.5-1', 'unknown'), tensor([[0., 1., nan]], dtype=torch.float64), tensor([[1, 1, 0]]))
     """
 
-    is_differentiable = False
-    higher_is_better = None
-    full_state_update = False
-
     objects: Tensor
     found: Tensor
     detections: Tensor
     true_detections: Tensor
-    frames: Tensor
 
     def __init__(
         self,
@@ -71,19 +67,23 @@ class RecallByVisibility(Metric):
         score_thresholds: Sequence[float] = (-math.inf,),
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
-        super().__init__(**kwargs)
+        threshold = float({"distance": 2.0, "iou": 0.5}.get(by, 0.0) if threshold is None else threshold)
+        borders = {
+            "visibility_borders": tuple(float(border) for border in visibility_borders),
+            "distance_borders": tuple(float(border) for border in distance_borders),
+        }
+        scores = tuple(float(score) for score in score_thresholds)
+        _check_parameters(by, threshold, borders, scores)
+        super().__init__({"by": by, "threshold": threshold, **borders, "score_thresholds": scores}, **kwargs)
         self.by = by
-        self.threshold = float({"distance": 2.0, "iou": 0.5}.get(by, 0.0) if threshold is None else threshold)
-        self.visibility_borders = tuple(float(border) for border in visibility_borders)
-        self.distance_borders = tuple(float(border) for border in distance_borders)
-        self.score_thresholds = tuple(float(score) for score in score_thresholds)
-        self._check_parameters()
+        self.threshold = threshold
+        self.visibility_borders = borders["visibility_borders"]
+        self.distance_borders = borders["distance_borders"]
+        self.score_thresholds = scores
         bins = (len(self.visibility_borders) + 2, len(self.distance_borders) + 1)
-        shapes = {"objects": bins, "frames": ()}
-        shapes |= {name: (len(self.score_thresholds), *bins) for name in ("found", "detections", "true_detections")}
-        for name, shape in shapes.items():
-            zeros = torch.zeros(shape, dtype=torch.int64)
-            self.add_state(name, zeros, dist_reduce_fx="sum", persistent=True)
+        self.add_sum("objects", bins, torch.int64)
+        for name in ("found", "detections", "true_detections"):
+            self.add_sum(name, (len(self.score_thresholds), *bins), torch.int64)
 
     def update(
         self,
@@ -136,7 +136,7 @@ class RecallByVisibility(Metric):
         self.found = self.found + self._counted([object_bin[found_at >= score] for score in self.score_thresholds])
         self.detections = self.detections + self._counted([detection_bin[some] for some in counts])
         self.true_detections = self.true_detections + self._counted([detection_bin[some & hit] for some in counts])
-        self.frames = self.frames + 1
+        self.steps = self.steps + 1
 
     def _bin(self, rows: Tensor, share: Tensor) -> Tensor:
         distance = torch.linalg.vector_norm(rows[:, :2].double(), dim=1)
@@ -164,32 +164,22 @@ class RecallByVisibility(Metric):
                 f"over {distance[-1]:g} m",
             ),
             score_thresholds=self.score_thresholds,
-            frames=int(self.frames),
+            steps=int(self.steps),
         )
 
-    def merge_state(self, incoming_state: "dict[str, Any] | Metric") -> None:
-        """Add the frames of another metric with the same parameters, or its `metric_state`."""
-        if isinstance(incoming_state, RecallByVisibility):
-            for name in ("by", "threshold", "visibility_borders", "distance_borders", "score_thresholds"):
-                mine, other = getattr(self, name), getattr(incoming_state, name)
-                if mine != other:
-                    raise ValueError(f"cannot merge metrics with different {name}: {mine} and {other}")
-        super().merge_state(incoming_state)
-        # torchmetrics would go on answering from the result it had cached.
-        self._computed = None
-        self._update_count = int(self.frames)
 
-    def _check_parameters(self) -> None:
-        if self.by not in ("distance", "iou"):
-            raise ValueError(f"by: 'distance' or 'iou' is needed; got {self.by!r}")
-        if not 0 < self.threshold < math.inf or (self.by == "iou" and self.threshold > 1):
-            raise ValueError(f"threshold: metres > 0, or a share in (0, 1] for 'iou', is needed; got {self.threshold}")
-        for name, highest in (("visibility_borders", 1.0), ("distance_borders", math.inf)):
-            borders = (0.0, *getattr(self, name), highest)
-            if not all(low < high for low, high in pairwise(borders)):
-                raise ValueError(f"{name}: ascending numbers within (0, {highest:g}) are needed; got {borders[1:-1]}")
-        if not self.score_thresholds or any(math.isnan(score) for score in self.score_thresholds):
-            raise ValueError(f"score_thresholds: at least one number is needed; got {self.score_thresholds}")
+def _check_parameters(
+    by: str, threshold: float, borders: dict[str, tuple[float, ...]], scores: tuple[float, ...]
+) -> None:
+    if by not in ("distance", "iou"):
+        raise ValueError(f"by: 'distance' or 'iou' is needed; got {by!r}")
+    if not 0 < threshold < math.inf or (by == "iou" and threshold > 1):
+        raise ValueError(f"threshold: metres > 0, or a share in (0, 1] for 'iou', is needed; got {threshold}")
+    for (name, given), highest in zip(borders.items(), (1.0, math.inf), strict=True):
+        if not all(low < high for low, high in pairwise((0.0, *given, highest))):
+            raise ValueError(f"{name}: ascending numbers within (0, {highest:g}) are needed; got {given}")
+    if not scores or any(math.isnan(score) for score in scores):
+        raise ValueError(f"score_thresholds: at least one number is needed; got {scores}")
 
 
 def _as_list(given: T | Sequence[T]) -> list[Any]:

@@ -69,7 +69,7 @@ class DetectionCounts:
         visibility_bins: Names of the V bins.
         distance_bins: Names of the D bins.
         score_thresholds: The S score thresholds.
-        frames: Number of frames.
+        steps: Number of frames that were counted.
     """
 
     # No dataclass: torchmetrics would take it apart and squeeze its tensors.
@@ -83,7 +83,7 @@ class DetectionCounts:
         visibility_bins: tuple[str, ...],
         distance_bins: tuple[str, ...],
         score_thresholds: tuple[float, ...],
-        frames: int,
+        steps: int,
     ) -> None:
         self.objects = objects
         self.found = found
@@ -92,7 +92,7 @@ class DetectionCounts:
         self.visibility_bins = visibility_bins
         self.distance_bins = distance_bins
         self.score_thresholds = score_thresholds
-        self.frames = frames
+        self.steps = steps
 
     def over(self, axis: Literal["visibility", "distance"]) -> Curve:
         """Recall and precision over bins of visibility or of distance."""

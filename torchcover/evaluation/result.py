@@ -30,7 +30,7 @@ from torchcover.report import (
     write_comparison,
     write_csv,
 )
-from torchcover.simulation.rig import Sensor
+from torchcover.simulation import Sensor
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -36,7 +36,7 @@ def rig_pictures(rig: Rig, scenario: Scenario, *, step: int = 0, seed: int = 0) 
         What to add to the name of the rig, ``""`` or ``"_depth"``, and the figure.
     """
     frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference_sensor=REFERENCE)
-    scene, step_of_world = frames.scene_of(step)
+    scene, step_of_world = frames.simulator.scene_of(step)
     ego = scene.world.ego.mesh
     length, width, height = scene.ego_box.size_m
     subtitle = f"on the ego of {scenario.name}, {length:.2f} x {width:.2f} x {height:.2f} m"
@@ -62,7 +62,7 @@ def scenario_picture(scenario: Scenario, rig: Rig, *, step: int = 0, seed: int =
     """
     frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference_sensor=REFERENCE)
     frame = frames[step]
-    scene, step_of_world = frames.scene_of(step)
+    scene, step_of_world = frames.simulator.scene_of(step)
     time_s = step_of_world * scene.world.time_step_s
     return draw_scene(
         GRID_X_M,

@@ -6,7 +6,7 @@ import numpy as np
 
 from torchcover.geometry import euler_from_rotation
 from torchcover.report import SensorMark, SensorView
-from torchcover.simulation.rig import Sensor
+from torchcover.simulation import Sensor
 
 
 def sensor_views(sensors: Sequence[Sensor]) -> list[SensorView]:

@@ -1,19 +1,15 @@
 """What an evaluation is done with, unless the user says otherwise."""
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 
 from torchcover.coverage import BevGrid, CoverageMetric, Region, forward_regions
 from torchcover.evaluation.target_error import TargetError
-from torchcover.simulation import EvenReference, PaperReference, Scenario
+from torchcover.simulation import REFERENCE_SENSORS, ReferenceSensor, Scenario
 
 DEFAULT_SCENARIO = "courtyard"
 DEFAULT_REFERENCE = "even"
-# The best of those tried for runs of seconds to a minute: `torchcover study`, docs/accuracy.md.
-DEFAULT_EVEN_RAYS = 262_144
 DEFAULT_STEPS = 64
 # With a target error; as many as the paper averages.
 MAX_STEPS = 4096
@@ -24,8 +20,6 @@ BLOCKS = 16
 # Holds the paper's regions, and the space beside and behind the vehicle.
 GRID_X_M = (-40.0, 160.0)
 GRID_Y_M = (-40.0, 40.0)
-
-AnyReference = EvenReference | PaperReference
 
 
 @dataclass(frozen=True)
@@ -105,30 +99,18 @@ def spread_s(scenario: Scenario, given_s: float | None) -> float | None:
     return EVERY_S_IN_TRAFFIC if given_s is None and scenario.traffic is not None else given_s
 
 
-def reference_called(name: str | None, rays: int | None) -> AnyReference:
-    """A reference sensor by its name in `REFERENCES`.
+def reference_called(name: str | None, rays: int | None) -> ReferenceSensor:
+    """A reference sensor by its name.
 
     Args:
-        name: "even", spread over the paper's regions and the whole grid, or "paper"; None for the default.
-        rays: Rays at each step, for the paper's rounded to a square; None for the sensor's own.
+        name: One of `REFERENCE_SENSORS`; None for the default. It is asked about the paper's regions and the whole grid.
+        rays: About how many rays at each step; None for the sensor's own number.
 
     Raises:
         ValueError: Another name, or too few rays.
     """
-    name = name or DEFAULT_REFERENCE
-    if name not in REFERENCES:
-        raise ValueError(f"reference {name}: {' or '.join(f'`{known}`' for known in REFERENCES)} is needed")
-    return REFERENCES[name](rays)
-
-
-def _even(rays: int | None) -> EvenReference:
+    kind = REFERENCE_SENSORS.get(name or DEFAULT_REFERENCE)
+    if kind is None:
+        raise ValueError(f"reference {name}: {' or '.join(f'`{known}`' for known in REFERENCE_SENSORS)} is needed")
     areas = (*((region.x, region.y) for region in forward_regions()), (GRID_X_M, GRID_Y_M))
-    return EvenReference(areas, rays=rays or DEFAULT_EVEN_RAYS)
-
-
-def _paper(rays: int | None) -> PaperReference:
-    side = 1024 if rays is None else max(1, round(math.sqrt(rays)))
-    return PaperReference(rows=side, columns=side)
-
-
-REFERENCES: dict[str, Callable[[int | None], AnyReference]] = {"even": _even, "paper": _paper}
+    return kind.from_rays(areas, rays)

@@ -12,7 +12,6 @@ from torchcover.simulation import Scenario
 
 # Seeds of the runs are next to each other; the long run's is far away.
 LONG_RUN_SEED = 1_000_003
-PATTERNS = ("even", "paper")
 
 
 @dataclass(frozen=True)

@@ -13,9 +13,10 @@ from torchcover.data import SimulatedFrames
 from torchcover.evaluation.observers import CoverageObserver
 from torchcover.evaluation.progress import progress_of
 from torchcover.evaluation.settings import reference_called
-from torchcover.evaluation.study_plan import PATTERNS, StudyPlan
+from torchcover.evaluation.study_plan import StudyPlan
 from torchcover.evaluation.study_truth import Truth
 from torchcover.neighbors import nearest
+from torchcover.simulation import REFERENCE_SENSORS
 
 # The other backend of the search is tried up to here; beyond, it takes minutes.
 MAX_RAYS_BY_BRUTE_FORCE = 4096
@@ -63,7 +64,7 @@ def one_run(plan: StudyPlan, seed: int, truth: Truth, *, progress: bool) -> Iter
     with progress_of(plan.steps, f"seed {seed}", shown=progress) as bar:
         for index in range(plan.steps):
             start = time.perf_counter()
-            trials[0].frames.scene_of(index)  # each of them would have built it alone
+            trials[0].frames.simulator.scene_of(index)  # each of them would have built it alone
             world_seconds = time.perf_counter() - start
             for trial in trials:
                 trial.seconds += world_seconds
@@ -94,12 +95,12 @@ def _trials(plan: StudyPlan, seed: int) -> list[_Trial]:
             CoverageObserver(plan.metric(blocks=1)),
         )
         for rays in plan.rays
-        for pattern in PATTERNS
+        for pattern in REFERENCE_SENSORS
     ]
 
 
 def _one_step(trial: _Trial, index: int) -> tuple[float, float, float, float]:
-    trial.frames.scene_of(index)  # not counted: it comes once for many steps
+    trial.frames.simulator.scene_of(index)  # not counted: it comes once for many steps
     start, metric = time.perf_counter(), trial.observer.metric
     frame = trial.frames[index]
     cast = time.perf_counter()

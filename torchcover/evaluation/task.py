@@ -7,8 +7,7 @@ from typing import NamedTuple
 from torchcover.data import FrameSource, SimulatedFrames, open_recording
 from torchcover.evaluation.rig_names import AnyRig, distinct_names, given_as, is_document, loaded
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings, reference_called, spread_s
-from torchcover.simulation import Scenario
-from torchcover.simulation.rig import Sensor
+from torchcover.simulation import Scenario, Sensor
 
 AnyScenario = Scenario | str | Path
 AnyFrames = FrameSource | str | Path

@@ -44,7 +44,7 @@ class BoundingBox:
 
     @property
     def outline_m(self) -> NDArray[np.float64]:
-        """(4, 2) corners x, y as seen from above, counter-clockwise."""
+        """(4, 2) corners x, y seen from above, counter-clockwise."""
         (x0, y0, _), (x1, y1, _) = self.lower_m, self.upper_m
         return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
 

@@ -80,24 +80,22 @@ class MergeableMetric(Metric):
             incoming_state: Such a metric, or its `metric_state`.
 
         Raises:
-            ValueError: Another kind of metric, or other parameters.
+            ValueError: Another kind of metric, other parameters, or a state that lacks something.
         """
-        if isinstance(incoming_state, MergeableMetric) and type(incoming_state) is type(self):
-            for name, mine in self.meaning.items():
-                other = incoming_state.meaning.get(name)
-                if mine != other:
-                    raise ValueError(f"cannot merge metrics with different {name}: {mine} and {other}")
-        elif isinstance(incoming_state, Metric):
-            raise ValueError(f"cannot merge a {type(incoming_state).__name__} into a {type(self).__name__}")
-        else:
-            self._check_fingerprint(incoming_state.get("fingerprint"))
-        super().merge_state(incoming_state)
+        if isinstance(incoming_state, Metric):
+            self._check_meaning(incoming_state)
+            incoming_state = incoming_state.metric_state
+        if not isinstance(incoming_state, dict):
+            raise ValueError(
+                f"a {type(self).__name__} or its metric_state is needed; got {type(incoming_state).__name__}"
+            )
+        super().merge_state(self._copied(incoming_state))
         self._follow_steps()
 
     def _reduce_states(self, incoming_state: dict[str, Any]) -> None:
-        incoming = {name: value.clone() for name, value in incoming_state.items()}
-        self._align_with(incoming)
-        super()._reduce_states(incoming)
+        # A copy already, here and in torchmetrics' `forward`.
+        self._align_with(incoming_state)
+        super()._reduce_states(incoming_state)
 
     def _align_with(self, incoming: dict[str, Any]) -> None:
         """Bring this state and another one, a copy, into a form in which they can be added up."""
@@ -118,27 +116,36 @@ class MergeableMetric(Metric):
         """Bring the states of all ranks into a form in which they can be added up."""
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:  # noqa: ANN401
-        # torchmetrics keeps the very tensors it is given, of any shape, and `update` adds into them in place.
-        for name in self._defaults:
-            if (loaded := state_dict.get(prefix + name)) is not None:
-                mine = getattr(self, name)
-                if loaded.shape != mine.shape:
-                    raise ValueError(
-                        f"state {name!r} has shape {tuple(loaded.shape)}; this metric's parameters need "
-                        f"{tuple(mine.shape)}"
-                    )
-                state_dict[prefix + name] = loaded.to(device=mine.device, dtype=mine.dtype, copy=True)
-        if prefix + "fingerprint" in state_dict:
-            self._check_fingerprint(state_dict[prefix + "fingerprint"])
+        # torchmetrics would keep the very tensors it is given, of any shape, and pass over those that are missing.
+        given = {name: state_dict[prefix + name] for name in self._defaults if prefix + name in state_dict}
+        if given:
+            state_dict.update({prefix + name: value for name, value in self._copied(given).items()})
         super()._load_from_state_dict(state_dict, prefix, *args)
         self._follow_steps()
 
-    def _check_fingerprint(self, other: Tensor | None) -> None:
-        if other is None or not torch.equal(other.to(self.fingerprint), self.fingerprint):
-            names = ", ".join(self.meaning)
+    def _check_meaning(self, other: Metric) -> None:
+        if not isinstance(other, MergeableMetric) or type(other) is not type(self):
+            raise ValueError(f"cannot merge a {type(other).__name__} into a {type(self).__name__}")
+        for name, mine in self.meaning.items():
+            if mine != other.meaning.get(name):
+                raise ValueError(f"cannot merge metrics with different {name}: {mine} and {other.meaning.get(name)}")
+
+    def _copied(self, states: Mapping[str, Tensor]) -> dict[str, Any]:
+        """The states of a metric, once they are known to mean the same, on this device and in these types."""
+        fingerprint = states.get("fingerprint")
+        if fingerprint is None or not torch.equal(fingerprint.to(self.fingerprint), self.fingerprint):
             raise ValueError(
-                f"the state was made by another metric than this {type(self).__name__}, or with other {names}"
+                f"the state was made by another metric than this {type(self).__name__}, or with other "
+                f"{', '.join(self.meaning)}"
             )
+        copies = {}
+        for name in self._defaults:
+            mine, other = getattr(self, name), states.get(name)
+            if other is None or other.shape != mine.shape:
+                arrived = "none" if other is None else tuple(other.shape)
+                raise ValueError(f"state {name!r} of shape {tuple(mine.shape)} is needed; got {arrived}")
+            copies[name] = other.to(device=mine.device, dtype=mine.dtype, copy=True)
+        return copies
 
     def _follow_steps(self) -> None:
         # torchmetrics would go on answering from the result it had cached.

@@ -1,22 +1,22 @@
 """A reference sensor that spreads its rays over the places that are asked about."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, rigid
+from torchcover.simulation.paper_reference import paper_density_at
 from torchcover.simulation.rays import Tile, into_tiles
-from torchcover.simulation.reference import MAX_TILT_DEG, position_in_shell
+from torchcover.simulation.reference_sensor import Area, Areas
+from torchcover.simulation.shell import position_in_shell
 
 # Height above the ground up to which half of the rays look for bodies that stand on it.
 TOP_M = 2.0
-# Steps in elevation at which the density of the paper's sensor is tabulated.
-ELEVATIONS = 181
-ORIENTATIONS = 48
+# The best number of those tried for runs of seconds to a minute: `torchcover study`, docs/accuracy.md.
+DEFAULT_RAYS = 262_144
 
 Float64 = NDArray[np.float64]
 
@@ -53,8 +53,10 @@ class EvenReference:
         1024
     """
 
-    areas: tuple[tuple[tuple[float, float], tuple[float, float]], ...]
-    rays: int = 16_384
+    name: ClassVar[str] = "even"
+
+    areas: Areas
+    rays: int
     shell_m: float = 0.5
     max_range_m: float = 250.0
 
@@ -70,6 +72,19 @@ class EvenReference:
             raise ValueError(f"shell_m: a positive thickness in metres is needed; got {self.shell_m}")
         if not self.max_range_m > 0:
             raise ValueError(f"max_range_m: a positive distance in metres is needed; got {self.max_range_m}")
+
+    @classmethod
+    def from_rays(cls, areas: Areas, rays: int | None) -> Self:
+        """One that asks about some areas.
+
+        Args:
+            areas: As above.
+            rays: About how many rays; 262,144 if not given.
+
+        Raises:
+            ValueError: As for the class.
+        """
+        return cls(areas, DEFAULT_RAYS if rays is None else rays)
 
     def vehicle_T_reference(self, ego: BoundingBox, generator: np.random.Generator) -> Float64:
         """Draw the pose of one step: its place is the paper's; its axes are those of the vehicle.
@@ -124,17 +139,14 @@ class EvenReference:
         place_m = vehicle_T_reference[:3, 3]
         counts = [math.prod(_patches(area, self._rays_each)) for area in self.areas]
         density = np.average([_density(area, place_m, towards) for area in self.areas], axis=0, weights=counts)
-        elevation = np.arcsin(np.clip(towards[2], -1.0, 1.0))
-        paper = np.interp(elevation, np.linspace(-np.pi / 2, np.pi / 2, ELEVATIONS), paper_density())
+        paper = paper_density_at(np.arcsin(np.clip(towards[2], -1.0, 1.0)))
         # The paper's sensor never looks up steeply, and a ray aimed at the very border of an area may have been rounded
         # out of it: neither may make a weight of 0 or infinity.
         weights: NDArray[np.float32] = (np.maximum(paper, 1e-6) / np.maximum(density, 1e-6)).astype(np.float32)
         return weights
 
 
-def _stratified(
-    area: tuple[tuple[float, float], tuple[float, float]], top_m: float, count: int, generator: np.random.Generator
-) -> Float64:
+def _stratified(area: Area, top_m: float, count: int, generator: np.random.Generator) -> Float64:
     """(3, rows, columns) points, one at random in each of about `count` patches; z between 0 and `top_m`."""
     (x_low, x_high), (y_low, y_high) = area
     length_m, width_m = x_high - x_low, y_high - y_low
@@ -145,14 +157,14 @@ def _stratified(
     return np.stack([x, y, top_m * jitter[2]])
 
 
-def _patches(area: Sequence[tuple[float, float]], count: int) -> tuple[int, int]:
+def _patches(area: Area, count: int) -> tuple[int, int]:
     """Rows and columns of nearly square patches, together at most `count`."""
     (x_low, x_high), (y_low, y_high) = area
     columns = min(count, max(1, round(math.sqrt(count * (x_high - x_low) / (y_high - y_low)))))
     return count // columns, columns
 
 
-def _density(area: Sequence[tuple[float, float]], place_m: Float64, directions: Float64) -> Float64:
+def _density(area: Area, place_m: Float64, directions: Float64) -> Float64:
     """Rays of one area per solid angle, of each of some directions: half aimed at the ground, half above it."""
     (x_low, x_high), (y_low, y_high) = area
     size_m2 = (x_high - x_low) * (y_high - y_low)
@@ -179,21 +191,3 @@ def _stretch_within(
             ends = [(bound_m[axis] - place_m[axis]) / directions[axis] for bound_m in (lower_m, upper_m)]
             near_m, far_m = np.fmax(near_m, np.fmin(*ends)), np.fmin(far_m, np.fmax(*ends))
     return near_m, np.maximum(near_m, far_m)
-
-
-@lru_cache
-def paper_density() -> Float64:
-    """Rays of the paper's sensor per solid angle at elevations from -90 to 90 degrees, averaged over its orientations.
-
-    Its rows are even in elevation below its own horizon: 1 / (pi^2 cos(elevation)) there, and nothing above. Yaw
-    being uniform, what is left of an orientation is the tilt of its axis: pitch and roll uniform in +-45 degrees.
-    """
-    middle = (np.arange(ORIENTATIONS) + 0.5) / ORIENTATIONS
-    tilt = np.deg2rad(MAX_TILT_DEG) * middle
-    cosine = (np.cos(tilt)[:, None] * np.cos(tilt)[None]).reshape(-1, 1, 1)
-    sine = np.sqrt(1 - cosine**2)
-    elevation = np.linspace(-np.pi / 2, np.pi / 2, ELEVATIONS)[:, None]
-    towards_axis = cosine * np.sin(elevation) + sine * np.cos(elevation) * np.cos(np.pi * middle)
-    density = np.where(towards_axis < 0, 1 / np.sqrt(np.maximum(1 - towards_axis**2, 1e-12)), 0.0)
-    average: Float64 = density.mean(axis=(0, 2)) / np.pi**2
-    return average

@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 from torchcover.simulation.instant import Instant, Scan
 from torchcover.simulation.rays import Tile
-from torchcover.simulation.rig import Sensor
 from torchcover.simulation.scene import Scene
+from torchcover.simulation.sensor import Sensor
 
 
 class MountedSensor:

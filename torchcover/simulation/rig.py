@@ -3,24 +3,19 @@
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import Field, PlainValidator, TypeAdapter, ValidationInfo, model_validator
 
-from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.documents import Document, load_document
-from torchcover.simulation.lidar import Lidar
+from torchcover.simulation.kinds import SENSORS
+from torchcover.simulation.sensor import Sensor
 
 
-def _kind(sensor: Any) -> str | None:  # noqa: ANN401  (whatever stood in the file, or a sensor)
-    kind = sensor.get("type", "lidar") if isinstance(sensor, dict) else getattr(sensor, "type", None)
-    return kind if isinstance(kind, str) else None
-
-
-Sensor = Annotated[
-    Annotated[Lidar, Tag("lidar")] | Annotated[CameraSensor, Tag("camera")],
-    Discriminator(
-        _kind, custom_error_type="sensor_type", custom_error_message="type: a sensor is a 'lidar' or a 'camera'"
-    ),
-]
+def _sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whatever stood in the file, or a sensor)
+    """A sensor of the kind that its `type` names."""
+    kind = content.get("type", "lidar") if isinstance(content, dict) else getattr(content, "type", type(content))
+    if not isinstance(kind, str) or kind not in SENSORS:
+        raise ValueError(f"type: a sensor is a {' or a '.join(map(repr, SENSORS))}; got {kind!r}")
+    return TypeAdapter(SENSORS[kind]).validate_python(content, context=info.context)
 
 
 class Rig(Document):
@@ -29,7 +24,7 @@ class Rig(Document):
     Args:
         name: What tables and maps call it.
         description: What it is, and where its numbers come from.
-        sensors: The sensors; their clouds are fused.
+        sensors: The sensors, each of a kind in `SENSORS`; their clouds are fused.
 
     Example:
         >>> [sensor.name for sensor in Rig.load("front_roof_128").sensors]
@@ -38,7 +33,7 @@ class Rig(Document):
 
     name: str
     description: str = ""
-    sensors: tuple[Sensor, ...] = Field(min_length=1)
+    sensors: tuple[Annotated[Sensor, PlainValidator(_sensor)], ...] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _check_names(self) -> Self:

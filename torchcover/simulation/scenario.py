@@ -7,12 +7,17 @@ from typing import Annotated, Self
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, model_validator
 
+from torchcover.geometry import BoundingBox
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, mover_mesh
 from torchcover.simulation.documents import Document, Pose, beside, load_document
+from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.tracks import read_boxes, read_trajectory
 from torchcover.simulation.traffic import Highway, Parking, Urban
 from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World, steps_of
+
+# What carries the rig in procedural traffic, unless the document says otherwise.
+DEFAULT_EGO = VehicleShape(type="vehicle", vehicle="suv")
 
 Traffic = Annotated[Urban | Highway | Parking, Field(discriminator="type")]
 
@@ -144,6 +149,24 @@ class Scenario(Document):
             )
         return steps
 
+    def ego_mesh(self) -> Mesh:
+        """The body of the vehicle that carries the rig, in the vehicle frame; no world is built for it.
+
+        Raises:
+            FileNotFoundError: A mesh or vehicle file is missing.
+            ValueError: A mesh cannot be used.
+        """
+        return mover_mesh("ego", self.ego.shape if self.ego else DEFAULT_EGO)
+
+    def ego_box(self) -> BoundingBox:
+        """The bounding box of that body.
+
+        Example:
+            >>> [round(metres, 2) for metres in Scenario.load("courtyard").ego_box().size_m]
+            [4.9, 1.94, 1.63]
+        """
+        return BoundingBox.around(self.ego_mesh().vertices_m)
+
     def world(self, seed: int = 0, episode: int = 0) -> World:
         """Build it.
 
@@ -156,9 +179,8 @@ class Scenario(Document):
             ValueError: A mesh or a trajectory cannot be used.
         """
         if self.traffic is not None:
-            shape = self.ego.shape if self.ego else VehicleShape(type="vehicle", vehicle="suv")
             own_seed = int(np.random.SeedSequence([seed, episode]).generate_state(1, np.uint64)[0])
-            return self.traffic.world(own_seed, mover_mesh("ego", shape))
+            return self.traffic.world(own_seed, self.ego_mesh())
         assert self.ego is not None  # checked in _check_given_or_procedural
         actors = tuple(actor.actor(actor.name, actor.category) for actor in self.actors)
         return World(

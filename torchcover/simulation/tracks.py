@@ -74,7 +74,7 @@ def read_boxes(path: Path) -> tuple[Actor, ...]:
 def _read_csv(path: Path) -> Trajectory:
     numbers = _numbers(_rows(path, TRAJECTORY_COLUMNS), TRAJECTORY_COLUMNS)
     time_s, position_m, (roll, pitch, yaw) = numbers[:, 0], numbers[:, 1:4], numbers[:, 4:].T
-    return Trajectory.of(time_s, position_m, np.stack([yaw, pitch, roll], axis=1))
+    return Trajectory.from_arrays(time_s, position_m, np.stack([yaw, pitch, roll], axis=1))
 
 
 def _read_npz(path: Path) -> Trajectory:

@@ -28,7 +28,7 @@ class Trajectory:
         ValueError: No pose, shapes that do not fit, NaN or infinite numbers, times that do not ascend.
 
     Example:
-        >>> drive = Trajectory.of(times_s=[0.0, 2.0], positions_m=[[0, 0, 0], [20, 0, 0]], angles_deg=[[0, 0, 0]] * 2)
+        >>> drive = Trajectory.from_arrays([0.0, 2.0], positions_m=[[0, 0, 0], [20, 0, 0]], angles_deg=[[0, 0, 0]] * 2)
         >>> drive.at(0.5)[:3, 3]
         array([5., 0., 0.])
     """
@@ -58,7 +58,7 @@ class Trajectory:
             )
 
     @classmethod
-    def of(cls, times_s: ArrayLike, positions_m: ArrayLike, angles_deg: ArrayLike) -> "Trajectory":
+    def from_arrays(cls, times_s: ArrayLike, positions_m: ArrayLike, angles_deg: ArrayLike) -> "Trajectory":
         """From anything that NumPy takes."""
         times, positions, angles = (np.array(a, dtype=np.float64) for a in (times_s, positions_m, angles_deg))
         return cls(times, positions, angles)
@@ -66,12 +66,12 @@ class Trajectory:
     @classmethod
     def resting(cls, position_m: ArrayLike, angles_deg: ArrayLike = (0.0, 0.0, 0.0)) -> "Trajectory":
         """A body that stays where it is."""
-        return cls.of([0.0], np.array([position_m]), np.array([angles_deg]))
+        return cls.from_arrays([0.0], np.array([position_m]), np.array([angles_deg]))
 
     @classmethod
     def from_poses(cls, times_s: ArrayLike, world_T_body: Matrix) -> "Trajectory":
         """From (K, 4, 4) rigid transforms."""
-        return cls.of(times_s, world_T_body[:, :3, 3], euler_from_rotation(world_T_body[:, :3, :3]))
+        return cls.from_arrays(times_s, world_T_body[:, :3, 3], euler_from_rotation(world_T_body[:, :3, :3]))
 
     @property
     def moves(self) -> bool:

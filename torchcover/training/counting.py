@@ -8,6 +8,7 @@ import torch
 from torch.utils.data.distributed import DistributedSampler
 
 from torchcover.data import Frame
+from torchcover.training.batches import UNKNOWN_INDEX
 
 
 class Shard(NamedTuple):
@@ -16,12 +17,17 @@ class Shard(NamedTuple):
     Args:
         process: Rank of this process.
         processes: Number of processes.
-        samples: Number of different samples; what is dealt out beyond it repeats the first ones.
+        samples: Number of different samples; what is dealt out beyond it repeats the first ones. None as long as it is
+            not known.
     """
 
     process: int
     processes: int
-    samples: int
+    samples: int | None
+
+    def is_padding(self, position: int) -> bool:
+        """Whether a sample of this process, by its position among them, repeats one of the first of all samples."""
+        return self.samples is not None and position * self.processes + self.process >= self.samples
 
 
 class CountOnce:
@@ -30,12 +36,14 @@ class CountOnce:
     A `torch.utils.data.DistributedSampler` deals out the same number of samples to every process and fills the last
     round with the first samples again. The position of a sample in the whole deal tells, whatever the order of the
     samples: from `len(dataset)` on it is a repetition. This covers samplers that deal out in the same way: those that
-    Lightning and OpenPCDet put in. It needs batches in order (`DataLoader(in_order=True)`, the default) with one frame
-    for each sample.
+    Lightning, MMEngine and OpenPCDet put in. Where the number of samples is told at the end only, as by MMEngine, the
+    last frame of a process is held back until then: no other can be a repetition. It needs batches in order
+    (`DataLoader(in_order=True)`, the default) with one frame for each sample.
 
     Within a process a frame that comes again before all are forgotten is recognised by its index, name and numbers of
-    points, and counted once. That covers samplers that repeat samples on purpose, and epochs that were resumed. A frame
-    that a sampler of another kind gives to two processes is counted twice.
+    points, and counted once; one with neither index nor name is a new one. That covers samplers that repeat samples on
+    purpose, and epochs that were resumed. A frame that a sampler of another kind gives to two processes is counted
+    twice.
 
     The memory is one number for each frame that was counted.
 
@@ -62,28 +70,36 @@ class CountOnce:
         if forget:
             self._counted: set[int] = set()
         self._position: dict[int, int] = {}
+        self._held_back: dict[int, Sequence[Frame]] = {}
 
     def new(self, frames: Sequence[Frame], shard: Shard | None = None, loader: int = 0) -> list[Frame]:
         """The frames of the next batch that are to be counted.
 
         Args:
             frames: One for each sample of the batch, in order.
-            shard: How the loader's samples are dealt out, see `shard_of`; None if this process gets all of them.
+            shard: How the loader's samples are dealt out, see `shard_of`; None if this process gets all of them. As
+                long as their number is not known, the last frame waits for the next call; a call without frames, but
+                with the number, gives it back.
             loader: Number of the loader, if there are several: equal frames of two loaders are different ones.
 
         Returns:
             Some or all of the frames, in order.
         """
+        frames = [*self._held_back.pop(loader, ()), *frames]
+        if shard is not None and shard.samples is None:
+            frames, self._held_back[loader] = frames[:-1], frames[-1:]
         first = self._position.get(loader, 0)
         self._position[loader] = first + len(frames)
-        new = []
-        for position, frame in enumerate(frames, first):
-            padding = shard is not None and position * shard.processes + shard.process >= shard.samples
-            identity = _identity(frame, loader)
-            if not padding and identity not in self._counted:
-                self._counted.add(identity)
-                new.append(frame)
-        return new
+        dealt = [frame for position, frame in enumerate(frames, first) if not (shard and shard.is_padding(position))]
+        return [frame for frame in dealt if self._is_new(frame, loader)]
+
+    def _is_new(self, frame: Frame, loader: int) -> bool:
+        if frame.index == UNKNOWN_INDEX and not frame.name:
+            return True
+        identity = _identity(frame, loader)
+        seen = identity in self._counted
+        self._counted.add(identity)
+        return not seen
 
     def state_dict(self) -> dict[str, Any]:
         """What `load_state_dict` takes, plain numbers: the frames that all processes have counted.

@@ -15,7 +15,9 @@ from mmengine.dist import get_comm_device, get_dist_info
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.data import Frame
-from torchcover.training.batches import UNKNOWN_INDEX, frames_in, frames_of_data_batch, sensor_of
+from torchcover.training.batches import UNKNOWN_INDEX, frames_in, sensor_of
+from torchcover.training.counting import CountOnce, Shard
+from torchcover.training.mmdetection3d import frames_of_data_batch
 
 
 @METRICS.register_module()
@@ -23,8 +25,7 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
     """Coverage of the frames that a model is validated on, under the names of `Coverage.scalars`.
 
     Where a `BaseMetric` gathers a result for each sample, this adds up fixed-size sums, which are reduced over the
-    processes. As MMEngine drops padding samples by the size of the dataset, which it tells at the end, the last frame
-    is held back until then.
+    processes. Padding samples and those that come again are left out, see `CountOnce`.
 
     Args:
         metric: A `CoverageMetric`, or its arguments as a config has them, with `grid` as a dict of those of `BevGrid`.
@@ -62,18 +63,15 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         pose = None if vehicle_T_lidar is None else torch.as_tensor(vehicle_T_lidar, dtype=torch.float64)
         self.frames_of = frames_of or partial(frames_of_data_batch, vehicle_T_lidar=pose)
         self.coverage: Coverage | None = None
-        self._held_back: Frame | None = None
-        self._frames = 0
+        self._once = CountOnce()
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:  # noqa: ANN401  (MMEngine's)
         """Add the frames of a batch."""
-        for frame in frames_in(self.frames_of(data_batch, data_samples)):
-            self._count_held_back()
-            self._held_back = frame
-            self._frames += 1
+        self._add(frames_in(self.frames_of(data_batch, data_samples)), size=None)
 
-    def _count_held_back(self) -> None:
-        if (frame := self._held_back) is not None:
+    def _add(self, frames: Sequence[Frame], size: int | None) -> None:
+        rank, processes = get_dist_info()
+        for frame in self._once.new(frames, Shard(rank, processes, size)):
             index = None if frame.index == UNKNOWN_INDEX else frame.index
             self.metric.update(sensor_of(frame), frame.reference, weights=frame.reference_weights, index=index)
 
@@ -84,7 +82,7 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         return coverage.scalars(self.regions)
 
     def evaluate(self, size: int) -> dict[str, float]:
-        """Count the last frame unless it is padding, add up the processes, and start anew.
+        """Add what was held back unless it is padding, add up the processes, and start anew.
 
         Args:
             size: Number of samples in the dataset. Of what a sampler deals out in turns, the rest is padding.
@@ -92,14 +90,12 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         Returns:
             The numbers under `prefix/`, the same on every process.
         """
-        rank, processes = get_dist_info()
-        if (self._frames - 1) * processes + rank < size:
-            self._count_held_back()
+        self._add([], size)
         self.metric.to(get_comm_device())  # processes on GPUs exchange nothing that lies on the CPU
         self.metric.update([], [])  # a process that was dealt nothing but padding has not updated yet
         scalars = self.compute_metrics(self.results)
         self.metric.reset()
-        self._held_back, self._frames = None, 0
+        self._once.start_epoch()
         return {f"{self.prefix}/{name}": value for name, value in scalars.items()}
 
 

@@ -81,7 +81,7 @@ class Simulation:
         )
         self._leader, self._lap = _leaders(lanes, self._lane, self.place_m)
         self._signals = signals
-        self._gates = Gates.of([lane.gates for lane in lanes])
+        self._gates = Gates.from_lanes([lane.gates for lane in lanes])
         self._next = (self._gates.exit_m[self._lane] < (self.place_m - self._length / 2)[:, None]).sum(axis=1)
         self.speed_mps = self._first_speed()
 

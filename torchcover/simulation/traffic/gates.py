@@ -40,7 +40,7 @@ class Gates(NamedTuple):
     green_needed_s: Numbers
 
     @classmethod
-    def of(cls, lanes: Sequence[tuple[Gate, ...]]) -> "Gates":
+    def from_lanes(cls, lanes: Sequence[tuple[Gate, ...]]) -> "Gates":
         """The tables of lanes, each with its gates in order; behind its last gate a lane has one never reached."""
         never = Gate(np.inf, np.inf, 0, 0)
         columns = max(len(gates) for gates in lanes) + 1

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-# Bins of the histogram behind the quantiles: 20 a decade from 1 cm to 100 m, and one beyond each end.
-QUANTILE_EDGES_M = torch.cat([torch.tensor([0.0]), torch.logspace(-2, 2, 81), torch.tensor([math.inf])]).double()
+# Bins of radii: 20 a decade from 1 cm to 100 m, and one beyond each end.
+RADIUS_EDGES_M = torch.cat([torch.tensor([0.0]), torch.logspace(-2, 2, 81), torch.tensor([math.inf])]).double()
 
 
 def bin_of(values: Tensor, edges: Tensor) -> Tensor:
@@ -53,3 +53,15 @@ def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float
         value = torch.where(high.isinf(), high, low + share * (high - low))
         rows.append(value.where(total > 0, math.nan))
     return torch.stack(rows)
+
+
+def check_levels(levels: Sequence[float]) -> tuple[float, ...]:
+    """The levels of quantiles as plain floats.
+
+    Raises:
+        ValueError: None, one given twice, or one outside [0, 1].
+    """
+    checked = tuple(float(level) for level in levels)
+    if not checked or len(set(checked)) != len(checked) or not all(0 <= level <= 1 for level in checked):
+        raise ValueError(f"levels: different numbers in [0, 1] are needed; got {tuple(levels)}")
+    return checked

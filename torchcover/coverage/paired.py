@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import torch
 
-from torchcover.coverage import Coverage, Region
-from torchcover.report.wording import ROUND_OFF
+from torchcover.coverage.errors import ROUND_OFF
+from torchcover.coverage.regions import Region
+from torchcover.coverage.result import Coverage
 
 # Of the standard normal distribution, exceeded to either side with 5 %.
 NORMAL_QUANTILE = 1.959963984540054
@@ -27,15 +28,23 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
         raise ValueError(f"a comparison needs at least two rigs; got {', '.join(coverages) or 'none'}")
     (first, expected), *others = coverages.items()
     for name, coverage in others:
-        for what in ("grid", "thresholds", "max_radius", "quantile_levels"):
+        for what in ("grid", "thresholds", "max_radius"):
             if getattr(coverage, what) != getattr(expected, what):
                 raise ValueError(f"{first!r} and {name!r} cannot be compared: they differ in their {what}")
-        same_points = torch.equal(coverage.points, expected.points)
-        if not same_points or coverage.counts["steps"] != expected.counts["steps"]:
+        if coverage.layers.keys() != expected.layers.keys():
+            raise ValueError(f"{first!r} and {name!r} cannot be compared: they have different layers")
+        if not _same_steps(coverage, expected):
             raise ValueError(
                 f"{first!r} and {name!r} cannot be compared: they were measured against different reference points; "
                 "evaluate both in one run"
             )
+
+
+def _same_steps(a: Coverage, b: Coverage) -> bool:
+    same = torch.equal(a.points, b.points) and a.counts["steps"] == b.counts["steps"]
+    if a.blocks is None or b.blocks is None:
+        return same and a.blocks is b.blocks
+    return same and torch.equal(a.blocks.steps, b.blocks.steps)
 
 
 class Difference(NamedTuple):
@@ -53,7 +62,7 @@ class Difference(NamedTuple):
     significant: bool | None
 
 
-def differences(coverages: Mapping[str, Coverage], region: Region, height: str) -> dict[str, tuple[Difference, ...]]:
+def differences(coverages: Mapping[str, Coverage], region: Region, height: str) -> dict[str, dict[str, Difference]]:
     """The differences of every rig, the first one too, to the first.
 
     Args:
@@ -62,20 +71,20 @@ def differences(coverages: Mapping[str, Coverage], region: Region, height: str) 
         height: Name of the band.
 
     Returns:
-        Name of the rig -> differences of the radius in metres and of the detection at each threshold.
+        Name of the rig -> key of the quantity -> difference.
     """
     estimates = {name: coverage.estimate(region, height) for name, coverage in coverages.items()}
-    first = next(iter(estimates.values()))
+    first, quantities = next(iter(estimates.values())), next(iter(coverages.values())).quantities
     found = {}
     for name, estimate in estimates.items():
         # Two infinite numbers are equal; their difference would be NaN, which means unknown.
         values = (estimate.value - first.value).where(estimate.value != first.value, 0.0)
         errors = estimate.minus(first).error
         freedom = len(estimate.steps) - 1
-        found[name] = tuple(
-            Difference(value, error, is_significant(value, error, freedom))
-            for value, error in zip(values.tolist(), errors.tolist(), strict=True)
-        )
+        found[name] = {
+            quantity.key: Difference(value, error, is_significant(value, error, freedom))
+            for quantity, value, error in zip(quantities, values.tolist(), errors.tolist(), strict=True)
+        }
     return found
 
 

@@ -1,16 +1,25 @@
-"""The random reference sensor: a best case to compare a rig with."""
+"""The paper's reference sensor: a best case to compare a rig with."""
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.simulation.rays import Tile, into_tiles, unit_directions
+from torchcover.simulation.reference_sensor import Areas
+from torchcover.simulation.shell import position_in_shell
 
 # Pitch and roll of the paper's sensor are uniform between minus this and this.
 MAX_TILT_DEG = 45.0
+# Steps in elevation at which the density of its rays is tabulated, and orientations over which it is averaged.
+ELEVATIONS = 181
+ORIENTATIONS = 48
+
+Float64 = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -39,6 +48,8 @@ class PaperReference:
         (4, 4)
     """
 
+    name: ClassVar[str] = "paper"
+
     rows: int = 1024
     columns: int = 1024
     shell_m: float = 0.5
@@ -55,22 +66,38 @@ class PaperReference:
         if not self.max_range_m > 0:
             raise ValueError(f"max_range_m: a positive distance in metres is needed; got {self.max_range_m}")
 
-    def directions(self) -> NDArray[np.float64]:
+    @classmethod
+    def from_rays(cls, areas: Areas, rays: int | None) -> Self:
+        """The paper's, or a smaller or larger square of rows and columns; it looks everywhere, whatever is asked about.
+
+        Args:
+            areas: Not used.
+            rays: About how many rays; 1024 x 1024 if not given.
+
+        Raises:
+            ValueError: Fewer than 1 ray.
+        """
+        if rays is None:
+            return cls()
+        if rays < 1:
+            raise ValueError(f"rays: at least 1 is needed; got {rays}")
+        side = round(math.sqrt(rays))
+        return cls(rows=side, columns=side)
+
+    def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the sensor's frame."""
         elevation = np.linspace(0.0, -90.0, self.rows)
         azimuth = 360.0 * np.arange(self.columns) / self.columns
         return unit_directions(elevation[:, None], azimuth[None, :])
 
-    def tiles(self, vehicle_T_reference: NDArray[np.float64], generator: np.random.Generator) -> tuple[Tile, ...]:
+    def tiles(self, vehicle_T_reference: Float64, generator: np.random.Generator) -> tuple[Tile, ...]:
         """The rays of one step in the sensor's frame: the same at every step."""
         return _tiles_of(self)
 
-    def weights(
-        self, vehicle_T_reference: NDArray[np.float64], tiles: tuple[Tile, ...], ray: NDArray[np.int64]
-    ) -> None:
+    def weights(self, vehicle_T_reference: Float64, tiles: tuple[Tile, ...], ray: NDArray[np.int64]) -> None:
         """None: the points of this sensor weigh the same."""
 
-    def vehicle_T_reference(self, ego: BoundingBox, generator: np.random.Generator) -> NDArray[np.float64]:
+    def vehicle_T_reference(self, ego: BoundingBox, generator: np.random.Generator) -> Float64:
         """Draw the pose of one step.
 
         Args:
@@ -85,23 +112,31 @@ class PaperReference:
         return rigid(rotation_from_euler(yaw, pitch, roll), position_in_shell(ego, self.shell_m, generator))
 
 
-def position_in_shell(ego: BoundingBox, shell_m: float, generator: np.random.Generator) -> NDArray[np.float64]:
-    """(3,) place in metres, uniform between the ego's bounding box and that box grown sideways and upwards.
-
-    Args:
-        ego: Bounding box of the ego in the vehicle frame.
-        shell_m: How far it is grown.
-        generator: Source of the random numbers.
-    """
-    lower, upper = np.array(ego.lower_m), np.array(ego.upper_m)
-    outer_lower, outer_upper = lower - [shell_m, shell_m, 0.0], upper + shell_m
-    while True:
-        position = generator.uniform(outer_lower, outer_upper)
-        if ((position < lower) | (position > upper)).any():
-            return position
-
-
 # Kept for the process, not with the sensor, which travels to DataLoader workers.
 @lru_cache(maxsize=2)
 def _tiles_of(sensor: PaperReference) -> tuple[Tile, ...]:
     return into_tiles(sensor.directions())
+
+
+def paper_density_at(elevation: Float64) -> Float64:
+    """Rays of the paper's sensor per solid angle at some elevations in radians; see `paper_density`."""
+    density: Float64 = np.interp(elevation, np.linspace(-np.pi / 2, np.pi / 2, ELEVATIONS), paper_density())
+    return density
+
+
+@lru_cache
+def paper_density() -> Float64:
+    """Rays of the paper's sensor per solid angle at elevations from -90 to 90 degrees, averaged over its orientations.
+
+    Its rows are even in elevation below its own horizon: 1 / (pi^2 cos(elevation)) there, and nothing above. Yaw
+    being uniform, what is left of an orientation is the tilt of its axis: pitch and roll uniform in +-45 degrees.
+    """
+    middle = (np.arange(ORIENTATIONS) + 0.5) / ORIENTATIONS
+    tilt = np.deg2rad(MAX_TILT_DEG) * middle
+    cosine = (np.cos(tilt)[:, None] * np.cos(tilt)[None]).reshape(-1, 1, 1)
+    sine = np.sqrt(1 - cosine**2)
+    elevation = np.linspace(-np.pi / 2, np.pi / 2, ELEVATIONS)[:, None]
+    towards_axis = cosine * np.sin(elevation) + sine * np.cos(elevation) * np.cos(np.pi * middle)
+    density = np.where(towards_axis < 0, 1 / np.sqrt(np.maximum(1 - towards_axis**2, 1e-12)), 0.0)
+    average: Float64 = density.mean(axis=(0, 2)) / np.pi**2
+    return average

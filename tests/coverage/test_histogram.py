@@ -1,0 +1,48 @@
+"""Quantiles from a histogram whose size is fixed."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from torchcover.coverage.histogram import bin_of, check_levels, histogram_quantiles
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.integers(-5, 5), min_size=2, max_size=6).map(sorted), st.floats(-6, 6))
+def test_bin_of_is_the_definition(edges, value):
+    found = bin_of(torch.tensor([value], dtype=torch.float64), torch.tensor(edges, dtype=torch.float64)).item()
+    bins = [i for i in range(len(edges) - 1) if edges[i] <= value < edges[i + 1]]
+    assert found == (bins[0] if bins else -1)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    values=st.lists(st.floats(0, 9.999), min_size=1, max_size=30),
+    level=st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0]),
+)
+def test_a_quantile_lies_in_the_bin_of_the_true_one(values, level):
+    edges = torch.arange(0, 11, dtype=torch.float64)
+    histogram = torch.zeros(10, 2, dtype=torch.float64)
+    for value in values:
+        histogram[int(value), 0] += 1.0
+    found = histogram_quantiles(histogram, edges, (level,))
+    true = np.quantile(values, level, method="inverted_cdf")
+    assert math.floor(true) <= found[0, 0].item() <= math.floor(true) + 1
+    assert found[0, 1].isnan()
+
+
+def test_quantiles_are_linear_within_a_bin():
+    edges = torch.tensor([0.0, 1.0, 3.0, math.inf], dtype=torch.float64)
+    histogram = torch.tensor([[0.0], [4.0], [1.0]], dtype=torch.float64)
+    found = histogram_quantiles(histogram, edges, (0.0, 0.2, 0.4, 0.8, 0.9, 1.0))
+    assert found.flatten().tolist() == [1.0, 1.5, 2.0, 3.0, math.inf, math.inf]
+
+
+@pytest.mark.parametrize("levels", [(), (0.5, 1.1), (math.nan,), (-0.1,), (0.5, 0.5)])
+def test_levels_that_make_no_sense_are_refused(levels):
+    with pytest.raises(ValueError, match=r"levels: different numbers in \[0, 1\] are needed; got"):
+        check_levels(levels)

@@ -1,0 +1,148 @@
+"""The metrics of the package, as the contract is asked of them: how to make one, and steps to feed it."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torchmetrics import Metric
+
+from torchcover import BevGrid, CoverageMetric
+from torchcover.coverage import Maximum, PooledMean, Quantiles, StepQuantiles
+from torchcover.detection import Boxes, RecallByVisibility
+
+Step = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One metric.
+
+    Args:
+        make: Makes it, with some of its parameters changed.
+        steps: Arguments of `update`, by name, 8 steps or more.
+        bland: A step after which metrics of other parameters have the same sums.
+        changes: Other parameters, each under a text that starts with the name of the one that differs.
+    """
+
+    make: Callable[..., Metric]
+    steps: Sequence[Step]
+    bland: Step
+    changes: Mapping[str, Step]
+
+    def over(self, steps: Sequence[Step], **changes: Any) -> Metric:
+        """The metric over some steps."""
+        metric = self.make(**changes)
+        for step in steps:
+            metric.update(**step)
+        return metric
+
+
+def in_lists(steps: Sequence[Step]) -> dict[str, list[Any]]:
+    """Several steps as one call of `update` takes them."""
+    return {name: [step[name] for step in steps] for name in steps[0]}
+
+
+def shares(steps: Sequence[Step]) -> tuple[Sequence[Step], Sequence[Step]]:
+    """What each of two processes gets: the first of them a few early steps, the second all others."""
+    early = 2 * (len(steps) // 8)
+    return steps[:early:2], [*steps[1:early:2], *steps[early:]]
+
+
+def flat(value: object, path: str = "") -> dict[str, object]:
+    """Every tensor and every plain value that a result holds, by where it is."""
+    if isinstance(value, Mapping):
+        parts = value
+    elif isinstance(value, tuple | list):
+        parts = dict(enumerate(value))
+    elif hasattr(value, "__dict__") and not isinstance(value, torch.Tensor):
+        parts = vars(value)
+    else:
+        return {path: value}
+    return {place: part for name, inner in parts.items() for place, part in flat(inner, f"{path}/{name}").items()}
+
+
+# Coverage.
+
+SHAPE = {"x": (-2.0, 2.0), "y": (-1.0, 1.0), "cell": 0.5}
+BANDS = {"low": (-2.0, 0.0), "high": (0.0, 2.0)}
+COVERAGE = {"grid": BevGrid(**SHAPE, heights=BANDS), "thresholds": (0.4, 0.8), "max_radius": 3.0}
+ALL = (Maximum(), PooledMean(), Quantiles((0.5,)), StepQuantiles((0.5,)))
+
+
+def coverage_step(index: int) -> Step:
+    generator = torch.Generator().manual_seed(index)
+    sensor, reference = (torch.randn(count, 3, generator=generator) for count in (20, 60))
+    return {"sensor": sensor, "reference": reference, "index": index}
+
+
+def coverage(steps: int, changes: Mapping[str, Step], **options: Any) -> Case:
+    return Case(
+        lambda **changed: CoverageMetric(**{**COVERAGE, **options, **changed}),
+        [coverage_step(index) for index in range(steps)],
+        {"sensor": torch.zeros(1, 3), "reference": torch.empty(0, 3), "index": 0},
+        {
+            "grid": {"grid": BevGrid(**{**SHAPE, "x": (-1.0, 3.0)}, heights=BANDS)},
+            "grid, bands in another order": {"grid": BevGrid(**SHAPE, heights=dict(reversed(BANDS.items())))},
+            "thresholds": {"thresholds": (1.0, 0.8)},
+            "thresholds in another order": {"thresholds": (0.8, 0.4)},
+            "thresholds, one less": {"thresholds": (0.4,)},
+            "max_radius": {"max_radius": 4.0},
+            "blocks": {"blocks": 16},
+            **changes,
+        },
+    )
+
+
+# Detection.
+
+
+def detection_step(seed: int) -> Step:
+    generator = torch.Generator().manual_seed(seed)
+    size = torch.tensor([120.0, 60, 1, 4, 2, 1, 6])
+    count = seed % 9
+    truth, false = (torch.rand(n, 7, generator=generator) * size + 0.3 for n in (count, 4))
+    jitter = torch.randn(count, 7, generator=generator) * torch.tensor([1.2, 1.2, 0, 0, 0, 0, 0])
+    share, scores, own = (torch.rand(n, generator=generator).double() for n in (count, count + 4, count + 4))
+    share[torch.rand(count, generator=generator) < 0.2] = math.nan
+    return {
+        "detections": torch.cat([truth + jitter, false]),
+        "boxes": Boxes.from_rows(truth),
+        "visibility": share,
+        "scores": scores,
+        "detection_visibility": own,
+    }
+
+
+CASES = {
+    "coverage": coverage(12, {}),
+    "coverage, everything": coverage(
+        40,
+        {
+            "aggregations, one less": {"aggregations": ALL[1:]},
+            "aggregations in another order": {"aggregations": ALL[::-1]},
+            "aggregations, other levels": {"aggregations": (*ALL[:3], StepQuantiles((0.9,)))},
+        },
+        blocks=8,
+        aggregations=ALL,
+    ),
+    "recall": Case(
+        lambda **changed: RecallByVisibility(**{"score_thresholds": (0.0, 0.5), **changed}),
+        [detection_step(seed) for seed in range(24)],
+        {
+            "detections": torch.empty(0, 7),
+            "boxes": Boxes.from_rows(torch.empty(0, 7)),
+            "visibility": torch.empty(0),
+            "scores": torch.empty(0),
+            "detection_visibility": torch.empty(0),
+        },
+        {
+            "by": {"by": "iou", "threshold": 0.9},
+            "threshold": {"threshold": 0.5},
+            "visibility_borders": {"visibility_borders": (0.1, 0.4, 0.6, 0.8)},
+            "distance_borders": {"distance_borders": (10.0, 20.0)},
+            "score_thresholds": {"score_thresholds": (0.0, 0.9)},
+        },
+    ),
+}

@@ -1,0 +1,387 @@
+"""What every metric of the package promises as a torchmetrics `Metric`, whatever it measures."""
+
+import copy
+import os
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from torchmetrics import Metric, MetricCollection
+from torchmetrics.aggregation import SumMetric
+
+from .cases import CASES, flat, in_lists
+
+EVERY = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
+EVERY_CHANGE = pytest.mark.parametrize(
+    ("case", "change"),
+    [pytest.param(case, change, id=f"{name}: {change}") for name, case in CASES.items() for change in case.changes],
+)
+
+
+def states(metric: Metric):
+    return {name: value.clone() for name, value in metric.metric_state.items()}
+
+
+def assert_states(metric, expected):
+    """Bit for bit."""
+    found = metric.metric_state
+    assert found.keys() == expected.keys()
+    for name, value in expected.items():
+        assert found[name].dtype == value.dtype, name
+        assert torch.equal(found[name], value), name
+
+
+def assert_same(result, expected):
+    """Equal up to the order in which numbers were added up."""
+    found, expected = flat(result), flat(expected)
+    assert found.keys() == expected.keys()
+    for path, value in expected.items():
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(found[path], value, rtol=1e-12, atol=0, equal_nan=True, msg=path)
+        else:
+            assert found[path] == value, path
+
+
+# Steps.
+
+
+@EVERY
+def test_before_any_step_it_answers_and_says_that_it_knows_nothing(case):
+    metric = case.make()
+    with pytest.warns(UserWarning, match="was called before the ``update`` method"):
+        metric.compute()
+    assert metric.steps == 0
+    assert not metric.update_called
+
+
+@EVERY
+def test_lists_are_the_same_as_one_by_one(case):
+    at_once = case.make()
+    at_once.update(**in_lists(case.steps))
+    assert_states(at_once, states(case.over(case.steps)))
+    assert at_once.steps == len(case.steps)
+
+
+@EVERY
+def test_the_inputs_are_as_they_were(case):
+    given = copy.deepcopy(case.steps[:3])
+    case.over(given).compute()
+    for step, before in zip(given, case.steps, strict=False):
+        assert_same(step, before)
+
+
+@EVERY
+def test_forward_gives_the_step_and_adds_it(case):
+    metric = case.make()
+    for step in case.steps:
+        assert_same(metric(**step), case.over([step]).compute())
+    assert_same(metric.compute(), case.over(case.steps).compute())
+    assert metric.steps == len(case.steps)
+
+
+@EVERY
+def test_compute_changes_nothing_and_sees_later_steps(case):
+    metric = case.over(case.steps[:4])
+    before = states(metric)
+    first = metric.compute()
+    kept = copy.deepcopy(first)
+    assert_states(metric, before)
+    metric.update(**case.steps[4])
+    assert_same(metric.compute(), case.over(case.steps[:5]).compute())
+    assert_same(first, kept)
+
+
+@EVERY
+def test_reset_forgets_every_step(case):
+    metric = case.over(case.steps[:4])
+    metric.compute()
+    metric.reset()
+    assert_states(metric, states(case.make()))
+    metric.update(**case.steps[5])
+    assert_same(metric.compute(), case.over(case.steps[5:6]).compute())
+    assert_states(case.make(), states(case.over([])))
+
+
+# What the state is.
+
+
+@EVERY
+def test_the_state_has_a_fixed_size(case):
+    metric = case.make()
+
+    def sizes():
+        return {name: value.untyped_storage().nbytes() for name, value in metric.metric_state.items()}
+
+    before = sizes()
+    metric.update(**in_lists(case.steps))
+    assert sizes() == before
+
+
+@EVERY
+def test_sums_are_float64_and_counts_are_int64(case):
+    assert {value.dtype for value in case.over(case.steps[:1]).metric_state.values()} <= {torch.float64, torch.int64}
+
+
+@pytest.mark.parametrize(
+    "cast",
+    [
+        lambda m: m.half(),
+        lambda m: m.float(),
+        lambda m: m.double(),
+        lambda m: m.to(torch.float16),
+        lambda m: m.to(torch.bfloat16),
+        lambda m: m.set_dtype(torch.float16),
+        lambda m: torch.nn.ModuleList([m]).half()[0],
+        lambda m: torch.nn.ModuleList([m]).to(torch.float16)[0],
+        lambda m: torch.nn.ModuleList([m]).bfloat16()[0],
+    ],
+    ids=["half", "float", "double", "to half", "to bfloat16", "set_dtype", "child half", "child to", "child bfloat16"],
+)
+@EVERY
+def test_a_cast_leaves_the_sums_alone(case, cast):
+    metric = case.over(case.steps[:1])
+    before = states(metric)
+    assert cast(metric) is metric
+    assert_states(metric, before)
+    metric.update(**case.steps[1])
+    metric.reset()
+    assert_states(metric, states(case.make()))
+
+
+@EVERY
+def test_a_move_takes_every_state_along(case):
+    metric = case.over(case.steps[:1])
+    metric.compute()
+    types = {name: value.dtype for name, value in metric.metric_state.items()}
+    assert metric.to("cpu").to("meta") is metric
+    assert metric.device == torch.device("meta")
+    metric.reset()
+    assert {value.device.type for value in metric.metric_state.values()} == {"meta"}
+    assert {name: value.dtype for name, value in metric.metric_state.items()} == types
+
+
+# Copies and files.
+
+
+@pytest.mark.parametrize(
+    "copied",
+    [copy.deepcopy, lambda m: pickle.loads(pickle.dumps(m)), lambda m: m.clone()],
+    ids=["deepcopy", "pickle", "clone"],
+)
+@EVERY
+def test_a_copy_goes_its_own_way(case, copied):
+    metric = case.over(case.steps[:1])
+    other = copied(metric)
+    before = states(metric)
+    other.update(**case.steps[1])
+    assert_states(metric, before)
+    assert_same(other.compute(), case.over(case.steps[:2]).compute())
+    assert_same(metric.compute(), case.over(case.steps[:1]).compute())
+    metric.merge_state(other)
+
+
+@pytest.mark.parametrize("inside", [False, True], ids=["alone", "in a module"])
+@EVERY
+def test_a_state_dict_goes_round_without_aliases(case, inside):
+    def wrap(metric):
+        return torch.nn.ModuleDict({"metric": metric}) if inside else metric
+
+    metric, other = case.over(case.steps[:1]), case.over(case.steps[5:7])
+    other.compute()
+    saved = wrap(metric).state_dict()
+    kept = copy.deepcopy(saved)
+    wrap(other).load_state_dict(saved)
+    assert_same(other.compute(), metric.compute())
+    before = states(metric)
+    other.update(**case.steps[1])
+    assert_states(metric, before)
+    assert all(torch.equal(saved[name], kept[name]) for name in kept)
+    assert_same(other.compute(), case.over(case.steps[:2]).compute())
+
+
+@EVERY
+def test_a_fresh_metric_that_loads_steps_computes_without_a_warning(case):
+    fresh = case.make()
+    fresh.load_state_dict(case.over(case.steps[:3]).state_dict())
+    assert fresh.update_called
+    assert_same(fresh.compute(), case.over(case.steps[:3]).compute())
+
+
+@EVERY
+def test_a_state_rounded_on_the_way_does_not_make_the_sums_short(case):
+    metric = case.make()
+    types = {name: value.dtype for name, value in metric.metric_state.items()}
+    short = {name: v.float() if v.is_floating_point() else v for name, v in metric.state_dict().items()}
+    metric.load_state_dict(short)
+    assert {name: value.dtype for name, value in metric.metric_state.items()} == types
+
+
+@EVERY
+def test_the_state_can_be_left_out_of_the_state_dict(case):
+    metric = case.over(case.steps[:1])
+    assert set(metric.state_dict()) == set(metric.metric_state)
+    metric.persistent(False)
+    assert not metric.state_dict()
+    before = states(metric)
+    metric.load_state_dict({})
+    assert_states(metric, before)
+
+
+# Merging.
+
+
+@pytest.mark.parametrize("as_dict", [False, True], ids=["metric", "state"])
+@pytest.mark.parametrize("last_first", [False, True], ids=["in order", "last first"])
+@pytest.mark.parametrize("cut", [0, 1, 5, None])
+@EVERY
+def test_merged_parts_are_the_whole_in_any_order_and_leave_the_other_alone(case, cut, last_first, as_dict):
+    parts = [case.over(case.steps[:cut]), case.over(case.steps[cut:] if cut is not None else [])]
+    first, second = parts[::-1] if last_first else parts
+    if first.update_called:
+        first.compute()  # outdated by the merge
+    before = states(second)
+    first.merge_state(second.metric_state if as_dict else second)
+    assert first.steps == len(case.steps)
+    assert_same(states(first), states(case.over(case.steps)))
+    assert_same(first.compute(), case.over(case.steps).compute())
+    first.update(**case.steps[-1])
+    assert_states(second, before)
+
+
+@EVERY
+def test_nothing_and_nothing_is_nothing(case):
+    nothing = case.make()
+    nothing.merge_state(case.make())
+    with pytest.warns(UserWarning, match="before the ``update``"):
+        nothing.compute()
+
+
+@EVERY
+def test_merging_is_associative(case):
+    def parts():
+        return [case.over(case.steps[k::3]) for k in range(3)]
+
+    a, b, c = parts()
+    a.merge_state(b)
+    a.merge_state(c)
+    d, e, f = parts()
+    e.merge_state(f)
+    d.merge_state(e)
+    assert_same(states(a), states(d))
+
+
+@EVERY
+def test_a_metric_merged_into_itself_has_every_step_twice(case):
+    metric = case.over(case.steps[:5])
+    metric.merge_state(metric)
+    assert_same(states(metric), states(case.over([*case.steps[:5], *case.steps[:5]])))
+
+
+# What is refused.
+
+
+@EVERY_CHANGE
+def test_sums_that_mean_something_else_are_not_merged_or_loaded(case, change):
+    metric, other = case.over(case.steps[:2]), case.over(case.steps[:2], **case.changes[change])
+    parameter = change.replace(",", " ").split()[0]
+    before = states(metric)
+    with pytest.raises(ValueError, match=f"cannot merge metrics with different {parameter}: "):
+        metric.merge_state(other)
+    with pytest.raises(ValueError, match=rf"the state was made by another .* or with other .*\b{parameter}\b"):
+        metric.merge_state(other.metric_state)
+    with pytest.raises(ValueError, match=rf"the state was made by another .* or with other .*\b{parameter}\b"):
+        metric.load_state_dict(other.state_dict())
+    assert_states(metric, before)
+
+
+@EVERY
+def test_other_metrics_and_things_that_are_none_are_not_merged(case):
+    metric = case.over(case.steps[:2])
+    before = states(metric)
+    others = [other for other in CASES.values() if type(other.make()) is not type(metric)]
+    for other in (SumMetric(), *(other.over(other.steps[:2]) for other in others)):
+        with pytest.raises(ValueError, match=f"cannot merge a {type(other).__name__} into a {type(metric).__name__}"):
+            metric.merge_state(other)
+        with pytest.raises(ValueError, match="made by another metric"):
+            metric.merge_state(other.metric_state)
+    for other in (3, None, [metric]):
+        with pytest.raises(
+            ValueError, match=f"a {type(metric).__name__} or its metric_state is needed; got {type(other).__name__}"
+        ):
+            metric.merge_state(other)
+    assert_states(metric, before)
+
+
+@EVERY
+def test_a_state_that_lacks_something_or_has_another_shape_is_refused(case):
+    metric, other = case.over(case.steps[:2]), case.over(case.steps[2:4])
+    before = states(metric)
+    for name, value in other.metric_state.items():
+        lacks = {key: state for key, state in states(other).items() if key != name}
+        wrong = {**states(other), name: value[None]}
+        for broken in (lacks, wrong):
+            with pytest.raises(ValueError, match=f"'{name}'|made by another metric"):
+                metric.merge_state(broken)
+            with pytest.raises(ValueError, match=f"'{name}'|made by another metric"):
+                metric.load_state_dict(broken)
+    assert_states(metric, before)
+
+
+# Collections.
+
+
+@EVERY
+def test_a_collection_keeps_metrics_apart_that_agree_at_first(case):
+    """torchmetrics lets metrics share one state if theirs are equal after the first step (its issue 2596)."""
+    wanted = {"one": {}, "the same": {}, **case.changes}
+    collection = MetricCollection({name: case.make(**changes) for name, changes in wanted.items()})
+    for step in (case.bland, *case.steps):
+        collection.update(**step)
+    results = collection.compute()
+    for name, changes in wanted.items():
+        assert_same(results[name], case.over([case.bland, *case.steps], **changes).compute())
+
+
+@EVERY
+def test_a_collection_resets_and_runs_forward(case):
+    collection = MetricCollection({"this": case.make()}, prefix="val/")
+    assert_same(collection(**case.steps[0])["val/this"], case.over(case.steps[:1]).compute())
+    collection.reset()
+    collection.update(**case.steps[1])
+    assert_same(collection.compute()["val/this"], case.over(case.steps[1:2]).compute())
+
+
+# Two processes.
+
+
+@pytest.fixture(scope="module")
+def answers(tmp_path_factory):
+    """What each of two processes found, which are started once for all cases."""
+    folder = tmp_path_factory.mktemp("ranks")
+    environment = {**os.environ, "GLOO_SOCKET_IFNAME": "lo0" if sys.platform == "darwin" else "lo"}
+    environment.update(OMP_NUM_THREADS="1", PYTHONPATH=os.pathsep.join(path for path in sys.path if path))
+    command = [sys.executable, "-m", "tests.metrics.two_ranks", str(folder)]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(2)]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_two_processes_equal_one_and_each_keeps_its_own_sums(answers, name):
+    case = CASES[name]
+    for answer in (of_rank[name] for of_rank in answers):
+        assert_same(answer["whole"], flat(case.over(case.steps).compute()))
+        assert answer["unchanged"], "the sums of all ranks stayed in the state of one"
+        assert_same(answer["more"], flat(case.over([*case.steps, case.steps[0], case.steps[0]]).compute()))
+        assert_same(answer["alone"], flat(case.over(case.steps[:5]).compute()))
+
+
+@EVERY_CHANGE
+def test_ranks_whose_sums_mean_different_things_all_say_so(answers, case, change):
+    name = next(name for name, other in CASES.items() if other is case)
+    for answer in answers:
+        assert "has other parameters on rank 1 than on rank 0" in (answer[name]["complaints"][change] or "no complaint")

@@ -1,0 +1,249 @@
+"""What every kind of sensor and every reference sensor promises, and that another one is a class and one line."""
+
+import pickle
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover import Rig
+from torchcover.data import SimulatedFrames
+from torchcover.geometry import BoundingBox, rigid
+from torchcover.simulation import (
+    REFERENCE_SENSORS,
+    SENSORS,
+    Document,
+    PaperReference,
+    Pose,
+    builtin_names,
+    into_tiles,
+    position_in_shell,
+    vertical_fov_deg,
+)
+
+EGO = BoundingBox((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6))
+AREAS = (((0.0, 20.0), (-5.0, 5.0)), ((-40.0, 160.0), (-40.0, 40.0)))
+MOUNT = {"x_m": 2.6, "z_m": 1.0, "yaw_deg": 30.0}
+RANGES = {"min_range_m": 1.0, "max_range_m": 60.0, "range_noise_m": 0.02, "dropout": 0.1}
+
+
+class Altimeter(Document):
+    """Looks down ahead: the smallest sensor there is."""
+
+    type: Literal["altimeter"] = "altimeter"
+    name: str
+    mount: Pose = Pose()
+    max_range_m: float = 20.0
+    horizontal_fov_deg: float = 20.0
+    min_range_m: float = 0.0
+    range_noise_m: float = 0.0
+    dropout: float = 0.0
+
+    def directions(self):
+        across = np.deg2rad(np.linspace(-10.0, 10.0, 5))
+        down = np.full(5, np.sqrt(0.5))
+        return np.stack([np.sqrt(0.5) * np.cos(across), np.sqrt(0.5) * np.sin(across), -down])[:, None]
+
+
+@dataclass(frozen=True)
+class DownReference:
+    """Looks straight down from its place: the smallest reference sensor there is."""
+
+    name: ClassVar[str] = "down"
+
+    rays: int
+    shell_m: float = 0.5
+    max_range_m: float = 30.0
+
+    @classmethod
+    def from_rays(cls, areas, rays):
+        if rays is not None and rays < 1:
+            raise ValueError(f"rays: at least 1 is needed; got {rays}")
+        return cls(8 if rays is None else rays)
+
+    def vehicle_T_reference(self, ego, generator):
+        return rigid(np.eye(3), position_in_shell(ego, self.shell_m, generator))
+
+    def tiles(self, vehicle_T_reference, generator):
+        x, y = generator.uniform(-0.1, 0.1, size=(2, 1, self.rays))
+        return into_tiles(np.stack([x, y, -np.sqrt(1 - x**2 - y**2)]))
+
+    def weights(self, vehicle_T_reference, tiles, ray):
+        return np.full(len(ray), 2.0, dtype=np.float32)
+
+
+# Keys of one sensor of each kind, beside name, type, mount and ranges.
+KEYS = {
+    "lidar": {"channels": 4, "vertical_fov_deg": [-20, 10], "horizontal_fov_deg": 90, "columns": 16},
+    "camera": {"width": 24, "height": 16, "fov_deg": 80},
+    "altimeter": {},
+}
+
+
+@pytest.fixture(params=[*SENSORS, "altimeter"])
+def sensor(request, monkeypatch):
+    """A sensor of each kind, from the keys of a rig's file."""
+    monkeypatch.setitem(SENSORS, "altimeter", Altimeter)
+    keys = {"type": request.param, "name": "a", "mount": MOUNT, **RANGES, **KEYS[request.param]}
+    (made,) = Rig.model_validate({"name": "r", "sensors": [keys]}).sensors
+    assert type(made) is SENSORS[request.param]
+    return made
+
+
+@pytest.fixture(params=[*REFERENCE_SENSORS, "down"])
+def reference_sensor(request, monkeypatch):
+    """A reference sensor of each pattern, from areas and a number of rays."""
+    monkeypatch.setitem(REFERENCE_SENSORS, "down", DownReference)
+    made = REFERENCE_SENSORS[request.param].from_rays(AREAS, 900)
+    assert made.name == request.param
+    return made
+
+
+def step_of(sensor, seed=0):
+    """Pose and tiles of one step, and the generator's next number."""
+    generator = np.random.default_rng(seed)
+    pose = sensor.vehicle_T_reference(EGO, generator)
+    return pose, sensor.tiles(pose, generator), generator.random()
+
+
+def directions_of(tiles):
+    return np.concatenate([tile.directions for tile in tiles], axis=1)
+
+
+def test_a_sensor_says_who_and_where_it_is_and_how_far_it_sees(sensor):
+    assert sensor.name == "a"
+    np.testing.assert_allclose(sensor.mount.matrix()[:3, 3], [2.6, 0.0, 1.0])
+    assert {key: getattr(sensor, key) for key in RANGES} == RANGES
+
+
+def test_a_sensors_directions_are_of_length_one_or_none(sensor):
+    directions = sensor.directions()
+    assert directions.dtype == np.float64
+    assert directions.ndim == 3
+    assert len(directions) == 3
+    there = ~np.isnan(directions)
+    assert there.any()
+    assert (there.all(axis=0) == there.any(axis=0)).all()
+    lengths = np.linalg.norm(directions, axis=0)[there[0]]
+    np.testing.assert_allclose(lengths, 1.0, atol=1e-12)
+    np.testing.assert_array_equal(sensor.directions(), directions)
+
+
+def test_a_sensors_fields_of_view_hold_its_rays(sensor):
+    x, y, z = sensor.directions()
+    low, high = vertical_fov_deg(sensor)
+    middle = np.rad2deg(np.arcsin(z))[:, x.shape[1] // 2]
+    assert (low, high) == pytest.approx((np.nanmin(middle), np.nanmax(middle)))
+    azimuth_deg = np.rad2deg(np.arctan2(y, x))[len(x) // 2]
+    assert 0 < np.nanmax(azimuth_deg) - np.nanmin(azimuth_deg) <= sensor.horizontal_fov_deg + 1e-9 <= 360 + 1e-9
+
+
+def test_a_sensor_survives_pickling_and_its_own_document(sensor):
+    assert pickle.loads(pickle.dumps(sensor)) == sensor
+    rig = Rig(name="r", sensors=(sensor,))
+    assert Rig.model_validate(rig.model_dump()) == rig
+
+
+def test_a_sensors_wrong_key_is_named_as_it_stands_in_the_file(sensor):
+    keys = sensor.model_dump() | {"colour": "red"}
+    with pytest.raises(ValueError, match=r"sensors\.0\.colour\n.*Extra inputs"):
+        Rig.model_validate({"name": "r", "sensors": [keys]})
+
+
+def test_a_sensor_is_simulated(sensor):
+    exact = sensor.model_copy(update={"range_noise_m": 0.0, "dropout": 0.0, "min_range_m": 0.0})
+    frames = SimulatedFrames(
+        "courtyard", Rig(name="r", sensors=(exact,)), steps=1, reference_sensor=PaperReference(8, 8)
+    )
+    frame = frames[0]
+    assert frame.counts["sensor_rays"] == (~np.isnan(exact.directions()[0])).sum()
+    ranges_m = (frame.sensor.double() - torch.tensor([2.6, 0.0, 1.0])).norm(dim=1)
+    assert 0 < len(ranges_m) <= frame.counts["sensor_rays"]
+    assert ranges_m.max() <= exact.max_range_m
+
+
+@pytest.mark.parametrize("content", ["lidar", 3, {"type": ["lidar"]}, {"type": "radar"}, None])
+def test_what_is_no_sensor_is_refused_with_the_kinds_there_are(content):
+    with pytest.raises(ValueError, match=r"sensors\.0\n.*type: a sensor is a 'lidar' or a 'camera'; got"):
+        Rig.model_validate({"name": "r", "sensors": [content]})
+
+
+@pytest.mark.parametrize("name", builtin_names("rigs"))
+def test_every_sensor_of_the_built_in_rigs_is_of_a_registered_kind(name):
+    assert {type(sensor) for sensor in Rig.load(name).sensors} <= set(SENSORS.values())
+
+
+def test_a_reference_sensors_place_is_in_the_shell_around_the_ego(reference_sensor):
+    grown_m = reference_sensor.shell_m + 1e-12
+    for seed in range(50):
+        pose, _, _ = step_of(reference_sensor, seed)
+        np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
+        np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
+        assert (pose[:3, 3] >= np.array(EGO.lower_m) - [grown_m, grown_m, 0]).all()
+        assert (pose[:3, 3] <= np.array(EGO.upper_m) + grown_m).all()
+        assert ((pose[:3, 3] < EGO.lower_m) | (pose[:3, 3] > EGO.upper_m)).any()
+
+
+def test_a_reference_sensors_rays_are_of_length_one_and_about_as_many_as_asked_for(reference_sensor):
+    _, tiles, _ = step_of(reference_sensor)
+    directions = directions_of(tiles)
+    assert directions.dtype == np.float32
+    assert directions.shape[1] == pytest.approx(900, rel=0.1)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=0), 1.0, atol=1e-6)
+
+
+def test_a_reference_sensor_without_a_number_of_rays_has_one_of_its_own(reference_sensor):
+    own = type(reference_sensor).from_rays(AREAS, None)
+    assert own == type(reference_sensor).from_rays(AREAS, None)
+    assert own != reference_sensor
+
+
+@pytest.mark.parametrize("rays", [0, -4])
+def test_a_reference_sensor_without_rays_is_refused(reference_sensor, rays):
+    with pytest.raises(ValueError, match=f"rays: at least .*; got {rays}"):
+        type(reference_sensor).from_rays(AREAS, rays)
+
+
+def test_a_reference_sensor_depends_on_the_generator_and_on_nothing_else(reference_sensor):
+    np.random.seed(1)  # noqa: NPY002  (the random numbers that it must not draw)
+    state = np.random.get_state()[1].copy()  # noqa: NPY002
+    (pose, tiles, after), (pose_again, tiles_again, after_again) = step_of(reference_sensor), step_of(reference_sensor)
+    np.testing.assert_array_equal(pose, pose_again)
+    np.testing.assert_array_equal(directions_of(tiles), directions_of(tiles_again))
+    assert after == after_again
+    assert not np.array_equal(step_of(reference_sensor, seed=1)[0], pose)
+    np.testing.assert_array_equal(np.random.get_state()[1], state)  # noqa: NPY002
+
+
+def test_a_reference_sensor_survives_pickling(reference_sensor):
+    used = step_of(reference_sensor)
+    travelled = pickle.loads(pickle.dumps(reference_sensor))
+    assert travelled == reference_sensor
+    assert hash(travelled) == hash(reference_sensor)
+    np.testing.assert_array_equal(directions_of(step_of(travelled)[1]), directions_of(used[1]))
+
+
+@pytest.mark.parametrize("every", [1, 7])
+def test_a_reference_sensors_weights_are_positive_and_finite_one_for_each_point(reference_sensor, every):
+    pose, tiles, _ = step_of(reference_sensor)
+    ray = np.arange(0, directions_of(tiles).shape[1], every)
+    weights = reference_sensor.weights(pose, tiles, ray)
+    if weights is not None:
+        assert weights.dtype == np.float32
+        assert weights.shape == ray.shape
+        assert np.isfinite(weights).all()
+        assert (weights > 0).all()
+        np.testing.assert_array_equal(reference_sensor.weights(pose, tiles, ray[::3]), weights[::3])
+    assert len(reference_sensor.weights(pose, tiles, ray[:0]) if weights is not None else ()) == 0
+
+
+def test_a_reference_sensor_is_simulated(reference_sensor):
+    frames = SimulatedFrames("courtyard", "front_roof_32", steps=2, seed=4, reference_sensor=reference_sensor)
+    frame, again = frames[1], pickle.loads(pickle.dumps(frames))[1]
+    assert frame.counts["reference_rays"] == pytest.approx(900, rel=0.1)
+    assert 0 < len(frame.reference) <= frame.counts["reference_rays"]
+    assert torch.equal(frame.reference, again.reference)
+    assert frame.reference_weights is None or len(frame.reference_weights) == len(frame.reference)
+    assert not torch.equal(frames[0].reference, frame.reference)

@@ -1,0 +1,107 @@
+"""The simulator: steps without tensors, and what it knows of the ego before it builds a world."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from torchcover.data import SimulatedFrames
+from torchcover.geometry import BoundingBox
+from torchcover.simulation import EvenReference, PaperReference, Rig, Scenario, Simulator, builtin_names
+
+SMALL = PaperReference(rows=24, columns=32)
+EVEN = EvenReference((((0.0, 20.0), (-5.0, 5.0)),), rays=256)
+SHORT = {"name": "urban", "traffic": {"type": "urban", "duration_s": 2.0, "time_step_s": 0.5}}
+
+
+def simulator(reference_sensor=SMALL, scenario=None, **options):
+    rigs = {name: Rig.load(name) for name in ("front_roof_32", "front_grille_128")}
+    return Simulator(scenario or Scenario.load("courtyard"), rigs, reference_sensor, **options)
+
+
+def same(a, b):
+    return (
+        all(np.array_equal(a.clouds[name], b.clouds[name]) for name in a.clouds | b.clouds)
+        and np.array_equal(a.reference, b.reference)
+        and a.counts == b.counts
+    )
+
+
+@pytest.mark.parametrize("reference_sensor", [SMALL, EVEN])
+def test_a_frame_is_a_step_in_tensors(reference_sensor):
+    seen = simulator(reference_sensor, seed=5).step(2)
+    rigs = {name: name for name in seen.clouds}
+    frame = SimulatedFrames("courtyard", rigs=rigs, steps=3, seed=5, reference_sensor=reference_sensor)[2]
+    assert list(frame.clouds) == list(seen.clouds)
+    for name, points in seen.clouds.items():
+        assert points.dtype == np.float32
+        np.testing.assert_array_equal(frame.clouds[name].numpy(), points)
+    np.testing.assert_array_equal(frame.reference.numpy(), seen.reference)
+    assert frame.counts == seen.counts
+    if seen.reference_weights is None:
+        assert frame.reference_weights is None
+    else:
+        np.testing.assert_array_equal(frame.reference_weights.numpy(), seen.reference_weights)
+
+
+def test_a_step_depends_on_seed_and_index_only_and_survives_pickling():
+    made = simulator(scenario=Scenario.model_validate(SHORT), seed=1)
+    late = made.step(6)
+    assert made.step(0).counts["moving_bodies"] > 0
+    assert same(made.step(6), late)
+    assert same(pickle.loads(pickle.dumps(made)).step(6), late)
+    assert not same(simulator(scenario=made.scenario, seed=2).step(6), late)
+
+
+def test_another_reference_sensor_sees_the_same_bodies_and_leaves_the_first_as_it_is():
+    base = simulator(every_s=0.5)
+    other = base.with_reference_sensor(EVEN)
+    assert other.scene_of(3)[0] is base.scene_of(3)[0]
+    assert (base.reference_sensor, other.reference_sensor) == (SMALL, EVEN)
+    assert (base.every_s, other.every_s) == (0.5, 0.5)
+    assert len(other.step(1).reference_weights) == len(other.step(1).reference)
+
+
+def test_labels_are_of_the_objects_in_the_reference_sensors_range():
+    far = simulator(PaperReference(8, 8, max_range_m=60.0), Scenario.model_validate(SHORT))
+    near = far.with_reference_sensor(PaperReference(8, 8, max_range_m=20.0))
+    names = [{label.name for label in made.labels(1)} for made in (near, far)]
+    assert names[0] < names[1]
+    assert all(np.hypot(*label.centre_m[:2]) < 65.0 for label in far.labels(1))
+
+
+def test_without_a_rig_there_is_the_reference_alone():
+    seen = Simulator(Scenario.load("courtyard"), {}, SMALL).step(0)
+    assert seen.clouds == {}
+    np.testing.assert_array_equal(seen.reference, simulator().step(0).reference)
+
+
+@pytest.mark.parametrize(
+    ("ask", "message"),
+    [
+        (lambda: simulator(seed=-1), "seed: a number >= 0 is needed; got -1"),
+        (lambda: simulator(every_s=0.03), "every_s: a positive multiple"),
+        (lambda: simulator().step(-1), "index: a number >= 0 is needed; got -1"),
+        (lambda: simulator().labels(-2), "index: a number >= 0 is needed; got -2"),
+    ],
+)
+def test_impossible_requests_are_refused(ask, message):
+    with pytest.raises(ValueError, match=message):
+        ask()
+
+
+@pytest.mark.parametrize("name", builtin_names("scenarios"))
+def test_the_egos_box_is_that_of_a_world_of_the_scenario(name):
+    scenario = Scenario.load(name)
+    ego = scenario.world(seed=3, episode=1).ego.mesh
+    np.testing.assert_array_equal(scenario.ego_mesh().vertices_m, ego.vertices_m)
+    assert scenario.ego_box() == BoundingBox.around(ego.vertices_m)
+
+
+@pytest.mark.parametrize("ego", [None, {"shape": {"type": "box", "size_m": [6, 2.5, 3]}}])
+def test_the_egos_box_is_known_without_a_world(ego, monkeypatch):
+    scenario = Scenario.model_validate({**SHORT, "ego": ego})
+    in_scene = Simulator(scenario, {}, SMALL).scene_of(0)[0].ego_box
+    monkeypatch.setattr(Scenario, "world", None)
+    assert scenario.ego_box() == in_scene
+    assert (scenario.ego_box().size_m == (6.0, 2.5, 3.0)) == (ego is not None)

@@ -1,0 +1,80 @@
+"""What an aggregation is: its sums, how a step enters them, and the layers that they make."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import ClassVar, Literal, NamedTuple
+
+from torch import Tensor
+
+from torchcover.coverage.binning import CellMeans
+from torchcover.coverage.layer import Layer
+
+
+class State(NamedTuple):
+    """A sum of an aggregation.
+
+    Args:
+        initial: What it is before the first step; float64 or int64.
+        reduction: How two of them become one: added up, or the larger of each entry.
+        in_blocks: Whether its first dimension is the blocks of contiguous steps.
+    """
+
+    initial: Tensor
+    reduction: Literal["sum", "max"] = "sum"
+    in_blocks: bool = False
+
+
+class BinnedStep(NamedTuple):
+    """The reference points of one step that lie in the grid.
+
+    Args:
+        cell: (N,) int64 cell of each point.
+        radius: (N,) float64 blind spot radius in metres, at most `max_radius`.
+        weight: (N,) weight of each point; None if all weigh the same.
+        means: Over the points of each cell: the radius, then the detection at each threshold.
+        block: Number of the block that the step belongs to.
+        cells: Number of cells of the grid.
+    """
+
+    cell: Tensor
+    radius: Tensor
+    weight: Tensor | None
+    means: CellMeans
+    block: int
+    cells: int
+
+
+class Aggregation(ABC):
+    """How the radii of a cell, point by point and step by step, become one number, or a few.
+
+    An aggregation is a frozen dataclass: its fields are part of what the sums of a metric mean. A new one is a class
+    and a line in `AGGREGATIONS`.
+
+    Attributes:
+        name: Tells it from the others; its states begin with it.
+        words: What it gives, in the plural, for what a run says that it left out.
+    """
+
+    name: ClassVar[str]
+    words: ClassVar[str]
+
+    @abstractmethod
+    def states(self, cells: int) -> dict[str, State]:
+        """The empty sums, by name."""
+
+    @abstractmethod
+    def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
+        """Add a step to the sums, in place."""
+
+    @abstractmethod
+    def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
+        """What the sums say.
+
+        Args:
+            sums: The sums.
+            probed_steps: (C,) steps that had a reference point in each cell.
+            max_radius: Saturation of the radius in metres.
+
+        Returns:
+            Layers of (C,) values, which the metric gives the shape of the grid.
+        """

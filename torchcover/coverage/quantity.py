@@ -1,0 +1,58 @@
+"""What a number is: its one key, its title, its unit, and which direction is better."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+# "m" is metres; a "share" lies in [0, 1], and tables and maps show it in percent.
+Unit = Literal["m", "share"]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a number, or every cell of a map, is.
+
+    Args:
+        key: Its name in files, dicts and loggers; with `_error` behind it, that of its standard error.
+        title: What tables and maps call it, without its unit.
+        unit: "m", or "share" for a number in [0, 1].
+        lower_is_better: Whether less of it is better.
+
+    Example:
+        >>> detection(0.4).key, RADIUS.key
+        ('detection_0.4m', 'radius_m')
+    """
+
+    key: str
+    title: str
+    unit: Unit
+    lower_is_better: bool
+
+    @property
+    def error_key(self) -> str:
+        """The key of its standard error."""
+        return f"{self.key}_error"
+
+
+def radius(which: str = "", title: str = "mean") -> Quantity:
+    """A blind spot radius in metres.
+
+    Args:
+        which: Part of the key that tells it from others; none for the mean of means.
+        title: Which one, in words.
+
+    Example:
+        >>> radius("maximum", "largest")
+        Quantity(key='radius_maximum_m', title='largest blind spot radius', unit='m', lower_is_better=True)
+    """
+    key = f"radius_{which}_m" if which else "radius_m"
+    return Quantity(key, f"{title} blind spot radius", "m", lower_is_better=True)
+
+
+def detection(threshold_m: float) -> Quantity:
+    """The share of reference points, or steps, whose radius is at most a threshold in metres."""
+    return Quantity(
+        f"detection_{threshold_m:g}m", f"detection within {threshold_m:g} m", "share", lower_is_better=False
+    )
+
+
+RADIUS = radius()

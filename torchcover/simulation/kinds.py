@@ -1,0 +1,14 @@
+"""The kinds of sensors and of reference sensors, by the names that files and options call them."""
+
+from torchcover.simulation.camera_sensor import CameraSensor
+from torchcover.simulation.even_reference import EvenReference
+from torchcover.simulation.lidar import Lidar
+from torchcover.simulation.paper_reference import PaperReference
+from torchcover.simulation.reference_sensor import ReferenceSensor
+from torchcover.simulation.sensor import Sensor
+
+# By the key `type` in a rig's file.
+SENSORS: dict[str, type[Sensor]] = {"lidar": Lidar, "camera": CameraSensor}
+REFERENCE_SENSORS: dict[str, type[ReferenceSensor]] = {
+    sensor.name: sensor for sensor in (EvenReference, PaperReference)
+}

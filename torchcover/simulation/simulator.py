@@ -1,0 +1,164 @@
+"""The simulator: what rigs and a reference sensor see of a scenario, step by step."""
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchcover.geometry import BoundingBox
+from torchcover.geometry.rigid import Matrix
+from torchcover.simulation.disturbance import disturb
+from torchcover.simulation.instant import Instant, Scan
+from torchcover.simulation.labels import Label, labels
+from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.observation import Observation, counts_of
+from torchcover.simulation.reference_sensor import ReferenceSensor
+from torchcover.simulation.rig import Rig
+from torchcover.simulation.scenario import Scenario
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.stage import Stage, Stages
+
+# A reference pose inside a body is drawn again, at most this often.
+MAX_DRAWS = 100
+
+
+class Simulator:
+    """What rigs and a reference sensor see of a scenario, at any step.
+
+    A step depends on the scenario, the rigs, the seed and its index, and on nothing else: not on threads, processes or
+    the order of steps. The reference is cast once, and every rig sees the same instant: comparisons are paired. Rays
+    are cast on as many threads as torch uses (`torch.set_num_threads`).
+
+    Args:
+        scenario: The world. Beyond its end its traffic starts anew with other random numbers.
+        rigs: The sensors, by the name under which `Observation.clouds` has their points.
+        reference_sensor: The reference sensor.
+        seed: Seed of the traffic, of the reference sensor, and of noise and drop-out.
+        every_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
+
+    Raises:
+        ValueError: A negative seed, a time that is no multiple of the time step.
+
+    Example:
+        >>> from torchcover.simulation import PaperReference
+        >>> rigs = {"roof": Rig.load("front_roof_128")}
+        >>> simulator = Simulator(Scenario.load("courtyard"), rigs, PaperReference(rows=16, columns=16))
+        >>> seen = simulator.step(0)
+        >>> seen.counts["sensor_rays"], seen.clouds["roof"].dtype
+        (230400, dtype('float32'))
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        rigs: Mapping[str, Rig],
+        reference_sensor: ReferenceSensor,
+        *,
+        seed: int = 0,
+        every_s: float | None = None,
+    ) -> None:
+        if seed < 0:
+            raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
+        self.scenario = scenario
+        self.rigs = rigs
+        self.reference_sensor = reference_sensor
+        self.seed = seed
+        self._every_steps = 1 if every_s is None else scenario.steps_in(every_s)
+        self._stages = Stages(scenario, rigs, seed)
+
+    @property
+    def every_s(self) -> float:
+        """Time between one step and the next."""
+        return self._every_steps * self.scenario.step_s
+
+    def with_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
+        """The same instants as another reference sensor sees them; the geometry is built once for both."""
+        other = copy.copy(self)
+        other.reference_sensor = reference_sensor
+        return other
+
+    def step(self, index: int) -> Observation:
+        """What is seen at one step.
+
+        Args:
+            index: Number of the step, from 0.
+
+        Raises:
+            FileNotFoundError: A mesh, vehicle or trajectory file is missing.
+            ValueError: A negative index, a sensor inside the ego's body, an actor that overlaps the ego, an ego below
+                the ground.
+        """
+        stage, step = self._stage(index)
+        instant = stage.scene.at(step, within_m=self._reach_m(stage.scene.ego_box))
+        scans = {name: self._scan_rig(sensors, instant, index) for name, sensors in stage.mounted.items()}
+        reference, weights, redrawn = self._scan_reference(stage.scene, instant, index)
+        of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
+        return Observation(
+            clouds={name: np.concatenate([scan.points for scan in of_rig]) for name, of_rig in scans.items()},
+            reference=reference.points,
+            reference_weights=weights,
+            counts=counts_of(stage.scene, instant, of_all_rigs, reference, redrawn),
+        )
+
+    def labels(self, index: int) -> list[Label]:
+        """The objects within the reference sensor's range at one step; names are an object's own within a run."""
+        scene, step = self.scene_of(index)
+        return labels(scene.world, step, self.reference_sensor.max_range_m)
+
+    def scene_of(self, index: int) -> tuple[Scene, int]:
+        """The geometry of the world in which a step plays, and the time step in it.
+
+        It is built when first needed, once in each process for each run through the scenario.
+        """
+        stage, step = self._stage(index)
+        return stage.scene, step
+
+    def _stage(self, index: int) -> tuple[Stage, int]:
+        if index < 0:
+            raise ValueError(f"index: a number >= 0 is needed; got {index}")
+        run, step = self.scenario.locate(index * self._every_steps)
+        return self._stages.of_run(run), step
+
+    def _reach_m(self, ego: BoundingBox) -> float:
+        """How far from the origin of the vehicle frame a sensor can see: its range starts where it is mounted."""
+        farthest_m = np.abs(ego.corners_m).max(axis=0) + self.reference_sensor.shell_m
+        reaches = [
+            float(np.linalg.norm(sensor.mount.matrix()[:3, 3])) + sensor.max_range_m
+            for rig in self.rigs.values()
+            for sensor in rig.sensors
+        ]
+        return max([float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches])
+
+    def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[Scan]:
+        scans = []
+        for k, mounted in enumerate(sensors, 1):
+            scan = mounted.scan(instant, threads=torch.get_num_threads())
+            generator = np.random.default_rng([self.seed, index, k])
+            origin_m, sensor = mounted.vehicle_T_sensor[:3, 3], mounted.sensor
+            scans.append(disturb(scan, origin_m, sensor.range_noise_m, sensor.dropout, generator))
+        return scans
+
+    def _scan_reference(
+        self, scene: Scene, instant: Instant, index: int
+    ) -> tuple[Scan, NDArray[np.float32] | None, int]:
+        """The scan of the reference sensor, the weights of its points, and how often its place was drawn again."""
+        sensor, generator = self.reference_sensor, np.random.default_rng([self.seed, index])
+        pose, redrawn = self._draw_reference_pose(scene, instant, index, generator)
+        tiles = sensor.tiles(pose, generator)
+        scan = instant.scan(pose, tiles, max_range_m=sensor.max_range_m, threads=torch.get_num_threads())
+        return scan, sensor.weights(pose, tiles, scan.ray), redrawn
+
+    def _draw_reference_pose(
+        self, scene: Scene, instant: Instant, index: int, generator: np.random.Generator
+    ) -> tuple[Matrix, int]:
+        for redrawn in range(MAX_DRAWS):
+            vehicle_T_reference = self.reference_sensor.vehicle_T_reference(scene.ego_box, generator)
+            if not instant.buried(vehicle_T_reference[:3, 3]):
+                return vehicle_T_reference, redrawn
+        raise ValueError(
+            f"{self.scenario.name} step {index}: {MAX_DRAWS} places beside and above the ego lie inside other bodies "
+            "or below the ground; does the ego stand on the ground, and do faces point outwards?"
+        )
