@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
 from torchcover.cli.explain import explanation, left_out
-from torchcover.cli.run import Progression, accumulate, check_out, device_called, new_metric, outline_m, sensor_marks
+from torchcover.cli.run import Progression, accumulate, check_out, device_called, new_metric, outline_m, sensor_views
 from torchcover.cli.settings import Settings, reference_note, reference_record, run_record, simulated_frames
 from torchcover.cli.stopping import TargetWatch, outcome
 from torchcover.coverage import Coverage, forward_regions
 from torchcover.data import SimulatedFrames
-from torchcover.report import comparison_dict, comparison_tables, draw_comparison, narrowest_width, write_comparison
+from torchcover.report import RENDERERS, CoverageTable, map_figures, print_table, table_dict, write_figures
 from torchcover.simulation import Rig
 
 
@@ -75,7 +74,8 @@ def _write(
     steps = next(iter(coverages.values())).counts["steps"]
     reference = reference_record(settings, progression, frames, steps)
     target_record, target_lines = outcome(settings.target, coverages, regions)
-    _print(comparison_tables(coverages, regions, [reference_note(reference)]), list(coverages))
+    table = CoverageTable.of(coverages, regions, [reference_note(reference)])
+    print_table(table, console)
     omissions = left_out(progression.counts, list(coverages.values()))
     if settings.explain:
         console.print(explanation(omissions))
@@ -83,7 +83,7 @@ def _write(
         console.print(line, markup=False, soft_wrap=True)
     for name, coverage in coverages.items():
         coverage.save(settings.out / "coverage" / f"{name}.npz")
-    write_comparison(coverages, regions, settings.out / "summary.csv")
+    (settings.out / "summary.csv").write_text(RENDERERS["csv"](table), encoding="utf-8")
     content: dict[str, Any] = {
         "rigs": dict(zip(coverages, request.rigs, strict=True)),
         "scenario": request.scenario,
@@ -92,25 +92,17 @@ def _write(
         **run_record(settings, progression),
         "target_error": target_record,
         "left_out": omissions,
-        **comparison_dict(coverages, regions),
+        **table_dict(table),
     }
     (settings.out / "summary.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    maps = draw_comparison(
+    figures = map_figures(
         coverages,
-        settings.out / "maps",
         ego_outline_m=outline_m(frames.scene.ego_box),
-        sensors={name: sensor_marks(rig) for name, rig in frames.rigs.items()},
+        sensors={name: sensor_views(rig) for name, rig in frames.rigs.items()},
         errors=settings.error_maps,
     )
+    maps = write_figures(figures, settings.out / "maps")
     console.print(
         f"Wrote summary.json, summary.csv, {len(coverages)} coverage files and {len(maps)} maps to {settings.out}",
         soft_wrap=True,
     )
-
-
-def _print(tables: Sequence[Table], rigs: Sequence[str]) -> None:
-    console = Console()
-    # Rather lines that are too long than numbers that are cut off; in a file the names are whole too.
-    console.width = max(console.width, narrowest_width(tables, rigs if console.is_terminal else ()))
-    for table in tables:
-        console.print(table)

@@ -19,13 +19,13 @@ from torchcover.cli.run import (
     device_called,
     new_metric,
     outline_m,
-    sensor_marks,
+    sensor_views,
 )
 from torchcover.cli.settings import Settings, reference_note, reference_record, run_record, simulated_frames
 from torchcover.cli.stopping import TargetWatch, outcome
 from torchcover.coverage import Coverage, forward_regions
 from torchcover.data import Frame, RecordedFrames, SimulatedFrames
-from torchcover.report import coverage_table, draw_maps, summary_dict, write_csv
+from torchcover.report import RENDERERS, CoverageTable, map_figures, print_table, table_dict, write_figures
 from torchcover.simulation import Rig
 
 
@@ -95,7 +95,9 @@ def _write(coverage: Coverage, request: Request, progression: Progression, frame
         "left_out": left_out(progression.counts, [coverage]),
     }
     notes = [reference_note(record["reference"])] if record["reference"] else []
-    console.print(coverage_table(coverage, regions, notes))
+    name = _name(request)
+    table = CoverageTable.of({name: coverage}, regions, notes)
+    print_table(table, console)
     if request.settings.explain:
         console.print(explanation(record["left_out"]))
     for line in progression.skipped:
@@ -103,16 +105,16 @@ def _write(coverage: Coverage, request: Request, progression: Progression, frame
     for line in target_lines:
         console.print(line, markup=False, soft_wrap=True)
     coverage.save(out / "coverage.npz")
-    write_csv(coverage, regions, out / "summary.csv")
-    record |= summary_dict(coverage, regions)
+    (out / "summary.csv").write_text(RENDERERS["csv"](table), encoding="utf-8")
+    record |= table_dict(table)
     (out / "summary.json").write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    maps = draw_maps(
-        coverage,
-        out / "maps",
+    figures = map_figures(
+        {name: coverage},
         ego_outline_m=_ego_outline(frames),
-        sensors=[] if request.rig is None else sensor_marks(Rig.load(request.rig)),
+        sensors={} if request.rig is None else {name: sensor_views(Rig.load(request.rig))},
         errors=request.settings.error_maps,
     )
+    maps = write_figures(figures, out / "maps")
     console.print(f"Wrote summary.json, summary.csv, coverage.npz and {len(maps)} maps to {out}", soft_wrap=True)
 
 

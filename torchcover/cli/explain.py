@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from rich.table import Table
 from rich.text import Text
 
-from torchcover.coverage import Coverage
+from torchcover.coverage import AGGREGATIONS, Coverage
 
 # What it is, how often it was left out, and of how many; the counts are those of the frames, added up.
 COUNTED = (
@@ -41,17 +41,9 @@ def left_out(frame_counts: Mapping[str, int], coverages: Sequence[Coverage]) -> 
     if outside:
         what = "reference points outside every cell: not searched for"
         records.append({"what": what, "count": outside, "of": inside + outside})
-    not_kept = [
-        name
-        for name, kept in (
-            ("maxima", coverages[0].maximum),
-            ("quantiles", coverages[0].quantiles),
-            ("pooled means", coverages[0].pooled),
-        )
-        if kept is None
-    ]
-    if not_kept:
-        records.append({"what": f"{', '.join(not_kept)}: not asked for, not kept", "count": None, "of": None})
+    if len(coverages[0].layers) == len(coverages[0].quantities):
+        others = ", ".join(aggregation.words for aggregation in AGGREGATIONS)
+        records.append({"what": f"{others}: not asked for, not kept", "count": None, "of": None})
     records += [
         {"what": f"{package}, for {use}: not imported", "count": None, "of": None}
         for package, use in HEAVY.items()

@@ -20,9 +20,10 @@ from torch.utils.data import DataLoader, Dataset
 from torchcover.cli.stopping import TargetWatch
 from torchcover.coverage import BevGrid, CoverageMetric
 from torchcover.data import BadFrameError, Frame, FrameBatch, collate_frames
-from torchcover.geometry import BoundingBox, euler_from_rotation
-from torchcover.report import SensorMark
+from torchcover.geometry import BoundingBox
+from torchcover.report import SensorView
 from torchcover.simulation import Rig
+from torchcover.simulation.rig import Sensor
 
 DEFAULT_SCENARIO = "courtyard"
 # For standard errors: at least half as many are in use at the end of a long run.
@@ -158,19 +159,22 @@ def outline_m(box: BoundingBox) -> NDArray[np.float64]:
     return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
 
 
-def sensor_marks(rig: Rig) -> list[SensorMark]:
-    """The sensors of a rig as maps show them."""
-    return [
-        SensorMark(
-            name=sensor.name,
-            x_m=sensor.mount.x_m,
-            y_m=sensor.mount.y_m,
-            yaw_deg=float(euler_from_rotation(sensor.mount.matrix()[:3, :3])[0]),
-            horizontal_fov_deg=sensor.horizontal_fov_deg,
-            range_m=sensor.max_range_m,
-        )
-        for sensor in rig.sensors
-    ]
+def sensor_views(rig: Rig) -> list[SensorView]:
+    """The sensors of a rig as pictures show them."""
+    return [_sensor_view(sensor) for sensor in rig.sensors]
+
+
+def _sensor_view(sensor: Sensor) -> SensorView:
+    x, y, z = sensor.directions()
+    middle = x.shape[1] // 2
+    elevation_deg = np.rad2deg(np.arctan2(z, np.hypot(x, y)))[:, middle]
+    return SensorView(
+        name=sensor.name,
+        vehicle_T_sensor=sensor.mount.matrix(),
+        horizontal_fov_deg=sensor.horizontal_fov_deg,
+        vertical_fov_deg=(float(np.nanmin(elevation_deg)), float(np.nanmax(elevation_deg))),
+        range_m=sensor.max_range_m,
+    )
 
 
 def _batches(

@@ -9,14 +9,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.console import Console
 
-from torchcover.cli.run import DEFAULT_SCENARIO, GRID_X_M, GRID_Y_M, outline_m
+from torchcover.cli.run import DEFAULT_SCENARIO, GRID_X_M, GRID_Y_M, outline_m, sensor_views
 from torchcover.data import SimulatedFrames
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
-from torchcover.report import ActorMark, SensorView, draw_depths, draw_rig, draw_scene
+from torchcover.report import ActorMark, draw_depths, draw_rig, draw_scene
 from torchcover.simulation import CameraSensor, PaperReference, Rig, Scenario, builtin_names
 from torchcover.simulation.instant import Instant
-from torchcover.simulation.rig import Sensor
 from torchcover.simulation.world import Actor, World
 
 DEFAULT_RIG = "front_roof_128"
@@ -84,8 +83,7 @@ def _draw_rig(rig: Rig, scenario: Scenario, step: int, seed: int) -> dict[str, F
     ego = scene.world.ego.mesh
     length, width, height = BoundingBox.around(ego.vertices_m).size_m
     subtitle = f"on the ego of {scenario.name}, {length:.2f} x {width:.2f} x {height:.2f} m"
-    sensors = [_sensor_view(sensor) for sensor in rig.sensors]
-    figures = {"": draw_rig(ego.vertices_m, ego.faces, sensors, title=rig.name, subtitle=subtitle)}
+    figures = {"": draw_rig(ego.vertices_m, ego.faces, sensor_views(rig), title=rig.name, subtitle=subtitle)}
     if cameras := _cameras(rig):
         instant = scene.at(step_of_world)
         images = {camera.name: _depth_image(camera, instant) for camera in cameras}
@@ -96,19 +94,6 @@ def _draw_rig(rig: Rig, scenario: Scenario, step: int, seed: int) -> dict[str, F
 
 def _depth_image(camera: CameraSensor, instant: Instant) -> NDArray[np.float32]:
     return instant.range_image(camera.mount.matrix(), camera.directions(), max_range_m=camera.max_range_m)
-
-
-def _sensor_view(sensor: Sensor) -> SensorView:
-    x, y, z = sensor.directions()
-    middle = x.shape[1] // 2
-    elevation_deg = np.rad2deg(np.arctan2(z, np.hypot(x, y)))[:, middle]
-    return SensorView(
-        name=sensor.name,
-        vehicle_T_sensor=sensor.mount.matrix(),
-        horizontal_fov_deg=sensor.horizontal_fov_deg,
-        vertical_fov_deg=(float(np.nanmin(elevation_deg)), float(np.nanmax(elevation_deg))),
-        range_m=sensor.max_range_m,
-    )
 
 
 def _draw_scenario(scenario: Scenario, rig: Rig, step: int, seed: int) -> Figure:

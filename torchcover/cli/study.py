@@ -25,11 +25,11 @@ from torchcover.report import (
     WorkPoint,
     cheapest,
     draw_work_precision,
+    json_record,
     narrowest_width,
     study_records,
     study_table,
 )
-from torchcover.report.records import json_record
 from torchcover.simulation import Scenario
 
 # Rays in a step of the long run: no fewer than any setting has, for fewer never see some cells of some steps.
@@ -258,7 +258,7 @@ def _write(request: Request, truth: Truth, points: Sequence[WorkPoint], stages: 
     (request.out / "study.json").write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
     console, tables = Console(), (study_table(points), _stage_table(stages))
     # Rather lines that are too long than numbers that are cut off.
-    console.width = max(console.width, narrowest_width(tables, ()))
+    console.width = max(console.width, narrowest_width(tables))
     for table in tables:
         console.print(table)
     console.print(
