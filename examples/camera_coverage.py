@@ -18,7 +18,7 @@ from rich.progress import track
 
 from torchcover import BevGrid, CoverageMetric, Region, Rig
 from torchcover.data import SimulatedFrames
-from torchcover.report import comparison_tables, draw_comparison
+from torchcover.report import CoverageTable, map_figures, print_table, write_figures
 from torchcover.simulation import CameraSensor, PaperReference
 
 GOPRO = {
@@ -95,9 +95,8 @@ def main():
             metric.update(frame.clouds[name], frame.reference)
     coverages = {name: metric.compute() for name, metric in metrics.items()}
     console = Console()
-    for table in comparison_tables(coverages, REGIONS):
-        console.print(table)
-    pictures = draw_comparison(coverages, options.out)
+    print_table(CoverageTable.of(coverages, REGIONS), console)
+    pictures = write_figures(map_figures(coverages), options.out)
     console.print(f"Wrote {len(pictures)} maps to {options.out}")
 
 

@@ -8,9 +8,9 @@ import torch
 from rich.progress import track
 
 from torchcover import BevGrid, Coverage, CoverageMetric
-from torchcover.cli.run import outline_m, sensor_marks
+from torchcover.cli.run import outline_m, sensor_views
 from torchcover.data import SimulatedFrames
-from torchcover.report import SensorMark
+from torchcover.report import SensorView
 from torchcover.simulation import EvenReference, PaperReference
 
 BLOCKS = 16  # for standard errors
@@ -25,7 +25,7 @@ class OnePass:
     coverages: dict[tuple[str, BevGrid], Coverage]
     points: dict[tuple[str, BevGrid], torch.Tensor]
     ego_outline_m: np.ndarray
-    marks: dict[str, list[SensorMark]]
+    sensors: dict[str, list[SensorView]]
     seconds: float
 
 
@@ -61,7 +61,7 @@ def one_pass(measured, counted, regions, options):
         coverages={key: metric.compute() for key, metric in metrics.items()},
         points=points,
         ego_outline_m=outline_m(frames.scene.ego_box),
-        marks={name: sensor_marks(rig) for name, rig in frames.rigs.items()},
+        sensors={name: sensor_views(rig) for name, rig in frames.rigs.items()},
         seconds=time.perf_counter() - start,
     )
 

@@ -8,8 +8,7 @@ import torch
 
 from torchcover.cli.study import Request, Truth, _advice, _errors
 from torchcover.coverage import BevGrid, CoverageMetric, forward_regions
-from torchcover.report import WorkPoint, cheapest, draw_work_precision
-from torchcover.report.work_precision import pareto_front
+from torchcover.report import WorkPoint, cheapest, draw_work_precision, pareto_front
 
 
 def point(seconds, error, rays=1024, reference="even"):

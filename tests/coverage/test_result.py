@@ -10,9 +10,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from torchcover.coverage.quantiles import bin_of, histogram_quantiles
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.coverage.quantiles import bin_of, histogram_quantiles
 
 GRID = BevGrid(x=(-1.0, 20.0), y=(-5.0, 5.0), cell=0.5)
 COUNTS = dict.fromkeys(Coverage.COUNTS, 3)

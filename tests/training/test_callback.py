@@ -176,14 +176,14 @@ def test_fixed_frames_are_measured_once_and_logged_at_every_epoch(tmp_path):
     for name, value in truth.scalars(REGIONS).items():
         logged = [event.value for event in events.Scalars(f"coverage/val/{name}")]
         assert logged == pytest.approx([value] * 3, rel=1e-6, nan_ok=True)
-    assert [event.step for event in events.Images("coverage/val/radius")] == [0]
+    assert [event.step for event in events.Images("coverage/val/radius_m")] == [0]
     # Another fit is another measurement, and has maps of its own.
     trainer = make_trainer(tmp_path, callback, logger=TensorBoardLogger(tmp_path, name="", version="other"))
     trainer.fit(Validated(), loader(2), loader(5))
     assert_same(callback.coverage, truth)
     events = EventAccumulator(str(tmp_path / "other"))
     events.Reload()
-    assert len(events.Images("coverage/val/radius")) == 1
+    assert len(events.Images("coverage/val/radius_m")) == 1
 
 
 def test_frames_that_were_said_to_be_fixed_and_are_not_are_added(tmp_path):
@@ -201,7 +201,7 @@ def test_frames_that_were_said_to_be_fixed_and_are_not_are_added(tmp_path):
     assert_same(callback.coverage, expected(RandomFrames(5)))
     events = EventAccumulator(logger.log_dir)
     events.Reload()
-    assert [event.step for event in events.Images("coverage/val/radius")] == [0, 1]
+    assert [event.step for event in events.Images("coverage/val/radius_m")] == [0, 1]
 
 
 def test_frames_that_a_sampler_repeats_are_counted_once(tmp_path):
@@ -278,7 +278,7 @@ def test_every_n_steps_logs_the_epoch_so_far(tmp_path):
     # Batches count from 0: after two of them, after four, and at the end.
     truth = {k: expected(frames[: 2 * k + 2]).scalars(REGIONS)["radius_m/all/ground"] for k in (1, 3, 4)}
     assert {step: values[tag] for step, values in logger.scalars if tag in values} == pytest.approx(truth, rel=1e-6)
-    assert [step for key, step, _ in logger.images if key == "coverage/train/radius"] == [1, 3, 4]
+    assert [step for key, step, _ in logger.images if key == "coverage/train/radius_m"] == [1, 3, 4]
 
 
 def test_another_rig_other_batches_and_frames(tmp_path):
@@ -330,7 +330,7 @@ def test_tensorboard_holds_the_tags_values_and_maps(tmp_path):
         last = events.Scalars(f"coverage/val/{name}")
         assert [event.value for event in last] == pytest.approx([value] * 2, rel=1e-6)
         assert [event.step for event in last] == [1, 3]
-    maps = {f"coverage/val/{name}" for name in ("radius", "detection_0.4m", "detection_0.8m")}
+    maps = {f"coverage/val/{name}" for name in ("radius_m", "detection_0.4m", "detection_0.8m")}
     assert set(events.Tags()["images"]) == maps
     for tag in maps:
         images = events.Images(tag)
@@ -342,7 +342,7 @@ def test_tensorboard_holds_the_tags_values_and_maps(tmp_path):
 def test_a_logger_that_takes_images_gets_pixels(tmp_path):
     logger = TakesImages()
     make_trainer(tmp_path, CoverageCallback(make_metric()), logger=logger).fit(Validated(), loader(2), loader(3))
-    assert [key for key, _, _ in logger.images] == ["coverage/val/radius", "coverage/val/detection_0.4m"]
+    assert [key for key, _, _ in logger.images] == ["coverage/val/radius_m", "coverage/val/detection_0.4m"]
     for _, _, image in logger.images:
         assert image.dtype == np.uint8
         assert image.shape[2] == 3
