@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchcover.coverage import BevGrid, Number, Region, differences
+from torchcover.coverage import BevGrid, CoverageMetric, Number, Region, differences
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.report import CoverageTable
 from torchcover.report.rounding import rounded
@@ -130,20 +130,21 @@ def test_the_best_are_the_best_and_what_looks_like_it(numbers, quantity):
             assert rounded(number, quantity.unit) in looks
 
 
-def test_remarks_are_made_of_what_did_happen_only(measure, points, blind, trios, regions):
+def test_remarks_are_made_of_what_did_happen_only(blind, trios, regions):
     table = CoverageTable.of(blind, regions)
     assert "empty_sensor_steps" not in names(table, "seeing")
     (remark,) = [remark for remark in table.conditions["blind"].remarks if remark.name == "empty_sensor_steps"]
     assert (remark.count, remark.of) == (1, 1)
     assert "unknown_cells" in names(table, "seeing")
     assert names(CoverageTable.of({"few": trios(5)["few"]}, ()), "few") == {"no_region", "too_few_blocks"}
-    everywhere = torch.cartesian_prod(torch.arange(4) + 0.5, torch.arange(2) + 0.5, torch.zeros(1))
+
+
+def test_there_is_nothing_to_remark_where_every_cell_is_known():
     grid = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, heights={"ground": (-0.5, 0.5)})
-    full = measure(points(9, 1), grid=grid)
-    full.probed_steps.fill_(1)
-    full.counts["outside_points"] = 0
-    assert len(everywhere) == full.probed_steps.numel()
-    assert not names(CoverageTable.of({"full": full}, [Region("all", grid.x, grid.y)]), "full")
+    metric = CoverageMetric(grid)
+    metric.update(torch.zeros(1, 3), torch.cartesian_prod(torch.arange(4) + 0.5, torch.arange(2) + 0.5, torch.zeros(1)))
+    table = CoverageTable.of({"full": metric.compute()}, [Region("all", grid.x, grid.y)])
+    assert not table.conditions["full"].remarks
 
 
 @pytest.mark.parametrize(
