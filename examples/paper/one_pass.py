@@ -7,9 +7,8 @@ import torch
 
 from torchcover import BevGrid, Coverage, CoverageMetric
 from torchcover.data import SimulatedFrames
-from torchcover.evaluation import CoverageObserver, observe
-from torchcover.evaluation.sensor_drawings import sensor_marks
-from torchcover.report import SensorMark
+from torchcover.evaluation import CoverageObserver, observe, sensor_views
+from torchcover.report import SensorView
 from torchcover.simulation import EvenReference, PaperReference
 
 BLOCKS = 16  # for standard errors
@@ -24,7 +23,7 @@ class OnePass:
     coverages: dict[tuple[str, BevGrid], Coverage]
     points: dict[tuple[str, BevGrid], torch.Tensor]
     ego_outline_m: np.ndarray
-    marks: dict[str, list[SensorMark]]
+    sensors: dict[str, list[SensorView]]
     seconds: float
 
 
@@ -57,7 +56,7 @@ def one_pass(measured, counted, regions, options):
         coverages={key: observer.compute() for key, observer in coverages.items()},
         points={key: observer.compute() for key, observer in points.items()},
         ego_outline_m=frames.ego_outline_m,
-        marks={name: sensor_marks(sensors) for name, sensors in frames.sensors.items()},
+        sensors={name: sensor_views(sensors) for name, sensors in frames.sensors.items()},
         seconds=run.seconds,
     )
 

@@ -51,7 +51,7 @@ def test_a_recording_is_evaluated_and_the_files_agree(torchcover, recording, tmp
         "detection_0.4m_obstacle.png",
         "detection_1m_ground.png",
         "detection_1m_obstacle.png",
-        "radius_ground.png",
+        "radius_m_ground.png",
         "radius_obstacle.png",
     ]
 
@@ -153,7 +153,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["reference"], summary["target_error"]) == (None, None)
     assert (summary["blocks"], summary["steps_per_block"]) == (4, 1)
-    assert summary["rows"][0]["radius_error_m"] is None
+    assert summary["rows"][0]["radius_m_error"] is None
     assert (tmp_path / "out" / "maps" / "radius_error_ground.png").is_file()
 
 

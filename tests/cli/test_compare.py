@@ -91,7 +91,7 @@ def test_errors_are_drawn_if_asked_for_and_differences_come_with_theirs(torchcov
     known = [row for row in summary["rows"] if row["rig"] == "both" and row["height"] == "ground"]
     assert len(known) == 3
     for row in known:
-        assert row["radius_error_m"] > 0
+        assert row["radius_m_error"] > 0
         assert row["radius_m_difference_error"] >= 0
         assert isinstance(row["radius_m_difference_significant"], bool)
     first = [row for row in summary["rows"] if row["rig"] == "low" and row["height"] == "ground"]

@@ -66,8 +66,8 @@ def test_every_known_number_of_every_rig_and_every_difference_counts():
     assert {one.target for one in found if one.quantity != "radius_m"} == {0.05}
     by_name = {(one.rig, one.region, one.quantity): one.error for one in found}
     (near, _, far, _) = coverages["b"].summary(REGIONS)
-    assert by_name["b", "near", "radius_m"] == near.radius_error_m
-    assert by_name["b", "far", "detection_0.4m"] == far.detection_error[0.4]
+    assert by_name["b", "near", "radius_m"] == near.numbers["radius_m"].error
+    assert by_name["b", "far", "detection_0.4m"] == far.numbers["detection_0.4m"].error
     difference = coverages["b"].estimate(REGIONS[1], "all").minus(coverages["a"].estimate(REGIONS[1], "all"))
     assert by_name["b minus a", "far", "radius_m"] == float(difference.error[0]) > 0
     assert by_name["c minus a", "far", "radius_m"] == 0.0

@@ -2,8 +2,7 @@
 
 import math
 
-from torchcover.report import WorkPoint, cheapest, draw_work_precision
-from torchcover.report.work_precision import pareto_front
+from torchcover.report import WorkPoint, cheapest, draw_work_precision, pareto_front
 
 
 def point(seconds, error, rays=1024, reference="even"):

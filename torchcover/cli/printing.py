@@ -10,13 +10,13 @@ from rich.table import Table
 from rich.text import Text
 
 from torchcover.evaluation import Omission, Result, Study, StudyPlan
-from torchcover.report import WorkPoint, narrowest_width, study_table
+from torchcover.report import WorkPoint, narrowest_width, print_table, study_table
 
 
 def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:
     """The tables, what the run left out if that is asked for, and where the files are."""
     console = Console()
-    _print_wide(result.tables(), list(result.coverages) if console.is_terminal else ())
+    print_table(result.table, console)
     if explain:
         console.print(_explanation(result.left_out))
     for line in result.run.skipped:
@@ -30,8 +30,12 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
 
 def print_study(study: Study, out: Path) -> None:
     """The tables, and the settings that are recommended."""
-    _print_wide([study_table(study.points), _stage_table(study.stages)], ())
     console, plan, floor = Console(), study.plan, study.floor
+    tables = study_table(study.points), _stage_table(study.stages)
+    # Rather lines that are too long than numbers that are cut off.
+    wide = Console(width=max(console.width, narrowest_width(tables)))
+    for table in tables:
+        wide.print(table)
     console.print(
         f"The long run ({plan.long_run_steps:,} steps of {plan.long_run_rays:,} rays, other seed) has itself an error "
         f"of {100 * floor['detection_error']:.2f} percentage points and {floor['radius_error_m']:.3f} m."
@@ -50,14 +54,6 @@ def advice(wanted: float, point: WorkPoint | None, plan: StudyPlan) -> str:
         f"For {100 * wanted:g} percentage points of detection: --reference {point.reference} --rays {point.rays} "
         f"--steps {point.steps} --cell {plan.cell_m:g}{every} ({point.seconds:.0f} s)."
     )
-
-
-def _print_wide(tables: Sequence[Table], names: Sequence[str]) -> None:
-    console = Console()
-    # Rather lines that are too long than numbers that are cut off; in a file the names are whole too.
-    console.width = max(console.width, narrowest_width(tables, names))
-    for table in tables:
-        console.print(table)
 
 
 def _explanation(omissions: Sequence[Omission]) -> Table:

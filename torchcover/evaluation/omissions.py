@@ -4,7 +4,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from torchcover.coverage import Coverage
+from torchcover.coverage import AGGREGATIONS, Coverage
 
 # What it is, how often it was left out, and of how many; the counts are those of the frames, added up.
 COUNTED = (
@@ -46,13 +46,8 @@ def left_out(frame_counts: Mapping[str, int], coverages: Sequence[Coverage]) -> 
     inside = sum(int(coverage.points.sum()) for coverage in coverages)
     if outside:
         found.append(Omission("reference points outside every cell: not searched for", outside, inside + outside))
-    aggregations = {
-        "maxima": coverages[0].maximum,
-        "quantiles": coverages[0].quantiles,
-        "pooled means": coverages[0].pooled,
-    }
-    not_kept = [name for name, kept in aggregations.items() if kept is None]
-    if not_kept:
-        found.append(Omission(f"{', '.join(not_kept)}: not asked for, not kept"))
+    if len(coverages[0].layers) == len(coverages[0].quantities):
+        others = ", ".join(aggregation.words for aggregation in AGGREGATIONS)
+        found.append(Omission(f"{others}: not asked for, not kept"))
     unused = [package for package in HEAVY if package not in sys.modules]
     return found + [Omission(f"{package}, for {HEAVY[package]}: not imported") for package in unused]

@@ -1,6 +1,5 @@
 """What an evaluation gives: numbers, maps and files of one rig or several. All that `report` is asked for is here."""
 
-import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -9,27 +8,15 @@ from typing import Any
 
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.table import Table
 
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
 from torchcover.evaluation.omissions import Omission, left_out
 from torchcover.evaluation.pipeline import Run
-from torchcover.evaluation.sensor_drawings import sensor_marks
+from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.evaluation.target_error import TargetError
 from torchcover.evaluation.target_outcome import outcome
-from torchcover.report import (
-    comparison_dict,
-    comparison_maps,
-    comparison_tables,
-    coverage_maps,
-    coverage_table,
-    narrowest_width,
-    summary_dict,
-    write_comparison,
-    write_csv,
-)
+from torchcover.report import RENDERERS, CoverageTable, map_figures, table_dict, write_figures
 from torchcover.simulation import Sensor
 
 
@@ -80,16 +67,14 @@ class Result:
         return len(self.coverages) > 1
 
     @property
-    def numbers(self) -> dict[str, Any]:
-        """The numbers and what they hold for, as in `summary.json`: unknown is None, infinite is "Infinity"."""
-        if self.is_comparison:
-            return comparison_dict(self.coverages, self.regions)
-        return summary_dict(self.coverage, self.regions)
+    def table(self) -> CoverageTable:
+        """The numbers, with errors, differences and marks; `RENDERERS` write it down."""
+        return CoverageTable.of(self.coverages, self.regions, self._notes)
 
     @property
     def summary(self) -> list[dict[str, Any]]:
-        """A row for each rig, region and height band: the rows of `summary.csv`."""
-        rows: list[dict[str, Any]] = self.numbers["rows"]
+        """A row for each rig, region and height band, as in `summary.json`: unknown is None, infinite "Infinity"."""
+        rows: list[dict[str, Any]] = table_dict(self.table)["rows"]
         return rows
 
     @property
@@ -118,14 +103,8 @@ class Result:
             "skipped_frames": self.run.skipped,
             "target_error": outcome(self.target_error, self.coverages, self.regions)[0],
             "left_out": [asdict(omission) for omission in self.left_out],
-            **self.numbers,
+            **table_dict(self.table),
         }
-
-    def tables(self) -> list[Table]:
-        """The tables for the terminal."""
-        if self.is_comparison:
-            return comparison_tables(self.coverages, self.regions, self._notes)
-        return [coverage_table(self.coverage, self.regions, self._notes)]
 
     def maps(self, *, errors: bool = False) -> Iterator[tuple[str, Figure]]:
         """Draw the maps, one by one; several rigs side by side, and their differences to the first.
@@ -136,11 +115,8 @@ class Result:
         Returns:
             The stem of the file name, and a figure of its own, outside pyplot.
         """
-        marks = {name: sensor_marks(sensors) for name, sensors in self.sensors.items()}
-        if self.is_comparison:
-            return comparison_maps(self.coverages, ego_outline_m=self.ego_outline_m, sensors=marks, errors=errors)
-        own = next(iter(marks.values()), [])
-        return coverage_maps(self.coverage, ego_outline_m=self.ego_outline_m, sensors=own, errors=errors)
+        views = {name: sensor_views(sensors) for name, sensors in self.sensors.items()}
+        return map_figures(self.coverages, ego_outline_m=self.ego_outline_m, sensors=views, errors=errors)
 
     def save(self, folder: str | Path, *, error_maps: bool = False) -> list[Path]:
         """Write the files of the command line; `summary.json` last, so that a folder that has it is complete.
@@ -154,16 +130,11 @@ class Result:
             The files.
         """
         folder = Path(folder)
-        (folder / "maps").mkdir(parents=True, exist_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
         files = self._save_coverages(folder)
         files.append(folder / "summary.csv")
-        if self.is_comparison:
-            write_comparison(self.coverages, self.regions, files[-1])
-        else:
-            write_csv(self.coverage, self.regions, files[-1])
-        for stem, figure in self.maps(errors=error_maps):
-            files.append(folder / "maps" / f"{stem}.png")
-            figure.savefig(files[-1], dpi=figure.dpi)
+        files[-1].write_text(RENDERERS["csv"](self.table), encoding="utf-8")
+        files += write_figures(self.maps(errors=error_maps), folder / "maps")
         files.append(folder / "summary.json")
         files[-1].write_text(json.dumps(self.record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         return files
@@ -195,10 +166,6 @@ class Result:
         return [f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."]
 
     def __repr__(self) -> str:
-        tables, buffer = self.tables(), io.StringIO()
-        console = Console(file=buffer, width=narrowest_width(tables, ()))
         cut_short = "" if self.run.complete else ", cut short"
-        console.print(f"Result of {', '.join(self.coverages)}: {self.run.steps} steps{cut_short}", soft_wrap=True)
-        for table in tables:
-            console.print(table)
-        return buffer.getvalue()
+        about = f"Result of {', '.join(self.coverages)}: {self.run.steps} steps{cut_short}"
+        return f"{about}\n{RENDERERS['text'](self.table)}"

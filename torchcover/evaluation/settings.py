@@ -103,7 +103,7 @@ def reference_called(name: str | None, rays: int | None) -> ReferenceSensor:
     """A reference sensor by its name.
 
     Args:
-        name: One of `REFERENCE_SENSORS`; None for the default. It is asked about the paper's regions and the whole grid.
+        name: One of `REFERENCE_SENSORS`; None for the default. Asked about the paper's regions and the grid.
         rays: About how many rays at each step; None for the sensor's own number.
 
     Raises:

@@ -13,8 +13,7 @@ from torchcover import __version__
 from torchcover.evaluation.study_plan import StudyPlan
 from torchcover.evaluation.study_runs import Sample, Setting, one_run, time_stages
 from torchcover.evaluation.study_truth import Truth, long_run
-from torchcover.report import WorkPoint, cheapest, draw_work_precision, study_records
-from torchcover.report.records import json_record
+from torchcover.report import WorkPoint, cheapest, draw_work_precision, json_record, study_records
 
 # Detection errors that a setting is recommended for.
 WANTED = (0.05, 0.02, 0.01, 0.005)

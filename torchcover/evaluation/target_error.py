@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from torchcover.coverage import Coverage, Region
 from torchcover.evaluation.observers import Observer
-from torchcover.report.quantity import quantities_of
 
 # An error from fewer steps is not believed, though they may fill enough blocks.
 MIN_STEPS = 32
@@ -121,13 +120,11 @@ def standings(target: TargetError, coverages: Mapping[str, Coverage], regions: S
             others = [name for name in estimates if name != first_name]
             paired = {f"{name} minus {first_name}": estimates[name].minus(estimates[first_name]) for name in others}
             for name, estimate in (estimates | paired).items():
-                numbers = zip(
-                    quantities_of(first.thresholds), estimate.value.tolist(), estimate.error.tolist(), strict=True
-                )
+                numbers = zip(first.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True)
                 for quantity, value, error in numbers:
-                    good = target.radius_m if quantity.threshold is None else target.detection
+                    good = target.radius_m if quantity.unit == "m" else target.detection
                     if good is not None and not math.isnan(value):
-                        where = (name, region.name, height, quantity.column)
+                        where = (name, region.name, height, quantity.key)
                         found.append(Standing(*where, error, good, first.counts["steps"]))
     return found
 

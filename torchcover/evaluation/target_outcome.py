@@ -7,7 +7,7 @@ from typing import Any
 
 from torchcover.coverage import Coverage, Region
 from torchcover.evaluation.target_error import Standing, TargetError, standings
-from torchcover.report.records import json_record
+from torchcover.report import json_record
 
 
 def outcome(

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -14,7 +13,8 @@ from matplotlib.patches import FancyArrowPatch, Patch, Polygon, Wedge
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 from numpy.typing import NDArray
 
-from torchcover.report.sheet import Sheet
+from torchcover.report.maps.sheet import Sheet
+from torchcover.report.sensor_view import SensorView
 
 # Okabe and Ito's colours, which the colour-blind can tell apart.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
@@ -24,39 +24,6 @@ OVERLAP_POINTS = 9.0
 DOT: dict[str, Any] = {"markersize": 4.5, "markerfacecolor": "black", "markeredgecolor": "white"}
 HALO: Sequence[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]
 THIN_HALO: Sequence[AbstractPathEffect] = [withStroke(linewidth=1.8, foreground="white")]
-
-
-@dataclass(frozen=True)
-class SensorMark:
-    """A sensor as a map shows it.
-
-    Args:
-        name: What the legend calls it.
-        x_m: Position forward in the vehicle frame, in metres.
-        y_m: Position to the left, in metres.
-        yaw_deg: Direction in degrees: 0 is forward, positive turns left.
-        horizontal_fov_deg: Horizontal field of view in degrees, in (0, 360].
-        range_m: Maximum range in metres, infinity if there is none.
-
-    Raises:
-        ValueError: A position or yaw that is not finite, a field of view outside (0, 360], a range that is not
-            positive.
-    """
-
-    name: str
-    x_m: float
-    y_m: float
-    yaw_deg: float
-    horizontal_fov_deg: float
-    range_m: float
-
-    def __post_init__(self) -> None:
-        if not all(math.isfinite(value) for value in (self.x_m, self.y_m, self.yaw_deg)):
-            raise ValueError(f"sensor {self.name!r}: x_m, y_m and yaw_deg must be finite; got {self}")
-        if not 0 < self.horizontal_fov_deg <= 360:
-            raise ValueError(f"sensor {self.name!r}: horizontal_fov_deg in (0, 360]; got {self.horizontal_fov_deg}")
-        if not self.range_m > 0:
-            raise ValueError(f"sensor {self.name!r}: range_m must be positive; got {self.range_m}")
 
 
 def draw_ego(axes: Axes, outline_m: NDArray[np.floating]) -> list[Artist]:
@@ -80,7 +47,7 @@ def draw_ego(axes: Axes, outline_m: NDArray[np.floating]) -> list[Artist]:
     return [ego]
 
 
-def draw_sensors(sheet: Sheet, sensors: Sequence[SensorMark], *, named: bool = True) -> list[Artist]:
+def draw_sensors(sheet: Sheet, sensors: Sequence[SensorView], *, named: bool = True) -> list[Artist]:
     """Draw each sensor as a dot with an arrow in its direction, numbered if there are several, and its field of view.
 
     Args:
@@ -106,7 +73,7 @@ def draw_sensors(sheet: Sheet, sensors: Sequence[SensorMark], *, named: bool = T
     return [*(_legend_entry(sheet, *pair) for pair in zip(numbers, sensors, strict=True)), view]
 
 
-def draw_sectors(sheet: Sheet, sensors: Sequence[SensorMark]) -> list[Artist]:
+def draw_sectors(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
     """Fill the horizontal field of view of each sensor, as if nothing were in its way: all that geometry alone says.
 
     Args:
@@ -124,12 +91,12 @@ def draw_sectors(sheet: Sheet, sensors: Sequence[SensorMark]) -> list[Artist]:
     return entries
 
 
-def _draw_view(sheet: Sheet, sensor: SensorMark) -> None:
+def _draw_view(sheet: Sheet, sensor: SensorView) -> None:
     dashes = {"fill": False, "edgecolor": "black", "linewidth": 0.8, "linestyle": (0, (5, 3))}
     _draw_wedge(sheet, sensor, zorder=2.5, path_effects=THIN_HALO, **dashes)
 
 
-def _draw_wedge(sheet: Sheet, sensor: SensorMark, **style: Any) -> None:  # noqa: ANN401  (matplotlib's own)
+def _draw_wedge(sheet: Sheet, sensor: SensorView, **style: Any) -> None:  # noqa: ANN401  (matplotlib's own)
     start, half = (sensor.x_m, sensor.y_m), sensor.horizontal_fov_deg / 2
     furthest = max(math.dist(start, corner) for corner in product(sheet.axes.get_xlim(), sheet.axes.get_ylim()))
     wedge = Wedge(
@@ -142,7 +109,7 @@ def _draw_wedge(sheet: Sheet, sensor: SensorMark, **style: Any) -> None:  # noqa
     sheet.axes.add_patch(wedge)
 
 
-def _draw_arrow(sheet: Sheet, sensor: SensorMark) -> None:
+def _draw_arrow(sheet: Sheet, sensor: SensorView) -> None:
     start, tip = (sensor.x_m, sensor.y_m), _ahead(sheet, sensor, ARROW_POINTS)
     arrow = FancyArrowPatch(
         start, tip, arrowstyle="-|>", mutation_scale=9, shrinkA=0, shrinkB=0, linewidth=1.2, color="black", zorder=4
@@ -152,7 +119,7 @@ def _draw_arrow(sheet: Sheet, sensor: SensorMark) -> None:
     sheet.axes.plot(*start, linestyle="none", marker="o", zorder=5, **DOT)
 
 
-def _draw_numbers(sheet: Sheet, sensors: Sequence[SensorMark]) -> None:
+def _draw_numbers(sheet: Sheet, sensors: Sequence[SensorView]) -> None:
     for (x, y), numbers in _places(sheet, sensors).items():
         # The text grows away from the arrow.
         side = {1: "left", 0: "center", -1: "right"}[round(math.cos(math.radians(sensors[numbers[0] - 1].yaw_deg)))]
@@ -160,7 +127,7 @@ def _draw_numbers(sheet: Sheet, sensors: Sequence[SensorMark]) -> None:
         text.set(zorder=5, path_effects=HALO)
 
 
-def _places(sheet: Sheet, sensors: Sequence[SensorMark]) -> dict[tuple[float, float], list[int]]:
+def _places(sheet: Sheet, sensors: Sequence[SensorView]) -> dict[tuple[float, float], list[int]]:
     """Where to write which numbers: sensors whose numbers would overlap share a place."""
     places: dict[tuple[float, float], list[int]] = {}
     for number, sensor in enumerate(sensors, start=1):
@@ -170,14 +137,14 @@ def _places(sheet: Sheet, sensors: Sequence[SensorMark]) -> dict[tuple[float, fl
     return places
 
 
-def _legend_entry(sheet: Sheet, number: str, sensor: SensorMark) -> Artist:
+def _legend_entry(sheet: Sheet, number: str, sensor: SensorView) -> Artist:
     (left, right), (bottom, top) = sheet.axes.get_xlim(), sheet.axes.get_ylim()
     inside = left <= sensor.x_m <= right and bottom <= sensor.y_m <= top
     label = f"{number}{sensor.name}{'' if inside else ' (beyond the map)'}"
     return Line2D([], [], linestyle="none", marker="o", label=label, **DOT)
 
 
-def _ahead(sheet: Sheet, sensor: SensorMark, points: float) -> tuple[float, float]:
+def _ahead(sheet: Sheet, sensor: SensorView, points: float) -> tuple[float, float]:
     """The place so many points (1/72 inch) in front of the sensor, in metres."""
     reach, yaw = points / 72 * sheet.metres_per_inch, math.radians(sensor.yaw_deg)
     return sensor.x_m + reach * math.cos(yaw), sensor.y_m + reach * math.sin(yaw)

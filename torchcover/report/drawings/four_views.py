@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import BevGrid
-from torchcover.report.cells import cell_entries, draw_cells, draw_colour_bar
-from torchcover.report.overlay import SensorMark, draw_ego, draw_sectors, draw_sensors
-from torchcover.report.scale import ColourScale, radius_scale
-from torchcover.report.sheet import (
+from torchcover.coverage.quantity import RADIUS
+from torchcover.report.maps.cells import cell_entries, draw_cells, draw_colour_bar
+from torchcover.report.maps.overlay import draw_ego, draw_sectors, draw_sensors
+from torchcover.report.maps.scale import ColourScale, scale_of
+from torchcover.report.maps.sheet import (
     HEADING_POINTS,
     Sheet,
     fit_paper,
@@ -23,6 +24,7 @@ from torchcover.report.sheet import (
     write_legend,
     write_title,
 )
+from torchcover.report.sensor_view import SensorView
 from torchcover.report.wording import span, steps_and_cell
 
 # A few cells beside the bumper hold most of the points.
@@ -38,7 +40,7 @@ def draw_four_views(
     steps: int,
     title: str,
     ego_outline_m: NDArray[np.floating],
-    sensors: Sequence[SensorMark],
+    sensors: Sequence[SensorView],
 ) -> Figure:
     """Draw what geometry alone says of a rig, what its points alone say, and what it sees of what there is to be seen.
 
@@ -66,7 +68,7 @@ def draw_four_views(
     write_heading(sectors.axes, "fields of view, as if nothing were in the way")
     entries += _draw_histogram(histogram, points.double().cpu().numpy() / steps)
     write_heading(histogram.axes, "points of the rig in each cell")
-    scale = radius_scale("mean blind spot radius", radius)
+    scale = scale_of(RADIUS, radius)
     together = radius.cpu().double().numpy()
     for sheet, values, (name, band) in zip(maps, together, grid.heights.items(), strict=True):
         draw_colour_bar(sheet, draw_cells(sheet.axes, values, scale), together, scale)

@@ -10,9 +10,9 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from torchcover.report.cells import UNKNOWN, draw_cells
-from torchcover.report.scale import ColourScale
-from torchcover.report.sheet import (
+from torchcover.report.maps.cells import UNKNOWN, draw_cells
+from torchcover.report.maps.scale import ColourScale
+from torchcover.report.maps.sheet import (
     BELOW_IN,
     COLOUR_BAR_IN,
     DOTS_PER_INCH,

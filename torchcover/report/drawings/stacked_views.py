@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from torchcover.report.sheet import BELOW_IN, DOTS_PER_INCH
+from torchcover.report.maps.sheet import BELOW_IN, DOTS_PER_INCH
 
 Bounds = tuple[float, float]
 

@@ -9,6 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
+from torchcover.coverage import Quantity
+from torchcover.report.units import UNITS
+
 # A few cells far behind an obstacle must not take the colours away from all others.
 ROBUST_PERCENTILE = 98
 
@@ -53,33 +56,41 @@ class ColourScale:
         return f"{self.quantity} ({self.unit})"
 
 
-def radius_scale(quantity: str, radius: Tensor) -> ColourScale:
-    """Scale for blind spot radii, from 0 to the 98th percentile of the known, finite ones.
+def scale_of(quantity: Quantity, values: Tensor) -> ColourScale:
+    """Scale for a quantity as it is shown: shares from 0 to 100 %, others from 0 to the 98th percentile of the known.
 
     Args:
-        quantity: What is measured, for the colour bar.
-        radius: Radii in metres, any shape: those of every map that shall be compared by eye. NaN is unknown.
+        quantity: What is shown; dark is the worse end.
+        values: Any shape, in the unit that is shown: those of every map that shall be compared by eye. NaN is unknown.
+
+    Example:
+        >>> import torch
+        >>> from torchcover.coverage.quantity import RADIUS
+        >>> scale_of(RADIUS, torch.tensor([0.5, 2.04])).label
+        'mean blind spot radius (m)'
     """
-    return ColourScale(quantity, "m", "viridis_r", 0.0, _robust_end(radius))
+    unit = UNITS[quantity.unit]
+    colormap = "viridis_r" if quantity.lower_is_better else "viridis"
+    high = unit.highest if math.isfinite(unit.highest) else _robust_end(values)
+    return ColourScale(quantity.title, unit.name, colormap, 0.0, high)
 
 
-def detection_scale(quantity: str) -> ColourScale:
-    """Scale for detection probabilities in percent, always from 0 to 100."""
-    return ColourScale(quantity, "%", "viridis", 0.0, 100.0)
+def error_scale(quantity: Quantity, errors: Tensor) -> ColourScale:
+    """Scale for standard errors, from 0 to the 98th percentile of the known; as `scale_of`."""
+    unit = UNITS[quantity.unit].difference_name
+    return ColourScale(quantity.title, unit, "viridis_r", 0.0, _robust_end(errors))
 
 
-def difference_scale(scale: ColourScale, difference: Tensor, *, lower_is_better: bool) -> ColourScale:
+def difference_scale(quantity: Quantity, differences: Tensor) -> ColourScale:
     """Scale for differences: white is none, blue is better, red is worse, both to the 98th percentile of the size.
 
     Args:
-        scale: That of the quantity itself.
-        difference: Differences, any shape: those of every map that shall be compared by eye. NaN is unknown.
-        lower_is_better: Whether a negative difference is an improvement.
+        quantity: What differs.
+        differences: As in `scale_of`.
     """
-    end = _robust_end(difference.abs())
-    colormap = "RdBu_r" if lower_is_better else "RdBu"
-    unit = "percentage points" if scale.unit == "%" else scale.unit
-    return ColourScale(f"difference, {scale.quantity}", unit, colormap, -end, end)
+    end = _robust_end(differences.abs())
+    colormap = "RdBu_r" if quantity.lower_is_better else "RdBu"
+    return ColourScale(f"difference, {quantity.title}", UNITS[quantity.unit].difference_name, colormap, -end, end)
 
 
 def _robust_end(values: Tensor) -> float:

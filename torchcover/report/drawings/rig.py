@@ -1,7 +1,6 @@
 """A rig on its vehicle, from above and from the side, with the fields of view of its sensors."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
@@ -13,10 +12,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from torchcover.geometry import euler_from_rotation
-from torchcover.report.overlay import COLOURS
-from torchcover.report.sheet import HEADING_POINTS, fit_paper, write_heading, write_legend, write_title
-from torchcover.report.views import stack_views
+from torchcover.report.drawings.stacked_views import stack_views
+from torchcover.report.maps.overlay import COLOURS
+from torchcover.report.maps.sheet import HEADING_POINTS, fit_paper, write_heading, write_legend, write_title
+from torchcover.report.sensor_view import SensorView
 
 Points = NDArray[np.float64]
 
@@ -27,40 +26,6 @@ FIRST_REACH_M, REACH_STEP_M = 4.0, 0.6
 ARC_POINTS = 241
 GROUND_M = -0.4
 LIGHT = np.array([0.3, -0.5, 0.81])
-
-
-@dataclass(frozen=True, eq=False)
-class SensorView:
-    """A sensor as a drawing of its rig shows it.
-
-    Args:
-        name: What the legend calls it.
-        vehicle_T_sensor: (4, 4) pose; its frame is x forward, y left, z up.
-        horizontal_fov_deg: Horizontal field of view about its x axis, in (0, 360].
-        vertical_fov_deg: Its lowest and its highest elevation.
-        range_m: Maximum range in metres.
-    """
-
-    name: str
-    vehicle_T_sensor: Points
-    horizontal_fov_deg: float
-    vertical_fov_deg: tuple[float, float]
-    range_m: float
-
-    @property
-    def position_m(self) -> Points:
-        """(3,) its place in the vehicle frame."""
-        return self.vehicle_T_sensor[:3, 3]
-
-    def sees(self, directions: Points) -> NDArray[np.bool_]:
-        """Which of (N, 3) directions in the vehicle frame lie in the field of view."""
-        x, y, z = (directions @ self.vehicle_T_sensor[:3, :3]).T
-        azimuth_deg = np.rad2deg(np.arctan2(y, x))
-        elevation_deg = np.rad2deg(np.arctan2(z, np.hypot(x, y)))
-        low, high = self.vertical_fov_deg
-        inside: NDArray[np.bool_] = np.logical_and(low <= elevation_deg, elevation_deg <= high)
-        inside &= abs(azimuth_deg) <= self.horizontal_fov_deg / 2
-        return inside
 
 
 def draw_rig(
@@ -104,9 +69,8 @@ def draw_rig(
 
 def _sector(sensor: SensorView, reach_m: float) -> Points:
     """(K, 2) outline of the horizontal field of view: its arc last to first, and its corner if it has one."""
-    yaw_deg = float(euler_from_rotation(sensor.vehicle_T_sensor[:3, :3])[0])
     half = sensor.horizontal_fov_deg / 2
-    angles = np.deg2rad(np.linspace(yaw_deg - half, yaw_deg + half, ARC_POINTS))
+    angles = np.deg2rad(np.linspace(sensor.yaw_deg - half, sensor.yaw_deg + half, ARC_POINTS))
     length_m = min(reach_m, sensor.range_m)
     arc = sensor.position_m[:2] + length_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return arc if sensor.horizontal_fov_deg == 360 else np.vstack([arc, sensor.position_m[:2]])

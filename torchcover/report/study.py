@@ -1,20 +1,13 @@
-"""Error against run time: which setting is worth its time."""
+"""A study of error against run time: its points, the best of them, and its table."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 
-from matplotlib import colormaps
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from rich.table import Table
 
-from torchcover.report.records import json_record
-
-MARKERS = "osD^vP*X"
-COLOURS = {"even": "viridis", "paper": "autumn"}
-MAX_LIGHTNESS = 0.85
+from torchcover.report.renderers.json_file import json_record
+from torchcover.report.wording import error_words, percent
 
 
 @dataclass(frozen=True)
@@ -48,11 +41,8 @@ class WorkPoint:
     known_share: float
 
 
-# Title of each panel, the number of it, and what to multiply it with.
-PANELS = (
-    ("error of the regions' detection (percentage points)", "detection_error", 100.0),
-    ("error of the regions' radius (m)", "radius_error_m", 1.0),
-)
+# The errors whose fastest points are marked.
+RANKED = ("detection_error", "radius_error_m")
 
 
 def pareto_front(points: Sequence[WorkPoint], error: str) -> list[WorkPoint]:
@@ -88,39 +78,6 @@ def cheapest(points: Sequence[WorkPoint], error: str, at_most: float) -> WorkPoi
     return min(good, key=lambda point: point.seconds, default=None)
 
 
-def draw_work_precision(points: Sequence[WorkPoint], floor: Mapping[str, float], title: str) -> Figure:
-    """Draw the work-precision diagram: error over time, both logarithmic, a line for each setting.
-
-    Args:
-        points: Measured points.
-        floor: Standard error of the long run for each of `PANELS`' fields: errors below it say nothing.
-        title: What was measured.
-    """
-    figure = Figure(figsize=(12.0, 5.6), dpi=150, layout="constrained")
-    FigureCanvasAgg(figure)
-    figure.suptitle(title, parse_math=False)
-    panels = figure.subplots(1, len(PANELS), squeeze=False)[0]
-    for axes, (label, error, factor) in zip(panels, PANELS, strict=True):
-        _draw_lines(axes, points, error, factor)
-        front = pareto_front(points, error)
-        axes.plot(
-            [point.seconds for point in front],
-            [factor * getattr(point, error) for point in front],
-            color="black",
-            linewidth=4.5,
-            alpha=0.25,
-            zorder=1,
-            label="Pareto front",
-        )
-        if math.isfinite(floor[error]):
-            axes.axhline(factor * floor[error], color="grey", linestyle=":", label="standard error of the long run")
-        axes.set(xscale="log", yscale="log", xlabel="run time (s)", ylabel=label)
-        axes.grid(visible=True, which="both", alpha=0.2)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right upper", title="rays a step", frameon=False)
-    return figure
-
-
 def study_table(points: Sequence[WorkPoint]) -> Table:
     """A row for each point, the Pareto front of the detection marked `*`."""
     front = pareto_front(points, "detection_error")
@@ -138,40 +95,19 @@ def study_table(points: Sequence[WorkPoint]) -> Table:
             f"{point.rays:,}",
             f"{point.steps:,}",
             f"{point.seconds:.1f}",
-            *_shown(point.detection_error, point.completed_detection_error, factor=100),
-            *_shown(point.radius_error_m, point.completed_radius_error_m),
-            *_shown(point.cell_detection_error, factor=100),
-            *_shown(point.cell_radius_error_m),
-            f"{100 * point.known_share:.0f}",
+            *(error_words(error, "share") for error in (point.detection_error, point.completed_detection_error)),
+            *(error_words(error, "m") for error in (point.radius_error_m, point.completed_radius_error_m)),
+            error_words(point.cell_detection_error, "share"),
+            error_words(point.cell_radius_error_m, "m"),
+            percent(point.known_share),
         )
     return table
 
 
 def study_records(points: Sequence[WorkPoint]) -> list[dict[str, object]]:
     """The points for `study.json`."""
-    fronts = {name: pareto_front(points, name) for _, name, _ in PANELS}
+    fronts = {name: pareto_front(points, name) for name in RANKED}
     return [
         json_record({**asdict(point), **{f"best_{name}": point in front for name, front in fronts.items()}})
         for point in points
     ]
-
-
-def _draw_lines(axes: Axes, points: Sequence[WorkPoint], error: str, factor: float) -> None:
-    for reference in dict.fromkeys(point.reference for point in points):
-        rays = sorted({point.rays for point in points if point.reference == reference})
-        for at, count in enumerate(rays):
-            line = [point for point in points if (point.reference, point.rays) == (reference, count)]
-            axes.plot(
-                [point.seconds for point in line],
-                [factor * getattr(point, error) for point in line],
-                marker=MARKERS[at % len(MARKERS)],
-                markersize=5,
-                linewidth=1.2,
-                linestyle="-" if reference == "even" else "--",
-                color=colormaps[COLOURS.get(reference, "winter")](MAX_LIGHTNESS * at / max(len(rays) - 1, 1)),
-                label=f"{reference} {count:,}",
-            )
-
-
-def _shown(*values: float, factor: float = 1.0) -> list[str]:
-    return ["unknown" if math.isnan(value) else f"{factor * value:.2f}" for value in values]

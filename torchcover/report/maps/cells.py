@@ -10,8 +10,8 @@ from matplotlib.image import AxesImage
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from torchcover.report.scale import ColourScale
-from torchcover.report.sheet import Sheet
+from torchcover.report.maps.scale import ColourScale
+from torchcover.report.maps.sheet import Sheet
 from torchcover.report.wording import percent
 
 UNKNOWN: dict[str, Any] = {"facecolor": "#c4c4c4", "edgecolor": "#b2b2b2", "hatch": "////"}

@@ -1,5 +1,7 @@
 """Drawings without cells: a rig on its vehicle, and a frame of a scenario."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,11 +12,11 @@ from matplotlib.figure import Figure
 
 from torchcover import BevGrid
 from torchcover.geometry import rigid, rotation_from_euler
-from torchcover.report import ActorMark, SensorMark, SensorView, draw_depths, draw_four_views, draw_rig, draw_scene
-from torchcover.report.depth_view import SKY
-from torchcover.report.overlay import COLOURS
-from torchcover.report.rig_view import FIRST_REACH_M
-from torchcover.report.scene_view import REFERENCE, SENSOR
+from torchcover.report import ActorMark, SensorView, draw_depths, draw_four_views, draw_rig, draw_scene
+from torchcover.report.drawings.depth import SKY
+from torchcover.report.drawings.rig import FIRST_REACH_M
+from torchcover.report.drawings.scene import REFERENCE, SENSOR
+from torchcover.report.maps.overlay import COLOURS
 
 VERTICES = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (0.0, 1.5)])
 FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [1, 5, 7], [1, 7, 3], [0, 4, 5], [0, 5, 1]])
@@ -56,6 +58,30 @@ def test_a_sensor_sees_within_its_angles_however_it_is_turned():
     outside = [direction(90, -51), direction(90, -9), direction(0, -20), direction(-90, -20)]
     assert left_down.sees(np.array(inside)).all()
     assert not left_down.sees(np.array(outside)).any()
+
+
+@pytest.mark.parametrize("yaw", [-170.0, -90.0, 0.0, 33.0, 180.0])
+def test_place_and_direction_are_those_of_the_pose(yaw):
+    sensor = view(yaw=yaw, pitch=20.0, at=(1.0, -2.0, 3.0))
+    assert (sensor.x_m, sensor.y_m, sensor.position_m[2]) == (1.0, -2.0, 3.0)
+    assert sensor.yaw_deg == pytest.approx(yaw)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("vehicle_T_sensor", np.full((4, 4), np.nan)),
+        ("vehicle_T_sensor", np.eye(3)),
+        ("horizontal_fov_deg", 361.0),
+        ("horizontal_fov_deg", 0.0),
+        ("vertical_fov_deg", (10.0, -10.0)),
+        ("vertical_fov_deg", (-91.0, 0.0)),
+        ("range_m", 0.0),
+    ],
+)
+def test_an_impossible_sensor_is_refused_by_name(field, value):
+    with pytest.raises(ValueError, match=f"'lidar': {field}"):
+        replace(view(), **{field: value})
 
 
 def test_from_above_the_sector_lies_about_the_yaw():
@@ -207,8 +233,8 @@ def test_what_is_no_image_is_refused(images, message):
 
 
 GRID = BevGrid(x=(-10.0, 10.0), y=(-8.0, 8.0), cell=0.5)
-FORWARD = SensorMark("front", x_m=2.0, y_m=0.0, yaw_deg=0.0, horizontal_fov_deg=90.0, range_m=200.0)
-LEFT = SensorMark("left", x_m=0.0, y_m=1.0, yaw_deg=90.0, horizontal_fov_deg=60.0, range_m=5.0)
+FORWARD = view(name="front", range_m=200.0)
+LEFT = view(yaw=90.0, name="left", at=(0.0, 1.0, 1.0), wide=60.0, range_m=5.0)
 
 
 def four_views(radius=None, points=None, **options) -> Picture:
