@@ -12,9 +12,15 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from torchcover.report.drawings.stacked_views import stack_views
 from torchcover.report.maps.overlay import COLOURS
-from torchcover.report.maps.sheet import HEADING_POINTS, fit_paper, write_heading, write_legend, write_title
+from torchcover.report.maps.sheet import (
+    HEADING_POINTS,
+    fit_paper,
+    stack_views,
+    write_heading,
+    write_legend,
+    write_title,
+)
 from torchcover.report.sensor_view import SensorView
 
 Points = NDArray[np.float64]

@@ -12,9 +12,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 
-from torchcover.report.drawings.stacked_views import Bounds, stack_views
 from torchcover.report.maps.overlay import draw_ego
-from torchcover.report.maps.sheet import fit_paper, write_legend, write_title
+from torchcover.report.maps.sheet import Bounds, fit_paper, stack_views, write_legend, write_title
 
 Points = NDArray[np.floating]
 

@@ -1,4 +1,4 @@
-"""The sheet that a map is drawn on: every cell a whole number of pixels, the paper as large as what is on it."""
+"""The paper under a picture: as large as what is on it; every cell of a map a whole number of pixels."""
 
 import math
 from collections.abc import Sequence
@@ -14,6 +14,8 @@ from matplotlib.transforms import Bbox, ScaledTranslation
 from numpy.typing import NDArray
 
 from torchcover.coverage import BevGrid
+
+Bounds = tuple[float, float]
 
 MAX_MAP_IN = (9.0, 6.0)
 MAX_PAPER_IN = (14.0, 8.75)
@@ -108,6 +110,29 @@ def _label(axes: Axes, *, left: bool, lowest: bool) -> None:
     axes.set_xlabel("x forward (m)" if lowest else "")
     axes.set_ylabel("y left (m)" if left else "")
     axes.tick_params(labelbottom=lowest, labelleft=left)
+
+
+def stack_views(x: Bounds, heights: Sequence[Bounds], *, width_in: float) -> tuple[Figure, list[Axes]]:
+    """Empty views in metres without cells, below each other, all with the same x axis and in equal metres.
+
+    Args:
+        x: Bounds of the axis to the right, in metres.
+        heights: Bounds of the axis upwards in each view, from the top.
+        width_in: Width in inches.
+
+    Returns:
+        The paper, and the views from the top.
+    """
+    inches_per_metre = width_in / (x[1] - x[0])
+    heights_in = [inches_per_metre * (high - low) for low, high in heights]
+    paper_in = sum(heights_in) + BELOW_IN * (len(heights) - 1)
+    figure = Figure(figsize=(width_in, paper_in), dpi=DOTS_PER_INCH)
+    top_in, views = paper_in, []
+    for bounds, height_in in zip(heights, heights_in, strict=True):
+        place = (0.0, (top_in - height_in) / paper_in, 1.0, height_in / paper_in)
+        views.append(figure.add_axes(place, xlim=x, ylim=bounds))
+        top_in -= height_in + BELOW_IN
+    return figure, views
 
 
 def write_title(axes: Axes, title: str, subtitle: str, lift_points: float = 0.0) -> None:
