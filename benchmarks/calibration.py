@@ -17,6 +17,7 @@ import torch
 from torchcover import BevGrid, CoverageMetric, forward_regions
 from torchcover.coverage.estimate import ESTIMATORS
 from torchcover.data import SimulatedFrames
+from torchcover.evaluation import CoverageObserver, observe
 from torchcover.simulation import EvenReference
 
 RIG, OTHER = "front_roof_32", "front_roof_128"
@@ -52,11 +53,11 @@ def estimates(job):
     reference = EvenReference(areas=tuple((region.x, region.y) for region in REGIONS), rays=rays)
     rigs = {rig: rig for rig in (RIG, OTHER)}
     frames = SimulatedFrames("urban", rigs=rigs, steps=steps, seed=seed, every_s=every_s, reference_sensor=reference)
-    metrics = {rig: CoverageMetric(GRID, max_radius=GRID.diagonal_m, blocks=16) for rig in rigs}
-    for frame in (frames[index] for index in range(steps)):
-        for rig, metric in metrics.items():
-            metric.update(frame.clouds[rig], frame.reference, weights=frame.reference_weights, index=frame.index)
-    coverages = {rig: metric.compute() for rig, metric in metrics.items()}
+    observers = {
+        rig: CoverageObserver(CoverageMetric(GRID, max_radius=GRID.diagonal_m, blocks=16), rig) for rig in rigs
+    }
+    observe(frames, observers.values())
+    coverages = {rig: observer.compute() for rig, observer in observers.items()}
     subjects = {RIG: [], f"{OTHER} - {RIG}": []}
     for estimator, region, height in product(ESTIMATORS, REGIONS, GRID.heights):
         own, other = (coverages[rig].estimate(region, height, estimator) for rig in (RIG, OTHER))

@@ -1,10 +1,13 @@
 """Rays spread evenly, with and without weights, beside the paper's: do they answer the same question?"""
 
+from dataclasses import replace
+
 import torch
 
 from benchmarks.timing import table
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.data import SimulatedFrames
+from torchcover.evaluation import CoverageObserver, observe
 from torchcover.simulation import EvenReference, PaperReference
 
 STEPS = 192
@@ -14,13 +17,18 @@ REGION = Region("all", GRID.x, GRID.y)
 MIN_FRAMES = 8
 
 
-def measured(frames, weighted):
+class Unweighted(CoverageObserver):
+    """Coverage as if every reference point weighed the same."""
+
+    def update(self, frame):
+        super().update(replace(frame, reference_weights=None))
+
+
+def measured(frames, observer):
     """Coverage of a run."""
-    metric = CoverageMetric(GRID, max_radius=GRID.diagonal_m)
-    for index in range(STEPS):
-        frame = frames[index]
-        metric.update(frame.sensor, frame.reference, weights=frame.reference_weights if weighted else None)
-    return metric.compute()
+    coverage = observer(CoverageMetric(GRID, max_radius=GRID.diagonal_m))
+    observe(frames, [coverage])
+    return coverage.compute()
 
 
 def main():
@@ -28,9 +36,9 @@ def main():
     paper = SimulatedFrames("courtyard", "front_roof_128", steps=STEPS, reference_sensor=PaperReference(512, 512))
     even = paper.with_reference_sensor(EvenReference((((0.0, 20.0), (-5.0, 5.0)), (GRID.x, GRID.y)), rays=65_536))
     runs = {
-        "the paper's 512 x 512": measured(paper, weighted=False),
-        "65,536 even, weighted": measured(even, weighted=True),
-        "65,536 even, unweighted": measured(even, weighted=False),
+        "the paper's 512 x 512": measured(paper, CoverageObserver),
+        "65,536 even, weighted": measured(even, CoverageObserver),
+        "65,536 even, unweighted": measured(even, Unweighted),
     }
     known = torch.stack([run.probed_steps >= MIN_FRAMES for run in runs.values()]).all(dim=0)
     rows = []

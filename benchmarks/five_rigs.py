@@ -3,6 +3,7 @@
 from benchmarks.timing import compare, table
 from benchmarks.urban_throughput import new_metric
 from torchcover.data import SimulatedFrames
+from torchcover.evaluation import CoverageObserver, observe
 from torchcover.simulation import PaperReference
 
 RIGS = ("front_roof_128", "front_grille_128", "front_roof_64", "front_roof_32", "three_cameras")
@@ -24,15 +25,8 @@ def evaluation(rigs, side):
     """A function that makes some frames of these rigs and adds them to their metrics."""
     reference = PaperReference(rows=side, columns=side)
     frames = SimulatedFrames("urban", rigs={rig: rig for rig in rigs}, steps=STEPS, seed=0, reference_sensor=reference)
-    metrics = {rig: new_metric() for rig in rigs}
-
-    def run():
-        for index in range(STEPS):
-            frame = frames[index]
-            for rig, metric in metrics.items():
-                metric.update(frame.clouds[rig], frame.reference, index=index)
-
-    return run
+    observers = [CoverageObserver(new_metric(), rig) for rig in rigs]
+    return lambda: observe(frames, observers)
 
 
 if __name__ == "__main__":

@@ -9,12 +9,12 @@ STEPS = """
 import resource, torch
 from torchcover import BevGrid, CoverageMetric
 from torchcover.data import SimulatedFrames
+from torchcover.evaluation import CoverageObserver, observe
 from torchcover.simulation import PaperReference
 sensor = PaperReference(rows=256, columns=256)
 frames = SimulatedFrames("courtyard", "front_roof_128", steps={0}, reference_sensor=sensor)
 metric = CoverageMetric(BevGrid(x=(-40.0, 160.0), y=(-40.0, 40.0), cell=0.25), max_radius=220.0)
-for index in range({0}):
-    metric.update(frames[index].sensor, frames[index].reference)
+observe(frames, [CoverageObserver(metric)])
 metric.compute()
 print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 """

@@ -2,7 +2,8 @@
 
 Short runs of `evaluate` and `compare` in the courtyard, in traffic and over a recording. Every number of summary.json
 and every array of the coverage files of OLD has to be in NEW, the same to the last bit; `--renamed OLD=NEW` says what
-a key or an array is called now. Times, versions and what was left out are not compared.
+a key or an array is called now. A name of NEW with a `*` stands for all arrays like it, one on top of the other:
+`--renamed 'detection=detection_*m'`. Times, versions and what was left out are not compared.
 """
 
 import argparse
@@ -11,6 +12,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -86,20 +88,30 @@ def compare(old, new, renamed):
     for path in sorted(old.rglob("*.npz")):
         with np.load(path) as first, np.load(new / path.relative_to(old)) as second:
             for name in set(first.files) - {"header"}:
-                other = renamed.get(name, name)
                 compared += first[name].size
-                if other not in second.files or not np.array_equal(first[name], second[other], equal_nan=True):
+                other = array_called(renamed.get(name, name), second)
+                if other is None or not np.array_equal(first[name], other, equal_nan=True):
                     complaints.append(f"{path.name}, {name}: missing or different")
     return compared, complaints
 
 
+def array_called(name, arrays):
+    """An array of a coverage file, or all whose names fit the pattern, in the order of the file; None for none."""
+    if "*" not in name:
+        return arrays[name] if name in arrays.files else None
+    fitting = [arrays[other] for other in arrays.files if fnmatchcase(other, name)]
+    return np.stack(fitting) if fitting else None
+
+
 def read(out):
-    """summary.json, its rows by what they are about."""
+    """summary.json, its rows by what they are about; of a single rig without its name."""
     content = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-    rows = {f"{row.get('rig', '')} {row['region']} {row['height']}": row for row in content.pop("rows")}
-    for row in rows.values():
+    rows = content.pop("rows")
+    several = len({row.get("rig") for row in rows}) > 1
+    named = {f"{row['rig'] if several else ''} {row['region']} {row['height']}": row for row in rows}
+    for row in rows:
         row.pop("rig", None)
-    return {**content, "rows": rows}
+    return {**content, "rows": named}
 
 
 def leaves(content, prefix=""):

@@ -15,6 +15,7 @@ from tests.stability.rays import bare_embree, far_room, from_mid_room
 from torchcover import BevGrid, CoverageMetric, Scenario, forward_regions, nearest
 from torchcover.cameras import Camera, inverse
 from torchcover.data import SimulatedFrames
+from torchcover.evaluation import CoverageObserver, observe
 from torchcover.simulation import PaperReference
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Mesh
@@ -223,8 +224,7 @@ def cell_sizes(steps=24):
         grid = BevGrid(x=(0.0, 80.0), y=(-20.0, 20.0), cell=cell)
         metric = CoverageMetric(grid, max_radius=grid.diagonal_m)
         begin = time.perf_counter()
-        for frame in kept:
-            metric.update(frame.sensor, frame.reference)
+        observe(kept, [CoverageObserver(metric)])
         coverage = metric.compute()
         seconds = (time.perf_counter() - begin) / steps
         megabytes = sum(state.numel() * state.element_size() for state in metric.state_dict().values()) / 1e6

@@ -5,12 +5,12 @@ from collections import Counter
 from contextlib import contextmanager
 
 import torch
-from torch.utils.data import DataLoader
 
 from benchmarks.timing import table
 from torchcover import BevGrid, CoverageMetric, forward_regions
 from torchcover.coverage import metric as metric_module
-from torchcover.data import SimulatedFrames, collate_frames
+from torchcover.data import SimulatedFrames
+from torchcover.evaluation import CoverageObserver, observe
 from torchcover.simulation import EvenReference, PaperReference
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.mounted import MountedSensor
@@ -64,19 +64,21 @@ def new_metric():
     return CoverageMetric(grid, (0.4,), max_radius=grid.diagonal_m)
 
 
-def update(metric, frame):
-    """Add one step."""
-    metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, index=frame.index)
+class Clock:
+    """When each step was done; an observer of frames."""
+
+    def __init__(self):
+        self.times_s = []
+
+    def update(self, _):
+        self.times_s.append(time.perf_counter())
 
 
 def steps_a_second(frames):
     """From workers, between the first and the last step that count."""
-    metric = new_metric()
-    for number, batch in enumerate(DataLoader(frames, collate_fn=collate_frames, num_workers=WORKERS)):
-        if number == FIRST:
-            start = time.perf_counter()
-        update(metric, batch.frames[0])
-    return (LAST - FIRST - 1) / (time.perf_counter() - start)
+    clock = Clock()
+    observe(frames, [CoverageObserver(new_metric()), clock], workers=WORKERS)
+    return (LAST - FIRST - 1) / (clock.times_s[-1] - clock.times_s[FIRST])
 
 
 def time_of_stages(frames):
@@ -85,12 +87,12 @@ def time_of_stages(frames):
     torch.set_num_threads(1)
     with stopwatches() as seconds:
         # A metric binds its `update` when it is made.
-        metric = new_metric()
-        update(metric, frames[0])
+        observer = CoverageObserver(new_metric())
+        observer.update(frames[0])
         seconds.clear()
         start = time.perf_counter()
         for index in range(1, STAGE_STEPS + 1):
-            update(metric, frames[index])
+            observer.update(frames[index])
         whole_s = time.perf_counter() - start
     torch.set_num_threads(threads)
     return {stage: seconds[stage] for stage in dict.fromkeys(STAGES.values())} | {

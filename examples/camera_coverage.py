@@ -14,11 +14,11 @@ import json
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import track
 
 from torchcover import BevGrid, CoverageMetric, Region, Rig
 from torchcover.data import SimulatedFrames
-from torchcover.report import comparison_tables, draw_comparison
+from torchcover.evaluation import CoverageObserver, observe
+from torchcover.report import CoverageTable, map_figures, print_table, write_figures
 from torchcover.simulation import CameraSensor, PaperReference
 
 GOPRO = {
@@ -88,16 +88,12 @@ def main():
     frames = SimulatedFrames(
         "courtyard", rigs=rigs, steps=options.steps, seed=0, reference_sensor=PaperReference(rows=512, columns=512)
     )
-    metrics = {name: CoverageMetric(GRID, max_radius=GRID.diagonal_m) for name in rigs}
-    for index in track(range(len(frames)), description="steps"):
-        frame = frames[index]
-        for name, metric in metrics.items():
-            metric.update(frame.clouds[name], frame.reference)
-    coverages = {name: metric.compute() for name, metric in metrics.items()}
+    observers = {name: CoverageObserver(CoverageMetric(GRID, max_radius=GRID.diagonal_m), name) for name in rigs}
+    observe(frames, observers.values(), progress=True)
+    coverages = {name: observer.compute() for name, observer in observers.items()}
     console = Console()
-    for table in comparison_tables(coverages, REGIONS):
-        console.print(table)
-    pictures = draw_comparison(coverages, options.out)
+    print_table(CoverageTable.of(coverages, REGIONS), console)
+    pictures = write_figures(map_figures(coverages), options.out)
     console.print(f"Wrote {len(pictures)} maps to {options.out}")
 
 

@@ -47,8 +47,8 @@ def test_every_public_name_is_there(name):
 def test_the_public_names_are_those_of_the_contract():
     assert set(torchcover.__all__) == {
         "BevGrid", "Camera", "Coverage", "CoverageMetric", "Region", "Rig", "Scenario", "blind_spot_radius", "cameras",
-        "coverage", "data", "detection", "evaluation", "forward_regions", "geometry", "metrics", "nearest", "neighbors",
-        "report", "simulation", "training",
+        "compare", "coverage", "data", "detection", "evaluate", "evaluation", "forward_regions", "geometry", "metrics",
+        "nearest", "neighbors", "report", "simulation", "training",
     }  # fmt: skip
     assert torchcover.__all__ == sorted(torchcover.__all__)
 

@@ -16,17 +16,10 @@ from typing import NamedTuple
 
 from rich.console import Console
 
-from examples.paper.markdown import as_markdown
 from examples.paper.one_pass import one_pass
+from examples.paper.published import with_published
 from torchcover import BevGrid, Region, forward_regions
-from torchcover.report import (
-    comparison_tables,
-    coverage_table,
-    draw_comparison,
-    draw_four_views,
-    draw_maps,
-    summary_dict,
-)
+from torchcover.report import CoverageTable, draw_four_views, map_figures, print_table, table_dict, write_figures
 
 FORWARD = BevGrid(x=(0.0, 160.0), y=(-40.0, 40.0), cell=0.25)
 AROUND = BevGrid(x=(-40.0, 40.0), y=(-40.0, 40.0), cell=0.25)
@@ -74,22 +67,16 @@ def report(name, done, options, out):
     """Tables on the terminal; maps, coverage and numbers in the folder of the experiment."""
     rigs, grid, regions = EXPERIMENTS[name]
     coverages = {rig: done.coverages[rig, grid] for rig in rigs}
-    if len(rigs) > 1:
-        tables = comparison_tables(coverages, regions)
-        draw_comparison(coverages, out / "maps", ego_outline_m=done.ego_outline_m, sensors=done.marks)
-    else:
-        tables = [coverage_table(coverages[rigs[0]], regions)]
-        draw_maps(coverages[rigs[0]], out / "maps", ego_outline_m=done.ego_outline_m, sensors=done.marks[rigs[0]])
+    table = CoverageTable.of(coverages, regions)
     console = Console()
     console.rule(name)
-    for table in tables:
-        console.print(table)
-    (out / "table.md").write_text(as_markdown(name, tables), encoding="utf-8")
+    print_table(table, console)
+    write_figures(map_figures(coverages, ego_outline_m=done.ego_outline_m, sensors=done.sensors), out / "maps")
+    (out / "table.md").write_text(with_published(name, table), encoding="utf-8")
     for rig, coverage in coverages.items():
         coverage.save(out / f"{rig}.npz")
-    numbers = {rig: summary_dict(coverage, regions) for rig, coverage in coverages.items()}
     conditions = {key: str(value) if isinstance(value, Path) else value for key, value in vars(options).items()}
-    text = json.dumps({"seconds": round(done.seconds), "options": conditions, "rigs": numbers}, indent=2)
+    text = json.dumps({"seconds": round(done.seconds), "options": conditions, **table_dict(table)}, indent=2)
     (out / "summary.json").write_text(text + "\n", encoding="utf-8")
 
 
@@ -104,7 +91,7 @@ def draw_figure(done, options, out):
         steps=options.steps,
         title=f"{rig}, four ways to look at it",
         ego_outline_m=done.ego_outline_m,
-        sensors=done.marks[rig],
+        sensors=done.sensors[rig],
     )
     figure.savefig(out / "figure_2.png", dpi=figure.dpi)
 

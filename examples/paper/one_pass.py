@@ -1,16 +1,14 @@
 """One pass over a scenario: all rigs at the same instants, against the same reference clouds."""
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from rich.progress import track
 
 from torchcover import BevGrid, Coverage, CoverageMetric
-from torchcover.cli.run import sensor_marks
 from torchcover.data import SimulatedFrames
-from torchcover.report import SensorMark
+from torchcover.evaluation import CoverageObserver, observe, sensor_views
+from torchcover.report import SensorView
 from torchcover.simulation import EvenReference, PaperReference
 
 BLOCKS = 16  # for standard errors
@@ -25,7 +23,7 @@ class OnePass:
     coverages: dict[tuple[str, BevGrid], Coverage]
     points: dict[tuple[str, BevGrid], torch.Tensor]
     ego_outline_m: np.ndarray
-    marks: dict[str, list[SensorMark]]
+    sensors: dict[str, list[SensorView]]
     seconds: float
 
 
@@ -48,21 +46,18 @@ def one_pass(measured, counted, regions, options):
         every_s=options.every,
         reference_sensor=reference_of(regions, options),
     )
-    metrics = {(rig, grid): CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=BLOCKS) for rig, grid in measured}
-    points = {(rig, grid): torch.zeros(grid.shape[1:], dtype=torch.int64) for rig, grid in counted}
-    start = time.perf_counter()
-    for index in track(range(len(frames)), description=" ".join(rigs)):
-        frame = frames[index]
-        for (rig, _), metric in metrics.items():
-            metric.update(frame.clouds[rig], frame.reference, weights=frame.reference_weights, index=index)
-        for rig, grid in counted:
-            points[rig, grid] += points_in_cells(frame.clouds[rig], grid)
+    coverages = {
+        (rig, grid): CoverageObserver(CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=BLOCKS), rig)
+        for rig, grid in measured
+    }
+    points = {(rig, grid): PointCount(grid, rig) for rig, grid in counted}
+    run = observe(frames, [*coverages.values(), *points.values()], progress=True, title=" ".join(rigs))
     return OnePass(
-        coverages={key: metric.compute() for key, metric in metrics.items()},
-        points=points,
-        ego_outline_m=frames.scenario.ego_box().outline_m,
-        marks={name: sensor_marks(rig) for name, rig in frames.rigs.items()},
-        seconds=time.perf_counter() - start,
+        coverages={key: observer.compute() for key, observer in coverages.items()},
+        points={key: observer.compute() for key, observer in points.items()},
+        ego_outline_m=frames.ego_outline_m,
+        sensors={name: sensor_views(sensors) for name, sensors in frames.sensors.items()},
+        seconds=run.seconds,
     )
 
 
@@ -74,8 +69,20 @@ def reference_of(regions, options):
     return EvenReference(tuple(dict.fromkeys((region.x, region.y) for region in regions)), rays=options.rays)
 
 
-def points_in_cells(cloud, grid):
-    """(Y, X) how many points of a cloud lie in each cell of a grid, at any height."""
-    flat = BevGrid(x=grid.x, y=grid.y, cell=grid.cell, heights=ANY_HEIGHT)
-    cells = flat.cell_of(cloud)
-    return torch.bincount(cells[cells >= 0], minlength=flat.cells).reshape(grid.shape[1:])
+class PointCount:
+    """(Y, X) how many points of a rig lie in each cell of a grid, at any height; an observer of frames."""
+
+    def __init__(self, grid, rig):
+        self.grid = BevGrid(x=grid.x, y=grid.y, cell=grid.cell, heights=ANY_HEIGHT)
+        self.rig = rig
+        self.points = torch.zeros(self.grid.cells, dtype=torch.int64)
+
+    def update(self, frame):
+        cells = self.grid.cell_of(frame.clouds[self.rig])
+        self.points += torch.bincount(cells[cells >= 0], minlength=self.grid.cells)
+
+    def compute(self):
+        return self.points.reshape(self.grid.shape[1:])
+
+    def merge_state(self, other):
+        self.points += other.points

@@ -51,7 +51,7 @@ def test_a_recording_is_evaluated_and_the_files_agree(torchcover, recording, tmp
         "detection_0.4m_obstacle.png",
         "detection_1m_ground.png",
         "detection_1m_obstacle.png",
-        "radius_ground.png",
+        "radius_m_ground.png",
         "radius_obstacle.png",
     ]
 
@@ -103,7 +103,7 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
         " horizontal_fov_deg: 360, columns: 90, max_range_m: 60}\n"
     )
     for out in ("a", "b"):
-        arguments = ["--steps", 1, "--cell", 1, "--reference", "paper", "--out", tmp_path / out]
+        arguments = ["--steps", 1, "--cell", 1, "--reference", "paper", "--rays", 16384, "--out", tmp_path / out]
         assert torchcover("evaluate", tmp_path / "rig.yaml", *arguments)[0] == 0
     a, b = (Coverage.load(tmp_path / out / "coverage.npz") for out in "ab")
     np.testing.assert_array_equal(a.radius, b.radius)
@@ -111,8 +111,8 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
     assert a.max_radius == pytest.approx(a.grid.diagonal_m)
     assert 0 < a.summary()[0].known_share <= 1
     summary = json.loads((tmp_path / "a" / "summary.json").read_text())
-    assert summary["frame_counts"]["reference_rays"] == 1024 * 1024
-    assert summary["reference"] == {"sensor": "paper", "rays_per_step": 1024 * 1024, "every_s": 0.1}
+    assert summary["frame_counts"]["reference_rays"] == 128 * 128
+    assert summary["reference"] == {"sensor": "paper", "rays_per_step": 128 * 128, "every_s": 0.1}
 
 
 def test_the_weights_of_an_even_reference_reach_the_metric(torchcover, worlds, monkeypatch):
@@ -153,7 +153,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["reference"], summary["target_error"]) == (None, None)
     assert (summary["blocks"], summary["steps_per_block"]) == (4, 1)
-    assert summary["rows"][0]["radius_error_m"] is None
+    assert summary["rows"][0]["radius_m_error"] is None
     assert (tmp_path / "out" / "maps" / "radius_error_ground.png").is_file()
 
 
@@ -165,27 +165,28 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["evaluate", "front_roof_128", "--scenario", "moon"], "one of the built-in scenarios: courtyard"),
         (["evaluate", "none.yaml"], "none.yaml: no such file"),
         (["evaluate", "--frames", "no_such_folder"], "no_such_folder"),
-        (["evaluate", "front_roof_128", "--scenario", "courtyard", "--frames", "x"], "exclude each other"),
+        (["evaluate", "kitti", "--scenario", "courtyard", "--frames", "recording"], "exclude each other"),
         (["evaluate", "front_roof_128", "--cell", "0.3"], "not a multiple of the cell of 0.3 m"),
         (["evaluate", "front_roof_128", "--cell", "-1"], "cell: a positive length"),
         (["evaluate", "front_roof_128", "--threshold", "-1"], "thresholds: distances >= 0"),
         (["evaluate", "front_roof_128", "--steps", "0"], "--steps"),
         (["evaluate", "front_roof_128", "--steps", "many"], "--steps"),
         (["evaluate", "front_roof_128", "--seed", "-1"], "--seed"),
-        (["evaluate", "front_roof_128", "--device", "abacus"], "--device abacus: cannot be used here"),
+        (["evaluate", "front_roof_128", "--device", "abacus"], "device abacus: cannot be used here"),
         (["evaluate", "front_roof_128", "--colour"], "No such option: --colour"),
-        (["evaluate", "front_roof_128", "--target-error", "5"], "--target-error 5: a positive number with its unit"),
-        (["evaluate", "front_roof_128", "--target-error", "-1m"], "--target-error -1m: a positive number"),
+        (["evaluate", "front_roof_128", "--target-error", "5"], "target error 5: a positive number with its unit"),
+        (["evaluate", "front_roof_128", "--target-error", "-1m"], "target error -1m: a positive number"),
         (["evaluate", "front_roof_128", "--target-error", "1m", "--target-error", "2m"], "another number in m"),
-        (["evaluate", "front_roof_128", "--reference", "best"], "--reference best: `even` or `paper` is needed"),
+        (["evaluate", "front_roof_128", "--reference", "best"], "reference best: `even` or `paper` is needed"),
         (["evaluate", "front_roof_128", "--rays", "7"], "rays: at least 2 for each of 4 areas are needed; got 7"),
         (["evaluate", "front_roof_128", "--rays", "0"], "--rays"),
-        (["evaluate", "--frames", "x", "--rays", "9"], "--reference, --rays and --every are for simulations"),
-        (["evaluate", "--frames", "x", "--reference", "even"], "--reference, --rays and --every are for simulations"),
+        (["evaluate", "--frames", "recording", "--rays", "9"], "reference, rays and every are for simulations"),
+        (["evaluate", "--frames", "recording", "--reference", "even"], "reference, rays and every are for simul"),
         (["measure"], "No such command 'measure'"),
     ],
 )
-def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, arguments, message):
+def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, recording, monkeypatch, arguments, message):
+    monkeypatch.chdir(recording.parent)
     code, _, error = torchcover(*arguments)
     assert code == 2
     assert message in error
@@ -201,7 +202,7 @@ def test_an_output_folder_that_cannot_be_made_is_a_mistake_too(torchcover, recor
 
 
 def test_an_impossible_output_folder_is_found_before_the_run(torchcover, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchcover.cli.evaluate.accumulate", lambda *_, **__: pytest.fail("it ran all the same"))
+    monkeypatch.setattr("torchcover.evaluation.measure.observe", lambda *_, **__: pytest.fail("it ran all the same"))
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         code, _, error = torchcover("evaluate", "--frames", recording, "--out", out)
@@ -232,6 +233,12 @@ def test_version_and_help(torchcover):
     assert "--skip-bad-frames" in printed
 
 
+def test_it_is_a_module_too():
+    command = [sys.executable, "-m", "torchcover", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "0.1.0"
+
+
 def test_help_loads_none_of_the_heavy_libraries():
     program = (
         "import sys; sys.argv = ['torchcover', '--help']\n"
@@ -248,10 +255,10 @@ def test_a_grid_that_does_not_fit_into_memory_ends_in_one_line(torchcover, tmp_p
     def no_memory(*_, **__):
         raise RuntimeError("[enforce fail at alloc_cpu.cpp] can't allocate memory")
 
-    monkeypatch.setattr("torchcover.cli.run.CoverageMetric", no_memory)
+    monkeypatch.setattr("torchcover.evaluation.settings.CoverageMetric", no_memory)
     code, _, complaints = torchcover("evaluate", "front_roof_32", "--cell", "0.05", "--out", tmp_path / "out")
     assert code == 2
     assert complaints.strip() == (
-        "torchcover: --cell 0.05: there is not enough memory for the sums of 12,800,000 cells in 16 blocks; "
+        "torchcover: a cell of 0.05 m: there is not enough memory for the sums of 12,800,000 cells in 16 blocks; "
         "use larger cells"
     )

@@ -91,7 +91,7 @@ def test_errors_are_drawn_if_asked_for_and_differences_come_with_theirs(torchcov
     known = [row for row in summary["rows"] if row["rig"] == "both" and row["height"] == "ground"]
     assert len(known) == 3
     for row in known:
-        assert row["radius_error_m"] > 0
+        assert row["radius_m_error"] > 0
         assert row["radius_m_difference_error"] >= 0
         assert isinstance(row["radius_m_difference_significant"], bool)
     first = [row for row in summary["rows"] if row["rig"] == "low" and row["height"] == "ground"]
@@ -142,20 +142,66 @@ def test_ctrl_c_between_two_rigs_leaves_a_paired_result(
     assert signal.getsignal(signal.SIGINT) is action
 
 
+@pytest.fixture
+def recording(tmp_path):
+    """Three frames of the rigs `far`, `kitti` and `near` against one reference point."""
+    folder = tmp_path / "recording"
+    for place, x in (("rigs/near", 5.0), ("rigs/kitti", 3.0), ("rigs/far", 1.0), ("reference", 6.0)):
+        (folder / place).mkdir(parents=True)
+        for frame in range(3):
+            np.save(folder / place / f"f{frame}.npy", np.array([[x, 0.1, 0.0]], dtype=np.float32))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("rigs", "radii"),
+    [
+        ([], {"far": 5.0, "kitti": 3.0, "near": 1.0}),
+        (["near", "far"], {"near": 1.0, "far": 5.0}),
+        (["kitti", "near"], {"kitti": 3.0, "near": 1.0}),
+    ],
+)
+def test_the_rigs_of_a_recording_are_compared(torchcover, recording, tmp_path, rigs, radii):
+    out = tmp_path / "out"
+    arguments = ["--frames", recording, "--format", "folder", "--cell", 4, "--out", out]
+    code, _, complaints = torchcover("compare", *rigs, *arguments)
+    assert code == 0, complaints
+    summary = json.loads((out / "summary.json").read_text())
+    assert list(summary["rigs"]) == list(radii)
+    assert (summary["frames"], summary["reference"], summary["complete"]) == (str(recording), None, True)
+    found = {row["rig"]: row["radius_m"] for row in summary["rows"] if row["region"] == "20m" and row["known_cells"]}
+    assert found == pytest.approx(radii)
+
+
+def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, tmp_path):
+    arguments = ["--frames", recording, "--out", tmp_path / "out"]
+    for command, rigs, message in (
+        ("compare", ["near", "middle"], "no clouds of the rig middle; the frames have far, kitti, near"),
+        ("evaluate", [], "holds the rigs far, kitti, near: say which, or compare them"),
+        ("compare", ["near", "far", "--format", "bag"], "format 'bag': no such format of recordings; there are folder"),
+        ("compare", ["near", "far", "--scenario", "urban"], "exclude each other"),
+    ):
+        code, _, error = torchcover(command, *rigs, *arguments)
+        assert (code, message in error, error.count("\n")) == (2, True, 1), error
+    assert torchcover("evaluate", "near", *arguments)[0] == 0
+    code, _, error = torchcover("evaluate", "kitti", "--format", "folder")
+    assert (code, "--format: for a recording" in error) == (2, True)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "Missing argument"),
+        ([], "which rig?"),
         (["front_roof_128"], "at least two rigs; got 'front_roof_128' only"),
         (["front_roof_128", "no_such_rig"], "neither a .yaml file nor one of the built-in rigs: argoverse2,"),
         (["front_roof_128", "none.yaml"], "none.yaml: no such file"),
         (["kitti", "nuscenes", "--scenario", "moon"], "one of the built-in scenarios: courtyard"),
         (["kitti", "nuscenes", "--cell", "0.3"], "not a multiple of the cell"),
         (["kitti", "nuscenes", "--threshold", "-1"], "thresholds: distances >= 0"),
-        (["kitti", "nuscenes", "--device", "abacus"], "--device abacus: cannot be used here"),
+        (["kitti", "nuscenes", "--device", "abacus"], "device abacus: cannot be used here"),
         (["kitti", "nuscenes", "--steps", "0"], "--steps"),
-        (["kitti", "nuscenes", "--target-error", "10cm"], "--target-error 10cm: a positive number with its unit"),
-        (["kitti", "nuscenes", "--reference", "best"], "--reference best: `even` or `paper` is needed"),
+        (["kitti", "nuscenes", "--target-error", "10cm"], "target error 10cm: a positive number with its unit"),
+        (["kitti", "nuscenes", "--reference", "best"], "reference best: `even` or `paper` is needed"),
         (["kitti", "nuscenes", "--rays", "7"], "rays: at least 2 for each of 4 areas are needed; got 7"),
     ],
 )

@@ -2,12 +2,6 @@
 
 import json
 
-import pytest
-import torch
-
-from torchcover.cli.explain import left_out
-from torchcover.coverage import BevGrid, CoverageMetric
-
 RAYS = ["--rays", "256", "--cell", "1"]
 
 
@@ -30,22 +24,3 @@ def test_without_the_option_it_stands_in_the_summary_only(torchcover, worlds):
     assert code == 0
     assert "Left out" not in text
     assert whats(worlds / "out")
-
-
-def test_points_outside_the_grid_are_counted_over_all_rigs():
-    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 2.0), cell=1.0)
-    metric = CoverageMetric(grid, maximum=True)
-    metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0], [9.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]))
-    records = {str(row["what"]): row for row in left_out({}, [metric.compute()] * 2)}
-    outside = records["reference points outside every cell: not searched for"]
-    assert (outside["count"], outside["of"]) == (4, 6)
-    assert "quantiles, pooled means: not asked for, not kept" in records
-
-
-@pytest.mark.parametrize("count", [0, 7])
-def test_what_was_not_left_out_is_not_listed(count):
-    metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 2.0), cell=1.0))
-    metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0]]))
-    counts = {"moving_bodies_out_of_range": count, "moving_bodies": 9}
-    listed = [row["count"] for row in left_out(counts, [metric.compute()]) if row["of"] == 9]
-    assert listed == ([7] if count else [])

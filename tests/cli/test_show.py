@@ -5,6 +5,7 @@ import pytest
 from matplotlib.image import imread
 
 from torchcover.cli import show
+from torchcover.evaluation import scene_pictures, sensor_views
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.documents import builtin_names
 
@@ -14,9 +15,11 @@ def drawn(monkeypatch):
     """What was drawn: the arguments of the last call."""
     calls: dict = {}
     for name in ("draw_rig", "draw_scene", "draw_depths"):
-        draw = getattr(show, name)
+        draw = getattr(scene_pictures, name)
         monkeypatch.setattr(
-            show, name, lambda *args, draw=draw, **kwargs: calls.update(kwargs, args=args) or draw(*args, **kwargs)
+            scene_pictures,
+            name,
+            lambda *args, draw=draw, **kwargs: calls.update(kwargs, args=args) or draw(*args, **kwargs),
         )
     return calls
 
@@ -98,7 +101,7 @@ def test_a_world_is_built_once(torchcover, worlds, monkeypatch, arguments):
 
 @pytest.mark.parametrize("name", builtin_names("rigs"))
 def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
-    for sensor in map(show._sensor_view, Rig.load(name).sensors):
+    for sensor in sensor_views(Rig.load(name).sensors):
         low, high = sensor.vertical_fov_deg
         assert -90 <= low < high <= 90
         assert 0 < sensor.horizontal_fov_deg <= 360

@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from torchcover.data.frame import collate_frames
-from torchcover.data.recorded import BadFrameError, RecordedFrames
+from torchcover.data import BadFrameError, RecordedFrames, collate_frames
 from torchcover.geometry.rigid import rigid, rotation_from_euler, transform
 
 CLOUD = np.array([[1.0, 2.0, 3.0], [-4.0, 5.0, 0.5]], dtype=np.float32)
@@ -19,6 +18,17 @@ def record(folder, frames, **sources):
         (folder / source).mkdir(parents=True)
         for name in frames:
             np.save(folder / source / f"{name}.npy", sources.get(source, CLOUD))
+    return folder
+
+
+def record_rigs(folder, **rigs):
+    """A recording of two frames of several rigs."""
+    record(folder, ["f2", "f10"])
+    (folder / "sensor").rename(folder / "aside")
+    for rig, cloud in rigs.items():
+        (folder / "rigs" / rig).mkdir(parents=True)
+        for name in ("f2", "f10"):
+            np.save(folder / "rigs" / rig / f"{name}.npy", cloud)
     return folder
 
 
@@ -112,7 +122,7 @@ def test_indices_count_from_both_ends_and_stop_there(tmp_path):
 
 
 def test_missing_folders_and_empty_ones(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"gone: no such folder; a recording holds sensor/ and reference/"):
+    with pytest.raises(FileNotFoundError, match=r"gone: no such folder; a recording holds sensor/FRAME"):
         RecordedFrames(tmp_path / "gone")
     with pytest.raises(FileNotFoundError, match=r"sensor: no such folder"):
         RecordedFrames(tmp_path)
@@ -120,7 +130,7 @@ def test_missing_folders_and_empty_ones(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"reference: no such folder"):
         RecordedFrames(tmp_path)
     (tmp_path / "reference").mkdir()
-    with pytest.raises(ValueError, match=r"no frames; both sensor/ and reference/ are empty"):
+    with pytest.raises(ValueError, match=r"no frames; sensor/ and reference/ are empty"):
         RecordedFrames(tmp_path)
 
 
@@ -129,7 +139,9 @@ def test_names_on_one_side_only_are_counted_and_the_first_listed(tmp_path):
     for number in (1, 2, 10, 3, 4, 5, 6):
         np.save(tmp_path / "sensor" / f"s{number}.npy", CLOUD)
     np.save(tmp_path / "reference" / "r.npy", CLOUD)
-    message = r"both sides; 7 only in sensor/ \(s1, s2, s3, s4, s5, \.\.\.\) and 1 only in reference/ \(r\)$"
+    message = (
+        r"sensor/ and reference/; 1 missing in sensor/ \(r\) and 7 missing in reference/ \(s1, s2, s3, s4, s5, \.+\)$"
+    )
     with pytest.raises(ValueError, match=message):
         RecordedFrames(tmp_path)
 
@@ -155,7 +167,7 @@ MATRIX = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", r"got NoneType, not a mapping; allowed are sensor and reference"),
+        ("", r"got NoneType, not a mapping; allowed are sensor, or rigs"),
         ("- 1", r"got list, not a mapping"),
         ("sensor: {", r"not a YAML file \(.*line 1"),
         ("\x00", r"not a YAML file"),
@@ -236,3 +248,43 @@ def test_a_caller_skips_bad_frames_with_and_without_workers(tmp_path, workers):
     assert [(error.name, error.index) for error in skipped] == [("f2", 2), ("f4", 4)]
     assert [str(error).splitlines()[0].split(":")[0] for error in skipped] == ["f2 (frame 2)", "f4 (frame 4)"]
     assert str(skipped[0]).endswith("12 bytes follow it")
+
+
+def test_several_rigs_share_a_reference_and_have_a_pose_each(tmp_path):
+    nowhere = np.array([[np.nan, 0, 0], [1.0, 2.0, 3.0]])
+    frames = RecordedFrames(record_rigs(tmp_path, rig10=CLOUD, rig2=nowhere))
+    assert frames.rigs == ("rig2", "rig10")
+    assert frames.names == ("f2", "f10")
+    assert frames[0].clouds["rig10"].tolist() == CLOUD.tolist()
+    assert frames[1].counts == {"sensor_nonfinite": 1, "reference_nonfinite": 0}
+    turned = rigid(rotation_from_euler(90.0, 0.0, 0.0), [1.0, 0.0, 0.0])
+    (tmp_path / "frames.yaml").write_text(f"rigs: {{rig2: {{vehicle_T_sensor: {turned.tolist()}}}}}")
+    frame = RecordedFrames(tmp_path)[0]
+    np.testing.assert_allclose(frame.clouds["rig2"], [[-1.0, 1.0, 3.0]], atol=1e-6)
+    assert frame.clouds["rig10"].tolist() == frame.reference.tolist() == CLOUD.tolist()
+
+
+def test_what_is_wrong_with_several_rigs_is_named(tmp_path):
+    folder = record_rigs(tmp_path, a=CLOUD, b=CLOUD)
+    (folder / "frames.yaml").write_text(f"rigs: {{c: {{vehicle_T_sensor: {MATRIX}}}}}")
+    with pytest.raises(ValueError, match=r"frames\.yaml: rigs\.c: there is no rigs/c/ beside it"):
+        RecordedFrames(folder)
+    (folder / "frames.yaml").write_text(f"rigs: {{b: {{vehicle_T_sensor: {MATRIX[:3]}}}}}")
+    with pytest.raises(ValueError, match=r"frames\.yaml: rigs\.b\.vehicle_T_sensor: a 4x4 matrix is needed"):
+        RecordedFrames(folder)
+    (folder / "frames.yaml").unlink()
+    (folder / "rigs" / "b" / "f2.npy").write_bytes(b"rubbish")
+    with pytest.raises(BadFrameError, match=r"^f2 \(frame 0\): .*f2\.npy"):
+        RecordedFrames(folder)[0]
+    (folder / "rigs" / "b" / "f2.npy").unlink()
+    with pytest.raises(ValueError, match=r"file in rigs/a/ and rigs/b/ and reference/; 1 missing in rigs/b/ \(f2\)$"):
+        RecordedFrames(folder)
+    (folder / "sensor").mkdir()
+    with pytest.raises(ValueError, match=r"both sensor/ and rigs/; sensor/ is for one rig, rigs/NAME/ for several"):
+        RecordedFrames(folder)
+
+
+def test_a_folder_of_rigs_without_any_is_an_error(tmp_path):
+    (tmp_path / "rigs").mkdir()
+    with pytest.raises(ValueError, match=r"rigs: no rig; each has a folder rigs/NAME/ of its own"):
+        RecordedFrames(tmp_path)

@@ -1,5 +1,6 @@
+"""One map: what its colours, marks and words say."""
+
 import math
-from itertools import product
 
 import matplotlib
 import numpy as np
@@ -9,11 +10,12 @@ from matplotlib import pyplot
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.image import imread
 
-from torchcover.coverage import BevGrid, Coverage, CoverageMetric
-from torchcover.report import ColourScale, SensorMark, detection_scale, draw_map, draw_maps, radius_scale
-from torchcover.report.cells import INFINITE
+from torchcover.coverage import BevGrid
+from torchcover.coverage.quantity import RADIUS, detection
+from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.report import ColourScale, SensorView, draw_map, scale_of
+from torchcover.report.maps.cells import INFINITE
 
 SCALE = ColourScale("blind spot radius", "m", "viridis_r", 0.0, 1.0)
 SQUARE = BevGrid(x=(-20.0, 20.0), y=(-10.0, 10.0), cell=1.0)
@@ -45,14 +47,14 @@ def flat(value: float = 0.0, grid: BevGrid = SQUARE) -> torch.Tensor:
     return torch.full(grid.shape[1:], value)
 
 
+def marked(name: str, x_m: float, y_m: float, yaw_deg: float, wide_deg: float, range_m: float) -> SensorView:
+    return SensorView(
+        name, rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), (x_m, y_m, 1.5)), wide_deg, (-9.0, 9.0), range_m
+    )
+
+
 def draw(values: torch.Tensor, grid: BevGrid = SQUARE, **options) -> Picture:
     return Picture(draw_map(values, grid, options.pop("scale", SCALE), title=options.pop("title", "A map"), **options))
-
-
-def coverage_of(grid: BevGrid, **options) -> Coverage:
-    metric = CoverageMetric(grid, **options)
-    metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5]]))
-    return metric.compute()
 
 
 def test_a_blind_spot_at_the_front_left_is_dark_at_the_upper_right():
@@ -109,7 +111,7 @@ def test_unknown_cells_are_grey_and_named_with_their_share():
 def test_infinite_cells_have_a_colour_of_their_own_and_leave_the_scale_alone():
     values = flat(0.5)
     values[:, 20:] = math.inf
-    picture = draw(values, scale=radius_scale("blind spot radius", values))
+    picture = draw(values, scale=scale_of(RADIUS, values))
     assert picture.at(10.5, 3.5) == pytest.approx(to_rgb(INFINITE), abs=0.01)
     assert "infinite: a step saw nothing (50.0 % of the cells)" in picture.legend
     assert picture.bar.get_ylim() == (0.0, 0.5)
@@ -131,12 +133,12 @@ def test_values_beyond_the_colours_are_admitted():
 
 def test_rounding_is_not_taken_for_values_beyond_the_colours():
     values = flat(1.0).double() * (0.1 + 0.2)
-    assert "beyond" not in draw(values, scale=radius_scale("radius", values)).bar.get_ylabel()
+    assert "beyond" not in draw(values, scale=scale_of(RADIUS, values)).bar.get_ylabel()
 
 
 @pytest.mark.parametrize(("yaw", "ahead"), [(0, (1, 0)), (90, (0, 1)), (180, (-1, 0)), (-90, (0, -1))])
 def test_a_positive_yaw_turns_the_arrow_to_the_left(yaw, ahead):
-    picture = draw(flat(), sensors=[SensorMark("lidar", 3.0, 2.0, yaw, 90.0, math.inf)])
+    picture = draw(flat(), sensors=[marked("lidar", 3.0, 2.0, yaw, 90.0, math.inf)])
     reach = 10 * picture.metres_per_point  # half an arrow, in metres
     for other in ((1, 0), (0, 1), (-1, 0), (0, -1)):
         dark = picture.at(3.0 + reach * other[0], 2.0 + reach * other[1]).sum() < 0.5
@@ -144,7 +146,7 @@ def test_a_positive_yaw_turns_the_arrow_to_the_left(yaw, ahead):
 
 
 def test_the_field_of_view_is_drawn_around_the_yaw_up_to_the_range():
-    picture = draw(flat(), sensors=[SensorMark("camera", 0.0, 0.0, 90.0, 60.0, 8.0)])
+    picture = draw(flat(), sensors=[marked("camera", 0.0, 0.0, 90.0, 60.0, 8.0)])
 
     def is_crossed(angle_deg: float, reaches: np.ndarray) -> bool:
         along = [math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))]
@@ -160,7 +162,7 @@ def test_the_field_of_view_is_drawn_around_the_yaw_up_to_the_range():
 
 
 def test_a_field_of_view_without_range_reaches_across_the_map_without_an_arc():
-    picture = draw(flat(), sensors=[SensorMark("camera", -20.0, 0.0, 0.0, 20.0, math.inf)])
+    picture = draw(flat(), sensors=[marked("camera", -20.0, 0.0, 0.0, 20.0, math.inf)])
     end = range(math.ceil(0.9 * picture.map.shape[1]), picture.map.shape[1] - 5)
     rows, columns = np.nonzero(picture.map[5:-5, end].sum(axis=2) < 0.5)
     y_m = 10.0 - (rows + 5) / len(picture.map) * 20.0
@@ -172,8 +174,8 @@ def test_a_field_of_view_without_range_reaches_across_the_map_without_an_arc():
 
 def test_several_sensors_are_numbered_and_those_close_together_share_a_label():
     at = (("a", 0.0, 0.0), ("b", 0.2, 0.0), ("c", 0.0, 180.0))
-    sensors = [SensorMark(name, x_m, 0.0, yaw, 90.0, 10.0) for name, x_m, yaw in at]
-    picture = draw(flat(), sensors=[*sensors, SensorMark("$away$", 99.0, 0.0, 0.0, 90.0, 10.0)])
+    sensors = [marked(name, x_m, 0.0, yaw, 90.0, 10.0) for name, x_m, yaw in at]
+    picture = draw(flat(), sensors=[*sensors, marked("$away$", 99.0, 0.0, 0.0, 90.0, 10.0)])
     labels = [text.get_text() for text in picture.axes.texts]
     assert "1, 2" in labels
     assert "3" in labels
@@ -189,7 +191,7 @@ def test_the_ego_is_filled_and_named():
 
 
 def test_nothing_is_clipped_and_the_legend_hides_no_data():
-    sensors = [SensorMark(f"a sensor with a long name, number {n}", 0.0, 0.0, 45.0 * n, 90.0, 10.0) for n in range(8)]
+    sensors = [marked(f"a sensor with a long name, number {n}", 0.0, 0.0, 45.0 * n, 90.0, 10.0) for n in range(8)]
     title = "A title that is much longer than this narrow map is wide, and that nobody would ever write"
     narrow = BevGrid(x=(-1.0, 1.0), y=(-20.0, 20.0), cell=1.0)
     for grid in (narrow, SQUARE, BevGrid(x=(-40.0, 40.0), y=(-1.0, 1.0), cell=1.0)):
@@ -204,7 +206,7 @@ def test_dollars_are_no_formula():
     broken = r"$\frac{$"
     headings = draw(flat(), title=broken, subtitle=f"{broken} too").axes.texts
     assert [text.get_text() for text in headings] == [broken, f"{broken} too"]
-    legend = draw(flat(), sensors=[SensorMark(broken, 0.0, 0.0, 0.0, 90.0, 10.0)]).axes.get_legend()
+    legend = draw(flat(), sensors=[marked(broken, 0.0, 0.0, 0.0, 90.0, 10.0)]).axes.get_legend()
     assert broken in [text.get_text() for text in legend.get_texts()]
 
 
@@ -220,71 +222,26 @@ def test_values_are_left_as_they_were():
 def test_a_map_of_one_cell_or_one_value_can_be_drawn(value):
     grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0)
     values = flat(value, grid)
-    picture = draw(values, grid, scale=radius_scale("radius", values))
+    picture = draw(values, grid, scale=scale_of(RADIUS, values))
     unknown = picture.axes.get_legend().get_texts()[0].get_text()
     assert unknown == f"unknown: never probed ({100 if math.isnan(value) else 0} % of the cells)"
 
 
 def test_the_radius_scale_ends_at_the_98th_percentile_of_the_known_cells():
     radius = torch.cat([torch.linspace(0.0, 1.0, 1000), torch.full((5,), 500.0), torch.tensor([math.nan, math.inf])])
-    assert radius_scale("radius", radius).high == pytest.approx(0.99, abs=0.01)
+    assert scale_of(RADIUS, radius).high == pytest.approx(0.99, abs=0.01)
 
 
 def test_dark_means_blind_in_every_scale():
     halves = flat(0.0)
     halves[:, 20:] = 100.0
-    for scale, blind in ((radius_scale("radius", halves), 10.0), (detection_scale("detected"), -10.0)):
+    for scale, blind in ((scale_of(RADIUS, halves), 10.0), (scale_of(detection(0.4), halves), -10.0)):
         picture = draw(halves, scale=scale)
         assert picture.at(blind, 5.0).sum() < 1.0 < picture.at(-blind, 5.0).sum()
 
 
 def test_a_few_blind_cells_among_perfect_ones_still_set_the_scale():
-    assert radius_scale("radius", torch.tensor([0.0] * 999 + [3.14])).high == 3.2
-
-
-def test_draw_maps_writes_a_file_for_each_metric_and_band(tmp_path):
-    coverage = coverage_of(SQUARE, thresholds=(0.4, 1.0))
-    paths = draw_maps(coverage, tmp_path / "new" / "maps", ego_outline_m=EGO)
-    stems = ("radius", "detection_0.4m", "detection_1m")
-    assert [path.name for path in paths] == [f"{s}_{band}.png" for s, band in product(stems, SQUARE.heights)]
-    for path in paths:
-        height, width, _ = imread(path).shape
-        assert 600 < height < 1500
-        assert 1350 < width < 2500
-
-
-def test_draw_maps_adds_what_was_asked_of_the_metric(tmp_path):
-    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
-    coverage = coverage_of(grid, thresholds=(), maximum=True, pooled=True, quantiles=(0.95,))
-    names = [path.name for path in draw_maps(coverage, tmp_path)]
-    assert names == ["radius_all.png", "radius_maximum_all.png", "radius_pooled_all.png", "radius_q0.95_all.png"]
-
-
-def test_the_bands_of_a_metric_share_their_colours(tmp_path):
-    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"low": (0.0, 1.0), "high": (9.0, 11.0)})
-    metric = CoverageMetric(grid, thresholds=())
-    metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.5], [0.5, 0.5, 10.0]]))
-    low, high = (imread(path)[400, 400, :3] for path in draw_maps(metric.compute(), tmp_path))
-    assert np.abs(low - high).max() > 0.5
-
-
-def test_any_band_name_becomes_a_file_in_the_folder_and_no_two_share_one(tmp_path):
-    names = ["../up", "a/b", "a\\b", "A b", "a_b_3", "$x$", "long" * 99, "Höhe", "\n"]
-    heights = {name: (float(at), at + 1.0) for at, name in enumerate(names)}
-    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights=heights)
-    paths = draw_maps(coverage_of(grid, thresholds=()), tmp_path / "maps")
-    assert len({path.name.lower() for path in paths}) == len(names)
-    assert sorted(tmp_path.rglob("*.png")) == sorted(paths)
-    assert all(path.parent == tmp_path / "maps" for path in paths)
-
-
-def test_the_title_names_metric_band_cell_and_steps(tmp_path, monkeypatch):
-    titles = []
-    monkeypatch.setattr(Figure, "savefig", lambda self, *_, **__: titles.append(self.axes[0].texts))
-    draw_maps(coverage_of(SQUARE, thresholds=()), tmp_path)
-    title, subtitle = (text.get_text() for text in titles[1][:2])
-    assert title == "Mean blind spot radius, obstacle"
-    assert subtitle == "z 0.5 to 2 m; 1 step, cells of 1 m"
+    assert scale_of(RADIUS, torch.tensor([0.0] * 999 + [3.14])).high == 3.2
 
 
 def test_drawing_leaves_the_global_state_of_matplotlib_alone():
@@ -306,54 +263,3 @@ def test_wrong_shapes_are_refused_with_what_arrived():
 def test_a_scale_without_extent_is_refused(bounds):
     with pytest.raises(ValueError, match="finite low < high"):
         ColourScale("radius", "m", "viridis", *bounds)
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("yaw_deg", math.nan), ("x_m", math.inf), ("horizontal_fov_deg", 361.0), ("range_m", 0.0)],
-)
-def test_an_impossible_sensor_is_refused_by_name(field, value):
-    good = {"name": "lidar", "x_m": 0.0, "y_m": 0.0, "yaw_deg": 0.0, "horizontal_fov_deg": 90.0, "range_m": 10.0}
-    with pytest.raises(ValueError, match=f"'lidar': .*{field}"):
-        SensorMark(**{**good, field: value})
-
-
-# Maps of the standard errors
-
-
-def blocked(steps: int) -> Coverage:
-    metric = CoverageMetric(SQUARE, blocks=16)
-    for index in range(steps):
-        points = [[0.5, 0.5, 0.0]] if index % 8 else [[0.5, 0.5, 0.0], [9.5, 0.5, 0.0]]
-        metric.update(torch.tensor([[0.5, 0.5, -0.3 - 0.02 * (index % 16)]]), torch.tensor(points), index=index)
-    return metric.compute()
-
-
-def test_errors_are_drawn_only_if_asked_for(tmp_path):
-    coverage = blocked(16)
-    plain = {path.name for path in draw_maps(coverage, tmp_path / "plain")}
-    more = {path.name for path in draw_maps(coverage, tmp_path / "more", errors=True)}
-    bands = ("ground", "obstacle")
-    assert more - plain == {f"{stem}_{band}.png" for stem in ("radius_error", "detection_0.4m_error") for band in bands}
-    assert plain < more
-    assert not any("error" in name for name in plain)
-    without_blocks = draw_maps(coverage_of(SQUARE), tmp_path / "none", errors=True)
-    assert not any("error" in path.name for path in without_blocks)
-
-
-def test_a_map_of_errors_says_what_it_shows_in_which_unit_and_why_cells_are_unknown(tmp_path, monkeypatch):
-    drawn: dict[str, Picture] = {}
-    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: drawn.update({path.name: Picture(self)}))
-    coverage = blocked(16)
-    draw_maps(coverage, tmp_path, errors=True)
-    radius, detection = drawn["radius_error_ground.png"], drawn["detection_0.4m_error_ground.png"]
-    assert radius.axes.texts[0].get_text() == "Standard error of the mean blind spot radius, ground"
-    assert radius.bar.get_ylabel() == "standard error of the mean blind spot radius (m)"
-    assert detection.axes.texts[0].get_text() == "Standard error of the detection within 0.4 m, ground"
-    assert detection.bar.get_ylabel() == "standard error of the detection within 0.4 m (percentage points)"
-    assert detection.bar.get_ylim()[1] >= 100 * float(coverage.detection_error[0, 0, 10, 20]) > 1
-    # Two of the sixteen blocks probed x = 9.5 m: known, but without an error.
-    assert radius.legend[0] == "unknown: probed in fewer than 4 blocks of steps (99.9 % of the cells)"
-    red, green, blue = radius.at(9.4, 0.3)
-    assert red == green == blue
-    assert drawn["radius_ground.png"].legend[0].startswith("unknown: never probed (99.8 %")

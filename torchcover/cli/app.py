@@ -4,11 +4,15 @@ import io
 import sys
 import warnings
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from torchcover.cli import options
+
+if TYPE_CHECKING:
+    from torchcover.data import FrameSource
+    from torchcover.evaluation import Result
 
 app = typer.Typer(
     name="torchcover",
@@ -52,16 +56,11 @@ def version(show: Annotated[bool, typer.Option("--version", help="Print the vers
 
 @app.command()
 def evaluate(
-    rig: Annotated[
-        str | None, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file. Optional with --frames.")
-    ] = None,
-    scenario: Annotated[str | None, typer.Option(help="Scenario: a built-in name or a YAML file.")] = None,
-    frames: Annotated[
-        Path | None, typer.Option(help="A recording instead: a folder with sensor/NAME.* beside reference/NAME.*")
-    ] = None,
-    steps: Annotated[
-        int | None, typer.Option(min=1, help="Steps to simulate (64), or most frames of a recording to use (all).")
-    ] = None,
+    rig: options.RigOrNone = None,
+    scenario: options.ScenarioOrNone = None,
+    frames: options.Frames = None,
+    recording_format: options.Format = None,
+    steps: options.Steps = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
     cell: options.Cell = 0.25,
@@ -74,38 +73,38 @@ def evaluate(
     explain: options.Explain = False,
     device: options.Device = "cpu",
     workers: options.Workers = 0,
-    skip_bad_frames: Annotated[
-        bool, typer.Option("--skip-bad-frames", help="Skip and count frames that cannot be read, instead of stopping.")
-    ] = False,
+    skip_bad_frames: options.SkipBadFrames = False,
 ) -> None:
     """Measure the coverage of a rig: a table, maps, and files to compare and to log."""
-    from torchcover.cli.evaluate import Request, run
-    from torchcover.cli.settings import Settings
-    from torchcover.cli.stopping import TargetError
+    from torchcover.evaluation import TargetError, evaluate
 
-    settings = Settings(
+    result = evaluate(
+        rig,
+        scenario,
+        frames=_opened(frames, recording_format),
         steps=steps,
         seed=seed,
-        out=out,
-        cell=cell,
-        thresholds=tuple(threshold or (0.4,)),
+        cell_m=cell,
+        thresholds=threshold or (0.4,),
         reference=reference,
         rays=rays,
         every_s=every,
-        target=TargetError.parse(target_error or ()),
-        error_maps=error_maps,
-        explain=explain,
+        target_error=TargetError.parse(target_error or ()),
         device=device,
         workers=workers,
+        skip_bad_frames=skip_bad_frames,
+        progress=True,
     )
-    run(Request(rig=rig, scenario=scenario, recording=frames, skip_bad_frames=skip_bad_frames, settings=settings))
+    _finish(result, out, error_maps=error_maps, explain=explain)
 
 
 @app.command()
 def compare(
-    rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; two or more.")],
-    scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "courtyard",
-    steps: Annotated[int | None, typer.Option(min=1, help="Steps to simulate (64).")] = None,
+    rigs: options.Rigs = None,
+    scenario: options.ScenarioOrNone = None,
+    frames: options.Frames = None,
+    recording_format: options.Format = None,
+    steps: options.Steps = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
     cell: options.Cell = 0.25,
@@ -118,33 +117,34 @@ def compare(
     explain: options.Explain = False,
     device: options.Device = "cpu",
     workers: options.Workers = 0,
+    skip_bad_frames: options.SkipBadFrames = False,
 ) -> None:
     """Compare rigs in the same frames: a table with the better values marked, maps side by side, differences."""
-    from torchcover.cli.compare import Request, run
-    from torchcover.cli.settings import Settings
-    from torchcover.cli.stopping import TargetError
+    from torchcover.evaluation import TargetError, compare
 
-    settings = Settings(
+    result = compare(
+        rigs or (),
+        scenario,
+        frames=_opened(frames, recording_format),
         steps=steps,
         seed=seed,
-        out=out,
-        cell=cell,
-        thresholds=tuple(threshold or (0.4,)),
+        cell_m=cell,
+        thresholds=threshold or (0.4,),
         reference=reference,
         rays=rays,
         every_s=every,
-        target=TargetError.parse(target_error or ()),
-        error_maps=error_maps,
-        explain=explain,
+        target_error=TargetError.parse(target_error or ()),
         device=device,
         workers=workers,
+        skip_bad_frames=skip_bad_frames,
+        progress=True,
     )
-    run(Request(rigs=tuple(rigs), scenario=scenario, settings=settings))
+    _finish(result, out, error_maps=error_maps, explain=explain)
 
 
 @app.command()
 def study(
-    rig: Annotated[str, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file.")],
+    rig: options.Rig,
     scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "courtyard",
     rays: Annotated[
         list[int] | None,
@@ -155,6 +155,9 @@ def study(
     long_run_steps: Annotated[
         int, typer.Option(min=8, help="Steps of the run that the others are measured against.")
     ] = 256,
+    long_run_rays: Annotated[
+        int, typer.Option(min=8, help="Rays of that run at each step; no fewer than any other has.")
+    ] = 1_048_576,
     every: options.Every = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
@@ -162,23 +165,25 @@ def study(
     threshold: Annotated[float, typer.Option(help="Detection threshold in metres.")] = 0.4,
 ) -> None:
     """Measure error against run time for reference sensors and numbers of steps, and recommend a setting."""
-    from torchcover.cli.study import DEFAULT_RAYS, Request, run
+    from torchcover.cli.printing import print_study
+    from torchcover.evaluation import StudyPlan, error_against_time
 
-    run(
-        Request(
-            rig=rig,
-            scenario=scenario,
-            rays=tuple(dict.fromkeys(rays or DEFAULT_RAYS)),
-            steps=steps,
-            runs=runs,
-            long_run_steps=long_run_steps,
-            every_s=every,
-            seed=seed,
-            cell=cell,
-            threshold=threshold,
-            out=out,
-        )
+    plan = StudyPlan(
+        rig=rig,
+        scenario=scenario,
+        rays=tuple(dict.fromkeys(rays or StudyPlan.rays)),
+        steps=steps,
+        runs=runs,
+        long_run_steps=long_run_steps,
+        long_run_rays=long_run_rays,
+        every_s=every,
+        seed=seed,
+        cell_m=cell,
+        threshold_m=threshold,
     )
+    found = error_against_time(plan, progress=True)
+    found.save(out)
+    print_study(found, out)
 
 
 @app.command()
@@ -190,7 +195,7 @@ def show(
     rig: Annotated[str | None, typer.Option(help="For a scenario: whose points to draw (front_roof_128).")] = None,
     step: Annotated[int | None, typer.Option(min=0, help="Time step of the scenario or the depth images (0).")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the simulation, likewise (0).")] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the picture.")] = Path("out"),
+    out: options.Out = Path("out"),
 ) -> None:
     """Draw a rig on its vehicle and the depth images of its cameras, or a frame of a scenario from above."""
     from torchcover.cli.show import run
@@ -204,6 +209,25 @@ def list_builtin() -> None:
     from torchcover.cli.listing import run
 
     run()
+
+
+def _opened(frames: Path | None, recording_format: str | None) -> "FrameSource | None":
+    if frames is None:
+        if recording_format is not None:
+            raise ValueError("--format: for a recording, which --frames gives")
+        return None
+    from torchcover.data import open_recording
+
+    return open_recording(frames, recording_format)
+
+
+def _finish(result: "Result", out: Path, *, error_maps: bool, explain: bool) -> None:
+    """Results are safe before anything is printed; then the command ends as the run did."""
+    from torchcover.cli.printing import print_result
+
+    files = result.save(out, error_maps=error_maps)
+    print_result(result, files, out, explain=explain)
+    result.run.raise_failure()
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)

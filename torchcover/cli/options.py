@@ -1,12 +1,45 @@
 """The options that several commands share."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+
+def check_out(folder: Path) -> Path:
+    """Find out before the run, not after it, whether its results can be written.
+
+    Raises:
+        ValueError: The folder, or the first of its parents that exists, is a file or may not be written to.
+    """
+    nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    if not nearest.is_dir():
+        raise ValueError(f"--out {folder}: {nearest} is a file, not a folder")
+    if not os.access(nearest, os.W_OK):
+        raise ValueError(f"--out {folder}: {nearest} may not be written to; choose another folder")
+    return folder
+
+
+RigOrNone = Annotated[
+    str | None, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file. Optional with --frames.")
+]
+Rig = Annotated[str, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file.")]
+Rigs = Annotated[
+    list[str] | None,
+    typer.Argument(help="Rigs: built-in names (see `list`) or YAML files, two or more; with --frames those in it."),
+]
+ScenarioOrNone = Annotated[str | None, typer.Option(help="Scenario: a built-in name or a YAML file (courtyard).")]
+Frames = Annotated[
+    Path | None,
+    typer.Option(help="A recording instead: a folder with sensor/NAME.*, or rigs/RIG/NAME.*, beside reference/NAME.*"),
+]
+Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
+Steps = Annotated[
+    int | None, typer.Option(min=1, help="Steps to simulate (64), or most frames of a recording to use (all).")
+]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the simulation.")]
-Out = Annotated[Path, typer.Option(help="Folder for the results.")]
+Out = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
 Cell = Annotated[float, typer.Option(help="Side of a grid cell in metres.")]
 Thresholds = Annotated[
     list[float] | None, typer.Option("--threshold", help="Detection threshold in metres (0.4); may be repeated.")
@@ -38,3 +71,6 @@ ErrorMaps = Annotated[bool, typer.Option("--error-maps", help="Draw maps of the 
 Explain = Annotated[bool, typer.Option("--explain", help="Say what was left out because the scene did not need it.")]
 Device = Annotated[str, typer.Option(help="Where the search and the sums run: cpu, cuda, cuda:1, ...")]
 Workers = Annotated[int, typer.Option(min=0, help="Processes that make frames; 0 makes them in this one.")]
+SkipBadFrames = Annotated[
+    bool, typer.Option("--skip-bad-frames", help="Skip and count frames that cannot be read, instead of stopping.")
+]

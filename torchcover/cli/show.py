@@ -1,26 +1,18 @@
-"""`torchcover show`: a rig on its vehicle and what its cameras see, or a frame of a scenario from above."""
+"""`torchcover show`: which of the two is meant, a rig or a scenario; its pictures."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from rich.console import Console
 
-from torchcover.cli.run import DEFAULT_SCENARIO, GRID_X_M, GRID_Y_M
-from torchcover.data import SimulatedFrames
-from torchcover.geometry import BoundingBox, invert, transform
-from torchcover.geometry.rigid import Matrix
-from torchcover.report import ActorMark, SensorView, draw_depths, draw_rig, draw_scene
-from torchcover.simulation import CameraSensor, PaperReference, Rig, Scenario, Sensor, builtin_names, vertical_fov_deg
-from torchcover.simulation.instant import Instant
-from torchcover.simulation.world import Actor, World
+from torchcover.evaluation import cameras_of, rig_pictures, scenario_picture
+from torchcover.evaluation.settings import DEFAULT_SCENARIO
+from torchcover.simulation import Rig, Scenario, builtin_names
 
 DEFAULT_RIG = "front_roof_128"
-# A picture needs fewer points than a measurement.
-REFERENCE = PaperReference(rows=256, columns=512)
 
 
 def run(name: str, *, scenario: str | None, rig: str | None, step: int | None, seed: int | None, out: Path) -> None:
@@ -30,18 +22,21 @@ def run(name: str, *, scenario: str | None, rig: str | None, step: int | None, s
         ValueError: The name of neither or of both, an option for the other kind, or a document that is not valid.
         FileNotFoundError: No such file.
     """
+    figures: Iterable[tuple[str, Figure]]
     if _is_rig(name):
         _refuse("a scenario", {"--rig": rig}, f"{name!r} is a rig")
         shown = Rig.load(name)
-        if not _cameras(shown):
+        if not cameras_of(shown):
             _refuse("a scenario or cameras", {"--step": step, "--seed": seed}, f"{name!r} is a rig without cameras")
-        figures = _draw_rig(shown, Scenario.load(scenario or DEFAULT_SCENARIO), step or 0, seed or 0)
+        world = Scenario.load(scenario or DEFAULT_SCENARIO)
+        figures = rig_pictures(shown, world, step=step or 0, seed=seed or 0)
     else:
         _refuse("a rig", {"--scenario": scenario}, f"{name!r} is a scenario")
-        figures = {"": _draw_scenario(Scenario.load(name), Rig.load(rig or DEFAULT_RIG), step or 0, seed or 0)}
-    out.mkdir(parents=True, exist_ok=True)
-    for suffix, figure in figures.items():
+        world, seen_by = Scenario.load(name), Rig.load(rig or DEFAULT_RIG)
+        figures = [("", scenario_picture(world, seen_by, step=step or 0, seed=seed or 0))]
+    for suffix, figure in figures:
         path = out / f"{Path(name).stem}{suffix}.png"
+        out.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=figure.dpi)
         Console().print(f"Wrote {path}", soft_wrap=True)
 
@@ -70,68 +65,3 @@ def _refuse(kind: str, options: dict[str, Any], reason: str) -> None:
     given = [option for option, value in options.items() if value is not None]
     if given:
         raise ValueError(f"{', '.join(given)}: for {kind} only, and {reason}")
-
-
-def _cameras(rig: Rig) -> list[CameraSensor]:
-    return [sensor for sensor in rig.sensors if isinstance(sensor, CameraSensor)]
-
-
-def _draw_rig(rig: Rig, scenario: Scenario, step: int, seed: int) -> dict[str, Figure]:
-    """The rig on its vehicle, and the depth images if it has cameras, by the suffix of the file name."""
-    frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference_sensor=REFERENCE)
-    scene, step_of_world = frames.simulator.scene_of(step)
-    ego = scene.world.ego.mesh
-    length, width, height = scene.ego_box.size_m
-    subtitle = f"on the ego of {scenario.name}, {length:.2f} x {width:.2f} x {height:.2f} m"
-    sensors = [_sensor_view(sensor) for sensor in rig.sensors]
-    figures = {"": draw_rig(ego.vertices_m, ego.faces, sensors, title=rig.name, subtitle=subtitle)}
-    if cameras := _cameras(rig):
-        instant = scene.at(step_of_world)
-        images = {camera.name: _depth_image(camera, instant) for camera in cameras}
-        when = f"{scenario.name}, step {step}, t = {step_of_world * scene.world.time_step_s:g} s, seed {seed}"
-        figures["_depth"] = draw_depths(images, title=f"{rig.name}: distance along the ray", subtitle=when)
-    return figures
-
-
-def _depth_image(camera: CameraSensor, instant: Instant) -> NDArray[np.float32]:
-    return instant.range_image(camera.mount.matrix(), camera.directions(), max_range_m=camera.max_range_m)
-
-
-def _sensor_view(sensor: Sensor) -> SensorView:
-    return SensorView(
-        name=sensor.name,
-        vehicle_T_sensor=sensor.mount.matrix(),
-        horizontal_fov_deg=sensor.horizontal_fov_deg,
-        vertical_fov_deg=vertical_fov_deg(sensor),
-        range_m=sensor.max_range_m,
-    )
-
-
-def _draw_scenario(scenario: Scenario, rig: Rig, step: int, seed: int) -> Figure:
-    frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference_sensor=REFERENCE)
-    frame = frames[step]
-    scene, step_of_world = frames.simulator.scene_of(step)
-    world = scene.world
-    time_s = step_of_world * world.time_step_s
-    return draw_scene(
-        GRID_X_M,
-        GRID_Y_M,
-        ego_outline_m=scene.ego_box.outline_m,
-        actors=_actor_marks(world, time_s),
-        sensor=frame.sensor.numpy(),
-        reference=frame.reference.numpy(),
-        title=f"{scenario.name}, step {step}",
-        subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name}",
-    )
-
-
-def _actor_marks(world: World, time_s: float) -> list[ActorMark]:
-    vehicle_T_world = invert(world.ego.trajectory.at(time_s))
-    there = [actor for actor in world.actors if np.isfinite(actor.trajectory.positions_at(np.array([time_s]))).all()]
-    return [ActorMark(actor.category, _footprint_m(actor, vehicle_T_world, time_s)) for actor in there]
-
-
-def _footprint_m(actor: Actor, vehicle_T_world: Matrix, time_s: float) -> Matrix:
-    corners = BoundingBox.around(actor.mesh.vertices_m).outline_m
-    on_ground = np.column_stack([corners, np.zeros(len(corners))])
-    return transform(vehicle_T_world @ actor.trajectory.at(time_s), on_ground)[:, :2]

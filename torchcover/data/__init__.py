@@ -1,20 +1,27 @@
 """Datasets of frames: simulated worlds, recordings, and the readers of cloud files."""
 
 from torchcover.data.augmentation import Augmentation, flip, rotate, scale
+from torchcover.data.bad_frame import BadFrameError
 from torchcover.data.clouds import read_cloud
 from torchcover.data.frame import Frame, FrameBatch, collate_frames
-from torchcover.data.recorded import BadFrameError, RecordedFrames
+from torchcover.data.recorded import RecordedFrames
+from torchcover.data.recordings import FORMATS, RecordingFormat, open_recording
 from torchcover.data.simulated import SimulatedFrames
+from torchcover.data.source import FrameSource
 
 __all__ = [
+    "FORMATS",
     "Augmentation",
     "BadFrameError",
     "Frame",
     "FrameBatch",
+    "FrameSource",
     "RecordedFrames",
+    "RecordingFormat",
     "SimulatedFrames",
     "collate_frames",
     "flip",
+    "open_recording",
     "read_cloud",
     "rotate",
     "scale",

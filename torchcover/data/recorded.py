@@ -1,77 +1,48 @@
-"""A recording in a folder: a sensor cloud beside a reference cloud for every instant."""
+"""A recording in a folder: the sensor clouds of one or several rigs beside a reference cloud for every instant."""
 
 import operator
 import os
 import re
-from collections.abc import Set
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
-import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
+from torchcover.data.bad_frame import BadFrameError
 from torchcover.data.clouds import READERS, read_cloud, split_name
 from torchcover.data.formats.arrays import Points
 from torchcover.data.frame import Frame
-from torchcover.geometry.rigid import Matrix, check_rigid, transform
+from torchcover.data.poses import read_poses
+from torchcover.geometry.rigid import Matrix, transform
+from torchcover.simulation import Sensor
 
-SOURCES = ("sensor", "reference")
 POSES_FILE = "frames.yaml"
+# What the clouds of the only rig are called.
+ONLY_RIG = "recording"
 # float32 resolves 8 mm here; clouds in world coordinates lie far beyond and would lose decimetres without a word.
 MAX_COORDINATE_M = 1e5
-NAMES_SHOWN = 5
-
-
-class BadFrameError(ValueError):
-    """One frame of a recording cannot be used; the others can.
-
-    `name` and `index` say which frame. A caller that skips bad frames catches this around `next`, with and without
-    worker processes.
-
-    Args:
-        message: `NAME (frame INDEX): reason`, or a worker's traceback that ends in it: DataLoader knows no other way to
-            build an exception again than from its text.
-
-    Example:
-        >>> error = BadFrameError("night_7 (frame 6): the reference cloud has no points")
-        >>> error.name, error.index
-        ('night_7', 6)
-    """
-
-    def __init__(self, message: str) -> None:
-        super().__init__(message.rpartition("BadFrameError: ")[2].strip())
-        parts = re.match(r"(?P<name>.*?) \(frame (?P<index>\d+)\): ", str(self))
-        self.name = parts["name"] if parts else ""
-        self.index = int(parts["index"]) if parts else -1
-
-
-class _Source(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-    vehicle_T_sensor: list[list[float]]
-
-
-class _Poses(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-    sensor: _Source | None = None
-    reference: _Source | None = None
+MAX_NAMES_SHOWN = 5
 
 
 class RecordedFrames(Dataset[Frame]):
-    """Frames of a folder with `sensor/NAME.*` beside `reference/NAME.*`, in natural order (frame2 before frame10).
+    """Frames of a folder with `sensor/FRAME.*` beside `reference/FRAME.*`, in natural order (frame2 before frame10).
 
-    Any format of `read_cloud` will do, and the two sides may differ. Clouds are in the vehicle frame, unless
-    `frames.yaml` in the folder says where their sensor is:
+    Several rigs have `rigs/NAME/FRAME.*` each, instead of `sensor/`, against one reference. Any format of `read_cloud`
+    will do, and the sides may differ. Clouds are in the vehicle frame, unless `frames.yaml` in the folder says where
+    their sensor is:
 
-        sensor:                      # both sources are optional
+        sensor:                      # all are optional
           vehicle_T_sensor:          # 4x4, metres
             - [1, 0, 0, 1.2]
             - [0, 1, 0, 0.0]
             - [0, 0, 1, 1.73]
             - [0, 0, 0, 1]
+
+    for the rig and likewise for `reference`; for several rigs `rigs: {NAME: {vehicle_T_sensor: ...}}`.
 
     Non-finite points are dropped and counted in `Frame.counts` (`sensor_nonfinite`, `reference_nonfinite`). An empty
     sensor cloud is a blind step; an empty reference cloud is an error, for nothing was measured.
@@ -81,8 +52,8 @@ class RecordedFrames(Dataset[Frame]):
 
     Raises:
         FileNotFoundError: The folder, or `sensor` or `reference` in it, is missing.
-        ValueError: No frames, a file that is no cloud, two files of one name, names on one side only, or a bad
-            `frames.yaml`. From indexing: `BadFrameError`.
+        ValueError: No frames, a file that is no cloud, two files of one name, names on one side only, both `sensor` and
+            `rigs`, or a bad `frames.yaml`. From indexing: `BadFrameError`.
 
     Example:
         >>> import tempfile
@@ -94,15 +65,50 @@ class RecordedFrames(Dataset[Frame]):
         [('frame7', [[1.0, 2.0, 3.0]])]
     """
 
+    layout: ClassVar[str] = "sensor/FRAME.*, or rigs/NAME/FRAME.* for several, beside reference/FRAME.*"
+
     def __init__(self, folder: str | os.PathLike[str]) -> None:
         self.folder = Path(folder)
         if not self.folder.is_dir():
-            raise FileNotFoundError(f"{self.folder}: no such folder; a recording holds sensor/ and reference/")
-        sensor, reference = (_clouds_by_name(self.folder / source) for source in SOURCES)
-        _check_pairs(self.folder, sensor.keys(), reference.keys())
-        self.names = tuple(sorted(sensor, key=_natural))
-        self._paths = [{"sensor": sensor[name], "reference": reference[name]} for name in self.names]
-        self._vehicle_T_source = _read_poses(self.folder / POSES_FILE)
+            raise FileNotFoundError(f"{self.folder}: no such folder; a recording holds {self.layout}")
+        # Name of the rig -> its folder; a pose is under the same path in frames.yaml.
+        self._places = _rig_places(self.folder)
+        files = {place: _clouds_by_name(self.folder / place) for place in (*self._places.values(), "reference")}
+        _check_same_names(self.folder, files)
+        self.names = tuple(sorted(files["reference"], key=_natural))
+        self._paths = [{place: clouds[name] for place, clouds in files.items()} for name in self.names]
+        self._vehicle_T_source = read_poses(self.folder / POSES_FILE)
+        _check_places(self.folder, self._vehicle_T_source, files)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether it is a folder with clouds of a sensor, of rigs or of a reference in it."""
+        return any((path / place).is_dir() for place in ("sensor", "rigs", "reference"))
+
+    @property
+    def rigs(self) -> tuple[str, ...]:
+        """Names of the rigs, in natural order; `recording` if there is one only, without a name."""
+        return tuple(self._places)
+
+    @property
+    def sensors(self) -> Mapping[str, Sequence[Sensor]]:
+        """Nothing: a recording does not say what its sensors are."""
+        return {}
+
+    @property
+    def ego_outline_m(self) -> NDArray[np.float64] | None:
+        """Nothing: nor does it say how large the vehicle is."""
+        return None
+
+    @property
+    def description(self) -> Mapping[str, object]:
+        """The folder."""
+        return {"scenario": None, "frames": str(self.folder), "seed": None}
+
+    @property
+    def reference(self) -> Mapping[str, object] | None:
+        """None: the reference was recorded."""
+        return None
 
     def __len__(self) -> int:
         return len(self.names)
@@ -112,29 +118,45 @@ class RecordedFrames(Dataset[Frame]):
 
         Raises:
             IndexError: There are fewer frames; also what ends a `for` loop.
-            BadFrameError: One of its two files cannot be used.
+            BadFrameError: One of its files cannot be used.
         """
         position = operator.index(index)
         if not -len(self) <= position < len(self):
             raise IndexError(f"frame {position} of {len(self)} in {self.folder}")
         position %= len(self)
+        name = self.names[position]
         try:
-            (sensor, reference), counts = self._read(position)
+            sensors = {rig: self._read(position, place) for rig, place in self._places.items()}
+            reference, reference_dropped = self._read(position, "reference")
         except (OSError, ValueError) as error:
-            raise BadFrameError(f"{self.names[position]} (frame {position}): {error}") from error
-        return Frame({"recording": sensor}, reference, index=position, name=self.names[position], counts=counts)
+            raise BadFrameError(f"{name} (frame {position}): {error}") from error
+        counts = {
+            "sensor_nonfinite": sum(dropped for _, dropped in sensors.values()),
+            "reference_nonfinite": reference_dropped,
+        }
+        clouds = {rig: cloud for rig, (cloud, _) in sensors.items()}
+        return Frame(clouds, reference, index=position, name=name, counts=counts)
 
-    def _read(self, position: int) -> tuple[list[torch.Tensor], dict[str, int]]:
-        clouds, counts = [], {}
-        for source in SOURCES:
-            path = self._paths[position][source]
-            points = read_cloud(path)
-            if source == "reference" and len(points) == 0:
-                raise ValueError(f"{path}: the reference cloud has no points, so there is nothing to measure against")
-            finite = np.isfinite(points).all(axis=1)
-            clouds.append(_to_vehicle(points[finite], self._vehicle_T_source.get(source), path))
-            counts[f"{source}_nonfinite"] = int((~finite).sum())
-        return clouds, counts
+    def _read(self, position: int, place: str) -> tuple[torch.Tensor, int]:
+        """One cloud in the vehicle frame, and how many of its points were not finite."""
+        path = self._paths[position][place]
+        points = read_cloud(path)
+        if place == "reference" and len(points) == 0:
+            raise ValueError(f"{path}: the reference cloud has no points, so there is nothing to measure against")
+        finite = np.isfinite(points).all(axis=1)
+        return _to_vehicle(points[finite], self._vehicle_T_source.get(place), path), int((~finite).sum())
+
+
+def _rig_places(folder: Path) -> dict[str, str]:
+    """Name of each rig -> its folder within the recording."""
+    if not (folder / "rigs").is_dir():
+        return {ONLY_RIG: "sensor"}
+    if (folder / "sensor").exists():
+        raise ValueError(f"{folder}: both sensor/ and rigs/; sensor/ is for one rig, rigs/NAME/ for several")
+    names = [path.name for path in (folder / "rigs").iterdir() if not path.name.startswith(".")]
+    if not names:
+        raise ValueError(f"{folder / 'rigs'}: no rig; each has a folder rigs/NAME/ of its own")
+    return {name: f"rigs/{name}" for name in sorted(names, key=_natural)}
 
 
 def _to_vehicle(points_m: Points, vehicle_T_source: Matrix | None, path: Path) -> torch.Tensor:
@@ -150,7 +172,7 @@ def _to_vehicle(points_m: Points, vehicle_T_source: Matrix | None, path: Path) -
 
 def _clouds_by_name(folder: Path) -> dict[str, Path]:
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder; a recording holds sensor/ and reference/")
+        raise FileNotFoundError(f"{folder}: no such folder; a recording holds {RecordedFrames.layout}")
     clouds: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
         if path.name.startswith("."):  # what file managers and version control leave behind
@@ -164,45 +186,31 @@ def _clouds_by_name(folder: Path) -> dict[str, Path]:
     return clouds
 
 
-def _check_pairs(folder: Path, sensor: Set[str], reference: Set[str]) -> None:
-    if not sensor and not reference:
-        raise ValueError(f"{folder}: no frames; both sensor/ and reference/ are empty")
+def _check_same_names(folder: Path, files: Mapping[str, Mapping[str, Path]]) -> None:
+    places = " and ".join(f"{place}/" for place in files)
+    anywhere = set[str]().union(*files.values())
+    if not anywhere:
+        raise ValueError(f"{folder}: no frames; {places} are empty")
     complaints = [
-        f"{len(alone)} only in {source}/ ({', '.join(alone[:NAMES_SHOWN])}{', ...' * (len(alone) > NAMES_SHOWN)})"
-        for source, alone in (
-            ("sensor", sorted(sensor - reference, key=_natural)),
-            ("reference", sorted(reference - sensor, key=_natural)),
-        )
-        if alone
+        f"{len(gaps)} missing in {place}/ ({_some_of(gaps)})"
+        for place, clouds in files.items()
+        if (gaps := sorted(anywhere - clouds.keys(), key=_natural))
     ]
     if complaints:
-        raise ValueError(f"{folder}: every frame needs a file on both sides; {' and '.join(complaints)}")
+        raise ValueError(f"{folder}: every frame needs a file in {places}; {' and '.join(complaints)}")
+
+
+def _some_of(names: Sequence[str]) -> str:
+    return ", ".join([*names[:MAX_NAMES_SHOWN], *["..."] * (len(names) > MAX_NAMES_SHOWN)])
+
+
+def _check_places(folder: Path, poses: Mapping[str, Matrix], files: Mapping[str, object]) -> None:
+    for place in poses:
+        if place not in files:
+            raise ValueError(f"{folder / POSES_FILE}: {place.replace('/', '.')}: there is no {place}/ beside it")
 
 
 def _natural(name: str) -> tuple[list[str | int], str]:
     # Text and number alternate, starting with text, so that two keys always compare; the name itself breaks a tie.
     parts = re.split(r"(\d+)", name)
     return [int(part) if position % 2 else part for position, part in enumerate(parts)], name
-
-
-def _read_poses(path: Path) -> dict[str, Matrix]:
-    if not path.exists():
-        return {}
-    allowed = "allowed are sensor and reference, each with a 4x4 vehicle_T_sensor"
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ValueError(f"{path}: not a YAML file ({' '.join(str(error).split())})") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: got {type(content).__name__}, not a mapping; {allowed}")
-    try:
-        poses = _Poses.model_validate(content)
-    except ValidationError as error:
-        complaints = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
-        raise ValueError(f"{path}: {'; '.join(complaints)}; {allowed}") from error
-    sources = {"sensor": poses.sensor, "reference": poses.reference}
-    return {
-        name: check_rigid(source.vehicle_T_sensor, f"{path}: {name}.vehicle_T_sensor")
-        for name, source in sources.items()
-        if source is not None
-    }

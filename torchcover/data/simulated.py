@@ -8,11 +8,12 @@ from typing import Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from torchcover.data.frame import Frame
 from torchcover.detection.boxes import Boxes, points_in_boxes
-from torchcover.simulation import Label, PaperReference, ReferenceSensor, Rig, Scenario, Simulator
+from torchcover.simulation import Label, PaperReference, ReferenceSensor, Rig, Scenario, Sensor, Simulator
 
 
 class SimulatedFrames(Dataset[Frame]):
@@ -99,6 +100,26 @@ class SimulatedFrames(Dataset[Frame]):
     def every_s(self) -> float:
         """Time between one frame and the next."""
         return self.simulator.every_s
+
+    @property
+    def sensors(self) -> Mapping[str, Sequence[Sensor]]:
+        """The sensors of each rig."""
+        return {name: rig.sensors for name, rig in self.rigs.items()}
+
+    @property
+    def ego_outline_m(self) -> NDArray[np.float64]:
+        """(4, 2) corners x, y of the ego as seen from above, counter-clockwise; no world is built for it."""
+        return self.scenario.ego_box().outline_m
+
+    @property
+    def description(self) -> Mapping[str, object]:
+        """The scenario's name and the seed."""
+        return {"scenario": self.scenario.name, "frames": None, "seed": self.seed}
+
+    @property
+    def reference(self) -> Mapping[str, object]:
+        """The name of the reference sensor and the time between two frames."""
+        return {"sensor": self.reference_sensor.name, "every_s": self.every_s}
 
     def with_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
         """The same instants as another reference sensor sees them; the geometry is built once for both."""

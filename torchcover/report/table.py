@@ -1,121 +1,181 @@
-"""The numbers of a coverage, a row for each region and height band: on the terminal, as CSV and as JSON."""
+"""The table: regions, bands, quantities and rigs as data. How it is written down is the business of the renderers."""
 
 import math
-from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
-from rich.table import Table
-from rich.text import Text
+from torchcover.coverage import (
+    BevGrid,
+    Coverage,
+    Difference,
+    Number,
+    Quantity,
+    Region,
+    RegionSummary,
+    check_paired,
+    differences,
+)
+from torchcover.report.remarks import Remark, remarks_on
+from torchcover.report.rounding import rounded
 
-from torchcover.coverage import Coverage, Region, RegionSummary
-from torchcover.coverage.blocks import MIN_BLOCKS
-from torchcover.report.records import columns_of, conditions_of, json_record, records_of, write_records
-from torchcover.report.wording import blocks_of_steps, metres, percent, span, steps_and_cell
 
-
-def coverage_table(coverage: Coverage, regions: Sequence[Region], notes: Sequence[str] = ()) -> Table:
-    """The table for the terminal; the conditions it holds under, and what went wrong, are its caption.
+@dataclass(frozen=True)
+class Row:
+    """The numbers of one rig in one region and height band.
 
     Args:
-        coverage: What `CoverageMetric.compute` returned.
-        regions: Regions within the grid.
-        notes: More conditions for the caption.
+        rig: Name of the rig.
+        region: The region.
+        summary: Its numbers by the key of their quantity, and how many of its cells are known.
+        best: Keys of the quantities in which no other rig is better here, to the digits that are shown; none if there
+            is no other rig.
+        differences: Key of the quantity -> difference to the first rig; empty if there is no other rig.
+    """
+
+    rig: str
+    region: Region
+    summary: RegionSummary
+    best: frozenset[str]
+    differences: Mapping[str, Difference]
+
+
+class Conditions(NamedTuple):
+    """What the numbers of one rig hold under.
+
+    Args:
+        counts: What happened in the run, as in `Coverage.counts`.
+        blocks: How many blocks of contiguous steps the errors come from; None without errors.
+        steps_per_block: Steps of a full one.
+        remarks: What its reader has to know.
+    """
+
+    counts: Mapping[str, int]
+    blocks: int | None
+    steps_per_block: int | None
+    remarks: tuple[Remark, ...]
+
+
+@dataclass(frozen=True)
+class CoverageTable:
+    """What a run has found, for one rig or for several over the same frames.
+
+    Args:
+        quantities: What there is a number of.
+        grid: Cells and height bands.
+        thresholds: Detection thresholds in metres.
+        max_radius: Saturation of the radius in metres.
+        rows: Name of the rig -> its rows in the order of the regions, then of the bands.
+        conditions: Name of the rig -> what its numbers hold under.
+        notes: What else they hold under, in words of the caller.
+    """
+
+    quantities: tuple[Quantity, ...]
+    grid: BevGrid
+    thresholds: tuple[float, ...]
+    max_radius: float
+    rows: Mapping[str, tuple[Row, ...]]
+    conditions: Mapping[str, Conditions]
+    notes: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls, coverages: Mapping[str, Coverage], regions: Sequence[Region], notes: Sequence[str] = ()
+    ) -> "CoverageTable":
+        """Make the table of one rig, or of several that were measured together.
+
+        Args:
+            coverages: What `CoverageMetric.compute` returned, by the name of the rig.
+            regions: Regions within the grid.
+            notes: What else the numbers hold under.
+
+        Raises:
+            ValueError: No rig; several that are not paired, as in `check_paired`; regions that `Coverage.summary`
+                refuses.
+        """
+        if not coverages:
+            raise ValueError("a table needs at least one rig; got none")
+        if len(coverages) > 1:
+            check_paired(coverages)
+        first = next(iter(coverages.values()))
+        summaries = {rig: coverage.summary(regions) for rig, coverage in coverages.items()}
+        rows = _rows(coverages, regions, summaries)
+        return cls(
+            quantities=first.quantities,
+            grid=first.grid,
+            thresholds=first.thresholds,
+            max_radius=first.max_radius,
+            rows={rig: tuple(row[rig] for row in rows) for rig in coverages},
+            conditions={rig: _conditions(coverage, summaries[rig]) for rig, coverage in coverages.items()},
+            notes=tuple(notes),
+        )
+
+    @property
+    def rigs(self) -> tuple[str, ...]:
+        """Names of the rigs."""
+        return tuple(self.rows)
+
+    @property
+    def first(self) -> Conditions:
+        """The conditions of the first rig; steps and blocks are those of every rig."""
+        return self.conditions[self.rigs[0]]
+
+    @property
+    def places(self) -> list[tuple[Row, ...]]:
+        """The rows of each region and band: one for each rig."""
+        return list(zip(*self.rows.values(), strict=True))
+
+
+def _rows(
+    coverages: Mapping[str, Coverage], regions: Sequence[Region], summaries: Mapping[str, Sequence[RegionSummary]]
+) -> list[dict[str, Row]]:
+    """For each region and band, the row of each rig."""
+    first = next(iter(coverages.values()))
+    places = [(region, height) for region in regions for height in first.grid.heights]
+    several = len(coverages) > 1
+    rows = []
+    for (region, height), of_rigs in zip(places, zip(*summaries.values(), strict=True), strict=True):
+        best = _best(first.quantities, of_rigs) if several else [frozenset[str]()]
+        compared = differences(coverages, region, height) if several else {}
+        each = zip(coverages, of_rigs, best, strict=True)
+        rows.append({rig: Row(rig, region, summary, own, compared.get(rig, {})) for rig, summary, own in each})
+    return rows
+
+
+def _best(quantities: Sequence[Quantity], rigs: Sequence[RegionSummary]) -> list[frozenset[str]]:
+    """For each rig, the quantities in which it is best."""
+    marks = {
+        quantity.key: best_of([summary.numbers[quantity.key] for summary in rigs], quantity) for quantity in quantities
+    }
+    return [frozenset(key for key, marked in marks.items() if marked[at]) for at in range(len(rigs))]
+
+
+def best_of(numbers: Sequence[Number], quantity: Quantity) -> list[bool]:
+    """Which numbers are the best of their row.
+
+    Args:
+        numbers: One for each rig.
+        quantity: What they are.
 
     Returns:
-        A table for `rich.console.Console.print`: mean blind spot radius in metres, detection and known cells in
-        percent, with standard errors if there are any. A number over no known cell reads "unknown".
+        True for the best and for all that look the same as they are shown; never for an unknown one.
 
-    Raises:
-        ValueError: As `Coverage.summary`.
+    Example:
+        >>> from torchcover.coverage.quantity import RADIUS
+        >>> none = float("nan")
+        >>> best_of([Number(0.121, none), Number(0.123, none), Number(0.13, none), Number(none, none)], RADIUS)
+        [True, True, False, False]
     """
-    rows = coverage.summary(regions)
-    caption = Text("\n".join([*notes_on(coverage, rows), *notes]))
-    table = Table(caption=caption, caption_justify="left", caption_style="")
-    table.add_column("region")
-    table.add_column("height")
-    table.add_column("mean blind spot\nradius (m)", justify="right")
-    for threshold in coverage.thresholds:
-        table.add_column(f"detection within\n{threshold:g} m (%)", justify="right")
-    table.add_column("known cells\n(%)", justify="right")
-    for at, row in enumerate(rows, 1):
-        table.add_row(*_cells(row), end_section=at % len(coverage.grid.heights) == 0)
-    return table
+    known = [number for number in numbers if not math.isnan(number.value)]
+    if not known:
+        return [False] * len(numbers)
+    best = (min if quantity.lower_is_better else max)(known, key=lambda number: number.value)
+    looks = rounded(best, quantity.unit)
+    return [number in known and rounded(number, quantity.unit) == looks for number in numbers]
 
 
-def write_csv(coverage: Coverage, regions: Sequence[Region], path: str | Path) -> None:
-    """Write the rows as CSV, with the bounds of region and band, the cell size and the steps on every row.
-
-    Args:
-        coverage: What `CoverageMetric.compute` returned.
-        regions: Regions within the grid.
-        path: File to write. An unknown number is an empty field, an infinite one is `inf`.
-
-    Raises:
-        ValueError: As `Coverage.summary`.
-    """
-    write_records(columns_of(coverage), records_of(coverage, regions, coverage.summary(regions)), path)
-
-
-def summary_dict(coverage: Coverage, regions: Sequence[Region]) -> dict[str, Any]:
-    """Everything but the maps, for `summary.json`.
-
-    Args:
-        coverage: What `CoverageMetric.compute` returned.
-        regions: Regions within the grid.
-
-    Returns:
-        A dict that `json.dumps(..., allow_nan=False)` takes: lengths in metres, detection and shares in [0, 1]. JSON
-        has neither NaN nor infinity: an unknown number is None, an infinite one the string "Infinity".
-
-    Raises:
-        ValueError: As `Coverage.summary`.
-    """
-    return {
-        **conditions_of(coverage),
-        "counts": dict(coverage.counts),
-        "rows": [json_record(record) for record in records_of(coverage, regions, coverage.summary(regions))],
-    }
-
-
-def notes_on(coverage: Coverage, rows: Sequence[RegionSummary]) -> list[str]:
-    """The conditions that the rows of a coverage hold under, and what went wrong, a sentence each."""
-    bands = ", ".join(f"{name} z {span(band)}" for name, band in coverage.grid.heights.items())
-    notes = [f"{steps_and_cell(coverage.counts['steps'], coverage.grid)}; {bands}."]
-    if not rows:
-        notes.append("No region, so no number: the maps cover the whole grid.")
-    if any(row.known_cells < row.cells for row in rows):
-        notes.append("Means over the known cells only; the fewer are known, the more the numbers may flatter the rig.")
-    return notes + _on_errors(coverage, rows) + _trouble(coverage)
-
-
-def _on_errors(coverage: Coverage, rows: Sequence[RegionSummary]) -> list[str]:
-    blocks, steps = blocks_of_steps(coverage)
-    if blocks is None:
-        return []
-    if blocks < MIN_BLOCKS:
-        return [f"Not enough steps for errors: {blocks} block{'s' * (blocks != 1)}, {MIN_BLOCKS} are needed."]
-    notes = [f"± is one standard error, from {blocks} blocks of up to {steps:,} steps in a row."]
-    if any(math.isfinite(row.radius_m) and math.isnan(row.radius_error_m) for row in rows):
-        notes.append("No ± where one block alone has probed the region.")
-    return notes
-
-
-def _cells(row: RegionSummary) -> list[Text]:
-    radius = metres(row.radius_m, row.radius_error_m)
-    detection = [percent(row.detection[threshold], row.detection_error[threshold]) for threshold in row.detection]
-    # As Text, for names may hold what rich takes for markup.
-    return [Text(cell) for cell in (row.region, row.height, radius, *detection, percent(row.known_share))]
-
-
-def _trouble(coverage: Coverage) -> list[str]:
-    counts, limit_m = coverage.counts, coverage.max_radius
-    steps, inside = counts["steps"], int(coverage.points.sum())
-    far = "infinitely far" if math.isinf(limit_m) else f"{limit_m:.4g} m far, the limit"
-    notes = {
-        "empty_sensor_steps": f"of {steps:,} steps had no sensor point: they count as blind, not as missing.",
-        "empty_reference_steps": f"of {steps:,} steps had no reference point: they say nothing.",
-        "saturated_points": f"of {inside:,} reference points count as {far}: no sensor point was nearer.",
-        "outside_points": f"of {inside + counts['outside_points']:,} reference points lie outside the grid: left out.",
-    }
-    return [f"{counts[name]:,} {note}" for name, note in notes.items() if counts[name]]
+def _conditions(coverage: Coverage, rows: Sequence[RegionSummary]) -> Conditions:
+    blocks = coverage.blocks
+    used = None if blocks is None else int((blocks.steps > 0).sum())
+    longest = None if blocks is None else int(blocks.steps.max())
+    return Conditions(dict(coverage.counts), used, longest, remarks_on(coverage, used, rows))

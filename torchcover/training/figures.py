@@ -1,6 +1,6 @@
 """Coverage maps as figures and images, for whichever logger takes them."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -9,24 +9,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from torchcover.coverage import Coverage
-from torchcover.report import draw_side_by_side
-from torchcover.report.metrics import metrics_of
-from torchcover.report.wording import span, steps_and_cell
-
-
-def map_figures(coverage: Coverage) -> Iterator[tuple[str, Figure]]:
-    """The maps of a coverage: for each metric a tag such as `radius` or `detection_0.4m` and a figure of all bands.
-
-    Args:
-        coverage: What `CoverageMetric.compute` returned.
-    """
-    heights = coverage.grid.heights
-    headings = [f"{name}, z {span(band)}" for name, band in heights.items()]
-    conditions = steps_and_cell(coverage.counts["steps"], coverage.grid)
-    for metric in metrics_of([coverage]):
-        bands = dict(zip(headings, metric.values[0], strict=True))
-        figure = draw_side_by_side(bands, coverage.grid, metric.scale, title=metric.title, subtitle=conditions)
-        yield metric.stem, figure
+from torchcover.report import band_figures
 
 
 def log_maps(coverage: Coverage, loggers: Sequence[Any], prefix: str, step: int) -> list[str]:
@@ -38,7 +21,7 @@ def log_maps(coverage: Coverage, loggers: Sequence[Any], prefix: str, step: int)
     Args:
         coverage: What `CoverageMetric.compute` returned.
         loggers: Lightning's loggers, or objects like them.
-        prefix: In front of the tags of `map_figures`, with a slash between.
+        prefix: In front of the tags of `band_figures`, with a slash between.
         step: Where on the logger's axis.
 
     Returns:
@@ -47,7 +30,7 @@ def log_maps(coverage: Coverage, loggers: Sequence[Any], prefix: str, step: int)
     takers = [(logger, _taker(logger)) for logger in loggers]
     able = [take for _, take in takers if take is not None]
     if able:
-        for tag, figure in map_figures(coverage):
+        for tag, figure in band_figures(coverage):
             for take in able:
                 take(f"{prefix}/{tag}", figure, step)
     return [type(logger).__name__ for logger, take in takers if take is None]

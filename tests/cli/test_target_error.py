@@ -1,0 +1,74 @@
+"""`--target-error`: a run that ends when it is good enough."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from torchcover import Coverage
+
+
+@pytest.fixture
+def long_recording(tmp_path):
+    """200 frames of two reference points in every step, with random radii."""
+    folder = tmp_path / "recording"
+    random = np.random.default_rng(0)
+    for source in ("sensor", "reference"):
+        (folder / source).mkdir(parents=True)
+    reference = np.array([[2.0, 0.1, 0.0], [30.0, 0.1, 0.0]], dtype=np.float32)
+    for frame in range(200):
+        below = np.array([0.0, 0.0, random.random()], dtype=np.float32)
+        np.save(folder / "sensor" / f"f{frame:03}.npy", reference - below)
+        np.save(folder / "reference" / f"f{frame:03}.npy", reference)
+    return folder
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_evaluate_stops_when_it_is_good_enough(torchcover, long_recording, tmp_path, workers):
+    arguments = ["--frames", long_recording, "--cell", 4, "--out", tmp_path / "out", "--workers", workers]
+    code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "0.05m", "--target-error", "20%")
+    assert code == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    steps = summary["counts"]["steps"]
+    assert 32 <= steps < 150
+    assert f"Target error reached after {steps} steps." in printed
+    assert (summary["complete"], summary["target_error"]["reached"]) == (True, True)
+    assert all(row["radius_m_error"] <= 0.05 for row in summary["rows"] if row["known_cells"])
+    assert re.search(r"0\.\d+ ± 0\.0\d+", printed)
+
+
+def test_a_target_beyond_the_steps_ends_the_run_as_ever_and_says_what_it_would_take(
+    torchcover, long_recording, tmp_path
+):
+    arguments = ["--frames", long_recording, "--cell", 4, "--out", tmp_path / "out", "--steps", 40]
+    code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "1e-3m")
+    assert code == 0
+    assert "Target error not reached in 40 steps" in printed
+    assert "20m ground, radius_m of" in printed
+    target = json.loads((tmp_path / "out" / "summary.json").read_text())["target_error"]
+    assert target["reached"] is False
+    assert 1_000 < target["steps_needed"] < 1_000_000
+    assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["steps"] == 40
+
+
+def test_compare_stops_when_rigs_and_differences_are_good_enough(torchcover, worlds):
+    options = [
+        "--scenario",
+        worlds / "yard.yaml",
+        "--cell",
+        4,
+        "--threshold",
+        2,
+        "--rays",
+        512,
+        "--out",
+        worlds / "out",
+    ]
+    rigs = [worlds / "low.yaml", worlds / "both.yaml"]
+    code, printed, _ = torchcover("compare", *rigs, *options, "--target-error", "50m")
+    assert code == 0
+    assert "Target error reached after 32 steps." in printed
+    assert "Difference to low: mean blind spot radius (m)" in printed
+    target = json.loads((worlds / "out" / "summary.json").read_text())["target_error"]
+    assert {number["rig"] for number in target["numbers"]} == {"low", "both", "both minus low"}

@@ -1,0 +1,183 @@
+"""The one loop: every observer has seen the same frames, however it ends."""
+
+import os
+import signal
+import threading
+
+import pytest
+import torch
+
+from torchcover import BevGrid, CoverageMetric
+from torchcover.data import BadFrameError
+from torchcover.evaluation import CoverageObserver, observe
+
+GRID = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+
+
+class Occupancy:
+    """How often each voxel of 1 m had a sensor point in it: a second observer, in one place."""
+
+    def __init__(self, size=4):
+        self.steps = torch.zeros(size, size, size, dtype=torch.int64)
+
+    def update(self, frame):
+        points = torch.cat(list(frame.clouds.values()))
+        hit = torch.zeros_like(self.steps, dtype=torch.bool)
+        hit[tuple(points.long().clamp(max=3).T)] = True
+        self.steps += hit
+
+    def compute(self):
+        return self.steps
+
+    def merge_state(self, other):
+        self.steps += other.steps
+
+
+class Names:
+    def __init__(self, then=lambda: None):
+        self.names, self.then = [], then
+
+    def update(self, frame):
+        self.names.append(frame.name)
+        self.then()
+
+
+class Spoiled:
+    """A dataset in which some frames are bad."""
+
+    def __init__(self, frames, bad):
+        self.frames, self.bad = frames, bad
+
+    def __len__(self):
+        return len(self.frames)
+
+    def __getitem__(self, index):
+        if index in self.bad:
+            raise BadFrameError(f"f{index} (frame {index}): rubbish")
+        return self.frames[index]
+
+
+def coverage(rig="a"):
+    return CoverageObserver(CoverageMetric(GRID, blocks=16), rig)
+
+
+def values(observer):
+    """A copy of what an observer has found."""
+    found = observer.compute()
+    return getattr(found, "radius", found).clone()
+
+
+@pytest.fixture
+def frames(frame_of):
+    return [frame_of(index) for index in range(6)]
+
+
+@pytest.mark.parametrize("make", [coverage, Occupancy])
+def test_observers_of_parts_merge_into_one_of_the_whole(frames, make):
+    whole, first, rest = make(), make(), make()
+    observe(frames, [whole])
+    observe(frames[:2], [first])
+    observe(frames[2:], [rest])
+    before = values(rest)
+    first.merge_state(rest)
+    torch.testing.assert_close(values(first), values(whole), rtol=1e-12, atol=0, equal_nan=True)
+    torch.testing.assert_close(values(rest), before, rtol=0, atol=0, equal_nan=True)
+
+
+def test_coverage_is_that_of_the_metric_with_weights_and_places_in_time(frames):
+    observers = {rig: coverage(rig) for rig in ("a", "b")}
+    run = observe(frames, observers.values())
+    for rig, observer in observers.items():
+        metric = CoverageMetric(GRID, blocks=16)
+        for frame in frames:
+            metric.update(frame.clouds[rig], frame.reference, weights=frame.reference_weights, index=frame.index)
+        assert torch.equal(observer.compute().radius, metric.compute().radius)
+        assert torch.equal(observer.compute().radius_error, metric.compute().radius_error)
+    assert (run.steps, dict(run.counts), run.complete) == (6, {"seen": 15}, True)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_workers_change_nothing_and_frames_come_in_order(frames, workers):
+    names, occupancy = Names(), Occupancy()
+    run = observe(frames, [names, occupancy], workers=workers, steps=5)
+    assert names.names == ["f0", "f1", "f2", "f3", "f4"]
+    assert run.steps == 5
+    assert int(occupancy.compute().max()) <= 5
+
+
+def test_of_two_rigs_none_is_meant_until_it_is_named(frames):
+    with pytest.raises(ValueError, match="say which"):
+        observe(frames, [coverage(rig=None)])
+    with pytest.raises(ValueError, match="cannot merge the coverage of rig 'b' into that of 'a'"):
+        coverage("a").merge_state(coverage("b"))
+
+
+def test_a_bad_frame_ends_the_run_and_is_noted(frames):
+    names = Names()
+    run = observe(Spoiled(frames, {3}), [names])
+    assert (run.steps, names.names, run.complete) == (3, ["f0", "f1", "f2"], False)
+    with pytest.raises(BadFrameError, match="f3"):
+        run.raise_failure()
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_bad_frames_are_skipped_if_that_is_asked_for(frames, workers):
+    names = Names()
+    run = observe(Spoiled(frames, {0, 3}), [names], skip_bad_frames=True, workers=workers)
+    assert names.names == ["f1", "f2", "f4", "f5"]
+    assert run.skipped == ["f0 (frame 0): rubbish", "f3 (frame 3): rubbish"]
+    assert run.complete
+    run.raise_failure()
+
+
+def test_without_a_good_frame_there_is_no_result(frames):
+    with pytest.raises(BadFrameError, match="f0"):
+        observe(Spoiled(frames, {0}), [Names()])
+    with pytest.raises(ValueError, match="no frame could be used"):
+        observe(Spoiled(frames, set(range(6))), [Names()], skip_bad_frames=True)
+
+
+def test_ctrl_c_within_a_frame_waits_for_all_observers(frames):
+    calls = []
+
+    def press():
+        calls.append(1)
+        if len(calls) == 3:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    before, first, last = signal.getsignal(signal.SIGINT), Names(press), Names()
+    run = observe(frames, [first, last])
+    assert first.names == last.names == ["f0", "f1", "f2"]
+    assert (run.steps, run.interrupted, run.complete) == (3, True, False)
+    assert signal.getsignal(signal.SIGINT) is before
+    with pytest.raises(KeyboardInterrupt):
+        run.raise_failure()
+
+
+def test_it_runs_in_any_thread(frames):
+    names = Names()
+    thread = threading.Thread(target=observe, args=(frames, [names]))
+    thread.start()
+    thread.join()
+    assert len(names.names) == 6
+
+
+class AfterThree:
+    """A rule that is content after three steps."""
+
+    words = "nearly there"
+
+    def is_reached(self, steps):
+        return steps >= 3
+
+    def expected_steps(self, most):
+        return min(most, 3)
+
+
+@pytest.mark.parametrize("progress", [False, True])
+def test_a_rule_ends_the_run_and_a_bar_tells_of_it(frames, progress, capsys):
+    run = observe(frames, [Names()], until=AfterThree(), progress=progress, title="frames")
+    assert (run.steps, run.complete) == (3, True)
+    told = capsys.readouterr().err
+    assert ("3/3" in told and "nearly there" in told) == progress
+    assert bool(told) == progress

@@ -1,0 +1,162 @@
+"""Target errors: what they may be, when a run stops, and what it says if it could not."""
+
+import json
+import math
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover import BevGrid, CoverageMetric, Region
+from torchcover.evaluation import CoverageObserver, Standing, TargetError, TargetWatch, outcome, standings
+
+GRID = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-0.5, 0.5), "above": (0.5, 1.0)})
+REGIONS = (Region("near", (0.0, 1.0), (0.0, 1.0)), Region("far", (1.0, 2.0), (0.0, 1.0)))
+
+
+def a_metric() -> CoverageMetric:
+    return CoverageMetric(GRID, (0.4, 0.8), blocks=16)
+
+
+def add(metric: CoverageMetric, index: int, scale: float = 0.3) -> None:
+    """A radius between 0 and 1, and one that is `scale` of it."""
+    radius = np.random.default_rng(index).random()
+    reference = torch.tensor([[0.5, 0.5, 0.0], [1.5, 0.5, 0.0]])
+    metric.update(reference - torch.tensor([[0.0, 0.0, radius], [0.0, 0.0, scale * radius]]), reference, index=index)
+
+
+def filled(steps: int, scale: float = 0.3) -> CoverageMetric:
+    metric = a_metric()
+    for index in range(steps):
+        add(metric, index, scale)
+    return metric
+
+
+def test_a_target_is_a_number_with_its_unit():
+    assert TargetError.parse([]) is None
+    assert TargetError.parse(["0.5%"]) == TargetError(detection=0.005)
+    assert TargetError.parse([".02 m", " 1e-1 % "]) == TargetError(radius_m=0.02, detection=0.001)
+
+
+@pytest.mark.parametrize(
+    "word",
+    ["0", "5", "0%", "-1m", "abc", "10cm", "nan%", "inf m", "1e999m", "1..2m", ".m", "%", "", "1 m 2%", "1,5m", "٣m"],
+)
+def test_rubbish_is_refused_by_its_name(word):
+    with pytest.raises(ValueError, match=f"target error {re.escape(word)}: a positive number with its unit"):
+        TargetError.parse(["0.1%" if word != "%" else "1m", word])
+
+
+def test_two_targets_in_one_unit_are_refused():
+    with pytest.raises(ValueError, match="target error 2%: another number in % was given before"):
+        TargetError.parse(["1%", "1m", "2%"])
+
+
+def test_every_known_number_of_every_rig_and_every_difference_counts():
+    coverages = {"a": filled(40).compute(), "b": filled(40, scale=0.5).compute(), "c": filled(40).compute()}
+    found = standings(TargetError(radius_m=0.1, detection=0.05), coverages, REGIONS)
+    names = ["a", "b", "c", "b minus a", "c minus a"]
+    quantities = ["radius_m", "detection_0.4m", "detection_0.8m"]
+    # Nothing is known above: nothing waits for it.
+    assert [(one.region, one.height, one.rig, one.quantity) for one in found] == [
+        (region, "all", name, quantity) for region in ("near", "far") for name in names for quantity in quantities
+    ]
+    assert {one.target for one in found if one.quantity == "radius_m"} == {0.1}
+    assert {one.target for one in found if one.quantity != "radius_m"} == {0.05}
+    by_name = {(one.rig, one.region, one.quantity): one.error for one in found}
+    (near, _, far, _) = coverages["b"].summary(REGIONS)
+    assert by_name["b", "near", "radius_m"] == near.numbers["radius_m"].error
+    assert by_name["b", "far", "detection_0.4m"] == far.numbers["detection_0.4m"].error
+    difference = coverages["b"].estimate(REGIONS[1], "all").minus(coverages["a"].estimate(REGIONS[1], "all"))
+    assert by_name["b minus a", "far", "radius_m"] == float(difference.error[0]) > 0
+    assert by_name["c minus a", "far", "radius_m"] == 0.0
+    only_radius = standings(TargetError(radius_m=0.1), coverages, REGIONS)
+    assert {one.quantity for one in only_radius} == {"radius_m"}
+
+
+def test_errors_fall_with_the_root_of_the_steps():
+    standing = Standing("a", "near", "all", "radius_m", error=0.3, target=0.1, steps=100)
+    assert not standing.reached
+    assert standing.steps_needed == pytest.approx(900, abs=1)
+    unknown = Standing("a", "near", "all", "radius_m", error=math.nan, target=0.1, steps=100)
+    assert (unknown.reached, unknown.steps_needed) == (False, None)
+    early = Standing("a", "near", "all", "radius_m", error=0.0, target=0.1, steps=31)
+    assert (early.reached, early.steps_needed) == (False, 32)
+
+
+def test_a_run_stops_at_the_first_look_at_which_every_error_is_small_enough():
+    target = TargetError(radius_m=0.025)
+    metric = a_metric()
+    watch = TargetWatch(target, {"a": CoverageObserver(metric)}, REGIONS)
+    looks, most = [], 4096
+    for index in range(most):
+        add(metric, index)
+        steps, before = index + 1, watch.next_look
+        assert watch.expected_steps(most) <= most
+        if watch.is_reached(steps):
+            break
+        if watch.next_look != before:
+            looks.append(steps)
+            assert watch.worst.error > 0.025
+            assert watch.worst.region == "near"
+            assert steps < watch.expected_steps(most)
+    # 0.29 / sqrt(steps) is the error of the mean of numbers in [0, 1).
+    assert 0.5 * (0.289 / 0.025) ** 2 < steps < 2 * (0.289 / 0.025) ** 2
+    assert looks[0] == 32
+    assert (np.diff([*looks, steps]) >= 3).all()
+    assert len(looks) < 15
+    record, lines = outcome(target, {"a": metric.compute()}, REGIONS)
+    assert record["reached"] is True
+    assert record["steps_needed"] == steps
+    assert record["unknown"] == ["near above", "far above"]
+    assert lines == [
+        f"Target error reached after {steps} steps.",
+        "Not waited for, as no cell of it is known: near above, far above.",
+    ]
+
+
+@pytest.mark.parametrize("steps", [5, 31])
+def test_however_good_it_looks_no_run_ends_before_32_steps(steps):
+    watch = TargetWatch(TargetError(radius_m=1e6), {"a": CoverageObserver(filled(steps))}, REGIONS)
+    assert not watch.is_reached(steps)
+    record, (first, *_) = outcome(watch.target, {"a": filled(steps).compute()}, REGIONS)
+    assert record["reached"] is False
+    assert first.startswith(f"Target error not reached in {steps} steps")
+
+
+def test_nothing_known_is_not_good_enough():
+    metric = a_metric()
+    for index in range(40):
+        metric.update(torch.zeros(1, 3), torch.tensor([[-9.0, 0.0, 0.0]]), index=index)
+    watch = TargetWatch(TargetError(radius_m=1.0), {"a": CoverageObserver(metric)}, REGIONS)
+    assert not watch.is_reached(40)
+    assert watch.expected_steps(100) == 100
+    record, lines = outcome(watch.target, {"a": metric.compute()}, REGIONS)
+    assert (record["reached"], record["steps_needed"], record["numbers"]) == (False, None, [])
+    assert lines[0] == "Target error not reached: no region has a known cell."
+
+
+def test_what_was_not_reached_is_told_for_each_region_with_the_steps_it_would_take():
+    target = TargetError(radius_m=0.005, detection=0.5)
+    record, lines = outcome(target, {"a": filled(64, scale=0.01).compute()}, REGIONS)
+    assert re.fullmatch(
+        r"  near all, radius_m of a: ± 0\.03\d m \(target 0\.005 m\), about \d,\d00 steps are needed", lines[1]
+    )
+    assert re.fullmatch(r"  far all, radius_m of a: ± 0\.000\d+ m \(target 0\.005 m\), reached", lines[2])
+    assert record["radius_m"] == 0.005
+    worst = max(record["numbers"], key=lambda number: number["steps_needed"])
+    assert record["steps_needed"] == worst["steps_needed"] == math.ceil(64 * (worst["error"] / 0.005) ** 2)
+    json.dumps(record, allow_nan=False)
+
+
+def test_without_an_error_no_number_of_steps_is_made_up():
+    record, lines = outcome(TargetError(radius_m=0.01), {"a": filled(5).compute()}, REGIONS)
+    assert record["steps_needed"] is None
+    assert {number["error"] for number in record["numbers"]} == {None}
+    assert lines[1] == "  near all, radius_m of a: not enough steps for an error"
+    json.dumps(record, allow_nan=False)
+
+
+def test_without_a_target_nothing_is_said():
+    assert outcome(None, {"a": filled(5).compute()}, REGIONS) == (None, [])

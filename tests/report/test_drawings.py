@@ -1,0 +1,298 @@
+"""Drawings without cells: a rig on its vehicle, and a frame of a scenario."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from matplotlib import colormaps
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import to_rgb
+from matplotlib.figure import Figure
+
+from torchcover import BevGrid
+from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.report import ActorMark, SensorView, draw_depths, draw_four_views, draw_rig, draw_scene
+from torchcover.report.drawings.depth import SKY
+from torchcover.report.drawings.rig import FIRST_REACH_M
+from torchcover.report.drawings.scene import REFERENCE, SENSOR
+from torchcover.report.maps.overlay import COLOURS
+
+VERTICES = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (0.0, 1.5)])
+FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [1, 5, 7], [1, 7, 3], [0, 4, 5], [0, 5, 1]])
+
+
+def view(yaw=0.0, pitch=0.0, *, at=(2.0, 0.0, 1.0), wide=90.0, high=(-30.0, 10.0), name="lidar", range_m=99.0):
+    pose = rigid(rotation_from_euler(yaw, pitch, 0.0), at)
+    return SensorView(name, pose, wide, high, range_m)
+
+
+class Picture:
+    """The pixels of a figure, addressed in metres."""
+
+    def __init__(self, figure: Figure) -> None:
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        self.figure = figure
+        self.pixels = np.asarray(canvas.buffer_rgba())[..., :3] / 255.0
+
+    def at(self, axes: int, x: float, y: float) -> np.ndarray:
+        column, row = self.figure.axes[axes].transData.transform((x, y))
+        return self.pixels[len(self.pixels) - 1 - int(row), int(column)]
+
+    def tinted(self, axes: int, x: float, y: float) -> bool:
+        return bool(np.ptp(self.at(axes, x, y)) > 0.03)
+
+
+def rig(*sensors, **options) -> Picture:
+    return Picture(draw_rig(VERTICES, FACES, sensors, title=options.pop("title", "Rig"), **options))
+
+
+def test_a_sensor_sees_within_its_angles_however_it_is_turned():
+    def direction(azimuth, elevation):
+        a, e = np.deg2rad([azimuth, elevation])
+        return [np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)]
+
+    left_down = view(yaw=90.0, pitch=20.0)
+    inside = [direction(90, -20), direction(90, -49), direction(90, -11), direction(60, -20)]
+    outside = [direction(90, -51), direction(90, -9), direction(0, -20), direction(-90, -20)]
+    assert left_down.sees(np.array(inside)).all()
+    assert not left_down.sees(np.array(outside)).any()
+
+
+@pytest.mark.parametrize("yaw", [-170.0, -90.0, 0.0, 33.0, 180.0])
+def test_place_and_direction_are_those_of_the_pose(yaw):
+    sensor = view(yaw=yaw, pitch=20.0, at=(1.0, -2.0, 3.0))
+    assert (sensor.x_m, sensor.y_m, sensor.position_m[2]) == (1.0, -2.0, 3.0)
+    assert sensor.yaw_deg == pytest.approx(yaw)
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("vehicle_T_sensor", np.full((4, 4), np.nan)),
+        ("vehicle_T_sensor", np.eye(3)),
+        ("horizontal_fov_deg", 361.0),
+        ("horizontal_fov_deg", 0.0),
+        ("vertical_fov_deg", (10.0, -10.0)),
+        ("vertical_fov_deg", (-91.0, 0.0)),
+        ("range_m", 0.0),
+    ],
+)
+def test_an_impossible_sensor_is_refused_by_name(field, value):
+    with pytest.raises(ValueError, match=f"'lidar': {field}"):
+        replace(view(), **{field: value})
+
+
+def test_from_above_the_sector_lies_about_the_yaw():
+    picture = rig(view(yaw=90.0, at=(0.0, 0.0, 2.0), wide=60.0))
+    assert picture.tinted(0, 0.0, 3.0)
+    assert not picture.tinted(0, 2.5, 1.2)
+    assert not picture.tinted(0, 0.0, -1.2)
+    assert not picture.tinted(0, 0.0, FIRST_REACH_M + 0.3)
+
+
+def test_from_the_side_the_fan_lies_about_the_pitch_and_ends_at_the_ground():
+    picture = rig(view(high=(-30.0, 10.0)))
+    assert picture.tinted(1, 4.0, 1.1)
+    assert picture.tinted(1, 4.0, 0.1)
+    assert not picture.tinted(1, 4.0, 1.6)
+    assert not picture.tinted(1, 2.6, 0.3)
+    below = picture.at(1, 4.5, -0.2)
+    assert below == pytest.approx(picture.at(1, -1.0, -0.2))
+
+
+def test_a_full_turn_is_a_fan_to_the_front_and_one_to_the_rear():
+    picture = rig(view(at=(0.0, 0.0, 2.0), wide=360.0, high=(-10.0, 10.0)))
+    assert picture.tinted(1, 3.0, 2.0)
+    assert picture.tinted(1, -3.0, 2.0)
+    assert not picture.tinted(1, 0.0, 2.6)
+    assert [text.get_text() for text in picture.figure.axes[1].texts].count("1") == 2
+
+
+def test_a_sensor_that_looks_sideways_is_marked_though_it_has_no_fan():
+    picture = rig(view(yaw=90.0), view())
+    labels = [text.get_text() for text in picture.figure.axes[1].texts]
+    assert labels.count("1") == 1
+    assert labels.count("2") == 1
+
+
+def test_a_short_range_is_drawn_as_it_is():
+    picture = rig(view(range_m=1.0))
+    assert picture.tinted(0, 2.8, 0.2)
+    assert not picture.tinted(0, 3.3, 0.2)
+
+
+def test_every_sensor_is_named_with_its_angles_and_nothing_is_clipped():
+    sensors = [view(yaw=30.0 * k, name=f"${k} a sensor with a long name") for k in range(9)]
+    picture = rig(*sensors, title="A title that is longer than the paper is wide " * 3, subtitle="small")
+    (legend,) = [axes.get_legend() for axes in picture.figure.axes if axes.get_legend()]
+    entries = [text.get_text() for text in legend.get_texts()]
+    assert entries[0] == "1  $0 a sensor with a long name: 90.0° wide, -30.0° to 10.0° high, to 99 m"
+    assert len(entries) == 9
+    pixels = picture.pixels
+    for border in (pixels[:5], pixels[-5:], pixels[:, :5], pixels[:, -5:]):
+        assert (border == 1.0).all()
+    above, side = picture.figure.axes
+    assert (above.get_ylabel(), side.get_xlabel(), side.get_ylabel()) == ("y left (m)", "x forward (m)", "z up (m)")
+    assert not above.get_tightbbox().overlaps(side.get_tightbbox())
+    for axes in (above, side):
+        width, height = axes.get_window_extent().size
+        assert width / np.ptp(axes.get_xlim()) == pytest.approx(height / np.ptp(axes.get_ylim()))
+
+
+def box(x: float, y: float) -> np.ndarray:
+    return np.array([[x - 2, y - 1], [x + 2, y - 1], [x + 2, y + 1], [x - 2, y + 1]])
+
+
+def scene(**options) -> Picture:
+    nothing = np.zeros((0, 3), dtype=np.float32)
+    given = {"ego_outline_m": box(0, 0), "actors": [], "sensor": nothing, "reference": nothing, "title": "Scene"}
+    return Picture(draw_scene((-20.0, 30.0), (-10.0, 10.0), **(given | options)))
+
+
+def test_actors_are_where_they_are_in_the_colour_of_their_category():
+    actors = [ActorMark("car", box(20, 5)), ActorMark("car", box(10, -5)), ActorMark("bus", box(-10, 5))]
+    picture = scene(actors=[*actors, ActorMark("car", box(99, 0))])
+    alone = scene(actors=actors[2:])
+    first, second, bus = (picture.at(0, *place) for place in ((20, 5), (10, -5), (-10, 5)))
+    assert first == pytest.approx(second)
+    assert abs(first - bus).max() > 0.1
+    assert alone.at(0, -10, 5) == pytest.approx(bus)
+    assert picture.at(0, 20, -5) == pytest.approx((1, 1, 1))
+    entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
+    assert entries[2:] == ["car (2)", "bus (1)", "ego"]
+
+
+def test_clouds_are_drawn_the_rig_over_the_reference():
+    line = np.stack([np.linspace(5, 25, 4000), np.full(4000, 5.0), np.zeros(4000)], axis=1)
+    picture = scene(reference=line, sensor=line[:2000])
+    assert picture.at(0, 8.0, 5.0) == pytest.approx(to_rgb(SENSOR), abs=0.02)
+    assert picture.at(0, 22.0, 5.0) == pytest.approx(to_rgb(REFERENCE), abs=0.02)
+    entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
+    assert entries[:2] == ["reference points (4,000)", "points of the rig (2,000)"]
+
+
+def test_colours_of_sensors_differ():
+    assert len(set(COLOURS)) == len(COLOURS)
+
+
+def depths(images, **options) -> Picture:
+    return Picture(draw_depths(images, title=options.pop("title", "Depths"), **options))
+
+
+def test_a_depth_image_stands_upright_and_shows_what_has_no_depth():
+    image = np.full((20, 30), 10.0)
+    image[:5] = np.inf
+    image[-5:] = 2.0
+    image[:, :3] = np.nan
+    picture = depths({"front": image})
+    # Cells count from below, rows of an image from above.
+    sky, wall, road = (picture.at(0, 15, height) for height in (18, 10, 2))
+    assert sky == pytest.approx(to_rgb(SKY), abs=0.02)
+    assert abs(wall - road).max() > 0.2
+    hatched = np.array([picture.at(0, 1, height) for height in np.arange(0.5, 19.0, 0.1)])
+    assert np.ptp(hatched, axis=1).max() < 0.02
+    assert np.ptp(hatched[:, 0]) > 0.02
+    entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
+    assert entries == ["nothing within range (22.5 % of the pixels)", "no ray: beyond the lens (10.0 % of the pixels)"]
+
+
+def test_depth_images_of_one_rig_share_their_colours_and_twice_as_far_is_one_step():
+    near, middle, far, all_of_them = (np.full((10, 12), value) for value in (4.0, 8.0, 16.0, 4.0))
+    all_of_them[:5] = 16.0
+    picture = depths({"a": near, "b": middle, "c": far, "d": all_of_them})
+    assert picture.at(0, 5, 5) == pytest.approx(picture.at(3, 5, 2))
+    assert picture.at(2, 5, 5) == pytest.approx(picture.at(3, 5, 8))
+    # The middle colour is that of the geometric mean.
+    assert picture.at(1, 5, 5) == pytest.approx(colormaps["viridis_r"](0.5)[:3], abs=0.02)
+
+
+def test_images_of_several_sizes_keep_square_pixels_and_do_not_overlap():
+    picture = depths({f"camera {k}": np.full((10 + 5 * k, 30), 1.0 + k) for k in range(8)})
+    *views, bar = picture.figure.axes
+    boxes = [axes.get_window_extent() for axes in views]
+    for axes, box_ in zip(views, boxes, strict=True):
+        assert box_.width / np.ptp(axes.get_xlim()) == pytest.approx(box_.height / np.ptp(axes.get_ylim()), rel=1e-3)
+    everything = [*boxes, bar.get_window_extent()]
+    assert not any(a.overlaps(b) for k, a in enumerate(everything) for b in everything[:k])
+
+
+@pytest.mark.parametrize("image", [np.full((3, 3), np.inf), np.full((3, 3), np.nan), np.full((1, 1), 7.0)])
+def test_images_without_a_range_of_depths_are_drawn_too(image):
+    assert depths({"only": image}).figure.axes
+
+
+@pytest.mark.parametrize(
+    ("images", "message"),
+    [({}, "at least one"), ({"x": np.zeros(3)}, "'x'.*shape \\(3,\\)"), ({"x": np.zeros((0, 3))}, "'x'")],
+)
+def test_what_is_no_image_is_refused(images, message):
+    with pytest.raises(ValueError, match=message):
+        draw_depths(images, title="t")
+
+
+GRID = BevGrid(x=(-10.0, 10.0), y=(-8.0, 8.0), cell=0.5)
+FORWARD = view(name="front", range_m=200.0)
+LEFT = view(yaw=90.0, name="left", at=(0.0, 1.0, 1.0), wide=60.0, range_m=5.0)
+
+
+def four_views(radius=None, points=None, **options) -> Picture:
+    given = {"steps": 10, "title": "Four", "ego_outline_m": box(0, 0), "sensors": [FORWARD, LEFT]}
+    radius = torch.full(GRID.shape, 1.0) if radius is None else radius
+    points = torch.ones(GRID.shape[1:]) if points is None else points
+    return Picture(draw_four_views(radius, points, GRID, **(given | options)))
+
+
+def test_four_panels_share_frame_extent_and_axes():
+    picture = four_views()
+    *panels, points_bar, radius_bar = picture.figure.axes
+    assert [(axes.get_xlim(), axes.get_ylim()) for axes in panels] == [(GRID.x, GRID.y)] * 4
+    sizes = {tuple(axes.get_window_extent().size.round(6)) for axes in panels}
+    assert len(sizes) == 1
+    (width, height) = sizes.pop()
+    assert width / 20 == pytest.approx(height / 16)
+    assert points_bar.get_ylabel().startswith("points in a cell (mean of the steps)")
+    assert radius_bar.get_ylabel().startswith("mean blind spot radius (m)")
+    assert picture.figure.axes[0].get_window_extent().height == pytest.approx(points_bar.get_window_extent().height)
+
+
+def test_sectors_lie_where_the_sensors_look_and_end_at_their_range():
+    picture = four_views()
+    assert picture.tinted(0, 9.0, 3.0)
+    assert not picture.tinted(0, 2.5, 3.0)
+    assert picture.tinted(0, 0.0, 5.0)
+    assert not picture.tinted(0, 0.0, 6.5)
+    assert not picture.tinted(0, -8.0, 0.0)
+    assert abs(picture.at(0, 9.0, 3.0) - picture.at(0, 0.0, 5.0)).max() > 0.05
+
+
+def test_the_histogram_says_no_point_where_the_maps_say_unknown():
+    radius, points = torch.full(GRID.shape, 1.0), torch.full(GRID.shape[1:], 10.0)
+    radius[0, :, :8] = float("nan")
+    points[:, :8] = 0.0
+    points[:, 30:] = 1000.0
+    picture = four_views(radius, points, sensors=[])
+    assert picture.at(1, -8.1, 4.1) == pytest.approx((1, 1, 1))
+    assert abs(picture.at(1, 0.1, 5.1) - picture.at(1, 8.1, 5.1)).max() > 0.3
+    hatched = np.array([picture.at(2, -8.0, y) for y in np.arange(2.0, 7.0, 0.02)])
+    assert hatched.max() < 0.9
+    assert picture.tinted(3, -8.1, 4.1)
+    entries = [text.get_text() for text in picture.figure.axes[2].get_legend().get_texts()]
+    assert entries == ["no point of the rig in any step", "unknown: never probed (10.0 % of the cells)", "ego"]
+
+
+def test_a_rig_without_a_point_is_drawn_too():
+    assert len(four_views(torch.full(GRID.shape, float("nan")), torch.zeros(GRID.shape[1:])).figure.axes) >= 4
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"radius": torch.zeros(2, 3, 4)}, r"radius: shape \(2, 32, 40\)"),
+        ({"points": torch.zeros(3, 4)}, "points: shape"),
+    ],
+)
+def test_arrays_of_another_grid_are_refused(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        four_views(**arguments)

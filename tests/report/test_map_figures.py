@@ -1,0 +1,238 @@
+"""All maps of a run: which there are, what they are called, and what their titles and colours say."""
+
+from dataclasses import dataclass
+from itertools import product
+from typing import ClassVar
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.image import imread
+
+from torchcover.coverage import (
+    AGGREGATIONS,
+    Aggregation,
+    BevGrid,
+    Coverage,
+    CoverageMetric,
+    Layer,
+    Maximum,
+    PooledMean,
+    Quantiles,
+    Quantity,
+    StepQuantiles,
+)
+from torchcover.coverage.aggregations import State
+from torchcover.coverage.quantity import RADIUS, detection
+from torchcover.report import SensorView, band_figures, difference_scale, map_figures, write_figures
+
+SQUARE = BevGrid(x=(-20.0, 20.0), y=(-10.0, 10.0), cell=1.0)
+SMALL = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+BANDS = ("ground", "obstacle")
+EGO = np.array([[2.0, 1.0], [-2.0, 1.0], [-2.0, -1.0], [2.0, -1.0]])
+
+
+def coverage_of(grid: BevGrid, **options) -> Coverage:
+    metric = CoverageMetric(grid, **options)
+    metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5]]))
+    return metric.compute()
+
+
+def blocked(steps: int) -> Coverage:
+    metric = CoverageMetric(SQUARE, blocks=16)
+    for index in range(steps):
+        points = [[0.5, 0.5, 0.0]] if index % 8 else [[0.5, 0.5, 0.0], [9.5, 0.5, 0.0]]
+        metric.update(torch.tensor([[0.5, 0.5, -0.3 - 0.02 * (index % 16)]]), torch.tensor(points), index=index)
+    return metric.compute()
+
+
+def names(coverages: dict[str, Coverage], **options) -> list[str]:
+    return [name for name, _ in map_figures(coverages, **options)]
+
+
+def words(figure: Figure) -> list[str]:
+    """Title and subtitle."""
+    return [text.get_text() for text in figure.axes[0].texts[:2]]
+
+
+def legend(figure: Figure) -> list[str]:
+    (found,) = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
+    return [text.get_text() for text in found.get_texts()]
+
+
+def colours(figure: Figure) -> np.ndarray:
+    """(height, width, 3) in [0, 1]."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3] / 255.0
+
+
+# One rig
+
+
+def test_there_is_a_figure_for_each_quantity_and_band(tmp_path):
+    coverage = coverage_of(SQUARE, thresholds=(0.4, 1.0))
+    keys = ("radius_m", "detection_0.4m", "detection_1m")
+    paths = write_figures(map_figures({"a": coverage}, ego_outline_m=EGO), tmp_path / "new" / "maps")
+    assert [path.name for path in paths] == [f"{key}_{band}.png" for key, band in product(keys, BANDS)]
+    assert sorted(paths) == sorted((tmp_path / "new" / "maps").iterdir())
+    for path in paths:
+        height, width, _ = imread(path).shape
+        assert 600 < height < 1500
+        assert 1350 < width < 2500
+
+
+def test_every_aggregation_is_drawn_under_its_key():
+    aggregations = (Maximum(), Quantiles((0.95,)), StepQuantiles((0.5,)), PooledMean())
+    assert {type(aggregation) for aggregation in aggregations} == set(AGGREGATIONS)
+    coverage = coverage_of(SMALL, thresholds=(), aggregations=aggregations)
+    assert names({"a": coverage}) == [f"{key}_all" for key in coverage.layers]
+    assert len(coverage.layers) == 5
+
+
+@dataclass(frozen=True)
+class Emptiness(Aggregation):
+    """Nothing that the package knows of."""
+
+    name: ClassVar[str] = "emptiness"
+    words: ClassVar[str] = "emptinesses"
+
+    def states(self, cells):
+        return {"sum": State(torch.zeros(cells, dtype=torch.float64))}
+
+    def update(self, sums, step):
+        pass
+
+    def layers(self, sums, probed_steps, max_radius):
+        return [Layer(Quantity("emptiness", "share of emptiness", "share", lower_is_better=True), sums["sum"] + 0.5)]
+
+
+def test_a_quantity_of_ones_own_is_drawn_without_being_known():
+    coverage = coverage_of(SMALL, thresholds=(), aggregations=(Emptiness(),))
+    figure = dict(map_figures({"a": coverage}))["emptiness_all"]
+    assert words(figure)[0] == "Share of emptiness, all"
+    assert (figure.axes[1].get_ylabel(), figure.axes[1].get_ylim()) == ("share of emptiness (%)", (0.0, 100.0))
+    assert "difference_emptiness_all_b_minus_a" in names({"a": coverage, "b": coverage})
+
+
+def test_the_bands_of_a_quantity_share_their_colours():
+    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"low": (0.0, 1.0), "high": (9.0, 11.0)})
+    metric = CoverageMetric(grid, thresholds=())
+    metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.5], [0.5, 0.5, 10.0]]))
+    low, high = (colours(figure)[400, 400] for _, figure in map_figures({"a": metric.compute()}))
+    assert np.abs(low - high).max() > 0.5
+
+
+def test_any_band_name_becomes_a_file_in_the_folder_and_no_two_share_one(tmp_path):
+    bands = ["../up", "a/b", "a\\b", "A b", "a_b_3", "$x$", "long" * 99, "Höhe", "\n"]
+    heights = {name: (float(at), at + 1.0) for at, name in enumerate(bands)}
+    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights=heights)
+    paths = write_figures(map_figures({"a": coverage_of(grid, thresholds=())}), tmp_path / "maps")
+    assert len({path.name.lower() for path in paths}) == len(bands)
+    assert sorted(tmp_path.rglob("*.png")) == sorted(paths)
+    assert all(path.parent == tmp_path / "maps" for path in paths)
+
+
+def test_the_title_names_quantity_band_cell_and_steps():
+    figures = dict(map_figures({"a": coverage_of(SQUARE, thresholds=())}))
+    expected = ["Mean blind spot radius, obstacle", "z 0.5 to 2 m; 1 step, cells of 1 m"]
+    assert words(figures["radius_m_obstacle"]) == expected
+
+
+def test_the_sensors_of_the_rig_are_named():
+    sensor = SensorView("the lidar", np.eye(4), 90.0, (-9.0, 9.0), 5.0)
+    coverage = coverage_of(SQUARE, thresholds=())
+    _, figure = next(map_figures({"a": coverage}, sensors={"a": [sensor], "another": []}, ego_outline_m=EGO))
+    assert {"the lidar", "ego"} <= set(legend(figure))
+
+
+def test_the_bands_of_a_quantity_lie_side_by_side_for_loggers():
+    figures = dict(band_figures(coverage_of(SQUARE)))
+    assert list(figures) == ["radius_m", "detection_0.4m"]
+    headings = [axes.texts[0].get_text() for axes in figures["radius_m"].axes[:2]]
+    assert headings == ["ground, z -0.5 to 0.5 m", "obstacle, z 0.5 to 2 m"]
+
+
+# Standard errors
+
+
+@pytest.mark.parametrize("rigs", ["a", "ab"])
+def test_errors_are_drawn_only_if_asked_for_and_never_as_differences(rigs):
+    coverages = dict.fromkeys(rigs, blocked(16))
+    plain, more = names(coverages), names(coverages, errors=True)
+    assert not any("error" in name for name in plain)
+    assert more[: len(plain)] == plain
+    errors = [f"{key}_error_{band}" for key in ("radius_m", "detection_0.4m") for band in BANDS]
+    assert more[len(plain) :] == errors
+
+
+def test_without_blocks_there_are_no_errors_to_draw():
+    assert not any("error" in name for name in names({"a": coverage_of(SQUARE)}, errors=True))
+
+
+def test_a_map_of_errors_says_what_it_shows_in_which_unit_and_why_cells_are_unknown():
+    coverage = blocked(16)
+    figures = dict(map_figures({"a": coverage}, errors=True))
+    radius, within = figures["radius_m_error_ground"], figures["detection_0.4m_error_ground"]
+    assert words(radius)[0] == "Standard error of the mean blind spot radius, ground"
+    assert radius.axes[1].get_ylabel() == "standard error of the mean blind spot radius (m)"
+    assert words(within)[0] == "Standard error of the detection within 0.4 m, ground"
+    assert within.axes[1].get_ylabel() == "standard error of the detection within 0.4 m (percentage points)"
+    assert within.axes[1].get_ylim()[1] >= 100 * float(coverage.errors["detection_0.4m"][0, 10, 20]) > 1
+    # Two of the sixteen blocks probed x = 9.5 m: known, but without an error.
+    assert legend(radius)[0] == "unknown: probed in fewer than 4 blocks of steps (99.9 % of the cells)"
+    assert legend(figures["radius_m_ground"])[0].startswith("unknown: never probed (99.8 %")
+
+
+# Several rigs
+
+
+def test_there_is_a_difference_for_each_rig_but_the_first(pair, measure, points, tmp_path):
+    three = {**pair, "a/b": measure(points(40, 5))}
+    paths = write_figures(map_figures(three, ego_outline_m=EGO), tmp_path)
+    places = [f"{key}_{band}" for key in ("radius_m", "detection_0.4m") for band in BANDS]
+    expected = [f"{place}.png" for place in places]
+    expected += [f"difference_{place}_{rig}_minus_few.png" for place in places for rig in ("many", "a_b")]
+    assert sorted(path.name for path in paths) == sorted(expected)
+
+
+def test_a_worse_place_is_red_and_a_better_one_blue_whatever_is_measured(measure):
+    """The second rig sees at the front left only, the first at the rear right only."""
+    front_left, rear_right = torch.tensor([[11.0, 4.0, 0.0]]), torch.tensor([[-4.0, -4.0, 0.0]])
+    rigs = {"first": measure(rear_right, thresholds=(5.0,)), "second": measure(front_left, thresholds=(5.0,))}
+    differences = [figure for name, figure in map_figures(rigs) if name.startswith("difference")]
+    assert len(differences) == 4
+    for figure in differences:
+        red, _, blue = np.moveaxis(colours(figure), 2, 0)
+        is_blue, is_red = blue - red > 0.2, red - blue > 0.2
+        width = red.shape[1]
+        # Left of the colour bar, which has both colours.
+        (blue_y, blue_x), (red_y, red_x) = (np.argwhere(c[:, : int(0.85 * width)]).T for c in (is_blue, is_red))
+        assert blue_x.mean() > red_x.mean() + 0.2 * width
+        assert blue_y.mean() < red_y.mean()
+
+
+def test_a_difference_says_which_minus_which_and_what_is_better(pair):
+    differences = [words(figure) for name, figure in map_figures(pair) if name.startswith("difference")]
+    quantities = ("mean blind spot radius", "detection within 0.4 m")
+    expected = [f"many minus few: {quantity}, {band}" for quantity in quantities for band in BANDS]
+    assert [title for title, _ in differences] == expected
+    assert all(subtitle.startswith("blue: many is better, red: few is better; z ") for _, subtitle in differences)
+
+
+def test_the_difference_scale_is_symmetric_and_robust_and_turns_with_what_is_better():
+    differences = torch.cat([torch.linspace(-1.0, 0.5, 1000), torch.tensor([900.0, float("nan"), float("inf")])])
+    scale = difference_scale(RADIUS, differences)
+    assert scale.low == -scale.high
+    assert 0.9 <= scale.high <= 1.0
+    assert (scale.colormap, scale.unit) == ("RdBu_r", "m")
+    within = difference_scale(detection(0.4), differences)
+    assert (within.colormap, within.unit) == ("RdBu", "percentage points")
+    assert difference_scale(RADIUS, torch.zeros(9)).high > 0
+
+
+def test_what_is_not_paired_is_refused_before_anything_is_drawn(measure, points):
+    with pytest.raises(ValueError, match="'a' and 'b' cannot be compared"):
+        map_figures({"a": measure(points(9, 1)), "b": measure(points(9, 1), seed=7)})

@@ -1,0 +1,172 @@
+"""Renderers: whatever a table is written as, it says the same."""
+
+import csv
+import io
+import json
+import math
+import re
+
+import pytest
+
+from torchcover.report import RENDERERS, CoverageTable, Part, as_markdown, json_record, parts_of, table_dict
+
+
+@pytest.fixture(params=["one rig", "one rig, no errors", "two rigs", "three rigs", "infinite", "no region"])
+def table(request, trio, pair, blind, regions):
+    """Tables of every kind."""
+    of = {
+        "one rig": {"few": trio["few"]},
+        "one rig, no errors": {"few": pair["few"]},
+        "two rigs": pair,
+        "three rigs": trio,
+        "infinite": blind,
+        "no region": trio,
+    }
+    return CoverageTable.of(of[request.param], () if request.param == "no region" else regions)
+
+
+def csv_rows(table: CoverageTable) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(RENDERERS["csv"](table))))
+
+
+def json_of(table: CoverageTable) -> dict:
+    def forbid(constant: str) -> None:
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(RENDERERS["json"](table), parse_constant=forbid)
+
+
+def text_cells(table: CoverageTable) -> list[list[str]]:
+    lines = [line for line in RENDERERS["text"](table).splitlines() if line.startswith("│")]
+    return [[re.sub(r"^[*!] ", "", cell.strip()) for cell in line.strip("│").split("│")] for line in lines]
+
+
+def markdown_lines(text: str) -> list[list[str]]:
+    rows = [line for line in text.splitlines() if line.startswith("| ")]
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in rows]
+
+
+def markdown_cells(table: CoverageTable) -> list[list[str]]:
+    rows = markdown_lines(RENDERERS["markdown"](table))
+    body = [row for row in rows if row[:2] not in (["region", "height"], ["---", "---"])]
+    return [[re.sub(r"\\(?=[^\w\s])", "", cell.strip("*")) for cell in row] for row in body]
+
+
+def as_field(value: object) -> str:
+    """What CSV makes of a number of JSON."""
+    return "" if value is None else str(float(value) if value in ("Infinity", "-Infinity") else value)
+
+
+def test_csv_reads_back_as_json_and_json_as_the_table(table):
+    rows = json_of(table)["rows"]
+    assert csv_rows(table) == [{name: as_field(value) for name, value in row.items()} for row in rows]
+    for record, row in zip(rows, [row for rows in table.rows.values() for row in rows], strict=True):
+        assert (record["rig"], record["region"], record["height"]) == (row.rig, row.region.name, row.summary.height)
+        assert (record["known_cells"], record["known_share"]) == (row.summary.known_cells, row.summary.known_share)
+        for prefix, numbers in (("", row.summary.numbers), ("completed_", row.summary.completed)):
+            for key, number in numbers.items():
+                expected = json_record({"value": number.value, "error": number.error})
+                assert record[f"{prefix}{key}"] == expected["value"]
+                assert record[f"{prefix}{key}_error"] == expected["error"]
+        for key, difference in row.differences.items():
+            expected = json_record(difference._asdict())
+            assert record[f"{key}_difference"] == expected["value"]
+            assert record[f"{key}_difference_error"] == expected["error"]
+            assert record[f"{key}_difference_significant"] is difference.significant
+            assert record[f"{key}_best"] is (key in row.best)
+
+
+def test_text_and_markdown_have_the_same_cells_and_they_are_those_of_the_parts(table):
+    parts = [[cell.text for cell in row] for part in parts_of(table) for row in part.rows]
+    assert text_cells(table) == markdown_cells(table) == parts
+
+
+def test_what_is_marked_in_text_is_bold_in_markdown(trio, regions):
+    table = CoverageTable.of(trio, regions)
+    signs = re.findall(r"│ +[*!] ", RENDERERS["text"](table))
+    bold = re.findall(r"\*\*[^*]+\*\*", RENDERERS["markdown"](table))
+    marks = [cell.mark for part in parts_of(table) for row in part.rows for cell in row if cell.mark]
+    assert len(signs) == len(bold) == len(marks) > 4
+    assert set(marks) == {"best", "significant"}
+
+
+def test_no_renderer_calls_anything_nan(table):
+    for render in RENDERERS.values():
+        assert "nan" not in render(table).lower()
+
+
+def test_the_columns_are_the_same_for_one_rig_and_for_several_which_have_more(trio, regions):
+    one, three = (list(csv_rows(CoverageTable.of(of, regions))[0]) for of in ({"few": trio["few"]}, trio))
+    assert three[: len(one)] == one
+    assert one[:5] == ["rig", "region", "height", "radius_m", "radius_m_error"]
+    names = ("best", "difference", "difference_error", "difference_significant")
+    assert three[len(one) :] == [f"{key}_{name}" for key in ("radius_m", "detection_0.4m") for name in names]
+
+
+def test_without_regions_csv_still_has_its_header(trio, regions):
+    headers = {RENDERERS["csv"](CoverageTable.of(trio, places)).splitlines()[0] for places in ((), regions)}
+    assert len(headers) == 1
+    assert headers.pop().startswith("rig,region,height,radius_m,")
+
+
+def test_files_hold_the_bounds_and_the_blocks(trio, regions):
+    table = CoverageTable.of(trio, regions)
+    row = csv_rows(table)[3]
+    assert [float(row[f"{axis}_{end}_m"]) for axis in "xyz" for end in ("min", "max")] == [-8, -6, -5, 5, 0.5, 2]
+    assert (row["steps"], row["blocks"], row["steps_per_block"], row["cell_m"]) == ("24", "12", "2", "1.0")
+    content = json_of(table)
+    assert (content["blocks"], content["steps_per_block"], content["thresholds_m"]) == (12, 2, [0.4])
+    assert content["grid"] == {
+        "x_m": [-8.0, 12.0],
+        "y_m": [-5.0, 5.0],
+        "cell_m": 1.0,
+        "heights_m": {"ground": [-0.5, 0.5], "obstacle": [0.5, 2.0]},
+    }
+    assert content["counts"] == {rig: coverage.counts for rig, coverage in trio.items()}
+    assert json_of(CoverageTable.of({"few": trio["few"]}, regions))["counts"] == trio["few"].counts
+
+
+def test_without_blocks_there_are_none_in_files(pair, regions):
+    content = table_dict(CoverageTable.of(pair, regions))
+    assert (content["blocks"], content["steps_per_block"]) == (None, None)
+    assert {row["radius_m_error"] for row in content["rows"]} == {None}
+
+
+def test_infinity_survives_json_and_is_not_unknown(blind, regions):
+    content = json_of(CoverageTable.of(blind, regions))
+    assert float(content["max_radius_m"]) == float(content["rows"][0]["radius_m"]) == math.inf
+    assert content["rows"][2]["radius_m"] is None
+
+
+def test_names_that_look_like_markup_stay_what_they_are(trio, regions):
+    names = ["a|b", "[bold]:car:[/bold]", "_x_*y* `z` <b> &amp; \\"]
+    table = CoverageTable.of(dict(zip(names, trio.values(), strict=True)), regions)
+    text, markdown = RENDERERS["text"](table), RENDERERS["markdown"](table)
+    assert all(name in text for name in names)
+    rows = markdown_lines(markdown)
+    assert {len(row) for row in rows} == {5, 6}  # the difference to the first rig has a column less
+    assert rows[0][2:5] == [r"a\|b", r"\[bold\]:car:\[/bold\]", r"\_x\_\*y\* \`z\` \<b> \&amp; \\"]
+    assert [row["rig"] for row in csv_rows(table)[::4]] == names
+
+
+def test_names_without_special_signs_are_left_alone_in_markdown(trio, regions):
+    table = CoverageTable.of({"front_roof_128": trio["few"], "it's 5 < 6 & more": trio["many"]}, regions)
+    assert "| front_roof_128 | it's 5 < 6 & more |" in RENDERERS["markdown"](table)
+
+
+def test_the_notes_of_the_caller_are_in_what_a_reader_reads(trio, regions):
+    table = CoverageTable.of(trio, regions, ["Reference sensor: a cat."])
+    assert "Reference sensor: a cat." in RENDERERS["text"](table)
+    assert "* Reference sensor: a cat." in RENDERERS["markdown"](table)
+
+
+def test_a_column_of_ones_own_is_the_last(trio, regions):
+    table = CoverageTable.of({"few": trio["few"]}, regions)
+    (part,) = parts_of(table)
+    headings, _, *rows = markdown_lines(as_markdown(table, [part.with_column("paper (m)", list("abcd"))]))
+    assert headings[-1] == "paper (m)"
+    assert [row[-1] for row in rows] == list("abcd")
+    assert headings[2] == "mean blind spot radius (m)"
+    with pytest.raises(ValueError, match="'paper': 4 cells are needed; got 1"):
+        part.with_column("paper", ["a"])
+    assert isinstance(part, Part)

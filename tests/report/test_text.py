@@ -1,0 +1,239 @@
+"""Tables on a terminal: their words, their marks, and how narrow they may be."""
+
+import io
+import re
+
+import pytest
+import torch
+from rich.console import Console
+
+from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
+from torchcover.report import CoverageTable, narrowest_width, print_table
+from torchcover.report.renderers.text import rich_tables
+
+NEAR = Region("near", x=(0.0, 2.0), y=(0.0, 2.0))
+FAR = Region("far", x=(2.0, 4.0), y=(0.0, 2.0))
+ORIGIN = torch.zeros(1, 3)
+
+
+def metric(thresholds=(0.4, 1.0), **options) -> CoverageMetric:
+    grid = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, heights={"ground": (-0.5, 0.5)})
+    return CoverageMetric(grid, thresholds=thresholds, **options)
+
+
+def one_cell_known() -> Coverage:
+    """One of the four near cells: radii 0.2 and 0.6, so mean 0.4, half of them within 0.4 m. No far cell."""
+    coverage = metric()
+    coverage.update(ORIGIN, torch.tensor([[0.2, 0.0, 0.0], [0.6, 0.0, 0.0]]))
+    return coverage.compute()
+
+
+def over_steps(steps: int) -> Coverage:
+    """A point with a radius of its own in every step, and so in every cell."""
+    coverage = metric(blocks=16)
+    radii = torch.rand(steps, generator=torch.Generator().manual_seed(0))
+    for index, radius in enumerate(radii):
+        place = torch.tensor([[0.5 + index % 2, 0.5 + index // 2 % 2, 0.0]])
+        coverage.update(place - torch.tensor([0.0, 0.0, float(radius)]), place, index=index)
+    return coverage.compute()
+
+
+def printed(coverages: dict[str, Coverage], regions, width=200, *, terminal=True) -> str:
+    console = Console(width=width, file=io.StringIO(), force_terminal=terminal, color_system=None)
+    print_table(CoverageTable.of(coverages, regions), console)
+    return re.sub(r"\x1b\[[\d;]*m", "", console.file.getvalue())
+
+
+def text_of(coverage: Coverage, *regions: Region) -> str:
+    return printed({"rig": coverage}, regions, 140)
+
+
+def cells_of(text: str, region: str) -> list[str]:
+    (line,) = [line for line in text.splitlines() if line.startswith(f"│ {region} ")]
+    return [cell.strip() for cell in line.strip("│").split("│")]
+
+
+def test_a_row_shows_metres_percent_and_the_share_of_known_cells():
+    assert cells_of(text_of(one_cell_known(), NEAR, FAR), "near") == ["near", "ground", "0.40", "50.0", "100", "25.0"]
+
+
+def test_an_unknown_number_is_called_unknown():
+    text = text_of(one_cell_known(), NEAR, FAR)
+    assert cells_of(text, "far") == ["far", "ground", "unknown", "unknown", "unknown", "0"]
+    assert "nan" not in text.lower()
+
+
+def test_a_blind_step_without_limit_is_called_infinite():
+    coverage = metric()
+    coverage.update(torch.zeros(0, 3), ORIGIN)
+    assert cells_of(text_of(coverage.compute(), NEAR), "near")[2] == "infinite"
+
+
+def test_units_cell_size_steps_and_bands_are_told():
+    text = text_of(one_cell_known(), NEAR)
+    head = text[: text.index("near")]
+    assert (head.count("(m)"), head.count("(%)")) == (1, 3)
+    for words in ("0.4 m (%)", "1 m (%)", "1 step, cells of 1 m", "ground z -0.5 to 0.5 m"):
+        assert words in text
+
+
+def test_trouble_is_told_in_words_with_its_count():
+    coverage = metric(thresholds=(0.4,), max_radius=0.5)
+    reference = torch.tensor([[0.2, 0.0, 0.0], [0.6, 0.0, 0.0], [-9.0, 0.0, 0.0]])
+    coverage.update([ORIGIN, torch.zeros(0, 3), ORIGIN], [reference, reference, torch.zeros(0, 3)])
+    text = text_of(coverage.compute(), NEAR)
+    assert "1 of 3 steps had no sensor point" in text
+    assert "1 of 3 steps had no reference point" in text
+    assert "3 of 4 reference points count as 0.5 m far, the limit" in text
+    assert "2 of 6 reference points lie outside the grid" in text
+
+
+def test_without_trouble_none_is_told():
+    coverage = metric()
+    everywhere = torch.cartesian_prod(torch.arange(4) + 0.5, torch.arange(2) + 0.5, torch.zeros(1))
+    coverage.update(ORIGIN, everywhere)
+    text = text_of(coverage.compute(), NEAR)
+    assert not any(words in text for words in (" of 1 step", "reference point", "known cells only"))
+
+
+def test_without_regions_the_table_says_so():
+    assert "No region" in text_of(one_cell_known())
+
+
+def test_every_number_has_its_standard_error_to_two_digits():
+    coverage = over_steps(64)
+    (row,) = coverage.summary([NEAR])
+    near, within = row.numbers["radius_m"], row.numbers["detection_0.4m"]
+    assert near.error > 0
+    _, _, radius, *detection, known = cells_of(text_of(coverage, NEAR), "near")
+    assert radius == f"{near.value:.3f} ± {near.error:.3f}"
+    assert detection == [f"{100 * within.value:.1f} ± {100 * within.error:.1f}", "100 ± 0"]
+    assert known == "100"
+    assert "± is one standard error, from 16 blocks of up to 4 steps in a row." in text_of(coverage, NEAR)
+
+
+def test_a_region_that_one_block_alone_has_probed_has_a_number_without_error():
+    coverage = metric(blocks=16)
+    for index in range(16):
+        x = 2.5 if index == 3 else 0.5
+        coverage.update(torch.tensor([[x, 0.5, -0.2]]), torch.tensor([[x, 0.5, 0.0]]), index=index)
+    text = text_of(coverage.compute(), NEAR, FAR)
+    assert cells_of(text, "near")[2] == "0.20 ± 0"
+    assert cells_of(text, "far")[2] == "0.20"
+    assert "No ± where one block alone has probed the region." in text
+
+
+def test_an_infinite_number_has_no_error():
+    coverage = metric(blocks=16)
+    for index in range(16):
+        coverage.update(ORIGIN if index else torch.zeros(0, 3), ORIGIN, index=index)
+    assert cells_of(text_of(coverage.compute(), NEAR), "near")[2] == "infinite"
+
+
+@pytest.mark.parametrize(("steps", "blocks"), [(1, "1 block"), (7, "7 blocks")])
+def test_too_few_steps_for_an_error_are_told_once_and_never_as_0(steps, blocks):
+    text = text_of(over_steps(steps), NEAR)
+    assert "±" not in text
+    assert text.count(f"Not enough steps for errors: {blocks}, 8 are needed.") == 1
+
+
+def test_without_blocks_nothing_is_said_about_errors():
+    text = text_of(one_cell_known(), NEAR)
+    assert "±" not in text
+    assert "error" not in text
+
+
+# Several rigs
+
+
+def test_the_table_marks_with_a_sign_that_needs_no_colours(pair, regions):
+    text = printed(pair, regions)
+    radius, detection = text.split("Detection within 0.4 m (%)")
+    for part in (radius, detection):
+        lines = [line for line in part.splitlines() if "near" in line]
+        assert len(lines) == 2
+        for line in lines:
+            _, _, _, few, many, known, _ = (cell.strip() for cell in line.split("│"))
+            assert not few.startswith("*")
+            assert many.startswith("* ")
+            assert float(known) == pytest.approx(100, abs=60)
+    assert "the best of its row" in text
+    assert "they know the same cells" in text
+
+
+def test_the_unknown_is_not_marked(pair, regions):
+    unknown = [line for line in printed(pair, regions).splitlines() if "unknown" in line and "behind" in line]
+    assert len(unknown) == 4
+    assert not any("*" in line for line in unknown)
+
+
+def test_notes_about_one_rig_name_it(blind, regions):
+    text = re.sub(r"\s+", " ", printed(blind, regions))
+    assert "[blind]: 1 of 1 steps had no sensor point" in text
+    assert "seeing:" not in text
+
+
+def test_differences_have_a_part_of_their_own_and_what_is_no_chance_is_marked(trio, regions):
+    text = printed(trio, regions)
+    parts = re.split(
+        r"Difference to few: (?:mean blind spot radius \(m\)|detection within 0.4 m \(percentage points\))", text
+    )
+    assert len(parts) == 3
+    for part, sign in zip(parts[1:], "-+", strict=True):
+        for line in [line for line in part.splitlines() if "│ near " in line]:
+            _, _, _, other, many, _, _ = (cell.strip() for cell in line.split("│"))
+            assert re.fullmatch(r"(! )?[+-][\d.]+ ± [\d.]+", other)
+            assert re.fullmatch(rf"! \{sign}[\d.]+ ± [\d.]+", many)
+        unknown = [line for line in part.splitlines() if "│ behind" in line]
+        assert len(unknown) == 2
+        assert all(line.count("unknown") == 2 and "!" not in line for line in unknown)
+    assert "of 20 rows without a difference, one is marked" in re.sub(r"\s+", " ", text)
+
+
+def test_from_too_few_steps_no_difference_is_called_significant(trios, regions):
+    text = printed(trios(5), regions)
+    assert "±" not in text
+    assert text.count("Not enough steps for errors: 5 blocks, 8 are needed.") == 1
+    assert "Difference to few" in text
+    assert not re.search(r"│ +! ", text)
+
+
+def test_the_parts_of_the_table_have_equal_columns(pair, regions):
+    borders = [line for line in printed(pair, regions).splitlines() if line.startswith("┏")]
+    assert len(borders) == 2
+    assert borders[0] == borders[1]
+
+
+@pytest.mark.parametrize("rigs", [2, 5, 9])
+def test_on_a_narrow_terminal_names_fold_but_numbers_stay_whole(pair, regions, rigs):
+    one, other = pair.values()
+    named = {f"rig_number_{at}_with_a_long_name": (one, other)[at % 2] for at in range(rigs)}
+    narrowest = narrowest_width(rich_tables(CoverageTable.of(named, regions)), list(named))
+    assert narrowest == 35 + (len("unknown") + 3) * rigs
+    assert_whole(named, regions, narrowest, r"(?:\* )?[\d.]+ │|unknown", 8 * rigs)
+
+
+@pytest.mark.parametrize("steps", [5, 24])
+def test_on_a_narrow_terminal_numbers_with_errors_stay_whole(trios, regions, steps):
+    names = ("a_rig_with_quite_a_long_name", "another_rig_with_a_long_name", "and_one_more_of_those")
+    named = dict(zip(names, trios(steps).values(), strict=True))
+    narrowest = narrowest_width(rich_tables(CoverageTable.of(named, regions)), names)
+    assert_whole(named, regions, narrowest, r"(?:[*!] )?[+-]?[\d.]+(?: ± [\d.]+)? │|unknown", 20)
+
+
+def assert_whole(named, regions, narrowest, pattern, more_than) -> None:
+    # On a terminal that is narrower still, lines are longer than it is.
+    narrow, wide = (printed(named, regions, width).split("the best of")[0] for width in (20, 400))
+    assert max(map(len, narrow.splitlines())) == narrowest
+    numbers = re.compile(pattern)
+    assert len(numbers.findall(wide)) > more_than
+    assert numbers.findall(narrow) == numbers.findall(wide)
+
+
+@pytest.mark.parametrize("rigs", [1, 3])
+def test_in_a_file_names_are_whole_however_narrow_it_says_it_is(trio, regions, rigs):
+    named = {f"rig_number_{at}_with_a_long_name": coverage for at, coverage in enumerate(list(trio.values())[:rigs])}
+    text = printed(named, regions, 20, terminal=False)
+    assert "mean blind spot" in text
+    assert "…" not in text
+    assert rigs == 1 or all(name in text for name in named)

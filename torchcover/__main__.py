@@ -1,0 +1,5 @@
+"""`python -m torchcover`: the command line."""
+
+from torchcover.cli.app import main
+
+main()

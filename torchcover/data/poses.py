@@ -1,0 +1,58 @@
+"""Where the sensors of a recording are: its `frames.yaml`."""
+
+from pathlib import Path
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from torchcover.geometry.rigid import Matrix, check_rigid
+
+ALLOWED = "allowed are sensor, or rigs by name, and reference, each with a 4x4 vehicle_T_sensor"
+
+
+class _Pose(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    vehicle_T_sensor: list[list[float]]
+
+
+class _Poses(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    sensor: _Pose | None = None
+    rigs: dict[str, _Pose] = Field(default_factory=dict)
+    reference: _Pose | None = None
+
+
+def read_poses(path: Path) -> dict[str, Matrix]:
+    """Read the poses of a recording.
+
+    Args:
+        path: The YAML file, which may be missing.
+
+    Returns:
+        `sensor`, `rigs/NAME` or `reference` -> (4, 4) vehicle_T_sensor, of those that are given.
+
+    Raises:
+        ValueError: Not such a file, or not a rigid transform; the message names file and field.
+    """
+    if not path.exists():
+        return {}
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ValueError(f"{path}: not a YAML file ({' '.join(str(error).split())})") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: got {type(content).__name__}, not a mapping; {ALLOWED}")
+    try:
+        poses = _Poses.model_validate(content)
+    except ValidationError as error:
+        complaints = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
+        raise ValueError(f"{path}: {'; '.join(complaints)}; {ALLOWED}") from error
+    given = {"sensor": poses.sensor, "reference": poses.reference}
+    given |= {f"rigs/{name}": pose for name, pose in poses.rigs.items()}
+    return {
+        name: check_rigid(pose.vehicle_T_sensor, f"{path}: {name.replace('/', '.')}.vehicle_T_sensor")
+        for name, pose in given.items()
+        if pose is not None
+    }

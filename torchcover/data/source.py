@@ -1,0 +1,54 @@
+"""What every source of frames says of itself, be it a simulation, a folder or another format."""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.data.frame import Frame
+from torchcover.simulation import Sensor
+
+
+class FrameSource(Protocol):
+    """A map-style torch Dataset of frames that knows whose they are and where they come from.
+
+    A format of recordings is a class like this that is made from a path; see `FORMATS`.
+    """
+
+    @property
+    def rigs(self) -> Collection[str]:
+        """The names under which `Frame.clouds` has the rigs."""
+        ...
+
+    @property
+    def sensors(self) -> Mapping[str, Sequence[Sensor]]:
+        """The sensors of the rigs that they are known of, for drawings; may be empty."""
+        ...
+
+    @property
+    def ego_outline_m(self) -> NDArray[np.float64] | None:
+        """(K, 2) corners x, y of the ego in the vehicle frame in metres; None if nobody knows."""
+        ...
+
+    @property
+    def description(self) -> Mapping[str, object]:
+        """Where the frames come from, for `summary.json`: `scenario` and `seed`, or `frames`, the others None."""
+        ...
+
+    @property
+    def reference(self) -> Mapping[str, object] | None:
+        """Which reference sensor was simulated and how often, `sensor` and `every_s`; None: it was recorded."""
+        ...
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        ...
+
+    def __getitem__(self, index: int, /) -> Frame:
+        """One frame.
+
+        Raises:
+            BadFrameError: It cannot be used; the others can.
+        """
+        ...

@@ -1,0 +1,86 @@
+"""What is fed with frames: coverage, and whatever else a user wants to know of them."""
+
+from typing import Any, Protocol, Self, TypeVar
+
+from torchcover.coverage import Coverage, CoverageMetric
+from torchcover.data import Frame
+
+ResultT = TypeVar("ResultT", covariant=True)
+
+
+class Observer(Protocol[ResultT]):
+    """Something that looks at frames, one after the other, and says something in the end.
+
+    Over several processes or ranks each has an observer of its own over other frames; one merges the others.
+
+    Example:
+        >>> class PointCount:
+        ...     def __init__(self) -> None:
+        ...         self.points = 0
+        ...     def update(self, frame: Frame) -> None:
+        ...         self.points += sum(len(cloud) for cloud in frame.clouds.values())
+        ...     def compute(self) -> int:
+        ...         return self.points
+        ...     def merge_state(self, other: "PointCount") -> None:
+        ...         self.points += other.points
+    """
+
+    def update(self, frame: Frame) -> None:
+        """Add a frame; its tensors are on the device of the run."""
+        ...
+
+    def compute(self) -> ResultT:
+        """What the frames so far say."""
+        ...
+
+    def merge_state(self, other: Self, /) -> None:
+        """Add the frames of another observer, which is left as it was."""
+        ...
+
+
+class CoverageObserver:
+    """Coverage of one rig: feeds frames to a `CoverageMetric`.
+
+    Args:
+        metric: Where the sums are.
+        rig: Whose clouds; those of the only rig if not given.
+
+    Example:
+        >>> import torch
+        >>> from torchcover import BevGrid
+        >>> observer = CoverageObserver(CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0)))
+        >>> observer.update(Frame({"rig": torch.zeros(1, 3)}, torch.tensor([[0.5, 0.0, 0.0]]), index=0, name="a"))
+        >>> observer.compute().radius[0].tolist()
+        [[0.5, nan]]
+    """
+
+    def __init__(self, metric: CoverageMetric, rig: str | None = None) -> None:
+        self.metric = metric
+        self.rig = rig
+
+    def update(self, frame: Frame) -> None:
+        """Add a frame, with the weights of its reference points and its place in time.
+
+        Raises:
+            ValueError: As `CoverageMetric.update`, or several rigs and none was named.
+        """
+        sensor = frame.sensor if self.rig is None else frame.clouds[self.rig]
+        self.metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.index)
+
+    def compute(self) -> Coverage:
+        """The coverage so far."""
+        coverage: Coverage = self.metric.compute()
+        return coverage
+
+    def merge_state(self, other: "CoverageObserver") -> None:
+        """Add the frames of another one of the same rig.
+
+        Raises:
+            ValueError: Of another rig, or metrics with other parameters.
+        """
+        if other.rig != self.rig:
+            raise ValueError(f"cannot merge the coverage of rig {other.rig!r} into that of {self.rig!r}")
+        self.metric.merge_state(other.metric)
+
+
+AnyObserver = Observer[Any]

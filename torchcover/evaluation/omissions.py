@@ -1,0 +1,53 @@
+"""What a run left out because its scene did not need it."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from torchcover.coverage import AGGREGATIONS, Coverage
+
+# What it is, how often it was left out, and of how many; the counts are those of the frames, added up.
+COUNTED = (
+    ("moving bodies out of every sensor's range: not placed", "moving_bodies_out_of_range", "moving_bodies"),
+    ("pairs of a ray and a moving body that cannot meet: not cast", "ray_body_pairs_left_out", "ray_body_pairs"),
+    ("rays of sensors where nothing moves: cast once, for all steps", "sensor_rays_reused", "sensor_rays"),
+    ("rays that end on the ego itself: known from the first scan", "sensor_self_hits_reused", "sensor_self_hits"),
+)
+# Packages that take long to import, and what would have needed them.
+HEAVY = {"kornia": "lenses with distortion", "lightning": "training", "pypcd4": "binary PCD files"}
+
+
+@dataclass(frozen=True)
+class Omission:
+    """Something that a run left out.
+
+    Args:
+        what: What it is, and why it could be left out.
+        count: How often; None where there is nothing to count.
+        of: Of how many; likewise.
+    """
+
+    what: str
+    count: int | None = None
+    of: int | None = None
+
+
+def left_out(frame_counts: Mapping[str, int], coverages: Sequence[Coverage]) -> list[Omission]:
+    """List what was left out of a run.
+
+    Args:
+        frame_counts: Sums of `Frame.counts`.
+        coverages: What the metrics gave, one for each rig.
+    """
+    found = [
+        Omission(what, frame_counts[count], frame_counts[of]) for what, count, of in COUNTED if frame_counts.get(count)
+    ]
+    outside = sum(coverage.counts["outside_points"] for coverage in coverages)
+    inside = sum(int(coverage.points.sum()) for coverage in coverages)
+    if outside:
+        found.append(Omission("reference points outside every cell: not searched for", outside, inside + outside))
+    if len(coverages[0].layers) == len(coverages[0].quantities):
+        others = ", ".join(aggregation.words for aggregation in AGGREGATIONS)
+        found.append(Omission(f"{others}: not asked for, not kept"))
+    unused = [package for package in HEAVY if package not in sys.modules]
+    return found + [Omission(f"{package}, for {HEAVY[package]}: not imported") for package in unused]

@@ -1,0 +1,159 @@
+"""The one loop: frames in order, and every observer is fed with each of them."""
+
+import time
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import torch
+from torch.utils.data import DataLoader, Dataset, Subset
+
+from torchcover.data import BadFrameError, Frame, FrameBatch, FrameSource, collate_frames
+from torchcover.evaluation.interrupt import held_back
+from torchcover.evaluation.observers import AnyObserver
+from torchcover.evaluation.progress import progress_of
+
+Frames = FrameSource | Dataset[Frame] | Sequence[Frame]
+
+
+@dataclass
+class Run:
+    """How a run went.
+
+    Args:
+        steps: Frames that all observers have seen.
+        counts: Sums of the frames' counts.
+        skipped: What was wrong with the frames that were skipped.
+        failure: The bad frame that ended it, if one did.
+        interrupted: Whether Ctrl-C ended it.
+        seconds: How long it took.
+    """
+
+    steps: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
+    skipped: list[str] = field(default_factory=list)
+    failure: BadFrameError | None = None
+    interrupted: bool = False
+    seconds: float = 0.0
+
+    @property
+    def complete(self) -> bool:
+        """Whether nothing but the end of the frames, or of what was waited for, ended it."""
+        return self.failure is None and not self.interrupted
+
+    def raise_failure(self) -> None:
+        """End as the run ended, once what was computed is safe.
+
+        Raises:
+            BadFrameError: A bad frame ended it.
+            KeyboardInterrupt: Ctrl-C ended it.
+        """
+        if self.failure is not None:
+            raise self.failure
+        if self.interrupted:
+            raise KeyboardInterrupt
+
+
+class StoppingRule(Protocol):
+    """Ends a run before its frames do; see `TargetWatch`."""
+
+    def is_reached(self, steps: int) -> bool:
+        """Whether the run may end after so many steps."""
+        ...
+
+    def expected_steps(self, most: int) -> int:
+        """Steps that the run is thought to take, of so many at most."""
+        ...
+
+    @property
+    def words(self) -> str:
+        """How far it is, for the progress bar."""
+        ...
+
+
+def observe(
+    frames: Frames,
+    observers: Iterable[AnyObserver],
+    *,
+    steps: int | None = None,
+    workers: int = 0,
+    device: torch.device | str = "cpu",
+    skip_bad_frames: bool = False,
+    until: StoppingRule | None = None,
+    progress: bool = False,
+    title: str = "steps",
+) -> Run:
+    """Feed observers with frames. However the run ends, all of them have seen the same frames.
+
+    Args:
+        frames: A source of frames, or any map-style dataset or list of them.
+        observers: What looks at them.
+        steps: Only so many frames, from the first on; all if not given.
+        workers: Processes that make frames; 0 makes them in this one.
+        device: Where the observers get the frames' tensors.
+        skip_bad_frames: Skip and note frames that cannot be used, instead of ending with the first.
+        until: Ends the run early.
+        progress: Whether to show a bar.
+        title: What stands before the bar.
+
+    Returns:
+        How it went; a bad frame or Ctrl-C after the first step is noted there, not raised.
+
+    Raises:
+        ValueError: Not a single frame could be used.
+        KeyboardInterrupt: Ctrl-C before the first step.
+
+    Example:
+        >>> class Names(list):
+        ...     def update(self, frame):
+        ...         self.append(frame.name)
+        >>> frames = [Frame({"rig": torch.rand(9, 3)}, torch.rand(9, 3), index, f"f{index}") for index in range(3)]
+        >>> names = Names()
+        >>> observe(frames, [names], steps=2).steps, names
+        (2, ['f0', 'f1'])
+    """
+    run, observers = Run(), list(observers)
+    most = len(frames) if steps is None else min(steps, len(frames))  # type: ignore[arg-type]  # map-style: has one
+    start = time.perf_counter()
+    with progress_of(most, title, shown=progress) as bar:
+        try:
+            for batch in _batches(frames, most, workers, run, skip_bad_frames=skip_bad_frames):
+                (frame,) = batch.to(device).frames
+                with held_back():
+                    _feed(frame, observers, run)
+                reached = until is not None and until.is_reached(run.steps)
+                expected = most if until is None else run.steps if reached else until.expected_steps(most)
+                bar.advance(expected, until.words if until else "")
+                if reached:
+                    break
+        except KeyboardInterrupt:
+            run.interrupted = True
+    run.seconds = time.perf_counter() - start
+    if not run.steps:
+        run.raise_failure()
+        raise ValueError("no frame could be used, so there is no result")
+    return run
+
+
+def _feed(frame: Frame, observers: Sequence[AnyObserver], run: Run) -> None:
+    for observer in observers:
+        observer.update(frame)
+    run.counts.update(frame.counts)
+    run.steps += 1
+
+
+def _batches(frames: Frames, most: int, workers: int, run: Run, *, skip_bad_frames: bool) -> Iterator[FrameBatch]:
+    """One frame at a time; notes bad ones, and ends at the first unless they are to be skipped."""
+    first: Dataset[Frame] = Subset(frames, range(most))  # type: ignore[arg-type]  # has a length and items
+    iterator = iter(DataLoader(first, batch_size=1, collate_fn=collate_frames, num_workers=workers))
+    while True:
+        try:
+            yield next(iterator)
+        except StopIteration:
+            return
+        except BadFrameError as error:
+            if not skip_bad_frames:
+                run.failure = error
+                return
+            run.skipped.append(str(error))

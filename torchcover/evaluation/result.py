@@ -1,0 +1,171 @@
+"""What an evaluation gives: numbers, maps and files of one rig or several. All that `report` is asked for is here."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from torchcover import __version__
+from torchcover.coverage import Coverage, Region
+from torchcover.evaluation.omissions import Omission, left_out
+from torchcover.evaluation.pipeline import Run
+from torchcover.evaluation.sensor_drawings import sensor_views
+from torchcover.evaluation.target_error import TargetError
+from torchcover.evaluation.target_outcome import outcome
+from torchcover.report import RENDERERS, CoverageTable, map_figures, table_dict, write_figures
+from torchcover.simulation import Sensor
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Result:
+    """What `evaluate` and `compare` return.
+
+    Args:
+        coverages: By the name of the rig; the others are compared with the first.
+        regions: Those that numbers are given for.
+        run: How the run went.
+        rigs: What the user called each rig, by its name; None for the rig of a recording that nobody named.
+        source: Where the frames came from: `scenario`, `frames`, `seed`.
+        reference: The reference sensor: `sensor` and `every_s`; None if it was recorded.
+        device: Where it ran.
+        target_error: What was aimed at.
+        sensors: The sensors of the rigs that they are known of, for the maps.
+        ego_outline_m: (K, 2) corners x, y of the ego in metres, for the maps.
+        observed: What the user's own observers computed, by their names.
+    """
+
+    coverages: Mapping[str, Coverage]
+    regions: Sequence[Region]
+    run: Run
+    rigs: Mapping[str, str | None]
+    source: Mapping[str, object]
+    reference: Mapping[str, object] | None
+    device: str = "cpu"
+    target_error: TargetError | None = None
+    sensors: Mapping[str, Sequence[Sensor]] = field(default_factory=dict)
+    ego_outline_m: NDArray[Any] | None = None
+    observed: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def coverage(self) -> Coverage:
+        """The coverage of the only rig.
+
+        Raises:
+            ValueError: There are several.
+        """
+        if len(self.coverages) != 1:
+            raise ValueError(f"there are {len(self.coverages)} rigs ({', '.join(self.coverages)}): use coverages[name]")
+        return next(iter(self.coverages.values()))
+
+    @property
+    def is_comparison(self) -> bool:
+        """Whether it is about several rigs."""
+        return len(self.coverages) > 1
+
+    @property
+    def table(self) -> CoverageTable:
+        """The numbers, with errors, differences and marks; `RENDERERS` write it down."""
+        return CoverageTable.of(self.coverages, self.regions, self._notes)
+
+    @property
+    def summary(self) -> list[dict[str, Any]]:
+        """A row for each rig, region and height band, as in `summary.json`: unknown is None, infinite "Infinity"."""
+        rows: list[dict[str, Any]] = table_dict(self.table)["rows"]
+        return rows
+
+    @property
+    def left_out(self) -> list[Omission]:
+        """What the run left out because the scene did not need it."""
+        return left_out(self.run.counts, list(self.coverages.values()))
+
+    @property
+    def target_lines(self) -> list[str]:
+        """What was reached of the target error, in words."""
+        return outcome(self.target_error, self.coverages, self.regions)[1]
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """Everything but the maps: what stands in `summary.json`."""
+        rigs = {"rigs": dict(self.rigs)} if self.is_comparison else {"rig": next(iter(self.rigs.values()))}
+        return {
+            **rigs,
+            **self.source,
+            "reference": self._reference_record,
+            "torchcover": __version__,
+            "device": self.device,
+            "seconds": round(self.run.seconds, 3),
+            "complete": self.run.complete,
+            "frame_counts": dict(self.run.counts),
+            "skipped_frames": self.run.skipped,
+            "target_error": outcome(self.target_error, self.coverages, self.regions)[0],
+            "left_out": [asdict(omission) for omission in self.left_out],
+            **table_dict(self.table),
+        }
+
+    def maps(self, *, errors: bool = False) -> Iterator[tuple[str, Figure]]:
+        """Draw the maps, one by one; several rigs side by side, and their differences to the first.
+
+        Args:
+            errors: Whether to draw the standard errors too.
+
+        Returns:
+            The stem of the file name, and a figure of its own, outside pyplot.
+        """
+        views = {name: sensor_views(sensors) for name, sensors in self.sensors.items()}
+        return map_figures(self.coverages, ego_outline_m=self.ego_outline_m, sensors=views, errors=errors)
+
+    def save(self, folder: str | Path, *, error_maps: bool = False) -> list[Path]:
+        """Write the files of the command line; `summary.json` last, so that a folder that has it is complete.
+
+        Args:
+            folder: Where to write: `coverage.npz`, or `coverage/RIG.npz` for several; `summary.csv`, `maps/STEM.png`,
+                `summary.json`. Made if it does not exist.
+            error_maps: Whether to draw maps of the standard errors too.
+
+        Returns:
+            The files.
+        """
+        folder = Path(folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        files = self._save_coverages(folder)
+        files.append(folder / "summary.csv")
+        files[-1].write_text(RENDERERS["csv"](self.table), encoding="utf-8")
+        files += write_figures(self.maps(errors=error_maps), folder / "maps")
+        files.append(folder / "summary.json")
+        files[-1].write_text(json.dumps(self.record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        return files
+
+    def _save_coverages(self, folder: Path) -> list[Path]:
+        if not self.is_comparison:
+            files = {folder / "coverage.npz": self.coverage}
+        else:
+            (folder / "coverage").mkdir(exist_ok=True)
+            files = {folder / "coverage" / f"{name}.npz": coverage for name, coverage in self.coverages.items()}
+        for path, coverage in files.items():
+            coverage.save(path)
+        return list(files)
+
+    @property
+    def _reference_record(self) -> dict[str, object] | None:
+        if self.reference is None:
+            return None
+        rays = self.run.counts["reference_rays"] // self.run.steps
+        return {"sensor": self.reference["sensor"], "rays_per_step": rays, "every_s": self.reference["every_s"]}
+
+    @property
+    def _notes(self) -> list[str]:
+        """The reference sensor in words, for a caption."""
+        record = self._reference_record
+        if record is None:
+            return []
+        rays, every_s = record["rays_per_step"], record["every_s"]
+        return [f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."]
+
+    def __repr__(self) -> str:
+        cut_short = "" if self.run.complete else ", cut short"
+        about = f"Result of {', '.join(self.coverages)}: {self.run.steps} steps{cut_short}"
+        return f"{about}\n{RENDERERS['text'](self.table)}"

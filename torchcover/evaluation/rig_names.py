@@ -1,0 +1,55 @@
+"""What rigs are called in tables and files."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from torchcover.simulation import Rig, builtin_names
+
+AnyRig = Rig | str | Path
+
+
+def distinct_names(rigs: Sequence[AnyRig]) -> list[str]:
+    """What the columns are called: the rig's name, or the stem of its file; numbered where two would be the same.
+
+    Example:
+        >>> distinct_names(["kitti", "old/my.yaml", "new/my.yaml"])
+        ['kitti', 'my', 'my_2']
+    """
+    names: list[str] = []
+    for rig in rigs:
+        stem = _stem(rig)
+        name, number = stem, 2
+        while name.lower() in (other.lower() for other in names):
+            name, number = f"{stem}_{number}", number + 1
+        names.append(name)
+    return names
+
+
+def loaded(rig: AnyRig) -> Rig:
+    """The rig itself.
+
+    Raises:
+        FileNotFoundError: No such file or built-in name.
+        ValueError: The file is not a rig.
+    """
+    return rig if isinstance(rig, Rig) else Rig.load(rig)
+
+
+def is_document(rig: AnyRig) -> bool:
+    """Whether there is more to it than a name: a rig, the path of one, or the name of a built-in one."""
+    return isinstance(rig, Rig) or _is_file(rig) or str(rig) in builtin_names("rigs")
+
+
+def given_as(rig: AnyRig) -> str:
+    """What the user called it."""
+    return rig.name if isinstance(rig, Rig) else str(rig)
+
+
+def _stem(rig: AnyRig) -> str:
+    if isinstance(rig, Rig):
+        return rig.name
+    return Path(rig).stem if _is_file(rig) else str(rig)
+
+
+def _is_file(rig: str | Path) -> bool:
+    return Path(rig).suffix in (".yaml", ".yml")

@@ -1,0 +1,68 @@
+"""The long run of a study, and how far others are from it."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcover.coverage import Coverage, Region, forward_regions
+from torchcover.coverage.estimate import Estimator
+from torchcover.evaluation.observers import CoverageObserver
+from torchcover.evaluation.pipeline import observe
+from torchcover.evaluation.settings import BLOCKS
+from torchcover.evaluation.study_plan import StudyPlan
+
+ESTIMATORS: tuple[Estimator, ...] = ("known", "completed")
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The long run: its maps, and what it says about each region and band.
+
+    Args:
+        coverage: Its coverage.
+        values: (regions x bands, 2) radius in metres and detection.
+        errors: Their standard errors.
+    """
+
+    coverage: Coverage
+    values: Tensor
+    errors: Tensor
+
+    @classmethod
+    def from_coverage(cls, coverage: Coverage) -> "Truth":
+        """What a coverage says, its unknown cells completed."""
+        estimates = [coverage.estimate(region, height, "completed") for region, height in _places(coverage)]
+        values = torch.stack([estimate.value for estimate in estimates])
+        return cls(coverage, values, torch.stack([estimate.error for estimate in estimates]))
+
+    def squared_errors(self, coverage: Coverage) -> Tensor:
+        """(7,) mean squares of what a coverage is off by, and its mean known share.
+
+        Radius and detection over the known cells, with the others completed, and cell by cell; the regions' share.
+        """
+        squares = []
+        for estimator in ESTIMATORS:
+            values = torch.stack([coverage.estimate(*place, estimator).value for place in _places(coverage)])
+            # A region of which nothing is known yet has no distance.
+            squares.append((values - self.values).square().nanmean(dim=0))
+        squares.append(self._cell_errors(coverage, forward_regions()[-1]))
+        known = torch.tensor([row.known_share for row in coverage.summary(forward_regions())], dtype=torch.float64)
+        return torch.cat([*squares, known.mean()[None]])
+
+    def _cell_errors(self, coverage: Coverage, region: Region) -> Tensor:
+        cells, truth = region.mask(coverage.grid), self.coverage
+        radius = (coverage.radius - truth.radius)[:, cells].square().nanmean()
+        detection = (coverage.detection[0] - truth.detection[0])[:, cells].square().nanmean()
+        return torch.stack([radius, detection])
+
+
+def long_run(plan: StudyPlan, *, progress: bool) -> Truth:
+    """Do it."""
+    observer = CoverageObserver(plan.metric(BLOCKS))
+    observe(plan.long_frames(), [observer], progress=progress, title="long run")
+    return Truth.from_coverage(observer.compute())
+
+
+def _places(coverage: Coverage) -> list[tuple[Region, str]]:
+    return [(region, height) for region in forward_regions() for height in coverage.grid.heights]

@@ -1,0 +1,176 @@
+"""A run ends as soon as its numbers are good enough: target errors, and how far each number is from them."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from torchcover.coverage import Coverage, Region
+from torchcover.evaluation.observers import Observer
+
+# An error from fewer steps is not believed, though they may fill enough blocks.
+MIN_STEPS = 32
+# Errors are looked at when they should have become small enough, but after 10 to 50 % more steps: some 20 times in
+# 4096 steps.
+MIN_GROWTH, MAX_GROWTH = 1.1, 1.5
+
+
+@dataclass(frozen=True)
+class TargetError:
+    """The largest standard errors that are good enough; None where any is.
+
+    Args:
+        radius_m: Of every radius in metres.
+        detection: Of every detection, as a share.
+    """
+
+    radius_m: float | None = None
+    detection: float | None = None
+
+    @classmethod
+    def parse(cls, words: Sequence[str]) -> "TargetError | None":
+        """Read numbers with their units; None for no words.
+
+        Raises:
+            ValueError: Not a positive number with % or m, or two with the same unit.
+
+        Example:
+            >>> TargetError.parse(["0.1%", "0.02m"])
+            TargetError(radius_m=0.02, detection=0.001)
+        """
+        found: dict[str, float] = {}
+        for word in words:
+            parts = re.fullmatch(r"([0-9.]+(?:e-?[0-9]+)?) ?(%|m)", word.strip())
+            try:
+                size = float(parts[1]) if parts else math.nan
+            except ValueError:
+                size = math.nan
+            if not parts or not 0 < size < math.inf:
+                raise ValueError(
+                    f"target error {word}: a positive number with its unit is needed, 0.1% for the detection or "
+                    "0.02m for the radius"
+                )
+            name, size = ("radius_m", size) if parts[2] == "m" else ("detection", size / 100)
+            if name in found:
+                raise ValueError(f"target error {word}: another number in {parts[2]} was given before; give one")
+            found[name] = size
+        return cls(**found) if found else None
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How far a number is from the error that is good enough.
+
+    Args:
+        rig: Whose number, or `B minus A` for a difference.
+        region: Name of the region.
+        height: Name of the height band.
+        quantity: As in the columns of `summary.csv`.
+        error: Standard error now, in metres or as a share; NaN if there are not enough steps.
+        target: What is good enough.
+        steps: Steps so far.
+    """
+
+    rig: str
+    region: str
+    height: str
+    quantity: str
+    error: float
+    target: float
+    steps: int
+
+    @property
+    def reached(self) -> bool:
+        """Whether it is good enough, and known well enough to say so."""
+        return self.steps >= MIN_STEPS and self.error <= self.target
+
+    @property
+    def excess(self) -> float:
+        """How many times the error is what it should be; infinite if it is not known."""
+        return math.inf if math.isnan(self.error) else self.error / self.target
+
+    @property
+    def steps_needed(self) -> int | None:
+        """Steps after which it should be good enough, for errors fall as 1 / sqrt(steps); None if there is no error."""
+        if math.isinf(self.excess):
+            return None
+        return max(MIN_STEPS, self.steps if self.reached else math.ceil(self.steps * self.excess**2))
+
+    @property
+    def words(self) -> str:
+        """Error and target."""
+        return f"± {_measure(self.error, self.quantity)} (target {_measure(self.target, self.quantity)})"
+
+
+def standings(target: TargetError, coverages: Mapping[str, Coverage], regions: Sequence[Region]) -> list[Standing]:
+    """How far every number is: those of each rig, and the differences to the first rig.
+
+    A number that is unknown, for want of a known cell, has no error, and nothing waits for it.
+
+    Args:
+        target: What is good enough.
+        coverages: What `CoverageMetric.compute` returned, by the name of the rig, from the same frames.
+        regions: Regions within the grid.
+    """
+    (first_name, first), *_ = coverages.items()
+    found = []
+    for region in regions:
+        for height in first.grid.heights:
+            estimates = {name: coverage.estimate(region, height) for name, coverage in coverages.items()}
+            others = [name for name in estimates if name != first_name]
+            paired = {f"{name} minus {first_name}": estimates[name].minus(estimates[first_name]) for name in others}
+            for name, estimate in (estimates | paired).items():
+                numbers = zip(first.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True)
+                for quantity, value, error in numbers:
+                    good = target.radius_m if quantity.unit == "m" else target.detection
+                    if good is not None and not math.isnan(value):
+                        where = (name, region.name, height, quantity.key)
+                        found.append(Standing(*where, error, good, first.counts["steps"]))
+    return found
+
+
+class TargetWatch:
+    """Looks at the errors of a run now and then: what `observe` takes as `until`.
+
+    Args:
+        target: What is good enough.
+        observers: Those whose coverage it is, by the name of the rig.
+        regions: Regions within their grid.
+    """
+
+    def __init__(
+        self, target: TargetError, observers: Mapping[str, Observer[Coverage]], regions: Sequence[Region]
+    ) -> None:
+        self.target = target
+        self.observers = observers
+        self.regions = regions
+        self.next_look = MIN_STEPS
+        self.worst: Standing | None = None
+
+    def is_reached(self, steps: int) -> bool:
+        """Whether the run may end after so many steps. Between two looks: no."""
+        if steps < self.next_look:
+            return False
+        coverages = {name: observer.compute() for name, observer in self.observers.items()}
+        found = standings(self.target, coverages, self.regions)
+        self.worst = max(found, key=lambda standing: standing.excess, default=None)
+        if self.worst is not None and self.worst.reached:
+            return True
+        needed = math.inf if self.worst is None else self.worst.steps_needed or math.inf
+        self.next_look = math.ceil(min(max(needed, MIN_GROWTH * steps), MAX_GROWTH * steps))
+        return False
+
+    def expected_steps(self, most: int) -> int:
+        """Steps that the run is thought to take, of so many at most."""
+        if self.worst is None or self.worst.steps_needed is None:
+            return most
+        return min(most, max(self.worst.steps_needed, self.next_look))
+
+    @property
+    def words(self) -> str:
+        """The worst error and its target."""
+        return self.worst.words if self.worst else ""
+
+
+def _measure(error: float, quantity: str) -> str:
+    return f"{error:.2g} m" if quantity == "radius_m" else f"{100 * error:.2g} %"

@@ -1,0 +1,1 @@
+"""Maps: what was measured in every cell, seen from above."""

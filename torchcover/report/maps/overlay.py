@@ -1,0 +1,150 @@
+"""What is drawn over a map: the ego vehicle, and the sensors with their directions; black and white, unlike data."""
+
+import math
+from collections.abc import Sequence
+from itertools import product
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import FancyArrowPatch, Patch, Polygon, Wedge
+from matplotlib.patheffects import AbstractPathEffect, withStroke
+from numpy.typing import NDArray
+
+from torchcover.report.maps.sheet import Sheet
+from torchcover.report.sensor_view import SensorView
+
+# Okabe and Ito's colours, which the colour-blind can tell apart.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+ARROW_POINTS = 20.0
+NUMBER_POINTS = 24.0
+OVERLAP_POINTS = 9.0
+DOT: dict[str, Any] = {"markersize": 4.5, "markerfacecolor": "black", "markeredgecolor": "white"}
+HALO: Sequence[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]
+THIN_HALO: Sequence[AbstractPathEffect] = [withStroke(linewidth=1.8, foreground="white")]
+
+
+def draw_ego(axes: Axes, outline_m: NDArray[np.floating]) -> list[Artist]:
+    """Fill the ego's outline.
+
+    Args:
+        axes: Axes of a map.
+        outline_m: (K, 2) corners x, y in the vehicle frame in metres, K >= 3.
+
+    Returns:
+        Legend entries.
+
+    Raises:
+        ValueError: Another shape.
+    """
+    outline = np.asarray(outline_m)
+    if outline.ndim != 2 or outline.shape[1] != 2 or len(outline) < 3:
+        raise ValueError(f"ego_outline_m: (K, 2) corners x, y with K >= 3 are needed; got shape {outline.shape}")
+    ego = Polygon(outline, closed=True, facecolor="white", edgecolor="black", linewidth=1.0, zorder=3, label="ego")
+    axes.add_patch(ego)
+    return [ego]
+
+
+def draw_sensors(sheet: Sheet, sensors: Sequence[SensorView], *, named: bool = True) -> list[Artist]:
+    """Draw each sensor as a dot with an arrow in its direction, numbered if there are several, and its field of view.
+
+    Args:
+        sheet: The sheet of the map.
+        sensors: What to draw.
+        named: Whether the legend names each; else there are no numbers either.
+
+    Returns:
+        Legend entries.
+    """
+    if not sensors:
+        return []
+    view = Line2D([], [], color="black", linewidth=0.8, linestyle=(0, (5, 3)), label="field of view, up to its range")
+    for sensor in sensors:
+        _draw_view(sheet, sensor)
+    for sensor in sensors:
+        _draw_arrow(sheet, sensor)
+    if not named:
+        return [Line2D([], [], linestyle="none", marker="o", label="sensor, with its direction", **DOT), view]
+    if len(sensors) > 1:
+        _draw_numbers(sheet, sensors)
+    numbers = [f"{number}  " if len(sensors) > 1 else "" for number in range(1, len(sensors) + 1)]
+    return [*(_legend_entry(sheet, *pair) for pair in zip(numbers, sensors, strict=True)), view]
+
+
+def draw_sectors(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
+    """Fill the horizontal field of view of each sensor, as if nothing were in its way: all that geometry alone says.
+
+    Args:
+        sheet: The sheet of an empty map.
+        sensors: What to draw.
+
+    Returns:
+        Legend entries.
+    """
+    entries: list[Artist] = []
+    for at, sensor in enumerate(sensors):
+        colour = COLOURS[at % len(COLOURS)]
+        _draw_wedge(sheet, sensor, facecolor=(colour, 0.3), edgecolor=colour, linewidth=1.0)
+        entries.append(Patch(facecolor=(colour, 0.3), edgecolor=colour, label=f"field of view: {sensor.name}"))
+    return entries
+
+
+def _draw_view(sheet: Sheet, sensor: SensorView) -> None:
+    dashes = {"fill": False, "edgecolor": "black", "linewidth": 0.8, "linestyle": (0, (5, 3))}
+    _draw_wedge(sheet, sensor, zorder=2.5, path_effects=THIN_HALO, **dashes)
+
+
+def _draw_wedge(sheet: Sheet, sensor: SensorView, **style: Any) -> None:  # noqa: ANN401  (matplotlib's own)
+    start, half = (sensor.x_m, sensor.y_m), sensor.horizontal_fov_deg / 2
+    furthest = max(math.dist(start, corner) for corner in product(sheet.axes.get_xlim(), sheet.axes.get_ylim()))
+    wedge = Wedge(
+        start,
+        min(sensor.range_m, 2 * furthest),  # infinity cannot be drawn; beyond the map all ranges look the same
+        sensor.yaw_deg - half,
+        sensor.yaw_deg + half,
+        **style,
+    )
+    sheet.axes.add_patch(wedge)
+
+
+def _draw_arrow(sheet: Sheet, sensor: SensorView) -> None:
+    start, tip = (sensor.x_m, sensor.y_m), _ahead(sheet, sensor, ARROW_POINTS)
+    arrow = FancyArrowPatch(
+        start, tip, arrowstyle="-|>", mutation_scale=9, shrinkA=0, shrinkB=0, linewidth=1.2, color="black", zorder=4
+    )
+    arrow.set(path_effects=HALO)
+    sheet.axes.add_patch(arrow)
+    sheet.axes.plot(*start, linestyle="none", marker="o", zorder=5, **DOT)
+
+
+def _draw_numbers(sheet: Sheet, sensors: Sequence[SensorView]) -> None:
+    for (x, y), numbers in _places(sheet, sensors).items():
+        # The text grows away from the arrow.
+        side = {1: "left", 0: "center", -1: "right"}[round(math.cos(math.radians(sensors[numbers[0] - 1].yaw_deg)))]
+        text = sheet.axes.text(x, y, ", ".join(map(str, numbers)), fontsize=8, ha=side, va="center", clip_on=True)
+        text.set(zorder=5, path_effects=HALO)
+
+
+def _places(sheet: Sheet, sensors: Sequence[SensorView]) -> dict[tuple[float, float], list[int]]:
+    """Where to write which numbers: sensors whose numbers would overlap share a place."""
+    places: dict[tuple[float, float], list[int]] = {}
+    for number, sensor in enumerate(sensors, start=1):
+        wanted = _ahead(sheet, sensor, NUMBER_POINTS)
+        near = (place for place in places if math.dist(place, wanted) < OVERLAP_POINTS / 72 * sheet.metres_per_inch)
+        places.setdefault(next(near, wanted), []).append(number)
+    return places
+
+
+def _legend_entry(sheet: Sheet, number: str, sensor: SensorView) -> Artist:
+    (left, right), (bottom, top) = sheet.axes.get_xlim(), sheet.axes.get_ylim()
+    inside = left <= sensor.x_m <= right and bottom <= sensor.y_m <= top
+    label = f"{number}{sensor.name}{'' if inside else ' (beyond the map)'}"
+    return Line2D([], [], linestyle="none", marker="o", label=label, **DOT)
+
+
+def _ahead(sheet: Sheet, sensor: SensorView, points: float) -> tuple[float, float]:
+    """The place so many points (1/72 inch) in front of the sensor, in metres."""
+    reach, yaw = points / 72 * sheet.metres_per_inch, math.radians(sensor.yaw_deg)
+    return sensor.x_m + reach * math.cos(yaw), sensor.y_m + reach * math.sin(yaw)

@@ -1,0 +1,182 @@
+"""The paper under a picture: as large as what is on it; every cell of a map a whole number of pixels."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.transforms import Bbox, ScaledTranslation
+from numpy.typing import NDArray
+
+from torchcover.coverage import BevGrid
+
+Bounds = tuple[float, float]
+
+MAX_MAP_IN = (9.0, 6.0)
+MAX_PAPER_IN = (14.0, 8.75)
+# Between maps on one paper, with room for the outer labels of two axes; below, for a heading.
+BESIDE_IN = 0.6
+BELOW_IN = 0.4
+DOTS_PER_INCH = 150
+# Beyond this, cells are smaller than pixels and are averaged.
+MAX_DOTS_PER_INCH = 300
+COLOUR_BAR_IN = 0.16
+# The label of the colour bar needs this much.
+MIN_COLOUR_BAR_IN = 2.4
+GAP_IN = 0.15
+X_LABEL_IN = 0.55
+LEGEND_COLUMN_IN = 3.0
+HEADING_POINTS = 18
+ABOVE: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "parse_math": False}
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """An empty map, alone on its paper or beside others.
+
+    Args:
+        figure: The whole paper.
+        axes: The map: x to the right and y upwards, in equal metres.
+        bar: Place of the colour bar, which the maps on one paper share, or those of one row.
+        legend_columns: How many entries of a legend fit beside each other.
+        metres_per_inch: Scale of the map.
+    """
+
+    figure: Figure
+    axes: Axes
+    bar: Axes
+    legend_columns: int
+    metres_per_inch: float
+
+
+def lay_out(grid: BevGrid, maps: int = 1, *, across: int | None = None) -> list[Sheet]:
+    """Empty maps of the grid on one paper: long ones below each other, others beside each other.
+
+    Args:
+        grid: Bounds and cells.
+        maps: How many.
+        across: How many in a row; each row then has its own colour bar.
+
+    Returns:
+        The maps, row by row from the upper left.
+    """
+    _, rows, columns = grid.shape
+    bar_for_all = across is None
+    across, inches_per_cell = _arrange(grid, maps, across)
+    dpi = min(math.ceil(DOTS_PER_INCH * inches_per_cell) / inches_per_cell, MAX_DOTS_PER_INCH)
+    map_in = inches_per_cell * np.array([columns, rows])
+    # Gaps of whole pixels, so that every cell of every map is whole pixels.
+    step_in = map_in + np.round(np.array([BESIDE_IN, BELOW_IN]) * dpi) / dpi
+    paper_in = map_in + step_in * [across - 1, math.ceil(maps / across) - 1]
+    figure = Figure(figsize=tuple(paper_in), dpi=dpi)
+
+    def place(left_in: float, top_in: float, size_in: NDArray[np.float64]) -> tuple[float, float, float, float]:
+        corner = np.array([left_in, paper_in[1] - top_in - size_in[1]]) / paper_in
+        return (*corner.tolist(), *(size_in / paper_in).tolist())
+
+    views = []
+    for at in range(maps):
+        left_in, top_in = (step_in * [at % across, at // across]).tolist()
+        views.append(figure.add_axes(place(left_in, top_in, map_in), xlim=grid.x, ylim=grid.y))
+        _label(views[-1], left=at % across == 0, lowest=at + across >= maps)
+    bar_in = np.array([COLOUR_BAR_IN, max(paper_in[1] if bar_for_all else map_in[1], MIN_COLOUR_BAR_IN)])
+    gap_in = GAP_IN if maps == 1 else BESIDE_IN  # the axis of a map above the last row has labels beside the bar
+    tops_in = [0.0] if bar_for_all else [step_in[1] * row for row in range(math.ceil(maps / across))]
+    bars = [figure.add_axes(place(paper_in[0] + gap_in, top_in, bar_in)) for top_in in tops_in]
+    legend_columns = max(1, int(paper_in[0] / LEGEND_COLUMN_IN))
+    bar_of = [bars[0 if bar_for_all else at // across] for at in range(maps)]
+    scale = grid.cell / inches_per_cell
+    return [Sheet(figure, axes, bar, legend_columns, scale) for axes, bar in zip(views, bar_of, strict=True)]
+
+
+def _arrange(grid: BevGrid, maps: int, across: int | None) -> tuple[int, float]:
+    """How many maps beside each other, and inches for each cell: the most that the paper allows."""
+    _, rows, columns = grid.shape
+    width_in, height_in = MAX_MAP_IN if maps == 1 else MAX_PAPER_IN
+
+    def inches_per_cell(across: int) -> float:
+        return min(width_in / (across * columns), height_in / (math.ceil(maps / across) * rows))
+
+    across = across or max(range(1, maps + 1), key=inches_per_cell)
+    return across, inches_per_cell(across)
+
+
+def _label(axes: Axes, *, left: bool, lowest: bool) -> None:
+    axes.set_xlabel("x forward (m)" if lowest else "")
+    axes.set_ylabel("y left (m)" if left else "")
+    axes.tick_params(labelbottom=lowest, labelleft=left)
+
+
+def stack_views(x: Bounds, heights: Sequence[Bounds], *, width_in: float) -> tuple[Figure, list[Axes]]:
+    """Empty views in metres without cells, below each other, all with the same x axis and in equal metres.
+
+    Args:
+        x: Bounds of the axis to the right, in metres.
+        heights: Bounds of the axis upwards in each view, from the top.
+        width_in: Width in inches.
+
+    Returns:
+        The paper, and the views from the top.
+    """
+    inches_per_metre = width_in / (x[1] - x[0])
+    heights_in = [inches_per_metre * (high - low) for low, high in heights]
+    paper_in = sum(heights_in) + BELOW_IN * (len(heights) - 1)
+    figure = Figure(figsize=(width_in, paper_in), dpi=DOTS_PER_INCH)
+    top_in, views = paper_in, []
+    for bounds, height_in in zip(heights, heights_in, strict=True):
+        place = (0.0, (top_in - height_in) / paper_in, 1.0, height_in / paper_in)
+        views.append(figure.add_axes(place, xlim=x, ylim=bounds))
+        top_in -= height_in + BELOW_IN
+    return figure, views
+
+
+def write_title(axes: Axes, title: str, subtitle: str, lift_points: float = 0.0) -> None:
+    """Write two lines above the map, the second smaller, both as they are: `$` is no formula."""
+    axes.annotate(title, (0, 1), (0, 22 + lift_points), fontsize=11, fontweight="bold", **ABOVE)
+    axes.annotate(subtitle, (0, 1), (0, 8 + lift_points), fontsize=9, color="#404040", **ABOVE)
+
+
+def write_heading(axes: Axes, heading: str) -> None:
+    """Write a line above one map of several, which leaves room for a title if that is lifted by `HEADING_POINTS`."""
+    axes.annotate(heading, (0, 1), (0, 5), fontsize=9, fontweight="bold", **ABOVE)
+
+
+def lower_left(sheets: Sequence[Sheet]) -> Axes:
+    """The map in the lower left corner, under which the legend of all has its place."""
+    return min((sheet.axes for sheet in sheets), key=lambda axes: (axes.get_position().y0, axes.get_position().x0))
+
+
+def write_legend(axes: Axes, entries: Sequence[Artist], columns: int) -> None:
+    """Write the legend under the map, where it hides nothing; what several maps share is in it once."""
+    below = ScaledTranslation(0, -X_LABEL_IN, axes.figure.dpi_scale_trans)
+    legend = axes.legend(
+        handles=list({entry.get_label(): entry for entry in entries}.values()),
+        loc="upper left",
+        bbox_to_anchor=(0, 0),
+        bbox_transform=axes.transAxes + below,
+        borderaxespad=0,
+        ncols=columns,
+        fontsize=8,
+        frameon=False,
+    )
+    for text in legend.get_texts():
+        text.set_parse_math(False)
+
+
+def fit_paper(figure: Figure) -> None:
+    """Make the paper as large as what is drawn on it, with a margin. Nothing is clipped, nothing changes its size."""
+    FigureCanvasAgg(figure)
+    drawn = figure.get_tightbbox().padded(GAP_IN)
+    dots = figure.dpi
+    left, bottom = (math.floor(edge * dots) / dots for edge in drawn.min)
+    right, top = (math.ceil(edge * dots) / dots for edge in drawn.max)
+    old, new = figure.get_size_inches(), (right - left, top - bottom)
+    figure.set_size_inches(*new)
+    for axes in figure.axes:
+        corners = axes.get_position(original=True).get_points() * old - (left, bottom)
+        axes.set_position(Bbox(corners / new))

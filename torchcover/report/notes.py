@@ -1,0 +1,75 @@
+"""The conditions of a table as sentences."""
+
+import math
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from torchcover.report.remarks import Remark, RemarkName
+from torchcover.report.table import CoverageTable
+from torchcover.report.wording import span, steps_and_cell
+
+
+def notes_on(table: CoverageTable) -> list[str]:
+    """What the numbers hold under and what went wrong, a sentence each; what is about one rig only begins with it."""
+    by_rig = {rig: _of_rig(table, rig) for rig in table.rigs}
+    common = [note for note in by_rig[table.rigs[0]] if all(note in notes for notes in by_rig.values())]
+    own = [f"{rig}: {note}" for rig, notes in by_rig.items() for note in notes if note not in common]
+    paired = ["All rigs were measured against the same reference points, so they know the same cells."]
+    return [*(paired if len(table.rigs) > 1 else []), *common, *own, *table.notes]
+
+
+def marks_on(table: CoverageTable) -> dict[str, str]:
+    """What the marks of a comparison mean, by their names; empty for one rig."""
+    if len(table.rigs) == 1:
+        return {}
+    marks = {"best": "the best of its row; equal numbers are all marked, unknown ones never."}
+    if table.first.blocks is not None:
+        chance = "more than chance, by Student's t at 95 %: of 20 rows without a difference, one is marked."
+        marks["significant"] = chance
+    return marks
+
+
+def _of_rig(table: CoverageTable, rig: str) -> list[str]:
+    conditions = table.conditions[rig]
+    bands = ", ".join(f"{name} z {span(band)}" for name, band in table.grid.heights.items())
+    first = f"{steps_and_cell(conditions.counts['steps'], table.grid)}; {bands}."
+    return [first, *(SENTENCES[remark.name](remark, table, rig) for remark in conditions.remarks)]
+
+
+def _too_few_blocks(remark: Remark, _: CoverageTable, __: str) -> str:
+    blocks = f"{remark.count} block{'s' * (remark.count != 1)}"
+    return f"Not enough steps for errors: {blocks}, {remark.of} are needed."
+
+
+def _standard_errors(remark: Remark, table: CoverageTable, rig: str) -> str:
+    steps = table.conditions[rig].steps_per_block
+    return f"± is one standard error, from {remark.count} blocks of up to {steps:,} steps in a row."
+
+
+def _saturated(remark: Remark, table: CoverageTable, _: str) -> str:
+    limit_m = table.max_radius
+    far = "infinitely far" if math.isinf(limit_m) else f"{limit_m:.4g} m far, the limit"
+    return f"{_some(remark)} reference points count as {far}: no sensor point was nearer."
+
+
+def _some(remark: Remark) -> str:
+    return f"{remark.count:,} of {remark.of:,}"
+
+
+SENTENCES: Mapping[RemarkName, Callable[[Remark, CoverageTable, str], str]] = MappingProxyType(
+    {
+        "no_region": lambda *_: "No region, so no number: the maps cover the whole grid.",
+        "unknown_cells": lambda *_: (
+            "Means over the known cells only; the fewer are known, the more the numbers may flatter the rig."
+        ),
+        "too_few_blocks": _too_few_blocks,
+        "standard_errors": _standard_errors,
+        "one_block_regions": lambda *_: "No ± where one block alone has probed the region.",
+        "empty_sensor_steps": lambda remark, *_: (
+            f"{_some(remark)} steps had no sensor point: they count as blind, not as missing."
+        ),
+        "empty_reference_steps": lambda remark, *_: f"{_some(remark)} steps had no reference point: they say nothing.",
+        "saturated_points": _saturated,
+        "outside_points": lambda remark, *_: f"{_some(remark)} reference points lie outside the grid: left out.",
+    }
+)

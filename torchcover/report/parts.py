@@ -1,0 +1,125 @@
+"""A table in words, before it is text: the parts of a page, which renderers for readers have in common."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from textwrap import fill
+from typing import NamedTuple
+
+from torchcover.coverage import Quantity
+from torchcover.report.table import CoverageTable, Row
+from torchcover.report.wording import (
+    capitalised,
+    difference_heading,
+    difference_words,
+    heading,
+    number_words,
+    percent,
+)
+
+MAX_HEADING_CHARS = 16
+PLACE_HEADINGS = ("region", "height")
+KNOWN_HEADING = "known cells\n(%)"
+
+
+class Words(NamedTuple):
+    """What a cell of a part says, and whether it is marked: as the best of its row, or as more than chance."""
+
+    text: str
+    mark: str = ""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A part of a table that has one heading for each column.
+
+    Args:
+        title: Above it; empty for none.
+        quantities: What it has numbers of.
+        of_differences: Whether these are differences.
+        headings: Of its columns, region and height first; line breaks are where they had better be.
+        rows: Its cells.
+        bands: After so many rows comes another region.
+    """
+
+    title: str
+    quantities: tuple[Quantity, ...]
+    of_differences: bool
+    headings: tuple[str, ...]
+    rows: tuple[tuple[Words, ...], ...]
+    bands: int
+
+    def with_column(self, heading: str, cells: Sequence[str]) -> "Part":
+        """The part with one more column.
+
+        Raises:
+            ValueError: Another number of cells than of rows.
+        """
+        if len(cells) != len(self.rows):
+            raise ValueError(f"column {heading!r}: {len(self.rows)} cells are needed; got {len(cells)}")
+        rows = tuple((*row, Words(cell)) for row, cell in zip(self.rows, cells, strict=True))
+        return replace(self, headings=(*self.headings, heading), rows=rows)
+
+
+def parts_of(table: CoverageTable) -> list[Part]:
+    """The parts of a table.
+
+    Args:
+        table: The table.
+
+    Returns:
+        For one rig one part, a column for each quantity. For several the paper's layout: a part for each quantity, a
+        column for each rig; and, if there are errors, as many parts with the differences to the first rig.
+    """
+    if len(table.rigs) == 1:
+        return [_of_one_rig(table)]
+    parts = [_of_quantity(table, quantity) for quantity in table.quantities]
+    if table.first.blocks is not None:
+        parts += [_of_differences(table, quantity) for quantity in table.quantities]
+    return parts
+
+
+def _of_one_rig(table: CoverageTable) -> Part:
+    headings = [fill(heading(quantity), MAX_HEADING_CHARS) for quantity in table.quantities]
+    cells = [[_number(row, quantity) for quantity in table.quantities] for (row,) in table.places]
+    return _part(table, "", table.quantities, headings, cells)
+
+
+def _of_quantity(table: CoverageTable, quantity: Quantity) -> Part:
+    cells = [[_number(row, quantity) for row in rows] for rows in table.places]
+    return _part(table, capitalised(heading(quantity)), (quantity,), table.rigs, cells)
+
+
+def _of_differences(table: CoverageTable, quantity: Quantity) -> Part:
+    first, *others = table.rigs
+    cells = [[_difference(row, quantity) for row in rows[1:]] for rows in table.places]
+    title = f"Difference to {first}: {difference_heading(quantity)}"
+    return _part(table, title, (quantity,), others, cells, of_differences=True)
+
+
+def _part(
+    table: CoverageTable,
+    title: str,
+    quantities: tuple[Quantity, ...],
+    headings: Sequence[str],
+    numbers: Sequence[Sequence[Words]],
+    *,
+    of_differences: bool = False,
+) -> Part:
+    """A part with the columns that every part has: the place before the numbers, the known cells behind them."""
+    rows = []
+    for (row, *_), cells in zip(table.places, numbers, strict=True):
+        summary = row.summary
+        place, known = (Words(summary.region), Words(summary.height)), Words(percent(summary.known_share))
+        rows.append((*place, *cells, known))
+    every = (*PLACE_HEADINGS, *headings, KNOWN_HEADING)
+    return Part(title, quantities, of_differences, every, tuple(rows), len(table.grid.heights))
+
+
+def _number(row: Row, quantity: Quantity) -> Words:
+    words = number_words(row.summary.numbers[quantity.key], quantity.unit)
+    return Words(words, "best" if quantity.key in row.best else "")
+
+
+def _difference(row: Row, quantity: Quantity) -> Words:
+    difference = row.differences[quantity.key]
+    return Words(difference_words(difference, quantity.unit), "significant" if difference.significant else "")

@@ -1,0 +1,50 @@
+"""A table as Markdown, for documents and web pages."""
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+
+from torchcover.report.notes import marks_on, notes_on
+from torchcover.report.parts import PLACE_HEADINGS, Part, Words, parts_of
+from torchcover.report.table import CoverageTable
+
+# What Markdown would take for something else: an underscore does so at the end of a word only.
+SPECIAL = re.compile(r"[\\`*|\[\]]|<(?=[A-Za-z/!?])|&(?=[\w#]+;)|(?<![^\W_])_|_(?![^\W_])")
+MARKS = {"best": "In bold", "significant": "In bold, if it is a difference"}
+
+
+def render(table: CoverageTable) -> str:
+    """The table as Markdown text; what is marked is bold."""
+    return as_markdown(table, parts_of(table))
+
+
+def as_markdown(table: CoverageTable, parts: Sequence[Part]) -> str:
+    """Parts of a table as Markdown text, with the table's notes below.
+
+    Args:
+        table: The table.
+        parts: Its parts as `parts_of` gives them, maybe with columns of one's own.
+    """
+    marks = [f"{MARKS[mark]}: {meaning}" for mark, meaning in marks_on(table).items()]
+    notes = [f"* {_escaped(note)}" for note in (*marks, *notes_on(table))]
+    return "\n".join([*(line for part in parts for line in _lines(part)), *notes, ""])
+
+
+def _lines(part: Part) -> Iterator[str]:
+    if part.title:
+        yield f"{_escaped(part.title)}\n"
+    yield _line(map(_escaped, part.headings))
+    yield _line(["---"] * len(PLACE_HEADINGS) + ["---:"] * (len(part.headings) - len(PLACE_HEADINGS)))
+    yield from (_line(map(_cell, row)) for row in part.rows)
+    yield ""
+
+
+def _cell(cell: Words) -> str:
+    return f"**{_escaped(cell.text)}**" if cell.mark else _escaped(cell.text)
+
+
+def _escaped(words: str) -> str:
+    return SPECIAL.sub(r"\\\g<0>", " ".join(words.split()))
+
+
+def _line(cells: Iterable[str]) -> str:
+    return f"| {' | '.join(cells)} |"

@@ -1,0 +1,75 @@
+"""A table as records, one for each rig, region and band: what CSV and JSON have in common."""
+
+from collections.abc import Callable
+
+from torchcover.report.table import CoverageTable, Row
+
+Record = dict[str, object]
+Columns = dict[str, Callable[[Row], object]]
+
+
+def records_of(table: CoverageTable) -> list[Record]:
+    """A record for each row, rig by rig; lengths in metres, detection and shares in [0, 1], NaN where unknown."""
+    columns = columns_of(table)
+    return [{name: of(row) for name, of in columns.items()} for rows in table.rows.values() for row in rows]
+
+
+def columns_of(table: CoverageTable) -> Columns:
+    """What each record has, and where it is in a row."""
+    keys = [quantity.key for quantity in table.quantities]
+    columns: Columns = {
+        "rig": lambda row: row.rig,
+        "region": lambda row: row.summary.region,
+        "height": lambda row: row.summary.height,
+    }
+    for key in keys:
+        columns |= _numbers(key)
+    for key in keys:
+        columns |= _completed(key)
+    columns |= _conditions(table)
+    for key in keys if len(table.rigs) > 1 else ():
+        columns |= _compared(key)
+    return columns
+
+
+def _numbers(key: str) -> Columns:
+    return {
+        key: lambda row: row.summary.numbers[key].value,
+        f"{key}_error": lambda row: row.summary.numbers[key].error,
+    }
+
+
+def _completed(key: str) -> Columns:
+    return {
+        f"completed_{key}": lambda row: row.summary.completed[key].value,
+        f"completed_{key}_error": lambda row: row.summary.completed[key].error,
+    }
+
+
+def _compared(key: str) -> Columns:
+    return {
+        f"{key}_best": lambda row: key in row.best,
+        f"{key}_difference": lambda row: row.differences[key].value,
+        f"{key}_difference_error": lambda row: row.differences[key].error,
+        f"{key}_difference_significant": lambda row: row.differences[key].significant,
+    }
+
+
+def _conditions(table: CoverageTable) -> Columns:
+    heights = table.grid.heights
+    return {
+        "known_share": lambda row: row.summary.known_share,
+        "known_cells": lambda row: row.summary.known_cells,
+        "unseen_cells": lambda row: row.summary.unseen_cells,
+        "cells": lambda row: row.summary.cells,
+        "cell_m": lambda _: table.grid.cell,
+        "steps": lambda row: table.conditions[row.rig].counts["steps"],
+        "blocks": lambda row: table.conditions[row.rig].blocks,
+        "steps_per_block": lambda row: table.conditions[row.rig].steps_per_block,
+        "x_min_m": lambda row: row.region.x[0],
+        "x_max_m": lambda row: row.region.x[1],
+        "y_min_m": lambda row: row.region.y[0],
+        "y_max_m": lambda row: row.region.y[1],
+        "z_min_m": lambda row: heights[row.summary.height][0],
+        "z_max_m": lambda row: heights[row.summary.height][1],
+    }

@@ -1,0 +1,93 @@
+"""A table as text for a terminal."""
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+from rich.cells import cell_len
+from rich.console import Console
+from rich.measure import Measurement
+from rich.table import Table
+from rich.text import Text
+
+from torchcover.report.notes import marks_on, notes_on
+from torchcover.report.parts import PLACE_HEADINGS, Part, Words, parts_of
+from torchcover.report.table import CoverageTable
+
+# Survive files and terminals without bold type.
+SIGNS = {"best": "*", "significant": "!"}
+# More characters than any table has in a line.
+MAX_LINE_CHARS = 10_000
+
+
+def render(table: CoverageTable) -> str:
+    """The table as it is printed where lines may be as long as they like."""
+    file = io.StringIO()
+    print_table(table, Console(file=file, width=1))
+    return file.getvalue()
+
+
+def print_table(table: CoverageTable, console: Console | None = None) -> None:
+    """Print a table, as wide as its numbers need; on a terminal that is narrower, names are folded.
+
+    Args:
+        table: The table.
+        console: Where to; the terminal if not given.
+    """
+    console = console or Console()
+    tables = rich_tables(table)
+    folded = table.rigs if console.is_terminal and len(table.rigs) > 1 else ()
+    # Rather lines that are too long than numbers that are cut off; in a file the names are whole too.
+    console.width = max(console.width, narrowest_width(tables, folded))
+    for part in tables:
+        console.print(part)
+
+
+def rich_tables(table: CoverageTable) -> list[Table]:
+    """The parts of a table for `rich.console.Console.print`.
+
+    The best number of each row is bold and marked `*`; a difference that is more than chance is bold and marked `!`.
+
+    Args:
+        table: The table.
+
+    Returns:
+        A table for each part; what they hold under, and what went wrong, is the caption of the last.
+    """
+    parts = parts_of(table)
+    widest = max((cell_len(_text(cell).plain) for part in parts for row in part.rows for cell in row[2:-1]), default=0)
+    tables = [_rich_table(part, widest) for part in parts]
+    marks = [f"{SIGNS[mark]} {meaning}" for mark, meaning in marks_on(table).items()]
+    tables[-1].caption = Text("\n".join([*marks, *notes_on(table)]))
+    return tables
+
+
+def narrowest_width(tables: Sequence[Table], folded: Sequence[str] = ()) -> int:
+    """Characters in a line that tables need at least.
+
+    Args:
+        tables: Tables for rich, whose numbers stay whole.
+        folded: Headings, each of one column, that may be folded to the width of the numbers below.
+    """
+    console = Console(width=MAX_LINE_CHARS)
+    natural = max(Measurement.get(console, console.options, table).maximum for table in tables)
+    numbers = max(column.min_width or 0 for table in tables for column in table.columns)
+    return natural - sum(max(0, cell_len(name) - numbers) for name in folded)
+
+
+def _rich_table(part: Part, widest: int) -> Table:
+    left: dict[str, Any] = {"title_justify": "left", "caption_justify": "left"}
+    table = Table(title=Text(part.title) if part.title else None, title_style="bold", caption_style="", **left)
+    for name in PLACE_HEADINGS:
+        table.add_column(name, no_wrap=True)
+    for name in part.headings[2:-1]:
+        # As Text, for names may hold what rich takes for markup. Names are folded, numbers never.
+        table.add_column(Text(name), justify="right", overflow="fold", min_width=widest)
+    table.add_column(part.headings[-1], justify="right", no_wrap=True)
+    for at, row in enumerate(part.rows, 1):
+        table.add_row(*map(_text, row), end_section=at % part.bands == 0)
+    return table
+
+
+def _text(cell: Words) -> Text:
+    return Text(f"{SIGNS[cell.mark]} {cell.text}", style="bold") if cell.mark else Text(cell.text)
