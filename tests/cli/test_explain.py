@@ -34,12 +34,12 @@ def test_without_the_option_it_stands_in_the_summary_only(torchcover, worlds):
 
 def test_points_outside_the_grid_are_counted_over_all_rigs():
     grid = BevGrid(x=(0.0, 2.0), y=(0.0, 2.0), cell=1.0)
-    metric = CoverageMetric(grid, maximum=True)
+    metric = CoverageMetric(grid)
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0], [9.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]))
     records = {str(row["what"]): row for row in left_out({}, [metric.compute()] * 2)}
     outside = records["reference points outside every cell: not searched for"]
     assert (outside["count"], outside["of"]) == (4, 6)
-    assert "quantiles, pooled means: not asked for, not kept" in records
+    assert "maxima, quantiles, quantiles over steps, pooled means: not asked for, not kept" in records
 
 
 @pytest.mark.parametrize("count", [0, 7])

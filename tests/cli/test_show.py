@@ -5,6 +5,7 @@ import pytest
 from matplotlib.image import imread
 
 from torchcover.cli import show
+from torchcover.cli.run import sensor_views
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.documents import builtin_names
 
@@ -98,7 +99,7 @@ def test_a_world_is_built_once(torchcover, worlds, monkeypatch, arguments):
 
 @pytest.mark.parametrize("name", builtin_names("rigs"))
 def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
-    for sensor in map(show._sensor_view, Rig.load(name).sensors):
+    for sensor in sensor_views(Rig.load(name)):
         low, high = sensor.vertical_fov_deg
         assert -90 <= low < high <= 90
         assert 0 < sensor.horizontal_fov_deg <= 360
