@@ -27,7 +27,10 @@ RigOrNone = Annotated[
 Rig = Annotated[str, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file.")]
 Rigs = Annotated[
     list[str] | None,
-    typer.Argument(help="Rigs: built-in names (see `list`) or YAML files, two or more; with --frames those in it."),
+    typer.Argument(
+        help="Rigs: built-in names (see `list`) or YAML files, two or more; with --frames those in it. Or coverage.npz "
+        "files of runs over the same frames."
+    ),
 ]
 ScenarioOrNone = Annotated[str | None, typer.Option(help="Scenario: a built-in name or a YAML file (courtyard).")]
 Frames = Annotated[

@@ -14,7 +14,7 @@ from torchcover.coverage.layer import Layer
 from torchcover.coverage.metric import CoverageMetric
 from torchcover.coverage.paired import Difference, check_paired, differences
 from torchcover.coverage.quantity import Quantity
-from torchcover.coverage.regions import Region, forward_regions
+from torchcover.coverage.regions import Region, forward_regions, regions_within
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.summary import Number, RegionSummary
 
@@ -38,4 +38,5 @@ __all__ = [
     "check_paired",
     "differences",
     "forward_regions",
+    "regions_within",
 ]

@@ -52,6 +52,23 @@ class Region:
         return ((y >= self.y[0]) & (y < self.y[1]))[:, None] & ((x >= self.x[0]) & (x < self.x[1]))
 
 
+def regions_within(grid: BevGrid) -> tuple[Region, ...]:
+    """Those of the paper's regions that the grid holds.
+
+    Example:
+        >>> [region.name for region in regions_within(BevGrid(x=(0.0, 100.0), y=(-40.0, 40.0)))]
+        ['20m', '80m']
+    """
+    return tuple(
+        region
+        for region in forward_regions()
+        if grid.x[0] <= region.x[0]
+        and region.x[1] <= grid.x[1]
+        and grid.y[0] <= region.y[0]
+        and region.y[1] <= grid.y[1]
+    )
+
+
 def forward_regions(ranges: Sequence[float] = (20.0, 80.0, 160.0)) -> tuple[Region, ...]:
     """The paper's regions in front of the vehicle: x in [0, R), y in [-R/4, R/4).
 

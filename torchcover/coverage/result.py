@@ -16,7 +16,7 @@ from torchcover.coverage.estimate import Estimator, RegionEstimate, estimate_reg
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import RADIUS, Quantity
-from torchcover.coverage.regions import Region, forward_regions
+from torchcover.coverage.regions import Region, regions_within
 from torchcover.coverage.summary import Number, RegionSummary
 
 
@@ -123,7 +123,8 @@ class Coverage:
         Raises:
             ValueError: A region reaches beyond the grid, or holds no cell centre.
         """
-        return [self._summarise(region, height) for region in self._regions(regions) for height in self.grid.heights]
+        wanted = regions_within(self.grid) if regions is None else regions
+        return [self._summarise(region, height) for region in wanted for height in self.grid.heights]
 
     def estimate(self, region: Region, height: str, estimator: Estimator = "known") -> RegionEstimate:
         """The numbers of one region in one band with what they become without each block, for errors of differences.
@@ -188,13 +189,6 @@ class Coverage:
             ValueError: Not a coverage file, a damaged one, or one of another version.
         """
         return cls(**read_coverage(Path(path)))
-
-    def _regions(self, regions: Sequence[Region] | None) -> Sequence[Region]:
-        if regions is not None:
-            return regions
-        (_, front), (right, left) = self.grid.x, self.grid.y
-        fitting = [r for r in forward_regions() if self.grid.x[0] <= 0 and r.x[1] <= front and right <= r.y[0]]
-        return [region for region in fitting if region.y[1] <= left]
 
     def _summarise(self, region: Region, height: str) -> RegionSummary:
         known, completed = self.estimate(region, height), self.estimate(region, height, "completed")

@@ -6,6 +6,7 @@ from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.pipeline import observe
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.rig_names import AnyRig
+from torchcover.evaluation.saved import are_saved, compare_saved
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import TargetError, TargetWatch
 from torchcover.evaluation.task import AnyFrames, AnyScenario, Task, task_of
@@ -98,7 +99,8 @@ def compare(
 
     Args:
         rigs: Two or more, each as in `evaluate`; the others are compared with the first. Of a recording: its rigs by
-            name, all if not given.
+            name, all if not given. Or `.npz` files of `Coverage.save`, of rigs that were measured in the same frames:
+            nothing is measured then, and nothing else may be set.
         scenario: As in `evaluate`, and so are all that follow.
         frames: Frames of several rigs.
         steps: Steps.
@@ -125,10 +127,18 @@ def compare(
     settings = Settings(
         steps, seed, cell_m, tuple(thresholds), reference, rays, every_s, target_error, device, workers, skip_bad_frames
     )
+    if are_saved(rigs):
+        _check_unset(scenario, frames, settings)
+        return compare_saved([str(rig) for rig in rigs])
     task = task_of(rigs, scenario, frames, settings)
     if len(task.clouds) < 2:
         raise ValueError(f"compare needs at least two rigs; got {next(iter(task.clouds))!r} only (for one: `evaluate`)")
     return _measured(task, settings, observers or {}, progress=progress)
+
+
+def _check_unset(scenario: AnyScenario | None, frames: AnyFrames | None, settings: Settings) -> None:
+    if scenario is not None or frames is not None or settings != Settings():
+        raise ValueError("coverage files are measured already: leave out the scenario, the frames and their settings")
 
 
 def _measured(task: Task, settings: Settings, others: Observers, *, progress: bool) -> Result:

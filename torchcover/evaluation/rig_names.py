@@ -15,9 +15,18 @@ def distinct_names(rigs: Sequence[AnyRig]) -> list[str]:
         >>> distinct_names(["kitti", "old/my.yaml", "new/my.yaml"])
         ['kitti', 'my', 'my_2']
     """
+    return distinct([_stem(rig) for rig in rigs])
+
+
+def distinct(stems: Sequence[str]) -> list[str]:
+    """Names of which no two are the same, for no file system; numbered where they would be.
+
+    Example:
+        >>> distinct(["roof", "Roof", "grille"])
+        ['roof', 'Roof_2', 'grille']
+    """
     names: list[str] = []
-    for rig in rigs:
-        stem = _stem(rig)
+    for stem in stems:
         name, number = stem, 2
         while name.lower() in (other.lower() for other in names):
             name, number = f"{stem}_{number}", number + 1

@@ -1,0 +1,67 @@
+"""`torchcover compare a/coverage.npz b/coverage.npz`: what was measured apart, compared as if it had been together."""
+
+import json
+
+import pytest
+
+from torchcover.evaluation import compare, evaluate
+
+
+@pytest.fixture
+def saved(worlds):
+    """Evaluate a rig of the yard, and give its coverage file."""
+
+    def run(rig, **changes):
+        settings = {"steps": 16, "cell_m": 4.0, "thresholds": (2.0,), "rays": 1024, **changes}
+        file = worlds / rig / "coverage.npz"
+        file.parent.mkdir()
+        evaluate(worlds / f"{rig}.yaml", worlds / "yard.yaml", **settings).coverage.save(file)
+        return file
+
+    return run
+
+
+def test_two_evaluations_of_the_same_frames_are_a_comparison(torchcover, worlds, saved):
+    """To the last bit: differences, their errors, marks."""
+    code, printed, _ = torchcover("compare", saved("low"), saved("both"), "--out", worlds / "out")
+    assert code == 0
+    assert "Difference to low" in printed
+    rigs, settings = [worlds / "low.yaml", worlds / "both.yaml"], {"cell_m": 4.0, "thresholds": (2.0,), "rays": 1024}
+    together = compare(rigs, worlds / "yard.yaml", steps=16, **settings)
+    rows = json.loads((worlds / "out" / "summary.json").read_text())["rows"]
+    assert rows == together.summary
+    assert {row["rig"] for row in rows} == {"low", "both"}
+    assert (worlds / "out" / "maps" / "difference_radius_m_ground_both_minus_low.png").is_file()
+    # And what a comparison wrote can be compared again.
+    assert compare([worlds / "out" / "coverage" / f"{name}.npz" for name in ("low", "both")]).summary == rows
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"seed": 5}, "different reference points"),
+        ({"steps": 15}, "different reference points"),
+        ({"thresholds": (1.0,)}, "differ in their thresholds"),
+        ({"cell_m": 8.0}, "differ in their grid"),
+    ],
+)
+def test_results_that_are_not_paired_are_refused(torchcover, worlds, saved, change, message):
+    code, _, complaint = torchcover("compare", saved("low"), saved("both", **change), "--out", worlds / "out")
+    assert code == 2
+    assert message in complaint
+    assert not (worlds / "out" / "summary.json").exists()
+
+
+def test_what_is_no_pair_of_coverage_files_is_said(torchcover, worlds, saved):
+    file = saved("low")
+    (worlds / "rubbish.npz").write_bytes(b"PK")
+    for arguments, message in (
+        ([file], "at least two coverage files"),
+        ([file, worlds / "missing.npz"], "no such coverage file"),
+        ([file, worlds / "rubbish.npz"], "not a coverage file"),
+        ([file, file, "--steps", 3], "measured already"),
+        ([file, worlds / "both.yaml"], "neither a .yaml file nor one of the built-in rigs"),
+    ):
+        code, _, complaint = torchcover("compare", *arguments, "--out", worlds / "out")
+        assert (code, complaint.count("\n")) == (2, 1)
+        assert message in complaint
