@@ -41,7 +41,7 @@ def test_a_recording_is_evaluated_and_the_files_agree(torchcover, recording, tmp
     assert summary["complete"] is True
     assert summary["counts"]["steps"] == 4
     first = coverage.summary()[0]
-    assert summary["rows"][0]["radius_m"] == pytest.approx(first.radius_m)
+    assert summary["rows"][0]["radius_m"] == pytest.approx(first.numbers["radius_m"].value)
     assert summary["rows"][0]["known_cells"] == 40
     with (out / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
@@ -52,7 +52,7 @@ def test_a_recording_is_evaluated_and_the_files_agree(torchcover, recording, tmp
         "detection_1m_ground.png",
         "detection_1m_obstacle.png",
         "radius_m_ground.png",
-        "radius_obstacle.png",
+        "radius_m_obstacle.png",
     ]
 
 
@@ -154,7 +154,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
     assert (summary["reference"], summary["target_error"]) == (None, None)
     assert (summary["blocks"], summary["steps_per_block"]) == (4, 1)
     assert summary["rows"][0]["radius_m_error"] is None
-    assert (tmp_path / "out" / "maps" / "radius_error_ground.png").is_file()
+    assert (tmp_path / "out" / "maps" / "radius_m_error_ground.png").is_file()
 
 
 @pytest.mark.parametrize(
