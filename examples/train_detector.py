@@ -335,8 +335,8 @@ def report(results, console):
     row = SCORES.index(OPERATING_SCORE)
     for rig, (module, coverage) in results.items():
         curve = module.counts.overall()
-        lines = coverage.summary(REGIONS)
-        seen = [f"{x.detection[0.4]:.3f} ± {x.detection_error[0.4]:.3f} ({x.known_share:.0%} known)" for x in lines]
+        lines = [(line.numbers["detection_0.4m"], line.known_share) for line in coverage.summary(REGIONS)]
+        seen = [f"{number.value:.3f} ± {number.error:.3f} ({known:.0%} known)" for number, known in lines]
         shares = [f"{ratio.value[row, 0]:.3f}" for ratio in (curve.recall, curve.precision)]
         table.add_row(rig, f"{average_precision(module.counts):.3f}", *seen, *shares)
     console.print(table)
@@ -367,9 +367,9 @@ def draw(results, path):
         ax.set_xticks(range(len(labels)), labels)
         ax.set(xlabel=f"{axis} of the car; below, cars for each rig, in order", ylabel="recall", ylim=(0, 1))
     for shift, (rig, (module, coverage)) in zip((-0.2, 0.2), results.items(), strict=True):
-        lines = coverage.summary(REGIONS)
-        bars = [average_precision(module.counts), *(line.detection[0.4] for line in lines)]
-        errors = [math.nan, *(line.detection_error[0.4] for line in lines)]
+        seen = [line.numbers["detection_0.4m"] for line in coverage.summary(REGIONS)]
+        bars = [average_precision(module.counts), *(number.value for number in seen)]
+        errors = [math.nan, *(number.error for number in seen)]
         right.bar(np.arange(len(bars)) + shift, bars, width=0.38, yerr=errors, capsize=3, label=rig)
     right.set_xticks(range(3), ["AP", *(f"seen within\n0.4 m, {region.name}" for region in REGIONS)])
     right.set(ylim=(0, 1))

@@ -162,7 +162,7 @@ def measured_frames(trainer, metric):
     return seen
 
 
-def test_fixed_frames_are_measured_once_and_logged_at_every_epoch(tmp_path):
+def test_fixed_frames_are_measured_once_and_logged_at_every_epoch(tmp_path, blank_maps):
     callback = CoverageCallback(make_metric(), regions=REGIONS, fixed_frames=True)
     logger = TensorBoardLogger(tmp_path, name="", version="run")
     trainer = make_trainer(tmp_path, callback, logger=logger, max_epochs=3)
@@ -176,17 +176,17 @@ def test_fixed_frames_are_measured_once_and_logged_at_every_epoch(tmp_path):
     for name, value in truth.scalars(REGIONS).items():
         logged = [event.value for event in events.Scalars(f"coverage/val/{name}")]
         assert logged == pytest.approx([value] * 3, rel=1e-6, nan_ok=True)
-    assert [event.step for event in events.Images("coverage/val/radius_m")] == [0]
+    assert [event.step for event in events.Images("coverage/val/radius")] == [0]
     # Another fit is another measurement, and has maps of its own.
     trainer = make_trainer(tmp_path, callback, logger=TensorBoardLogger(tmp_path, name="", version="other"))
     trainer.fit(Validated(), loader(2), loader(5))
     assert_same(callback.coverage, truth)
     events = EventAccumulator(str(tmp_path / "other"))
     events.Reload()
-    assert len(events.Images("coverage/val/radius_m")) == 1
+    assert len(events.Images("coverage/val/radius")) == 1
 
 
-def test_frames_that_were_said_to_be_fixed_and_are_not_are_added(tmp_path):
+def test_frames_that_were_said_to_be_fixed_and_are_not_are_added(tmp_path, blank_maps):
     class Alternating(Validated):
         def val_dataloader(self):
             return loader([RandomFrames(5)[2 * min(self.current_epoch, 1) + k] for k in range(3)])
@@ -201,7 +201,7 @@ def test_frames_that_were_said_to_be_fixed_and_are_not_are_added(tmp_path):
     assert_same(callback.coverage, expected(RandomFrames(5)))
     events = EventAccumulator(logger.log_dir)
     events.Reload()
-    assert [event.step for event in events.Images("coverage/val/radius_m")] == [0, 1]
+    assert [event.step for event in events.Images("coverage/val/radius")] == [0, 1]
 
 
 def test_frames_that_a_sampler_repeats_are_counted_once(tmp_path):
@@ -269,7 +269,7 @@ def test_the_weights_of_reference_points_count(tmp_path):
     assert not torch.equal(callback.coverage.radius, expected(frames).radius)
 
 
-def test_every_n_steps_logs_the_epoch_so_far(tmp_path):
+def test_every_n_steps_logs_the_epoch_so_far(tmp_path, blank_maps):
     callback = CoverageCallback(make_metric(), regions=REGIONS, stage="train", every_n_steps=2)
     logger = TakesImages()
     make_trainer(tmp_path, callback, logger=logger).fit(Model(), loader(9))
@@ -278,7 +278,7 @@ def test_every_n_steps_logs_the_epoch_so_far(tmp_path):
     # Batches count from 0: after two of them, after four, and at the end.
     truth = {k: expected(frames[: 2 * k + 2]).scalars(REGIONS)["radius_m/all/ground"] for k in (1, 3, 4)}
     assert {step: values[tag] for step, values in logger.scalars if tag in values} == pytest.approx(truth, rel=1e-6)
-    assert [step for key, step, _ in logger.images if key == "coverage/train/radius_m"] == [1, 3, 4]
+    assert [step for key, step, _ in logger.images if key == "coverage/train/radius"] == [1, 3, 4]
 
 
 def test_another_rig_other_batches_and_frames(tmp_path):
@@ -319,8 +319,7 @@ class TakesImages(Logger):
 def test_tensorboard_holds_the_tags_values_and_maps(tmp_path):
     logger = TensorBoardLogger(tmp_path, name="", version="run")
     callback = CoverageCallback(make_metric(thresholds=(0.4, 0.8)), regions=REGIONS)
-    trainer = make_trainer(tmp_path, callback, logger=logger, max_epochs=2)
-    trainer.fit(Validated(), loader(4), loader(5))
+    make_trainer(tmp_path, callback, logger=logger).fit(Validated(), loader(4), loader(5))
     events = EventAccumulator(str(tmp_path / "run"))
     events.Reload()
     truth = callback.coverage.scalars(REGIONS)
@@ -328,13 +327,13 @@ def test_tensorboard_holds_the_tags_values_and_maps(tmp_path):
     assert {tag for tag in events.Tags()["scalars"] if tag.startswith("coverage")} == tags
     for name, value in truth.items():
         last = events.Scalars(f"coverage/val/{name}")
-        assert [event.value for event in last] == pytest.approx([value] * 2, rel=1e-6)
-        assert [event.step for event in last] == [1, 3]
+        assert [event.value for event in last] == pytest.approx([value], rel=1e-6)
+        assert [event.step for event in last] == [1]
     maps = {f"coverage/val/{name}" for name in ("radius_m", "detection_0.4m", "detection_0.8m")}
     assert set(events.Tags()["images"]) == maps
     for tag in maps:
         images = events.Images(tag)
-        assert [event.step for event in images] == [1, 3]
+        assert [event.step for event in images] == [1]
         assert images[0].encoded_image_string.startswith(b"\x89PNG")
         assert min(images[0].width, images[0].height) > 100
 
@@ -468,22 +467,26 @@ def test_a_checkpoint_between_epochs_holds_no_sums_and_one_within_an_epoch_does(
     assert CoverageCallback(make_metric()).state_key != callback.state_key
 
 
-def test_memory_does_not_grow_over_epochs(tmp_path):
-    counts = []
+def test_memory_does_not_grow_over_epochs(tmp_path, blank_maps):
+    counts, counted = [], []
 
     class Count(pl.Callback):
+        def on_train_batch_end(self, *arguments):
+            counted.append(len(callback.state_dict()["frames"]["counted"]))
+
         def on_train_epoch_end(self, trainer, pl_module):
             gc.collect()
             # `type`, as `isinstance` asks deprecated objects of torch for their class.
             tensors = [thing for thing in gc.get_objects() if issubclass(type(thing), torch.Tensor)]
             size = sum(tensor.numel() * tensor.element_size() for tensor in tensors)
-            counts.append((len(tensors), size, len(callback._once._counted)))
+            counts.append((len(tensors), size))
 
     callback = CoverageCallback(make_metric(), stage="train")
     logger = TensorBoardLogger(tmp_path, name="", version="run")
     trainer = make_trainer(tmp_path, callback, Count(), logger=logger, max_epochs=4)
     trainer.fit(Model(), loader(6))
     assert counts[1:] == [counts[1]] * 3
+    assert counted == [2, 4, 6] * 4
 
 
 @pytest.mark.parametrize(
