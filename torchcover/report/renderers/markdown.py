@@ -9,7 +9,7 @@ from torchcover.report.table import CoverageTable
 
 # What Markdown would take for something else: an underscore does so at the end of a word only.
 SPECIAL = re.compile(r"[\\`*|\[\]]|<(?=[A-Za-z/!?])|&(?=[\w#]+;)|(?<![^\W_])_|_(?![^\W_])")
-MARKS = {"best": "In bold", "significant": "In bold, if it is a difference"}
+MARKS = {"best": "In bold", "significant": "In bold among the differences"}
 
 
 def render(table: CoverageTable) -> str:
