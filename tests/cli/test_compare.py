@@ -84,9 +84,8 @@ def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
 def test_errors_are_drawn_if_asked_for_and_differences_come_with_theirs(torchcover, worlds):
     *_, out = compare(torchcover, worlds, "low", "both", steps=9, options=["--error-maps"])
     names = {path.name for path in (out / "maps").iterdir()}
-    errors = {
-        f"{metric}_error_{band}.png" for metric in ("radius_m", "detection_2m") for band in ("ground", "obstacle")
-    }
+    keys = ("radius_m", "detection_2m")
+    errors = {f"{key}_error_{band}.png" for key in keys for band in ("ground", "obstacle")}
     assert {name for name in names if "error" in name} == errors
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["blocks"], summary["steps_per_block"]) == (9, 1)
