@@ -12,17 +12,14 @@ from torch import Tensor
 from torchcover.cameras import calibration
 from torchcover.cameras.calibration import Calibration
 from torchcover.cameras.depth import count_unusable, usable
-from torchcover.cameras.inverse import ANSWERED, OUTSIDE, UNCONVERGED
+from torchcover.cameras.inverse import ANSWERED
 from torchcover.cameras.lens import Scalar
-from torchcover.cameras.models import check_model
+from torchcover.cameras.models import as_vector, check_image, check_model
 from torchcover.cameras.optics import Optics
+from torchcover.cameras.ray_table import RayTable
 from torchcover.cameras.unprojection import DepthKind, Selection, check_depth, scale_rays, select
-from torchcover.geometry import check_rigid, invert
+from torchcover.geometry import check_rigid, invert, transform_tensor
 from torchcover.geometry.rigid import Matrix
-
-# Pixels whose float64 rays exist at the same time while the table of an image is made.
-_BAND = 1 << 20
-_STATUS_NAMES = {"pixels_valid": ANSWERED, "pixels_outside": OUTSIDE, "pixels_unconverged": UNCONVERGED}
 
 
 class Camera:
@@ -71,24 +68,14 @@ class Camera:
         name: str = "camera",
     ) -> None:
         self.width, self.height, self.model, self.name = width, height, model, name
-        self.intrinsics = _vector([fx, fy, cx, cy])
-        self.coefficients = _vector(list(coefficients))
-        self._check()
+        self.intrinsics = as_vector([fx, fy, cx, cy])
+        self.coefficients = as_vector(list(coefficients))
+        check_image(name, width, height, self.intrinsics)
+        check_model(model, self.coefficients.tolist())
         pose = np.eye(4) if vehicle_T_camera is None else vehicle_T_camera
         self.vehicle_T_camera: Matrix = check_rigid(pose, f"{name}: vehicle_T_camera")
         self._optics = Optics(self.intrinsics, model, self.coefficients)
-        self._tables: dict[tuple[str, torch.dtype, str], tuple[Tensor, Tensor]] = {}
-        self._pixel_counts: dict[str, int] | None = None
-
-    def _check(self) -> None:
-        for name, size in (("width", self.width), ("height", self.height)):
-            if isinstance(size, bool) or not isinstance(size, int) or size <= 0:
-                raise ValueError(f"{self.name}: {name} must be a positive integer; got {size!r}")
-        if not torch.isfinite(self.intrinsics).all():
-            raise ValueError(f"{self.name}: fx, fy, cx, cy must be finite; got {self.intrinsics.tolist()}")
-        if not (self.intrinsics[:2] > 0).all():
-            raise ValueError(f"{self.name}: fx and fy must be positive; got {self.intrinsics[:2].tolist()}")
-        check_model(self.model, self.coefficients.tolist())
+        self._table = RayTable(self._optics, width, height)
 
     @classmethod
     def from_calibration(cls, source: Calibration) -> "Camera":
@@ -163,10 +150,6 @@ class Camera:
         size = f"{self.width}x{self.height}"
         return f"Camera({self.name!r}, {size}, {self.model}, fx={fx:g}, fy={fy:g}, cx={cx:g}, cy={cy:g})"
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Without the tables: a worker process makes its own, which is faster than receiving them."""
-        return {**self.__dict__, "_tables": {}}
-
     def rays(
         self, pixels: Tensor | None = None, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
     ) -> tuple[Tensor, Tensor]:
@@ -182,7 +165,7 @@ class Camera:
             others are NaN: outside the valid region of the lens, or not converged (`pixel_counts` tells which).
         """
         if pixels is None:
-            return self._table(str(torch.device(device)), dtype, "distance")
+            return self._table.points(str(torch.device(device)), dtype, "distance")
         if not pixels.is_floating_point() or pixels.shape[-1:] != (2,):
             raise ValueError(f"{self.name}: pixels are floats (..., 2); got {pixels.dtype} {tuple(pixels.shape)}")
         directions, status = self._optics.directions(pixels.reshape(-1, 2).double())
@@ -196,39 +179,7 @@ class Camera:
             `pixels_valid`, `pixels_outside` (no direction of the valid region has this image) and
             `pixels_unconverged` (the solver gave up); they add up to width * height.
         """
-        if self._pixel_counts is None:
-            self._table("cpu", torch.float32, "distance")
-        return dict(self._pixel_counts or {})
-
-    def _table(self, device: str, dtype: torch.dtype, kind: DepthKind) -> tuple[Tensor, Tensor]:
-        """Per pixel the point at depth 1, and whether there is one; made once unless gradients flow through it."""
-        trace = self._trace_image if kind == "distance" else self._plane
-        if self._optics.differentiable and torch.is_grad_enabled():
-            return trace(device, dtype)
-        key = (device, dtype, kind)
-        if key not in self._tables:
-            self._tables[key] = trace(device, dtype)
-        return self._tables[key]
-
-    def _plane(self, device: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        """Rays scaled to z = 1; at and beyond 90 degrees there is no z-depth."""
-        rays, valid = self._table(device, dtype, "distance")
-        valid = valid & (rays[..., 2] > 0)
-        return rays / torch.where(valid, rays[..., 2], torch.nan)[..., None], valid
-
-    def _trace_image(self, device: str, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        rows = torch.arange(self.height, dtype=torch.float64, device=device)
-        columns = torch.arange(self.width, dtype=torch.float64, device=device)
-        parts = torch.split(rows, max(1, _BAND // self.width))
-        bands = [self._trace_rows(part, columns, dtype) for part in parts]
-        status = torch.cat([band[1] for band in bands])
-        self._pixel_counts = {name: int((status == code).sum()) for name, code in _STATUS_NAMES.items()}
-        return torch.cat([band[0] for band in bands]), status == ANSWERED
-
-    def _trace_rows(self, rows: Tensor, columns: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        y, x = torch.meshgrid(rows, columns, indexing="ij")
-        directions, status = self._optics.directions(torch.stack((x, y), dim=-1).reshape(-1, 2))
-        return directions.to(dtype).reshape(*y.shape, 3), status.reshape(y.shape)
+        return self._table.pixel_counts()
 
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels at which points are seen.
@@ -313,7 +264,7 @@ class Camera:
 
     def _select(self, depth: Tensor, kind: DepthKind, stride: int, valid: Tensor | None) -> Selection:
         depth = check_depth(depth, kind, stride, valid, (self.height, self.width), self.name)
-        rays, has_ray = self._table(str(depth.device), depth.dtype, kind)
+        rays, has_ray = self._table.points(str(depth.device), depth.dtype, kind)
         return select(rays, has_ray, depth, stride, valid)
 
     def z_to_distance(self, depth: Tensor) -> Tensor:
@@ -335,25 +286,13 @@ class Camera:
 
     def _forward(self, device: torch.device) -> Tensor:
         """Cosine of the angle between every pixel's ray and the axis, float64."""
-        rays, _ = self._table(str(device), torch.float64, "distance")
+        rays, _ = self._table.points(str(device), torch.float64, "distance")
         return rays[..., 2]
 
     def to_vehicle(self, points: Tensor) -> Tensor:
         """Points (N, 3) of the camera frame in the vehicle frame."""
-        return self._moved(points, self.vehicle_T_camera)
+        return transform_tensor(self.vehicle_T_camera, points)
 
     def to_camera(self, points: Tensor) -> Tensor:
         """Points (N, 3) of the vehicle frame in the camera frame."""
-        return self._moved(points, invert(self.vehicle_T_camera))
-
-    @staticmethod
-    def _moved(points: Tensor, matrix: Matrix) -> Tensor:
-        # In float64, which neither autocast nor TF32 rounds: either would cost decimetres.
-        transform = torch.as_tensor(matrix, dtype=torch.float64, device=points.device)
-        return (points.double() @ transform[:3, :3].T + transform[:3, 3]).to(points.dtype)
-
-
-def _vector(values: Sequence[Scalar]) -> Tensor:
-    """Numbers, or tensors with their gradients, as a float64 vector."""
-    parts = [torch.as_tensor(value, dtype=torch.float64) for value in values]
-    return torch.stack(parts) if parts else torch.empty(0, dtype=torch.float64)
+        return transform_tensor(invert(self.vehicle_T_camera), points)

@@ -2,6 +2,9 @@
 
 from collections.abc import Callable, Sequence
 
+import torch
+from torch import Tensor
+
 from torchcover.cameras.brown_conrady import BrownConrady, SensorTilt
 from torchcover.cameras.kannala_brandt import AngleChart, KannalaBrandt, ThetaPolynomial
 from torchcover.cameras.lens import Distortion, Lens, Scalar
@@ -94,3 +97,30 @@ def build_lens(model: str, coefficients: Sequence[Scalar], *, trainable: bool) -
         The lens, without a distortion where that does nothing.
     """
     return _BUILD[model](coefficients, trainable)
+
+
+def check_image(name: str, width: int, height: int, intrinsics: Tensor) -> None:
+    """Refuse an image or intrinsics that no camera has.
+
+    Args:
+        name: What messages call the camera.
+        width: Columns.
+        height: Rows.
+        intrinsics: (4,) fx, fy, cx, cy in pixels.
+
+    Raises:
+        ValueError: A size or focal length that is not positive, or a number that is not finite.
+    """
+    for side, size in (("width", width), ("height", height)):
+        if isinstance(size, bool) or not isinstance(size, int) or size <= 0:
+            raise ValueError(f"{name}: {side} must be a positive integer; got {size!r}")
+    if not torch.isfinite(intrinsics).all():
+        raise ValueError(f"{name}: fx, fy, cx, cy must be finite; got {intrinsics.tolist()}")
+    if not (intrinsics[:2] > 0).all():
+        raise ValueError(f"{name}: fx and fy must be positive; got {intrinsics[:2].tolist()}")
+
+
+def as_vector(values: Sequence[Scalar]) -> Tensor:
+    """Numbers, or tensors with their gradients, as a float64 vector."""
+    parts = [torch.as_tensor(value, dtype=torch.float64) for value in values]
+    return torch.stack(parts) if parts else torch.empty(0, dtype=torch.float64)

@@ -10,6 +10,7 @@ from torchcover.geometry.rigid import (
     rotation_from_quaternion,
     transform,
 )
+from torchcover.geometry.tensors import transform_tensor
 
 __all__ = [
     "BoundingBox",
@@ -21,4 +22,5 @@ __all__ = [
     "rotation_from_euler",
     "rotation_from_quaternion",
     "transform",
+    "transform_tensor",
 ]

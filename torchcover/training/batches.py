@@ -3,6 +3,7 @@
 from torch import Tensor
 
 from torchcover.data import Frame
+from torchcover.geometry import transform_tensor
 
 # In place of the index of a frame that only has a name, or not even that.
 UNKNOWN_INDEX = -1
@@ -67,7 +68,7 @@ def _in_vehicle_frame(points: Tensor, vehicle_T_lidar: Tensor | None) -> Tensor:
         raise ValueError(f"points of shape (N, 3 + ...) are needed; got {tuple(points.shape)}")
     if vehicle_T_lidar is None:
         return points[:, :3].float()
-    pose = vehicle_T_lidar.to(points.device).double()
-    if pose.shape != (4, 4):
-        raise ValueError(f"vehicle_T_lidar: shape (4, 4) is needed; got {tuple(pose.shape)}")
-    return (points[:, :3].double() @ pose[:3, :3].T + pose[:3, 3]).float()
+    if vehicle_T_lidar.shape != (4, 4):
+        raise ValueError(f"vehicle_T_lidar: shape (4, 4) is needed; got {tuple(vehicle_T_lidar.shape)}")
+    # From the points as they came: rounded first, UTM-sized ones would lose decimetres.
+    return transform_tensor(vehicle_T_lidar, points[:, :3].double()).float()

@@ -1,0 +1,28 @@
+"""Rigid transforms of tensors."""
+
+import torch
+from torch import Tensor
+
+from torchcover.geometry.rigid import Matrix
+
+
+def transform_tensor(destination_T_source: Matrix | Tensor, points: Tensor) -> Tensor:
+    """Points of the source frame in the destination frame.
+
+    Args:
+        destination_T_source: (4, 4) rigid transform.
+        points: (N, 3) floating-point points in metres.
+
+    Returns:
+        (N, 3) on the device and of the type of `points`; computed in float64, which neither autocast nor TF32 rounds:
+        either would cost decimetres.
+
+    Example:
+        >>> import numpy as np
+        >>> lifted = np.eye(4)
+        >>> lifted[2, 3] = 1.5
+        >>> transform_tensor(lifted, torch.zeros(1, 3))
+        tensor([[0.0000, 0.0000, 1.5000]])
+    """
+    pose = torch.as_tensor(destination_T_source, dtype=torch.float64, device=points.device)
+    return (points.double() @ pose[:3, :3].T + pose[:3, 3]).to(points.dtype)
