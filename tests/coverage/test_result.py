@@ -8,23 +8,22 @@ import re
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from torchcover.coverage.quantiles import bin_of, histogram_quantiles
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region
+from torchcover.coverage import Layer, Maximum, MeanOfMeans, PooledMean, Quantiles, StepQuantiles, differences
 
 GRID = BevGrid(x=(-1.0, 20.0), y=(-5.0, 5.0), cell=0.5)
+EVERY_AGGREGATION = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), StepQuantiles((0.9,)))
 COUNTS = dict.fromkeys(Coverage.COUNTS, 3)
 
 
-def a_coverage(seed=0, thresholds=(0.4, 0.8), grid=GRID, **more):
+def a_coverage(seed=0, thresholds=(0.4, 0.8), grid=GRID):
     random = torch.Generator().manual_seed(seed)
     frames = torch.randint(0, 3, grid.shape, generator=random)
     unknown = frames == 0
 
-    def values(*leading):
-        return torch.rand(*leading, *grid.shape, generator=random, dtype=torch.float64).masked_fill(unknown, math.nan)
+    def values():
+        return torch.rand(grid.shape, generator=random, dtype=torch.float64).masked_fill(unknown, math.nan)
 
     return Coverage(
         grid=grid,
@@ -32,10 +31,8 @@ def a_coverage(seed=0, thresholds=(0.4, 0.8), grid=GRID, **more):
         max_radius=30.0,
         probed_steps=frames,
         points=5 * frames,
-        radius=values(),
-        detection=values(len(thresholds)),
+        layers=[Layer(quantity, values()) for quantity in MeanOfMeans(thresholds).quantities],
         counts=COUNTS,
-        **{name: values(*leading) for name, leading in more.items()},
     )
 
 
@@ -58,10 +55,10 @@ def test_a_regions_number_is_the_unweighted_mean_over_its_known_cells(region):
         assert 0 < len(known) < len(inside)
         assert (row.cells, row.known_cells) == (len(inside), len(known))
         assert row.known_share == len(known) / len(inside)
-        assert row.radius_m == pytest.approx(np.mean([result.radius[(band, *cell)] for cell in known]))
-        assert list(row.detection) == [0.4, 0.8]
-        for at, mean in enumerate(row.detection.values()):
-            assert mean == pytest.approx(np.mean([result.detection[(at, band, *cell)] for cell in known]))
+        assert row.numbers["radius_m"].value == pytest.approx(np.mean([result.radius[(band, *cell)] for cell in known]))
+        assert list(row.numbers) == ["radius_m", "detection_0.4m", "detection_0.8m"]
+        for at, number in enumerate(list(row.numbers.values())[1:]):
+            assert number.value == pytest.approx(np.mean([result.detection[(at, band, *cell)] for cell in known]))
 
 
 def test_a_region_of_which_nothing_is_known_is_unknown():
@@ -69,14 +66,13 @@ def test_a_region_of_which_nothing_is_known_is_unknown():
     result.probed_steps.zero_()
     row = result.summary([Region("r", (0.0, 2.0), (-1.0, 1.0))])[0]
     assert (row.known_cells, row.known_share) == (0, 0.0)
-    assert math.isnan(row.radius_m)
-    assert all(math.isnan(value) for value in row.detection.values())
+    assert all(math.isnan(number.value) for number in row.numbers.values())
 
 
 def test_a_cell_that_is_blind_without_end_makes_its_region_so():
     result = a_coverage()
     result.radius[0, 10, 10], result.probed_steps[0, 10, 10] = math.inf, 1
-    assert result.summary([Region("all", GRID.x, GRID.y)])[0].radius_m == math.inf
+    assert result.summary([Region("all", GRID.x, GRID.y)])[0].numbers["radius_m"].value == math.inf
 
 
 @pytest.mark.parametrize(
@@ -106,13 +102,13 @@ def test_scalars_are_the_summary_laid_flat():
     result = a_coverage()
     (ground, obstacle), flat = result.summary(), result.scalars()
     assert flat == {
-        "radius_m/20m/ground": ground.radius_m,
-        "detection_0.4m/20m/ground": ground.detection[0.4],
-        "detection_0.8m/20m/ground": ground.detection[0.8],
+        "radius_m/20m/ground": ground.numbers["radius_m"].value,
+        "detection_0.4m/20m/ground": ground.numbers["detection_0.4m"].value,
+        "detection_0.8m/20m/ground": ground.numbers["detection_0.8m"].value,
         "known_share/20m/ground": ground.known_share,
-        "radius_m/20m/obstacle": obstacle.radius_m,
-        "detection_0.4m/20m/obstacle": obstacle.detection[0.4],
-        "detection_0.8m/20m/obstacle": obstacle.detection[0.8],
+        "radius_m/20m/obstacle": obstacle.numbers["radius_m"].value,
+        "detection_0.4m/20m/obstacle": obstacle.numbers["detection_0.4m"].value,
+        "detection_0.8m/20m/obstacle": obstacle.numbers["detection_0.8m"].value,
         "known_share/20m/obstacle": obstacle.known_share,
     }
     assert all(type(value) is float for value in flat.values())
@@ -131,18 +127,23 @@ def test_the_share_of_known_cells_is_in_the_repr():
 def assert_same(one, other):
     assert one.grid == other.grid
     assert list(one.grid.heights) == list(other.grid.heights)
-    for name in ("thresholds", "max_radius", "quantile_levels", "counts"):
+    for name in ("thresholds", "max_radius", "quantities", "counts"):
         assert getattr(one, name) == getattr(other, name), name
-    for name in ("probed_steps", "points", "radius", "detection", "maximum", "pooled", "quantiles"):
-        a, b = getattr(one, name), getattr(other, name)
-        assert (a is None) == (b is None), name
-        if a is not None:
-            torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True)
+    pairs = [(getattr(one, name), getattr(other, name)) for name in ("probed_steps", "points")]
+    assert [layer.quantity for layer in one.layers.values()] == [layer.quantity for layer in other.layers.values()]
+    pairs += [(layer.values, other.layers[key].values) for key, layer in one.layers.items()]
+    assert (one.blocks is None) == (other.blocks is None)
+    if one.blocks is not None:
+        pairs += [
+            (getattr(one.blocks, name), getattr(other.blocks, name)) for name in ("steps", "probed_steps", "sums")
+        ]
+    for a, b in pairs:
+        torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True)
 
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"thresholds": (), "max_radius": math.inf}, {"maximum": True, "pooled": True, "quantiles": (0.5, 0.9)}],
+    [{}, {"thresholds": (), "max_radius": math.inf}, {"aggregations": EVERY_AGGREGATION, "blocks": 8}],
 )
 @pytest.mark.parametrize("as_text", [False, True])
 def test_a_file_gives_back_what_was_saved(tmp_path, options, as_text):
@@ -156,11 +157,33 @@ def test_a_file_gives_back_what_was_saved(tmp_path, options, as_text):
     assert_same(Coverage.load(str(path) if as_text else path), result)
 
 
+def test_a_loaded_result_has_its_errors_and_can_be_compared(tmp_path):
+    """To the last bit: what is written is the sums in blocks, not what was made of them."""
+    random = torch.Generator().manual_seed(3)
+    grid = BevGrid(x=(0.0, 4.0), y=(-2.0, 2.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    region, found = Region("all", grid.x, grid.y), {}
+    metrics = {name: CoverageMetric(grid, blocks=16) for name in ("a", "b")}
+    for _ in range(20):
+        reference = torch.rand(40, 3, generator=random) * 4 - torch.tensor([0.0, 2.0, 0.0])
+        for metric in metrics.values():
+            metric.update(torch.rand(30, 3, generator=random) * 4, reference)
+    for name, metric in metrics.items():
+        found[name] = metric.compute()
+        found[name].save(tmp_path / f"{name}.npz")
+    loaded = {name: Coverage.load(tmp_path / f"{name}.npz") for name in found}
+    assert loaded["b"].summary([region]) == found["b"].summary([region])
+    assert loaded["b"].summary([region])[0].numbers["radius_m"].error > 0
+    assert differences(loaded, region, "all") == differences(found, region, "all")
+    for key, error in found["a"].errors.items():
+        assert torch.equal(loaded["a"].errors[key].nan_to_num(), error.nan_to_num())
+
+
 def test_a_file_can_be_read_by_numpy_alone(tmp_path):
     result = a_coverage()
     result.save(tmp_path / "coverage.npz")
     with np.load(tmp_path / "coverage.npz") as file:
-        np.testing.assert_array_equal(file["radius"], result.radius.numpy())
+        np.testing.assert_array_equal(file["radius_m"], result.radius.numpy())
+        np.testing.assert_array_equal(file["detection_0.8m"], result.detection[1].numpy())
         assert json.loads(str(file["header"]))["grid"]["cell"] == 0.5
 
 
@@ -219,13 +242,13 @@ def rewrite(path, header=None, **arrays):
 @pytest.mark.parametrize(
     "change",
     [
-        {"header": None, "radius": None},
-        {"header": None, "radius": np.zeros((2, 2))},
-        {"header": None, "surplus": np.zeros((2, 2, 4))},
+        {"header": None, "radius_m": None},
+        {"header": None, "radius_m": np.zeros((2, 2))},
+        {"header": None, "points": np.zeros((2, 2))},
         {"header": lambda _: "[1]"},
         {"header": lambda _: "3"},
         {"header": lambda _: "no JSON"},
-        {"header": lambda _: '{"format": 1}'},
+        {"header": lambda _: '{"format": 2}'},
         {"header": lambda old: json.dumps({name: value for name, value in old.items() if name != "counts"})},
         {"header": lambda old: json.dumps({**old, "grid": {**old["grid"], "cell": 0.7}})},
     ],
@@ -244,40 +267,6 @@ def test_an_array_file_is_no_coverage_file(saved):
 
 
 def test_a_newer_format_is_refused_by_its_number(saved):
-    rewrite(saved, header=lambda old: json.dumps({**old, "format": 2, "unheard of": 1}))
-    with pytest.raises(ValueError, match=r"coverage\.npz: coverage format 2; this torchcover reads format 1"):
+    rewrite(saved, header=lambda old: json.dumps({**old, "format": 3, "unheard of": 1}))
+    with pytest.raises(ValueError, match=r"coverage\.npz: coverage format 3; this torchcover reads format 2"):
         Coverage.load(saved)
-
-
-# Quantiles from a histogram
-
-
-@settings(max_examples=100, deadline=None)
-@given(st.lists(st.integers(-5, 5), min_size=2, max_size=6).map(sorted), st.floats(-6, 6))
-def test_bin_of_is_the_definition(edges, value):
-    found = bin_of(torch.tensor([value], dtype=torch.float64), torch.tensor(edges, dtype=torch.float64)).item()
-    bins = [i for i in range(len(edges) - 1) if edges[i] <= value < edges[i + 1]]
-    assert found == (bins[0] if bins else -1)
-
-
-@settings(max_examples=60, deadline=None)
-@given(
-    values=st.lists(st.floats(0, 9.999), min_size=1, max_size=30),
-    level=st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0]),
-)
-def test_a_quantile_lies_in_the_bin_of_the_true_one(values, level):
-    edges = torch.arange(0, 11, dtype=torch.float64)
-    histogram = torch.zeros(10, 2, dtype=torch.float64)
-    for value in values:
-        histogram[int(value), 0] += 1.0
-    found = histogram_quantiles(histogram, edges, (level,))
-    true = np.quantile(values, level, method="inverted_cdf")
-    assert math.floor(true) <= found[0, 0].item() <= math.floor(true) + 1
-    assert found[0, 1].isnan()
-
-
-def test_quantiles_are_linear_within_a_bin():
-    edges = torch.tensor([0.0, 1.0, 3.0, math.inf], dtype=torch.float64)
-    histogram = torch.tensor([[0.0], [4.0], [1.0]], dtype=torch.float64)
-    found = histogram_quantiles(histogram, edges, (0.0, 0.2, 0.4, 0.8, 0.9, 1.0))
-    assert found.flatten().tolist() == [1.0, 1.5, 2.0, 3.0, math.inf, math.inf]
