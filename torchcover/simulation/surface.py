@@ -60,10 +60,11 @@ class Surface:
         cells = np.flatnonzero(boxes.meet(*_moved_bounds(vehicle_T_static, self._cells.bounds)))
         near = [self._static.taken(_ranges(self._cells.first[cells], self._cells.first[cells + 1]))]
         near[0] = near[0].moved(vehicle_T_static)
-        for part in instant.moving:
-            ball = Bounds(part.centre_m[None] - part.radius_m, part.centre_m[None] + part.radius_m)
-            if part.body != instant.ego and boxes.meet(*ball).any():
-                near.append(self._moving[part.body].moved(invert(part.part_T_vehicle)))
+        bodies = [part for part in instant.moving if part.body != instant.ego]
+        centres_m = np.array([part.centre_m for part in bodies]).reshape(-1, 3)
+        radii_m = np.array([part.radius_m for part in bodies])[:, None]
+        for k in np.flatnonzero(boxes.meet(centres_m - radii_m, centres_m + radii_m)).tolist():
+            near.append(self._moving[bodies[k].body].moved(invert(bodies[k].part_T_vehicle)))
         return Patches.joined(near)
 
 
