@@ -109,7 +109,7 @@ def test_of_a_box_the_sides_that_are_turned_to_the_place_are_seen(at, tmp_path, 
     at([2.5, 3.0, 2.5])
     sensor = SurfaceReference((AHEAD,), rays=1000, places=1, bands_m=((0.5, 2.0),))
     agrees(sums(scenario(body, FLOOR), sensor), 2.0 + 2.0 + 4.0)
-    on_top = sums(scenario(body, FLOOR), sensor, lambda points: points[:, 2] > 1.499)
+    on_top = sums(scenario(body, FLOOR), sensor, lambda points: points[:, 2] > 1.49999)
     agrees(on_top, 4.0)
 
 
@@ -133,10 +133,11 @@ def test_the_egos_own_surface_is_in_no_cloud_but_hides(at):
     assert seen.counts["reference_self_hits"] == seen.counts["reference_rays"] - len(seen.reference)
 
 
-def test_a_vehicle_that_pitches_takes_its_boxes_along():
+def test_a_vehicle_that_pitches_takes_its_boxes_along(at):
+    at([2.6, 0.0, 1.0])
     ego = {**EGO, "pose": {"z_m": 3.0, "pitch_deg": 5.0}}
     sensor = SurfaceReference((AHEAD,), rays=1000, places=2, bands_m=((-6.0, 0.0),))
-    agrees(sums(scenario(FLOOR, ego=ego), sensor, steps=60), 200.0 / math.cos(math.radians(5)), within=0.03)
+    agrees(sums(scenario(FLOOR, ego=ego), sensor), 200.0 / math.cos(math.radians(5)))
 
 
 def test_the_ray_budget_and_the_number_of_places_do_not_move_the_mean():
@@ -182,7 +183,7 @@ def test_nothing_to_see_is_no_point_and_no_square_metre(at):
     behind = SurfaceReference((((15.0, 20.0), (-1.0, 1.0)),), rays=100)
     hidden = Simulator(scenario(box([0.2, 40, 30], x_m=8), FLOOR), {}, behind).step(0)
     assert len(hidden.reference) == 0
-    assert hidden.counts["reference_rays"] > 80
+    assert hidden.counts["reference_rays"] > 40
 
 
 @pytest.mark.parametrize(("rays", "places"), [(1, 1), (1, 4), (7, 3)])

@@ -74,7 +74,7 @@ def test_both_see_the_same_area_at_the_same_places(made, seed, monkeypatch):
     for low, high in BANDS:
         ours, theirs = (_sums(found, low, high) for found in (points, twins))
         assert ours[0] == pytest.approx(theirs[0], rel=0.01)
-        assert ours[1:] / ours[0] == pytest.approx(theirs[1:] / theirs[0], rel=0.01, abs=0.05)
+        assert ours[1:] / ours[0] == pytest.approx(theirs[1:] / theirs[0], rel=0.01, abs=0.15)
 
 
 def _sums(found, low, high):

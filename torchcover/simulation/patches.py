@@ -5,6 +5,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.simulation.instant import rotate
 from torchcover.simulation.outward import outward_faces
 from torchcover.simulation.shapes import Mesh
 
@@ -55,27 +56,29 @@ class Patches(NamedTuple):
         """
         triangles, face = _cut(mesh.vertices_m[mesh.faces], bounds)
         corner, second, third = triangles.transpose(1, 2, 0)
-        outward = outward_faces(mesh)[face]
-        return cls(*(part.astype(np.float32) for part in (corner, second - corner, third - corner)), outward)
+        first_m, second_m = (second - corner).astype(np.float32), (third - corner).astype(np.float32)
+        return cls(corner.astype(np.float32), first_m, second_m, outward_faces(mesh)[face])
 
     @classmethod
     def joined(cls, parts: "list[Patches]") -> Self:
         """Those of several, one after the other."""
         none = np.empty((3, 0), dtype=np.float32)
-        rows = zip(Patches(none, none, none, np.empty(0, dtype=bool)), *parts, strict=True)
-        return cls(*(np.concatenate(row, axis=-1) for row in rows))
+        parts = [Patches(none, none, none, np.empty(0, dtype=bool)), *parts]
+        corner_m, first_m, second_m = (np.concatenate([part[k] for part in parts], axis=1) for k in range(3))
+        return cls(corner_m, first_m, second_m, np.concatenate([part.outward for part in parts]))
 
     def taken(self, numbers: NDArray[np.int64]) -> Self:
         """Some of them."""
-        return type(self)(*(part.take(numbers, axis=-1) for part in self))
+        corner_m, first_m, second_m = (part.take(numbers, axis=1) for part in self[:3])
+        return type(self)(corner_m, first_m, second_m, self.outward[numbers])
 
     def moved(self, destination_T_source: Float64) -> Self:
         """Them in another frame. What becomes of one does not depend on the others."""
         rotation = destination_T_source[:3, :3]
         # The corner may be a kilometre away, in either frame.
         corner_m = np.einsum("ij,jn->in", rotation, self.corner_m.astype(np.float64)) + destination_T_source[:3, 3:]
-        turned = (np.einsum("ij,jn->in", rotation.astype(np.float32), edge) for edge in (self.first_m, self.second_m))
-        return type(self)(corner_m.astype(np.float32), *turned, self.outward)
+        first_m, second_m = rotate(rotation, self.first_m), rotate(rotation, self.second_m)
+        return type(self)(corner_m.astype(np.float32), first_m, second_m, self.outward)
 
     @property
     def lower_m(self) -> Float32:
