@@ -101,15 +101,14 @@ class SurfaceReference:
         surface = surroundings.scene.surface(boxes.lower_m.min(axis=0), boxes.upper_m.max(axis=0))
         strata = SurfaceStrata(surface.near(instant, boxes), boxes)
         above_m = max(ABOVE_M, ABOVE_SHARE * float(np.abs(instant.static_T_vehicle[:3, 3]).max()))
-        looks, redrawn = [], 0
-        for _ in range(self.places):
-            pose, thrown_away = surroundings.free_pose(self._pose)
-            redrawn += thrown_away
-            place_m = pose[:3, 3]
+        # All places before the first point: they are the same for any number of rays.
+        drawn = [surroundings.free_pose(self._pose) for _ in range(self.places)]
+        looks = []
+        for place_m in (pose[:3, 3] for pose, _ in drawn):
             found = self._in_range(strata.draw(place_m, self._rays_each, surroundings.generator), place_m)
             targets_m = found.points_m + np.float32(above_m) * found.normals
             looks.append((found, sight(instant, place_m, targets_m, threads=surroundings.threads)))
-        return self._gathered(looks, redrawn)
+        return self._gathered(looks, redrawn=sum(redrawn for _, redrawn in drawn))
 
     def _boxes(self) -> Bounds:
         sides = [(*area, band) for area in self.areas for band in self.bands_m]
