@@ -26,6 +26,22 @@ class Blocks:
     sums: Tensor
 
 
+@dataclass(frozen=True)
+class AreaSums:
+    """The sums over the visible surface, in blocks of contiguous steps; one block if errors were not asked for.
+
+    Args:
+        steps: (B,) int64 steps in each block; 0 in the blocks that are not in use.
+        m2: (B, H, Y, X) float64 square metres of the points in the cell.
+        sums: (B, Q, H, Y, X) float64 sums of square metres times the radius in metres, then of the square metres of
+            points within each threshold.
+    """
+
+    steps: Tensor
+    m2: Tensor
+    sums: Tensor
+
+
 def check_blocks(blocks: int) -> None:
     """Refuse a number of blocks that gives no error to believe.
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchcover.coverage.blocks import Blocks
+from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import Quantity
@@ -21,7 +21,7 @@ from torchcover.coverage.quantity import Quantity
 if TYPE_CHECKING:
     from torchcover.coverage.result import Coverage
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 Arrays = dict[str, NDArray[Any]]
 
 
@@ -36,6 +36,7 @@ def write_coverage(coverage: "Coverage", path: Path) -> None:
         "layers": [asdict(layer.quantity) for layer in coverage.layers.values()],
         "counts": coverage.counts,
         "blocks": 1 if coverage.blocks is None else len(coverage.blocks.steps),
+        "square_metres": coverage.area is not None,
     }
     tensors = {"probed_steps": coverage.probed_steps, "points": coverage.points}
     tensors |= {key: layer.values for key, layer in coverage.layers.items()}
@@ -43,6 +44,8 @@ def write_coverage(coverage: "Coverage", path: Path) -> None:
     arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
     if coverage.blocks is not None:
         arrays |= _listed(coverage.blocks)
+    if coverage.area is not None:
+        arrays |= _listed_area(coverage.area)
     with path.open("wb") as file:
         np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
 
@@ -84,6 +87,7 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
         "layers": [Layer(quantity, torch.from_numpy(arrays[quantity.key])) for quantity in quantities],
         "counts": header["counts"],
         "blocks": None if header["blocks"] == 1 else _blocks(header, grid, arrays),
+        "area": _area(header, grid, arrays) if header["square_metres"] else None,
     }
 
 
@@ -108,6 +112,26 @@ def _blocks(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> Blocks:
     sums = torch.zeros((len(listed), *shape), dtype=torch.float64)
     sums.view(len(listed), -1)[:, where] = listed
     return Blocks(torch.from_numpy(arrays["block_steps"]), probed_steps, sums.movedim(0, 1))
+
+
+def _listed_area(area: AreaSums) -> Arrays:
+    """The entries of the sums over the surface that are not empty, and where they are."""
+    where = area.m2.flatten().nonzero().squeeze(1)
+    return {
+        "area_steps": area.steps.cpu().numpy(),
+        "area_cell": where.cpu().numpy(),
+        "area_m2": area.m2.flatten()[where].cpu().numpy(),
+        "area_sums": area.sums.movedim(1, 0).flatten(1)[:, where].cpu().numpy(),
+    }
+
+
+def _area(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> AreaSums:
+    shape = (header["blocks"], *grid.shape)
+    where, listed = torch.from_numpy(arrays["area_cell"]), torch.from_numpy(arrays["area_sums"])
+    m2, sums = (torch.zeros(size, dtype=torch.float64) for size in (shape, (len(listed), *shape)))
+    m2.view(-1)[where] = torch.from_numpy(arrays["area_m2"])
+    sums.view(len(listed), -1)[:, where] = listed
+    return AreaSums(torch.from_numpy(arrays["area_steps"]), m2, sums.movedim(0, 1))
 
 
 def _read_npz(path: Path) -> tuple[dict[str, Any], Arrays]:

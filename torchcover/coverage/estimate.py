@@ -1,4 +1,4 @@
-"""The numbers of one region: a mean over its known cells, or over those that it would know in the end."""
+"""The numbers of one region: over its visible surface, over its known cells, or over those it would know in the end."""
 
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
@@ -7,10 +7,11 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchcover.coverage.blocks import Blocks
+from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.errors import jackknife_error
 
-Estimator = Literal["known", "completed"]
+CellEstimator = Literal["known", "completed"]
+Estimator = Literal["known", "completed", "area"]
 
 
 class RegionEstimate(NamedTuple):
@@ -37,7 +38,7 @@ class RegionEstimate(NamedTuple):
 
 
 def estimate_region(
-    probed: Tensor, sums: Tensor, blocks: Blocks | None, band: int, cells: Tensor, estimator: Estimator
+    probed: Tensor, sums: Tensor, blocks: Blocks | None, band: int, cells: Tensor, estimator: CellEstimator
 ) -> RegionEstimate:
     """Estimate the numbers of a region, and what they become without each block.
 
@@ -59,6 +60,32 @@ def estimate_region(
         own = blocks.sums[block, :, band][:, cells]
         left_out.append(mean(probed - blocks.probed_steps[block, band][cells], sums - own))
     return RegionEstimate(whole, torch.stack(left_out) if left_out else whole[None][:0], blocks.steps[used])
+
+
+def estimate_area(area: AreaSums, band: int, cells: Tensor) -> RegionEstimate:
+    """The ratio of sums over the visible surface of a region, and what it becomes without each block.
+
+    R = E[ sum of r dA ] / E[ sum of dA ]: a ratio of additive sums, so that the number of points, the size of cells and
+    the share of known ones do not move it.
+
+    Args:
+        area: The sums over the whole grid.
+        band: Number of the height band.
+        cells: (Y, X) bool, the cells of the region.
+
+    Returns:
+        NaN where no square metre was seen.
+    """
+    m2, sums = area.m2[:, band][:, cells].sum(dim=1), area.sums[:, :, band][:, :, cells].sum(dim=2)
+    whole = sums.sum(dim=0) / m2.sum()
+    used = area.steps.nonzero().flatten().tolist() if len(area.steps) > 1 else []
+    left_out = [_without(sums, block).sum(dim=0) / _without(m2, block).sum() for block in used]
+    return RegionEstimate(whole, torch.stack(left_out) if left_out else whole[None][:0], area.steps[used])
+
+
+def _without(sums: Tensor, block: int) -> Tensor:
+    # Not by a difference: infinite radii, and what is left of nearly everything, would not survive it.
+    return torch.cat([sums[:block], sums[block + 1 :]])
 
 
 def known_mean(probed: Tensor, sums: Tensor) -> Tensor:

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 from torchmetrics.utilities.distributed import gather_all_tensors
 
-from torchcover.coverage.aggregations import Aggregation, BinnedStep, MeanOfMeans
+from torchcover.coverage.aggregations import Aggregation, BinnedStep, MeanOfMeans, VisibleArea
 from torchcover.coverage.binning import mean_per_cell
-from torchcover.coverage.blocks import Blocks, check_blocks, pair_up
+from torchcover.coverage.blocks import AreaSums, Blocks, check_blocks, pair_up
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.result import Coverage
@@ -49,6 +49,8 @@ class CoverageMetric(MergeableMetric):
             long run. The state grows with it: 24 bytes a cell and block.
         aggregations: Maps beside the mean of means, from `torchcover.coverage`: `Maximum()`, `PooledMean()`,
             `Quantiles(levels)`, `StepQuantiles(levels)`, or a class of one's own; at most one of each.
+        square_metres: Whether the weights of reference points are square metres of surface, as `SurfaceReference` gives
+            them: then there is an estimate by area too. The state grows by 8 (2 + thresholds) bytes a cell and block.
         backend: Nearest-neighbour search, as in `torchcover.nearest`.
         memory_mb: As in `torchcover.nearest`.
         kwargs: For `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
@@ -67,6 +69,8 @@ class CoverageMetric(MergeableMetric):
     probed_steps: Tensor
     points: Tensor
     mean_sums: Tensor
+    area_m2: Tensor
+    area_sums: Tensor
     block_length: Tensor
     block_steps: Tensor
     empty_sensor_steps: Tensor
@@ -82,6 +86,7 @@ class CoverageMetric(MergeableMetric):
         max_radius: float = math.inf,
         blocks: int = 1,
         aggregations: Sequence[Aggregation] = (),
+        square_metres: bool = False,
         backend: str = "auto",
         memory_mb: float = 256.0,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
@@ -94,13 +99,16 @@ class CoverageMetric(MergeableMetric):
             "max_radius": float(max_radius),
             "blocks": blocks,
             "aggregations": tuple(aggregations),
+            "square_metres": square_metres,
         }
         super().__init__(meaning, **kwargs)
         self.grid = grid
         self.thresholds: tuple[float, ...] = tuple(float(threshold) for threshold in thresholds)
         self.max_radius = float(max_radius)
         self.blocks = blocks
-        self.aggregations: tuple[Aggregation, ...] = (MeanOfMeans(self.thresholds, blocks), *aggregations)
+        self.square_metres = square_metres
+        over_area = [VisibleArea(self.thresholds, blocks)] if square_metres else []
+        self.aggregations: tuple[Aggregation, ...] = (MeanOfMeans(self.thresholds, blocks), *over_area, *aggregations)
         self.backend = backend
         self.memory_mb = memory_mb
         self._add_states()
@@ -148,9 +156,14 @@ class CoverageMetric(MergeableMetric):
 
         Raises:
             ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights
-                that are not positive and finite, a negative index.
+                that are not positive and finite, none where they are square metres, a negative index.
             TypeError: A cloud is not a floating-point tensor.
         """
+        if self.square_metres and weights is None:
+            raise ValueError(
+                "weights: the square metres of each reference point are needed, as a SurfaceReference gives them; got "
+                "none (without square_metres=True, points may do without)"
+            )
         for step in checked_steps(sensor, reference, weights, index, first=int(self.steps)):
             self._add_step(step)
 
@@ -226,6 +239,7 @@ class CoverageMetric(MergeableMetric):
                 for layer in aggregation.layers(self._sums_of(aggregation), probed_steps, self.max_radius)
             ],
             blocks=self._blocks() if self.blocks > 1 else None,
+            area=self._area() if self.square_metres else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
         )
 
@@ -236,6 +250,11 @@ class CoverageMetric(MergeableMetric):
             probed_steps=self.probed_steps.view(-1, *shape).clone(),
             sums=self.mean_sums.view(self.blocks, -1, *shape).clone(),
         )
+
+    def _area(self) -> AreaSums:
+        shape = self.grid.shape
+        m2, sums = self.area_m2.view(-1, *shape), self.area_sums.view(self.blocks, -1, *shape)
+        return AreaSums(self.block_steps.clone(), m2.clone(), sums.clone())
 
     def _align_with(self, incoming: dict[str, Any]) -> None:
         # Blocks of the same length only can be added up.

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import MeanOfMeans
-from torchcover.coverage.blocks import Blocks
+from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.coverage_file import read_coverage, write_coverage
 from torchcover.coverage.errors import cell_errors
-from torchcover.coverage.estimate import Estimator, RegionEstimate, estimate_region, unseen_cells
+from torchcover.coverage.estimate import Estimator, RegionEstimate, estimate_area, estimate_region, unseen_cells
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import RADIUS, Quantity
@@ -34,6 +34,7 @@ class Coverage:
         layers: What was measured: the mean radius, the detection at each threshold, then those of other aggregations.
         counts: What happened on the way, one number for each name in `COUNTS`.
         blocks: The sums in blocks of contiguous steps, if errors were asked for.
+        area: The sums over the visible surface, if the reference points had square metres.
 
     Attributes:
         layers: By the key of their quantity: `coverage.layers["radius_m"].values`.
@@ -58,6 +59,7 @@ class Coverage:
         layers: Iterable[Layer],
         counts: Mapping[str, int],
         blocks: Blocks | None = None,
+        area: AreaSums | None = None,
     ) -> None:
         self.grid = grid
         self.thresholds = tuple(thresholds)
@@ -67,6 +69,7 @@ class Coverage:
         self.layers: Mapping[str, Layer] = {layer.quantity.key: layer for layer in layers}
         self.counts = dict(counts)
         self.blocks = blocks
+        self.area = area
         self._estimates: dict[tuple[Region, str, Estimator], RegionEstimate] = {}
 
     def __repr__(self) -> str:
@@ -132,11 +135,13 @@ class Coverage:
         Args:
             region: A region within the grid.
             height: Name of the band.
-            estimator: "known", the paper's unweighted mean over the known cells, or "completed", which adds those that
-                more steps would make known (`torchcover.coverage.estimate.completed_mean`).
+            estimator: "known", the paper's unweighted mean over the known cells; "completed", which adds those that
+                more steps would make known (`torchcover.coverage.estimate.completed_mean`); "area", the mean over the
+                visible surface (`torchcover.coverage.estimate.estimate_area`), for points that have square metres.
 
         Raises:
-            ValueError: A region that reaches beyond the grid, or holds no cell centre; no such band.
+            ValueError: A region that reaches beyond the grid, or holds no cell centre; no such band; "area" of points
+                without square metres.
         """
         if (region, height, estimator) not in self._estimates:
             self._estimates[region, height, estimator] = self._estimate(region, height, estimator)
@@ -149,10 +154,20 @@ class Coverage:
         if height not in self.grid.heights:
             raise ValueError(f"height {height!r}: the grid has {', '.join(self.grid.heights)}")
         band = list(self.grid.heights).index(height)
+        if estimator == "area":
+            return estimate_area(self._square_metres(), band, cells)
         probed = self.probed_steps[band][cells]
         means = torch.stack([self.layers[quantity.key].values[band][cells] for quantity in self.quantities])
         sums = (means * probed).where(probed > 0, 0.0)
         return estimate_region(probed, sums, self.blocks, band, cells, estimator)
+
+    def _square_metres(self) -> AreaSums:
+        if self.area is None:
+            raise ValueError(
+                "no estimate by area: the reference points had no square metres; take them from a SurfaceReference and "
+                "give the metric square_metres=True"
+            )
+        return self.area
 
     def scalars(self, regions: Sequence[Region] | None = None) -> dict[str, float]:
         """The summary as a flat dict for a logger.

@@ -9,12 +9,14 @@ from torchcover.simulation.lidar import Lidar, LidarModel
 from torchcover.simulation.observation import Observation
 from torchcover.simulation.paper_reference import PaperReference
 from torchcover.simulation.rays import Tile, into_tiles
-from torchcover.simulation.reference_sensor import Areas, ReferenceSensor
+from torchcover.simulation.reference_sensor import Areas, ReferenceScan, ReferenceSensor, WeightKind
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.sensor import Sensor, vertical_fov_deg
 from torchcover.simulation.shell import position_in_shell
 from torchcover.simulation.simulator import Simulator
+from torchcover.simulation.surface_reference import SurfaceReference
+from torchcover.simulation.surroundings import Surroundings
 
 __all__ = [
     "REFERENCE_SENSORS",
@@ -29,12 +31,16 @@ __all__ = [
     "Observation",
     "PaperReference",
     "Pose",
+    "ReferenceScan",
     "ReferenceSensor",
     "Rig",
     "Scenario",
     "Sensor",
     "Simulator",
+    "SurfaceReference",
+    "Surroundings",
     "Tile",
+    "WeightKind",
     "builtin_names",
     "into_tiles",
     "position_in_shell",

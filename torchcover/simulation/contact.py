@@ -37,9 +37,15 @@ class Faces:
         self._corner_m = first
         self._lower_m = np.min([first, second, third], axis=0) - 2 * self.contact_m
         self._upper_m = np.max([first, second, third], axis=0) + 2 * self.contact_m
+        self._least_m, self._most_m = (
+            self._lower_m.min(axis=1, initial=np.inf),
+            self._upper_m.max(axis=1, initial=-np.inf),
+        )
 
     def hold(self, place_m: NDArray[np.floating]) -> bool:
         """Whether a (3,) place lies on one of them."""
+        if ((place_m < self._least_m) | (place_m > self._most_m)).any():
+            return False
         x, y, z = place_m
         # One axis after the other: the first, which asks all faces, leaves few to the second.
         near = np.flatnonzero((self._lower_m[2] <= z) & (z <= self._upper_m[2]))

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation.paper_reference import paper_density_at
+from torchcover.simulation.ray_pattern import cast_pattern
 from torchcover.simulation.rays import Tile, into_tiles
-from torchcover.simulation.reference_sensor import Area, Areas
+from torchcover.simulation.reference_sensor import Area, Areas, ReferenceScan, check_areas, check_reach
 from torchcover.simulation.shell import position_in_shell
+from torchcover.simulation.surroundings import Surroundings
 
 # Height above the ground up to which half of the rays look for bodies that stand on it.
 TOP_M = 2.0
@@ -61,17 +63,10 @@ class EvenReference:
     max_range_m: float = 250.0
 
     def __post_init__(self) -> None:
-        if not self.areas:
-            raise ValueError("areas: at least one rectangle ((x_low, x_high), (y_low, y_high)) is needed")
-        for area in self.areas:
-            if not all(-math.inf < low < high < math.inf for low, high in area):
-                raise ValueError(f"areas: finite bounds, lower first, are needed; got {area}")
+        check_areas(self.areas)
         if self.rays < 2 * len(self.areas):
             raise ValueError(f"rays: at least 2 for each of {len(self.areas)} areas are needed; got {self.rays}")
-        if not self.shell_m > 0:
-            raise ValueError(f"shell_m: a positive thickness in metres is needed; got {self.shell_m}")
-        if not self.max_range_m > 0:
-            raise ValueError(f"max_range_m: a positive distance in metres is needed; got {self.max_range_m}")
+        check_reach(self.shell_m, self.max_range_m)
 
     @classmethod
     def from_rays(cls, areas: Areas, rays: int | None) -> Self:
@@ -85,6 +80,10 @@ class EvenReference:
             ValueError: As for the class.
         """
         return cls(areas, DEFAULT_RAYS if rays is None else rays)
+
+    def scan(self, surroundings: Surroundings) -> ReferenceScan:
+        """What its rays hit at one step; see `ReferenceSensor.scan`."""
+        return cast_pattern(self, surroundings)
 
     def vehicle_T_reference(self, ego: BoundingBox, generator: np.random.Generator) -> Float64:
         """Draw the pose of one step: its place is the paper's; its axes are those of the vehicle.

@@ -95,10 +95,10 @@ class Instant:
         Returns:
             A `Scan`, the points in the order of the tiles.
         """
-        bodies = self._outlines(vehicle_T_sensor[:3, 3])
+        bodies = self.outlines(vehicle_T_sensor[:3, 3])
 
         def scan_tile(tile: Tile, own_m: Float32 | None) -> tuple[Float32, NDArray[np.bool_], int, int]:
-            directions, hits, casts = self._cast_tile(vehicle_T_sensor, tile, max_range_m, bodies, own_m)
+            directions, hits, casts = self.cast(vehicle_T_sensor, tile, _limit(tile, max_range_m), bodies, own_m)
             seen = (hits.body >= 0) & (hits.body != self.ego)
             if min_range_m > 0:
                 seen &= hits.range_m >= min_range_m
@@ -130,11 +130,11 @@ class Instant:
             (rows, columns) metres; infinite where a ray hits nothing, NaN where there is none.
         """
         image = np.full(directions.shape[1:], np.nan, dtype=np.float32)
-        bodies = self._outlines(vehicle_T_sensor[:3, 3])
+        bodies = self.outlines(vehicle_T_sensor[:3, 3])
         for top in range(0, len(image), TILE_ROWS):
             rows = slice(top, top + TILE_ROWS)
             (tile,) = into_tiles(directions[:, rows], tile_columns=directions.shape[2])
-            _, hits, _ = self._cast_tile(vehicle_T_sensor, tile, max_range_m, bodies)
+            _, hits, _ = self.cast(vehicle_T_sensor, tile, _limit(tile, max_range_m), bodies)
             image[rows][~np.isnan(directions[0, rows])] = np.where(hits.body >= 0, hits.range_m, np.inf)
         return image
 
@@ -151,23 +151,33 @@ class Instant:
             for caster, part_T_vehicle in casters
         )
 
-    def _outlines(self, origin_m: Matrix) -> Outlines:
-        """The bodies that move, as a sensor sees them."""
+    def outlines(self, origin_m: Matrix) -> Outlines:
+        """The bodies that move, as they look from a place."""
         corners_m = [part.corners_m for part in self.moving]
         return outlines(np.array(corners_m).reshape(-1, 8, 3), origin_m)
 
-    def _cast_tile(
+    def cast(
         self,
         vehicle_T_sensor: Matrix,
         tile: Tile,
-        max_range_m: float,
+        limit_m: Float32,
         bodies: Outlines,
         own_m: Float32 | None = None,
     ) -> tuple[Float32, Hits, int]:
-        """Directions in the vehicle frame, their hits, and how many rays were cast at bodies that move."""
+        """Cast the rays of one tile.
+
+        Args:
+            vehicle_T_sensor: (4, 4) pose of the sensor.
+            tile: n of its rays.
+            limit_m: (n,) distance at which each of them ends; finite.
+            bodies: The bodies that move as they look from there, from `outlines`.
+            own_m: (n,) where the ego's body ends them, if that is known.
+
+        Returns:
+            (3, n) directions in the vehicle frame, their hits, and how many rays were cast at bodies that move.
+        """
         origin_m, vehicle_R_sensor = vehicle_T_sensor[:3, 3], vehicle_T_sensor[:3, :3]
         directions = rotate(vehicle_R_sensor, tile.directions)
-        limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
         if own_m is not None:
             limit_m = np.minimum(limit_m, own_m)
         hits = cast_from(self.static, self.static_T_vehicle, origin_m, directions, limit_m)
@@ -193,6 +203,10 @@ class Instant:
                 hits.range_m[rays] = nearer.range_m
                 hits.body[rays[nearer.body >= 0]] = part.body
         return directions, hits, casts
+
+
+def _limit(tile: Tile, max_range_m: float) -> Float32:
+    return np.full(tile.directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
 
 
 def _points(origin_m: Matrix, directions: Float32, range_m: Float32, seen: NDArray[np.bool_]) -> Float32:

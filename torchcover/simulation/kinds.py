@@ -6,9 +6,10 @@ from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.paper_reference import PaperReference
 from torchcover.simulation.reference_sensor import ReferenceSensor
 from torchcover.simulation.sensor import Sensor
+from torchcover.simulation.surface_reference import SurfaceReference
 
 # By the key `type` in a rig's file.
 SENSORS: dict[str, type[Sensor]] = {"lidar": Lidar, "camera": CameraSensor}
 REFERENCE_SENSORS: dict[str, type[ReferenceSensor]] = {
-    sensor.name: sensor for sensor in (EvenReference, PaperReference)
+    sensor.name: sensor for sensor in (EvenReference, PaperReference, SurfaceReference)
 }

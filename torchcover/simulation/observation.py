@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.simulation.instant import Instant, Scan
+from torchcover.simulation.reference_sensor import ReferenceScan, WeightKind
 from torchcover.simulation.scene import Scene
 
 Float32 = NDArray[np.float32]
@@ -20,16 +21,18 @@ class Observation:
         clouds: Name of each rig -> (N, 3) float32 points of all its sensors, in their order.
         reference: (M, 3) float32 points of the reference sensor.
         reference_weights: (M,) float32 weight of each of them; None if they weigh the same.
+        weight_kind: What the weights are, from `ReferenceScan`.
         counts: How many rays there were, how many of them the ego took, and what was left out, by name.
     """
 
     clouds: Mapping[str, Float32]
     reference: Float32
     reference_weights: Float32 | None
+    weight_kind: WeightKind | None
     counts: Mapping[str, int]
 
 
-def counts_of(scene: Scene, instant: Instant, scans: Sequence[Scan], reference: Scan, redrawn: int) -> dict[str, int]:
+def counts_of(scene: Scene, instant: Instant, scans: Sequence[Scan], reference: ReferenceScan) -> dict[str, int]:
     """The counts of an observation.
 
     Args:
@@ -37,24 +40,23 @@ def counts_of(scene: Scene, instant: Instant, scans: Sequence[Scan], reference: 
         instant: The scene at the step.
         scans: Of all sensors of all rigs.
         reference: Of the reference sensor.
-        redrawn: How often its place lay inside a body.
     """
     return {
         **_ray_counts("sensor", scans),
         **_ray_counts("reference", [reference]),
-        "reference_poses_redrawn": redrawn,
+        "reference_poses_redrawn": reference.redrawn,
         **_left_out(scene, instant, scans, reference),
     }
 
 
-def _ray_counts(source: str, scans: Sequence[Scan]) -> dict[str, int]:
+def _ray_counts(source: str, scans: Sequence[Scan | ReferenceScan]) -> dict[str, int]:
     return {
         f"{source}_rays": sum(scan.rays for scan in scans),
         f"{source}_self_hits": sum(scan.self_hits for scan in scans),
     }
 
 
-def _left_out(scene: Scene, instant: Instant, scans: Sequence[Scan], reference: Scan) -> dict[str, int]:
+def _left_out(scene: Scene, instant: Instant, scans: Sequence[Scan], reference: ReferenceScan) -> dict[str, int]:
     """What this step did not need, beside the number of all that there were of the kind."""
     rays = sum(scan.rays for scan in scans)
     pairs = (rays + reference.rays) * len(instant.moving)

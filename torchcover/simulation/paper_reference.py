@@ -9,9 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
+from torchcover.simulation.ray_pattern import cast_pattern
 from torchcover.simulation.rays import Tile, into_tiles, unit_directions
-from torchcover.simulation.reference_sensor import Areas
+from torchcover.simulation.reference_sensor import Areas, ReferenceScan, check_reach
 from torchcover.simulation.shell import position_in_shell
+from torchcover.simulation.surroundings import Surroundings
 
 # Pitch and roll of the paper's sensor are uniform between minus this and this.
 MAX_TILT_DEG = 45.0
@@ -59,12 +61,9 @@ class PaperReference:
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
             raise ValueError(f"the reference sensor needs rows and columns; got {self.rows} x {self.columns}")
-        if not self.shell_m > 0:
-            raise ValueError(f"shell_m: a positive thickness in metres is needed; got {self.shell_m}")
         if not 0 <= self.max_tilt_deg <= 90:
             raise ValueError(f"max_tilt_deg: an angle from 0 to 90 is needed; got {self.max_tilt_deg}")
-        if not self.max_range_m > 0:
-            raise ValueError(f"max_range_m: a positive distance in metres is needed; got {self.max_range_m}")
+        check_reach(self.shell_m, self.max_range_m)
 
     @classmethod
     def from_rays(cls, areas: Areas, rays: int | None) -> Self:
@@ -83,6 +82,10 @@ class PaperReference:
             raise ValueError(f"rays: at least 1 is needed; got {rays}")
         side = round(math.sqrt(rays))
         return cls(rows=side, columns=side)
+
+    def scan(self, surroundings: Surroundings) -> ReferenceScan:
+        """What its rays hit at one step; see `ReferenceSensor.scan`."""
+        return cast_pattern(self, surroundings)
 
     def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the sensor's frame."""

@@ -1,25 +1,49 @@
 """What a reference sensor is: another pattern is a class with these members and a line in `kinds.py`."""
 
-from typing import ClassVar, Protocol, Self
+import math
+from typing import ClassVar, Literal, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox
-from torchcover.simulation.rays import Tile
+from torchcover.simulation.surroundings import Surroundings
 
 # A rectangle of the ground in the vehicle frame in metres: ((x_low, x_high), (y_low, y_high)).
 Area = tuple[tuple[float, float], tuple[float, float]]
 Areas = tuple[Area, ...]
 
+# What the weights of points are: "density", a ratio of densities of rays, good for means within a cell of a step; or
+# "m2", the visible square metres that each point stands for, good for sums over any cells and steps.
+WeightKind = Literal["density", "m2"]
+
+
+class ReferenceScan(NamedTuple):
+    """What a reference sensor saw at one step.
+
+    Args:
+        points: (M, 3) float32 in the vehicle frame, without those on the ego.
+        weights: (M,) float32, positive and finite: what each point counts for; None if all count the same.
+        weight_kind: What the weights are; None if there are none.
+        rays: How many rays were cast.
+        self_hits: How many of them the ego took.
+        body_casts: At how many pairs of a ray and a moving body; the other pairs could not meet.
+        redrawn: How often its place was drawn again, because it lay inside a body.
+    """
+
+    points: NDArray[np.float32]
+    weights: NDArray[np.float32] | None
+    weight_kind: WeightKind | None
+    rays: int
+    self_hits: int
+    body_casts: int
+    redrawn: int
+
 
 class ReferenceSensor(Protocol):
-    """A sensor that no rig is measured to be better than: at every step its rays leave from another place at the ego.
+    """A sensor that no rig is measured to be better than: at every step it looks from other places at the ego.
 
-    A value: equal ones cast the same rays, from random numbers of the generator that they are given and no others. It
-    can be pickled, for it travels to the workers of a DataLoader.
-
-    The order of calls at a step is `vehicle_T_reference` (again if the place is inside a body), `tiles`, `weights`.
+    A value: equal ones see the same, with random numbers of the generator that they are given and no others. It can be
+    pickled, for it travels to the workers of a DataLoader.
     """
 
     name: ClassVar[str]
@@ -45,44 +69,44 @@ class ReferenceSensor(Protocol):
 
     @property
     def max_range_m(self) -> float:
-        """Hits that are farther from it, in metres, give no point."""
+        """What is farther from its place, in metres, gives no point."""
         ...
 
-    def vehicle_T_reference(self, ego: BoundingBox, generator: np.random.Generator) -> NDArray[np.float64]:
-        """Draw the pose of one step.
+    def scan(self, surroundings: Surroundings) -> ReferenceScan:
+        """What it sees at one step.
 
         Args:
-            ego: Bounding box of the ego in the vehicle frame.
-            generator: Source of the random numbers.
+            surroundings: The vehicle, the scene around it, and the random numbers.
 
         Returns:
-            (4, 4) transform; its place is outside the box.
+            The points and what they count for; no point at all is an answer too.
+
+        Raises:
+            ValueError: There is no place for it that is not inside a body.
         """
         ...
 
-    def tiles(self, vehicle_T_reference: NDArray[np.float64], generator: np.random.Generator) -> tuple[Tile, ...]:
-        """The rays of one step in the sensor's frame.
 
-        Args:
-            vehicle_T_reference: (4, 4) pose, from `vehicle_T_reference`.
-            generator: Source of the random numbers.
+def check_areas(areas: Areas) -> None:
+    """Refuse areas that ask nothing.
 
-        Returns:
-            From `into_tiles`, of (3, rows, columns) unit directions.
-        """
-        ...
+    Raises:
+        ValueError: No area, or one with inverted or infinite bounds.
+    """
+    if not areas:
+        raise ValueError("areas: at least one rectangle ((x_low, x_high), (y_low, y_high)) is needed")
+    for area in areas:
+        if not all(-math.inf < low < high < math.inf for low, high in area):
+            raise ValueError(f"areas: finite bounds, lower first, are needed; got {area}")
 
-    def weights(
-        self, vehicle_T_reference: NDArray[np.float64], tiles: tuple[Tile, ...], ray: NDArray[np.int64]
-    ) -> NDArray[np.float32] | None:
-        """What the points count for: the density per solid angle that is meant, over that of the rays.
 
-        Args:
-            vehicle_T_reference: (4, 4) pose, from `vehicle_T_reference`.
-            tiles: The rays of the step, from `tiles`.
-            ray: (N,) numbers of the rays that made a point, counted over the tiles.
+def check_reach(shell_m: float, max_range_m: float) -> None:
+    """Refuse a shell or a range that is not positive.
 
-        Returns:
-            (N,) positive finite weights, or None if all weigh the same.
-        """
-        ...
+    Raises:
+        ValueError: As said.
+    """
+    if not shell_m > 0:
+        raise ValueError(f"shell_m: a positive thickness in metres is needed; got {shell_m}")
+    if not max_range_m > 0:
+        raise ValueError(f"max_range_m: a positive distance in metres is needed; got {max_range_m}")

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 from torchcover.geometry import BoundingBox, invert, overlap, transform
 from torchcover.simulation.culling import SLACK_M, SLACK_SHARE
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant, Part, rotate
+from torchcover.simulation.patches import Bounds
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import Tile
 from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.surface import Surface, bounds_along
 from torchcover.simulation.world import Actor, World
 
 Matrix = NDArray[np.float64]
@@ -62,12 +64,37 @@ class Scene:
         self._reach_m = np.array([self._solids[id(actor.mesh)].reach_m for actor in self._resting + self._moving])
         # Subtracted in float64: world coordinates may be of UTM size. Where the ego rests, this frame is its own.
         self._world_T_local = world.ego.trajectory.at(0.0)
-        self._static = RayCaster(self._static_meshes())
+        self._static = RayCaster(self._static_meshes(self._resting))
+        self._surfaces: dict[tuple[float, ...], Surface] = {}
 
-    def _static_meshes(self) -> list[Mesh]:
+    def _static_meshes(self, resting: Sequence[Actor]) -> list[Mesh]:
         local_T_world = invert(self._world_T_local)
-        meshes = [actor.mesh.moved(local_T_world @ actor.trajectory.at(0.0)) for actor in self._resting]
+        meshes = [actor.mesh.moved(local_T_world @ actor.trajectory.at(0.0)) for actor in resting]
         return meshes + [mesh.moved(local_T_world) for mesh in self.world.static]
+
+    def surface(self, lower_m: Matrix, upper_m: Matrix) -> Surface:
+        """The surface of everything but the ego, for questions about a box that the vehicle carries along.
+
+        It is cut when first asked for, once for each box.
+
+        Args:
+            lower_m: (3,) smallest coordinates of the box in the vehicle frame.
+            upper_m: (3,) largest.
+        """
+        box = (*lower_m.tolist(), *upper_m.tolist())
+        if box not in self._surfaces:
+            ego, step_s = self.world.ego, self.world.time_step_s
+            poses = [ego.trajectory.at(step * step_s) for step in range(self.world.steps)]
+            bounds = bounds_along(
+                np.stack([invert(self._world_T_local) @ pose for pose in poses]), Bounds(lower_m[None], upper_m[None])
+            )
+            first = len(self._resting) + len(self.world.static)
+            self._surfaces[box] = Surface(
+                self._static_meshes([actor for actor in self._resting if actor is not ego]),
+                {first + k: actor.mesh for k, actor in enumerate(self._moving) if actor is not ego},
+                bounds,
+            )
+        return self._surfaces[box]
 
     def at(self, step: int, within_m: float = np.inf) -> "Instant":
         """Place everything for one step.

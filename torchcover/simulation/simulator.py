@@ -6,10 +6,8 @@ from typing import Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox
-from torchcover.geometry.rigid import Matrix
 from torchcover.simulation.disturbance import disturb
 from torchcover.simulation.instant import Instant, Scan
 from torchcover.simulation.labels import Label, labels
@@ -20,9 +18,7 @@ from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.stage import Stage, Stages
-
-# A reference pose inside a body is drawn again, at most this often.
-MAX_DRAWS = 100
+from torchcover.simulation.surroundings import Surroundings
 
 
 class Simulator:
@@ -94,13 +90,14 @@ class Simulator:
         stage, step = self._stage(index)
         instant = stage.scene.at(step, within_m=self._reach_m(stage.scene.ego_box))
         scans = {name: self._scan_rig(sensors, instant, index) for name, sensors in stage.mounted.items()}
-        reference, weights, redrawn = self._scan_reference(stage.scene, instant, index)
+        reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
         return Observation(
             clouds={name: np.concatenate([scan.points for scan in of_rig]) for name, of_rig in scans.items()},
             reference=reference.points,
-            reference_weights=weights,
-            counts=counts_of(stage.scene, instant, of_all_rigs, reference, redrawn),
+            reference_weights=reference.weights,
+            weight_kind=reference.weight_kind,
+            counts=counts_of(stage.scene, instant, of_all_rigs, reference),
         )
 
     def labels(self, index: int) -> list[Label]:
@@ -141,24 +138,7 @@ class Simulator:
             scans.append(disturb(scan, origin_m, sensor.range_noise_m, sensor.dropout, generator))
         return scans
 
-    def _scan_reference(
-        self, scene: Scene, instant: Instant, index: int
-    ) -> tuple[Scan, NDArray[np.float32] | None, int]:
-        """The scan of the reference sensor, the weights of its points, and how often its place was drawn again."""
-        sensor, generator = self.reference_sensor, np.random.default_rng([self.seed, index])
-        pose, redrawn = self._draw_reference_pose(scene, instant, index, generator)
-        tiles = sensor.tiles(pose, generator)
-        scan = instant.scan(pose, tiles, max_range_m=sensor.max_range_m, threads=torch.get_num_threads())
-        return scan, sensor.weights(pose, tiles, scan.ray), redrawn
-
-    def _draw_reference_pose(
-        self, scene: Scene, instant: Instant, index: int, generator: np.random.Generator
-    ) -> tuple[Matrix, int]:
-        for redrawn in range(MAX_DRAWS):
-            vehicle_T_reference = self.reference_sensor.vehicle_T_reference(scene.ego_box, generator)
-            if not instant.buried(vehicle_T_reference[:3, 3]):
-                return vehicle_T_reference, redrawn
-        raise ValueError(
-            f"{self.scenario.name} step {index}: {MAX_DRAWS} places beside and above the ego lie inside other bodies "
-            "or below the ground; does the ego stand on the ground, and do faces point outwards?"
-        )
+    def _surroundings(self, scene: Scene, instant: Instant, index: int) -> Surroundings:
+        generator = np.random.default_rng([self.seed, index])
+        name = f"{self.scenario.name} step {index}"
+        return Surroundings(scene, instant, generator, name, threads=torch.get_num_threads())

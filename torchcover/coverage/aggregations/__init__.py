@@ -6,6 +6,7 @@ from torchcover.coverage.aggregations.mean_of_means import MeanOfMeans
 from torchcover.coverage.aggregations.pooled_mean import PooledMean
 from torchcover.coverage.aggregations.quantiles import Quantiles
 from torchcover.coverage.aggregations.step_quantiles import StepQuantiles
+from torchcover.coverage.aggregations.visible_area import VisibleArea
 
 # Those that a metric may have beside the mean of means.
 AGGREGATIONS: tuple[type[Aggregation], ...] = (Maximum, Quantiles, StepQuantiles, PooledMean)
@@ -20,4 +21,5 @@ __all__ = [
     "Quantiles",
     "State",
     "StepQuantiles",
+    "VisibleArea",
 ]

@@ -1,0 +1,150 @@
+"""The estimate by area: a ratio of sums over square metres, which neither cells nor the number of points move."""
+
+import math
+
+import pytest
+import torch
+
+from torchcover import BevGrid, Coverage, CoverageMetric, Region
+from torchcover.data import SimulatedFrames
+from torchcover.simulation import SurfaceReference
+
+REGION = Region("all", x=(0.0, 8.0), y=(0.0, 4.0))
+HEIGHTS = {"low": (0.0, 1.0), "high": (1.0, 2.0)}
+
+
+def grid(cell=1.0):
+    return BevGrid(x=(0.0, 8.0), y=(0.0, 4.0), cell=cell, heights=HEIGHTS)
+
+
+def steps_of(count, seed=0, points=40):
+    """Sensor cloud, reference cloud and square metres, over ten decades, of some steps."""
+    random = torch.Generator().manual_seed(seed)
+    size = torch.tensor([8.0, 4.0, 2.0])
+    return [
+        (
+            torch.rand(20, 3, generator=random) * size,
+            torch.rand(points, 3, generator=random) * size,
+            10 ** (10 * torch.rand(points, generator=random) - 5),
+        )
+        for _ in range(count)
+    ]
+
+
+def metric_over(steps, index=None, cell=1.0, **options):
+    metric = CoverageMetric(grid(cell), (0.4, 0.8), square_metres=True, **options)
+    for number, (sensor, reference, m2) in zip(index or range(len(steps)), steps, strict=True):
+        metric.update(sensor, reference, weights=m2, index=number)
+    return metric
+
+
+def by_hand(steps, low, high):
+    """The radius and the detections over all points in a band, each weighted with its square metres."""
+    sums, whole = torch.zeros(3, dtype=torch.float64), 0.0
+    for sensor, reference, m2 in steps:
+        radius = torch.cdist(reference.double(), sensor.double()).amin(dim=1)
+        inside = m2.double() * ((reference[:, 2] >= low) & (reference[:, 2] < high))
+        sums += torch.stack([(inside * part).sum() for part in (radius, radius <= 0.4, radius <= 0.8)])
+        whole += inside.sum()
+    return sums / whole
+
+
+@pytest.mark.parametrize("cell", [0.25, 1.0, 4.0])
+def test_it_is_the_ratio_of_sums_whatever_the_cells(cell):
+    steps = steps_of(9)
+    coverage = metric_over(steps, cell=cell).compute()
+    for height, band in HEIGHTS.items():
+        estimate = coverage.estimate(REGION, height, "area")
+        torch.testing.assert_close(estimate.value, by_hand(steps, *band), rtol=1e-6, atol=1e-9)
+        assert estimate.error.isnan().all()
+
+
+def test_what_is_left_out_is_what_a_run_without_the_block_gives():
+    steps = steps_of(40)
+    coverage = metric_over(steps, blocks=16).compute()
+    estimate = coverage.estimate(REGION, "low", "area")
+    assert estimate.steps.tolist() == [4] * 10
+    for block in range(10):
+        kept = [number for number in range(40) if number // 4 != block]
+        without = by_hand([steps[number] for number in kept], *HEIGHTS["low"])
+        torch.testing.assert_close(estimate.left_out[block], without, rtol=1e-6, atol=1e-9)
+    assert (estimate.error > 0).all()
+
+
+def test_points_that_are_split_up_change_nothing():
+    whole = steps_of(8)
+    halves = [(sensor, reference.repeat(4, 1), m2.repeat(4) / 4) for sensor, reference, m2 in whole]
+    values = [metric_over(steps).compute().estimate(REGION, "low", "area").value for steps in (whole, halves)]
+    torch.testing.assert_close(*values, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize("blocks", [1, 8])
+def test_two_halves_merge_to_the_whole_and_a_file_gives_back_what_was_saved(tmp_path, blocks):
+    steps = steps_of(20)
+    whole = metric_over(steps, blocks=blocks)
+    first, second = metric_over(steps[:7], blocks=blocks), metric_over(steps[7:], list(range(7, 20)), blocks=blocks)
+    first.merge_state(second)
+    coverage = whole.compute()
+    coverage.save(tmp_path / "coverage.npz")
+    loaded = Coverage.load(tmp_path / "coverage.npz")
+    for other, exact in ((first.compute(), 1e-12), (loaded, 0.0)):
+        one, two = (each.estimate(REGION, "high", "area") for each in (coverage, other))
+        torch.testing.assert_close(one.value, two.value, rtol=exact, atol=0)
+        torch.testing.assert_close(one.left_out, two.left_out, rtol=exact, atol=0)
+    assert torch.equal(loaded.layers["radius_area_m"].values, coverage.layers["radius_area_m"].values)
+
+
+def test_a_cell_has_the_ratio_of_its_own_sums():
+    coverage = metric_over(steps_of(30), cell=4.0).compute()
+    band = coverage.area.m2.sum(dim=0)[0]
+    radius = coverage.layers["radius_area_m"].values[0]
+    detection = coverage.layers["detection_area_0.8m"].values[0]
+    value = coverage.estimate(REGION, "low", "area").value
+    assert ((radius * band).sum() / band.sum()).item() == pytest.approx(value[0].item(), rel=1e-12)
+    assert ((detection * band).sum() / band.sum()).item() == pytest.approx(value[2].item(), rel=1e-12)
+
+
+def test_no_square_metre_is_unknown_and_no_sensor_point_is_infinitely_far():
+    sensor, nowhere, none = torch.zeros(1, 3), torch.zeros(0, 3), torch.zeros(0)
+    assert metric_over([(sensor, nowhere, none)]).compute().estimate(REGION, "low", "area").value.isnan().all()
+    one = (torch.zeros(0, 3), torch.tensor([[1.0, 1.0, 0.5]]), torch.tensor([2.0]))
+    value = metric_over([one]).compute().estimate(REGION, "low", "area").value
+    assert value.tolist() == [math.inf, 0.0, 0.0]
+
+
+def test_it_needs_square_metres():
+    sensor, reference, _ = steps_of(1)[0]
+    with pytest.raises(ValueError, match="weights: the square metres of each reference point are needed"):
+        CoverageMetric(grid(), square_metres=True).update(sensor, reference)
+    plain = CoverageMetric(grid())
+    plain.update(sensor, reference)
+    with pytest.raises(ValueError, match="no estimate by area: the reference points had no square metres"):
+        plain.compute().estimate(REGION, "low", "area")
+    with pytest.raises(ValueError, match="different square_metres"):
+        metric_over(steps_of(1)).merge_state(CoverageMetric(grid(), (0.4, 0.8)))
+
+
+def test_the_ray_budget_does_not_move_it():
+    ahead = Region("ahead", x=(0.0, 40.0), y=(-10.0, 10.0))
+    few, many = (
+        simulated(ahead, SurfaceReference(((ahead.x, ahead.y),), rays), steps=steps)
+        for rays, steps in ((1024, 64), (16_384, 64))
+    )
+    for height in ("ground", "obstacle"):
+        for ours, theirs in zip(few[height], many[height], strict=True):
+            error = math.hypot(ours[1], theirs[1])
+            assert abs(ours[0] - theirs[0]) < 4 * error
+            assert error < 0.12 * theirs[0]
+
+
+def simulated(region, reference_sensor, steps):
+    """Height -> (value, error) of the radius and of the detection."""
+    metric = CoverageMetric(BevGrid(x=region.x, y=region.y, cell=0.5), max_radius=50.0, blocks=16, square_metres=True)
+    for frame in SimulatedFrames("courtyard", "front_roof_32", steps=steps, reference_sensor=reference_sensor):
+        metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, index=frame.index)
+    coverage = metric.compute()
+    estimates = {height: coverage.estimate(region, height, "area") for height in ("ground", "obstacle")}
+    return {
+        height: list(zip(found.value.tolist(), found.error.tolist(), strict=True))
+        for height, found in estimates.items()
+    }

@@ -1,0 +1,258 @@
+"""The surface reference: its weights add up to the area that is seen, whatever the number of rays and places."""
+
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from torch.utils.data import DataLoader
+
+from torchcover.data import SimulatedFrames, collate_frames
+from torchcover.simulation import Scenario, Simulator, SurfaceReference
+from torchcover.simulation.shapes import Mesh
+
+AHEAD = ((4.0, 24.0), (-5.0, 5.0))
+ALL_HEIGHTS = ((-3.0, 3.0),)
+EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
+FLOOR = {"name": "floor", "shape": {"type": "plane", "size_m": [400, 400]}}
+
+
+def box(size_m, **pose):
+    return {"name": "box", "shape": {"type": "box", "size_m": size_m}, "poses": [pose]}
+
+
+def scenario(*bodies, ego=EGO, **keys):
+    return Scenario.model_validate({"name": "s", "ego": ego, "bodies": bodies, **keys})
+
+
+def sheet_file(folder, triangles, name="sheet.ply"):
+    triangles = np.asarray(triangles, dtype=np.float64)
+    path = folder / name
+    mesh = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=False)
+    mesh.export(path)
+    return {"name": name, "shape": {"type": "mesh", "path": str(path)}}
+
+
+def rectangle(x, y, z=0.0):
+    (x0, x1), (y0, y1) = x, y
+    return [[[x0, y0, z], [x1, y0, z], [x1, y1, z]], [[x0, y0, z], [x1, y1, z], [x0, y1, z]]]
+
+
+@pytest.fixture
+def at(monkeypatch):
+    """Let every place be this one."""
+
+    def put(place_m):
+        monkeypatch.setattr(
+            "torchcover.simulation.surface_reference.position_in_shell", lambda *_: np.array(place_m, dtype=np.float64)
+        )
+
+    return put
+
+
+def sums(made, sensor, value=lambda points: np.ones(len(points)), steps=40, first=0):
+    """(steps,) sum over the points of weight times a value of them."""
+    simulator = Simulator(made, {}, sensor)
+    seen = [simulator.step(index) for index in range(first, first + steps)]
+    return np.array([(step.reference_weights.astype(np.float64) * value(step.reference)).sum() for step in seen])
+
+
+def agrees(samples, exact, within=0.02):
+    """The mean is the exact value within 4 standard errors, and these are small."""
+    error = samples.std(ddof=1) / math.sqrt(len(samples))
+    assert error <= within * abs(exact)
+    assert abs(samples.mean() - exact) <= 4 * error + 1e-5 * abs(exact), (samples.mean(), exact, error)
+
+
+def along_x(points):
+    return points[:, 0].astype(np.float64)
+
+
+@pytest.mark.filterwarnings("ignore:.*the mesh is not closed")
+def test_a_floor_with_a_hole(at, tmp_path):
+    parts = [((-50, 10), (-50, 50)), ((12, 50), (-50, 50)), ((10, 12), (-50, -1)), ((10, 12), (1, 50))]
+    floor = sheet_file(tmp_path, [triangle for part in parts for triangle in rectangle(*part)])
+    at([2.5, 0.3, 1.0])
+    sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=ALL_HEIGHTS)
+    agrees(sums(scenario(floor), sensor), 200.0 - 4.0)
+    agrees(sums(scenario(floor), sensor, along_x), 200.0 * 14.0 - 4.0 * 11.0)
+
+
+@pytest.mark.filterwarnings("ignore:.*the mesh is not closed")
+@pytest.mark.parametrize("turned", [False, True])
+def test_an_open_sheet_is_seen_from_either_side(at, tmp_path, turned):
+    parts = [((-4, -1), (0, 4)), ((1, 4), (0, 4)), ((-1, 1), (0, 1)), ((-1, 1), (2, 4))]
+    upright = np.array([triangle for part in parts for triangle in rectangle(*part)])[..., [2, 0, 1]] + [12, 0, 0]
+    sheet = sheet_file(tmp_path, upright[:, ::-1] if turned else upright)
+    at([2.5, 0.3, 1.0])
+    sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=((0.5, 2.0),))
+    agrees(sums(scenario(sheet, FLOOR), sensor), 8 * 1.5 - 2 * 1)
+
+
+def test_a_sheet_with_a_face_on_either_side_counts_once(at, tmp_path):
+    one = np.array(rectangle((-2, 2), (0, 3)))[..., [2, 0, 1]] + [12, 0, 0]
+    at([2.5, 0.3, 1.0])
+    sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=((0.5, 2.0),))
+    both = sheet_file(tmp_path, np.concatenate([one, one[:, ::-1]]))
+    agrees(sums(scenario(both, FLOOR), sensor), 4 * 1.5)
+
+
+@pytest.mark.filterwarnings("ignore:.*the mesh is not closed")
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_of_a_box_the_sides_that_are_turned_to_the_place_are_seen(at, tmp_path, inside_out):
+    made = trimesh.creation.box(extents=[2, 2, 1.5])
+    made.apply_translation([10, 0, 0.75])
+    faces = made.vertices[made.faces]
+    body = sheet_file(tmp_path, faces[:, ::-1] if inside_out else faces)
+    at([2.5, 3.0, 2.5])
+    sensor = SurfaceReference((AHEAD,), rays=1000, places=1, bands_m=((0.5, 2.0),))
+    agrees(sums(scenario(body, FLOOR), sensor), 2.0 + 2.0 + 4.0)
+    on_top = sums(scenario(body, FLOOR), sensor, lambda points: points[:, 2] > 1.49999)
+    agrees(on_top, 4.0)
+
+
+def test_a_wall_that_another_one_half_hides(at):
+    wall, screen = box([0.2, 10, 3], x_m=20), box([0.2, 2, 10], x_m=10, y_m=1)
+    at([2.6, 0.0, 1.0])
+    sensor = SurfaceReference((((15.0, 25.0), (-6.0, 6.0)),), rays=1000, places=1, bands_m=((0.5, 2.0),))
+    hidden_m = 2.0 * (19.9 - 2.6) / (9.9 - 2.6)
+    agrees(sums(scenario(wall, screen, FLOOR), sensor), 1.5 * (10 - hidden_m))
+    heights = sums(scenario(wall, screen, FLOOR), sensor, lambda points: points[:, 2].astype(np.float64))
+    agrees(heights, 1.5 * 1.25 * (10 - hidden_m))
+
+
+def test_the_egos_own_surface_is_in_no_cloud_but_hides(at):
+    at([0.0, 0.0, 2.0])  # half a metre above the roof
+    around = SurfaceReference((((-5.0, 5.0), (-5.0, 5.0)),), rays=2000, places=1, bands_m=ALL_HEIGHTS)
+    # The shadow of the roof, four times as far from the place as the roof is.
+    agrees(sums(scenario(box([1, 1, 1], x_m=90), FLOOR), around), 100.0 - 10.0 * 8.0)
+    seen = Simulator(scenario(FLOOR), {}, around).step(0)
+    assert np.abs(seen.reference[:, 2]).max() < 1e-4
+    assert seen.counts["reference_self_hits"] == seen.counts["reference_rays"] - len(seen.reference)
+
+
+def test_a_vehicle_that_pitches_takes_its_boxes_along(at):
+    at([2.6, 0.0, 1.0])
+    ego = {**EGO, "pose": {"z_m": 3.0, "pitch_deg": 5.0}}
+    sensor = SurfaceReference((AHEAD,), rays=1000, places=2, bands_m=((-6.0, 0.0),))
+    agrees(sums(scenario(FLOOR, ego=ego), sensor), 200.0 / math.cos(math.radians(5)))
+
+
+def test_the_ray_budget_and_the_number_of_places_do_not_move_the_mean():
+    made = Scenario.load("courtyard")
+    areas = (((0.0, 20.0), (-5.0, 5.0)), ((-10.0, 40.0), (-10.0, 10.0)))
+    many = sums(made, SurfaceReference(areas, rays=16_384, places=4), steps=48)
+    for rays, places, steps in [(1024, 1, 96), (256, 4, 48), (64, 4, 96), (1, 1, 500)]:
+        few = sums(made, SurfaceReference(areas, rays=rays, places=places), steps=steps, first=100)
+        error = math.hypot(*(kind.std(ddof=1) / math.sqrt(len(kind)) for kind in (few, many)))
+        assert abs(few.mean() - many.mean()) < 4 * error
+        assert error < 0.1 * many.mean() or rays == 1
+    # More places a step say more, at the same number of rays.
+    spread = [sums(made, SurfaceReference(areas, 4096, places), steps=64).std() for places in (1, 4)]
+    assert spread[1] < 0.75 * spread[0]
+
+
+def test_strata_that_overlap_share_their_points_out(at):
+    at([2.6, 0.0, 1.0])
+    inner = ((6.0, 9.0), (-2.0, 3.0))
+    sensor = SurfaceReference((AHEAD, inner, AHEAD), rays=900, places=1, bands_m=((-0.5, 0.5), (-0.2, 0.1)))
+    agrees(sums(scenario(FLOOR), sensor), 200.0)
+    agrees(sums(scenario(FLOOR), sensor, lambda points: (points[:, 0] >= 6) & (points[:, 0] < 9)), 30.0)
+    step = Simulator(scenario(FLOOR), {}, sensor).step(0)
+    inside = (np.abs(step.reference[:, 1] - 0.5) < 2.5) & (np.abs(step.reference[:, 0] - 7.5) < 1.5)
+    assert len(np.unique(step.reference_weights.round(4))) == 2
+    assert step.reference_weights[inside].max() < step.reference_weights[~inside].min()
+
+
+def test_what_is_out_of_range_is_not_seen(at):
+    at([2.5, 0.0, 1.0])
+    sensor = SurfaceReference((((0.0, 40.0), (-20.0, 20.0)),), rays=4000, places=1, max_range_m=12.0)
+    points = Simulator(scenario(FLOOR), {}, sensor).step(0).reference
+    assert 11.5 < np.linalg.norm(points - [2.5, 0.0, 1.0], axis=1).max() <= 12.0001
+
+
+def test_nothing_to_see_is_no_point_and_no_square_metre(at):
+    at([2.5, 0.0, 1.0])
+    empty = SurfaceReference((AHEAD,), rays=100, bands_m=((1.0, 2.0), (50.0, 60.0)))
+    seen = Simulator(scenario(FLOOR), {}, empty).step(0)
+    assert seen.reference.shape == (0, 3)
+    assert seen.reference_weights.shape == (0,)
+    assert (seen.weight_kind, seen.counts["reference_rays"]) == ("m2", 0)
+    behind = SurfaceReference((((15.0, 20.0), (-1.0, 1.0)),), rays=100)
+    hidden = Simulator(scenario(box([0.2, 40, 30], x_m=8), FLOOR), {}, behind).step(0)
+    assert len(hidden.reference) == 0
+    assert hidden.counts["reference_rays"] > 40
+
+
+@pytest.mark.parametrize(("rays", "places"), [(1, 1), (1, 4), (7, 3)])
+def test_one_point_or_one_place_will_do(rays, places):
+    simulator = Simulator(Scenario.load("courtyard"), {}, SurfaceReference((AHEAD,), rays=rays, places=places))
+    counts = [simulator.step(index).counts["reference_rays"] for index in range(40)]
+    assert 0.5 * rays < np.mean(counts) < 2 * rays
+
+
+@pytest.mark.filterwarnings("ignore:.*the mesh is not closed")
+def test_huge_faces_needles_and_faces_without_area_are_taken_as_they_are(at, tmp_path):
+    at([2.5, 0.3, 1.0])
+    huge = rectangle((-1e5, 1e5), (-1e5, 1e5))
+    needle = [[[5, 0, 0.6], [1e5, 0, 0.6], [5, 1e-7, 0.6]]]
+    nothing = [[[6, 0, 1], [6, 0, 1], [6, 0, 1]], [[6, 0, 1], [7, 0, 1], [8, 0, 1]]]
+    sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=ALL_HEIGHTS)
+    agrees(sums(scenario(sheet_file(tmp_path, [*huge, *needle, *nothing])), sensor), 200.0)
+
+
+def test_threads_workers_and_pickling_change_nothing():
+    made = Scenario.model_validate({"name": "u", "traffic": {"type": "urban", "duration_s": 1.0, "time_step_s": 0.5}})
+    sensor = SurfaceReference((AHEAD, ((0.0, 80.0), (-20.0, 20.0))), rays=30_000, places=2)
+    frames = SimulatedFrames(made, "front_roof_32", steps=4, seed=2, reference_sensor=sensor)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        one = [frames[index] for index in (3, 0, 1, 2)]
+        torch.set_num_threads(3)
+        three = [pickle.loads(pickle.dumps(frames))[index] for index in (3, 0, 1, 2)]
+    finally:
+        torch.set_num_threads(threads)
+    batches = DataLoader(frames, sampler=[3, 0, 1, 2], num_workers=2, collate_fn=collate_frames)
+    loaded = [frame for batch in batches for frame in batch.frames]
+    for frame, *others in zip(one, three, loaded, strict=True):
+        for other in others:
+            assert torch.equal(frame.reference, other.reference)
+            assert torch.equal(frame.reference_weights, other.reference_weights)
+            assert frame.counts == other.counts
+
+
+def test_the_surface_is_cut_once_a_world(monkeypatch):
+    cuts = []
+    monkeypatch.setattr(
+        "torchcover.simulation.patches.outward_faces",
+        lambda mesh: cuts.append(mesh) or np.zeros(len(mesh.faces), dtype=bool),
+    )
+    simulator = Simulator(Scenario.load("courtyard"), {}, SurfaceReference((AHEAD,), rays=100))
+    simulator.step(0)
+    once = len(cuts)
+    simulator.step(1)
+    simulator.with_reference_sensor(SurfaceReference((AHEAD,), rays=200)).step(2)
+    assert len(cuts) == once > 0
+    assert all(isinstance(mesh, Mesh) for mesh in cuts)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"areas": ()}, "areas: at least one rectangle"),
+        ({"areas": (((1.0, 0.0), (0.0, 1.0)),)}, "areas: finite bounds, lower first"),
+        ({"bands_m": ()}, "bands_m: at least one"),
+        ({"bands_m": ((0.5, 0.5),)}, "bands_m: at least one"),
+        ({"bands_m": ((0.0, math.inf),)}, "bands_m: at least one"),
+        ({"rays": 0}, "rays: at least 1 is needed; got 0"),
+        ({"places": 0}, "places: at least 1 is needed; got 0"),
+        ({"shell_m": 0.0}, "shell_m: a positive thickness"),
+        ({"max_range_m": math.nan}, "max_range_m: a positive distance"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        SurfaceReference(**{"areas": (AHEAD,), **options})

@@ -1,0 +1,85 @@
+"""The surface reference beside its slow twin: rays over directions, each weighted with the area that it stands for."""
+
+import numpy as np
+import pytest
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from torchcover.geometry import invert
+from torchcover.simulation import Scenario, Simulator, SurfaceReference, position_in_shell
+
+
+def visible_area(world, step, place_m, box_m, rays, seed, max_range_m=250.0):
+    """Points on the surface within a box that a place sees, and the square metres that each stands for.
+
+    Rays aim at points drawn evenly from the box, so that there are rays * (far^3 - near^3) / (3 volume) of them for
+    each solid angle, where near and far are where they enter and leave it. One that hits at a distance d under an angle
+    stands for d^2 / |cos| of surface for each solid angle; |cos| is never clipped.
+    """
+    low, high = np.array(box_m, dtype=np.float64).T
+    way_m = np.random.default_rng(seed).uniform(low, high, size=(rays, 3)) - place_m
+    towards = (way_m / np.linalg.norm(way_m, axis=1, keepdims=True)).astype(np.float32)
+    with np.errstate(divide="ignore"):
+        ends_m = np.stack([(low - place_m) / towards, (high - place_m) / towards])
+    near_m, far_m = ends_m.min(axis=0).max(axis=1).clip(min=0), ends_m.max(axis=0).min(axis=1)
+    per_angle = rays * (far_m**3 - near_m**3) / (3 * np.prod(high - low))
+    scene, ego = _scene(world, step)
+    origins = np.repeat(np.asarray(place_m, dtype=np.float32)[None], rays, axis=0)
+    hits = scene.run(origins, towards, output=True)
+    range_m = hits["tfar"].astype(np.float64)
+    points_m = place_m + range_m[:, None] * towards
+    seen = (hits["geomID"] >= 0) & (hits["geomID"] != ego) & (range_m <= max_range_m)
+    seen &= ((points_m >= low) & (points_m < high)).all(axis=1)
+    normals = hits["Ng"][seen].astype(np.float64)
+    cosine = np.abs((normals * towards[seen]).sum(axis=1)) / np.linalg.norm(normals, axis=1)
+    return points_m[seen], range_m[seen] ** 2 / (cosine * per_angle[seen])
+
+
+def _scene(world, step):
+    """Everything at one time in the vehicle frame, and the number of the ego."""
+    time_s = step * world.time_step_s
+    vehicle_T_world = invert(world.ego.trajectory.at(time_s))
+    scene = EmbreeScene(robust=True)
+    meshes = [world.ego.mesh, *(mesh.moved(vehicle_T_world) for mesh in world.static)]
+    meshes += [actor.mesh.moved(vehicle_T_world @ actor.trajectory.at(time_s)) for actor in world.actors]
+    for mesh in meshes:
+        TriangleMesh(scene, mesh.vertices_m.astype(np.float32), mesh.faces.astype(np.int32))
+    return scene, 0
+
+
+URBAN = {"name": "urban", "traffic": {"type": "urban", "duration_s": 2.0, "time_step_s": 0.5}}
+AREA = ((0.0, 40.0), (-10.0, 10.0))
+BANDS = ((-0.5, 0.5), (0.5, 2.0))
+
+
+@pytest.mark.parametrize(("made", "seed"), [(Scenario.load("courtyard"), 0), (Scenario.model_validate(URBAN), 4)])
+def test_both_see_the_same_area_at_the_same_places(made, seed, monkeypatch):
+    places = []
+
+    def remembered(ego, shell_m, generator):
+        places.append(position_in_shell(ego, shell_m, generator))
+        return places[-1]
+
+    monkeypatch.setattr("torchcover.simulation.surface_reference.position_in_shell", remembered)
+    simulator = Simulator(made, {}, SurfaceReference((AREA,), rays=16_384, bands_m=BANDS), seed=seed)
+    points, twins = [], []
+    for index in range(8):
+        places.clear()
+        step = simulator.step(index)
+        points.append((step.reference, step.reference_weights))
+        scene, time_step = simulator.scene_of(index)
+        for place_m in places[-4:]:
+            points_m, m2 = visible_area(scene.world, time_step, place_m, (*AREA, (-0.6, 2.1)), 100_000, seed=index)
+            twins.append((points_m, m2 / 4))
+    for low, high in BANDS:
+        ours, theirs = (_sums(found, low, high) for found in (points, twins))
+        assert ours[0] == pytest.approx(theirs[0], rel=0.01)
+        assert ours[1:] / ours[0] == pytest.approx(theirs[1:] / theirs[0], rel=0.01, abs=0.15)
+
+
+def _sums(found, low, high):
+    """Square metres in a band, and the sums over them of the distance from the vehicle and of y."""
+    points_m, m2 = (np.concatenate(part).astype(np.float64) for part in zip(*found, strict=True))
+    m2 = m2 * (points_m[:, 2] >= low) * (points_m[:, 2] < high)
+    # The twin's box is a little higher than the bands: its rays are few at its borders.
+    return np.array([m2.sum(), (m2 * np.linalg.norm(points_m, axis=1)).sum(), (m2 * points_m[:, 1]).sum()])

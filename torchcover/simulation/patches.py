@@ -1,0 +1,130 @@
+"""Patches: the triangles of surfaces, cut small, so that they are drawn from by place."""
+
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.simulation.instant import rotate
+from torchcover.simulation.outward import outward_faces
+from torchcover.simulation.shapes import Mesh
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+# No edge of a patch is longer.
+LONGEST_M = 4.0
+# A triangle with less area is a line: no point will ever be drawn from it.
+SMALLEST_M2 = 1e-10
+
+
+class Bounds(NamedTuple):
+    """K upright boxes: `lower_m` (K, 3) and `upper_m` (K, 3)."""
+
+    lower_m: Float64
+    upper_m: Float64
+
+    def meet(self, lower_m: Float64, upper_m: Float64) -> Bools:
+        """(N,) whether each of N boxes, (N, 3) and (N, 3), meets any of these."""
+        met = np.zeros(len(lower_m), dtype=bool)
+        for low, high in zip(self.lower_m, self.upper_m, strict=True):
+            met |= ((lower_m <= high) & (upper_m >= low)).all(axis=1)
+        return met
+
+
+class Patches(NamedTuple):
+    """N triangles in one frame.
+
+    `corner_m`, `first_m` and `second_m` (3, N) float32: one corner, and the edges from there to the other two; float64
+    would say no more, for rays meet float32 triangles. `outward` (N,): whether they are seen from the side only to
+    which first x second points.
+    """
+
+    corner_m: Float32
+    first_m: Float32
+    second_m: Float32
+    outward: Bools
+
+    @classmethod
+    def of(cls, mesh: Mesh, bounds: Bounds | None = None) -> Self:
+        """Cut a mesh.
+
+        Args:
+            mesh: Any; faces without an area are left out.
+            bounds: What lies outside of these boxes is left out.
+        """
+        triangles, face = _cut(mesh.vertices_m[mesh.faces], bounds)
+        corner, second, third = triangles.transpose(1, 2, 0)
+        first_m, second_m = (second - corner).astype(np.float32), (third - corner).astype(np.float32)
+        return cls(corner.astype(np.float32), first_m, second_m, outward_faces(mesh)[face])
+
+    @classmethod
+    def joined(cls, parts: "list[Patches]") -> Self:
+        """Those of several, one after the other."""
+        none = np.empty((3, 0), dtype=np.float32)
+        parts = [Patches(none, none, none, np.empty(0, dtype=bool)), *parts]
+        corner_m, first_m, second_m = (np.concatenate([part[k] for part in parts], axis=1) for k in range(3))
+        return cls(corner_m, first_m, second_m, np.concatenate([part.outward for part in parts]))
+
+    def taken(self, numbers: NDArray[np.int64]) -> Self:
+        """Some of them."""
+        corner_m, first_m, second_m = (part.take(numbers, axis=1) for part in self[:3])
+        return type(self)(corner_m, first_m, second_m, self.outward[numbers])
+
+    def moved(self, destination_T_source: Float64) -> Self:
+        """Them in another frame. What becomes of one does not depend on the others."""
+        rotation = destination_T_source[:3, :3]
+        # The corner may be a kilometre away, in either frame.
+        corner_m = np.einsum("ij,jn->in", rotation, self.corner_m.astype(np.float64)) + destination_T_source[:3, 3:]
+        first_m, second_m = rotate(rotation, self.first_m), rotate(rotation, self.second_m)
+        return type(self)(corner_m.astype(np.float32), first_m, second_m, self.outward)
+
+    @property
+    def lower_m(self) -> Float32:
+        """(3, N) smallest coordinates."""
+        lower: Float32 = self.corner_m + np.minimum(np.minimum(self.first_m, self.second_m), 0)
+        return lower
+
+    @property
+    def upper_m(self) -> Float32:
+        """(3, N) largest coordinates."""
+        upper: Float32 = self.corner_m + np.maximum(np.maximum(self.first_m, self.second_m), 0)
+        return upper
+
+    @property
+    def normals_m2(self) -> Float32:
+        """(3, N) normals, as long as twice the area."""
+        (ax, ay, az), (bx, by, bz) = self.first_m, self.second_m
+        normals: Float32 = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
+        return normals
+
+
+def _cut(triangles: Float64, bounds: Bounds | None) -> tuple[Float64, NDArray[np.int64]]:
+    """(N, 3, 3) triangles with short edges, and (N,) of which one of those given each is a part."""
+    face, done, done_face = np.arange(len(triangles)), [np.empty((0, 3, 3))], [np.empty(0, dtype=np.int64)]
+    while len(triangles):
+        kept = _areas(triangles) >= SMALLEST_M2
+        if bounds is not None:
+            kept &= bounds.meet(triangles.min(axis=1), triangles.max(axis=1))
+        triangles, face = triangles[kept], face[kept]
+        edges_m = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
+        small = (edges_m <= LONGEST_M).all(axis=1)
+        done.append(triangles[small])
+        done_face.append(face[small])
+        triangles, face = _halved(triangles[~small], edges_m[~small].argmax(axis=1)), np.tile(face[~small], 2)
+    return np.concatenate(done), np.concatenate(done_face)
+
+
+def _halved(triangles: Float64, longest: NDArray[np.int64]) -> Float64:
+    """(2 N, 3, 3) halves of N triangles on either side of the middle of one edge, first one of each, then the other."""
+    number = np.arange(len(triangles))
+    start, end, across = (triangles[number, (longest + k) % 3] for k in range(3))
+    middle = (start + end) / 2
+    return np.concatenate([np.stack([start, middle, across], axis=1), np.stack([middle, end, across], axis=1)])
+
+
+def _areas(triangles: Float64) -> Float64:
+    first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    areas: Float64 = np.linalg.norm(np.cross(first, second), axis=1) / 2
+    return areas

@@ -1,0 +1,78 @@
+"""Which points a place sees."""
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import rigid
+from torchcover.simulation.instant import Instant
+from torchcover.simulation.rays import BLOCK, Tile, into_tiles
+
+# Rays in a tile: of neighbours all, so that a tile is narrow. A constant, so that nothing depends on threads.
+TILE_RAYS = 4096
+# A ray ends before its target by this share of its length, which float32 leaves open.
+SHORTER = 1e-6
+
+
+class Sight(NamedTuple):
+    """What a place sees of N points: `seen` (N,); `self_hits` were hidden by the ego; `body_casts` as in `Scan`."""
+
+    seen: NDArray[np.bool_]
+    self_hits: int
+    body_casts: int
+
+
+def sight(instant: Instant, place_m: NDArray[np.float64], targets_m: NDArray[np.float32], *, threads: int = 1) -> Sight:
+    """Cast one ray from a place to each of some points; a point is seen if nothing lies in between.
+
+    Args:
+        instant: The scene.
+        place_m: (3,) in the vehicle frame.
+        targets_m: (N, 3) likewise; a little above the surface that they lie on, lest it hides them.
+        threads: Number of threads; the result does not depend on it.
+    """
+    vehicle_T_place, bodies = rigid(np.eye(3), place_m), instant.outlines(place_m)
+    way_m = targets_m.T - place_m[:, None]
+    distance_m = np.linalg.norm(way_m, axis=0)
+    # A point at the place itself is seen in any direction.
+    way_m[0, distance_m == 0] = 1.0
+    directions = way_m / np.where(distance_m == 0, 1.0, distance_m)
+    limit_m = (distance_m * (1 - SHORTER)).astype(np.float32)
+    order = _neighbours(directions)
+
+    def cast(first: int) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
+        rays, tile = _tile(order[first : first + TILE_RAYS], directions)
+        _, hits, casts = instant.cast(vehicle_T_place, tile, limit_m[rays], bodies)
+        return rays, hits.body, casts
+
+    hidden_by, tiles = np.full(len(targets_m), -1, dtype=np.int32), range(0, len(order), TILE_RAYS)
+    if threads <= 1 or len(tiles) <= 1:
+        answers = list(map(cast, tiles))
+    else:
+        # A pool for each place: threads do not survive the fork that makes a DataLoader worker.
+        with ThreadPoolExecutor(threads) as pool:
+            answers = list(pool.map(cast, tiles))
+    for rays, body, _ in answers:
+        hidden_by[rays] = body
+    self_hits = int(np.count_nonzero(hidden_by == instant.ego))
+    return Sight(hidden_by < 0, self_hits, sum(casts for _, _, casts in answers))
+
+
+def _neighbours(directions: NDArray[np.float64]) -> NDArray[np.int64]:
+    """An order in which as many directions as a block of a tile has are close to each other."""
+    azimuth = np.arctan2(directions[1], directions[0])
+    sectors = max(1, round(np.sqrt(len(azimuth)) / BLOCK))
+    rank = np.empty(len(azimuth), dtype=np.int64)
+    rank[np.argsort(azimuth, kind="stable")] = np.arange(len(azimuth))
+    return np.lexsort((directions[2], rank * sectors // max(len(azimuth), 1)))
+
+
+def _tile(rays: NDArray[np.int64], directions: NDArray[np.float64]) -> tuple[NDArray[np.int64], Tile]:
+    """The tile of some rays, and their numbers in its order; the last may be there more than once."""
+    rays = np.pad(rays, (0, -len(rays) % BLOCK**2), mode="edge")
+    # What follows each other becomes a square of rows and columns, as blocks are.
+    rays = rays.reshape(-1, BLOCK, BLOCK).transpose(1, 0, 2).reshape(BLOCK, -1)
+    (tile,) = into_tiles(directions[:, rays], tile_rows=BLOCK, tile_columns=rays.shape[1])
+    return rays.ravel(), tile

@@ -1,0 +1,138 @@
+"""Points drawn evenly over a surface, stratified by boxes."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.simulation.patches import Bounds, Patches
+
+Bools = NDArray[np.bool_]
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+# Patches are looked up with this much to spare: drawn points are rounded to float32.
+SLACK_M = 1e-3
+# Steps of a sequence in the plane whose points keep apart, whatever their number (Roberts 2018, "R2").
+PLANE_STEPS = (0.7548776662466927, 0.5698402909980532)
+# Where a stratum holds little of its patches, at most this many points are drawn for one that is wanted.
+MOST_DRAWN = 16.0
+
+
+class SurfacePoints(NamedTuple):
+    """K points of a surface.
+
+    `points_m` (K, 3) where; `normals` (K, 3) of length one on the side from which they are looked at; `per_m2` (K,) how
+    many points a square metre was given there, from all strata together.
+    """
+
+    points_m: Float32
+    normals: Float32
+    per_m2: Float64
+
+
+class Stratum(NamedTuple):
+    """The patches that may meet one box: numbers, whole areas, and about what lies within, judged by their own boxes.
+
+    All three are (K,).
+    """
+
+    patch: Numbers
+    m2: Float64
+    inside_m2: Float64
+
+
+class SurfaceStrata:
+    """A surface, ready to draw points from: evenly within each of some boxes, which may overlap.
+
+    Args:
+        patches: The surface in the frame of the boxes.
+        boxes: The strata, half-open: lower bounds belong to them.
+    """
+
+    def __init__(self, patches: Patches, boxes: Bounds) -> None:
+        self._patches = patches
+        self._boxes = boxes
+        normals = patches.normals_m2
+        twice_m2 = np.sqrt((normals**2).sum(axis=0))
+        self._normals = normals / np.maximum(twice_m2, np.finfo(np.float32).tiny)
+        self._plane_m = (self._normals * patches.corner_m).sum(axis=0)
+        lower_m, upper_m = patches.lower_m - np.float32(SLACK_M), patches.upper_m + np.float32(SLACK_M)
+        self._strata = [
+            _stratum(twice_m2 / 2, lower_m, upper_m, low.tolist(), high.tolist())
+            for low, high in zip(*boxes, strict=True)
+        ]
+
+    def draw(self, place_m: Float64, each: float, generator: np.random.Generator) -> SurfacePoints:
+        """Points on the patches that a place is in front of.
+
+        Args:
+            place_m: (3,) the place.
+            each: About how many points each stratum gets; if it is below 1, one with this probability.
+            generator: Source of the random numbers.
+        """
+        x, y, z = place_m.tolist()
+        height_m = x * self._normals[0] + y * self._normals[1] + z * self._normals[2] - self._plane_m
+        front = (height_m > 0) | (~self._patches.outward & (height_m < 0))
+        drawn = [_drawn(stratum, front, each, generator) for stratum in self._strata]
+        number = np.repeat(np.arange(len(drawn)), [len(patch) for patch, _ in drawn])
+        per_m2 = np.array([density for _, density in drawn])
+        return self._points(np.concatenate([patch for patch, _ in drawn]), number, per_m2, height_m, generator)
+
+    def _points(
+        self, patch: Numbers, stratum: Numbers, per_m2: Float64, height_m: Float32, generator: np.random.Generator
+    ) -> SurfacePoints:
+        """One point on each of the patches, if it lies in its stratum."""
+        start = generator.random((2, 1))
+        a, b = ((start + np.arange(len(patch)) * np.array(PLANE_STEPS)[:, None]) % 1).astype(np.float32)
+        beyond = a + b > 1
+        a, b = np.where(beyond, 1 - a, a), np.where(beyond, 1 - b, b)
+        corner_m, first_m, second_m, _ = self._patches.taken(patch)
+        points_m = corner_m + a * first_m + b * second_m
+        inside = np.stack([_inside(points_m, low, high) for low, high in zip(*self._boxes, strict=True)])
+        kept = np.flatnonzero(inside[stratum, np.arange(len(patch))])
+        patch = patch[kept]
+        return SurfacePoints(
+            np.ascontiguousarray(points_m[:, kept].T),
+            (self._normals[:, patch] * np.sign(height_m[patch])).T,
+            per_m2 @ inside[:, kept],
+        )
+
+
+def _inside(points_m: Float32, low: Float64, high: Float64) -> Bools:
+    inside = np.ones(points_m.shape[1], dtype=bool)
+    for axis in range(3):
+        inside &= (points_m[axis] >= low[axis]) & (points_m[axis] < high[axis])
+    return inside
+
+
+def _stratum(m2: Float32, lower_m: Float32, upper_m: Float32, low: list[float], high: list[float]) -> Stratum:
+    meets = np.ones(lower_m.shape[1], dtype=bool)
+    for axis in range(3):
+        meets &= upper_m[axis] >= low[axis]
+        meets &= lower_m[axis] <= high[axis]
+    patch = np.flatnonzero(meets)
+    inside_m2 = m2[patch]
+    for axis in range(3):
+        from_m, to_m = lower_m[axis, patch], upper_m[axis, patch]
+        inside_m2 *= (np.minimum(to_m, high[axis]) - np.maximum(from_m, low[axis])) / (to_m - from_m)
+    return Stratum(patch, m2[patch].astype(np.float64), inside_m2.astype(np.float64))
+
+
+def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Generator) -> tuple[Numbers, float]:
+    """Patches, drawn by their area so that about `each` points lie in the stratum, and points per square metre."""
+    seen = front[stratum.patch]
+    up_to_m2 = np.cumsum(stratum.m2 * seen)
+    whole_m2 = float(up_to_m2[-1]) if len(up_to_m2) else 0.0
+    if whole_m2 == 0:
+        return np.empty(0, dtype=np.int64), 0.0
+    inside_m2 = max(float((stratum.inside_m2 * seen).sum()), whole_m2 / MOST_DRAWN)
+    wanted = each * whole_m2 / inside_m2
+    expected = float(round(wanted)) if wanted >= 1 else wanted
+    count = int(expected + generator.random())
+    # One in each of as many equal parts of the area: the order of patches is one of places.
+    at_m2 = (np.arange(count) + generator.random(count)) / max(count, 1) * whole_m2
+    # Rounding must not take the last one beyond the end, where patches may follow that are not seen.
+    number = np.searchsorted(up_to_m2, np.minimum(at_m2, np.nextafter(whole_m2, 0.0)), side="right")
+    return stratum.patch[number], expected / whole_m2

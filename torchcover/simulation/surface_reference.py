@@ -1,0 +1,141 @@
+"""A reference sensor that asks the surface itself: which of it is seen from beside and above the ego."""
+
+import math
+from dataclasses import dataclass
+from typing import ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import BoundingBox, rigid
+from torchcover.simulation.patches import Bounds
+from torchcover.simulation.reference_sensor import Areas, ReferenceScan, check_areas, check_reach
+from torchcover.simulation.shell import position_in_shell
+from torchcover.simulation.sight import Sight, sight
+from torchcover.simulation.surface_points import SurfacePoints, SurfaceStrata
+from torchcover.simulation.surroundings import Surroundings
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Bands = tuple[tuple[float, float], ...]
+
+DEFAULT_RAYS = 16_384
+# The paper's heights: ground, and what stands on it.
+PAPER_BANDS_M = ((-0.5, 0.5), (0.5, 2.0))
+# How far above the surface a ray to it ends, in metres, and as a share of the coordinates that casting rounds.
+ABOVE_M = 1e-3
+ABOVE_SHARE = 5e-7
+
+
+@dataclass(frozen=True)
+class SurfaceReference:
+    """Points drawn evenly over the surface near the vehicle, of which those are kept that a random place sees.
+
+    The place is that of the paper's sensor: uniform in the shell between the ego's bounding box and that box grown
+    sideways and upwards. In every area and height band about the same number of points is drawn, evenly over the
+    surface of everything but the ego, and a ray from the place asks whether each is seen. A point's weight is the
+    square metres that it stands for, so that the sum of w f over the points has the expectation
+
+        E_place[ integral of f over the surface that the place sees ],
+
+    whatever the number of rays and of places. A face of a closed body is seen from its outer side; a face of anything
+    open, such as a plane, from both. Where two faces coincide and look the same way, both count.
+
+    Args:
+        areas: Rectangles x, y in the vehicle frame in metres, ((x_low, x_high), (y_low, y_high)) each. They may
+            overlap: small ones inside of large ones get more points.
+        rays: About how many rays there are in all, one for each point drawn.
+        places: How many places share the rays of a step.
+        bands_m: Height bands (low, high) in metres; half-open, as areas are. They may overlap too.
+        shell_m: Thickness of the shell around the ego in which the places are.
+        max_range_m: Farther points are not seen.
+
+    Raises:
+        ValueError: No area or no band, one with inverted or infinite bounds, no ray, no place, a shell or a range that
+            is not positive.
+
+    Example:
+        >>> from torchcover.simulation import Scenario, Simulator
+        >>> sensor = SurfaceReference(areas=(((0.0, 20.0), (-5.0, 5.0)),), rays=1024)
+        >>> seen = Simulator(Scenario.load("courtyard"), {}, sensor).step(0)
+        >>> seen.weight_kind, bool(100 < seen.reference_weights.sum() < 400)
+        ('m2', True)
+    """
+
+    name: ClassVar[str] = "surface"
+
+    areas: Areas
+    rays: int = DEFAULT_RAYS
+    places: int = 4
+    bands_m: Bands = PAPER_BANDS_M
+    shell_m: float = 0.5
+    max_range_m: float = 250.0
+
+    def __post_init__(self) -> None:
+        check_areas(self.areas)
+        if not self.bands_m or not all(-math.inf < low < high < math.inf for low, high in self.bands_m):
+            raise ValueError(f"bands_m: at least one (low, high) with finite bounds is needed; got {self.bands_m}")
+        if self.rays < 1:
+            raise ValueError(f"rays: at least 1 is needed; got {self.rays}")
+        if self.places < 1:
+            raise ValueError(f"places: at least 1 is needed; got {self.places}")
+        check_reach(self.shell_m, self.max_range_m)
+
+    @classmethod
+    def from_rays(cls, areas: Areas, rays: int | None) -> Self:
+        """One that asks about some areas.
+
+        Args:
+            areas: As above.
+            rays: About how many rays; 16,384 if not given.
+
+        Raises:
+            ValueError: As for the class.
+        """
+        return cls(areas, DEFAULT_RAYS if rays is None else rays)
+
+    def scan(self, surroundings: Surroundings) -> ReferenceScan:
+        """Draw points, and keep those that are seen; see `ReferenceSensor.scan`."""
+        boxes = self._boxes()
+        instant = surroundings.instant
+        surface = surroundings.scene.surface(boxes.lower_m.min(axis=0), boxes.upper_m.max(axis=0))
+        strata = SurfaceStrata(surface.near(instant, boxes), boxes)
+        above_m = max(ABOVE_M, ABOVE_SHARE * float(np.abs(instant.static_T_vehicle[:3, 3]).max()))
+        # All places before the first point: they are the same for any number of rays.
+        drawn = [surroundings.free_pose(self._pose) for _ in range(self.places)]
+        looks = []
+        for place_m in (pose[:3, 3] for pose, _ in drawn):
+            found = self._in_range(strata.draw(place_m, self._rays_each, surroundings.generator), place_m)
+            targets_m = found.points_m + np.float32(above_m) * found.normals
+            looks.append((found, sight(instant, place_m, targets_m, threads=surroundings.threads)))
+        return self._gathered(looks, redrawn=sum(redrawn for _, redrawn in drawn))
+
+    def _boxes(self) -> Bounds:
+        sides = [(*area, band) for area in self.areas for band in self.bands_m]
+        lower_m, upper_m = np.array(sides, dtype=np.float64).transpose(2, 0, 1)
+        return Bounds(lower_m, upper_m)
+
+    @property
+    def _rays_each(self) -> float:
+        """Rays from one place to one stratum."""
+        return self.rays / (self.places * len(self.areas) * len(self.bands_m))
+
+    def _pose(self, ego: BoundingBox, generator: np.random.Generator) -> Float64:
+        return rigid(np.eye(3), position_in_shell(ego, self.shell_m, generator))
+
+    def _in_range(self, drawn: SurfacePoints, place_m: Float64) -> SurfacePoints:
+        near = np.linalg.norm(drawn.points_m - place_m, axis=1) <= self.max_range_m
+        return drawn if near.all() else SurfacePoints(*(part[near] for part in drawn))
+
+    def _gathered(self, looks: list[tuple[SurfacePoints, Sight]], redrawn: int) -> ReferenceScan:
+        # One place stands for one of so many: every place's points are a surface of their own.
+        weights = [1.0 / (self.places * found.per_m2[look.seen]) for found, look in looks]
+        return ReferenceScan(
+            points=np.concatenate([found.points_m[look.seen] for found, look in looks]),
+            weights=np.concatenate(weights).astype(np.float32),
+            weight_kind="m2",
+            rays=sum(len(found.points_m) for found, _ in looks),
+            self_hits=sum(look.self_hits for _, look in looks),
+            body_casts=sum(look.body_casts for _, look in looks),
+            redrawn=redrawn,
+        )
