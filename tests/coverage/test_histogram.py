@@ -42,7 +42,7 @@ def test_quantiles_are_linear_within_a_bin():
     assert found.flatten().tolist() == [1.0, 1.5, 2.0, 3.0, math.inf, math.inf]
 
 
-@pytest.mark.parametrize("levels", [(), (0.5, 1.1), (math.nan,), (-0.1,), (0.5, 0.5)])
+@pytest.mark.parametrize("levels", [(), (0.5, 1.1), (math.nan,), (-0.1,), (0.5, 0.5), (0.5, 0.5000001)])
 def test_levels_that_make_no_sense_are_refused(levels):
     with pytest.raises(ValueError, match=r"levels: different numbers in \[0, 1\] are needed; got"):
         check_levels(levels)

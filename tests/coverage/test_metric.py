@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchcover import BevGrid, CoverageMetric
-from torchcover.coverage import Maximum, PooledMean, Quantiles, StepQuantiles
+from torchcover.coverage import Maximum, MeanOfMeans, PooledMean, Quantiles, StepQuantiles
 
 GRID = BevGrid(x=(-2.0, 3.0), y=(-1.5, 1.0), cell=0.5, heights={"high": (1.0, 2.0), "low": (-1.0, 0.5)})
 ONE_CELL = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
@@ -284,17 +284,25 @@ def test_a_step_split_in_two_is_another_number():
     [
         ({"thresholds": (0.4, -0.1)}, r"thresholds: distances >= 0 in metres are needed; got \(0.4, -0.1\)"),
         ({"thresholds": (math.nan,)}, "thresholds: distances >= 0"),
-        ({"thresholds": (0.4, 0.5, 0.4)}, r"thresholds: each may be given once; got \(0.4, 0.5, 0.4\)"),
+        ({"thresholds": (0.4, 0.5, 0.4)}, r"thresholds: each may be given once.*got \(0.4, 0.5, 0.4\)"),
+        ({"thresholds": (0.4, 0.40000004)}, "thresholds: each may be given once, to the six digits that name it"),
         ({"thresholds": (0.4, 3.0), "max_radius": 2.0}, "thresholds: at most max_radius = 2.0 m"),
         ({"max_radius": 0.0}, "max_radius: a positive distance in metres is needed; got 0.0"),
         ({"max_radius": -1.0}, "max_radius: a positive distance"),
         ({"max_radius": math.nan}, "max_radius: a positive distance"),
         ({"aggregations": [Maximum(), Maximum()]}, "aggregations: one of each kind.*got maximum, maximum"),
+        ({"aggregations": [MeanOfMeans((0.4,))]}, "none of those that are built in; got mean"),
     ],
 )
 def test_parameters_that_make_no_sense_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         CoverageMetric(ONE_CELL, **options)
+
+
+@pytest.mark.parametrize("aggregations", [Maximum(), (Quantiles,), ("maximum",)])
+def test_what_is_no_sequence_of_aggregations_is_refused(aggregations):
+    with pytest.raises(TypeError, match=r"aggregations: a sequence of objects such as Maximum\(\) is needed; got"):
+        CoverageMetric(ONE_CELL, aggregations=aggregations)
 
 
 BAD = torch.tensor([[0.0, 0.0, math.nan], [0.0, 0.0, 0.0], [math.inf, 0.0, 0.0]])

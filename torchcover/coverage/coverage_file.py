@@ -64,7 +64,8 @@ def read_coverage(path: Path) -> dict[str, Any]:
         version = header.pop("format")
         parts = _parts(header, arrays) if version == FORMAT_VERSION else None
     except Exception as error:  # damage shows anywhere: in the zip, zlib, NumPy, JSON, or as a missing part
-        raise ValueError(f"{path}: not a coverage file as Coverage.save writes it ({error})") from error
+        reason = str(error) or type(error).__name__
+        raise ValueError(f"{path}: not a coverage file as Coverage.save writes it ({reason})") from error
     if parts is None:
         raise ValueError(f"{path}: coverage format {version}; this torchcover reads format {FORMAT_VERSION}")
     return parts

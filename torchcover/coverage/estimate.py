@@ -12,6 +12,8 @@ from torchcover.coverage.errors import jackknife_error
 
 CellEstimator = Literal["known", "completed"]
 Estimator = Literal["known", "completed", "area"]
+# Those that a result may be headed by: "area" where the reference points have square metres.
+Measure = Literal["known", "area"]
 
 
 class RegionEstimate(NamedTuple):

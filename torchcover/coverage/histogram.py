@@ -62,6 +62,7 @@ def check_levels(levels: Sequence[float]) -> tuple[float, ...]:
         ValueError: None, one given twice, or one outside [0, 1].
     """
     checked = tuple(float(level) for level in levels)
-    if not checked or len(set(checked)) != len(checked) or not all(0 <= level <= 1 for level in checked):
+    distinct = {f"{level:g}" for level in checked}  # as the keys of their layers tell them apart
+    if not checked or len(distinct) != len(checked) or not all(0 <= level <= 1 for level in checked):
         raise ValueError(f"levels: different numbers in [0, 1] are needed; got {tuple(levels)}")
     return checked

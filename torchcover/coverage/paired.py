@@ -31,7 +31,7 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
         for what in ("grid", "thresholds", "max_radius"):
             if getattr(coverage, what) != getattr(expected, what):
                 raise ValueError(f"{first!r} and {name!r} cannot be compared: they differ in their {what}")
-        if coverage.layers.keys() != expected.layers.keys():
+        if coverage.measure != expected.measure or coverage.layers.keys() != expected.layers.keys():
             raise ValueError(f"{first!r} and {name!r} cannot be compared: they have different layers")
         if not _same_steps(coverage, expected):
             raise ValueError(

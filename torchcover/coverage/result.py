@@ -1,5 +1,6 @@
 """The result: maps over the grid, and one number a region."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +13,14 @@ from torchcover.coverage.aggregations import MeanOfMeans
 from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.coverage_file import read_coverage, write_coverage
 from torchcover.coverage.errors import cell_errors
-from torchcover.coverage.estimate import Estimator, RegionEstimate, estimate_area, estimate_region, unseen_cells
+from torchcover.coverage.estimate import (
+    Estimator,
+    Measure,
+    RegionEstimate,
+    estimate_area,
+    estimate_region,
+    unseen_cells,
+)
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import RADIUS, Quantity
@@ -129,7 +137,12 @@ class Coverage:
         wanted = regions_within(self.grid) if regions is None else regions
         return [self._summarise(region, height) for region in wanted for height in self.grid.heights]
 
-    def estimate(self, region: Region, height: str, estimator: Estimator = "known") -> RegionEstimate:
+    @property
+    def measure(self) -> Measure:
+        """What its numbers are means over: "area" if the reference points had square metres, else "known"."""
+        return "known" if self.area is None else "area"
+
+    def estimate(self, region: Region, height: str, estimator: Estimator | None = None) -> RegionEstimate:
         """The numbers of one region in one band with what they become without each block, for errors of differences.
 
         Args:
@@ -137,15 +150,17 @@ class Coverage:
             height: Name of the band.
             estimator: "known", the paper's unweighted mean over the known cells; "completed", which adds those that
                 more steps would make known (`torchcover.coverage.estimate.completed_mean`); "area", the mean over the
-                visible surface (`torchcover.coverage.estimate.estimate_area`), for points that have square metres.
+                visible surface (`torchcover.coverage.estimate.estimate_area`), for points that have square metres. Not
+                given: `measure`.
 
         Raises:
             ValueError: A region that reaches beyond the grid, or holds no cell centre; no such band; "area" of points
                 without square metres.
         """
-        if (region, height, estimator) not in self._estimates:
-            self._estimates[region, height, estimator] = self._estimate(region, height, estimator)
-        return self._estimates[region, height, estimator]
+        key = region, height, estimator or self.measure
+        if key not in self._estimates:
+            self._estimates[key] = self._estimate(*key)
+        return self._estimates[key]
 
     def _estimate(self, region: Region, height: str, estimator: Estimator) -> RegionEstimate:
         cells = region.mask(self.grid).to(self.radius.device)
@@ -176,7 +191,8 @@ class Coverage:
             regions: As in `summary`.
 
         Returns:
-            `"radius_m/20m/ground"`, `"detection_0.4m/20m/ground"`, `"known_share/20m/ground"` and so on.
+            `"radius_m/20m/ground"`, `"detection_0.4m/20m/ground"`, `"known_share/20m/ground"` and so on, and
+            `"visible_m2/20m/ground"` if the reference points had square metres.
         """
         flat = {}
         for row in self.summary(regions):
@@ -186,6 +202,8 @@ class Coverage:
                 if self.blocks is not None:
                     flat[f"{key}_error/{place}"] = number.error
             flat[f"known_share/{place}"] = row.known_share
+            if row.measure == "area":
+                flat[f"visible_m2/{place}"] = row.visible_m2
         return flat
 
     def save(self, path: str | Path) -> None:
@@ -206,17 +224,24 @@ class Coverage:
         return cls(**read_coverage(Path(path)))
 
     def _summarise(self, region: Region, height: str) -> RegionSummary:
-        known, completed = self.estimate(region, height), self.estimate(region, height, "completed")
-        probed = self.probed_steps[list(self.grid.heights).index(height)].cpu()[region.mask(self.grid)]
+        cells, band = region.mask(self.grid), list(self.grid.heights).index(height)
+        probed = self.probed_steps[band].cpu()[cells]
         return RegionSummary(
             region=region.name,
             height=height,
             cells=len(probed),
             known_cells=int((probed > 0).sum()),
             unseen_cells=unseen_cells(probed),
-            numbers=self._numbers(known),
-            completed=self._numbers(completed),
+            measure=self.measure,
+            numbers=self._numbers(self.estimate(region, height)),
+            known=self._numbers(self.estimate(region, height, "known")),
+            completed=self._numbers(self.estimate(region, height, "completed")),
+            visible_m2=math.nan if self.area is None else self._visible_m2(self.area, band, cells),
         )
+
+    def _visible_m2(self, area: AreaSums, band: int, cells: Tensor) -> float:
+        total = float(area.m2[:, band].cpu()[:, cells].sum())
+        return total / self.counts["steps"] if self.counts["steps"] else math.nan
 
     def _numbers(self, estimate: RegionEstimate) -> dict[str, Number]:
         numbers = map(Number, estimate.value.tolist(), estimate.error.tolist())

@@ -5,8 +5,12 @@ from typing import NamedTuple, TypeAlias
 
 from torch import Tensor
 
-from torchcover.coverage.aggregations import Aggregation
+from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
+from torchcover.coverage.quantity import detection
 from torchcover.neighbors import check_cloud
+
+# The aggregations that a metric has by itself, and the names that its own states begin with.
+BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, "block", "probed"})
 
 # One step, or a list with an entry for each.
 Clouds: TypeAlias = Tensor | Sequence[Tensor]
@@ -26,22 +30,30 @@ def check_parameters(thresholds: Sequence[float], max_radius: float, aggregation
 
     Raises:
         ValueError: A threshold that is negative, NaN, over `max_radius`, or given twice; a `max_radius` that is not
-            positive; two aggregations of one kind.
+            positive; two aggregations of one kind, or one that is built in.
+        TypeError: What is no sequence of aggregations.
     """
     if not all(threshold >= 0 for threshold in thresholds):
         raise ValueError(f"thresholds: distances >= 0 in metres are needed; got {tuple(thresholds)}")
-    if len(set(thresholds)) != len(thresholds):
-        raise ValueError(f"thresholds: each may be given once; got {tuple(thresholds)}")
+    if len({detection(threshold).key for threshold in thresholds}) != len(thresholds):
+        raise ValueError(f"thresholds: each may be given once, to the six digits that name it; got {tuple(thresholds)}")
     if not max_radius > 0:
         raise ValueError(f"max_radius: a positive distance in metres is needed; got {max_radius}")
     if any(threshold > max_radius for threshold in thresholds):
         raise ValueError(
             f"thresholds: at most max_radius = {max_radius} m, where r saturates, is possible; got {tuple(thresholds)}"
         )
+    _check_aggregations(aggregations)
+
+
+def _check_aggregations(aggregations: Sequence[Aggregation]) -> None:
+    if not isinstance(aggregations, Sequence) or not all(isinstance(each, Aggregation) for each in aggregations):
+        raise TypeError(f"aggregations: a sequence of objects such as Maximum() is needed; got {aggregations!r}")
     kinds = [aggregation.name for aggregation in aggregations]
-    if len(set(kinds)) != len(kinds):
+    if len(set(kinds)) != len(kinds) or not BUILT_IN.isdisjoint(kinds):
         raise ValueError(
-            f"aggregations: one of each kind is possible, with several levels in it; got {', '.join(kinds)}"
+            "aggregations: one of each kind is possible, with several levels in it, and none of those that are built in; "
+            f"got {', '.join(kinds)}"
         )
 
 

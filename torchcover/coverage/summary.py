@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+from torchcover.coverage.estimate import Measure
+
 
 class Number(NamedTuple):
     """A number in the unit of its quantity, and its standard error; NaN where it is not known."""
@@ -14,7 +16,7 @@ class Number(NamedTuple):
 
 @dataclass(frozen=True)
 class RegionSummary:
-    """The numbers of one region in one height band, over its known cells, every cell weighing the same.
+    """The numbers of one region in one height band.
 
     Args:
         region: Name of the region.
@@ -22,10 +24,14 @@ class RegionSummary:
         cells: Number of cells in the region.
         known_cells: How many of them a reference point has probed.
         unseen_cells: About how many more would become known with more steps.
+        measure: What `numbers` are means over: "area", the visible surface, or "known", the known cells.
         numbers: Key of the quantity, such as `"radius_m"` or `"detection_0.4m"` -> its number; the error is NaN if it
             was not asked for, or if there are not enough steps.
-        completed: The numbers with the unseen cells, as far as can be told; less biased as long as there are many. See
+        known: The numbers over the known cells, every cell weighing the same; `numbers` itself if that is its measure.
+        completed: These with the unseen cells, as far as can be told; less biased as long as there are many. See
             `torchcover.coverage.estimate.completed_mean`.
+        visible_m2: Mean over the steps of the square metres of the region's surface that the reference sees; NaN where
+            its points have none.
     """
 
     region: str
@@ -33,10 +39,13 @@ class RegionSummary:
     cells: int
     known_cells: int
     unseen_cells: float
+    measure: Measure
     numbers: Mapping[str, Number]
+    known: Mapping[str, Number]
     completed: Mapping[str, Number]
+    visible_m2: float
 
     @property
     def known_share(self) -> float:
-        """Share of the region's cells that are known. The numbers are about this share, and biased when it is low."""
+        """Share of the region's cells that are known. `known` is about this share, and biased when it is low."""
         return self.known_cells / self.cells

@@ -43,6 +43,16 @@ class Frame:
             raise ValueError(f"the frame has clouds of {len(self.clouds)} rigs ({', '.join(self.clouds)}): say which")
         return next(iter(self.clouds.values()))
 
+    def cloud_of(self, rig: str) -> Tensor:
+        """(N, 3) points of one rig.
+
+        Raises:
+            ValueError: The frame has no such rig.
+        """
+        if rig not in self.clouds:
+            raise ValueError(f"frame {self.name!r} has no rig {rig!r}; it has {', '.join(self.clouds)}")
+        return self.clouds[rig]
+
     def pin_memory(self) -> "Frame":
         """A copy in page-locked memory; DataLoader calls it when `pin_memory=True`."""
         return self._each(Tensor.pin_memory, None if self.boxes is None else self.boxes.pin_memory())

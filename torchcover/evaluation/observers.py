@@ -64,7 +64,7 @@ class CoverageObserver:
         Raises:
             ValueError: As `CoverageMetric.update`, or several rigs and none was named.
         """
-        sensor = frame.sensor if self.rig is None else frame.clouds[self.rig]
+        sensor = frame.sensor if self.rig is None else frame.cloud_of(self.rig)
         self.metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.index)
 
     def compute(self) -> Coverage:
