@@ -32,12 +32,19 @@ from torchcover.report.maps.sheet import (
 from torchcover.report.wording import percent
 
 Points = NDArray[np.floating]
+Image = NDArray[np.floating]
 
 WIDTH_IN = 13.0
 REFERENCE, SENSOR = "#c8c8c8", "#3b6ea5"
 # These have the same colours in every picture; others take what follows.
 CATEGORIES = ("car", "truck", "bus", "cyclist", "motorcycle", "pedestrian")
 COLOURS = ("#d55e00", "#7a3fa0", "#e6b400", "#009e73", "#8b5a2b", "#d62598", "#a3122f", "#555555", "#000000")
+IMAGE_HEIGHT_IN = 2.4
+SKY = "#dfe9f2"
+MAX_ROW_IN = 13.5
+# The colours leave out this share of the pixels at either end: a bumper, and a few walls at the horizon.
+ROBUST_PERCENTILES = (0.5, 99.5)
+FALLBACK_SCALE_M = (1.0, 100.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,16 +123,6 @@ def _draw_actors(axes: Axes, actors: Sequence[ActorMark]) -> list[Artist]:
 def _is_inside(outline_m: Points, x: Bounds, y: Bounds) -> bool:
     low, high = outline_m.min(axis=0), outline_m.max(axis=0)
     return bool(high[0] >= x[0] and low[0] <= x[1] and high[1] >= y[0] and low[1] <= y[1])
-
-
-Image = NDArray[np.floating]
-
-IMAGE_HEIGHT_IN = 2.4
-SKY = "#dfe9f2"
-MAX_ROW_IN = 13.5
-# The colours leave out this share of the pixels at either end: a bumper, and a few walls at the horizon.
-ROBUST_PERCENTILES = (0.5, 99.5)
-FALLBACK_SCALE_M = (1.0, 100.0)
 
 
 def draw_depths(images: Mapping[str, Image], *, title: str, subtitle: str = "") -> Figure:

@@ -22,6 +22,9 @@ from torchcover.report.wording import UNITS, percent
 
 # A few cells far behind an obstacle must not take the colours away from all others.
 ROBUST_PERCENTILE = 98
+UNKNOWN: dict[str, Any] = {"facecolor": "#c4c4c4", "edgecolor": "#b2b2b2", "hatch": "////"}
+INFINITE = "#d55e00"
+NEVER_PROBED = "never probed"
 
 
 @dataclass(frozen=True)
@@ -113,11 +116,6 @@ def _round_up(value: float) -> float:
         return 0.0
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
     return float(f"{math.ceil(value / step - 1e-9) * step:.2g}")
-
-
-UNKNOWN: dict[str, Any] = {"facecolor": "#c4c4c4", "edgecolor": "#b2b2b2", "hatch": "////"}
-INFINITE = "#d55e00"
-NEVER_PROBED = "never probed"
 
 
 def draw_cells(axes: Axes, array: NDArray[np.float64], scale: ColourScale, *, infinite: str = INFINITE) -> AxesImage:

@@ -18,6 +18,9 @@ from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, difference
 from torchcover.report.maps.overlay import SensorView
 from torchcover.report.wording import UNITS, capitalised, span, steps_and_cell
 
+MAX_FILE_NAME = 48
+Named = tuple[str, Figure]
+
 
 @dataclass(frozen=True)
 class Subject:
@@ -70,10 +73,6 @@ def _first(coverages: Mapping[str, Coverage]) -> Coverage:
 
 def _shown(quantity: Quantity, values: Sequence[Tensor]) -> list[Tensor]:
     return [UNITS[quantity.unit].factor * each for each in values]
-
-
-MAX_FILE_NAME = 48
-Named = tuple[str, Figure]
 
 
 def map_figures(

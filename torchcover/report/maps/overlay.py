@@ -17,6 +17,15 @@ from numpy.typing import NDArray
 from torchcover.geometry import euler_from_rotation
 from torchcover.report.maps.sheet import Sheet
 
+# Okabe and Ito's colours, which the colour-blind can tell apart.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+ARROW_POINTS = 20.0
+NUMBER_POINTS = 24.0
+OVERLAP_POINTS = 9.0
+DOT: dict[str, Any] = {"markersize": 4.5, "markerfacecolor": "black", "markeredgecolor": "white"}
+HALO: Sequence[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]
+THIN_HALO: Sequence[AbstractPathEffect] = [withStroke(linewidth=1.8, foreground="white")]
+
 
 @dataclass(frozen=True, eq=False)
 class SensorView:
@@ -85,16 +94,6 @@ class SensorView:
         inside: NDArray[np.bool_] = np.logical_and(low <= elevation_deg, elevation_deg <= high)
         inside &= abs(azimuth_deg) <= self.horizontal_fov_deg / 2
         return inside
-
-
-# Okabe and Ito's colours, which the colour-blind can tell apart.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
-ARROW_POINTS = 20.0
-NUMBER_POINTS = 24.0
-OVERLAP_POINTS = 9.0
-DOT: dict[str, Any] = {"markersize": 4.5, "markerfacecolor": "black", "markeredgecolor": "white"}
-HALO: Sequence[AbstractPathEffect] = [withStroke(linewidth=2.2, foreground="white")]
-THIN_HALO: Sequence[AbstractPathEffect] = [withStroke(linewidth=1.8, foreground="white")]
 
 
 def draw_ego(axes: Axes, outline_m: NDArray[np.floating]) -> list[Artist]:
