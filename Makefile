@@ -27,11 +27,11 @@ doctest: $(VENV)/.ready  ## the examples in the docstrings and in the documentat
 smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the repository
 	PYTHON="$(PYTHON)" bash .ci/smoke $(BIN)/python
 
-bench: $(VENV)/.ready  ## the speed and memory figures of docs/performance.md
+bench: $(VENV)/.ready  ## the speed and memory figures of docs/measured/performance.md
 	$(BIN)/python -m benchmarks
 
 paper: STEPS ?= 4096
-paper: $(VENV)/.ready  ## the paper's three experiments and Figure 2: make paper STEPS=256 (docs/paper.md: STEPS=4096)
+paper: $(VENV)/.ready  ## the paper's three experiments and Figure 2: make paper STEPS=256 (docs/measured/paper.md: STEPS=4096)
 	$(BIN)/python -m examples.paper --steps $(STEPS) --rays $(RAYS)
 
 clean:

@@ -11,14 +11,14 @@ import subprocess
 import sys
 import venv
 
-MINIMUM = (3, 11)
+MIN_PYTHON = (3, 11)
 
 
 def main(folder: str) -> None:
-    if sys.version_info < MINIMUM:
+    if sys.version_info < MIN_PYTHON:
         sys.exit(
-            f"torchcover needs Python >= {MINIMUM[0]}.{MINIMUM[1]}; {sys.executable} is {sys.version.split()[0]}. "
-            "Name another interpreter, for example: make PYTHON=python3.12 test"
+            f"torchcover needs Python >= {MIN_PYTHON[0]}.{MIN_PYTHON[1]}; {sys.executable} is {sys.version.split()[0]}."
+            " Name another interpreter, for example: make PYTHON=python3.12 test"
         )
     if importlib.util.find_spec("ensurepip"):
         venv.create(folder, with_pip=True, clear=True)

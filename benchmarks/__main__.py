@@ -18,6 +18,7 @@ BENCHMARKS = (
     "omissions",
     "metric_omissions",
     "even_reference",
+    "ray_budget",
     "calibration",
     "training_overhead",
     "known_boxes",

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from torchcover import BevGrid, Coverage, CoverageMetric
-from torchcover.coverage import AGGREGATIONS, Aggregation, Layer, Quantiles, Quantity, StepQuantiles
-from torchcover.coverage.aggregations import State
+from torchcover.coverage import AGGREGATIONS, Aggregation, Layer, Quantiles, Quantity, State, StepQuantiles
 
 ONE_CELL = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
 NOTHING = torch.zeros(0, 3)

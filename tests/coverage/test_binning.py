@@ -1,6 +1,7 @@
 """The scatter mean: one value a point in, one mean a cell out."""
 
 import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -28,7 +29,7 @@ def test_sums_are_taken_in_float64():
     count = 300_000
     values = torch.full((1, count), 0.1)
     found = mean_per_cell(torch.zeros(count, dtype=torch.int64), values, 1)
-    assert found.mean.dtype == torch.float64
+    assert found.mean.dtype == found.weight.dtype == torch.float64
     np.testing.assert_allclose(found.mean.item(), float(np.float32(0.1)), rtol=1e-12)
     large = torch.tensor([[2.0**24, 1.0, 1.0, 1.0]])
     assert mean_per_cell(torch.zeros(4, dtype=torch.int64), large, 1).mean.item() == (2.0**24 + 3) / 4
@@ -40,7 +41,8 @@ def test_infinite_values_stay_in_their_cell():
     assert (found.cell.dtype, found.points.dtype) == (torch.int64, torch.int64)
 
 
-def test_no_points_touch_no_cell():
-    found = mean_per_cell(torch.zeros(0, dtype=torch.int64), torch.zeros(2, 0), 5)
+@pytest.mark.parametrize("weights", [None, torch.zeros(0)])
+def test_no_points_touch_no_cell(weights):
+    found = mean_per_cell(torch.zeros(0, dtype=torch.int64), torch.zeros(2, 0), 5, weights)
     assert (found.cell.numel(), found.points.numel(), found.mean.shape) == (0, 0, (2, 0))
-    assert found.mean.dtype == torch.float64
+    assert found.mean.dtype == found.weight.dtype == torch.float64

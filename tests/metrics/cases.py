@@ -74,14 +74,19 @@ ALL = (Maximum(), PooledMean(), Quantiles((0.5,)), StepQuantiles((0.5,)))
 def coverage_step(index: int) -> Step:
     generator = torch.Generator().manual_seed(index)
     sensor, reference = (torch.randn(count, 3, generator=generator) for count in (20, 60))
-    return {"sensor": sensor, "reference": reference, "index": index}
+    return {
+        "sensor": sensor,
+        "reference": reference,
+        "weights": torch.rand(60, generator=generator) + 0.1,
+        "index": index,
+    }
 
 
 def coverage(steps: int, changes: Mapping[str, Step], **options: Any) -> Case:
     return Case(
         lambda **changed: CoverageMetric(**{**COVERAGE, **options, **changed}),
         [coverage_step(index) for index in range(steps)],
-        {"sensor": torch.zeros(1, 3), "reference": torch.empty(0, 3), "index": 0},
+        {"sensor": torch.zeros(1, 3), "reference": torch.empty(0, 3), "weights": torch.empty(0), "index": 0},
         {
             "grid": {"grid": BevGrid(**{**SHAPE, "x": (-1.0, 3.0)}, heights=BANDS)},
             "grid, bands in another order": {"grid": BevGrid(**SHAPE, heights=dict(reversed(BANDS.items())))},
@@ -127,6 +132,7 @@ CASES = {
         blocks=8,
         aggregations=ALL,
     ),
+    "coverage, by area": coverage(24, {"square_metres": {"square_metres": False}}, blocks=8, square_metres=True),
     "recall": Case(
         lambda **changed: RecallByVisibility(**{"score_thresholds": (0.0, 0.5), **changed}),
         [detection_step(seed) for seed in range(24)],

@@ -1,8 +1,10 @@
 """What every metric of the package promises as a torchmetrics `Metric`, whatever it measures."""
 
 import copy
+import importlib
 import os
 import pickle
+import pkgutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +14,11 @@ import torch
 from torchmetrics import Metric, MetricCollection
 from torchmetrics.aggregation import SumMetric
 
-from .cases import CASES, flat, in_lists
+import torchcover
+from torchcover.coverage import AGGREGATIONS
+from torchcover.metrics import MergeableMetric
+
+from .cases import ALL, CASES, flat, in_lists
 
 EVERY = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
 EVERY_CHANGE = pytest.mark.parametrize(
@@ -46,6 +52,15 @@ def assert_same(result, expected):
 
 
 # Steps.
+
+
+def test_every_metric_and_every_aggregation_of_the_package_is_asked():
+    for room in (torchcover.coverage, torchcover.detection):
+        for module in pkgutil.iter_modules(room.__path__, f"{room.__name__}."):
+            importlib.import_module(module.name)
+    own = {kind for kind in MergeableMetric.__subclasses__() if kind.__module__.startswith("torchcover.")}
+    assert {type(case.make()) for case in CASES.values()} == own
+    assert {type(aggregation) for aggregation in ALL} == set(AGGREGATIONS)
 
 
 @EVERY

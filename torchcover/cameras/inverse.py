@@ -27,7 +27,7 @@ STOP_PX, ACCEPT_PX = 1e-10, 5e-10
 _MAX_STEPS = 80
 # Nearly all pixels are done after these; the others are collected and go on together.
 _QUICK_STEPS = 6
-_LEAST_DAMPING = 2.0**-20
+_MIN_DAMPING = 2.0**-20
 # Pixels solved side by side: few enough for the cache, many enough to outweigh the interpreter.
 _CHUNK = 1 << 15
 
@@ -59,7 +59,7 @@ class _Search:
     def run(self, steps: int) -> None:
         """Iterate until every point has converged or is stuck, or the steps are used up."""
         for _ in range(steps):
-            going = np.flatnonzero((self.error > STOP_PX) & (self.damping > _LEAST_DAMPING))
+            going = np.flatnonzero((self.error > STOP_PX) & (self.damping > _MIN_DAMPING))
             if len(going) == 0:
                 return
             self._advance(slice(None) if len(going) == len(self.a) else going)

@@ -3,10 +3,12 @@
 from torchcover.coverage.aggregations import (
     AGGREGATIONS,
     Aggregation,
+    BinnedStep,
     Maximum,
     MeanOfMeans,
     PooledMean,
     Quantiles,
+    State,
     StepQuantiles,
 )
 from torchcover.coverage.grid import BevGrid
@@ -22,6 +24,7 @@ __all__ = [
     "AGGREGATIONS",
     "Aggregation",
     "BevGrid",
+    "BinnedStep",
     "Coverage",
     "CoverageMetric",
     "Difference",
@@ -34,6 +37,7 @@ __all__ = [
     "Quantity",
     "Region",
     "RegionSummary",
+    "State",
     "StepQuantiles",
     "check_paired",
     "differences",

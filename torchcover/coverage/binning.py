@@ -46,7 +46,12 @@ def mean_per_cell(cell: Tensor, values: Tensor, cells: int, weights: Tensor | No
         weight, weighted = points.double(), values.double()
     else:
         weights = weights.double()
-        weight, weighted = torch.bincount(cell, weights=weights, minlength=cells)[touched], values.double() * weights
-    sums = [torch.bincount(cell, weights=row, minlength=cells)[touched] for row in weighted]
+        weight, weighted = _sum_per_cell(cell, weights, cells)[touched], values.double() * weights
+    sums = [_sum_per_cell(cell, row, cells)[touched] for row in weighted]
     mean = torch.stack(sums) / weight if sums else values.new_empty((0, len(touched)), dtype=torch.float64)
     return CellMeans(touched, points, weight, mean)
+
+
+def _sum_per_cell(cell: Tensor, values: Tensor, cells: int) -> Tensor:
+    # Of no points at all, torch makes an int64 count, whatever the weights.
+    return torch.bincount(cell, weights=values, minlength=cells).double()

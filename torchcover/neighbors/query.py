@@ -15,7 +15,7 @@ BACKENDS = {
 }
 
 # On the CPU brute force beats the tree only for few queries against many points, where building it does not pay
-# (docs/performance.md, crossover).
+# (docs/measured/performance.md, crossover).
 MAX_QUERIES_COMPARED = 16
 MANY_POINTS = 10_000
 # Queries that are measured together on a CPU.
