@@ -202,7 +202,7 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
         (["kitti", "nuscenes", "--device", "abacus"], "device abacus: cannot be used here"),
         (["kitti", "nuscenes", "--steps", "0"], "--steps"),
         (["kitti", "nuscenes", "--target-error", "10cm"], "target error 10cm: a positive number with its unit"),
-        (["kitti", "nuscenes", "--reference", "best"], "reference best: `even` or `paper` is needed"),
+        (["kitti", "nuscenes", "--reference", "best"], "reference best: `even` or `paper`"),
         (["kitti", "nuscenes", "--rays", "7"], "rays: at least 2 for each of 4 areas are needed; got 7"),
     ],
 )
