@@ -5,6 +5,7 @@ import torch
 
 from torchcover.coverage import BevGrid, CoverageMetric
 from torchcover.evaluation import StudyPlan, Truth, error_against_time
+from torchcover.simulation import REFERENCE_SENSORS
 
 
 def test_the_long_run_itself_has_no_error_and_a_shifted_one_its_shift():
@@ -31,10 +32,9 @@ def test_the_long_run_itself_has_no_error_and_a_shifted_one_its_shift():
 def test_more_steps_cost_more_time_and_every_setting_is_timed():
     plan = StudyPlan("front_roof_32", rays=(64,), steps=2, runs=1, long_run_steps=8, long_run_rays=1024, cell_m=4.0)
     study = error_against_time(plan)
-    assert [(point.reference, point.rays, point.steps) for point in study.points] == [
-        ("even", 64, 1), ("even", 64, 2), ("paper", 64, 1), ("paper", 64, 2)
-    ]  # fmt: skip
-    for one, two in (study.points[:2], study.points[2:]):
+    points = [(point.reference, point.rays, point.steps) for point in study.points]
+    assert points == [(name, 64, steps) for name in sorted(REFERENCE_SENSORS) for steps in (1, 2)]
+    for one, two in zip(study.points[::2], study.points[1::2], strict=True):
         assert 0 < one.seconds < two.seconds
         assert one.known_share <= two.known_share
     assert all(stage["rays_s"] > 0 and stage["cdist_s"] > 0 for stage in study.stages)

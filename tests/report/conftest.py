@@ -31,6 +31,15 @@ def over_steps(size: int, seed: int, steps: int, **options) -> Coverage:
     return metric.compute()
 
 
+def over_surface(size: int, seed: int, steps: int) -> Coverage:
+    """As `over_steps`, but every reference point stands for 0.1 to 0.9 square metres."""
+    metric = CoverageMetric(GRID, blocks=16, square_metres=True)
+    for index in range(steps):
+        m2 = 0.1 + 0.8 * torch.rand(100, generator=torch.Generator().manual_seed(index))
+        metric.update(cloud(size, seed * 100 + index), cloud(100, 1000 + index), weights=m2, index=index)
+    return metric.compute()
+
+
 @pytest.fixture(scope="session")
 def regions():
     """One that is known in part, one that is not."""
@@ -75,6 +84,12 @@ def trios():
         return kept[steps]
 
     return trio
+
+
+@pytest.fixture(scope="session")
+def surface_pair():
+    """Few points and many, against the same surface points; 24 steps, with errors."""
+    return {"few": over_surface(20, 1, 24), "many": over_surface(300, 3, 24)}
 
 
 @pytest.fixture(scope="session")

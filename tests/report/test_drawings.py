@@ -13,9 +13,8 @@ from matplotlib.figure import Figure
 from torchcover import BevGrid
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.report import ActorMark, SensorView, draw_depths, draw_four_views, draw_rig, draw_scene
-from torchcover.report.drawings.depth import SKY
+from torchcover.report.drawings.frame import REFERENCE, SENSOR, SKY
 from torchcover.report.drawings.rig import FIRST_REACH_M
-from torchcover.report.drawings.scene import REFERENCE, SENSOR
 from torchcover.report.maps.overlay import COLOURS
 
 VERTICES = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (0.0, 1.5)])

@@ -15,7 +15,7 @@ from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.report import ColourScale, SensorView, draw_map, scale_of
-from torchcover.report.maps.cells import INFINITE
+from torchcover.report.maps.colours import INFINITE
 
 SCALE = ColourScale("blind spot radius", "m", "viridis_r", 0.0, 1.0)
 SQUARE = BevGrid(x=(-20.0, 20.0), y=(-10.0, 10.0), cell=1.0)

@@ -8,7 +8,19 @@ import re
 
 import pytest
 
-from torchcover.report import RENDERERS, CoverageTable, Part, as_markdown, json_record, parts_of, table_dict
+from torchcover.report import (
+    BOLD_MARKS,
+    RENDERERS,
+    CoverageTable,
+    Part,
+    Words,
+    as_markdown,
+    json_record,
+    marks_on,
+    notes_on,
+    parts_of,
+    table_dict,
+)
 
 
 @pytest.fixture(params=["one rig", "one rig, no errors", "two rigs", "three rigs", "infinite", "no region"])
@@ -170,3 +182,25 @@ def test_a_column_of_ones_own_is_the_last(trio, regions):
     with pytest.raises(ValueError, match="'paper': 4 cells are needed; got 1"):
         part.with_column("paper", ["a"])
     assert isinstance(part, Part)
+
+
+def test_a_renderer_of_ones_own_needs_no_more_than_what_is_public(trio, regions):
+    def as_html(table: CoverageTable) -> str:
+        cells = ("<td>{}</td>".format(f"<b>{cell.text}</b>" if cell.mark else cell.text) for cell in cells_of(table))
+        legend = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in marks_on(table).items()]
+        return "".join([*cells, *(f"<li>{note}</li>" for note in (*legend, *notes_on(table)))])
+
+    def cells_of(table: CoverageTable) -> list[Words]:
+        return [cell for part in parts_of(table) for row in part.rows for cell in row]
+
+    table = CoverageTable.of(trio, regions)
+    html = as_html(table)
+    assert html.count("<td>") == len(cells_of(table))
+    assert html.count("<b>") == sum(bool(cell.mark) for cell in cells_of(table)) > 4
+    assert html.count("<li>") == len(notes_on(table)) + len(BOLD_MARKS)
+    assert "<li>In bold among the differences: more than chance" in html
+
+
+@pytest.mark.parametrize("name", RENDERERS)
+def test_a_renderer_is_in_the_file_of_its_name(name):
+    assert RENDERERS[name].__module__.rpartition(".")[2] == f"{name}_file"

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 
 from torchcover.coverage import BevGrid, CoverageMetric, Number, Region, differences
 from torchcover.coverage.quantity import RADIUS, detection
-from torchcover.report import CoverageTable
-from torchcover.report.rounding import rounded
+from torchcover.report import CoverageTable, remarks_on
 from torchcover.report.table import best_of
+from torchcover.report.wording import rounded
 
 NUMBERS = st.lists(
     st.builds(Number, st.floats(0.0, 1.0) | st.sampled_from([math.nan, 0.5, 1.0]), st.just(math.nan) | st.just(0.01)),
@@ -22,7 +22,7 @@ NUMBERS = st.lists(
 
 
 def names(table: CoverageTable, rig: str) -> set[str]:
-    return {remark.name for remark in table.conditions[rig].remarks}
+    return {remark.name for remark in remarks_on(table, rig)}
 
 
 def test_a_table_has_the_summaries_of_its_coverages(trio, regions):
@@ -133,7 +133,7 @@ def test_the_best_are_the_best_and_what_looks_like_it(numbers, quantity):
 def test_remarks_are_made_of_what_did_happen_only(blind, trios, regions):
     table = CoverageTable.of(blind, regions)
     assert "empty_sensor_steps" not in names(table, "seeing")
-    (remark,) = [remark for remark in table.conditions["blind"].remarks if remark.name == "empty_sensor_steps"]
+    (remark,) = [remark for remark in remarks_on(table, "blind") if remark.name == "empty_sensor_steps"]
     assert (remark.count, remark.of) == (1, 1)
     assert "unknown_cells" in names(table, "seeing")
     assert names(CoverageTable.of({"few": trios(5)["few"]}, ()), "few") == {"no_region", "too_few_blocks"}
@@ -144,7 +144,7 @@ def test_there_is_nothing_to_remark_where_every_cell_is_known():
     metric = CoverageMetric(grid)
     metric.update(torch.zeros(1, 3), torch.cartesian_prod(torch.arange(4) + 0.5, torch.arange(2) + 0.5, torch.zeros(1)))
     table = CoverageTable.of({"full": metric.compute()}, [Region("all", grid.x, grid.y)])
-    assert not table.conditions["full"].remarks
+    assert not remarks_on(table, "full")
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchcover.coverage import Difference, Number
-from torchcover.report.rounding import rounded
-from torchcover.report.wording import difference_words, error_words, number_words, percent
+from torchcover.report.wording import difference_words, error_words, number_words, percent, rounded
 
 NUMBERS = st.builds(
     Number,

@@ -1,43 +1,47 @@
-"""Error against run time: the front, the cheapest, the diagram."""
+"""The diagram of error against run time."""
 
 import math
 
-from torchcover.report import WorkPoint, cheapest, draw_work_precision, pareto_front
+import pytest
+
+from torchcover.report import WorkPanel, draw_work_precision
+
+POINTS = [(1.0, 3.0), (2.0, 1.0)]
 
 
-def point(seconds, error, rays=1024, reference="even"):
-    return WorkPoint(reference, rays, 1, seconds, error, error, error, error, error, error, 1.0)
+def panel(groups, floor: float = math.nan) -> WorkPanel:
+    return WorkPanel("error (%)", {name: dict.fromkeys(("64", "256"), POINTS) for name in groups}, POINTS, floor)
 
 
-def test_more_time_without_less_error_is_not_on_the_front():
-    front = pareto_front([point(3, 0.3), point(1, 0.5), point(2, 0.6), point(4, 0.3), point(5, 0.1)], "detection_error")
-    assert [one.seconds for one in front] == [1, 3, 5]
+def lines(figure, at: int = 0):
+    return {line.get_label(): line for line in figure.axes[at].get_lines()}
 
 
-def test_a_point_whose_error_is_unknown_is_not_on_the_front_and_does_not_hide_the_others():
-    front = pareto_front([point(1, math.nan), point(2, 0.3), point(3, math.nan), point(4, 0.1)], "detection_error")
-    assert [one.seconds for one in front] == [2, 4]
+def test_it_has_a_line_for_each_setting_the_front_and_the_floor_where_there_is_one():
+    figure = draw_work_precision([panel("ab", 0.5), panel("ab")], title="rig in $scene$", legend_title="rays")
+    first, second = lines(figure, 0), lines(figure, 1)
+    assert list(second) == ["a 64", "a 256", "b 64", "b 256", "Pareto front"]
+    assert list(first) == [*second, "standard error of the long run"]
+    assert first["a 64"].get_xydata().tolist() == [list(one) for one in POINTS]
+    assert [(axes.get_xscale(), axes.get_yscale(), axes.get_ylabel()) for axes in figure.axes] == [
+        ("log", "log", "error (%)")
+    ] * 2
+    assert figure.legends[0].get_title().get_text() == "rays"
 
 
-def test_the_cheapest_that_is_good_enough_is_advised():
-    points = [point(9, 0.01), point(4, 0.02), point(1, 0.5)]
-    assert cheapest(points, "detection_error", 0.02).seconds == 4
-    assert cheapest(points, "detection_error", 0.001) is None
+@pytest.mark.parametrize("groups", [("even", "paper"), ("surface", "mine"), ("paper", "even")])
+def test_colours_and_line_styles_follow_the_order_and_no_name(groups):
+    def looks(names):
+        drawn = lines(draw_work_precision([panel(names)], title=""))
+        return [
+            (drawn[f"{name} {rays}"].get_color(), drawn[f"{name} {rays}"].get_linestyle())
+            for name in names
+            for rays in ("64", "256")
+        ]
+
+    assert looks(groups) == looks("ab")
+    assert len(set(looks(groups))) == 4
 
 
-def test_the_diagram_has_a_line_for_each_setting_and_both_panels_name_their_unit():
-    points = [point(k, 1 / k, rays, name) for k in (1, 2) for rays in (64, 256) for name in ("even", "paper")]
-    figure = draw_work_precision(points, {"detection_error": 0.01, "radius_error_m": math.nan}, "rig in scene")
-    panels = figure.axes
-    assert [axes.get_xscale() for axes in panels] == ["log", "log"]
-    assert "percentage points" in panels[0].get_ylabel()
-    assert "(m)" in panels[1].get_ylabel()
-    labels = [line.get_label() for line in panels[0].get_lines()]
-    assert [label for label in labels if label.startswith(("even", "paper"))] == [
-        "even 64",
-        "even 256",
-        "paper 64",
-        "paper 256",
-    ]
-    assert "standard error of the long run" in labels
-    assert "standard error of the long run" not in [line.get_label() for line in panels[1].get_lines()]
+def test_more_groups_than_colours_are_drawn_too():
+    assert len(lines(draw_work_precision([panel("abcdefg")], title=""))) == 15

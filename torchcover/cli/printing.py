@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from torchcover.evaluation import Omission, Result, Study, StudyPlan
-from torchcover.report import WorkPoint, narrowest_width, print_table, study_table
+from torchcover.evaluation import Omission, Result, Study, StudyPlan, WorkPoint, study_table
+from torchcover.report import narrowest_width, print_table
 
 
 def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:

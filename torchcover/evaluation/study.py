@@ -13,7 +13,8 @@ from torchcover import __version__
 from torchcover.evaluation.study_plan import StudyPlan
 from torchcover.evaluation.study_runs import Sample, Setting, one_run, time_stages
 from torchcover.evaluation.study_truth import Truth, long_run
-from torchcover.report import WorkPoint, cheapest, draw_work_precision, json_record, study_records
+from torchcover.evaluation.work_points import WorkPoint, cheapest, study_records, work_panels
+from torchcover.report import draw_work_precision, json_record
 
 # Detection errors that a setting is recommended for.
 WANTED = (0.05, 0.02, 0.01, 0.005)
@@ -78,7 +79,8 @@ class Study:
     def draw(self) -> Figure:
         """The diagram of error against run time."""
         about = f"{self.plan.runs} runs, a step every {self.every_s:g} s, cells of {self.plan.cell_m:g} m"
-        return draw_work_precision(self.points, self.floor, f"{self.plan.rig} in {self.plan.scenario}: {about}")
+        title = f"{self.plan.rig} in {self.plan.scenario}: {about}"
+        return draw_work_precision(work_panels(self.points, self.floor), title=title, legend_title="rays a step")
 
     def save(self, folder: str | Path) -> None:
         """Write `work_precision.png` and `study.json` into a folder, which is made if it does not exist."""

@@ -1,25 +1,25 @@
 """What a run shows: one table and its renderers, maps, and drawings. Imports matplotlib and rich, so import it late."""
 
-from torchcover.report.drawings.depth import draw_depths
 from torchcover.report.drawings.four_views import draw_four_views
+from torchcover.report.drawings.frame import ActorMark, draw_depths, draw_scene
 from torchcover.report.drawings.rig import draw_rig
-from torchcover.report.drawings.scene import ActorMark, draw_scene
-from torchcover.report.drawings.work_precision import draw_work_precision
-from torchcover.report.maps.figures import band_figures, map_figures, write_figures
-from torchcover.report.maps.one_map import draw_map
-from torchcover.report.maps.scale import ColourScale, difference_scale, error_scale, scale_of
-from torchcover.report.maps.side_by_side import draw_side_by_side
-from torchcover.report.parts import Part, Words, parts_of
-from torchcover.report.remarks import Remark
+from torchcover.report.drawings.work_precision import WorkPanel, draw_work_precision
+from torchcover.report.maps.arrays import draw_map, draw_side_by_side
+from torchcover.report.maps.colours import ColourScale, difference_scale, error_scale, scale_of
+from torchcover.report.maps.figures import band_figures, file_stems, map_figures, write_figures
+from torchcover.report.maps.overlay import SensorView
+from torchcover.report.remarks import Remark, marks_on, notes_on, remarks_on
 from torchcover.report.renderers import RENDERERS
 from torchcover.report.renderers.json_file import json_record, table_dict
-from torchcover.report.renderers.markdown import as_markdown
-from torchcover.report.renderers.text import narrowest_width, print_table
-from torchcover.report.sensor_view import SensorView
-from torchcover.report.study import WorkPoint, cheapest, pareto_front, study_records, study_table
+from torchcover.report.renderers.layout import BOLD_MARKS, PLACE_HEADINGS, Part, Words, parts_of
+from torchcover.report.renderers.markdown_file import as_markdown
+from torchcover.report.renderers.text_file import narrowest_width, print_table, text_table
 from torchcover.report.table import CoverageTable, Row
+from torchcover.report.wording import error_words, percent
 
 __all__ = [
+    "BOLD_MARKS",
+    "PLACE_HEADINGS",
     "RENDERERS",
     "ActorMark",
     "ColourScale",
@@ -29,10 +29,9 @@ __all__ = [
     "Row",
     "SensorView",
     "Words",
-    "WorkPoint",
+    "WorkPanel",
     "as_markdown",
     "band_figures",
-    "cheapest",
     "difference_scale",
     "draw_depths",
     "draw_four_views",
@@ -42,15 +41,19 @@ __all__ = [
     "draw_side_by_side",
     "draw_work_precision",
     "error_scale",
+    "error_words",
+    "file_stems",
     "json_record",
     "map_figures",
+    "marks_on",
     "narrowest_width",
-    "pareto_front",
+    "notes_on",
     "parts_of",
+    "percent",
     "print_table",
+    "remarks_on",
     "scale_of",
-    "study_records",
-    "study_table",
     "table_dict",
+    "text_table",
     "write_figures",
 ]

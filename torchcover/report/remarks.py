@@ -1,15 +1,18 @@
-"""What the reader of a table has to know about the numbers of a rig, as data; `notes` has the words."""
+"""What the reader of a table has to know about its numbers: as data, and as sentences."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Literal
 
-from torchcover.coverage import Coverage, RegionSummary
 from torchcover.coverage.blocks import MIN_BLOCKS
+from torchcover.report.table import CoverageTable
+from torchcover.report.wording import span, steps_and_cell
 
 RemarkName = Literal[
     "no_region",
+    "visible_surface",
     "unknown_cells",
     "too_few_blocks",
     "standard_errors",
@@ -36,20 +39,14 @@ class Remark:
     of: int
 
 
-def remarks_on(coverage: Coverage, blocks: int | None, rows: Sequence[RegionSummary]) -> tuple[Remark, ...]:
-    """What is to be known about a coverage and its rows, of that which did happen.
-
-    Args:
-        coverage: What `CoverageMetric.compute` returned.
-        blocks: How many blocks of steps are in use; None without errors.
-        rows: Its summary.
-    """
-    counts, inside = coverage.counts, int(coverage.points.sum())
-    cells, known = sum(row.cells for row in rows), sum(row.known_cells for row in rows)
+def remarks_on(table: CoverageTable, rig: str) -> tuple[Remark, ...]:
+    """What is to be known about the numbers of a rig, of that which did happen."""
+    counts, inside = table.conditions[rig].counts, table.conditions[rig].points
+    rows = table.rows[rig]
     found = [
         Remark("no_region", int(not rows), 1),
-        Remark("unknown_cells", cells - known, cells),
-        *_on_errors(blocks, rows),
+        *_on_measure(table, rig),
+        *_on_errors(table, rig),
         Remark("empty_sensor_steps", counts["empty_sensor_steps"], counts["steps"]),
         Remark("empty_reference_steps", counts["empty_reference_steps"], counts["steps"]),
         Remark("saturated_points", counts["saturated_points"], inside),
@@ -58,12 +55,86 @@ def remarks_on(coverage: Coverage, blocks: int | None, rows: Sequence[RegionSumm
     return tuple(remark for remark in found if remark.count)
 
 
-def _on_errors(blocks: int | None, rows: Sequence[RegionSummary]) -> list[Remark]:
+def _on_measure(table: CoverageTable, rig: str) -> list[Remark]:
+    summaries = [row.summary for row in table.rows[rig]]
+    if table.measure == "area":
+        return [Remark("visible_surface", len(summaries), len(summaries))]
+    cells, known = sum(summary.cells for summary in summaries), sum(summary.known_cells for summary in summaries)
+    return [Remark("unknown_cells", cells - known, cells)]
+
+
+def _on_errors(table: CoverageTable, rig: str) -> list[Remark]:
+    blocks = table.conditions[rig].blocks
     if blocks is None:
         return []
     if blocks < MIN_BLOCKS:
         return [Remark("too_few_blocks", blocks, MIN_BLOCKS)]
-    without = sum(
-        any(math.isfinite(number.value) and math.isnan(number.error) for number in row.numbers.values()) for row in rows
-    )
-    return [Remark("standard_errors", blocks, blocks), Remark("one_block_regions", without, len(rows))]
+    numbers = [row.summary.numbers.values() for row in table.rows[rig]]
+    without = sum(any(math.isfinite(number.value) and math.isnan(number.error) for number in row) for row in numbers)
+    return [Remark("standard_errors", blocks, blocks), Remark("one_block_regions", without, len(numbers))]
+
+
+def notes_on(table: CoverageTable) -> list[str]:
+    """What the numbers hold under and what went wrong, a sentence each; what is about one rig only begins with it."""
+    by_rig = {rig: _of_rig(table, rig) for rig in table.rigs}
+    common = [note for note in by_rig[table.rigs[0]] if all(note in notes for notes in by_rig.values())]
+    own = [f"{rig}: {note}" for rig, notes in by_rig.items() for note in notes if note not in common]
+    paired = ["All rigs were measured against the same reference points, so they know the same cells."]
+    return [*(paired if len(table.rigs) > 1 else []), *common, *own, *table.notes]
+
+
+def marks_on(table: CoverageTable) -> dict[str, str]:
+    """What the marks of a comparison mean, by their names; empty for one rig."""
+    if len(table.rigs) == 1:
+        return {}
+    marks = {"best": "the best of its row; equal numbers are all marked, unknown ones never."}
+    if table.first.blocks is not None:
+        chance = "more than chance, by Student's t at 95 %: of 20 rows without a difference, one is marked."
+        marks["significant"] = chance
+    return marks
+
+
+def _of_rig(table: CoverageTable, rig: str) -> list[str]:
+    bands = ", ".join(f"{name} z {span(band)}" for name, band in table.grid.heights.items())
+    first = f"{steps_and_cell(table.conditions[rig].counts['steps'], table.grid)}; {bands}."
+    return [first, *(SENTENCES[remark.name](remark, table, rig) for remark in remarks_on(table, rig))]
+
+
+def _too_few_blocks(remark: Remark, _: CoverageTable, __: str) -> str:
+    blocks = f"{remark.count} block{'s' * (remark.count != 1)}"
+    return f"Not enough steps for errors: {blocks}, {remark.of} are needed."
+
+
+def _standard_errors(remark: Remark, table: CoverageTable, rig: str) -> str:
+    steps = table.conditions[rig].steps_per_block
+    return f"± is one standard error, from {remark.count} blocks of up to {steps:,} steps in a row."
+
+
+def _saturated(remark: Remark, table: CoverageTable, _: str) -> str:
+    limit_m = table.max_radius
+    far = "infinitely far" if math.isinf(limit_m) else f"{limit_m:.4g} m far, the limit"
+    return f"{_some(remark)} reference points count as {far}: no sensor point was nearer."
+
+
+def _some(remark: Remark) -> str:
+    return f"{remark.count:,} of {remark.of:,}"
+
+
+SENTENCES: Mapping[RemarkName, Callable[[Remark, CoverageTable, str], str]] = MappingProxyType(
+    {
+        "no_region": lambda *_: "No region, so no number: the maps cover the whole grid.",
+        "visible_surface": lambda *_: "Means over the square metres that the reference sees.",
+        "unknown_cells": lambda *_: (
+            "Means over the known cells only; the fewer are known, the more the numbers may flatter the rig."
+        ),
+        "too_few_blocks": _too_few_blocks,
+        "standard_errors": _standard_errors,
+        "one_block_regions": lambda *_: "No ± where one block alone has probed the region.",
+        "empty_sensor_steps": lambda remark, *_: (
+            f"{_some(remark)} steps had no sensor point: they count as blind, not as missing."
+        ),
+        "empty_reference_steps": lambda remark, *_: f"{_some(remark)} steps had no reference point: they say nothing.",
+        "saturated_points": _saturated,
+        "outside_points": lambda remark, *_: f"{_some(remark)} reference points lie outside the grid: left out.",
+    }
+)

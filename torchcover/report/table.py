@@ -16,8 +16,8 @@ from torchcover.coverage import (
     check_paired,
     differences,
 )
-from torchcover.report.remarks import Remark, remarks_on
-from torchcover.report.rounding import rounded
+from torchcover.coverage.estimate import Measure
+from torchcover.report.wording import rounded
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,13 @@ class Conditions(NamedTuple):
         counts: What happened in the run, as in `Coverage.counts`.
         blocks: How many blocks of contiguous steps the errors come from; None without errors.
         steps_per_block: Steps of a full one.
-        remarks: What its reader has to know.
+        points: Reference points within the grid.
     """
 
     counts: Mapping[str, int]
     blocks: int | None
     steps_per_block: int | None
-    remarks: tuple[Remark, ...]
+    points: int
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,7 @@ class CoverageTable:
         grid: Cells and height bands.
         thresholds: Detection thresholds in metres.
         max_radius: Saturation of the radius in metres.
+        measure: What the numbers of the rows are means over: "area", the visible surface, or "known", the known cells.
         rows: Name of the rig -> its rows in the order of the regions, then of the bands.
         conditions: Name of the rig -> what its numbers hold under.
         notes: What else they hold under, in words of the caller.
@@ -74,6 +75,7 @@ class CoverageTable:
     grid: BevGrid
     thresholds: tuple[float, ...]
     max_radius: float
+    measure: Measure
     rows: Mapping[str, tuple[Row, ...]]
     conditions: Mapping[str, Conditions]
     notes: tuple[str, ...]
@@ -105,8 +107,9 @@ class CoverageTable:
             grid=first.grid,
             thresholds=first.thresholds,
             max_radius=first.max_radius,
+            measure=first.measure,
             rows={rig: tuple(row[rig] for row in rows) for rig in coverages},
-            conditions={rig: _conditions(coverage, summaries[rig]) for rig, coverage in coverages.items()},
+            conditions={rig: _conditions(coverage) for rig, coverage in coverages.items()},
             notes=tuple(notes),
         )
 
@@ -174,8 +177,8 @@ def best_of(numbers: Sequence[Number], quantity: Quantity) -> list[bool]:
     return [number in known and rounded(number, quantity.unit) == looks for number in numbers]
 
 
-def _conditions(coverage: Coverage, rows: Sequence[RegionSummary]) -> Conditions:
+def _conditions(coverage: Coverage) -> Conditions:
     blocks = coverage.blocks
     used = None if blocks is None else int((blocks.steps > 0).sum())
     longest = None if blocks is None else int(blocks.steps.max())
-    return Conditions(dict(coverage.counts), used, longest, remarks_on(coverage, used, rows))
+    return Conditions(dict(coverage.counts), used, longest, int(coverage.points.sum()))

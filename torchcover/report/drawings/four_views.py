@@ -11,9 +11,8 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS
-from torchcover.report.maps.cells import cell_entries, draw_cells, draw_colour_bar
-from torchcover.report.maps.overlay import draw_ego, draw_sectors, draw_sensors
-from torchcover.report.maps.scale import ColourScale, scale_of
+from torchcover.report.maps.colours import ColourScale, cell_entries, draw_cells, draw_colour_bar, scale_of
+from torchcover.report.maps.overlay import SensorView, draw_ego, draw_sectors, draw_sensors
 from torchcover.report.maps.sheet import (
     HEADING_POINTS,
     Sheet,
@@ -24,7 +23,6 @@ from torchcover.report.maps.sheet import (
     write_legend,
     write_title,
 )
-from torchcover.report.sensor_view import SensorView
 from torchcover.report.wording import span, steps_and_cell
 
 # A few cells beside the bumper hold most of the points.

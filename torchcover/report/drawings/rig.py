@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from torchcover.report.maps.overlay import COLOURS
+from torchcover.report.maps.overlay import COLOURS, SensorView
 from torchcover.report.maps.sheet import (
     HEADING_POINTS,
     fit_paper,
@@ -21,7 +21,6 @@ from torchcover.report.maps.sheet import (
     write_legend,
     write_title,
 )
-from torchcover.report.sensor_view import SensorView
 
 Points = NDArray[np.float64]
 

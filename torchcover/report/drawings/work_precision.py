@@ -1,70 +1,86 @@
 """Error against run time: which setting is worth its time."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
 
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from torchcover.report.study import WorkPoint, pareto_front
-
 MARKERS = "osD^vP*X"
-COLOURS = {"even": "viridis", "paper": "autumn"}
+# Of the first group of lines, the second, ...
+COLORMAPS = ("viridis", "autumn", "winter", "copper")
+LINE_STYLES = ("-", "--", "-.", ":")
 MAX_LIGHTNESS = 0.85
-# Title of each panel, the number of it, and what to multiply it with.
-PANELS = (
-    ("error of the regions' detection (percentage points)", "detection_error", 100.0),
-    ("error of the regions' radius (m)", "radius_error_m", 1.0),
-)
+
+Point = tuple[float, float]
 
 
-def draw_work_precision(points: Sequence[WorkPoint], floor: Mapping[str, float], title: str) -> Figure:
-    """Draw the work-precision diagram: error over time, both logarithmic, a line for each setting.
+class WorkPanel(NamedTuple):
+    """One panel of the diagram. A point is the run time in seconds, and an error as it is shown.
 
     Args:
-        points: Measured points.
-        floor: Standard error of the long run for each of `PANELS`' fields: errors below it say nothing.
-        title: What was measured.
+        label: What the errors are, with their unit.
+        lines: Name of a group, such as a pattern of rays -> name of a line in it -> its points.
+        front: The points that no other beats.
+        floor: Errors below it say nothing; NaN for none.
     """
+
+    label: str
+    lines: Mapping[str, Mapping[str, Sequence[Point]]]
+    front: Sequence[Point]
+    floor: float
+
+
+def draw_work_precision(panels: Iterable[WorkPanel], *, title: str, legend_title: str = "") -> Figure:
+    """Draw the work-precision diagram: error over time, both logarithmic.
+
+    Args:
+        panels: What is beside each other; all have the same lines.
+        title: What was measured.
+        legend_title: What the names of the lines are.
+
+    Returns:
+        A figure of its own, outside pyplot. Groups differ in colours and line style, by their order; the lines of a
+        group in marker and lightness.
+    """
+    panels = list(panels)
     figure = Figure(figsize=(12.0, 5.6), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, parse_math=False)
-    panels = figure.subplots(1, len(PANELS), squeeze=False)[0]
-    for axes, (label, error, factor) in zip(panels, PANELS, strict=True):
-        _draw_lines(axes, points, error, factor)
-        front = pareto_front(points, error)
-        axes.plot(
-            [point.seconds for point in front],
-            [factor * getattr(point, error) for point in front],
-            color="black",
-            linewidth=4.5,
-            alpha=0.25,
-            zorder=1,
-            label="Pareto front",
-        )
-        if math.isfinite(floor[error]):
-            axes.axhline(factor * floor[error], color="grey", linestyle=":", label="standard error of the long run")
-        axes.set(xscale="log", yscale="log", xlabel="run time (s)", ylabel=label)
-        axes.grid(visible=True, which="both", alpha=0.2)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right upper", title="rays a step", frameon=False)
+    views = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, panel in zip(views, panels, strict=True):
+        _draw_panel(axes, panel)
+    handles, labels = views[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right upper", title=legend_title, frameon=False)
     return figure
 
 
-def _draw_lines(axes: Axes, points: Sequence[WorkPoint], error: str, factor: float) -> None:
-    for reference in dict.fromkeys(point.reference for point in points):
-        rays = sorted({point.rays for point in points if point.reference == reference})
-        for at, count in enumerate(rays):
-            line = [point for point in points if (point.reference, point.rays) == (reference, count)]
-            axes.plot(
-                [point.seconds for point in line],
-                [factor * getattr(point, error) for point in line],
-                marker=MARKERS[at % len(MARKERS)],
-                markersize=5,
-                linewidth=1.2,
-                linestyle="-" if reference == "even" else "--",
-                color=colormaps[COLOURS.get(reference, "winter")](MAX_LIGHTNESS * at / max(len(rays) - 1, 1)),
-                label=f"{reference} {count:,}",
-            )
+def _draw_panel(axes: Axes, panel: WorkPanel) -> None:
+    for at, (name, lines) in enumerate(panel.lines.items()):
+        _draw_group(axes, at, name, lines)
+    axes.plot(*_xy(panel.front), color="black", linewidth=4.5, alpha=0.25, zorder=1, label="Pareto front")
+    if math.isfinite(panel.floor):
+        axes.axhline(panel.floor, color="grey", linestyle=":", label="standard error of the long run")
+    axes.set(xscale="log", yscale="log", xlabel="run time (s)", ylabel=panel.label)
+    axes.grid(visible=True, which="both", alpha=0.2)
+
+
+def _draw_group(axes: Axes, group: int, name: str, lines: Mapping[str, Sequence[Point]]) -> None:
+    colours = colormaps[COLORMAPS[group % len(COLORMAPS)]]
+    for at, (line, points) in enumerate(lines.items()):
+        axes.plot(
+            *_xy(points),
+            marker=MARKERS[at % len(MARKERS)],
+            markersize=5,
+            linewidth=1.2,
+            linestyle=LINE_STYLES[group % len(LINE_STYLES)],
+            color=colours(MAX_LIGHTNESS * at / max(len(lines) - 1, 1)),
+            label=f"{name} {line}",
+        )
+
+
+def _xy(points: Sequence[Point]) -> tuple[list[float], list[float]]:
+    return [x for x, _ in points], [y for _, y in points]

@@ -9,17 +9,70 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from torch import Tensor
 
-from torchcover.coverage import BevGrid, Coverage, check_paired
-from torchcover.report.maps.one_map import draw_map
-from torchcover.report.maps.scale import difference_scale
-from torchcover.report.maps.side_by_side import draw_side_by_side
-from torchcover.report.maps.subjects import Subject, error_subjects_of, subjects_of
-from torchcover.report.sensor_view import SensorView
-from torchcover.report.wording import capitalised, span, steps_and_cell
+from torchcover.coverage import BevGrid, Coverage, Quantity, check_paired
+from torchcover.coverage.errors import MIN_BLOCKS_OF_A_CELL
+from torchcover.report.maps.arrays import draw_map, draw_side_by_side
+from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, difference_scale, error_scale, scale_of
+from torchcover.report.maps.overlay import SensorView
+from torchcover.report.wording import UNITS, capitalised, span, steps_and_cell
 
 MAX_FILE_NAME = 48
 Named = tuple[str, Figure]
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What some maps show: one quantity of every rig in every band.
+
+    Args:
+        quantity: What the values are.
+        values: Name of the rig -> (H, Y, X) in the unit that is shown.
+        scale: What the colours mean: the same for all bands and rigs.
+        unknown: Why a cell has no number, for the legend.
+    """
+
+    quantity: Quantity
+    values: Mapping[str, Tensor]
+    scale: ColourScale
+    unknown: str
+
+
+def subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
+    """All that was measured.
+
+    Args:
+        coverages: By the name of the rig; one, or several that are paired.
+    """
+    for key, layer in _first(coverages).layers.items():
+        values = _shown(layer.quantity, [coverage.layers[key].values for coverage in coverages.values()])
+        named = dict(zip(coverages, values, strict=True))
+        yield Subject(layer.quantity, named, scale_of(layer.quantity, torch.stack(values)), NEVER_PROBED)
+
+
+def error_subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
+    """The standard errors of what has any.
+
+    Args:
+        coverages: As in `subjects_of`.
+    """
+    unknown = f"probed in fewer than {MIN_BLOCKS_OF_A_CELL} blocks of steps"
+    first = _first(coverages)
+    for key in first.errors:
+        of = first.layers[key].quantity
+        quantity = Quantity(of.error_key, f"standard error of the {of.title}", of.unit, lower_is_better=True)
+        values = _shown(quantity, [coverage.errors[key] for coverage in coverages.values()])
+        named = dict(zip(coverages, values, strict=True))
+        yield Subject(quantity, named, error_scale(quantity, torch.stack(values)), unknown)
+
+
+def _first(coverages: Mapping[str, Coverage]) -> Coverage:
+    return next(iter(coverages.values()))
+
+
+def _shown(quantity: Quantity, values: Sequence[Tensor]) -> list[Tensor]:
+    return [UNITS[quantity.unit].factor * each for each in values]
 
 
 def map_figures(

@@ -24,6 +24,8 @@ def columns_of(table: CoverageTable) -> Columns:
     }
     for key in keys:
         columns |= _numbers(key)
+    for key in keys if table.measure == "area" else ():
+        columns |= _known(key)
     for key in keys:
         columns |= _completed(key)
     columns |= _conditions(table)
@@ -36,6 +38,13 @@ def _numbers(key: str) -> Columns:
     return {
         key: lambda row: row.summary.numbers[key].value,
         f"{key}_error": lambda row: row.summary.numbers[key].error,
+    }
+
+
+def _known(key: str) -> Columns:
+    return {
+        f"known_{key}": lambda row: row.summary.known[key].value,
+        f"known_{key}_error": lambda row: row.summary.known[key].error,
     }
 
 
@@ -58,6 +67,8 @@ def _compared(key: str) -> Columns:
 def _conditions(table: CoverageTable) -> Columns:
     heights = table.grid.heights
     return {
+        "measure": lambda row: row.summary.measure,
+        "visible_m2": lambda row: row.summary.visible_m2,
         "known_share": lambda row: row.summary.known_share,
         "known_cells": lambda row: row.summary.known_cells,
         "unseen_cells": lambda row: row.summary.unseen_cells,

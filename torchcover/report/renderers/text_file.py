@@ -1,7 +1,7 @@
 """A table as text for a terminal."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from rich.cells import cell_len
@@ -10,8 +10,8 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from torchcover.report.notes import marks_on, notes_on
-from torchcover.report.parts import PLACE_HEADINGS, Part, Words, parts_of
+from torchcover.report.remarks import marks_on, notes_on
+from torchcover.report.renderers.layout import PLACE_HEADINGS, Part, Words, parts_of
 from torchcover.report.table import CoverageTable
 
 # Survive files and terminals without bold type.
@@ -60,6 +60,27 @@ def rich_tables(table: CoverageTable) -> list[Table]:
     marks = [f"{SIGNS[mark]} {meaning}" for mark, meaning in marks_on(table).items()]
     tables[-1].caption = Text("\n".join([*marks, *notes_on(table)]))
     return tables
+
+
+def text_table(
+    headings: Sequence[str], sections: Iterable[Sequence[Sequence[str]]], *, title: str = "", caption: str = ""
+) -> Table:
+    """A table of words for `rich.console.Console.print`: the first column left, the others right.
+
+    Args:
+        headings: Of the columns.
+        sections: Their rows, a line between two sections; the words are no markup.
+        title: Above it; empty for none.
+        caption: Below it, likewise.
+    """
+    table = Table(title=Text(title) if title else None, caption=Text(caption) if caption else None)
+    for at, heading in enumerate(headings):
+        table.add_column(Text(heading), justify="right" if at else "left")
+    for rows in sections:
+        for row in rows:
+            table.add_row(*map(Text, row))
+        table.add_section()
+    return table
 
 
 def narrowest_width(tables: Sequence[Table], folded: Sequence[str] = ()) -> int:

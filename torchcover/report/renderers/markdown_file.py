@@ -3,13 +3,12 @@
 import re
 from collections.abc import Iterable, Iterator, Sequence
 
-from torchcover.report.notes import marks_on, notes_on
-from torchcover.report.parts import PLACE_HEADINGS, Part, Words, parts_of
+from torchcover.report.remarks import marks_on, notes_on
+from torchcover.report.renderers.layout import BOLD_MARKS, PLACE_HEADINGS, Part, Words, parts_of
 from torchcover.report.table import CoverageTable
 
 # What Markdown would take for something else: an underscore does so at the end of a word only.
 SPECIAL = re.compile(r"[\\`*|\[\]]|<(?=[A-Za-z/!?])|&(?=[\w#]+;)|(?<![^\W_])_|_(?![^\W_])")
-MARKS = {"best": "In bold", "significant": "In bold among the differences"}
 
 
 def render(table: CoverageTable) -> str:
@@ -24,7 +23,7 @@ def as_markdown(table: CoverageTable, parts: Sequence[Part]) -> str:
         table: The table.
         parts: Its parts as `parts_of` gives them, maybe with columns of one's own.
     """
-    marks = [f"{MARKS[mark]}: {meaning}" for mark, meaning in marks_on(table).items()]
+    marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in marks_on(table).items()]
     notes = [f"* {_escaped(note)}" for note in (*marks, *notes_on(table))]
     return "\n".join([*(line for part in parts for line in _lines(part)), *notes, ""])
 

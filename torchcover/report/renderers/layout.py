@@ -1,11 +1,13 @@
 """A table in words, before it is text: the parts of a page, which renderers for readers have in common."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from textwrap import fill
+from types import MappingProxyType
 from typing import NamedTuple
 
-from torchcover.coverage import Quantity
+from torchcover.coverage import Quantity, RegionSummary
+from torchcover.coverage.estimate import Measure
 from torchcover.report.table import CoverageTable, Row
 from torchcover.report.wording import (
     capitalised,
@@ -14,11 +16,14 @@ from torchcover.report.wording import (
     heading,
     number_words,
     percent,
+    square_metres,
 )
 
 MAX_HEADING_CHARS = 16
 PLACE_HEADINGS = ("region", "height")
-KNOWN_HEADING = "known cells\n(%)"
+BASIS_HEADINGS: Mapping[Measure, str] = MappingProxyType({"known": "known cells\n(%)", "area": "visible surface\n(m2)"})
+# What the marks look like, and what the legend calls that, where text may be bold.
+BOLD_MARKS: Mapping[str, str] = MappingProxyType({"best": "In bold", "significant": "In bold among the differences"})
 
 
 class Words(NamedTuple):
@@ -105,14 +110,18 @@ def _part(
     *,
     of_differences: bool = False,
 ) -> Part:
-    """A part with the columns that every part has: the place before the numbers, the known cells behind them."""
+    """A part with the columns that every part has: the place first, how much the numbers are means over last."""
     rows = []
     for (row, *_), cells in zip(table.places, numbers, strict=True):
         summary = row.summary
-        place, known = (Words(summary.region), Words(summary.height)), Words(percent(summary.known_share))
-        rows.append((*place, *cells, known))
-    every = (*PLACE_HEADINGS, *headings, KNOWN_HEADING)
+        rows.append((Words(summary.region), Words(summary.height), *cells, _basis(summary)))
+    every = (*PLACE_HEADINGS, *headings, BASIS_HEADINGS[table.measure])
     return Part(title, quantities, of_differences, every, tuple(rows), len(table.grid.heights))
+
+
+def _basis(summary: RegionSummary) -> Words:
+    """How much the numbers are means over."""
+    return Words(percent(summary.known_share) if summary.measure == "known" else square_metres(summary.visible_m2))
 
 
 def _number(row: Row, quantity: Quantity) -> Words:

@@ -1,13 +1,14 @@
-"""A study of error against run time: its points, the best of them, and its table."""
+"""What the settings of a study have reached: the points of error and run time, the best of them, table and records."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from itertools import groupby
+from types import MappingProxyType
 
 from rich.table import Table
 
-from torchcover.report.renderers.json_file import json_record
-from torchcover.report.wording import error_words, percent
+from torchcover.report import WorkPanel, error_words, json_record, percent, text_table
 
 
 @dataclass(frozen=True)
@@ -41,8 +42,26 @@ class WorkPoint:
     known_share: float
 
 
-# The errors whose fastest points are marked.
-RANKED = ("detection_error", "radius_error_m")
+# The errors whose fastest points are marked -> what the diagram calls them, and what it multiplies them with.
+RANKED: Mapping[str, tuple[str, float]] = MappingProxyType(
+    {
+        "detection_error": ("error of the regions' detection (percentage points)", 100.0),
+        "radius_error_m": ("error of the regions' radius (m)", 1.0),
+    }
+)
+HEADINGS = (
+    "reference",
+    "rays",
+    "steps",
+    "time (s)",
+    "detection\nerror (pp)",
+    "completed\n(pp)",
+    "radius\nerror (m)",
+    "completed\n(m)",
+    "cells:\ndet. (pp)",
+    "cells:\nradius (m)",
+    "known\n(%)",
+)
 
 
 def pareto_front(points: Sequence[WorkPoint], error: str) -> list[WorkPoint]:
@@ -81,27 +100,42 @@ def cheapest(points: Sequence[WorkPoint], error: str, at_most: float) -> WorkPoi
 def study_table(points: Sequence[WorkPoint]) -> Table:
     """A row for each point, the Pareto front of the detection marked `*`."""
     front = pareto_front(points, "detection_error")
-    table = Table(caption="* no other setting is both faster and more accurate (regions' detection)")
-    table.add_column("reference")
-    for column in ("rays", "steps", "time (s)", "detection\nerror (pp)", "completed\n(pp)"):
-        table.add_column(column, justify="right")
-    for column in ("radius\nerror (m)", "completed\n(m)", "cells:\ndet. (pp)", "cells:\nradius (m)", "known\n(%)"):
-        table.add_column(column, justify="right")
-    for at, point in enumerate(points):
-        if at and points[at - 1].rays != point.rays:
-            table.add_section()
-        table.add_row(
-            f"{point.reference} *" if point in front else point.reference,
-            f"{point.rays:,}",
-            f"{point.steps:,}",
-            f"{point.seconds:.1f}",
-            *(error_words(error, "share") for error in (point.detection_error, point.completed_detection_error)),
-            *(error_words(error, "m") for error in (point.radius_error_m, point.completed_radius_error_m)),
-            error_words(point.cell_detection_error, "share"),
-            error_words(point.cell_radius_error_m, "m"),
-            percent(point.known_share),
-        )
-    return table
+    by_rays = (list(of_rays) for _, of_rays in groupby(points, lambda point: point.rays))
+    return text_table(
+        HEADINGS,
+        [[_row(point, is_best=point in front) for point in section] for section in by_rays],
+        caption="* no other setting is both faster and more accurate (regions' detection)",
+    )
+
+
+def _row(point: WorkPoint, *, is_best: bool) -> list[str]:
+    return [
+        f"{point.reference} *" if is_best else point.reference,
+        f"{point.rays:,}",
+        f"{point.steps:,}",
+        f"{point.seconds:.1f}",
+        *(error_words(error, "share") for error in (point.detection_error, point.completed_detection_error)),
+        *(error_words(error, "m") for error in (point.radius_error_m, point.completed_radius_error_m)),
+        error_words(point.cell_detection_error, "share"),
+        error_words(point.cell_radius_error_m, "m"),
+        percent(point.known_share),
+    ]
+
+
+def work_panels(points: Sequence[WorkPoint], floor: Mapping[str, float]) -> Iterator[WorkPanel]:
+    """What the work-precision diagram shows of them.
+
+    Args:
+        points: Measured points.
+        floor: Standard error of the long run by the name of the field: errors below it say nothing.
+    """
+    for error, (label, factor) in RANKED.items():
+        lines: dict[str, dict[str, list[tuple[float, float]]]] = {}
+        for point in sorted(points, key=lambda point: point.rays):
+            line = lines.setdefault(point.reference, {}).setdefault(f"{point.rays:,}", [])
+            line.append((point.seconds, factor * getattr(point, error)))
+        front = [(point.seconds, factor * getattr(point, error)) for point in pareto_front(points, error)]
+        yield WorkPanel(label, lines, front, factor * floor[error])
 
 
 def study_records(points: Sequence[WorkPoint]) -> list[dict[str, object]]:

@@ -1,0 +1,100 @@
+"""What the numbers are means over: the known cells, or the surface that the reference sees."""
+
+import csv
+import io
+import json
+
+import pytest
+import torch
+
+from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
+from torchcover.report import RENDERERS, CoverageTable, map_figures, parts_of, remarks_on
+
+KEYS = ("radius_m", "detection_0.4m")
+SURFACE, CELLS = "Means over the square metres that the reference sees.", "Means over the known cells only"
+WALL = Region("wall", (0.0, 2.0), (0.0, 1.0))
+NOTHING = Region("nothing", (2.0, 3.0), (0.0, 1.0))
+
+
+@pytest.fixture
+def table(surface_pair, regions):
+    """Of the surface."""
+    return CoverageTable.of(surface_pair, regions)
+
+
+def two_cells() -> Coverage:
+    """3 m2 at a radius of 0 and 1 m2 at one of 1 m, in cells of their own; then a step of nothing."""
+    grid = BevGrid(x=(0.0, 3.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    metric = CoverageMetric(grid, square_metres=True)
+    reference = torch.tensor([[0.5, 0.5, 0.0], [1.5, 0.5, 0.0]])
+    metric.update(reference[:1], reference, weights=torch.tensor([3.0, 1.0]))
+    metric.update(reference[:1], torch.zeros(0, 3), weights=torch.zeros(0))
+    return metric.compute()
+
+
+def records(table: CoverageTable) -> list[dict]:
+    return json.loads(RENDERERS["json"](table))["rows"]
+
+
+def header(table: CoverageTable) -> list[str]:
+    return next(csv.reader(io.StringIO(RENDERERS["csv"](table))))
+
+
+def test_a_row_has_the_mean_over_the_surface_and_how_much_of_it_there_is():
+    (part,) = parts_of(CoverageTable.of({"rig": two_cells()}, [WALL, NOTHING]))
+    assert part.headings[-1] == "visible surface\n(m2)"
+    wall, nothing = [[cell.text for cell in row] for row in part.rows]
+    assert wall == ["wall", "all", "0.25", "75.0", "2.0"]
+    assert nothing == ["nothing", "all", "unknown", "unknown", "0"]
+
+
+def test_files_have_both_measures_each_under_its_name():
+    wall, nothing = records(CoverageTable.of({"rig": two_cells()}, [WALL, NOTHING]))
+    assert (wall["measure"], wall["visible_m2"], nothing["visible_m2"]) == ("area", 2.0, 0.0)
+    assert (wall["radius_m"], wall["known_radius_m"]) == (0.25, 0.5)
+    assert (wall["detection_0.4m"], wall["known_detection_0.4m"]) == (0.75, 0.5)
+    assert (nothing["radius_m"], nothing["known_radius_m"]) == (None, None)
+
+
+def test_records_are_those_of_the_summary(table, surface_pair, regions):
+    rows = [row for coverage in surface_pair.values() for row in coverage.summary(regions)]
+    for record, row in zip(records(table), rows, strict=True):
+        for key in KEYS if row.known_cells else ():
+            assert (record[key], record[f"{key}_error"]) == row.numbers[key]
+            assert (record[f"known_{key}"], record[f"known_{key}_error"]) == row.known[key]
+            assert (record[f"completed_{key}"], record[f"completed_{key}_error"]) == row.completed[key]
+            assert record[key] != record[f"known_{key}"]
+
+
+def test_the_surface_adds_the_numbers_over_known_cells_and_no_other_column(table, trio, regions):
+    known = CoverageTable.of({name: trio[name] for name in table.rigs}, regions)
+    more = {f"known_{key}{end}" for key in KEYS for end in ("", "_error")}
+    assert [name for name in header(table) if name not in more] == header(known)
+    assert set(header(table)) - set(header(known)) == more
+
+
+def test_known_cells_have_no_square_metres(trio, regions):
+    table = CoverageTable.of(trio, regions)
+    assert {(row["measure"], row["visible_m2"]) for row in records(table)} == {("known", None)}
+    assert {part.headings[-1] for part in parts_of(table)} == {"known cells\n(%)"}
+
+
+@pytest.mark.parametrize("name", ["text", "markdown"])
+def test_readers_are_told_which_measure_it_is(name, table, trio, regions):
+    surface, known = RENDERERS[name](table), RENDERERS[name](CoverageTable.of(trio, regions))
+    assert (SURFACE in surface, CELLS in surface, SURFACE in known, CELLS in known) == (True, False, False, True)
+    assert ("visible surface" in surface, "known cells" in known) == (True, True)
+
+
+def test_without_a_region_no_measure_is_told(surface_pair):
+    table = CoverageTable.of(surface_pair, ())
+    assert {remark.name for remark in remarks_on(table, "few")} >= {"no_region"}
+    assert SURFACE not in RENDERERS["text"](table)
+
+
+def test_both_measures_are_drawn_and_cells_without_a_square_metre_are_unknown():
+    figures = dict(map_figures({"rig": two_cells()}))
+    assert {"radius_m_all", "radius_area_m_all", "detection_area_0.4m_all"} <= set(figures)
+    for figure in figures.values():
+        (legend,) = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
+        assert legend.get_texts()[0].get_text().endswith("(33.3 % of the cells)")

@@ -1,0 +1,122 @@
+"""One array over a grid as a map, or several side by side."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchcover.coverage import BevGrid
+from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, cell_entries, draw_cells, draw_colour_bar
+from torchcover.report.maps.overlay import SensorView, draw_ego, draw_sensors
+from torchcover.report.maps.sheet import (
+    HEADING_POINTS,
+    fit_paper,
+    lay_out,
+    lower_left,
+    write_heading,
+    write_legend,
+    write_title,
+)
+
+
+def draw_map(
+    values: Tensor,
+    grid: BevGrid,
+    scale: ColourScale,
+    *,
+    title: str,
+    subtitle: str = "",
+    ego_outline_m: NDArray[np.floating] | None = None,
+    sensors: Sequence[SensorView] = (),
+    unknown: str = NEVER_PROBED,
+) -> Figure:
+    """Draw one array over a grid, seen from above: x forward to the right, y left upwards.
+
+    Args:
+        values: (Y, X) numbers in the unit of `scale`. NaN is unknown and drawn hatched grey; infinity has a colour of
+            its own.
+        grid: The cells.
+        scale: What the colours mean.
+        title: First line.
+        subtitle: Second line, smaller.
+        ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
+        sensors: What to mark.
+        unknown: Why a cell is, for the legend.
+
+    Returns:
+        A figure of its own, outside pyplot: `figure.savefig(path)`, or hand it to a logger.
+
+    Raises:
+        ValueError: `values` or the outline have another shape.
+
+    Example:
+        >>> import torch
+        >>> grid = BevGrid(x=(0.0, 2.0), y=(-1.0, 1.0), cell=1.0)
+        >>> change = torch.tensor([[0.5, -0.5], [float("nan"), 0.0]])
+        >>> scale = ColourScale("change of the blind spot radius", "m", "PuOr", -1.0, 1.0)
+        >>> draw_map(change, grid, scale, title="Rig B against rig A").axes[0].get_xlabel()
+        'x forward (m)'
+    """
+    if tuple(values.shape) != grid.shape[1:]:
+        raise ValueError(
+            f"values: shape {grid.shape[1:]} is needed, as of a band of the grid; got {tuple(values.shape)}"
+        )
+    array = values.detach().cpu().double().numpy()
+    (sheet,) = lay_out(grid)
+    draw_colour_bar(sheet, draw_cells(sheet.axes, array, scale), array, scale)
+    entries = cell_entries(array, unknown)
+    if ego_outline_m is not None:
+        entries += draw_ego(sheet.axes, ego_outline_m)
+    entries += draw_sensors(sheet, sensors)
+    write_title(sheet.axes, title, subtitle)
+    write_legend(sheet.axes, entries, sheet.legend_columns)
+    fit_paper(sheet.figure)
+    return sheet.figure
+
+
+def draw_side_by_side(
+    values: Mapping[str, Tensor],
+    grid: BevGrid,
+    scale: ColourScale,
+    *,
+    title: str,
+    subtitle: str = "",
+    ego_outline_m: NDArray[np.floating] | None = None,
+    sensors: Mapping[str, Sequence[SensorView]] | None = None,
+    unknown: str = NEVER_PROBED,
+) -> Figure:
+    """Draw several arrays over one grid, with one colour bar.
+
+    Args:
+        values: (Y, X) numbers in the unit of `scale`, by their headings; as in `draw_map`.
+        grid: The cells.
+        scale: What the colours of all of them mean.
+        title: First line.
+        subtitle: Second line, smaller.
+        ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
+        sensors: What to mark, by the headings.
+        unknown: Why a cell is, for the legend.
+
+    Returns:
+        A figure of its own, outside pyplot.
+
+    Raises:
+        ValueError: An outline of another shape.
+    """
+    arrays = [value.detach().cpu().double().numpy() for value in values.values()]
+    sheets = lay_out(grid, len(arrays))
+    images = [draw_cells(sheet.axes, array, scale) for sheet, array in zip(sheets, arrays, strict=True)]
+    together = np.stack(arrays)
+    draw_colour_bar(sheets[0], images[0], together, scale)
+    entries = cell_entries(together, unknown)
+    for sheet, name in zip(sheets, values, strict=True):
+        write_heading(sheet.axes, name)
+        if ego_outline_m is not None:
+            entries += draw_ego(sheet.axes, ego_outline_m)
+        entries += draw_sensors(sheet, (sensors or {}).get(name, ()), named=False)
+    write_title(sheets[0].axes, title, subtitle, lift_points=HEADING_POINTS)
+    write_legend(lower_left(sheets), entries, sheets[0].legend_columns)
+    fit_paper(sheets[0].figure)
+    return sheets[0].figure

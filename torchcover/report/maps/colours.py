@@ -1,0 +1,188 @@
+"""Colours: how the numbers of a map become colours, and what says what they mean.
+
+Dark means blind. In a difference blue means better, red means worse. Unknown cells are hatched.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from matplotlib.image import AxesImage
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchcover.coverage import Quantity
+from torchcover.report.maps.sheet import Sheet
+from torchcover.report.wording import UNITS, percent
+
+# A few cells far behind an obstacle must not take the colours away from all others.
+ROBUST_PERCENTILE = 98
+UNKNOWN: dict[str, Any] = {"facecolor": "#c4c4c4", "edgecolor": "#b2b2b2", "hatch": "////"}
+INFINITE = "#d55e00"
+NEVER_PROBED = "never probed"
+
+
+@dataclass(frozen=True)
+class ColourScale:
+    """What a colour says.
+
+    Args:
+        quantity: What is measured, for the colour bar.
+        unit: Its unit, for the colour bar.
+        colormap: Name of a matplotlib colour map.
+        low: Value of the first colour.
+        high: Value of the last colour. Values beyond either end keep its colour, and the colour bar says so.
+        logarithmic: Whether equal ratios, rather than equal differences, are equally far apart in colour.
+
+    Raises:
+        ValueError: `low` is not below `high`, or one of them is not finite; a logarithmic scale that does not begin
+            above 0.
+
+    Example:
+        >>> ColourScale("change of the blind spot radius", "m", "PuOr", -1.0, 1.0).label
+        'change of the blind spot radius (m)'
+    """
+
+    quantity: str
+    unit: str
+    colormap: str
+    low: float
+    high: float
+    logarithmic: bool = False
+
+    def __post_init__(self) -> None:
+        if not (-math.inf < self.low < self.high < math.inf):
+            raise ValueError(f"a colour scale needs finite low < high; got {self.low} and {self.high}")
+        if self.logarithmic and not self.low > 0:
+            raise ValueError(f"a logarithmic colour scale needs low > 0; got {self.low}")
+
+    @property
+    def label(self) -> str:
+        """Quantity and unit."""
+        return f"{self.quantity} ({self.unit})"
+
+
+def scale_of(quantity: Quantity, values: Tensor) -> ColourScale:
+    """Scale for a quantity as it is shown: shares from 0 to 100 %, others from 0 to the 98th percentile of the known.
+
+    Args:
+        quantity: What is shown; dark is the worse end.
+        values: Any shape, in the unit that is shown: those of every map that shall be compared by eye. NaN is unknown.
+
+    Example:
+        >>> import torch
+        >>> from torchcover.coverage.quantity import RADIUS
+        >>> scale_of(RADIUS, torch.tensor([0.5, 2.04])).label
+        'mean blind spot radius (m)'
+    """
+    unit = UNITS[quantity.unit]
+    colormap = "viridis_r" if quantity.lower_is_better else "viridis"
+    high = unit.highest if math.isfinite(unit.highest) else _robust_end(values)
+    return ColourScale(quantity.title, unit.name, colormap, 0.0, high)
+
+
+def error_scale(quantity: Quantity, errors: Tensor) -> ColourScale:
+    """Scale for standard errors, from 0 to the 98th percentile of the known; as `scale_of`."""
+    unit = UNITS[quantity.unit].difference_name
+    return ColourScale(quantity.title, unit, "viridis_r", 0.0, _robust_end(errors))
+
+
+def difference_scale(quantity: Quantity, differences: Tensor) -> ColourScale:
+    """Scale for differences: white is none, blue is better, red is worse, both to the 98th percentile of the size.
+
+    Args:
+        quantity: What differs.
+        differences: As in `scale_of`.
+    """
+    end = _robust_end(differences.abs())
+    colormap = "RdBu_r" if quantity.lower_is_better else "RdBu"
+    return ColourScale(f"difference, {quantity.title}", UNITS[quantity.unit].difference_name, colormap, -end, end)
+
+
+def _robust_end(values: Tensor) -> float:
+    known = values[values.isfinite()].cpu().numpy()
+    high = float(np.percentile(known, ROBUST_PERCENTILE) or known.max()) if len(known) else 0.0
+    return _round_up(high) or 1.0
+
+
+def _round_up(value: float) -> float:
+    """To two digits, so that the end of the colour bar is a number one can say."""
+    if value <= 0:
+        return 0.0
+    step = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(f"{math.ceil(value / step - 1e-9) * step:.2g}")
+
+
+def draw_cells(axes: Axes, array: NDArray[np.float64], scale: ColourScale, *, infinite: str = INFINITE) -> AxesImage:
+    """Colour each cell; unknown ones are hatched grey, infinite ones have a colour of their own.
+
+    Args:
+        axes: Axes of a map, with limits set to the grid's bounds.
+        array: (Y, X) values, NaN where unknown.
+        scale: What the colours mean.
+        infinite: Colour of infinite cells.
+
+    Returns:
+        The image, for the colour bar.
+    """
+    # Unknown cells are holes through which the ground of the axes shows.
+    axes.patch.set(**UNKNOWN, linewidth=0)
+    norm = (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
+    image = _draw_image(axes, np.ma.masked_invalid(array), cmap=scale.colormap, norm=norm)
+    endless = np.isinf(array)
+    if endless.any():
+        _draw_image(axes, np.ma.masked_where(~endless, endless), cmap=ListedColormap([infinite]))
+    return image
+
+
+def cell_entries(array: NDArray[np.float64], unknown: str = NEVER_PROBED) -> list[Artist]:
+    """The legend entries for cells without a colour of the scale.
+
+    Args:
+        array: Values of one map, or of several, NaN where unknown.
+        unknown: Why they are.
+    """
+    unknown_share = percent(float(np.isnan(array).mean()))
+    entries: list[Artist] = [Patch(label=f"unknown: {unknown} ({unknown_share} % of the cells)", **UNKNOWN)]
+    infinite = np.isinf(array)
+    if infinite.any():
+        label = f"infinite: a step saw nothing ({percent(float(infinite.mean()))} % of the cells)"
+        entries.append(Patch(facecolor=INFINITE, label=label))
+    return entries
+
+
+def draw_colour_bar(sheet: Sheet, image: AxesImage, array: NDArray[np.float64], scale: ColourScale) -> None:
+    """Draw the colour bar with quantity and unit; if values lie beyond an end, an arrow and how many there are.
+
+    Args:
+        sheet: The sheet of the map, or of one of several that share the colour bar.
+        image: What `draw_cells` returned.
+        array: Values of all the maps, NaN where unknown.
+        scale: What the colours mean.
+    """
+    known = array[np.isfinite(array)]
+    rounding = 1e-6 * (scale.high - scale.low)
+    below, above = (known < scale.low - rounding).sum(), (known > scale.high + rounding).sum()
+    extend = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
+    label = scale.label
+    if beyond := below + above:
+        label += f"\n{percent(float(beyond / len(known)))} % of the known cells lie beyond"
+    sheet.figure.colorbar(image, cax=sheet.bar, extend=extend[bool(below), bool(above)], label=label)
+
+
+def _draw_image(axes: Axes, array: NDArray[Any], **colours: Any) -> AxesImage:  # noqa: ANN401  (imshow's own)
+    # A cell is a whole number of pixels, or smaller than a pixel: then they are averaged.
+    larger_than_pixel = axes.get_window_extent().width > 0.99 * array.shape[1]
+    return axes.imshow(
+        array,
+        extent=(*axes.get_xlim(), *axes.get_ylim()),
+        origin="lower",
+        aspect="equal",
+        interpolation="nearest" if larger_than_pixel else "auto",
+        **colours,
+    )
