@@ -45,9 +45,9 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
         source[2]
     assert set(source.sensors) <= set(source.rigs)
     assert set(source.description) == {"scenario", "frames", "seed"}
-    assert (source.reference is None) == (source.description["scenario"] is None)
-    if source.reference is not None:
-        assert set(source.reference) == {"sensor", "every_s"}
+    assert (source.reference_record is None) == (source.description["scenario"] is None)
+    if source.reference_record is not None:
+        assert set(source.reference_record) == {"sensor", "every_s"}
     if source.ego_outline_m is not None:
         assert source.ego_outline_m.shape[1] == 2
     torch.testing.assert_close(pickle.loads(pickle.dumps(source))[1].reference, source[1].reference)

@@ -55,6 +55,7 @@ class DownReference:
     """Looks straight down from its place: the smallest reference sensor there is."""
 
     name: ClassVar[str] = "down"
+    weight_kind: ClassVar[str] = "density"
 
     rays: int
     shell_m: float = 0.5

@@ -52,8 +52,8 @@ def _check_aggregations(aggregations: Sequence[Aggregation]) -> None:
     kinds = [aggregation.name for aggregation in aggregations]
     if len(set(kinds)) != len(kinds) or not BUILT_IN.isdisjoint(kinds):
         raise ValueError(
-            "aggregations: one of each kind is possible, with several levels in it, and none of those that are built in; "
-            f"got {', '.join(kinds)}"
+            "aggregations: one of each kind is possible, with several levels in it, and none of those that are built "
+            f"in; got {', '.join(kinds)}"
         )
 
 
