@@ -172,5 +172,5 @@ def test_a_target_that_no_run_or_every_run_reaches_is_refused(sizes):
 
 def test_words_may_stand_alone_and_numbers_need_a_unit():
     assert TargetError.parse("0.5%") == TargetError(detection=0.005)
-    with pytest.raises(TypeError, match='numbers with their units are needed, "0.1%"'):
+    with pytest.raises(TypeError, match=r'numbers with their units are needed, "0\.1%"'):
         TargetError.parse(0.1)
