@@ -78,7 +78,7 @@ class PointCount:
         self.points = torch.zeros(self.grid.cells, dtype=torch.int64)
 
     def update(self, frame):
-        cells = self.grid.cell_of(frame.clouds[self.rig])
+        cells = self.grid.cell_of(frame.cloud_of(self.rig))
         self.points += torch.bincount(cells[cells >= 0], minlength=self.grid.cells)
 
     def compute(self):

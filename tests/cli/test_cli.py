@@ -11,6 +11,7 @@ import pytest
 from rich.console import Console
 
 from torchcover import Coverage, CoverageMetric
+from torchcover.simulation import REFERENCE_SENSORS
 
 
 @pytest.fixture
@@ -134,6 +135,17 @@ def test_the_weights_of_an_even_reference_reach_the_metric(torchcover, worlds, m
     assert [index for *_, index in given] == [0, 1, 0, 1]
 
 
+@pytest.mark.parametrize("name", REFERENCE_SENSORS)
+def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchcover, worlds, name):
+    options = ["--scenario", worlds / "yard.yaml", "--steps", 1, "--cell", 4, "--rays", 1024, "--out", worlds / "out"]
+    assert torchcover("evaluate", worlds / "low.yaml", *options, "--reference", name)[0] == 0
+    summary = json.loads((worlds / "out" / "summary.json").read_text())
+    by_area = REFERENCE_SENSORS[name].weight_kind == "m2"
+    assert (summary["reference"]["sensor"], summary["measure"]) == (name, "area" if by_area else "known")
+    assert Coverage.load(worlds / "out" / "coverage.npz").measure == summary["measure"]
+    assert name in torchcover("evaluate", "--help")[1]
+
+
 def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording, tmp_path, monkeypatch):
     (recording / "reference" / "f2.npy").write_bytes(b"rubbish")
     update, given = CoverageMetric.update, []
@@ -177,7 +189,10 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["evaluate", "front_roof_128", "--target-error", "5"], "target error 5: a positive number with its unit"),
         (["evaluate", "front_roof_128", "--target-error", "-1m"], "target error -1m: a positive number"),
         (["evaluate", "front_roof_128", "--target-error", "1m", "--target-error", "2m"], "another number in m"),
-        (["evaluate", "front_roof_128", "--reference", "best"], "reference best: `even` or `paper` is needed"),
+        (
+            ["evaluate", "front_roof_128", "--reference", "best"],
+            f"reference best: {' or '.join(f'`{name}`' for name in REFERENCE_SENSORS)} is needed",
+        ),
         (["evaluate", "front_roof_128", "--rays", "7"], "rays: at least 2 for each of 4 areas are needed; got 7"),
         (["evaluate", "front_roof_128", "--rays", "0"], "--rays"),
         (["evaluate", "--frames", "recording", "--rays", "9"], "reference, rays and every are for simulations"),
@@ -202,7 +217,7 @@ def test_an_output_folder_that_cannot_be_made_is_a_mistake_too(torchcover, recor
 
 
 def test_an_impossible_output_folder_is_found_before_the_run(torchcover, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchcover.evaluation.measure.observe", lambda *_, **__: pytest.fail("it ran all the same"))
+    monkeypatch.setattr("torchcover.evaluation.evaluating.observe", lambda *_, **__: pytest.fail("it ran all the same"))
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         code, _, error = torchcover("evaluate", "--frames", recording, "--out", out)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from torchcover import Coverage, CoverageMetric
+from torchcover.simulation import REFERENCE_SENSORS
 
 
 def compare(torchcover, worlds, *rigs, steps=1, out="out", options=()):
@@ -178,7 +179,7 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
     arguments = ["--frames", recording, "--out", tmp_path / "out"]
     for command, rigs, message in (
         ("compare", ["near", "middle"], "no clouds of the rig middle; the frames have far, kitti, near"),
-        ("evaluate", [], "holds the rigs far, kitti, near: say which, or compare them"),
+        ("evaluate", [], f"{recording} holds the rigs far, kitti, near: say which, or compare them"),
         ("compare", ["near", "far", "--format", "bag"], "format 'bag': no such format of recordings; there are folder"),
         ("compare", ["near", "far", "--scenario", "urban"], "exclude each other"),
     ):
@@ -202,7 +203,10 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
         (["kitti", "nuscenes", "--device", "abacus"], "device abacus: cannot be used here"),
         (["kitti", "nuscenes", "--steps", "0"], "--steps"),
         (["kitti", "nuscenes", "--target-error", "10cm"], "target error 10cm: a positive number with its unit"),
-        (["kitti", "nuscenes", "--reference", "best"], "reference best: `even` or `paper`"),
+        (
+            ["kitti", "nuscenes", "--reference", "best"],
+            f"reference best: {' or '.join(f'`{name}`' for name in REFERENCE_SENSORS)} is needed",
+        ),
         (["kitti", "nuscenes", "--rays", "7"], "rays: at least 2 for each of 4 areas are needed; got 7"),
     ],
 )

@@ -23,9 +23,12 @@ def saved(worlds):
 
 def test_two_evaluations_of_the_same_frames_are_a_comparison(torchcover, worlds, saved):
     """To the last bit: differences, their errors, marks."""
-    code, printed, _ = torchcover("compare", saved("low"), saved("both"), "--out", worlds / "out")
+    code, printed, _ = torchcover("compare", saved("low"), saved("both"), "--explain", "--out", worlds / "out")
     assert code == 0
     assert "Difference to low" in printed
+    summary = json.loads((worlds / "out" / "summary.json").read_text())
+    unknown = ("complete", "seconds", "device", "frame_counts", "skipped_frames", "left_out", "reference", "scenario")
+    assert [summary[name] for name in unknown] == [None] * len(unknown)
     rigs, settings = [worlds / "low.yaml", worlds / "both.yaml"], {"cell_m": 4.0, "thresholds": (2.0,), "rays": 1024}
     together = compare(rigs, worlds / "yard.yaml", steps=16, **settings)
     rows = json.loads((worlds / "out" / "summary.json").read_text())["rows"]
@@ -60,8 +63,17 @@ def test_what_is_no_pair_of_coverage_files_is_said(torchcover, worlds, saved):
         ([file, worlds / "missing.npz"], "no such coverage file"),
         ([file, worlds / "rubbish.npz"], "not a coverage file"),
         ([file, file, "--steps", 3], "measured already"),
-        ([file, worlds / "both.yaml"], "neither a .yaml file nor one of the built-in rigs"),
+        ([file, worlds / "both.yaml"], "coverage files are compared with coverage files only"),
     ):
         code, _, complaint = torchcover("compare", *arguments, "--out", worlds / "out")
         assert (code, complaint.count("\n")) == (2, 1)
         assert message in complaint
+
+
+def test_what_is_measured_is_not_measured_again(torchcover, saved):
+    file = saved("low")
+    code, _, complaint = torchcover("evaluate", file)
+    assert (code, complaint.count("\n")) == (2, 1)
+    assert "is measured already: read it by Coverage.load, or compare it" in complaint
+    with pytest.raises(ValueError, match="leave out .* observers"):
+        compare([file, file], observers={"any": object()})

@@ -5,8 +5,8 @@ import json
 import pytest
 
 from torchcover.cli.printing import advice
-from torchcover.evaluation import StudyPlan, WorkPoint
-from torchcover.simulation import REFERENCE_SENSORS
+from torchcover.evaluation import StudyPlan
+from torchcover.report import WorkPoint
 
 
 def test_a_small_study_writes_a_table_a_diagram_and_an_advice(torchcover, tmp_path):
@@ -19,13 +19,14 @@ def test_a_small_study_writes_a_table_a_diagram_and_an_advice(torchcover, tmp_pa
     assert "…" not in text
     assert (out / "work_precision.png").read_bytes()[:4] == b"\x89PNG"
     study = json.loads((out / "study.json").read_text())
+    names = StudyPlan.references
     settings = {(row["reference"], row["rays"], row["steps"]) for row in study["points"]}
-    assert settings == {(name, rays, steps) for name in REFERENCE_SENSORS for rays in (64, 256) for steps in (1, 2, 4)}
+    assert settings == {(name, rays, steps) for name in names for rays in (64, 256) for steps in (1, 2, 4)}
     assert all(row["seconds"] > 0 for row in study["points"])
     best = [row for row in study["points"] if row["best_detection_error"]]
     assert min(row["detection_error"] for row in study["points"]) in {row["detection_error"] for row in best}
     assert [(stage["reference"], stage["rays"]) for stage in study["stages"]] == [
-        (name, rays) for rays in (64, 256) for name in REFERENCE_SENSORS
+        (name, rays) for rays in (64, 256) for name in names
     ]
     assert study["long_run"]["steps"] == 8
 

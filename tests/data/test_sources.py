@@ -7,8 +7,16 @@ import pytest
 import torch
 
 from torchcover import Scenario
-from torchcover.data import FORMATS, RecordedFrames, SimulatedFrames, open_recording
-from torchcover.simulation import PaperReference
+from torchcover.data import (
+    FORMATS,
+    ChosenRigs,
+    FrameSource,
+    RecordedFrames,
+    SimulatedFrames,
+    collate_frames,
+    open_recording,
+)
+from torchcover.simulation import PaperReference, SurfaceReference
 
 
 def folder_of(path, places):
@@ -32,22 +40,33 @@ def recorded_rigs(path):
     return open_recording(folder_of(path, ["rigs/b", "rigs/a", "reference"]))
 
 
-@pytest.mark.parametrize("make", [simulated, recorded, recorded_rigs])
+def chosen(path):
+    return ChosenRigs(recorded_rigs(path), {"first": "b"})
+
+
+def by_area(_):
+    reference_sensor = SurfaceReference((((0.0, 20.0), (-5.0, 5.0)),), rays=256)
+    return SimulatedFrames("courtyard", "front_roof_32", steps=2, reference_sensor=reference_sensor)
+
+
+@pytest.mark.parametrize("make", [simulated, by_area, recorded, recorded_rigs, chosen])
 def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_path, make):
     source = make(tmp_path)
+    assert isinstance(source, FrameSource)
     assert len(source) == 2
     for index in range(2):
         frame = source[index]
         assert frame.index == index
         assert list(frame.clouds) == list(source.rigs)
+        assert frame.weight_kind == source.weight_kind
         assert all(cloud.dtype == torch.float32 for cloud in (*frame.clouds.values(), frame.reference))
     with pytest.raises(IndexError):
         source[2]
     assert set(source.sensors) <= set(source.rigs)
     assert set(source.description) == {"scenario", "frames", "seed"}
-    assert (source.reference is None) == (source.description["scenario"] is None)
-    if source.reference is not None:
-        assert set(source.reference) == {"sensor", "every_s"}
+    assert (source.reference_record is None) == (source.description["scenario"] is None)
+    if source.reference_record is not None:
+        assert set(source.reference_record) == {"sensor", "every_s"}
     if source.ego_outline_m is not None:
         assert source.ego_outline_m.shape[1] == 2
     torch.testing.assert_close(pickle.loads(pickle.dumps(source))[1].reference, source[1].reference)
@@ -90,3 +109,24 @@ def test_another_format_is_a_class_and_a_line(tmp_path, monkeypatch):
     folder_of(tmp_path / "drive", ["sensor", "reference"])
     (tmp_path / "drive.one").write_text("")
     assert isinstance(open_recording(tmp_path / "drive.one"), Single)
+
+
+def test_rigs_are_chosen_in_any_order_under_any_name_with_what_belongs_to_them():
+    rigs = {"a": "front_roof_32", "b": "front_grille_128"}
+    reference_sensor = PaperReference(16, 16)
+    both = SimulatedFrames("parking", rigs=rigs, steps=1, boxes=True, reference_sensor=reference_sensor)
+    turned = ChosenRigs(both, {"second": "b", "a": "a"})
+    assert list(turned.rigs) == list(turned.sensors) == list(turned[0].clouds) == ["second", "a"]
+    assert turned.sensors["second"] == both.sensors["b"]
+    assert torch.equal(turned[0].cloud_of("second"), both[0].cloud_of("b"))
+    assert torch.equal(turned[0].reference, both[0].reference)
+    assert torch.equal(turned[0].boxes.hits["second"], both[0].boxes.hits["b"])
+    assert list(ChosenRigs(both, {"b": "b"})[0].boxes.hits) == ["b"]
+    with pytest.raises(ValueError, match="no clouds of the rig c; the frames have a, b"):
+        ChosenRigs(both, {"b": "c"})
+
+
+def test_a_batch_without_the_rig_that_is_asked_for_says_what_it_has(tmp_path):
+    batch = collate_frames([recorded_rigs(tmp_path)[0]])
+    with pytest.raises(ValueError, match="frame 'f0' has no rig 'c'; it has a, b"):
+        batch.clouds_of("c")

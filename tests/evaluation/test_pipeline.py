@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+from dataclasses import replace
 
 import pytest
 import torch
@@ -112,12 +113,30 @@ def test_of_two_rigs_none_is_meant_until_it_is_named(frames):
         coverage("a").merge_state(coverage("b"))
 
 
-def test_a_bad_frame_ends_the_run_and_is_noted(frames):
+def test_a_bad_frame_ends_the_run_and_is_noted_for_who_keeps_what_there_is(frames):
     names = Names()
-    run = observe(Spoiled(frames, {3}), [names])
+    run = observe(Spoiled(frames, {3}), [names], keep_partial=True)
     assert (run.steps, names.names, run.complete) == (3, ["f0", "f1", "f2"], False)
     with pytest.raises(BadFrameError, match="f3"):
         run.raise_failure()
+
+
+def test_what_ended_a_run_is_raised_unless_the_caller_keeps_what_there_is(frames):
+    with pytest.raises(BadFrameError, match="f3"):
+        observe(Spoiled(frames, {3}), [Names()])
+    names = Names(then=lambda: len(names.names) < 3 or os.kill(os.getpid(), signal.SIGINT))
+    with pytest.raises(KeyboardInterrupt):
+        observe(frames, [names])
+    assert names.names == ["f0", "f1", "f2"]
+
+
+@pytest.mark.parametrize("kind", [None, "density"])
+def test_square_metres_are_not_made_up(frames, kind):
+    metric = CoverageMetric(GRID, square_metres=True)
+    with pytest.raises(ValueError, match="needs the square metres of each reference point"):
+        CoverageObserver(metric, "a").update(replace(frames[0], weight_kind=kind))
+    CoverageObserver(metric, "a").update(replace(frames[0], weight_kind="m2"))
+    assert metric.compute().measure == "area"
 
 
 @pytest.mark.parametrize("workers", [0, 2])
@@ -146,7 +165,7 @@ def test_ctrl_c_within_a_frame_waits_for_all_observers(frames):
             os.kill(os.getpid(), signal.SIGINT)
 
     before, first, last = signal.getsignal(signal.SIGINT), Names(press), Names()
-    run = observe(frames, [first, last])
+    run = observe(frames, [first, last], keep_partial=True)
     assert first.names == last.names == ["f0", "f1", "f2"]
     assert (run.steps, run.interrupted, run.complete) == (3, True, False)
     assert signal.getsignal(signal.SIGINT) is before

@@ -160,3 +160,17 @@ def test_without_an_error_no_number_of_steps_is_made_up():
 
 def test_without_a_target_nothing_is_said():
     assert outcome(None, {"a": filled(5).compute()}, REGIONS) == (None, [])
+
+
+@pytest.mark.parametrize(
+    "sizes", [{}, {"radius_m": 0.0}, {"detection": -0.1}, {"radius_m": math.nan, "detection": 0.1}]
+)
+def test_a_target_that_no_run_or_every_run_reaches_is_refused(sizes):
+    with pytest.raises(ValueError, match="target error: "):
+        TargetError(**sizes)
+
+
+def test_words_may_stand_alone_and_numbers_need_a_unit():
+    assert TargetError.parse("0.5%") == TargetError(detection=0.005)
+    with pytest.raises(TypeError, match=r'numbers with their units are needed, "0\.1%"'):
+        TargetError.parse(0.1)

@@ -55,6 +55,7 @@ class DownReference:
     """Looks straight down from its place: the smallest reference sensor there is."""
 
     name: ClassVar[str] = "down"
+    weight_kind: ClassVar[str] = "density"
 
     rays: int
     shell_m: float = 0.5
@@ -254,6 +255,7 @@ def test_a_reference_sensors_points_are_near_enough_and_their_weights_say_what_t
     assert seen.reference.shape == (len(seen.reference), 3)
     farthest_m = np.linalg.norm(EGO.corners_m, axis=1).max() + 2 * reference_sensor.shell_m
     assert np.linalg.norm(seen.reference, axis=1).max() <= reference_sensor.max_range_m + farthest_m
+    assert seen.weight_kind == reference_sensor.weight_kind
     assert seen.weight_kind in ("density", "m2", None)
     assert (seen.weight_kind is None) == (seen.reference_weights is None)
     if seen.reference_weights is not None:

@@ -76,7 +76,7 @@ def evaluate(
     skip_bad_frames: options.SkipBadFrames = False,
 ) -> None:
     """Measure the coverage of a rig: a table, maps, and files to compare and to log."""
-    from torchcover.evaluation import TargetError, evaluate
+    from torchcover.evaluation import evaluate
 
     result = evaluate(
         rig,
@@ -86,10 +86,10 @@ def evaluate(
         seed=seed,
         cell_m=cell,
         thresholds=threshold or (0.4,),
-        reference=reference,
+        reference_sensor=reference,
         rays=rays,
         every_s=every,
-        target_error=TargetError.parse(target_error or ()),
+        target_error=target_error,
         device=device,
         workers=workers,
         skip_bad_frames=skip_bad_frames,
@@ -120,7 +120,7 @@ def compare(
     skip_bad_frames: options.SkipBadFrames = False,
 ) -> None:
     """Compare rigs in the same frames: a table with the better values marked, maps side by side, differences."""
-    from torchcover.evaluation import TargetError, compare
+    from torchcover.evaluation import compare
 
     result = compare(
         rigs or (),
@@ -130,10 +130,10 @@ def compare(
         seed=seed,
         cell_m=cell,
         thresholds=threshold or (0.4,),
-        reference=reference,
+        reference_sensor=reference,
         rays=rays,
         every_s=every,
-        target_error=TargetError.parse(target_error or ()),
+        target_error=target_error,
         device=device,
         workers=workers,
         skip_bad_frames=skip_bad_frames,
@@ -227,7 +227,8 @@ def _finish(result: "Result", out: Path, *, error_maps: bool, explain: bool) -> 
 
     files = result.save(out, error_maps=error_maps)
     print_result(result, files, out, explain=explain)
-    result.run.raise_failure()
+    if result.run is not None:
+        result.run.raise_failure()
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)

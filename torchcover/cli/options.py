@@ -49,11 +49,17 @@ Thresholds = Annotated[
 ]
 Reference = Annotated[
     str | None,
-    typer.Option(help="Reference sensor: `even`, rays spread over the regions and the grid (default), or `paper`."),
+    typer.Option(
+        help="Reference sensor: `even`, rays spread over the regions and the grid (default); `paper`; or `surface`, "
+        "points with square metres, for numbers by area."
+    ),
 ]
 Rays = Annotated[
     int | None,
-    typer.Option(min=1, help="Rays of the reference sensor at each step (even: 262144; paper: 1048576, a square)."),
+    typer.Option(
+        min=1,
+        help="Rays of the reference sensor at each step (even: 262144; paper: 1048576, a square; surface: 16384).",
+    ),
 ]
 Every = Annotated[
     float | None,

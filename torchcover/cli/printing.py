@@ -17,9 +17,9 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
     """The tables, what the run left out if that is asked for, and where the files are."""
     console = Console()
     print_table(result.table, console)
-    if explain:
+    if explain and result.left_out:
         console.print(_explanation(result.left_out))
-    for line in result.run.skipped:
+    for line in result.run.skipped if result.run else ():
         console.print(f"skipped: {line}", style="yellow", markup=False)
     for line in result.target_lines:
         console.print(line, markup=False, soft_wrap=True)

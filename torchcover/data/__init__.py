@@ -2,6 +2,7 @@
 
 from torchcover.data.augmentation import Augmentation, flip, rotate, scale
 from torchcover.data.bad_frame import BadFrameError
+from torchcover.data.chosen_rigs import ChosenRigs
 from torchcover.data.clouds import read_cloud
 from torchcover.data.frame import Frame, FrameBatch, collate_frames
 from torchcover.data.recorded import RecordedFrames
@@ -13,6 +14,7 @@ __all__ = [
     "FORMATS",
     "Augmentation",
     "BadFrameError",
+    "ChosenRigs",
     "Frame",
     "FrameBatch",
     "FrameSource",

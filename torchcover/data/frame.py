@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcover.detection.boxes import Boxes
+from torchcover.simulation import WeightKind
 
 
 @dataclass(frozen=True)
@@ -21,6 +22,8 @@ class Frame:
         name: What a user calls it: a file stem, or scenario and step.
         counts: What was left out on the way here, by name (`sensor_self_hits`, `reference_nonfinite`, ...).
         reference_weights: (M,) float32 weight of each reference point, where they differ; see `EvenReference`.
+        weight_kind: What the weights are: "density", good for means within a cell, or "m2", the visible square metres
+            that each point stands for; None if there are none, or nobody knows.
         boxes: The objects of that instant; None if nobody looked for them, which is not the same as none being there.
     """
 
@@ -30,6 +33,7 @@ class Frame:
     name: str
     counts: Mapping[str, int] = field(default_factory=dict)
     reference_weights: Tensor | None = None
+    weight_kind: WeightKind | None = None
     boxes: Boxes | None = None
 
     @property
@@ -85,8 +89,12 @@ class FrameBatch:
         return [frame.sensor for frame in self.frames]
 
     def clouds_of(self, rig: str) -> list[Tensor]:
-        """One (N, 3) cloud a frame, of one of several rigs."""
-        return [frame.clouds[rig] for frame in self.frames]
+        """One (N, 3) cloud a frame, of one of several rigs.
+
+        Raises:
+            ValueError: A frame has no such rig.
+        """
+        return [frame.cloud_of(rig) for frame in self.frames]
 
     @property
     def reference(self) -> list[Tensor]:

@@ -18,7 +18,7 @@ from torchcover.data.formats.arrays import Points
 from torchcover.data.frame import Frame
 from torchcover.data.poses import read_poses
 from torchcover.geometry.rigid import Matrix, transform
-from torchcover.simulation import Sensor
+from torchcover.simulation import Sensor, WeightKind
 
 POSES_FILE = "frames.yaml"
 # What the clouds of the only rig are called.
@@ -106,7 +106,12 @@ class RecordedFrames(Dataset[Frame]):
         return {"scenario": None, "frames": str(self.folder), "seed": None}
 
     @property
-    def reference(self) -> Mapping[str, object] | None:
+    def weight_kind(self) -> WeightKind | None:
+        """None: all points of the reference count the same."""
+        return None
+
+    @property
+    def reference_record(self) -> Mapping[str, object] | None:
         """None: the reference was recorded."""
         return None
 

@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 
 from torchcover.data.frame import Frame
 from torchcover.detection.boxes import Boxes, points_in_boxes
-from torchcover.simulation import Label, PaperReference, ReferenceSensor, Rig, Scenario, Sensor, Simulator
+from torchcover.simulation import Label, PaperReference, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
 
 
 class SimulatedFrames(Dataset[Frame]):
@@ -117,7 +117,12 @@ class SimulatedFrames(Dataset[Frame]):
         return {"scenario": self.scenario.name, "frames": None, "seed": self.seed}
 
     @property
-    def reference(self) -> Mapping[str, object]:
+    def weight_kind(self) -> WeightKind | None:
+        """What the weights of the reference sensor's points are."""
+        return self.reference_sensor.weight_kind
+
+    @property
+    def reference_record(self) -> Mapping[str, object]:
         """The name of the reference sensor and the time between two frames."""
         return {"sensor": self.reference_sensor.name, "every_s": self.every_s}
 
@@ -140,6 +145,7 @@ class SimulatedFrames(Dataset[Frame]):
             clouds=clouds,
             reference=torch.from_numpy(seen.reference),
             reference_weights=None if weights is None else torch.from_numpy(weights),
+            weight_kind=seen.weight_kind,
             index=index,
             name=f"{self.scenario.name} step {index}",
             counts=seen.counts,

@@ -1,15 +1,16 @@
 """What every source of frames says of itself, be it a simulation, a folder or another format."""
 
 from collections.abc import Collection, Mapping, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.data.frame import Frame
-from torchcover.simulation import Sensor
+from torchcover.simulation import Sensor, WeightKind
 
 
+@runtime_checkable
 class FrameSource(Protocol):
     """A map-style torch Dataset of frames that knows whose they are and where they come from.
 
@@ -37,7 +38,12 @@ class FrameSource(Protocol):
         ...
 
     @property
-    def reference(self) -> Mapping[str, object] | None:
+    def weight_kind(self) -> WeightKind | None:
+        """What the weights of the reference points are, as in `Frame`."""
+        ...
+
+    @property
+    def reference_record(self) -> Mapping[str, object] | None:
         """Which reference sensor was simulated and how often, `sensor` and `every_s`; None: it was recorded."""
         ...
 

@@ -1,5 +1,5 @@
-from .measure import compare as compare
-from .measure import evaluate as evaluate
+from .evaluating import compare as compare
+from .evaluating import evaluate as evaluate
 from .observers import CoverageObserver as CoverageObserver
 from .observers import Observer as Observer
 from .omissions import Omission as Omission

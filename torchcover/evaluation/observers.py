@@ -62,8 +62,15 @@ class CoverageObserver:
         """Add a frame, with the weights of its reference points and its place in time.
 
         Raises:
-            ValueError: As `CoverageMetric.update`, or several rigs and none was named.
+            ValueError: As `CoverageMetric.update`, several rigs and none was named, or reference points without the
+                square metres that the metric wants.
         """
+        if self.metric.square_metres and frame.weight_kind != "m2":
+            raise ValueError(
+                f'frame {frame.name!r}: the metric needs the square metres of each reference point (weight_kind "m2", '
+                f"as of a SurfaceReference), and the frame has weight_kind {frame.weight_kind!r}; leave out "
+                "square_metres=True"
+            )
         sensor = frame.sensor if self.rig is None else frame.cloud_of(self.rig)
         self.metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.index)
 

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from torchcover.coverage import AGGREGATIONS, Coverage
+from torchcover.coverage import AGGREGATIONS, Aggregation, Coverage
 
 # What it is, how often it was left out, and of how many; the counts are those of the frames, added up.
 COUNTED = (
@@ -32,12 +32,15 @@ class Omission:
     of: int | None = None
 
 
-def left_out(frame_counts: Mapping[str, int], coverages: Sequence[Coverage]) -> list[Omission]:
-    """List what was left out of a run.
+def left_out(
+    frame_counts: Mapping[str, int], coverages: Sequence[Coverage], aggregations: Sequence[Aggregation] = ()
+) -> list[Omission]:
+    """List what was left out of a run, at its end: later, other modules may have been imported for other reasons.
 
     Args:
         frame_counts: Sums of `Frame.counts`.
         coverages: What the metrics gave, one for each rig.
+        aggregations: Those that were asked for.
     """
     found = [
         Omission(what, frame_counts[count], frame_counts[of]) for what, count, of in COUNTED if frame_counts.get(count)
@@ -46,8 +49,9 @@ def left_out(frame_counts: Mapping[str, int], coverages: Sequence[Coverage]) -> 
     inside = sum(int(coverage.points.sum()) for coverage in coverages)
     if outside:
         found.append(Omission("reference points outside every cell: not searched for", outside, inside + outside))
-    if len(coverages[0].layers) == len(coverages[0].quantities):
-        others = ", ".join(aggregation.words for aggregation in AGGREGATIONS)
-        found.append(Omission(f"{others}: not asked for, not kept"))
+    asked_for = {aggregation.name for aggregation in aggregations}
+    others = [aggregation.words for aggregation in AGGREGATIONS if aggregation.name not in asked_for]
+    if others:
+        found.append(Omission(f"{', '.join(others)}: not asked for, not kept"))
     unused = [package for package in HEAVY if package not in sys.modules]
     return found + [Omission(f"{package}, for {HEAVY[package]}: not imported") for package in unused]

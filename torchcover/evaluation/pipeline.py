@@ -83,6 +83,7 @@ def observe(
     until: StoppingRule | None = None,
     progress: bool = False,
     title: str = "steps",
+    keep_partial: bool = False,
 ) -> Run:
     """Feed observers with frames. However the run ends, all of them have seen the same frames.
 
@@ -96,13 +97,16 @@ def observe(
         until: Ends the run early.
         progress: Whether to show a bar.
         title: What stands before the bar.
+        keep_partial: After the first step, a bad frame or Ctrl-C is noted in the run and not raised: for who looks at
+            `Run.complete`.
 
     Returns:
-        How it went; a bad frame or Ctrl-C after the first step is noted there, not raised.
+        How it went.
 
     Raises:
+        BadFrameError: The frame that ended it.
         ValueError: Not a single frame could be used.
-        KeyboardInterrupt: Ctrl-C before the first step.
+        KeyboardInterrupt: Ctrl-C.
 
     Example:
         >>> class Names(list):
@@ -130,8 +134,9 @@ def observe(
         except KeyboardInterrupt:
             run.interrupted = True
     run.seconds = time.perf_counter() - start
-    if not run.steps:
+    if not (keep_partial and run.steps):
         run.raise_failure()
+    if not run.steps:
         raise ValueError("no frame could be used, so there is no result")
     return run
 

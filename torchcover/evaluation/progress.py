@@ -25,6 +25,40 @@ class Silence:
         """Nothing."""
 
 
+class Bar:
+    """A bar with the steps done, steps a second, the worst error, and the time that is left; on stderr.
+
+    Args:
+        steps: Steps that the run is thought to have.
+        title: What stands before it.
+    """
+
+    def __init__(self, steps: int, title: str) -> None:
+        # rich takes 0.1 s to import, which nobody should wait for who wants no bar.
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+        from rich.progress import Progress as RichProgress
+
+        self.rich = RichProgress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[rate]}"),
+            TextColumn("{task.fields[words]}"),
+            TimeRemainingColumn(),
+            TextColumn("left"),
+            console=Console(stderr=True),
+        )
+        self._task = self.rich.add_task(title, total=steps, rate="", words="")
+
+    def advance(self, expected_steps: int, words: str = "") -> None:
+        """Move on by a step."""
+        self.rich.advance(self._task)
+        speed = self.rich.tasks[0].speed
+        rate = f"{speed:.2f} steps/s" if speed else ""
+        self.rich.update(self._task, total=expected_steps, rate=rate, words=words)
+
+
 def progress_of(steps: int, title: str, *, shown: bool) -> AbstractContextManager[Progress]:
     """A bar on stderr (in a notebook: below the cell), or nothing."""
     return _bar(steps, title) if shown else _silence()
@@ -37,7 +71,6 @@ def _silence() -> Iterator[Progress]:
 
 @contextmanager
 def _bar(steps: int, title: str) -> Iterator[Progress]:
-    from torchcover.evaluation.bar import RichBar  # rich takes 0.1 s to import
-
-    with RichBar(steps, title) as bar:
+    bar = Bar(steps, title)
+    with bar.rich:
         yield bar

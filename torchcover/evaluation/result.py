@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,18 @@ from numpy.typing import NDArray
 
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
-from torchcover.evaluation.omissions import Omission, left_out
+from torchcover.evaluation.omissions import Omission
 from torchcover.evaluation.pipeline import Run
+from torchcover.evaluation.result_files import ResultFiles
 from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.evaluation.target_error import TargetError
 from torchcover.evaluation.target_outcome import outcome
-from torchcover.report import RENDERERS, CoverageTable, map_figures, table_dict, write_figures
+from torchcover.report import RENDERERS, CoverageTable, map_figures, table_dict
+from torchcover.report.maps.figures import file_stems
 from torchcover.simulation import Sensor
+
+# What `summary.json` says of how the run went.
+RUN_KEYS = ("seconds", "complete", "frame_counts", "skipped_frames", "left_out")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -27,28 +33,30 @@ class Result:
     Args:
         coverages: By the name of the rig; the others are compared with the first.
         regions: Those that numbers are given for.
-        run: How the run went.
+        run: How the run went; None if nobody knows, for they were saved.
         rigs: What the user called each rig, by its name; None for the rig of a recording that nobody named.
         source: Where the frames came from: `scenario`, `frames`, `seed`.
-        reference: The reference sensor: `sensor` and `every_s`; None if it was recorded.
-        device: Where it ran.
+        reference_record: The reference sensor: `sensor` and `every_s`; None if it was recorded.
+        device: Where it ran; None if nobody knows.
         target_error: What was aimed at.
         sensors: The sensors of the rigs that they are known of, for the maps.
         ego_outline_m: (K, 2) corners x, y of the ego in metres, for the maps.
         observed: What the user's own observers computed, by their names.
+        left_out: What the run left out because the scene did not need it.
     """
 
     coverages: Mapping[str, Coverage]
     regions: Sequence[Region]
-    run: Run
+    run: Run | None
     rigs: Mapping[str, str | None]
     source: Mapping[str, object]
-    reference: Mapping[str, object] | None
-    device: str = "cpu"
+    reference_record: Mapping[str, object] | None
+    device: str | None
     target_error: TargetError | None = None
     sensors: Mapping[str, Sequence[Sensor]] = field(default_factory=dict)
     ego_outline_m: NDArray[Any] | None = None
     observed: Mapping[str, Any] = field(default_factory=dict)
+    left_out: Sequence[Omission] = ()
 
     @property
     def coverage(self) -> Coverage:
@@ -78,31 +86,23 @@ class Result:
         return rows
 
     @property
-    def left_out(self) -> list[Omission]:
-        """What the run left out because the scene did not need it."""
-        return left_out(self.run.counts, list(self.coverages.values()))
-
-    @property
     def target_lines(self) -> list[str]:
         """What was reached of the target error, in words."""
         return outcome(self.target_error, self.coverages, self.regions)[1]
 
     @property
     def record(self) -> dict[str, Any]:
-        """Everything but the maps: what stands in `summary.json`."""
+        """Everything but the maps: what stands in `summary.json`; what nobody knows is None."""
         rigs = {"rigs": dict(self.rigs)} if self.is_comparison else {"rig": next(iter(self.rigs.values()))}
         return {
             **rigs,
             **self.source,
-            "reference": self._reference_record,
+            "reference": self._reference_used,
             "torchcover": __version__,
             "device": self.device,
-            "seconds": round(self.run.seconds, 3),
-            "complete": self.run.complete,
-            "frame_counts": dict(self.run.counts),
-            "skipped_frames": self.run.skipped,
+            **self._run_record,
             "target_error": outcome(self.target_error, self.coverages, self.regions)[0],
-            "left_out": [asdict(omission) for omission in self.left_out],
+            "measure": self._first.measure,
             **table_dict(self.table),
         }
 
@@ -123,49 +123,65 @@ class Result:
 
         Args:
             folder: Where to write: `coverage.npz`, or `coverage/RIG.npz` for several; `summary.csv`, `maps/STEM.png`,
-                `summary.json`. Made if it does not exist.
+                `summary.json`. Made if it does not exist. Other coverage files and maps in these places, of an earlier
+                run, are deleted.
             error_maps: Whether to draw maps of the standard errors too.
 
         Returns:
             The files.
         """
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        files = self._save_coverages(folder)
-        files.append(folder / "summary.csv")
-        files[-1].write_text(RENDERERS["csv"](self.table), encoding="utf-8")
-        files += write_figures(self.maps(errors=error_maps), folder / "maps")
-        files.append(folder / "summary.json")
-        files[-1].write_text(json.dumps(self.record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        return files
-
-    def _save_coverages(self, folder: Path) -> list[Path]:
-        if not self.is_comparison:
-            files = {folder / "coverage.npz": self.coverage}
-        else:
-            (folder / "coverage").mkdir(exist_ok=True)
-            files = {folder / "coverage" / f"{name}.npz": coverage for name, coverage in self.coverages.items()}
-        for path, coverage in files.items():
-            coverage.save(path)
-        return list(files)
+        with ResultFiles(Path(folder)) as files:
+            for name, coverage in self._coverage_files.items():
+                files.add(name, coverage.save)
+            files.add("summary.csv", lambda path: path.write_text(RENDERERS["csv"](self.table), encoding="utf-8"))
+            for stem, figure in self.maps(errors=error_maps):
+                files.add(f"maps/{stem}.png", partial(_draw, figure))
+            files.finish(json.dumps(self.record, indent=2, allow_nan=False) + "\n")
+        return files.paths
 
     @property
-    def _reference_record(self) -> dict[str, object] | None:
-        if self.reference is None:
+    def _coverage_files(self) -> dict[str, Coverage]:
+        """By their paths in the folder; a rig may be called what no file can be."""
+        if not self.is_comparison:
+            return {"coverage.npz": self.coverage}
+        stems = file_stems(list(self.coverages))
+        return {f"coverage/{stem}.npz": coverage for stem, coverage in zip(stems, self.coverages.values(), strict=True)}
+
+    @property
+    def _first(self) -> Coverage:
+        return next(iter(self.coverages.values()))
+
+    @property
+    def _run_record(self) -> dict[str, Any]:
+        run = self.run
+        if run is None:
+            return dict.fromkeys(RUN_KEYS)
+        known = (round(run.seconds, 3), run.complete, dict(run.counts), run.skipped, list(map(asdict, self.left_out)))
+        return dict(zip(RUN_KEYS, known, strict=True))
+
+    @property
+    def _reference_used(self) -> dict[str, object] | None:
+        """The reference sensor with the rays that it cast."""
+        record = self.reference_record
+        if self.run is None or record is None:
             return None
         rays = self.run.counts["reference_rays"] // self.run.steps
-        return {"sensor": self.reference["sensor"], "rays_per_step": rays, "every_s": self.reference["every_s"]}
+        return {"sensor": record["sensor"], "rays_per_step": rays, "every_s": record["every_s"]}
 
     @property
     def _notes(self) -> list[str]:
         """The reference sensor in words, for a caption."""
-        record = self._reference_record
+        record = self._reference_used
         if record is None:
             return []
         rays, every_s = record["rays_per_step"], record["every_s"]
         return [f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."]
 
     def __repr__(self) -> str:
-        cut_short = "" if self.run.complete else ", cut short"
-        about = f"Result of {', '.join(self.coverages)}: {self.run.steps} steps{cut_short}"
+        cut_short = ", cut short" if self.run is not None and not self.run.complete else ""
+        about = f"Result of {', '.join(self.coverages)}: {self._first.counts['steps']} steps{cut_short}"
         return f"{about}\n{RENDERERS['text'](self.table)}"
+
+
+def _draw(figure: Figure, path: Path) -> None:
+    figure.savefig(path, dpi=figure.dpi)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from torchcover.coverage import Coverage, regions_within
-from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.rig_names import AnyRig, distinct
 
@@ -13,9 +12,9 @@ SUFFIX = ".npz"
 USUAL_STEM = "coverage"
 
 
-def are_saved(rigs: Sequence[AnyRig]) -> bool:
-    """Whether rigs were named by coverage files."""
-    return bool(rigs) and all(isinstance(rig, str | Path) and Path(rig).suffix == SUFFIX for rig in rigs)
+def saved_among(rigs: Sequence[AnyRig]) -> list[str]:
+    """Those that are named by coverage files."""
+    return [str(rig) for rig in rigs if isinstance(rig, str | Path) and Path(rig).suffix == SUFFIX]
 
 
 def compare_saved(files: Sequence[str | Path]) -> Result:
@@ -26,7 +25,7 @@ def compare_saved(files: Sequence[str | Path]) -> Result:
             `compare`, or by several `evaluate` of the same scenario, steps, seed and reference sensor.
 
     Returns:
-        As `compare`. Its run is that of the files: as many steps, and no time.
+        As `compare`, but nobody knows how the runs went: `Result.run` is None.
 
     Raises:
         FileNotFoundError: No such file.
@@ -41,10 +40,11 @@ def compare_saved(files: Sequence[str | Path]) -> Result:
     return Result(
         coverages=coverages,
         regions=regions_within(first.grid),
-        run=Run(steps=first.counts["steps"]),
+        run=None,
         rigs={name: str(file) for name, file in zip(names, files, strict=True)},
         source={"scenario": None, "frames": None, "seed": None},
-        reference=None,
+        reference_record=None,
+        device=None,
     )
 
 

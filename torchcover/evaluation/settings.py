@@ -1,12 +1,15 @@
 """What an evaluation is done with, unless the user says otherwise."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from numbers import Real
+from typing import Any, Self
 
 import torch
 
-from torchcover.coverage import BevGrid, CoverageMetric, Region, forward_regions
-from torchcover.evaluation.target_error import TargetError
-from torchcover.simulation import REFERENCE_SENSORS, ReferenceSensor, Scenario
+from torchcover.coverage import Aggregation, BevGrid, CoverageMetric, Region, forward_regions
+from torchcover.evaluation.target_error import AnyTargetError, TargetError
+from torchcover.simulation import REFERENCE_SENSORS, ReferenceSensor, Scenario, WeightKind
 
 DEFAULT_SCENARIO = "courtyard"
 DEFAULT_REFERENCE = "even"
@@ -21,16 +24,24 @@ BLOCKS = 16
 GRID_X_M = (-40.0, 160.0)
 GRID_Y_M = (-40.0, 40.0)
 
+AnyThresholds = float | Iterable[float]
+AnyDevice = str | torch.device
+
 
 @dataclass(frozen=True)
 class Settings:
-    """What `evaluate` and `compare` let the user set, see there; None where the user gave nothing."""
+    """What `evaluate` and `compare` let the user set, see there; None where the user gave nothing.
+
+    Raises:
+        ValueError: A number of steps below 1.
+    """
 
     steps: int | None = None
     seed: int = 0
     cell_m: float = 0.25
     thresholds: tuple[float, ...] = (0.4,)
-    reference: str | None = None
+    aggregations: tuple[Aggregation, ...] = ()
+    reference_sensor: str | None = None
     rays: int | None = None
     every_s: float | None = None
     target_error: TargetError | None = None
@@ -38,10 +49,31 @@ class Settings:
     workers: int = 0
     skip_bad_frames: bool = False
 
+    def __post_init__(self) -> None:
+        if self.steps is not None and self.steps < 1:
+            raise ValueError(f"steps: at least 1 is needed; got {self.steps}")
+
+    @classmethod
+    def among(cls, arguments: Mapping[str, Any]) -> Self:
+        """The settings among the arguments of a call, in the one form that they have from here on.
+
+        Raises:
+            ValueError: One that makes no sense.
+            TypeError: One of a wrong kind.
+        """
+        given = {field.name: arguments[field.name] for field in fields(cls)}
+        given["thresholds"] = _thresholds(given["thresholds"])
+        given["aggregations"] = _aggregations(given["aggregations"])
+        given["target_error"] = _target(given["target_error"])
+        given["device"] = str(given["device"])
+        return cls(**given)
+
     @property
     def simulated_steps(self) -> int:
         """Steps of a simulation, at most."""
-        return self.steps or (DEFAULT_STEPS if self.target_error is None else MAX_STEPS)
+        if self.steps is not None:
+            return self.steps
+        return DEFAULT_STEPS if self.target_error is None else MAX_STEPS
 
     @property
     def regions(self) -> tuple[Region, ...]:
@@ -54,12 +86,17 @@ class Settings:
         Raises:
             ValueError: The reference sensor, its rays or the time between steps was set.
         """
-        if any(setting is not None for setting in (self.reference, self.rays, self.every_s)):
+        if any(setting is not None for setting in (self.reference_sensor, self.rays, self.every_s)):
             raise ValueError("reference, rays and every are for simulations; a recording has its reference points")
 
-    def metric(self) -> CoverageMetric:
-        """An empty metric."""
-        return new_metric(self.cell_m, self.thresholds, usable_device(self.device))
+    def metric(self, weight_kind: WeightKind | None) -> CoverageMetric:
+        """An empty metric.
+
+        Args:
+            weight_kind: What the weights of reference points are.
+        """
+        device = usable_device(self.device)
+        return new_metric(self.cell_m, self.thresholds, device, aggregations=self.aggregations, weight_kind=weight_kind)
 
 
 def usable_device(name: str) -> torch.device:
@@ -77,7 +114,13 @@ def usable_device(name: str) -> torch.device:
 
 
 def new_metric(
-    cell_m: float, thresholds: tuple[float, ...], device: torch.device, *, blocks: int = BLOCKS
+    cell_m: float,
+    thresholds: tuple[float, ...],
+    device: torch.device,
+    *,
+    blocks: int = BLOCKS,
+    aggregations: Sequence[Aggregation] = (),
+    weight_kind: WeightKind | None = None,
 ) -> CoverageMetric:
     """An empty metric over the grid of every evaluation, with standard errors unless there is one block only.
 
@@ -86,7 +129,14 @@ def new_metric(
     """
     grid = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=cell_m)
     try:
-        return CoverageMetric(grid, thresholds, max_radius=grid.diagonal_m, blocks=blocks).to(device)
+        return CoverageMetric(
+            grid,
+            thresholds,
+            max_radius=grid.diagonal_m,
+            blocks=blocks,
+            aggregations=aggregations,
+            square_metres=weight_kind == "m2",
+        ).to(device)
     except RuntimeError as error:  # what torch raises when there is no memory left
         raise ValueError(
             f"a cell of {cell_m:g} m: there is not enough memory for the sums of {grid.cells:,} cells in {blocks} "
@@ -109,8 +159,34 @@ def reference_called(name: str | None, rays: int | None) -> ReferenceSensor:
     Raises:
         ValueError: Another name, or too few rays.
     """
-    kind = REFERENCE_SENSORS.get(name or DEFAULT_REFERENCE)
+    areas = (*((region.x, region.y) for region in forward_regions()), (GRID_X_M, GRID_Y_M))
+    return reference_kind(name or DEFAULT_REFERENCE).from_rays(areas, rays)
+
+
+def reference_kind(name: str) -> type[ReferenceSensor]:
+    """The class of a reference sensor.
+
+    Raises:
+        ValueError: There is none of this name.
+    """
+    kind = REFERENCE_SENSORS.get(name)
     if kind is None:
         raise ValueError(f"reference {name}: {' or '.join(f'`{known}`' for known in REFERENCE_SENSORS)} is needed")
-    areas = (*((region.x, region.y) for region in forward_regions()), (GRID_X_M, GRID_Y_M))
-    return kind.from_rays(areas, rays)
+    return kind
+
+
+def _thresholds(given: Any) -> tuple[float, ...]:  # noqa: ANN401  (whatever the user gave)
+    each = tuple(given) if isinstance(given, Iterable) else (given,)
+    if not all(isinstance(threshold, Real) for threshold in each):
+        raise TypeError(f"thresholds: metres are needed, as in 0.4 or (0.4, 1.0); got {given!r}")
+    return tuple(float(threshold) for threshold in each)
+
+
+def _aggregations(given: Any) -> tuple[Aggregation, ...]:  # noqa: ANN401
+    if not isinstance(given, Sequence):  # what is in it the metric checks
+        raise TypeError(f"aggregations: a sequence of objects such as [Maximum()] is needed; got {given!r}")
+    return tuple(given)
+
+
+def _target(given: AnyTargetError | None) -> TargetError | None:
+    return given if given is None or isinstance(given, TargetError) else TargetError.parse(given)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from torchcover import __version__
 from torchcover.evaluation.study_plan import StudyPlan
-from torchcover.evaluation.study_runs import Sample, Setting, one_run, time_stages
+from torchcover.evaluation.study_runs import Sample, Trial, one_run, time_stages
 from torchcover.evaluation.study_truth import Truth, long_run
 from torchcover.evaluation.work_points import WorkPoint, cheapest, study_records, work_panels
 from torchcover.report import draw_work_precision, json_record
@@ -28,7 +28,7 @@ class Study:
         plan: What it was about.
         every_s: Time between two steps in seconds.
         truth: The long run.
-        points: What each setting costs after some steps, and how far it is off; means over the runs.
+        points: What each trial costs after some steps, and how far it is off; means over the runs.
         stages: Where the time of a step goes: records with `reference`, `rays`, `rays_s`, `search_s`, `binning_s` and
             `cdist_s`, NaN where that was not tried.
     """
@@ -103,10 +103,10 @@ def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
         FileNotFoundError: An unknown name or file.
     """
     truth = long_run(plan, progress=progress)
-    samples: dict[tuple[Setting, int], list[Sample]] = {}
+    samples: dict[tuple[Trial, int], list[Sample]] = {}
     for seed in range(plan.seed, plan.seed + plan.runs):
         for sample in one_run(plan, seed, truth, progress=progress):
-            samples.setdefault((sample.setting, sample.steps), []).append(sample)
+            samples.setdefault((sample.trial, sample.steps), []).append(sample)
     points = [_point(of_runs) for _, of_runs in sorted(samples.items())]
     every_s = plan.frames(plan.seed, plan.steps).every_s
     return Study(plan, every_s, truth, points, time_stages(plan))
@@ -116,8 +116,8 @@ def _point(runs: Sequence[Sample]) -> WorkPoint:
     *squares, known = torch.stack([run.squared_errors for run in runs]).mean(dim=0).tolist()
     radius, detection, completed_radius, completed_detection, cell_radius, cell_detection = (x**0.5 for x in squares)
     return WorkPoint(
-        reference=runs[0].setting.pattern,
-        rays=runs[0].setting.rays,
+        reference=runs[0].trial.reference_sensor,
+        rays=runs[0].trial.rays,
         steps=runs[0].steps,
         seconds=sum(run.seconds for run in runs) / len(runs),
         detection_error=detection,

@@ -7,7 +7,7 @@ import torch
 
 from torchcover.coverage import CoverageMetric
 from torchcover.data import SimulatedFrames
-from torchcover.evaluation.settings import DEFAULT_SCENARIO, new_metric, reference_called, spread_s
+from torchcover.evaluation.settings import DEFAULT_SCENARIO, new_metric, reference_called, reference_kind, spread_s
 from torchcover.simulation import Scenario
 
 # Seeds of the runs are next to each other; the long run's is far away.
@@ -21,7 +21,7 @@ class StudyPlan:
     Args:
         rig: A built-in name or a YAML file.
         scenario: Likewise.
-        rays: Rays of the reference at each step; each number is tried with every pattern.
+        rays: Rays of the reference sensor at each step; each number is tried with every sensor.
         steps: Most steps of a run.
         runs: Runs with other seeds that errors are averaged over.
         long_run_steps: Steps of the run that the others are measured against.
@@ -30,6 +30,12 @@ class StudyPlan:
         seed: Seed of the first run.
         cell_m: Side of a grid cell in metres.
         threshold_m: Detection threshold in metres.
+        references: Names of the reference sensors that are tried; the long run is of the first. Those whose points have
+            square metres have another measure, and are not possible.
+
+    Raises:
+        ValueError: No ray, step, run or reference sensor, a long run with fewer rays than another, or a reference
+            sensor that is not possible.
     """
 
     rig: str | Path
@@ -43,6 +49,22 @@ class StudyPlan:
     seed: int = 0
     cell_m: float = 0.5
     threshold_m: float = 0.4
+    references: tuple[str, ...] = ("even", "paper")
+
+    def __post_init__(self) -> None:
+        for name in ("rays", "references"):
+            if not getattr(self, name):
+                raise ValueError(f"{name}: at least one is needed; got none")
+        for name in ("steps", "runs", "long_run_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: at least 1 is needed; got {getattr(self, name)}")
+        if self.long_run_rays < max(self.rays):
+            raise ValueError(
+                f"long_run_rays: no fewer than any run has are needed, {max(self.rays)}; got {self.long_run_rays}"
+            )
+        for name in self.references:
+            if reference_kind(name).weight_kind == "m2":
+                raise ValueError(f"references: {name} measures by area, which the others do not")
 
     def frames(self, seed: int, steps: int) -> SimulatedFrames:
         """The frames of a run, whatever the reference sensor."""
@@ -52,7 +74,7 @@ class StudyPlan:
     def long_frames(self) -> SimulatedFrames:
         """Those of the long run."""
         frames = self.frames(LONG_RUN_SEED + self.seed, self.long_run_steps)
-        return frames.with_reference_sensor(reference_called("even", self.long_run_rays))
+        return frames.with_reference_sensor(reference_called(self.references[0], self.long_run_rays))
 
     def metric(self, blocks: int) -> CoverageMetric:
         """An empty metric."""

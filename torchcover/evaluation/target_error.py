@@ -22,24 +22,42 @@ class TargetError:
     Args:
         radius_m: Of every radius in metres.
         detection: Of every detection, as a share.
+
+    Raises:
+        ValueError: Neither, or one that is not positive and finite.
     """
 
     radius_m: float | None = None
     detection: float | None = None
 
+    def __post_init__(self) -> None:
+        given = {name: size for name, size in vars(self).items() if size is not None}
+        if not given:
+            raise ValueError("target error: radius_m, detection or both are needed; got neither")
+        for name, size in given.items():
+            if not 0 < size < math.inf:
+                raise ValueError(f"target error: {name} must be positive and finite; got {size}")
+
     @classmethod
-    def parse(cls, words: Sequence[str]) -> "TargetError | None":
+    def parse(cls, words: str | Sequence[str]) -> "TargetError | None":
         """Read numbers with their units; None for no words.
 
         Raises:
             ValueError: Not a positive number with % or m, or two with the same unit.
+            TypeError: Not words.
 
         Example:
             >>> TargetError.parse(["0.1%", "0.02m"])
             TargetError(radius_m=0.02, detection=0.001)
         """
+        each = [words] if isinstance(words, str) else words
+        if not isinstance(each, Sequence) or not all(isinstance(word, str) for word in each):
+            raise TypeError(
+                f'target error: numbers with their units are needed, "0.1%" or ["0.1%", "0.02m"], or a '
+                f"TargetError; got {words!r}"
+            )
         found: dict[str, float] = {}
-        for word in words:
+        for word in each:
             parts = re.fullmatch(r"([0-9.]+(?:e-?[0-9]+)?) ?(%|m)", word.strip())
             try:
                 size = float(parts[1]) if parts else math.nan
@@ -55,6 +73,9 @@ class TargetError:
                 raise ValueError(f"target error {word}: another number in {parts[2]} was given before; give one")
             found[name] = size
         return cls(**found) if found else None
+
+
+AnyTargetError = TargetError | str | Sequence[str]
 
 
 @dataclass(frozen=True)

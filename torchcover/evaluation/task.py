@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from torchcover.data import FrameSource, SimulatedFrames, open_recording
+from torchcover.data import ChosenRigs, FrameSource, SimulatedFrames, open_recording
 from torchcover.evaluation.rig_names import AnyRig, distinct_names, given_as, is_document, loaded
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings, reference_called, spread_s
 from torchcover.simulation import Scenario, Sensor
@@ -17,8 +17,7 @@ class Task(NamedTuple):
     """Which rigs are measured in which frames.
 
     Args:
-        frames: Where the frames come from.
-        clouds: Name of each rig in tables and files -> in the frames.
+        frames: Frames of these rigs, under the names that they have in tables and files.
         given: Name of each rig -> what the user called it; None if nobody named it.
         sensors: Name of each rig -> its sensors, where they are known.
         description: Where the frames come from, in words.
@@ -26,11 +25,20 @@ class Task(NamedTuple):
     """
 
     frames: FrameSource
-    clouds: Mapping[str, str]
     given: Mapping[str, str | None]
     sensors: Mapping[str, Sequence[Sensor]]
     description: Mapping[str, object]
     steps: int | None = None
+
+    @property
+    def rigs(self) -> tuple[str, ...]:
+        """What the rigs are called in tables and files."""
+        return tuple(self.given)
+
+    @property
+    def place(self) -> str:
+        """Where the frames come from, for a message."""
+        return str(self.description["frames"] or self.description["scenario"])
 
 
 def task_of(rigs: Sequence[AnyRig], scenario: AnyScenario | None, frames: AnyFrames | None, settings: Settings) -> Task:
@@ -45,13 +53,20 @@ def task_of(rigs: Sequence[AnyRig], scenario: AnyScenario | None, frames: AnyFra
     Raises:
         ValueError: No rig, a scenario beside a recording, settings for the other of the two, a rig that is not there.
         FileNotFoundError: An unknown name or file.
+        TypeError: Frames that do not say whose they are.
     """
     if frames is None:
         return _simulation(rigs, DEFAULT_SCENARIO if scenario is None else scenario, settings)
     if scenario is not None:
         raise ValueError("scenario and frames exclude each other: simulate a scenario or read a recording")
     settings.check_recording()
-    return _recording(rigs, open_recording(frames) if isinstance(frames, str | Path) else frames, settings)
+    source = open_recording(frames) if isinstance(frames, str | Path) else frames
+    if not isinstance(source, FrameSource):
+        raise TypeError(
+            f"frames: a recording's path or a torchcover.data.FrameSource is needed; got {type(source).__name__}; for "
+            "a list of frames, or a dataset, feed observers: torchcover.evaluation.observe(frames, observers)"
+        )
+    return _recording(rigs, source, settings)
 
 
 def _simulation(rigs: Sequence[AnyRig], scenario: AnyScenario, settings: Settings) -> Task:
@@ -65,30 +80,21 @@ def _simulation(rigs: Sequence[AnyRig], scenario: AnyScenario, settings: Setting
         steps=settings.simulated_steps,
         seed=settings.seed,
         every_s=spread_s(world, settings.every_s),
-        reference_sensor=reference_called(settings.reference, settings.rays),
+        reference_sensor=reference_called(settings.reference_sensor, settings.rays),
     )
     given = {name: given_as(rig) for name, rig in zip(names, rigs, strict=True)}
     # A path says more than the name within the file.
     description = {**frames.description, "scenario": world.name if world is scenario else str(scenario)}
-    return Task(frames, dict(zip(names, names, strict=True)), given, frames.sensors, description)
+    return Task(frames, given, frames.sensors, description)
 
 
 def _recording(rigs: Sequence[AnyRig], frames: FrameSource, settings: Settings) -> Task:
     names = distinct_names(rigs or list(frames.rigs))
-    clouds = _clouds(names, frames)
+    only_one = len(names) == len(frames.rigs) == 1  # which goes by any name
+    chosen = ChosenRigs(frames, dict(zip(names, frames.rigs if only_one else names, strict=True)))
     named = dict(zip(names, rigs, strict=True)) if rigs else {}
     given = {name: given_as(named[name]) if named else None for name in names}
     # A name that is in the recording may be a name only; any other has to be that of a rig.
     documents = {name: rig for name, rig in named.items() if is_document(rig) or name not in frames.rigs}
-    sensors = {**frames.sensors, **{name: loaded(rig).sensors for name, rig in documents.items()}}
-    return Task(frames, clouds, given, sensors, frames.description, settings.steps)
-
-
-def _clouds(names: Sequence[str], frames: FrameSource) -> dict[str, str]:
-    """Whose clouds each name means; the only rig of a recording goes by any name."""
-    if len(names) == len(frames.rigs) == 1:
-        return dict(zip(names, frames.rigs, strict=True))
-    unknown = [name for name in names if name not in frames.rigs]
-    if unknown:
-        raise ValueError(f"no clouds of the rig {', '.join(unknown)}; the frames have {', '.join(frames.rigs)}")
-    return dict(zip(names, names, strict=True))
+    sensors = {**chosen.sensors, **{name: loaded(rig).sensors for name, rig in documents.items()}}
+    return Task(chosen, given, sensors, frames.description, settings.steps)

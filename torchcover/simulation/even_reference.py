@@ -11,7 +11,7 @@ from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation.paper_reference import paper_density_at
 from torchcover.simulation.ray_pattern import cast_pattern
 from torchcover.simulation.rays import Tile, into_tiles
-from torchcover.simulation.reference_sensor import Area, Areas, ReferenceScan, check_areas, check_reach
+from torchcover.simulation.reference_sensor import Area, Areas, ReferenceScan, WeightKind, check_areas, check_reach
 from torchcover.simulation.shell import position_in_shell
 from torchcover.simulation.surroundings import Surroundings
 
@@ -56,6 +56,7 @@ class EvenReference:
     """
 
     name: ClassVar[str] = "even"
+    weight_kind: ClassVar[WeightKind | None] = "density"
 
     areas: Areas
     rays: int

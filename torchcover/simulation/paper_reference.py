@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.simulation.ray_pattern import cast_pattern
 from torchcover.simulation.rays import Tile, into_tiles, unit_directions
-from torchcover.simulation.reference_sensor import Areas, ReferenceScan, check_reach
+from torchcover.simulation.reference_sensor import Areas, ReferenceScan, WeightKind, check_reach
 from torchcover.simulation.shell import position_in_shell
 from torchcover.simulation.surroundings import Surroundings
 
@@ -51,6 +51,7 @@ class PaperReference:
     """
 
     name: ClassVar[str] = "paper"
+    weight_kind: ClassVar[WeightKind | None] = None
 
     rows: int = 1024
     columns: int = 1024

@@ -48,6 +48,8 @@ class ReferenceSensor(Protocol):
 
     name: ClassVar[str]
     """What it is registered as, and what `--reference` and `summary.json` call it."""
+    weight_kind: ClassVar[WeightKind | None]
+    """What the weights of its points are; None if all of them count the same. The same in every scan."""
 
     @classmethod
     def from_rays(cls, areas: Areas, rays: int | None) -> Self:

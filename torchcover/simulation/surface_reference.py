@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation.patches import Bounds
-from torchcover.simulation.reference_sensor import Areas, ReferenceScan, check_areas, check_reach
+from torchcover.simulation.reference_sensor import Areas, ReferenceScan, WeightKind, check_areas, check_reach
 from torchcover.simulation.shell import position_in_shell
 from torchcover.simulation.sight import Sight, sight
 from torchcover.simulation.surface_points import SurfacePoints, SurfaceStrata
@@ -63,6 +63,7 @@ class SurfaceReference:
     """
 
     name: ClassVar[str] = "surface"
+    weight_kind: ClassVar[WeightKind | None] = "m2"
 
     areas: Areas
     rays: int = DEFAULT_RAYS
@@ -133,7 +134,7 @@ class SurfaceReference:
         return ReferenceScan(
             points=np.concatenate([found.points_m[look.seen] for found, look in looks]),
             weights=np.concatenate(weights).astype(np.float32),
-            weight_kind="m2",
+            weight_kind=self.weight_kind,
             rays=sum(len(found.points_m) for found, _ in looks),
             self_hits=sum(look.self_hits for _, look in looks),
             body_casts=sum(look.body_casts for _, look in looks),

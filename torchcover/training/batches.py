@@ -35,11 +35,7 @@ def sensor_of(frame: Frame, rig: str | None = None) -> Tensor:
     Raises:
         ValueError: The frame has no such rig, or several and none is named.
     """
-    if rig is None:
-        return frame.sensor
-    if rig not in frame.clouds:
-        raise ValueError(f"frame {frame.name!r} has no rig {rig!r}; it has {', '.join(frame.clouds)}")
-    return frame.clouds[rig]
+    return frame.sensor if rig is None else frame.cloud_of(rig)
 
 
 def frame_of(sensor: Tensor, reference: Tensor, name: object, vehicle_T_lidar: Tensor | None) -> Frame:

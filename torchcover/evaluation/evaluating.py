@@ -2,13 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 
+from torchcover.coverage import Aggregation
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
+from torchcover.evaluation.omissions import left_out
 from torchcover.evaluation.pipeline import observe
 from torchcover.evaluation.result import Result
-from torchcover.evaluation.rig_names import AnyRig
-from torchcover.evaluation.saved import are_saved, compare_saved
-from torchcover.evaluation.settings import Settings
-from torchcover.evaluation.target_error import TargetError, TargetWatch
+from torchcover.evaluation.rig_names import AnyRig, given_as
+from torchcover.evaluation.saved import compare_saved, saved_among
+from torchcover.evaluation.settings import AnyDevice, AnyThresholds, Settings
+from torchcover.evaluation.target_error import AnyTargetError, TargetWatch
 from torchcover.evaluation.task import AnyFrames, AnyScenario, Task, task_of
 
 Observers = Mapping[str, AnyObserver]
@@ -22,12 +24,13 @@ def evaluate(
     steps: int | None = None,
     seed: int = 0,
     cell_m: float = 0.25,
-    thresholds: Sequence[float] = (0.4,),
-    reference: str | None = None,
+    thresholds: AnyThresholds = (0.4,),
+    aggregations: Sequence[Aggregation] = (),
+    reference_sensor: str | None = None,
     rays: int | None = None,
     every_s: float | None = None,
-    target_error: TargetError | None = None,
-    device: str = "cpu",
+    target_error: AnyTargetError | None = None,
+    device: AnyDevice = "cpu",
     workers: int = 0,
     skip_bad_frames: bool = False,
     observers: Observers | None = None,
@@ -43,11 +46,13 @@ def evaluate(
         steps: Steps to simulate (64; with a target error at most, 4096), or frames to use at most (all).
         seed: Seed of the simulation.
         cell_m: Side of a grid cell in metres.
-        thresholds: Detection thresholds in metres.
-        reference: Reference sensor: "even" (if not given) or "paper".
-        rays: Its rays at each step (even: 262144; paper: 1048576, a square).
+        thresholds: Detection thresholds in metres, or a single one.
+        aggregations: Maps beside the mean of means, as in `CoverageMetric`.
+        reference_sensor: Name of the reference sensor, as in `torchcover.simulation.REFERENCE_SENSORS`; "even" if not
+            given. Numbers are by area for one whose points have square metres.
+        rays: Its rays at each step; as many as it does best with if not given.
         every_s: Time between two steps in seconds; 10 in traffic if not given, else the scenario's own step.
-        target_error: End once every number is this good.
+        target_error: End once every number is this good: a `TargetError`, "0.1%", or ["0.1%", "0.02m"].
         device: Where the search and the sums run: "cpu", "cuda", ...
         workers: Processes that make frames; 0 makes them in this one.
         skip_bad_frames: Skip and note frames that cannot be read, instead of ending with the first.
@@ -61,18 +66,20 @@ def evaluate(
     Raises:
         ValueError: Settings that make no sense, or not a single good frame.
         FileNotFoundError: An unknown name or file.
+        TypeError: A setting of a wrong kind.
 
     Example:
         >>> result = evaluate("front_roof_32", steps=2, cell_m=1.0, rays=1024)
         >>> result.coverage.counts["steps"], [row["region"] for row in result.summary][::2]
         (2, ['20m', '80m', '160m'])
     """
-    settings = Settings(
-        steps, seed, cell_m, tuple(thresholds), reference, rays, every_s, target_error, device, workers, skip_bad_frames
-    )
-    task = task_of([] if rig is None else [rig], scenario, frames, settings)
-    if len(task.clouds) > 1:
-        raise ValueError(f"{frames} holds the rigs {', '.join(task.clouds)}: say which, or compare them")
+    settings = Settings.among(locals())
+    named = [] if rig is None else [rig]
+    if saved_among(named):
+        raise ValueError(f"{rig} is measured already: read it by Coverage.load, or compare it with others")
+    task = task_of(named, scenario, frames, settings)
+    if len(task.rigs) > 1:
+        raise ValueError(f"{task.place} holds the rigs {', '.join(task.rigs)}: say which, or compare them")
     return _measured(task, settings, observers or {}, progress=progress)
 
 
@@ -84,12 +91,13 @@ def compare(
     steps: int | None = None,
     seed: int = 0,
     cell_m: float = 0.25,
-    thresholds: Sequence[float] = (0.4,),
-    reference: str | None = None,
+    thresholds: AnyThresholds = (0.4,),
+    aggregations: Sequence[Aggregation] = (),
+    reference_sensor: str | None = None,
     rays: int | None = None,
     every_s: float | None = None,
-    target_error: TargetError | None = None,
-    device: str = "cpu",
+    target_error: AnyTargetError | None = None,
+    device: AnyDevice = "cpu",
     workers: int = 0,
     skip_bad_frames: bool = False,
     observers: Observers | None = None,
@@ -107,7 +115,8 @@ def compare(
         seed: Seed.
         cell_m: Side of a grid cell in metres.
         thresholds: Detection thresholds in metres.
-        reference: Reference sensor.
+        aggregations: Maps beside the mean of means.
+        reference_sensor: Name of the reference sensor.
         rays: Its rays at each step.
         every_s: Time between two steps in seconds.
         target_error: End once every number, and every difference, is this good.
@@ -123,47 +132,64 @@ def compare(
     Raises:
         ValueError: Fewer than two rigs, or as `evaluate`.
         FileNotFoundError: An unknown name or file.
+        TypeError: A single rig, or a setting of a wrong kind.
     """
-    settings = Settings(
-        steps, seed, cell_m, tuple(thresholds), reference, rays, every_s, target_error, device, workers, skip_bad_frames
-    )
-    if are_saved(rigs):
-        _check_unset(scenario, frames, settings)
-        return compare_saved([str(rig) for rig in rigs])
+    settings = Settings.among(locals())
+    if isinstance(rigs, AnyRig):
+        raise TypeError(f"rigs: a list of two or more is needed; got {given_as(rigs)!r} (for one: `evaluate`)")
+    if saved := saved_among(rigs):
+        _check_saved_only(saved, rigs, observers, (scenario, frames), settings)
+        return compare_saved(saved)
     task = task_of(rigs, scenario, frames, settings)
-    if len(task.clouds) < 2:
-        raise ValueError(f"compare needs at least two rigs; got {next(iter(task.clouds))!r} only (for one: `evaluate`)")
+    if len(task.rigs) < 2:
+        raise ValueError(f"compare needs at least two rigs; got {task.rigs[0]!r} only (for one: `evaluate`)")
     return _measured(task, settings, observers or {}, progress=progress)
 
 
-def _check_unset(scenario: AnyScenario | None, frames: AnyFrames | None, settings: Settings) -> None:
-    if scenario is not None or frames is not None or settings != Settings():
-        raise ValueError("coverage files are measured already: leave out the scenario, the frames and their settings")
+def _check_saved_only(
+    saved: Sequence[str],
+    rigs: Sequence[AnyRig],
+    observers: Observers | None,
+    world: tuple[AnyScenario | None, AnyFrames | None],
+    settings: Settings,
+) -> None:
+    if len(saved) < len(rigs):
+        raise ValueError(
+            f"{', '.join(saved)}: coverage files are compared with coverage files only; `evaluate` the rigs in the "
+            "same frames first, and compare their files"
+        )
+    if observers or any(given is not None for given in world) or settings != Settings():
+        raise ValueError(
+            "coverage files are measured already: leave out the scenario, the frames, their settings and observers"
+        )
 
 
 def _measured(task: Task, settings: Settings, others: Observers, *, progress: bool) -> Result:
-    coverages = {name: CoverageObserver(settings.metric(), of) for name, of in task.clouds.items()}
-    regions, target = settings.regions, settings.target_error
+    frames, regions, target = task.frames, settings.regions, settings.target_error
+    observers = {name: CoverageObserver(settings.metric(frames.weight_kind), name) for name in task.rigs}
     run = observe(
-        task.frames,
-        [*coverages.values(), *others.values()],
+        frames,
+        [*observers.values(), *others.values()],
         steps=task.steps,
         workers=settings.workers,
         device=settings.device,
         skip_bad_frames=settings.skip_bad_frames,
-        until=TargetWatch(target, coverages, regions) if target else None,
+        until=TargetWatch(target, observers, regions) if target else None,
         progress=progress,
+        keep_partial=True,
     )
+    coverages = {name: observer.compute() for name, observer in observers.items()}
     return Result(
-        coverages={name: observer.compute() for name, observer in coverages.items()},
+        coverages=coverages,
         regions=regions,
         run=run,
         rigs=task.given,
         source=task.description,
-        reference=task.frames.reference,
+        reference_record=frames.reference_record,
         device=settings.device,
         target_error=target,
         sensors=task.sensors,
-        ego_outline_m=task.frames.ego_outline_m,
+        ego_outline_m=frames.ego_outline_m,
         observed={name: observer.compute() for name, observer in others.items()},
+        left_out=left_out(run.counts, list(coverages.values()), settings.aggregations),
     )

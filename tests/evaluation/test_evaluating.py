@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from matplotlib.figure import Figure
 
 import torchcover
 from torchcover import Coverage, Rig, Scenario
+from torchcover.coverage import Maximum
 from torchcover.data import Frame
 from torchcover.evaluation import TargetError
+from torchcover.evaluation.omissions import HEAVY
 
 SMALL = {"steps": 2, "cell_m": 4.0, "rays": 1024}
 
@@ -37,7 +40,8 @@ class Source:
     sensors = {}  # noqa: RUF012
     ego_outline_m = None
     description = {"scenario": None, "frames": "made up", "seed": None}  # noqa: RUF012
-    reference = None
+    weight_kind = None
+    reference_record = None
 
     def __len__(self):
         return 3
@@ -136,3 +140,115 @@ def test_the_only_rig_of_a_source_goes_by_the_name_of_the_sensors_it_is():
     assert list(result.coverages) == list(result.sensors) == ["kitti"]
     with pytest.raises(FileNotFoundError, match=r"neither a \.yaml file nor one of the built-in rigs"):
         torchcover.evaluate("no_such_rig", frames=Single())
+
+
+class Rigs:
+    """Which rigs an observer was shown."""
+
+    def __init__(self):
+        self.seen = set()
+
+    def update(self, frame):
+        self.seen.add(tuple(frame.clouds))
+
+    def compute(self):
+        return self.seen
+
+    def merge_state(self, other):
+        self.seen |= other.seen
+
+
+def test_observers_see_the_rigs_that_are_measured_under_their_names():
+    one = torchcover.evaluate("high", frames=Source(), cell_m=4.0, observers={"rigs": Rigs()})
+    assert one.observed["rigs"] == {("high",)}
+    named = torchcover.evaluate("kitti", frames=Single(), cell_m=4.0, steps=2, observers={"rigs": Rigs()})
+    assert named.observed["rigs"] == {("kitti",)}
+    both = torchcover.compare(["high", "low"], frames=Source(), cell_m=4.0, observers={"rigs": Rigs()})
+    assert both.observed["rigs"] == {("high", "low")}
+
+
+def test_a_rig_may_be_called_what_no_file_can_be(tmp_path):
+    rigs = [Rig.load("front_roof_32").model_copy(update={"name": name}) for name in ("a/b", "a b")]
+    result = torchcover.compare(rigs, **{**SMALL, "steps": 1})
+    result.save(tmp_path)
+    stems = [path.stem for path in sorted((tmp_path / "coverage").iterdir())]
+    assert len(stems) == 2
+    assert Coverage.load(tmp_path / "coverage" / f"{stems[0]}.npz").counts["steps"] == 1
+
+
+def test_settings_have_one_form_whatever_they_are_given_as():
+    result = torchcover.evaluate(
+        frames=Single(), cell_m=4.0, steps=1, thresholds=0.4, device=torch.device("cpu"), target_error="5%"
+    )
+    assert result.coverage.thresholds == (0.4,)
+    assert result.record["device"] == "cpu"
+    assert result.target_error == TargetError(detection=0.05)
+    json.dumps(result.record)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"steps": 0}, ValueError, "steps: at least 1 is needed; got 0"),
+        ({"steps": -1}, ValueError, "steps: at least 1 is needed; got -1"),
+        ({"thresholds": "0.4"}, TypeError, "thresholds: metres are needed, as in 0.4"),
+        ({"target_error": 0.1}, TypeError, "target error: numbers with their units"),
+        ({"aggregations": Maximum()}, TypeError, "aggregations: a sequence of objects"),
+        ({"frames": [1, 2]}, TypeError, "FrameSource is needed; got list; for a list of frames"),
+    ],
+)
+def test_what_a_setting_cannot_be_is_said_before_the_run(settings, error, message):
+    with pytest.raises(error, match=message):
+        torchcover.evaluate(**{"frames": Single(), "cell_m": 4.0, **settings})
+
+
+def test_a_single_rig_is_no_list_of_rigs():
+    with pytest.raises(TypeError, match="a list of two or more is needed; got 'front_roof_32'"):
+        torchcover.compare("front_roof_32")
+
+
+def test_aggregations_are_measured_drawn_and_saved(tmp_path):
+    result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1, aggregations=[Maximum()])
+    (quantity,) = [layer.quantity for layer in result.coverage.layers.values() if "maximum" in layer.quantity.key]
+    files = result.save(tmp_path)
+    assert f"{quantity.key}_ground" in {path.stem for path in files}
+    assert quantity.key in Coverage.load(tmp_path / "coverage.npz").layers
+    (kept_not,) = [omission.what for omission in result.left_out if "not kept" in omission.what]
+    assert Maximum.words not in kept_not
+
+
+def test_what_a_run_left_out_is_told_as_it_was_at_its_end(monkeypatch):
+    result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1)
+    before = result.record["left_out"]
+    for package in HEAVY:
+        monkeypatch.setitem(sys.modules, package, sys)
+    assert result.record["left_out"] == before
+
+
+def test_a_folder_of_results_is_of_one_run(tmp_path):
+    (tmp_path / "maps").mkdir()
+    for mine in ("notes.txt", "maps/notes.txt"):
+        (tmp_path / mine).write_text("mine")
+    torchcover.compare(frames=Source(), cell_m=8.0, thresholds=(0.4, 1.0)).save(tmp_path, error_maps=True)
+    files = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=2).save(tmp_path)
+    found = {path for path in tmp_path.rglob("*") if path.is_file()}
+    assert found == {*files, tmp_path / "notes.txt", tmp_path / "maps" / "notes.txt"}
+    torchcover.compare(frames=Source(), cell_m=8.0).save(tmp_path)
+    assert not (tmp_path / "coverage.npz").exists()
+
+
+def test_results_that_could_not_be_written_do_not_look_complete(tmp_path, monkeypatch):
+    result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=2)
+    result.save(tmp_path)
+    before = (tmp_path / "maps" / "radius_m_ground.png").read_bytes()
+
+    def full(self, path, **_):
+        path.write_bytes(b"half")
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(Figure, "savefig", full)
+    with pytest.raises(OSError, match="no space left"):
+        result.save(tmp_path)
+    assert not (tmp_path / "summary.json").exists()
+    assert (tmp_path / "maps" / "radius_m_ground.png").read_bytes() == before
+    assert not [path for path in tmp_path.rglob("*") if "partial" in path.name]
