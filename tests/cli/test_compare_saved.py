@@ -75,5 +75,5 @@ def test_what_is_measured_is_not_measured_again(torchcover, saved):
     code, _, complaint = torchcover("evaluate", file)
     assert (code, complaint.count("\n")) == (2, 1)
     assert "is measured already: read it by Coverage.load, or compare it" in complaint
-    with pytest.raises(ValueError, match="leave out .* observers"):
+    with pytest.raises(ValueError, match=r"leave out .* observers"):
         compare([file, file], observers={"any": object()})
