@@ -1,16 +1,13 @@
 """What the commands print."""
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 
-from torchcover.evaluation import Omission, Result, Study, StudyPlan, WorkPoint, study_table
-from torchcover.report import narrowest_width, print_table
+from torchcover.evaluation import Omission, Result, Study, StudyPlan, WorkPoint, stage_table, study_table
+from torchcover.report import narrowest_width, print_table, text_table
 
 
 def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:
@@ -31,7 +28,7 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
 def print_study(study: Study, out: Path) -> None:
     """The tables, and the settings that are recommended."""
     console, plan, floor = Console(), study.plan, study.floor
-    tables = study_table(study.points), _stage_table(study.stages)
+    tables = study_table(study.points), stage_table(study.stages)
     # Rather lines that are too long than numbers that are cut off.
     wide = Console(width=max(console.width, narrowest_width(tables)))
     for table in tables:
@@ -57,25 +54,10 @@ def advice(wanted: float, point: WorkPoint | None, plan: StudyPlan) -> str:
 
 
 def _explanation(omissions: Sequence[Omission]) -> Table:
-    table = Table(title="Left out, for this run did not need it", title_justify="left")
-    table.add_column("what")
-    for column in ("count", "of", "share"):
-        table.add_column(column, justify="right")
+    rows = []
     for omission in omissions:
         count, of = omission.count, omission.of
         numbers = ("", "", "") if count is None or of is None else (f"{count:,}", f"{of:,}", f"{count / of:.1%}")
-        table.add_row(Text(omission.what), *numbers)
-    return table
-
-
-def _stage_table(stages: Sequence[Mapping[str, Any]]) -> Table:
-    table = Table(title="One step: where the time goes", title_justify="left")
-    table.add_column("reference")
-    for column in ("rays", "step (ms)", "rays (%)", "search (%)", "binning (%)", "search by cdist (ms)"):
-        table.add_column(column, justify="right")
-    for stage in stages:
-        parts = [stage["rays_s"], stage["search_s"], stage["binning_s"]]
-        shares = [f"{100 * part / sum(parts):.0f}" for part in parts]
-        brute_force = "" if math.isnan(stage["cdist_s"]) else f"{1000 * stage['cdist_s']:.0f}"
-        table.add_row(stage["reference"], f"{stage['rays']:,}", f"{1000 * sum(parts):.0f}", *shares, brute_force)
-    return table
+        rows.append((omission.what, *numbers))
+    headings = ("what", "count", "of", "share")
+    return text_table(headings, [rows], title="Left out, for this run did not need it")

@@ -25,6 +25,7 @@ from .target_outcome import outcome as outcome
 from .work_points import WorkPoint as WorkPoint
 from .work_points import cheapest as cheapest
 from .work_points import pareto_front as pareto_front
+from .work_points import stage_table as stage_table
 from .work_points import study_records as study_records
 from .work_points import study_table as study_table
 from .work_points import work_panels as work_panels

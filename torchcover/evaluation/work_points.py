@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
 from types import MappingProxyType
+from typing import Any
 
 from rich.table import Table
 
@@ -120,6 +121,18 @@ def _row(point: WorkPoint, *, is_best: bool) -> list[str]:
         error_words(point.cell_radius_error_m, "m"),
         percent(point.known_share),
     ]
+
+
+def stage_table(stages: Sequence[Mapping[str, Any]]) -> Table:
+    """How a step of each setting divides into its parts; `Study.stages`."""
+    rows = []
+    for stage in stages:
+        parts = [stage["rays_s"], stage["search_s"], stage["binning_s"]]
+        shares = [f"{100 * part / sum(parts):.0f}" for part in parts]
+        brute_force = "" if math.isnan(stage["cdist_s"]) else f"{1000 * stage['cdist_s']:.0f}"
+        rows.append((stage["reference"], f"{stage['rays']:,}", f"{1000 * sum(parts):.0f}", *shares, brute_force))
+    headings = ("reference", "rays", "step (ms)", "rays (%)", "search (%)", "binning (%)", "search by cdist (ms)")
+    return text_table(headings, [rows], title="One step: where the time goes")
 
 
 def work_panels(points: Sequence[WorkPoint], floor: Mapping[str, float]) -> Iterator[WorkPanel]:
