@@ -55,6 +55,16 @@ def test_results_that_are_not_paired_are_refused(torchcover, worlds, saved, chan
     assert not (worlds / "out" / "summary.json").exists()
 
 
+@pytest.mark.parametrize("out", ["low", "low/.", "both"])
+def test_the_folder_of_what_is_compared_is_not_written_to(torchcover, worlds, saved, out):
+    """Its files would be those of an earlier run, and be deleted."""
+    files = saved("low"), saved("both")
+    code, _, complaint = torchcover("compare", *files, "--out", worlds / out)
+    assert (code, complaint.count("\n")) == (2, 1)
+    assert "which is compared, and would lose it; choose another folder" in complaint
+    assert all(file.is_file() for file in files)
+
+
 def test_what_is_no_pair_of_coverage_files_is_said(torchcover, worlds, saved):
     file = saved("low")
     (worlds / "rubbish.npz").write_bytes(b"PK")

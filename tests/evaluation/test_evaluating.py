@@ -227,14 +227,27 @@ def test_what_a_run_left_out_is_told_as_it_was_at_its_end(monkeypatch):
 
 def test_a_folder_of_results_is_of_one_run(tmp_path):
     (tmp_path / "maps").mkdir()
-    for mine in ("notes.txt", "maps/notes.txt"):
+    for mine in ("notes.txt", "maps/mine.png"):
         (tmp_path / mine).write_text("mine")
     torchcover.compare(frames=Source(), cell_m=8.0, thresholds=(0.4, 1.0)).save(tmp_path, error_maps=True)
     files = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=2).save(tmp_path)
     found = {path for path in tmp_path.rglob("*") if path.is_file()}
-    assert found == {*files, tmp_path / "notes.txt", tmp_path / "maps" / "notes.txt"}
+    assert found == {*files, tmp_path / "notes.txt", tmp_path / "maps" / "mine.png"}
+    listed = json.loads((tmp_path / "summary.json").read_text())["files"]
+    assert {tmp_path / name for name in listed} == {*files} - {tmp_path / "summary.json"}
     torchcover.compare(frames=Source(), cell_m=8.0).save(tmp_path)
     assert not (tmp_path / "coverage.npz").exists()
+
+
+@pytest.mark.parametrize("names", [["../mine.txt"], ["/mine.txt"], [3, None], "mine.txt", None])
+def test_a_summary_that_lists_others_deletes_nothing(tmp_path, names):
+    (tmp_path / "mine.txt").write_text("mine")
+    out = tmp_path / "out"
+    out.mkdir()
+    named = [str(tmp_path / name) if name == "/mine.txt" else name for name in names] if names else names
+    (out / "summary.json").write_text(json.dumps({"files": named}))
+    torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1).save(out)
+    assert (tmp_path / "mine.txt").read_text() == "mine"
 
 
 def test_results_that_could_not_be_written_do_not_look_complete(tmp_path, monkeypatch):

@@ -1,6 +1,5 @@
 """What an evaluation gives: numbers, maps and files of one rig or several. All that `report` is asked for is here."""
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -18,8 +17,7 @@ from torchcover.evaluation.result_files import ResultFiles
 from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.evaluation.target_error import TargetError
 from torchcover.evaluation.target_outcome import outcome
-from torchcover.report import RENDERERS, CoverageTable, map_figures, table_dict
-from torchcover.report.maps.figures import file_stems
+from torchcover.report import RENDERERS, CoverageTable, file_stems, map_figures, table_dict
 from torchcover.simulation import Sensor
 
 # What `summary.json` says of how the run went.
@@ -43,6 +41,7 @@ class Result:
         ego_outline_m: (K, 2) corners x, y of the ego in metres, for the maps.
         observed: What the user's own observers computed, by their names.
         left_out: What the run left out because the scene did not need it.
+        inputs: Coverage files that it was made from.
     """
 
     coverages: Mapping[str, Coverage]
@@ -57,6 +56,7 @@ class Result:
     ego_outline_m: NDArray[Any] | None = None
     observed: Mapping[str, Any] = field(default_factory=dict)
     left_out: Sequence[Omission] = ()
+    inputs: Sequence[Path] = ()
 
     @property
     def coverage(self) -> Coverage:
@@ -123,20 +123,26 @@ class Result:
 
         Args:
             folder: Where to write: `coverage.npz`, or `coverage/RIG.npz` for several; `summary.csv`, `maps/STEM.png`,
-                `summary.json`. Made if it does not exist. Other coverage files and maps in these places, of an earlier
-                run, are deleted.
+                `summary.json`. Made if it does not exist. Files of an earlier run that this one does not write are
+                deleted: those that its `summary.json` lists.
             error_maps: Whether to draw maps of the standard errors too.
 
         Returns:
             The files.
+
+        Raises:
+            ValueError: The folder is that of a file which is compared.
         """
+        for path in self.inputs:
+            if path.resolve().parent in (Path(folder).resolve(), Path(folder).resolve() / "coverage"):
+                raise ValueError(f"{folder}: holds {path}, which is compared, and would lose it; choose another folder")
         with ResultFiles(Path(folder)) as files:
             for name, coverage in self._coverage_files.items():
                 files.add(name, coverage.save)
             files.add("summary.csv", lambda path: path.write_text(RENDERERS["csv"](self.table), encoding="utf-8"))
             for stem, figure in self.maps(errors=error_maps):
                 files.add(f"maps/{stem}.png", partial(_draw, figure))
-            files.finish(json.dumps(self.record, indent=2, allow_nan=False) + "\n")
+            files.finish(self.record)
         return files.paths
 
     @property

@@ -1,23 +1,22 @@
 """A folder of results: it is of one run only, and `summary.json` says that it is complete."""
 
+import json
 import os
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Mapping
+from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 # Written last, and taken away first: without it the folder is not complete.
 SUMMARY = "summary.json"
-# What an earlier run may have left that the next does not write.
-MAYBE_LEFT_OVER = ("coverage.npz", "coverage/*.npz", "maps/*.png")
 
 
 class ResultFiles:
     """Writes the files of a run into a folder, each of them whole or not at all. A context manager.
 
-    Files of an earlier run that this one does not write are deleted at the end: `coverage.npz`, `coverage/*.npz` and
-    `maps/*.png`. If it is left by an error, they stay, and there is no `summary.json`.
+    What an earlier run has written here, as its `summary.json` lists it, and this one does not write, is deleted at the
+    end. If it is left by an error, that stays, and there is no `summary.json`.
 
     Args:
         folder: Where to write; made if it does not exist.
@@ -26,6 +25,7 @@ class ResultFiles:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.paths: list[Path] = []
+        self._earlier = _listed(folder / SUMMARY)
 
     def __enter__(self) -> Self:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -48,14 +48,26 @@ class ResultFiles:
         os.replace(partial, path)
         self.paths.append(path)
 
-    def finish(self, summary: str) -> None:
-        """Delete what is left of an earlier run, and write `summary.json`."""
-        for pattern in MAYBE_LEFT_OVER:
-            for path in set(self.folder.glob(pattern)).difference(self.paths):
+    def finish(self, record: Mapping[str, Any]) -> None:
+        """Delete what is left of an earlier run, and write `summary.json`: the record, and the names of all files."""
+        names = [path.relative_to(self.folder).as_posix() for path in self.paths]
+        for path in {self.folder / name for name in self._earlier}.difference(self.paths):
+            if path.is_file():
                 path.unlink()
-        self.add(SUMMARY, lambda path: path.write_text(summary, encoding="utf-8"))
+        text = json.dumps({**record, "files": names}, indent=2, allow_nan=False) + "\n"
+        self.add(SUMMARY, lambda path: path.write_text(text, encoding="utf-8"))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
     ) -> None:
         self._partial.cleanup()
+
+
+def _listed(summary: Path) -> list[str]:
+    """The files that an earlier run lists; none where there is no such list. Nothing outside of the folder is in it."""
+    try:
+        names = json.loads(summary.read_text(encoding="utf-8"))["files"]
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
+    paths = [PurePosixPath(name) for name in names if isinstance(name, str)] if isinstance(names, list) else []
+    return [str(path) for path in paths if not path.is_absolute() and ".." not in path.parts]

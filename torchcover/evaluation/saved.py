@@ -45,6 +45,7 @@ def compare_saved(files: Sequence[str | Path]) -> Result:
         source={"scenario": None, "frames": None, "seed": None},
         reference_record=None,
         device=None,
+        inputs=[Path(file) for file in files],
     )
 
 
