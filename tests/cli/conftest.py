@@ -42,3 +42,10 @@ def worlds(tmp_path):
         "  - {name: b, category: far, shape: {type: box, size_m: [4, 2, 1]}, pose: {x_m: 1000, y_m: 100}}\n"
     )
     return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def _maps(request):
+    """Blank, unless a test asks for `drawn_maps`: what is on them is the business of tests/report."""
+    if "drawn_maps" not in request.fixturenames:
+        request.getfixturevalue("blank_maps")

@@ -27,7 +27,7 @@ def recording(tmp_path):
     return folder
 
 
-def test_a_recording_is_evaluated_and_the_files_agree(torchcover, recording, tmp_path):
+def test_a_recording_is_evaluated_and_the_files_agree(drawn_maps, torchcover, recording, tmp_path):
     out = tmp_path / "out"
     code, printed, _ = torchcover("evaluate", "--frames", recording, "--out", out, "--threshold", 0.4, "--threshold", 1)
     assert code == 0

@@ -5,8 +5,7 @@ import json
 import pytest
 
 from torchcover.cli.printing import advice
-from torchcover.evaluation import StudyPlan
-from torchcover.report import WorkPoint
+from torchcover.evaluation import StudyPlan, WorkPoint
 
 
 def test_a_small_study_writes_a_table_a_diagram_and_an_advice(torchcover, tmp_path):

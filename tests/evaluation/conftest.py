@@ -18,3 +18,10 @@ def frame_of():
         return Frame(clouds, reference, index, f"f{index}", counts={"seen": index}, reference_weights=weights)
 
     return make
+
+
+@pytest.fixture(autouse=True)
+def _maps(request):
+    """Blank, unless a test asks for `drawn_maps`: what is on them is the business of tests/report."""
+    if "drawn_maps" not in request.fixturenames:
+        request.getfixturevalue("blank_maps")
