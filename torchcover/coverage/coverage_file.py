@@ -5,53 +5,70 @@ no step of theirs has probed, are lists of what was probed.
 """
 
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import Quantity
 
-if TYPE_CHECKING:
-    from torchcover.coverage.result import Coverage
-
 FORMAT_VERSION = 3
 Arrays = dict[str, NDArray[Any]]
 
 
-def write_coverage(coverage: "Coverage", path: Path) -> None:
-    """Write a coverage to one compressed file."""
-    grid = coverage.grid
+class CoverageParts(TypedDict):
+    """What a `Coverage` is made of: the arguments of its constructor."""
+
+    grid: BevGrid
+    thresholds: Sequence[float]
+    max_radius: float
+    probed_steps: Tensor
+    points: Tensor
+    layers: Sequence[Layer]
+    counts: Mapping[str, int]
+    blocks: Blocks | None
+    area: AreaSums | None
+
+
+def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Path) -> None:
+    """Write a coverage to one compressed file.
+
+    Args:
+        parts: All that is read again.
+        errors: Maps of standard errors by the key of their quantity, for NumPy users.
+        path: The file.
+    """
+    grid, blocks, area = parts["grid"], parts["blocks"], parts["area"]
     header = {
         "format": FORMAT_VERSION,
         "grid": {"x": grid.x, "y": grid.y, "cell": grid.cell, "heights": dict(grid.heights)},
-        "thresholds": coverage.thresholds,
-        "max_radius": coverage.max_radius,
-        "layers": [asdict(layer.quantity) for layer in coverage.layers.values()],
-        "counts": coverage.counts,
-        "blocks": 1 if coverage.blocks is None else len(coverage.blocks.steps),
-        "square_metres": coverage.area is not None,
+        "thresholds": parts["thresholds"],
+        "max_radius": parts["max_radius"],
+        "layers": [asdict(layer.quantity) for layer in parts["layers"]],
+        "counts": parts["counts"],
+        "blocks": 1 if blocks is None else len(blocks.steps),
+        "square_metres": area is not None,
     }
-    tensors = {"probed_steps": coverage.probed_steps, "points": coverage.points}
-    tensors |= {key: layer.values for key, layer in coverage.layers.items()}
-    tensors |= {f"{key}_error": error for key, error in coverage.errors.items()}
+    tensors = {"probed_steps": parts["probed_steps"], "points": parts["points"]}
+    tensors |= {layer.quantity.key: layer.values for layer in parts["layers"]}
+    tensors |= {f"{key}_error": error for key, error in errors.items()}
     arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
-    if coverage.blocks is not None:
-        arrays |= _listed(coverage.blocks)
-    if coverage.area is not None:
-        arrays |= _listed_area(coverage.area)
+    arrays |= {} if blocks is None else _listed(blocks)
+    arrays |= {} if area is None else _listed_area(area)
     with path.open("wb") as file:
         np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
 
 
-def read_coverage(path: Path) -> dict[str, Any]:
-    """Read what `write_coverage` wrote: the arguments of `Coverage`.
+def read_coverage(path: Path) -> CoverageParts:
+    """Read what `write_coverage` wrote.
 
     Raises:
         FileNotFoundError: No such file.
@@ -71,7 +88,7 @@ def read_coverage(path: Path) -> dict[str, Any]:
     return parts
 
 
-def _parts(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
+def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
     stored = header["grid"]
     heights = {name: (band[0], band[1]) for name, band in stored["heights"].items()}
     grid = BevGrid(x=tuple(stored["x"]), y=tuple(stored["y"]), cell=stored["cell"], heights=heights)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchcover.coverage.aggregations import MeanOfMeans
 from torchcover.coverage.blocks import AreaSums, Blocks
-from torchcover.coverage.coverage_file import read_coverage, write_coverage
+from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
 from torchcover.coverage.errors import cell_errors
 from torchcover.coverage.estimate import (
     Estimator,
@@ -211,7 +211,18 @@ class Coverage:
 
         What `load` gives back has the same numbers, errors and differences to the last bit.
         """
-        write_coverage(self, Path(path))
+        parts: CoverageParts = {
+            "grid": self.grid,
+            "thresholds": self.thresholds,
+            "max_radius": self.max_radius,
+            "probed_steps": self.probed_steps,
+            "points": self.points,
+            "layers": list(self.layers.values()),
+            "counts": self.counts,
+            "blocks": self.blocks,
+            "area": self.area,
+        }
+        write_coverage(parts, self.errors, Path(path))
 
     @classmethod
     def load(cls, path: str | Path) -> "Coverage":
