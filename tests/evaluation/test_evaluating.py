@@ -194,7 +194,7 @@ def test_settings_have_one_form_whatever_they_are_given_as():
         ({"thresholds": "0.4"}, TypeError, "thresholds: metres are needed, as in 0.4"),
         ({"target_error": 0.1}, TypeError, "target error: numbers with their units"),
         ({"aggregations": Maximum()}, TypeError, "aggregations: a sequence of objects"),
-        ({"frames": [1, 2]}, TypeError, "FrameSource is needed; got list; for a list of frames"),
+        ({"frames": [1, 2]}, TypeError, "FrameSource is needed; got list, which has no rigs, "),
     ],
 )
 def test_what_a_setting_cannot_be_is_said_before_the_run(settings, error, message):
@@ -265,3 +265,11 @@ def test_results_that_could_not_be_written_do_not_look_complete(tmp_path, monkey
     assert not (tmp_path / "summary.json").exists()
     assert (tmp_path / "maps" / "radius_m_ground.png").read_bytes() == before
     assert not [path for path in tmp_path.rglob("*") if "partial" in path.name]
+
+
+def test_a_source_that_lacks_something_is_told_what():
+    class Unfinished(Single):
+        weight_kind = property()  # raises AttributeError, as what is not there does
+
+    with pytest.raises(TypeError, match="got Unfinished, which has no weight_kind; for a list"):
+        torchcover.evaluate(frames=Unfinished(), cell_m=8.0)

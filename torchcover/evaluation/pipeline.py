@@ -85,7 +85,9 @@ def observe(
     title: str = "steps",
     keep_partial: bool = False,
 ) -> Run:
-    """Feed observers with frames. However the run ends, all of them have seen the same frames.
+    """Feed observers with frames. If a bad frame or Ctrl-C ends the run, all of them have seen the same frames.
+
+    What an observer itself raises ends the run as it is, and those before it have seen one frame more.
 
     Args:
         frames: A source of frames, or any map-style dataset or list of them.
@@ -109,12 +111,18 @@ def observe(
         KeyboardInterrupt: Ctrl-C.
 
     Example:
-        >>> class Names(list):
+        >>> class Names:
+        ...     def __init__(self):
+        ...         self.seen = []
         ...     def update(self, frame):
-        ...         self.append(frame.name)
+        ...         self.seen.append(frame.name)
+        ...     def compute(self):
+        ...         return self.seen
+        ...     def merge_state(self, other):
+        ...         self.seen += other.seen
         >>> frames = [Frame({"rig": torch.rand(9, 3)}, torch.rand(9, 3), index, f"f{index}") for index in range(3)]
         >>> names = Names()
-        >>> observe(frames, [names], steps=2).steps, names
+        >>> observe(frames, [names], steps=2).steps, names.compute()
         (2, ['f0', 'f1'])
     """
     run, observers = Run(), list(observers)

@@ -16,7 +16,7 @@ DEFAULT_REFERENCE = "even"
 DEFAULT_STEPS = 64
 # With a target error; as many as the paper averages.
 MAX_STEPS = 4096
-# A world is built once a minute of traffic, for about the price of eight steps: docs/accuracy.md has the trade.
+# Steps that follow each other are alike (docs/measured/error_bars.md), and every minute is another city.
 EVERY_S_IN_TRAFFIC = 10.0
 # For standard errors: at least half as many are in use at the end of a long run.
 BLOCKS = 16

@@ -62,9 +62,11 @@ def task_of(rigs: Sequence[AnyRig], scenario: AnyScenario | None, frames: AnyFra
     settings.check_recording()
     source = open_recording(frames) if isinstance(frames, str | Path) else frames
     if not isinstance(source, FrameSource):
+        missing = [name for name in vars(FrameSource) if not name.startswith("_") and not hasattr(source, name)]
         raise TypeError(
-            f"frames: a recording's path or a torchcover.data.FrameSource is needed; got {type(source).__name__}; for "
-            "a list of frames, or a dataset, feed observers: torchcover.evaluation.observe(frames, observers)"
+            f"frames: a recording's path or a torchcover.data.FrameSource is needed; got {type(source).__name__}, "
+            f"which has no {', '.join(missing)}; for a list of frames, or a dataset, feed observers: "
+            "torchcover.evaluation.observe(frames, observers)"
         )
     return _recording(rigs, source, settings)
 
