@@ -52,21 +52,23 @@ def main():
         for lidar in (SPINNING, SOLID_STATE, ACCUMULATED):
             generator = np.random.default_rng([options.seed, index, lidar.columns])
             add_step(sums, lidar, *recorded_and_true(frames, index, lidar, generator), sensor)
-    rows = []
+    rows, true = [], []
     for reference in dict.fromkeys(reference for reference, _, _ in sums):
         truth = sums[reference, "truth", 1].ratio()
         for name in dict.fromkeys(name for of, name, _ in sums if of == reference and name != "truth"):
             full, quarter = (sums[reference, name, every].ratio() for every in (1, 2))
             rows.append((reference, name, *distance(full, truth), distance(quarter, full)[0]))
-    table(("reference", "weights", "rms", "worst", "rms move at a quarter of the points"), rows)
+        true.append((reference, *(f"{100 * detection:.0f} % / {radius_m:.2f} m" for radius_m, detection in truth)))
+    table(("reference", "estimator", "rms", "worst", "rms move at a quarter of the points"), rows)
+    print()
+    table(("the truth", *(f"{region.name} {height}" for region in REGIONS for height in GRID.heights)), true)
     print()
     flat_ground(options.rig)
 
 
-def flat_ground(rig, cuts=200_000):
+def flat_ground(rig, cuts=20_000):
     """Straight ahead on flat ground: the rings of a reference, each with the exact ground that it stands for."""
-    (tested,) = Rig.load(rig).sensors
-    met_m, rows = np.sort(rings_m(tested)), []
+    met_m, rows = np.concatenate([rings_m(lidar) for lidar in Rig.load(rig).sensors]), []
     for lidar in (SPINNING, SOLID_STATE):
         probed_m = np.sort(rings_m(lidar))
         for region in REGIONS:
