@@ -116,6 +116,7 @@ def test_the_bands_of_loggers_are_those_of_the_measure():
     assert [name for name, _ in band_figures(two_cells())] == ["radius_area_m", "detection_area_0.4m"]
 
 
+@pytest.mark.usefixtures("blank_maps")
 def test_errors_and_differences_are_those_of_the_measure(surface_pair):
     names = [name for name, _ in map_figures(surface_pair, errors=True)]
     assert len(names) == 2 * 2 * 3

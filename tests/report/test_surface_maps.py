@@ -130,6 +130,8 @@ def test_open_ground_is_opaque_in_squares_that_the_grid_cuts_off_too():
     for side in (1, 2, 4, 8):
         opacity = opacity_of(sums_of(ground), 10, torch.full((1, 5, 5), side), CELL_M)
         torch.testing.assert_close(opacity, torch.ones_like(opacity), rtol=1e-12, atol=0)
+        quarter = opacity_of(sums_of(ground / 4), 10, torch.full((1, 5, 5), side), CELL_M)
+        torch.testing.assert_close(quarter, torch.full_like(quarter, (1 + FAINTEST) / 2), rtol=1e-12, atol=0)
 
 
 def test_errors_are_those_of_cells_where_squares_are_cells(coverage, sides):
