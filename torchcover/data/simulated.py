@@ -149,7 +149,7 @@ class SimulatedFrames(Dataset[Frame]):
             index=index,
             name=f"{self.scenario.name} step {index}",
             counts=seen.counts,
-            boxes=_boxes(self.simulator.labels(index), clouds) if self.boxes else None,
+            boxes=_boxes(self.simulator.labels(index), clouds, seen.drawn) if self.boxes else None,
         )
 
 
@@ -167,13 +167,14 @@ def _load(rig: Rig | str | Path) -> Rig:
     return rig if isinstance(rig, Rig) else Rig.load(rig)
 
 
-def _boxes(found: Sequence[Label], clouds: Mapping[str, torch.Tensor]) -> Boxes:
+def _boxes(found: Sequence[Label], clouds: Mapping[str, torch.Tensor], drawn: NDArray[np.int64] | None) -> Boxes:
     rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
     boxes = Boxes.from_rows(
         torch.tensor(rows, dtype=torch.float32).view(-1, 7),
         velocity_mps=torch.tensor(np.array([label.velocity_mps for label in found]), dtype=torch.float32).view(-1, 2),
         ids=tuple(label.name for label in found),
         categories=tuple(label.category for label in found),
+        drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
     )
     inside = {name: points_in_boxes(cloud, boxes).box for name, cloud in clouds.items()}
     return replace(boxes, hits={name: torch.bincount(box, minlength=len(boxes)) for name, box in inside.items()})
