@@ -157,6 +157,15 @@ def test_an_object_that_turns_only_its_inner_side_to_a_place_hides_itself():
     assert sight(instant, place_m, drawn.points_m - np.float32(1e-3) * drawn.normals).seen.all()
 
 
+def test_an_object_of_any_size_is_cut_whole():
+    huge = Patches.of(Plane(type="plane", size_m=(1e6, 10.0)).mesh())
+    assert len(huge.outward) < 10_000
+    assert np.linalg.norm(huge.normals_m2.astype(np.float64), axis=0).sum() / 2 == pytest.approx(1e7, rel=1e-5)
+    assert max(np.abs(huge.first_m).max(), np.abs(huge.second_m).max()) <= 1e6 / 64
+    car = Patches.of(Box(type="box", size_m=(18.0, 2.5, 4.0)).mesh())
+    assert max(np.linalg.norm(edges, axis=0).max() for edges in (car.first_m, car.second_m)) <= 4.0
+
+
 LIDAR = {
     "type": "lidar", "name": "top", "mount": {"z_m": 1.9}, "channels": 32, "vertical_fov_deg": (-30, 5),
     "horizontal_fov_deg": 180, "columns": 720, "max_range_m": 120,

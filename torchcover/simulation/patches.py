@@ -14,8 +14,10 @@ Float64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Int32 = NDArray[np.int32]
 
-# No edge of a patch is longer.
+# No edge of a patch is longer,
 LONGEST_M = 4.0
+# except where all of a mesh is wanted, however large it is: then this share of its extent may be.
+LONGEST_SHARE = 1 / 64
 # A triangle with less area is a line: no point will ever be drawn from it.
 SMALLEST_M2 = 1e-10
 
@@ -54,9 +56,10 @@ class Patches(NamedTuple):
 
         Args:
             mesh: Any, of no object; faces without an area are left out.
-            bounds: What lies outside of these boxes is left out.
+            bounds: What lies outside of these boxes is left out; all is wanted if not given.
         """
-        triangles, face = _cut(mesh.vertices_m[mesh.faces], bounds)
+        extent_m = 0.0 if bounds is not None else float(np.ptp(mesh.vertices_m, axis=0).max())
+        triangles, face = _cut(mesh.vertices_m[mesh.faces], bounds, max(LONGEST_M, LONGEST_SHARE * extent_m))
         corner, second, third = triangles.transpose(1, 2, 0)
         first_m, second_m = (second - corner).astype(np.float32), (third - corner).astype(np.float32)
         nobodys = np.full(len(face), -1, dtype=np.int32)
@@ -105,7 +108,7 @@ class Patches(NamedTuple):
         return normals
 
 
-def _cut(triangles: Float64, bounds: Bounds | None) -> tuple[Float64, NDArray[np.int64]]:
+def _cut(triangles: Float64, bounds: Bounds | None, longest_m: float) -> tuple[Float64, NDArray[np.int64]]:
     """(N, 3, 3) triangles with short edges, and (N,) of which one of those given each is a part."""
     face, done, done_face = np.arange(len(triangles)), [np.empty((0, 3, 3))], [np.empty(0, dtype=np.int64)]
     while len(triangles):
@@ -114,7 +117,7 @@ def _cut(triangles: Float64, bounds: Bounds | None) -> tuple[Float64, NDArray[np
             kept &= bounds.meet(triangles.min(axis=1), triangles.max(axis=1))
         triangles, face = triangles[kept], face[kept]
         edges_m = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
-        small = (edges_m <= LONGEST_M).all(axis=1)
+        small = (edges_m <= longest_m).all(axis=1)
         done.append(triangles[small])
         done_face.append(face[small])
         triangles, face = _halved(triangles[~small], edges_m[~small].argmax(axis=1)), np.tile(face[~small], 2)
