@@ -68,14 +68,9 @@ def thinned(cloud):
 
 def simulate(steps, seed, reference, name, keep_clouds):
     """Frames with both rigs, 4 from each drive of a minute; `network RIG` is what the detector is fed."""
+    rigs = {rig: rig for rig in RIGS}
     frames = SimulatedFrames(
-        "urban",
-        rigs={rig: rig for rig in RIGS},
-        steps=steps,
-        seed=seed,
-        every_s=15.0,
-        reference_sensor=reference,
-        boxes=True,
+        "urban", rigs=rigs, steps=steps, seed=seed, every_s=15.0, reference_sensor=reference, boxes=True
     )
     kept = []
     for index in track(range(steps), description=f"simulating {name}"):
@@ -256,7 +251,7 @@ class Training(lightning.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def train(rig, training_frames, validation_frames, visibility, options, console):
+def train(rig, training_frames, validation_frames, options, console):
     """Train one rig's detector; its module, and its coverage by region."""
     lightning.seed_everything(options.seed, verbose=False)
     loaders = [
@@ -267,6 +262,10 @@ def train(rig, training_frames, validation_frames, visibility, options, console)
     # As many blocks as drives, with the defaults: errors of drives that know nothing of each other.
     metric = CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=16, square_metres=True)
     coverage = CoverageCallback(metric, regions=REGIONS, rig=rig, fixed_frames=True)
+    visibility = {
+        f.index: box_visibility(f.clouds[rig], f.reference, f.boxes, reference_weights=f.reference_weights)
+        for f in validation_frames
+    }
     module = Training(rig, visibility, steps=options.epochs * len(loaders[0]), seed=options.seed)
     profiler = SimpleProfiler(dirpath=options.out, filename=f"profile-{rig}")
     trainer = lightning.Trainer(
@@ -400,13 +399,7 @@ def main():
     validation_frames = simulate(options.validate, options.seed + 1, surface, "validation frames", keep_clouds=True)
     results = {}
     for rig in RIGS:
-        visibility = {
-            frame.index: box_visibility(
-                frame.clouds[rig], frame.reference, frame.boxes, reference_weights=frame.reference_weights
-            )
-            for frame in validation_frames
-        }
-        results[rig] = train(rig, training_frames, validation_frames, visibility, options, console)
+        results[rig] = train(rig, training_frames, validation_frames, options, console)
     report(results, console)
     draw(results, options.out / "detector.png")
     console.print(f"Wrote {options.out / 'detector.png'} and event files for TensorBoard beside it")
