@@ -71,6 +71,7 @@ def test_exr_without_its_package(tmp_path, monkeypatch):
             raise ImportError(name)
         return plain(name, *args, **kwargs)
 
+    (tmp_path / "depth.exr").write_bytes(b"v/1")
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ImportError, match=r"torchcover\[exr\]"):
         read_depth(tmp_path / "depth.exr")
