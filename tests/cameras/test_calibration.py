@@ -140,7 +140,7 @@ def test_kitti_places_the_camera_through_the_lidar(tmp_path):
     pose[:3, 3] = [0.76, 0.0, 1.73]
     camera = Camera.from_kitti(tmp_path / "c.txt", 0, width=640, height=480, vehicle_T_lidar=pose)
     np.testing.assert_allclose(camera.vehicle_T_camera, pose)
-    with pytest.raises(ValueError, match=r"P2 with 12 numbers is needed; the file holds P0, Tr"):
+    with pytest.raises(ValueError, match=r"P2 with 12 numbers is needed; got nothing; the file holds P0, Tr"):
         Camera.from_kitti(tmp_path / "c.txt", 2, width=640, height=480)
 
 

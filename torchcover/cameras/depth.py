@@ -149,11 +149,11 @@ def _read_exr(path: Path) -> NDArray[Any]:
     # The header alone first: with the pixels, memory is reserved for as many as it claims.
     with OpenEXR.File(str(path), header_only=True) as file:
         headers = [file.header(part) for part in range(len(file.parts))]
-    channels = [channel.name for header in headers for channel in header["channels"]]
-    if len(channels) != 1:
-        raise ValueError(f"a depth EXR has one channel; got {', '.join(channels)[:80] or 'none'}")
-    low, high = headers[0]["dataWindow"]
-    width, height = (int(last) - int(first) + 1 for first, last in zip(low, high, strict=True))
+        channels = [channel.name for header in headers for channel in header["channels"]]
+        if len(channels) != 1:
+            raise ValueError(f"a depth EXR has one channel; got {', '.join(channels)[:80] or 'none'}")
+        low, high = headers[0]["dataWindow"]
+        width, height = (int(last) - int(first) + 1 for first, last in zip(low, high, strict=True))
     check_memory(width * height * _BYTES_PER_PIXEL)
     with OpenEXR.File(str(path)) as file:
         # It prints what is wrong with the pixels, and leaves them out.

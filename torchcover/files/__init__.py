@@ -1,7 +1,7 @@
-"""What every reader of a file shares: its door, the one kind of error, the memory that a file may take, NumPy's files."""
+"""What every reader of a file shares: its door, its error, the memory it may take, and NumPy's files."""
 
 from torchcover.files.bad_file import BadFileError, naming, reads
-from torchcover.files.budget import check_memory
+from torchcover.files.budget import TooLargeError, check_memory
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, read_npy, read_npz
 from torchcover.files.text import decode, read_short_text
 
@@ -9,6 +9,7 @@ __all__ = [
     "DEFLATE_MAX_RATIO",
     "BadFileError",
     "NpyHeader",
+    "TooLargeError",
     "check_memory",
     "decode",
     "naming",

@@ -4,9 +4,13 @@ import math
 import os
 
 VARIABLE = "TORCHCOVER_MAX_FILE_GB"
-# A LiDAR's scan takes megabytes, a saved result of the command line's grid 0.4 GB. Compressed, either fits in a
-# file of a thousandth of its size, and so does a bomb.
-DEFAULT_GB = 1.0
+# A scan takes megabytes; a saved result with eight thresholds in the command line's grid, which is much, twice a
+# thousand of them.
+DEFAULT_GB = 2.0
+
+
+class TooLargeError(ValueError):
+    """Reading a file takes more memory than one may take."""
 
 
 def check_memory(needed_bytes: int) -> None:
@@ -16,7 +20,7 @@ def check_memory(needed_bytes: int) -> None:
         needed_bytes: What reading it takes at its largest, the file's own bytes included where they are held.
 
     Raises:
-        ValueError: More than 1 GB, or than the environment variable TORCHCOVER_MAX_FILE_GB says.
+        TooLargeError: More than 2 GB, or than the environment variable TORCHCOVER_MAX_FILE_GB says.
 
     Example:
         >>> check_memory(16 * 100_000)  # a scan
@@ -24,7 +28,7 @@ def check_memory(needed_bytes: int) -> None:
     allowed_gb = _allowed_gb()
     if needed_bytes > allowed_gb * 1e9:
         needed_gb = f"{needed_bytes / 1e9:.3g}" if needed_bytes < 10**300 else "endless"
-        raise ValueError(
+        raise TooLargeError(
             f"reading it takes {needed_gb} GB of memory, more than the {allowed_gb:g} GB that one file may take; "
             f"use a smaller one, or set the environment variable {VARIABLE}"
         )

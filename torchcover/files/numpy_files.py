@@ -81,7 +81,7 @@ def read_npz(
             wanted = {name: members[name] for name in choose(members)}
             for member in wanted.values():
                 _check_growth(archive, member)
-            check_memory(2 * sum(member.file_size for member in wanted.values()))
+            check_memory(sum(member.file_size for member in wanted.values()))
             return {
                 name: _load(partial(archive.open, member), member.file_size, check) for name, member in wanted.items()
             }
@@ -116,7 +116,7 @@ def _load(open_stream: Callable[[], IO[bytes]], size_bytes: int, check: Callable
     claimed_bytes = math.prod(shape) * dtype.itemsize
     if claimed_bytes != data_bytes:
         raise ValueError(f"the header claims {shape} {dtype} = {claimed_bytes} bytes; {data_bytes} bytes follow it")
-    check_memory(2 * claimed_bytes)
+    check_memory(2 * claimed_bytes)  # whoever takes some columns copies them
     with open_stream() as stream, _quiet():
         array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
     return array
