@@ -277,9 +277,7 @@ def _read_table(path: Path, keys: Sequence[str]) -> list[dict[str, Any]]:
     return rows
 
 
-def _distorted(
-    name: str, size: tuple[int, int], matrix: ArrayLike, model: str, coefficients: Sequence[float]
-) -> Calibration:
+def _distorted(name: str, size: tuple[int, int], matrix: Matrix, model: str, coefficients: Matrix) -> Calibration:
     """A distorted camera; a file without any coefficient means a pinhole."""
     values = tuple(float(value) for value in coefficients)
     model = model if values else "pinhole"

@@ -3,7 +3,6 @@
 Every reader returns metres as float32, with infinity where nothing was hit within the sensor's range.
 """
 
-import math
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -86,7 +85,8 @@ def read_depth(path: Path, *, metres_per_unit: float | None = None) -> Tensor:
     _check_shape(values.shape)
     if np.issubdtype(values.dtype, np.floating):
         _refuse_scale(metres_per_unit, f"{values.dtype} metres")
-        return torch.from_numpy(values.astype(np.float32))
+        with np.errstate(over="ignore"):  # beyond float32 lies infinity
+            return torch.from_numpy(values.astype(np.float32))
     return _scaled(values, metres_per_unit)
 
 
@@ -107,7 +107,8 @@ def _scaled(values: NDArray[Any], scale: float | None) -> Tensor:
         raise ValueError(f"{values.dtype} depth needs metres_per_unit > 0 (0.001 for millimetres); got {scale}")
     metres = values.astype(np.float64) * scale
     metres[values == np.iinfo(values.dtype).max] = np.inf
-    return torch.from_numpy(metres.astype(np.float32))
+    with np.errstate(over="ignore"):
+        return torch.from_numpy(metres.astype(np.float32))
 
 
 def _read_png(path: Path) -> NDArray[Any]:
@@ -136,9 +137,10 @@ def _read_npy(path: Path) -> NDArray[Any]:
         _check_shape(header.shape)
         if header.dtype.kind not in "fiu":
             raise ValueError(f"depths are integers or floats; got {header.dtype}")
-        check_memory(math.prod(header.shape) * _BYTES_PER_PIXEL)
 
-    return read_npy(path, check)
+    values = read_npy(path, check)
+    check_memory(values.size * _BYTES_PER_PIXEL)
+    return values
 
 
 def _read_exr(path: Path) -> NDArray[Any]:

@@ -1,7 +1,7 @@
 """Entries of calibration files: what they must be before anything is made of them."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 
@@ -56,7 +56,7 @@ def numbers_of(table: Mapping[str, Sequence[str]], key: str, length: int) -> Mat
     return np.array(words, dtype=np.float64)
 
 
-def has_numbers(values: object, length: int | None = None) -> bool:
+def has_numbers(values: object, length: int | None = None) -> TypeGuard[list[Any]]:
     """Whether it is a list of finite numbers, without a look into whatever else may be in it.
 
     YAML takes 1e-1, without a point, for text.

@@ -67,7 +67,7 @@ def reads(
                 _check_regular(path, content)
                 return read(path, *args, **kwargs)
 
-        return door
+        return door  # type: ignore[return-value]  # which would have the path without a name
 
     return decorate
 

@@ -126,6 +126,8 @@ def _npy_header(stream: IO[bytes]) -> NpyHeader:
     # The header is a Python literal: NumPy, the parser and the tokenizer each fail with exceptions of their own.
     try:
         version = np.lib.format.read_magic(stream)
+        if version not in _HEADER_READERS:
+            raise ValueError(f"version {version[0]}.{version[1]} of the format")
         with _quiet():
             shape, _, dtype = _HEADER_READERS[version](stream)
     except Exception as error:
