@@ -85,8 +85,7 @@ def read_depth(path: Path, *, metres_per_unit: float | None = None) -> Tensor:
     _check_shape(values.shape)
     if np.issubdtype(values.dtype, np.floating):
         _refuse_scale(metres_per_unit, f"{values.dtype} metres")
-        with np.errstate(over="ignore"):  # beyond float32 lies infinity
-            return torch.from_numpy(values.astype(np.float32))
+        return torch.from_numpy(values.astype(np.float32))
     return _scaled(values, metres_per_unit)
 
 
@@ -107,8 +106,7 @@ def _scaled(values: NDArray[Any], scale: float | None) -> Tensor:
         raise ValueError(f"{values.dtype} depth needs metres_per_unit > 0 (0.001 for millimetres); got {scale}")
     metres = values.astype(np.float64) * scale
     metres[values == np.iinfo(values.dtype).max] = np.inf
-    with np.errstate(over="ignore"):
-        return torch.from_numpy(metres.astype(np.float32))
+    return torch.from_numpy(metres.astype(np.float32))
 
 
 def _read_png(path: Path) -> NDArray[Any]:

@@ -8,6 +8,8 @@ from functools import wraps
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
+import numpy as np
+
 Arguments = ParamSpec("Arguments")
 Content = TypeVar("Content")
 
@@ -63,7 +65,8 @@ def reads(
         @wraps(read)
         def door(path: str | os.PathLike[str], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Content:
             path = Path(path)
-            with naming(path, content):
+            # Numbers of damaged files overflow; what they become is infinite or NaN, and judged as such.
+            with naming(path, content), np.errstate(all="ignore"):
                 _check_regular(path, content)
                 return read(path, *args, **kwargs)
 

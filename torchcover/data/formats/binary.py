@@ -57,12 +57,11 @@ def check_records(data: bytes, columns: int) -> NDArray[np.float32]:
     records = np.frombuffer(data, "<f4").reshape(-1, columns)
     if not data.strip(b"\0"):
         raise ValueError(f"all of its {len(data)} bytes are zero: it was never written")
-    with np.errstate(invalid="ignore"):  # the bits of other types are signals, too
-        complaint = _complaint(records[:, :3]) or _of_other_columns(records)
-        likelier = _likelier(data, columns) if complaint else ""
+    complaint = _complaint(records[:, :3]) or _of_other_columns(records)
     if complaint:
         raise ValueError(
-            f"{complaint}, so it holds no {SUFFIXES[columns]}; likelier is {likelier}. Rename it, or write it again"
+            f"{complaint}, so it holds no {SUFFIXES[columns]}; likelier is {_likelier(data, columns)}. "
+            "Rename it, or write it again"
         )
     return records
 
