@@ -24,6 +24,7 @@ from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, r
 
 FORMAT_VERSION = 3
 Arrays = dict[str, NDArray[Any]]
+SPREAD = ("block_probed_steps", "block_sums", "area_m2", "area_sums")
 
 
 class CoverageParts(TypedDict):
@@ -108,6 +109,7 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
     for name in ("probed_steps", "points", *(quantity.key for quantity in quantities)):
         if arrays[name].shape != grid.shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, the grid {grid.shape}")
+    _check_spread(grid, arrays)
     return {
         "grid": grid,
         "thresholds": tuple(header["thresholds"]),
@@ -164,6 +166,14 @@ def _block_steps(header: dict[str, Any], steps: NDArray[Any]) -> Tensor:
     return torch.from_numpy(steps)
 
 
+def _check_spread(grid: BevGrid, arrays: Arrays) -> None:
+    """The lists of the blocks become arrays over all cells of all blocks."""
+    blocks = max((len(arrays[name]) for name in ("block_steps", "area_steps") if name in arrays), default=0)
+    listed = [arrays[name] for name in SPREAD if name in arrays]
+    spread_bytes = blocks * grid.cells * sum(math.prod(one.shape[:-1]) * one.itemsize for one in listed)
+    check_memory(spread_bytes + sum(array.nbytes for array in arrays.values()))
+
+
 def _spread(cells: NDArray[Any], listed: NDArray[Any], shape: tuple[int, ...]) -> Tensor:
     """(..., *shape): `listed` (..., N) at the N cells of blocks that it belongs to, and zeros elsewhere."""
     leading = listed.shape[:-1]
@@ -173,7 +183,6 @@ def _spread(cells: NDArray[Any], listed: NDArray[Any], shape: tuple[int, ...]) -
         or not 0 <= cells.min(initial=0) <= cells.max(initial=0) < math.prod(shape)
     ):
         raise ValueError(f"sums of shape {listed.shape} at {cells.shape} cells do not fit into {shape}")
-    check_memory(math.prod((*leading, *shape)) * listed.itemsize)
     spread = np.zeros((*leading, math.prod(shape)), listed.dtype)
     spread[..., cells] = listed
     return torch.from_numpy(spread.reshape(*leading, *shape))
