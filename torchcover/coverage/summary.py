@@ -23,13 +23,10 @@ class RegionSummary:
         height: Name of the height band.
         cells: Number of cells in the region.
         known_cells: How many of them a reference point has probed.
-        unseen_cells: About how many more would become known with more steps.
         measure: What `numbers` are means over: "area", the visible surface, or "known", the known cells.
         numbers: Key of the quantity, such as `"radius_m"` or `"detection_0.4m"` -> its number; the error is NaN if it
             was not asked for, or if there are not enough steps.
         known: The numbers over the known cells, every cell weighing the same; `numbers` itself if that is its measure.
-        completed: These with the unseen cells, as far as can be told; less biased as long as there are many. See
-            `torchcover.coverage.estimate.completed_mean`.
         visible_m2: Mean over the steps of the square metres of the region's surface that the reference sees; NaN where
             its points have none.
     """
@@ -38,11 +35,9 @@ class RegionSummary:
     height: str
     cells: int
     known_cells: int
-    unseen_cells: float
     measure: Measure
     numbers: Mapping[str, Number]
     known: Mapping[str, Number]
-    completed: Mapping[str, Number]
     visible_m2: float
 
     @property
