@@ -324,6 +324,8 @@ def test_pieces_that_are_there_are_not_measured_again(paper, out, options, monke
         (["moon"], "no experiment moon; there are tables, cameras"),
         (["--steps", "10"], "steps: a multiple of the piece of 16 is needed; got 10"),
         (["--rigs", "mine"], "rigs: {} must stand where the LiDARs differ; got mine"),
+        (["--rigs", "mine_{}"], "'mine_grille_128' is neither a .yaml file nor one of the built-in rigs"),
+        (["--every", "0.15"], "every_s: a positive multiple of the time step"),
     ],
 )
 def test_a_mistake_is_said_in_a_line(paper, monkeypatch, capsys, given, message):

@@ -35,7 +35,7 @@ def main():
         "--rigs",
         nargs="+",
         default=["front_{}", "paper_fit_{}"],
-        help="sets of LiDARs: names or YAML files, with {} for grille_128, roof_128, roof_64, roof_32",
+        help="sets of LiDARs: names or YAML files, {} for each of grille_128, roof_128, roof_64, roof_32",
     )
     parser.add_argument("--scenario", default="urban")
     parser.add_argument("--seed", type=int, default=0)
@@ -43,12 +43,15 @@ def main():
     options = parser.parse_args()
     if unknown := set(options.experiments) - set(EXPERIMENTS):
         parser.error(f"no experiment {', '.join(sorted(unknown))}; there are {', '.join(EXPERIMENTS)}")
-    if options.steps % options.piece:
+    if options.piece < 1 or options.steps < 1 or options.steps % options.piece:
         parser.error(f"steps: a multiple of the piece of {options.piece} is needed; got {options.steps}")
-    if same := [pattern for pattern in options.rigs if pattern.format("a") == pattern]:
+    if same := [pattern for pattern in options.rigs if "{}" not in pattern]:
         parser.error(f"rigs: {{}} must stand where the LiDARs differ; got {', '.join(same)}")
-    for name in dict.fromkeys(options.experiments) or EXPERIMENTS:
-        EXPERIMENTS[name](options)
+    try:
+        for name in dict.fromkeys(options.experiments) or EXPERIMENTS:
+            EXPERIMENTS[name](options)
+    except (ValueError, FileNotFoundError) as error:
+        parser.error(str(error))
 
 
 if __name__ == "__main__":

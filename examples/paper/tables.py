@@ -18,7 +18,7 @@ MAPPED = ("grille_128", "roof_128")
 
 def run(options):
     """Measure the pieces that are missing; print and write what all of them say."""
-    sets = {pattern: {lidar: pattern.format(lidar) for lidar in LIDARS} for pattern in options.rigs}
+    sets = {pattern: {lidar: pattern.replace("{}", lidar) for lidar in LIDARS} for pattern in options.rigs}
     x0_m = options.origin
     grid = BevGrid(x=(x0_m, x0_m + 160.0), y=(-40.0, 40.0), cell=0.25)
     regions = [Region(each.name, (x0_m, x0_m + each.x[1]), each.y) for each in forward_regions()]
