@@ -2,6 +2,7 @@
 
 import json
 import sys
+from argparse import Namespace
 from importlib import import_module
 from itertools import combinations, islice, product
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 import torch
 from matplotlib.image import imread
 
-from torchcover import BevGrid, CoverageMetric, Region
+from torchcover import BevGrid, Coverage, CoverageMetric, Region, forward_regions
 from torchcover.data import SimulatedFrames
 from torchcover.report import write_figures
 from torchcover.simulation import PaperReference, Scenario
@@ -215,6 +216,16 @@ def test_pieces_merge_to_what_one_run_with_a_block_for_each_says(paper, square_m
         assert one.error.allclose(other.error, rtol=1e-9, equal_nan=True)
 
 
+def test_a_piece_that_was_interrupted_while_written_is_none(paper, tmp_path):
+    class Full:
+        def save(self, path):
+            raise OSError("no space left")
+
+    with pytest.raises(OSError, match="no space left"):
+        paper.pieces.save_piece(tmp_path / "00000", {("rig", "known"): Full()})
+    assert not (tmp_path / "00000").exists()
+
+
 def test_pieces_of_another_run_are_refused(paper, tmp_path):
     paper.pieces.check_conditions(tmp_path / "pieces", {"seed": 1})
     paper.pieces.check_conditions(tmp_path / "pieces", {"seed": 1})
@@ -240,6 +251,18 @@ def test_the_ego_gives_points_if_they_are_wanted_and_nothing_else_changes():
     assert len(own) == without.counts["reference_self_hits"] > 50
     assert (own >= torch.tensor(box.lower_m) - 1e-3).all()
     assert (own <= torch.tensor(box.upper_m) + 1e-3).all()
+
+
+def test_both_references_have_the_range_that_is_asked_for(paper):
+    options = Namespace(
+        scenario="courtyard", steps=1, seed=0, every=0.1, rays=100, reference_range=120.0, ego_points=True
+    )
+    asked = paper.measuring.Measurement(
+        {"rig": "front_roof_32"}, BevGrid((0, 160), (-40, 40)), forward_regions(), options
+    )
+    assert asked.frames.reference_sensor == PaperReference(10, 10, max_range_m=120.0, ego_points=True)
+    assert asked.surface_frames.reference_sensor.max_range_m == 120.0
+    assert asked.surface_frames.reference_sensor.areas == tuple((region.x, region.y) for region in forward_regions())
 
 
 # The command
@@ -276,7 +299,9 @@ def test_a_run_leaves_tables_scores_coverage_and_maps(out):
     ]
     assert {len(each["numbers"]) for each in found["results"]} == {48}
     assert len(list((out / "maps").glob("*/*.png"))) == 1
-    assert len(list((out / "pieces").glob("0000[01]/*_*.npz"))) == 2 * 4 * 2
+    pieces = list((out / "pieces").glob("0000[01]/*_*.npz"))
+    assert len(pieces) == 2 * 4 * 2
+    assert {Coverage.load(piece).grid.x for piece in pieces} == {(-1.4, 158.6)}
     assert sorted(path.name for path in (out / "cameras").iterdir()) == [
         "figure_2.png",
         "maps",
@@ -325,6 +350,7 @@ def test_pieces_that_are_there_are_not_measured_again(paper, out, options, monke
         (["--steps", "10"], "steps: a multiple of the piece of 16 is needed; got 10"),
         (["--rigs", "mine"], "rigs: {} must stand where the LiDARs differ; got mine"),
         (["--rigs", "mine_{}"], "'mine_grille_128' is neither a .yaml file nor one of the built-in rigs"),
+        (["--rays", "-1"], "nonnegative"),
         (["--every", "0.15"], "every_s: a positive multiple of the time step"),
     ],
 )

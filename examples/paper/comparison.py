@@ -48,15 +48,15 @@ def scores_of(results):
 def as_markdown(results):
     """A table of numbers and a line of scores for each set of LiDARs, then the scores by set, measure and steps."""
     scores = scores_of(results)
-    steps = max(steps for _, _, steps in results)
+    last = max(steps for _, _, steps in results)
     lines = []
     for lidars in dict.fromkeys(lidars for lidars, _, _ in results):
         lines += [
-            f"### {lidars}, {steps} steps",
+            f"### {lidars}, {last} steps",
             "",
-            *_table(results[lidars, "known", steps], results[lidars, "area", steps]),
+            *_table(results[lidars, "known", last], results[lidars, "area", last]),
         ]
-        lines += [f"{MEASURE_WORDS[measure]}: {scores[lidars, measure, steps]}.\n" for measure in MEASURE_WORDS]
+        lines += [f"{MEASURE_WORDS[measure]}: {scores[lidars, measure, last]}.\n" for measure in MEASURE_WORDS]
     lines += ["### Scores", "", SCORE_HEADINGS, f"|{' --- |' * 2}{' ---: |' * 7}"]
     for (lidars, measure, steps), each in scores.items():
         lines.append(

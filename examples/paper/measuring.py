@@ -1,6 +1,8 @@
 """Rigs at the same instants against two references: the paper's rays for its mean over known cells, and points drawn on
 the surface for the mean over the visible square metres."""
 
+import math
+
 from rich.progress import track
 
 from examples.paper.thinning import thinned
@@ -8,7 +10,7 @@ from torchcover import BevGrid, CoverageMetric
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import PaperReference, SurfaceReference
 
-# What a mean over a cell needs at most: with 16 points of it, region numbers of 8 steps are within 0.1 points.
+# Of the paper's points in a cell so many are kept: numbers of 8 steps move by less than 0.1 points and 0.1 %.
 POINTS_PER_CELL = 16
 # Sums over the surface do not depend on the cell.
 CELL_OF_AREAS_M = 1.0
@@ -26,7 +28,7 @@ class Measurement:
 
     def __init__(self, rigs, grid, regions, options):
         self.grid = grid
-        side = round(options.rays**0.5)
+        side = math.isqrt(options.rays)
         reach_m = options.reference_range
         rays = PaperReference(rows=side, columns=side, max_range_m=reach_m, ego_points=options.ego_points)
         areas = tuple(dict.fromkeys((region.x, region.y) for region in regions))

@@ -71,7 +71,7 @@ def merged(pieces):
         layers=map(Layer, first.quantities, whole),
         counts={name: sum(piece.counts[name] for piece in pieces) for name in Coverage.COUNTS},
         blocks=Blocks(steps, probed_steps, sums),
-        area=_merged_area([piece.area for piece in pieces], steps) if first.area else None,
+        area=_merged_area([piece.area for piece in pieces], steps) if first.area is not None else None,
     )
 
 
