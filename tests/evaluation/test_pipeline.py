@@ -9,8 +9,9 @@ import pytest
 import torch
 
 from torchcover import BevGrid, CoverageMetric
-from torchcover.data import BadFrameError
+from torchcover.data import BadFrameError, SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe
+from torchcover.evaluation.pipeline import MOST_TOGETHER, made_together
 
 GRID = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, heights={"all": (-1.0, 1.0)})
 
@@ -104,6 +105,22 @@ def test_workers_change_nothing_and_frames_come_in_order(frames, workers):
     assert names.names == ["f0", "f1", "f2", "f3", "f4"]
     assert run.steps == 5
     assert int(occupancy.compute().max()) <= 5
+
+
+def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_order():
+    spread = SimulatedFrames("urban", "front_roof_32", steps=15, every_s=10.0)
+    tasks = made_together(spread, 15, workers=2)
+    assert tasks == [[*range(7)], [*range(7, 13)], [13, 14]]
+    assert [{spread.simulator.run_of(index) for index in task} for task in tasks] == [{0}, {1}, {2}]
+    dense = made_together(SimulatedFrames("urban", "front_roof_32", steps=1000), 700, workers=2)
+    assert [index for task in dense for index in task] == [*range(700)]
+    assert max(map(len, dense)) == MOST_TOGETHER
+    for alone in (
+        made_together(spread, 3, workers=1),
+        made_together(SimulatedFrames("courtyard", "front_roof_32", steps=3), 3, workers=2),
+        made_together([], 3, workers=2),
+    ):
+        assert alone == [[0], [1], [2]]
 
 
 def test_of_two_rigs_none_is_meant_until_it_is_named(frames):

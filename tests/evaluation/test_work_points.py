@@ -6,51 +6,56 @@ import math
 
 from rich.console import Console
 
+from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.evaluation import WorkPoint, cheapest, pareto_front, study_records, study_table, work_panels
 
+DETECTION = detection(0.4)
+BOTH = (RADIUS, DETECTION)
 
-def point(seconds: float, error: float, rays: int = 1024, reference: str = "even") -> WorkPoint:
-    return WorkPoint(reference, rays, 8, seconds, error, error, error, error)
+
+def point(seconds: float, error: float, rays: int = 1024) -> WorkPoint:
+    return WorkPoint(rays, 8, 2, seconds, {RADIUS.key: error, DETECTION.key: error})
 
 
 def test_more_time_without_less_error_is_not_on_the_front():
-    front = pareto_front([point(3, 0.3), point(1, 0.5), point(2, 0.6), point(4, 0.3), point(5, 0.1)], "detection_error")
+    front = pareto_front([point(3, 0.3), point(1, 0.5), point(2, 0.6), point(4, 0.3), point(5, 0.1)], DETECTION.key)
     assert [one.seconds for one in front] == [1, 3, 5]
 
 
 def test_a_point_whose_error_is_unknown_is_not_on_the_front_and_does_not_hide_the_others():
-    front = pareto_front([point(1, math.nan), point(2, 0.3), point(3, math.nan), point(4, 0.1)], "detection_error")
+    front = pareto_front([point(1, math.nan), point(2, 0.3), point(3, math.nan), point(4, 0.1)], RADIUS.key)
     assert [one.seconds for one in front] == [2, 4]
 
 
 def test_the_cheapest_that_is_good_enough_is_advised():
     points = [point(9, 0.01), point(4, 0.02), point(1, 0.5)]
-    assert cheapest(points, "detection_error", 0.02).seconds == 4
-    assert cheapest(points, "detection_error", 0.001) is None
+    assert cheapest(points, DETECTION.key, 0.02).seconds == 4
+    assert cheapest(points, DETECTION.key, 0.001) is None
 
 
 def test_errors_have_two_digits_and_the_fastest_of_their_error_are_marked():
     console = Console(file=io.StringIO(), width=200)
-    console.print(study_table([point(1.0, 0.0123), point(2.0, 0.0234), point(3.0, math.nan)]))
+    console.print(study_table([point(1.0, 0.0123), point(2.0, 0.0234), point(3.0, math.nan)], BOTH))
     rows = [
         [cell.strip() for cell in line.split("│")[1:-1]] for line in console.file.getvalue().splitlines() if "│" in line
     ]
-    assert rows[0] == ["even *", "1,024", "8", "1.0", "1.2", "0.012", "1.2", "0.012"]
-    assert rows[1][0] == "even"
-    assert rows[2][4:] == ["unknown"] * 4
+    assert rows[0] == ["1,024 *", "8", "2", "1.0", "0.012", "1.2"]
+    assert rows[1][0] == "1,024"
+    assert rows[2][4:] == ["unknown"] * 2
 
 
 def test_records_are_json_without_nan():
-    best, unknown = json.loads(json.dumps(study_records([point(1.0, 0.1), point(2.0, math.nan)]), allow_nan=False))
-    assert (best["best_detection_error"], best["best_radius_error_m"]) == (True, True)
-    assert (unknown["detection_error"], unknown["best_detection_error"]) == (None, False)
+    records = study_records([point(1.0, 0.1), point(2.0, math.nan)], BOTH)
+    best, unknown = json.loads(json.dumps(records, allow_nan=False))
+    assert best["best"] == ["radius_m", "detection_0.4m"]
+    assert (unknown["errors"]["detection_0.4m"], unknown["best"]) == (None, [])
 
 
 def test_the_diagram_is_given_a_line_for_each_setting_in_the_unit_that_it_names():
-    points = [point(k, 1 / k, rays, name) for k in (1, 2) for rays in (256, 64) for name in ("odd", "even")]
-    share, length = work_panels(points, {"detection_error": 0.01, "radius_error_m": math.nan})
-    assert {name: list(lines) for name, lines in share.lines.items()} == {"odd": ["64", "256"], "even": ["64", "256"]}
-    assert share.lines["odd"]["64"] == share.front == [(1, 100.0), (2, 50.0)]
-    assert length.lines["even"]["256"] == [(1, 1.0), (2, 0.5)]
+    points = [point(k, 1 / k, rays) for rays in (64, 256) for k in (1, 2)]
+    length, share = work_panels(points, BOTH, {RADIUS.key: math.nan, DETECTION.key: 0.01})
+    assert list(share.lines) == list(length.lines) == ["64", "256"]
+    assert share.lines["64"] == share.front == [(1, 100.0), (2, 50.0)]
+    assert length.lines["256"] == [(1, 1.0), (2, 0.5)]
     assert ("percentage points" in share.label, "(m)" in length.label) == (True, True)
     assert (share.floor, math.isnan(length.floor)) == (1.0, True)

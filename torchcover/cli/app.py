@@ -159,34 +159,36 @@ def study(
     scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "courtyard",
     rays: Annotated[
         list[int] | None,
-        typer.Option(min=8, help="Rays of the reference at each step; may be repeated (1024 to 1048576)."),
+        typer.Option(min=1, help="Rays of the reference at each step; may be repeated (1024 to 65536)."),
     ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Most steps of a run.")] = 64,
-    runs: Annotated[int, typer.Option(min=1, help="Runs with other seeds that errors are averaged over.")] = 3,
-    long_run_steps: Annotated[
-        int, typer.Option(min=8, help="Steps of the run that the others are measured against.")
-    ] = 256,
-    long_run_rays: Annotated[
-        int, typer.Option(min=8, help="Rays of that run at each step; no fewer than any other has.")
-    ] = 1_048_576,
+    steps: Annotated[int, typer.Option(min=1, help="Most steps of a run.")] = 256,
+    runs: Annotated[int, typer.Option(min=1, help="Runs of so many steps that errors are averaged over.")] = 2,
+    long_run: Annotated[
+        Path | None,
+        typer.Option(
+            help="What runs are measured against: coverage.npz of `evaluate` with another seed, or long_run.npz of an "
+            "earlier study. Not given: a run is made for it."
+        ),
+    ] = None,
+    long_run_steps: Annotated[int, typer.Option(min=8, help="Steps of that run.")] = 1024,
     every: options.Every = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.5,
+    cell: options.Cell = 0.25,
     threshold: Annotated[float, typer.Option(help="Detection threshold in metres.")] = 0.4,
 ) -> None:
-    """Measure error against run time for reference sensors and numbers of steps, and recommend a setting."""
+    """Measure error against run time for numbers of rays and of steps, and recommend a setting."""
     from torchcover.cli.printing import print_study
     from torchcover.evaluation import StudyPlan, claimed, error_against_time
 
     plan = StudyPlan(
         rig=rig,
         scenario=scenario,
-        rays=tuple(dict.fromkeys(rays or StudyPlan.rays)),
+        rays=tuple(sorted(set(rays or StudyPlan.rays))),
         steps=steps,
         runs=runs,
+        long_run=long_run,
         long_run_steps=long_run_steps,
-        long_run_rays=long_run_rays,
         every_s=every,
         seed=seed,
         cell_m=cell,

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.table import Table
 
 from torchcover.evaluation import Omission, Result, Study, StudyPlan, WorkPoint, stage_table, study_table
-from torchcover.report import narrowest_width, print_table, text_table
+from torchcover.report import UNITS, error_words, narrowest_width, print_table, text_table
 
 
 def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:
@@ -27,29 +27,33 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
 
 def print_study(study: Study, out: Path) -> None:
     """The tables, and the settings that are recommended."""
-    console, plan, floor = Console(), study.plan, study.floor
-    tables = study_table(study.points), stage_table(study.stages)
+    console, quantities = Console(), study.quantities
+    tables = study_table(study.points, quantities), stage_table(study.stages)
     # Rather lines that are too long than numbers that are cut off.
     wide = Console(width=max(console.width, narrowest_width(tables)))
     for table in tables:
         wide.print(table)
+    floor = [
+        f"{error_words(study.truth.errors[one.key], one.unit)} {UNITS[one.unit].difference_name}" for one in quantities
+    ]
     console.print(
-        f"The long run ({plan.long_run_steps:,} steps of {plan.long_run_rays:,} rays, other seed) has itself an error "
-        f"of {100 * floor['detection_error']:.2f} percentage points and {floor['radius_error_m']:.3f} m."
+        f"Times are those of `torchcover evaluate` from start to end: {study.start_s:.1f} s of each for Python, "
+        f"imports, maps and files. The long run of {study.truth.coverage.counts['steps']:,} steps has itself an error "
+        f"of {' and '.join(floor)}."
     )
     for wanted, point in study.recommended.items():
-        console.print(advice(wanted, point, plan), soft_wrap=True)
-    console.print(f"Wrote study.json and work_precision.png to {out}", soft_wrap=True)
+        console.print(advice(wanted, point, study.plan), soft_wrap=True)
+    console.print(f"Wrote study.json, long_run.npz and work_precision.png to {out}", soft_wrap=True)
 
 
 def advice(wanted: float, point: WorkPoint | None, plan: StudyPlan) -> str:
-    """The options of `evaluate` that reach an error; the size of the cells, which decides about it, among them."""
+    """The options of `evaluate` that reach an error."""
     if point is None:
-        return f"For {100 * wanted:g} percentage points of detection: not reached within {plan.steps:,} steps."
+        return f"For {100 * wanted:g} percentage points of detection: not reached within {plan.lengths[-1]:,} steps."
     every = "" if plan.every_s is None else f" --every {plan.every_s:g}"
     return (
-        f"For {100 * wanted:g} percentage points of detection: --reference {point.reference} --rays {point.rays} "
-        f"--steps {point.steps} --cell {plan.cell_m:g}{every} ({point.seconds:.0f} s)."
+        f"For {100 * wanted:g} percentage points of detection: --rays {point.rays} --steps {point.steps}{every} "
+        f"({point.seconds:.0f} s)."
     )
 
 

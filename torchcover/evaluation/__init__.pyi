@@ -18,6 +18,7 @@ from .study import Study as Study
 from .study import error_against_time as error_against_time
 from .study_plan import StudyPlan as StudyPlan
 from .study_truth import Truth as Truth
+from .study_truth import area_sums as area_sums
 from .target_error import Standing as Standing
 from .target_error import TargetError as TargetError
 from .target_error import TargetWatch as TargetWatch

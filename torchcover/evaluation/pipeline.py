@@ -4,18 +4,22 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from traceback import clear_frames
 from typing import Protocol
 
 import torch
-from torch.utils.data import DataLoader, Dataset, Subset
+from torch.utils.data import DataLoader, Dataset
 
-from torchcover.data import BadFrameError, Frame, FrameBatch, FrameSource, collate_frames
+from torchcover.data import BadFrameError, Frame, FrameSource, SimulatedFrames, collate_frames
 from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.progress import progress_of
 
 Frames = FrameSource | Dataset[Frame] | Sequence[Frame]
+
+# Frames that a worker makes at a time, at most: they wait together in memory.
+MOST_TOGETHER = 16
 
 
 @dataclass
@@ -124,10 +128,9 @@ def observe(
     start = time.perf_counter()
     try:
         with progress_of(most, title, shown=progress) as bar:
-            for batch in _batches(frames, most, workers, run, skip_bad_frames=skip_bad_frames):
-                (frame,) = batch.to(device).frames
+            for frame in _each(frames, most, workers, run, skip_bad_frames=skip_bad_frames):
                 with held_back():
-                    _feed(frame, observers, run)
+                    _feed(frame.to(device), observers, run)
                 reached = until is not None and until.is_reached(run.steps)
                 expected = most if until is None else run.steps if reached else until.expected_steps(most)
                 bar.advance(expected, until.words if until else "")
@@ -161,16 +164,40 @@ def _feed(frame: Frame, observers: Sequence[AnyObserver], run: Run) -> None:
     run.steps += 1
 
 
-def _batches(frames: Frames, most: int, workers: int, run: Run, *, skip_bad_frames: bool) -> Iterator[FrameBatch]:
+def made_together(frames: Frames, steps: int, workers: int) -> list[list[int]]:
+    """Which frames a worker makes in a row: in traffic those of one world, so that only one worker builds it.
+
+    Args:
+        frames: Where they come from.
+        steps: How many there are.
+        workers: Processes that make them.
+    """
+    if workers < 2 or not isinstance(frames, SimulatedFrames) or frames.scenario.traffic is None:
+        return [[index] for index in range(steps)]
+    together = []
+    for _, indices in groupby(range(steps), frames.simulator.run_of):
+        of_world = list(indices)
+        together += [of_world[at : at + MOST_TOGETHER] for at in range(0, len(of_world), MOST_TOGETHER)]
+    return together
+
+
+def _each(frames: Frames, most: int, workers: int, run: Run, *, skip_bad_frames: bool) -> Iterator[Frame]:
     """One frame at a time; notes bad ones if they are to be skipped."""
-    first: Dataset[Frame] = Subset(frames, range(most))  # type: ignore[arg-type]  # has a length and items
-    iterator = iter(DataLoader(first, batch_size=1, collate_fn=collate_frames, num_workers=workers))
+    loader = DataLoader(
+        frames,  # type: ignore[arg-type]  # has a length and items
+        batch_sampler=made_together(frames, most, workers),
+        collate_fn=collate_frames,
+        num_workers=workers,
+    )
+    iterator = iter(loader)
     while True:
         try:
-            yield next(iterator)
+            batch = next(iterator)
         except StopIteration:
             return
         except BadFrameError as error:
             if not skip_bad_frames:
                 raise
             run.skipped.append(str(error))
+        else:
+            yield from batch.frames

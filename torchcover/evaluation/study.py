@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
 from matplotlib.figure import Figure
 
 from torchcover import __version__
+from torchcover.coverage import Quantity
 from torchcover.evaluation.study_plan import StudyPlan
-from torchcover.evaluation.study_runs import Sample, Trial, one_run, time_stages
+from torchcover.evaluation.study_runs import tried
 from torchcover.evaluation.study_truth import Truth, long_run
 from torchcover.evaluation.work_points import WorkPoint, cheapest, study_records, work_panels
 from torchcover.report import draw_work_precision, json_record
@@ -28,27 +28,27 @@ class Study:
         plan: What it was about.
         every_s: Time between two steps in seconds.
         truth: The long run.
-        points: What each trial costs after some steps, and how far it is off; means over the runs.
-        stages: Where the time of a step goes: records with `reference`, `rays`, `rays_s`, `search_s`, `binning_s` and
-            `cdist_s`, NaN where that was not tried.
+        points: What each number of rays and of steps costs, and how far it is off.
+        start_s: What a command takes whatever its steps: Python, imports, maps and files. It is in all times.
+        stages: Where the time of a step goes: records with `rays`, and in seconds `worlds`, `casting` and `measuring`.
     """
 
     plan: StudyPlan
     every_s: float
     truth: Truth
     points: Sequence[WorkPoint]
+    start_s: float
     stages: Sequence[dict[str, Any]]
 
     @property
-    def floor(self) -> dict[str, float]:
-        """Standard errors of the long run itself: no smaller error can be told."""
-        radius_m, detection = self.truth.errors.square().nanmean(dim=0).sqrt().tolist()
-        return {"detection_error": detection, "radius_error_m": radius_m}
+    def quantities(self) -> Sequence[Quantity]:
+        """What errors are of: the radius and the detection."""
+        return self.truth.coverage.quantities
 
     @property
     def recommended(self) -> dict[float, WorkPoint | None]:
         """The cheapest point for each wanted error of the detection; None where none is good enough."""
-        return {wanted: cheapest(self.points, "detection_error", wanted) for wanted in WANTED}
+        return {wanted: cheapest(self.points, self.quantities[1].key, wanted) for wanted in WANTED}
 
     @property
     def record(self) -> dict[str, Any]:
@@ -59,40 +59,39 @@ class Study:
             "rig": str(plan.rig),
             "scenario": str(plan.scenario),
             "seed": plan.seed,
-            "runs": plan.runs,
             "every_s": self.every_s,
             "cell_m": plan.cell_m,
-            "threshold_m": plan.threshold_m,
             "long_run": {
-                "steps": plan.long_run_steps,
-                "rays": plan.long_run_rays,
-                "standard_errors": json_record(self.floor),
+                "steps": self.truth.coverage.counts["steps"],
+                "standard_errors": json_record(self.truth.errors),
             },
-            "points": study_records(self.points),
-            "stages": [json_record(stage) for stage in self.stages],
+            "start_s": self.start_s,
+            "points": study_records(self.points, self.quantities),
+            "seconds_a_step": list(self.stages),
             "recommended": [
-                {"detection_error": wanted, **({} if point is None else study_records([point])[0])}
+                {"error": wanted, "rays": point and point.rays, "steps": point and point.steps}
                 for wanted, point in self.recommended.items()
             ],
         }
 
     def draw(self) -> Figure:
         """The diagram of error against run time."""
-        about = f"{self.plan.runs} runs, a step every {self.every_s:g} s, cells of {self.plan.cell_m:g} m"
-        title = f"{self.plan.rig} in {self.plan.scenario}: {about}"
-        return draw_work_precision(work_panels(self.points, self.floor), title=title, legend_title="rays a step")
+        title = f"{self.plan.rig} in {self.plan.scenario}: a step every {self.every_s:g} s"
+        panels = work_panels(self.points, self.quantities, self.truth.errors)
+        return draw_work_precision(panels, title=title, legend_title="rays a step")
 
     def save(self, folder: str | Path) -> None:
-        """Write `work_precision.png` and `study.json` into a folder, which is made if it does not exist."""
+        """Write `work_precision.png`, `long_run.npz` and `study.json` into a folder, which is made if need be."""
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         self.draw().savefig(folder / "work_precision.png")
+        self.truth.coverage.save(folder / "long_run.npz")
         text = json.dumps(self.record, indent=2, allow_nan=False) + "\n"
         (folder / "study.json").write_text(text, encoding="utf-8")
 
 
 def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
-    """Measure what each reference sensor costs and how far it is off after how many steps.
+    """Measure what each number of rays costs and how far it is off after how many steps.
 
     Args:
         plan: What to try.
@@ -102,26 +101,25 @@ def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
         ValueError: A plan that makes no sense.
         FileNotFoundError: An unknown name or file.
     """
-    truth = long_run(plan, progress=progress)
-    samples: dict[tuple[Trial, int], list[Sample]] = {}
-    for seed in range(plan.seed, plan.seed + plan.runs):
-        for sample in one_run(plan, seed, truth, progress=progress):
-            samples.setdefault((sample.trial, sample.steps), []).append(sample)
-    points = [_point(of_runs) for _, of_runs in sorted(samples.items())]
-    every_s = plan.frames(plan.seed, plan.steps).every_s
-    return Study(plan, every_s, truth, points, time_stages(plan))
-
-
-def _point(runs: Sequence[Sample]) -> WorkPoint:
-    squares = torch.stack([run.squared_errors for run in runs]).mean(dim=0)
-    radius, detection, cell_radius, cell_detection = squares.sqrt().tolist()
-    return WorkPoint(
-        reference=runs[0].trial.reference_sensor,
-        rays=runs[0].trial.rays,
-        steps=runs[0].steps,
-        seconds=sum(run.seconds for run in runs) / len(runs),
-        detection_error=detection,
-        radius_error_m=radius,
-        cell_detection_error=cell_detection,
-        cell_radius_error_m=cell_radius,
-    )
+    truth, done = long_run(plan, progress=progress), tried(plan, progress=progress)
+    points = [
+        WorkPoint(
+            rays=trial.rays,
+            steps=steps,
+            runs=done.steps // steps,
+            seconds=done.seconds(trial, steps),
+            errors=truth.distances(trial.sums(steps // plan.lengths[0])),
+        )
+        for trial in done.trials
+        for steps in plan.lengths
+    ]
+    stages = [
+        {
+            "rays": trial.rays,
+            "worlds": done.worlds_s / done.steps,
+            "casting": trial.casting.seconds / done.steps,
+            "measuring": trial.measuring.seconds / done.steps,
+        }
+        for trial in done.trials
+    ]
+    return Study(plan, plan.frames(plan.seed, 1).every_s, truth, points, done.start_s, stages)

@@ -6,76 +6,68 @@ from pathlib import Path
 import torch
 
 from torchcover.coverage import CoverageMetric
-from torchcover.data import SimulatedFrames, reference_called
+from torchcover.data import SimulatedFrames
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, new_metric, spread_s
 from torchcover.simulation import Scenario
 
-# Seeds of the runs are next to each other; the long run's is far away.
+# The long run's seed is far away from any other.
 LONG_RUN_SEED = 1_000_003
+# What runs have reached is looked at after these steps at the least, then after twice as many, ...
+DOUBLINGS = 5
 
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """Which reference sensors are tried, for how long, and what they are measured against.
+    """Which numbers of rays of the surface reference are tried, for how many steps, and what they are measured against.
 
     Args:
         rig: A built-in name or a YAML file.
         scenario: Likewise.
-        rays: Rays of the reference sensor at each step; each number is tried with every sensor.
+        rays: Numbers of rays of the reference sensor at each step.
         steps: Most steps of a run.
-        runs: Runs with other seeds that errors are averaged over.
-        long_run_steps: Steps of the run that the others are measured against.
-        long_run_rays: Its rays at each step: no fewer than any other has, for fewer never see some cells of some steps.
+        runs: Runs of so many steps that errors are averaged over; shorter ones are their parts, so that there are more.
+        long_run: What the runs are measured against: a coverage file of the same rig in the same scenario, with another
+            seed. Not given: a run is made for it.
+        long_run_steps: Steps of that run.
         every_s: Time between two steps in seconds; as in `evaluate` if not given.
-        seed: Seed of the first run.
+        seed: Seed of the runs.
         cell_m: Side of a grid cell in metres.
         threshold_m: Detection threshold in metres.
-        references: Names of the reference sensors that are tried; the long run is of the first. Those whose points have
-            square metres have another measure, and are not possible.
 
     Raises:
-        ValueError: No ray, step, run or reference sensor, a long run with fewer rays than another, or a reference
-            sensor that is not possible.
+        ValueError: No number of rays, step or run.
     """
 
     rig: str | Path
     scenario: str | Path = DEFAULT_SCENARIO
-    rays: tuple[int, ...] = (1024, 4096, 16_384, 65_536, 262_144, 1_048_576)
-    steps: int = 64
-    runs: int = 3
-    long_run_steps: int = 256
-    long_run_rays: int = 1_048_576
+    rays: tuple[int, ...] = (1024, 4096, 16_384, 65_536)
+    steps: int = 256
+    runs: int = 2
+    long_run: Path | None = None
+    long_run_steps: int = 1024
     every_s: float | None = None
     seed: int = 0
-    cell_m: float = 0.5
+    cell_m: float = 0.25
     threshold_m: float = 0.4
-    references: tuple[str, ...] = ("even", "paper")
 
     def __post_init__(self) -> None:
-        for name in ("rays", "references"):
-            if not getattr(self, name):
-                raise ValueError(f"{name}: at least one is needed; got none")
+        if not self.rays:
+            raise ValueError("rays: at least one is needed; got none")
         for name in ("steps", "runs", "long_run_steps"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: at least 1 is needed; got {getattr(self, name)}")
-        if self.long_run_rays < max(self.rays):
-            raise ValueError(
-                f"long_run_rays: no fewer than any run has are needed, {max(self.rays)}; got {self.long_run_rays}"
-            )
-        for name in self.references:
-            if reference_called(name).weight_kind == "m2":
-                raise ValueError(f"references: {name} measures by area, which the others do not")
+
+    @property
+    def lengths(self) -> list[int]:
+        """Steps after which runs are looked at: each twice the one before."""
+        shortest = max(1, self.steps >> DOUBLINGS)
+        return [shortest << k for k in range(DOUBLINGS + 1) if shortest << k <= self.steps]
 
     def frames(self, seed: int, steps: int) -> SimulatedFrames:
-        """The frames of a run, whatever the reference sensor."""
+        """The frames of a run."""
         scenario = Scenario.load(self.scenario)
         return SimulatedFrames(scenario, self.rig, steps=steps, seed=seed, every_s=spread_s(scenario, self.every_s))
 
-    def long_frames(self) -> SimulatedFrames:
-        """Those of the long run."""
-        frames = self.frames(LONG_RUN_SEED + self.seed, self.long_run_steps)
-        return frames.with_reference_sensor(reference_called(self.references[0], self.long_run_rays))
-
     def metric(self, blocks: int) -> CoverageMetric:
         """An empty metric."""
-        return new_metric(self.cell_m, (self.threshold_m,), torch.device("cpu"), blocks=blocks)
+        return new_metric(self.cell_m, (self.threshold_m,), torch.device("cpu"), blocks=blocks, square_metres=True)

@@ -1,115 +1,131 @@
-"""The short runs of a study: every trial over the same instants, with a stopwatch."""
+"""The runs of a study: every number of rays over the same instants, with a stopwatch."""
 
-import math
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
-from statistics import median
-from typing import Any, NamedTuple
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from tempfile import TemporaryDirectory
 
+import torch
 from torch import Tensor
 
 from torchcover.data import SimulatedFrames, reference_called
 from torchcover.evaluation.observers import CoverageObserver
 from torchcover.evaluation.progress import progress_of
 from torchcover.evaluation.study_plan import StudyPlan
-from torchcover.evaluation.study_truth import Truth
-from torchcover.neighbors import nearest
-
-# The other backend of the search is tried up to here; beyond, it takes minutes.
-MAX_RAYS_BY_BRUTE_FORCE = 4096
-# What a run has reached is noted after all its steps, half of them, a quarter, ...
-HALVINGS = 6
-TIMED_STEPS = 5
-
-
-class Trial(NamedTuple):
-    """A reference sensor, by its name, with a number of rays."""
-
-    reference_sensor: str
-    rays: int
-
-
-class Sample(NamedTuple):
-    """What one run of a trial has reached after some steps."""
-
-    trial: Trial
-    steps: int
-    seconds: float
-    squared_errors: Tensor
+from torchcover.evaluation.study_truth import area_sums
 
 
 @dataclass
-class _Timed:
-    """A trial at work, and what it has cost so far."""
+class Clock:
+    """Seconds that went into something."""
 
-    trial: Trial
-    frames: SimulatedFrames
-    observer: CoverageObserver
     seconds: float = 0.0
 
-    def add(self, index: int) -> None:
-        """Do a step, and note the time."""
+    @contextmanager
+    def running(self) -> Iterator[None]:
+        """Add what is done within."""
         start = time.perf_counter()
-        self.observer.update(self.frames[index])
+        yield
         self.seconds += time.perf_counter() - start
 
 
-def one_run(plan: StudyPlan, seed: int, truth: Truth, *, progress: bool) -> Iterator[Sample]:
-    """Every trial over the same instants; yields what it has reached whenever the steps have doubled."""
-    every = _trials(plan, seed)
-    stops = {max(1, plan.steps >> halvings) for halvings in range(HALVINGS)}
-    with progress_of(plan.steps, f"seed {seed}", shown=progress) as bar:
-        for index in range(plan.steps):
-            start = time.perf_counter()
-            every[0].frames.simulator.scene_of(index)  # each of them would have built it alone
-            world_seconds = time.perf_counter() - start
-            for timed in every:
-                timed.seconds += world_seconds
-                timed.add(index)
-                if index + 1 in stops:
-                    reached = truth.squared_errors(timed.observer.compute())
-                    yield Sample(timed.trial, index + 1, timed.seconds, reached)
-            bar.advance(plan.steps)
+@dataclass
+class Trial:
+    """A number of rays at work.
+
+    Args:
+        rays: How many.
+        frames: What they see.
+        observer: Fed with it; empty after every `lengths[0]` steps.
+        casting: The rays of the rig and of the reference.
+        measuring: The search and the sums.
+        parts: What `area_sums` said each time.
+    """
+
+    rays: int
+    frames: SimulatedFrames
+    observer: CoverageObserver
+    casting: Clock = field(default_factory=Clock)
+    measuring: Clock = field(default_factory=Clock)
+    parts: list[Tensor] = field(default_factory=list)
+
+    def add(self, index: int) -> None:
+        """Do a step."""
+        with self.casting.running():
+            frame = self.frames[index]
+        with self.measuring.running():
+            self.observer.update(frame)
+
+    def end_part(self) -> None:
+        """Note what the last steps said."""
+        self.parts.append(area_sums(self.observer.compute()))
+        self.observer.metric.reset()
+
+    def sums(self, parts: int) -> Tensor:
+        """(N, ...) those of N runs, each of so many parts."""
+        each = torch.stack(self.parts)
+        return each.view(-1, parts, *each.shape[1:]).sum(dim=1)
 
 
-def time_stages(plan: StudyPlan) -> list[dict[str, Any]]:
-    """How a step of each trial divides into the rays, the search and the binning, in seconds; medians of five."""
-    stages = []
-    for timed in _trials(plan, plan.seed):
-        times = zip(*(_one_step(timed, index % plan.steps) for index in range(TIMED_STEPS)), strict=True)
-        names = ("rays_s", "search_s", "binning_s", "cdist_s")
-        medians = {name: median(seconds) for name, seconds in zip(names, times, strict=True)}
-        stages.append({"reference": timed.trial.reference_sensor, "rays": timed.trial.rays, **medians})
-    return stages
+@dataclass(frozen=True)
+class Tried:
+    """All trials, and what time they share.
+
+    Args:
+        trials: One for each number of rays.
+        steps: Steps of each.
+        start_s: What a command of any number of steps takes beside them: Python, imports, maps and files.
+        worlds_s: What building the worlds took.
+    """
+
+    trials: list[Trial]
+    steps: int
+    start_s: float
+    worlds_s: float
+
+    def seconds(self, trial: Trial, steps: int) -> float:
+        """What a command of so many steps takes."""
+        whole = self.worlds_s + trial.casting.seconds + trial.measuring.seconds
+        return self.start_s + whole * steps / self.steps
 
 
-def _trials(plan: StudyPlan, seed: int) -> list[_Timed]:
-    base = plan.frames(seed, plan.steps)
-    return [
-        _Timed(
-            Trial(name, rays),
-            base.with_reference_sensor(reference_called(name, rays)),
-            CoverageObserver(plan.metric(blocks=1)),
-        )
+def tried(plan: StudyPlan, *, progress: bool) -> Tried:
+    """Do all steps of all runs, one after the other."""
+    steps, part = plan.runs * plan.lengths[-1], plan.lengths[0]
+    base = plan.frames(plan.seed, steps)
+    trials = [
+        Trial(rays, base.with_reference_sensor(reference_called(rays=rays)), CoverageObserver(plan.metric(blocks=1)))
         for rays in plan.rays
-        for name in plan.references
     ]
+    worlds, first, scene, first_step_s = Clock(), trials[0], None, 0.0
+    with progress_of(steps, "runs", shown=progress) as bar:
+        for index in range(steps):
+            cast_s = first.casting.seconds
+            with worlds.running():  # each trial would have built it alone
+                before, (scene, _) = scene, base.simulator.scene_of(index)
+                if scene is not before:
+                    first.frames[index]  # what the first frame of a world prepares for the others
+            for trial in trials:
+                trial.add(index)
+                if (index + 1) % part == 0:
+                    trial.end_part()
+            if scene is not before:  # that frame was cast twice
+                worlds.seconds -= first.casting.seconds - cast_s
+            if index == 0:
+                first_step_s = worlds.seconds + first.casting.seconds + first.measuring.seconds
+            bar.advance(steps)
+    return Tried(trials, steps, command_s(plan) - first_step_s, worlds.seconds)
 
 
-def _one_step(timed: _Timed, index: int) -> tuple[float, float, float, float]:
-    timed.frames.simulator.scene_of(index)  # not counted: it comes once for many steps
-    start, metric = time.perf_counter(), timed.observer.metric
-    frame = timed.frames[index]
-    cast = time.perf_counter()
-    timed.observer.update(frame)
-    updated = time.perf_counter()
-    inside = frame.reference[metric.grid.cell_of(frame.reference) >= 0]
-    searching = time.perf_counter()
-    nearest(inside, frame.sensor, max_distance=metric.max_radius)
-    searched = time.perf_counter()
-    search_s, brute_force_s = searched - searching, math.nan
-    if timed.trial.rays <= MAX_RAYS_BY_BRUTE_FORCE:
-        nearest(inside, frame.sensor, max_distance=metric.max_radius, backend="cdist")
-        brute_force_s = time.perf_counter() - searched
-    return cast - start, search_s, max(0.0, updated - cast - search_s), brute_force_s
+def command_s(plan: StudyPlan) -> float:
+    """How long `torchcover evaluate` takes for one step, from its start to its end."""
+    command = [sys.executable, "-m", "torchcover", "evaluate", str(plan.rig), "--scenario", str(plan.scenario)]
+    settings = {"rays": plan.rays[0], "steps": 1, "seed": plan.seed, "cell": plan.cell_m}
+    clock = Clock()
+    with TemporaryDirectory() as folder, clock.running():
+        options = [f"--{name}={value}" for name, value in settings.items()]
+        subprocess.run([*command, *options, f"--out={folder}"], check=True, capture_output=True)
+    return clock.seconds

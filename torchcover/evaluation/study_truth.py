@@ -5,54 +5,80 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchcover.coverage import Coverage, Region, forward_regions
+from torchcover.coverage import Coverage, forward_regions
 from torchcover.evaluation.observers import CoverageObserver
 from torchcover.evaluation.pipeline import observe
 from torchcover.evaluation.settings import BLOCKS
-from torchcover.evaluation.study_plan import StudyPlan
+from torchcover.evaluation.study_plan import LONG_RUN_SEED, StudyPlan
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The long run: its maps, and what it says about each region and band.
+    """The long run: what it says about the paper's regions and bands.
 
     Args:
-        coverage: Its coverage.
-        values: (regions x bands, 2) radius in metres and detection.
-        errors: Their standard errors.
+        coverage: Its coverage, by area.
+
+    Raises:
+        ValueError: It has no square metres.
     """
 
     coverage: Coverage
-    values: Tensor
-    errors: Tensor
 
-    @classmethod
-    def from_coverage(cls, coverage: Coverage) -> "Truth":
-        """What a coverage says."""
-        estimates = [coverage.estimate(region, height) for region, height in _places(coverage)]
-        values = torch.stack([estimate.value for estimate in estimates])
-        return cls(coverage, values, torch.stack([estimate.error for estimate in estimates]))
+    def __post_init__(self) -> None:
+        if self.coverage.measure != "area":
+            raise ValueError("long run: its reference points had no square metres; make it with the surface reference")
 
-    def squared_errors(self, coverage: Coverage) -> Tensor:
-        """(4,) mean squares of what a coverage is off by: radius and detection of the regions, then of the cells."""
-        values = torch.stack([coverage.estimate(*place).value for place in _places(coverage)])
-        # A region of which nothing is known yet has no distance.
-        regions = (values - self.values).square().nanmean(dim=0)
-        return torch.cat([regions, self._cell_errors(coverage, forward_regions()[-1])])
+    @property
+    def errors(self) -> dict[str, float]:
+        """Its own standard errors by the key of their quantity, root mean squares: no smaller error can be told."""
+        places = [(region, height) for region in forward_regions() for height in self.coverage.grid.heights]
+        each = torch.stack([self.coverage.estimate(*place).error for place in places])
+        return self._by_key(each.square().nanmean(dim=0).sqrt())
 
-    def _cell_errors(self, coverage: Coverage, region: Region) -> Tensor:
-        cells, truth = region.mask(coverage.grid), self.coverage
-        radius = (coverage.radius - truth.radius)[:, cells].square().nanmean()
-        detection = (coverage.detection[0] - truth.detection[0])[:, cells].square().nanmean()
-        return torch.stack([radius, detection])
+    def distances(self, sums: Tensor) -> dict[str, float]:
+        """Root mean squares of what runs are off by, over them, the regions and the bands, by the key of the quantity.
+
+        Args:
+            sums: (N, R, 1 + Q, H) what `area_sums` says of each of N runs.
+        """
+        off = _ratios(sums) - _ratios(area_sums(self.coverage))
+        # A region of which nothing was seen has no distance.
+        return self._by_key(off.square().nanmean(dim=(0, 1, 3)).sqrt())
+
+    def _by_key(self, numbers: Tensor) -> dict[str, float]:
+        keys = [quantity.key for quantity in self.coverage.quantities]
+        return dict(zip(keys, numbers.tolist(), strict=True))
+
+
+def area_sums(coverage: Coverage) -> Tensor:
+    """(R, 1 + Q, H) sums over the visible surface of the paper's R regions in H bands; those of other steps add up.
+
+    The square metres, then those times each of Q quantities.
+    """
+    assert coverage.area is not None  # no other is studied
+    sums = torch.cat([coverage.area.m2.sum(dim=0)[None], coverage.area.sums.sum(dim=0)])
+    return torch.stack([sums[:, :, region.mask(coverage.grid)].sum(dim=2) for region in forward_regions()])
 
 
 def long_run(plan: StudyPlan, *, progress: bool) -> Truth:
-    """Do it."""
-    observer = CoverageObserver(plan.metric(BLOCKS))
-    observe(plan.long_frames(), [observer], progress=progress, title="long run")
-    return Truth.from_coverage(observer.compute())
+    """Do it, or read it.
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: It is no coverage by area, or one with other thresholds.
+    """
+    if plan.long_run is None:
+        observer = CoverageObserver(plan.metric(BLOCKS))
+        frames = plan.frames(LONG_RUN_SEED + plan.seed, plan.long_run_steps)
+        observe(frames, [observer], progress=progress, title="long run")
+        return Truth(observer.compute())
+    coverage = Coverage.load(plan.long_run)
+    if coverage.thresholds != (plan.threshold_m,):
+        measured = " and ".join(f"{threshold:g} m" for threshold in coverage.thresholds)
+        raise ValueError(f"{plan.long_run}: measured within {measured}; wanted is {plan.threshold_m:g} m")
+    return Truth(coverage)
 
 
-def _places(coverage: Coverage) -> list[tuple[Region, str]]:
-    return [(region, height) for region in forward_regions() for height in coverage.grid.heights]
+def _ratios(sums: Tensor) -> Tensor:
+    return sums[..., 1:, :] / sums[..., :1, :]

@@ -2,149 +2,124 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import groupby
-from types import MappingProxyType
 from typing import Any
 
 from rich.table import Table
 
-from torchcover.report import WorkPanel, error_words, json_record, text_table
+from torchcover.coverage import Quantity
+from torchcover.report import UNITS, WorkPanel, difference_heading, error_words, json_record, text_table
 
 
 @dataclass(frozen=True)
 class WorkPoint:
-    """What a setting reached in a time. Errors are root mean squares of the distance to a long run.
+    """What a setting reached in a time.
 
     Args:
-        reference: Pattern of the reference sensor.
-        rays: Its rays in each step.
-        steps: Steps done.
-        seconds: Time that they took, a mean over the runs.
-        detection_error: Of the regions' detection, in [0, 1], over regions, bands and runs.
-        radius_error_m: Of the regions' radius.
-        cell_detection_error: Of the detection of the cells that both know.
-        cell_radius_error_m: Of their radius.
+        rays: Rays of the reference sensor at each step.
+        steps: Steps.
+        runs: How many runs of so many steps there were.
+        seconds: Time that a command with this setting takes, from its start to its end.
+        errors: By the key of the quantity, the root mean square of the distance to a long run, over regions, bands and
+            runs.
     """
 
-    reference: str
     rays: int
     steps: int
+    runs: int
     seconds: float
-    detection_error: float
-    radius_error_m: float
-    cell_detection_error: float
-    cell_radius_error_m: float
+    errors: Mapping[str, float]
 
 
-# The errors whose fastest points are marked -> what the diagram calls them, and what it multiplies them with.
-RANKED: Mapping[str, tuple[str, float]] = MappingProxyType(
-    {
-        "detection_error": ("error of the regions' detection (percentage points)", 100.0),
-        "radius_error_m": ("error of the regions' radius (m)", 1.0),
-    }
-)
-HEADINGS = (
-    "reference",
-    "rays",
-    "steps",
-    "time (s)",
-    "detection\nerror (pp)",
-    "radius\nerror (m)",
-    "cells:\ndet. (pp)",
-    "cells:\nradius (m)",
-)
-
-
-def pareto_front(points: Sequence[WorkPoint], error: str) -> list[WorkPoint]:
+def pareto_front(points: Sequence[WorkPoint], key: str) -> list[WorkPoint]:
     """The points that no other beats in both time and error, fastest first; none whose error is unknown.
 
     Args:
         points: Measured points.
-        error: Which error, by the name of its field.
+        key: Of the quantity whose error counts.
 
     Example:
-        >>> def point(seconds, error):
-        ...     return WorkPoint("even", 1, 1, seconds, error, 0, 0, 0)
-        >>> front = pareto_front([point(1, 3), point(2, 4), point(3, 1)], "detection_error")
-        >>> [one.seconds for one in front]
+        >>> points = [WorkPoint(1, 1, 1, seconds, {"radius_m": error}) for seconds, error in ((1, 3), (2, 4), (3, 1))]
+        >>> [one.seconds for one in pareto_front(points, "radius_m")]
         [1, 3]
     """
     front: list[WorkPoint] = []
-    known = [point for point in points if not math.isnan(getattr(point, error))]
-    for point in sorted(known, key=lambda point: (point.seconds, getattr(point, error))):
-        if not front or getattr(point, error) < getattr(front[-1], error):
+    known = [point for point in points if not math.isnan(point.errors[key])]
+    for point in sorted(known, key=lambda point: (point.seconds, point.errors[key])):
+        if not front or point.errors[key] < front[-1].errors[key]:
             front.append(point)
     return front
 
 
-def cheapest(points: Sequence[WorkPoint], error: str, at_most: float) -> WorkPoint | None:
+def cheapest(points: Sequence[WorkPoint], key: str, at_most: float) -> WorkPoint | None:
     """The fastest point with an error of at most this; None if there is none.
 
     Example:
-        >>> cheapest([], "detection_error", 0.01) is None
+        >>> cheapest([], "detection_0.4m", 0.01) is None
         True
     """
-    good = [point for point in points if getattr(point, error) <= at_most]
+    good = [point for point in points if point.errors[key] <= at_most]
     return min(good, key=lambda point: point.seconds, default=None)
 
 
-def study_table(points: Sequence[WorkPoint]) -> Table:
-    """A row for each point, the Pareto front of the detection marked `*`."""
-    front = pareto_front(points, "detection_error")
+def study_table(points: Sequence[WorkPoint], quantities: Sequence[Quantity]) -> Table:
+    """A row for each point, the Pareto front of the last quantity marked `*`."""
+    front = pareto_front(points, quantities[-1].key)
     by_rays = (list(of_rays) for _, of_rays in groupby(points, lambda point: point.rays))
     return text_table(
-        HEADINGS,
-        [[_row(point, is_best=point in front) for point in section] for section in by_rays],
-        caption="* no other setting is both faster and more accurate (regions' detection)",
+        ("rays", "steps", "runs", "time (s)", *(f"error of {difference_heading(one)}" for one in quantities)),
+        [[_row(point, quantities, is_best=point in front) for point in section] for section in by_rays],
+        caption=f"* no other setting is both faster and more accurate ({quantities[-1].title})",
     )
 
 
-def _row(point: WorkPoint, *, is_best: bool) -> list[str]:
-    return [
-        f"{point.reference} *" if is_best else point.reference,
-        f"{point.rays:,}",
-        f"{point.steps:,}",
-        f"{point.seconds:.1f}",
-        error_words(point.detection_error, "share"),
-        error_words(point.radius_error_m, "m"),
-        error_words(point.cell_detection_error, "share"),
-        error_words(point.cell_radius_error_m, "m"),
-    ]
+def _row(point: WorkPoint, quantities: Sequence[Quantity], *, is_best: bool) -> list[str]:
+    errors = [error_words(point.errors[one.key], one.unit) for one in quantities]
+    rays = f"{point.rays:,}{' *' * is_best}"
+    return [rays, f"{point.steps:,}", f"{point.runs:,}", f"{point.seconds:.1f}", *errors]
 
 
 def stage_table(stages: Sequence[Mapping[str, Any]]) -> Table:
     """How a step of each setting divides into its parts; `Study.stages`."""
     rows = []
     for stage in stages:
-        parts = [stage["rays_s"], stage["search_s"], stage["binning_s"]]
+        parts = [stage["worlds"], stage["casting"], stage["measuring"]]
         shares = [f"{100 * part / sum(parts):.0f}" for part in parts]
-        brute_force = "" if math.isnan(stage["cdist_s"]) else f"{1000 * stage['cdist_s']:.0f}"
-        rows.append((stage["reference"], f"{stage['rays']:,}", f"{1000 * sum(parts):.0f}", *shares, brute_force))
-    headings = ("reference", "rays", "step (ms)", "rays (%)", "search (%)", "binning (%)", "search by cdist (ms)")
+        rows.append((f"{stage['rays']:,}", f"{1000 * sum(parts):.0f}", *shares))
+    headings = ("rays", "step (ms)", "worlds (%)", "casting (%)", "search and sums (%)")
     return text_table(headings, [rows], title="One step: where the time goes")
 
 
-def work_panels(points: Sequence[WorkPoint], floor: Mapping[str, float]) -> Iterator[WorkPanel]:
+def work_panels(
+    points: Sequence[WorkPoint], quantities: Sequence[Quantity], floor: Mapping[str, float]
+) -> Iterator[WorkPanel]:
     """What the work-precision diagram shows of them.
 
     Args:
         points: Measured points.
-        floor: Standard error of the long run by the name of the field: errors below it say nothing.
+        quantities: What errors are of: a panel each.
+        floor: Standard errors of the long run, likewise by key: errors below them say nothing.
     """
-    for error, (label, factor) in RANKED.items():
-        lines: dict[str, dict[str, list[tuple[float, float]]]] = {}
-        for point in sorted(points, key=lambda point: point.rays):
-            line = lines.setdefault(point.reference, {}).setdefault(f"{point.rays:,}", [])
-            line.append((point.seconds, factor * getattr(point, error)))
-        front = [(point.seconds, factor * getattr(point, error)) for point in pareto_front(points, error)]
-        yield WorkPanel(label, lines, front, factor * floor[error])
+    for quantity in quantities:
+        key, factor = quantity.key, UNITS[quantity.unit].factor
+
+        def line(of: Sequence[WorkPoint], key: str = key, factor: float = factor) -> list[tuple[float, float]]:
+            return [(point.seconds, factor * point.errors[key]) for point in of]
+
+        lines = {f"{rays:,}": line(list(of)) for rays, of in groupby(points, lambda point: point.rays)}
+        label = f"error of the {difference_heading(quantity)}"
+        yield WorkPanel(label, lines, line(pareto_front(points, key)), factor * floor[key])
 
 
-def study_records(points: Sequence[WorkPoint]) -> list[dict[str, object]]:
+def study_records(points: Sequence[WorkPoint], quantities: Sequence[Quantity]) -> list[dict[str, object]]:
     """The points for `study.json`."""
-    fronts = {name: pareto_front(points, name) for name in RANKED}
+    fronts = {quantity.key: pareto_front(points, quantity.key) for quantity in quantities}
     return [
-        json_record({**asdict(point), **{f"best_{name}": point in front for name, front in fronts.items()}})
+        {
+            **{name: getattr(point, name) for name in ("rays", "steps", "runs", "seconds")},
+            "errors": json_record(point.errors),
+            "best": [key for key, front in fronts.items() if point in front],
+        }
         for point in points
     ]

@@ -15,12 +15,13 @@ from torchcover.report.renderers.layout import BOLD_MARKS, PLACE_HEADINGS, Part,
 from torchcover.report.renderers.markdown_file import as_markdown
 from torchcover.report.renderers.text_file import narrowest_width, print_table, text_table
 from torchcover.report.table import CoverageTable, Row
-from torchcover.report.wording import error_words, percent
+from torchcover.report.wording import UNITS, difference_heading, error_words, percent
 
 __all__ = [
     "BOLD_MARKS",
     "PLACE_HEADINGS",
     "RENDERERS",
+    "UNITS",
     "ActorMark",
     "ColourScale",
     "CoverageTable",
@@ -32,6 +33,7 @@ __all__ = [
     "WorkPanel",
     "as_markdown",
     "band_figures",
+    "difference_heading",
     "difference_scale",
     "draw_depths",
     "draw_four_views",

@@ -11,6 +11,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, mod
 
 from torchcover.geometry import rigid, rotation_from_euler, rotation_from_quaternion
 
+# That of libyaml is ten times as fast; not every build of PyYAML has it.
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
 
 class Document(BaseModel):
     """Base of everything that is written in YAML: unknown keys, NaN and infinity are errors; values do not change."""
@@ -80,7 +83,7 @@ def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -
     """
     path = _find(kind, path_or_name)
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=LOADER)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
     if not isinstance(content, dict):

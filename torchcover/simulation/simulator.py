@@ -114,6 +114,10 @@ class Simulator:
         stage, step = self._stage(index)
         return stage.scene, step
 
+    def run_of(self, index: int) -> int:
+        """Which run through the scenario a step belongs to: in traffic, each is a world of its own."""
+        return self.scenario.locate(index * self._every_steps)[0]
+
     def _stage(self, index: int) -> tuple[Stage, int]:
         if index < 0:
             raise ValueError(f"index: a number >= 0 is needed; got {index}")

@@ -10,9 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 MARKERS = "osD^vP*X"
-# Of the first group of lines, the second, ...
-COLORMAPS = ("viridis", "autumn", "winter", "copper")
-LINE_STYLES = ("-", "--", "-.", ":")
+COLORMAP = "viridis"
 MAX_LIGHTNESS = 0.85
 
 Point = tuple[float, float]
@@ -23,13 +21,13 @@ class WorkPanel(NamedTuple):
 
     Args:
         label: What the errors are, with their unit.
-        lines: Name of a group, such as a pattern of rays -> name of a line in it -> its points.
+        lines: Name of a line, such as a number of rays -> its points.
         front: The points that no other beats.
         floor: Errors below it say nothing; NaN for none.
     """
 
     label: str
-    lines: Mapping[str, Mapping[str, Sequence[Point]]]
+    lines: Mapping[str, Sequence[Point]]
     front: Sequence[Point]
     floor: float
 
@@ -43,8 +41,7 @@ def draw_work_precision(panels: Iterable[WorkPanel], *, title: str, legend_title
         legend_title: What the names of the lines are.
 
     Returns:
-        A figure of its own, outside pyplot. Groups differ in colours and line style, by their order; the lines of a
-        group in marker and lightness.
+        A figure of its own, outside pyplot. Lines differ in marker and colour, by their order.
     """
     panels = list(panels)
     figure = Figure(figsize=(12.0, 5.6), dpi=150, layout="constrained")
@@ -59,27 +56,15 @@ def draw_work_precision(panels: Iterable[WorkPanel], *, title: str, legend_title
 
 
 def _draw_panel(axes: Axes, panel: WorkPanel) -> None:
-    for at, (name, lines) in enumerate(panel.lines.items()):
-        _draw_group(axes, at, name, lines)
+    colours = colormaps[COLORMAP]
+    for at, (name, points) in enumerate(panel.lines.items()):
+        colour, marker = colours(MAX_LIGHTNESS * at / max(len(panel.lines) - 1, 1)), MARKERS[at % len(MARKERS)]
+        axes.plot(*_xy(points), marker=marker, markersize=5, linewidth=1.2, color=colour, label=name)
     axes.plot(*_xy(panel.front), color="black", linewidth=4.5, alpha=0.25, zorder=1, label="Pareto front")
     if math.isfinite(panel.floor):
         axes.axhline(panel.floor, color="grey", linestyle=":", label="standard error of the long run")
     axes.set(xscale="log", yscale="log", xlabel="run time (s)", ylabel=panel.label)
     axes.grid(visible=True, which="both", alpha=0.2)
-
-
-def _draw_group(axes: Axes, group: int, name: str, lines: Mapping[str, Sequence[Point]]) -> None:
-    colours = colormaps[COLORMAPS[group % len(COLORMAPS)]]
-    for at, (line, points) in enumerate(lines.items()):
-        axes.plot(
-            *_xy(points),
-            marker=MARKERS[at % len(MARKERS)],
-            markersize=5,
-            linewidth=1.2,
-            linestyle=LINE_STYLES[group % len(LINE_STYLES)],
-            color=colours(MAX_LIGHTNESS * at / max(len(lines) - 1, 1)),
-            label=f"{name} {line}",
-        )
 
 
 def _xy(points: Sequence[Point]) -> tuple[list[float], list[float]]:

@@ -1,6 +1,7 @@
 """Who is on the road: bodies by kind, how each kind drives, and lanes filled with them."""
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 
 import numpy as np
 
@@ -36,7 +37,8 @@ CYCLING = Driver(
 )
 
 
-def load_bodies() -> dict[str, Mesh]:
+@cache
+def load_bodies() -> Mapping[str, Mesh]:
     """The built-in bodies, by kind."""
     return {kind: load_document(Vehicle, "vehicles", kind).mesh() for kind in CATEGORIES}
 

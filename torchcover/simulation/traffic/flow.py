@@ -83,6 +83,8 @@ class Simulation:
         self._signals = signals
         self._gates = Gates.from_lanes([lane.gates for lane in lanes])
         self._next = (self._gates.exit_m[self._lane] < (self.place_m - self._length / 2)[:, None]).sum(axis=1)
+        # The gate that each agent is in, or else the next one ahead.
+        self._gate = self._gates.take(self._lane, self._next)
         self.speed_mps = self._first_speed()
 
     def run(self, times_s: Numbers, warm_up_s: float = 0.0) -> Flow:
@@ -102,7 +104,7 @@ class Simulation:
         steps = int(np.ceil(duration_s / MAX_STEP_S - 1e-9))
         for step in range(steps):
             self._step(start_s + step * duration_s / steps, duration_s / steps)
-        return self.place_m, self.speed_mps, self._occupied(self._gate())
+        return self.place_m, self.speed_mps, self._occupied(self._gate)
 
     def _step(self, time_s: float, step_s: float) -> None:
         gap = self._gap_to_leader()
@@ -115,7 +117,10 @@ class Simulation:
         )
         way, self.speed_mps = advance(self.speed_mps, wanted, np.minimum(gap, line), step_s)
         self.place_m = self.place_m + way
-        self._next = self._next + (self.place_m - self._length / 2 > self._gate().exit_m)
+        passed = self.place_m - self._length / 2 > self._gate.exit_m
+        if passed.any():
+            self._next = self._next + passed
+            self._gate = self._gates.take(self._lane, self._next)
 
     def _gap_to_leader(self) -> Numbers:
         """(N,) free road to the one ahead, bumper to bumper."""
@@ -124,7 +129,7 @@ class Simulation:
 
     def _gap_to_closed_gate(self, time_s: float) -> Numbers:
         """(N,) way from the front to the next stop line that one may not and need not cross; else infinite."""
-        gate = self._gate()
+        gate = self._gate
         green = self._signals.green_left_s(time_s)[gate.junction, gate.phase] > gate.green_needed_s
         free = ~self._occupied(gate)[gate.junction, 1 - gate.phase]
         closed = (~(green & free) | self._jammed_behind(gate)) & ~self._committed(gate)
@@ -151,13 +156,9 @@ class Simulation:
         occupied[gate.junction[committed], gate.phase[committed]] = True
         return occupied
 
-    def _gate(self) -> Gates:
-        """The gate that each agent is in, or else the next one ahead."""
-        return self._gates.take(self._lane, self._next)
-
     def _first_speed(self) -> Numbers:
         """(N,) fast, but slow enough to stop at the next line, and for the gap to the one ahead."""
-        stoppable = np.sqrt(self._driver.deceleration_mps2 * np.maximum(self._gap_to(self._gate()), 0.0))
+        stoppable = np.sqrt(self._driver.deceleration_mps2 * np.maximum(self._gap_to(self._gate), 0.0))
         to_leader = np.maximum(self._gap_to_leader() - self._driver.standstill_gap_m, 0.0)
         bearable = to_leader / self._driver.headway_s
         return np.asarray(np.minimum(0.95 * self._driver.desired_speed_mps, np.minimum(stoppable, bearable)))
