@@ -15,7 +15,6 @@ from pathlib import Path
 import torch
 
 from torchcover import BevGrid, CoverageMetric, forward_regions
-from torchcover.coverage.estimate import ESTIMATORS
 from torchcover.data import SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe
 from torchcover.simulation import EvenReference
@@ -47,7 +46,7 @@ def main():
 
 
 def estimates(job):
-    """One run: [value, error] of each estimator, region, band and quantity, for a rig and for the difference to it."""
+    """One run: [value, error] of each region, band and quantity, for a rig and for the difference to it."""
     seed, every_s, steps, rays = job
     torch.set_num_threads(1)
     reference = EvenReference(areas=tuple((region.x, region.y) for region in REGIONS), rays=rays)
@@ -59,8 +58,8 @@ def estimates(job):
     observe(frames, observers.values())
     coverages = {rig: observer.compute() for rig, observer in observers.items()}
     subjects = {RIG: [], f"{OTHER} - {RIG}": []}
-    for estimator, region, height in product(ESTIMATORS, REGIONS, GRID.heights):
-        own, other = (coverages[rig].estimate(region, height, estimator) for rig in (RIG, OTHER))
+    for region, height in product(REGIONS, GRID.heights):
+        own, other = (coverages[rig].estimate(region, height) for rig in (RIG, OTHER))
         for rows, estimate in zip(subjects.values(), (own, other.minus(own)), strict=True):
             rows.extend(zip(estimate.value.tolist(), estimate.error.tolist(), strict=True))
     return subjects
@@ -68,9 +67,9 @@ def estimates(job):
 
 def report(runs):
     """The tables of docs/measured/error_bars.md: spread over the runs, root mean square of the errors, their ratio."""
-    print("| estimator | region | height | quantity | mean | spread | reported error | spread / error |")
-    print("|---|---|---|---|---|---|---|---|")
-    names = product(ESTIMATORS, [region.name for region in REGIONS], GRID.heights, ["radius (m)", "detection"])
+    print("| region | height | quantity | mean | spread | reported error | spread / error |")
+    print("|---|---|---|---|---|---|---|")
+    names = product([region.name for region in REGIONS], GRID.heights, ["radius (m)", "detection"])
     ratios = []
     for at, name in enumerate(names):
         values, errors = torch.tensor([run[at] for run in runs], dtype=torch.float64).T

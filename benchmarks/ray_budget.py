@@ -22,7 +22,6 @@ GRID = BevGrid(x=(0.0, 160.0), y=(-40.0, 40.0), cell=0.25)
 ESTIMATORS = (
     ("paper's pattern, known cells", "paper", "known"),
     ("even rays, known cells", "even", "known"),
-    ("even rays, completed", "even", "completed"),
     ("surface points, by area", "surface", "area"),
 )
 

@@ -146,6 +146,20 @@ def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchco
     assert name in torchcover("evaluate", "--help")[1]
 
 
+def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_not(torchcover, worlds):
+    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell", 4, "--rays", 1024, "--out"]
+    rows = {}
+    for measure in ("area", "known"):
+        assert torchcover("evaluate", worlds / "low.yaml", *options, worlds / measure, "--estimate", measure)[0] == 0
+        summary = json.loads((worlds / measure / "summary.json").read_text())
+        assert summary["measure"] == measure
+        rows[measure] = summary["rows"]
+    for area, known in zip(rows["area"], rows["known"], strict=True):
+        assert area["known_radius_m"] == known["radius_m"]
+        assert area["known_share"] == known["known_share"]
+    assert any(area["radius_m"] != known["radius_m"] for area, known in zip(rows["area"], rows["known"], strict=True))
+
+
 def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording, tmp_path, monkeypatch):
     (recording / "reference" / "f2.npy").write_bytes(b"rubbish")
     update, given = CoverageMetric.update, []
@@ -193,7 +207,15 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             ["evaluate", "front_roof_128", "--reference", "best"],
             f"reference best: {' or '.join(f'`{name}`' for name in REFERENCE_SENSORS)} is needed",
         ),
-        (["evaluate", "front_roof_128", "--rays", "7"], "rays: at least 2 for each of 4 areas are needed; got 7"),
+        (
+            ["evaluate", "front_roof_128", "--reference", "even", "--rays", "7"],
+            "rays: at least 2 for each of 4 areas are needed; got 7",
+        ),
+        (["evaluate", "front_roof_128", "--estimate", "best"], "'best' is not one of 'area', 'known'"),
+        (
+            ["evaluate", "front_roof_128", "--reference", "paper", "--estimate", "area"],
+            "estimate area: it needs the",
+        ),
         (["evaluate", "front_roof_128", "--rays", "0"], "--rays"),
         (["evaluate", "--frames", "recording", "--rays", "9"], "reference, rays and every are for simulations"),
         (["evaluate", "--frames", "recording", "--reference", "even"], "reference, rays and every are for simul"),

@@ -76,7 +76,7 @@ def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
     *_, out = compare(torchcover, worlds, "low", "both")
     assert sorted(path.name for path in (out / "maps").iterdir()) == sorted(
         f"{prefix}{metric}_{band}{suffix}.png"
-        for metric in ("radius_m", "detection_2m")
+        for metric in ("radius_m", "detection_2m", "radius_area_m", "detection_area_2m")
         for band in ("ground", "obstacle")
         for prefix, suffix in (("", ""), ("difference_", "_both_minus_low"))
     )
@@ -102,7 +102,7 @@ def test_errors_are_drawn_if_asked_for_and_differences_come_with_theirs(torchcov
 
 @pytest.mark.parametrize(
     ("options", "sensor", "rays"),
-    [([], "even", 4080), (["--reference", "even"], "even", 4080), (["--reference", "paper"], "paper", 64 * 64)],
+    [(["--reference", "even"], "even", 4080), (["--reference", "paper"], "paper", 64 * 64)],
 )
 def test_the_reference_sensor_is_the_one_that_was_asked_for_and_is_named(torchcover, worlds, options, sensor, rays):
     _, printed, _, out = compare(torchcover, worlds, "low", "both", steps=2, options=options)
@@ -207,7 +207,10 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
             ["kitti", "nuscenes", "--reference", "best"],
             f"reference best: {' or '.join(f'`{name}`' for name in REFERENCE_SENSORS)} is needed",
         ),
-        (["kitti", "nuscenes", "--rays", "7"], "rays: at least 2 for each of 4 areas are needed; got 7"),
+        (
+            ["kitti", "nuscenes", "--reference", "even", "--rays", "7"],
+            "rays: at least 2 for each of 4 areas are needed; got 7",
+        ),
     ],
 )
 def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, arguments, message, tmp_path):

@@ -48,7 +48,7 @@ def test_what_makes_no_sense_ends_in_one_line(torchcover, tmp_path, options, mes
 
 def test_the_advice_has_every_option_that_decides_about_the_error():
     plan = StudyPlan("rig", "urban", steps=8, every_s=2.0)
-    point = WorkPoint("even", 1024, 1, 7, *[0.01] * 6, 1.0)
+    point = WorkPoint("even", 1024, 1, 7, *[0.01] * 4)
     expected = (
         "For 2 percentage points of detection: --reference even --rays 1024 --steps 1 --cell 0.5 --every 2 (7 s)."
     )

@@ -1,4 +1,4 @@
-"""The numbers of a region: over its known cells, and completed by those that are still to be seen."""
+"""The numbers of a region over its known cells."""
 
 import math
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchcover import BevGrid, CoverageMetric, Region
-from torchcover.coverage.estimate import completed_mean, known_mean, unseen_cells
+from torchcover.coverage.estimate import known_mean
 
 GRID = BevGrid(x=(0.0, 8.0), y=(0.0, 4.0), cell=1.0, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)})
 PART = Region("part", x=(1.0, 7.0), y=(0.0, 3.0))
@@ -32,17 +32,16 @@ def metric_over(steps, index=None, **options):
     return metric
 
 
-@pytest.mark.parametrize("estimator", ["known", "completed"])
-def test_what_is_left_out_is_what_a_run_without_the_block_gives(estimator):
+def test_what_is_left_out_is_what_a_run_without_the_block_gives():
     steps = steps_of(40)  # blocks of 4 steps, ten of them in use
     coverage = metric_over(steps, blocks=16).compute()
     for height in GRID.heights:
-        estimate = coverage.estimate(PART, height, estimator)
+        estimate = coverage.estimate(PART, height)
         assert estimate.steps.tolist() == [4] * 10
         for block in range(10):
             kept = [number for number in range(40) if number // 4 != block]
             without = metric_over([steps[number] for number in kept], kept).compute()
-            expected = without.estimate(PART, height, estimator).value
+            expected = without.estimate(PART, height).value
             torch.testing.assert_close(estimate.left_out[block], expected, rtol=1e-10, atol=1e-12)
 
 
@@ -69,45 +68,16 @@ def test_the_mean_over_known_cells_is_that_of_the_map():
         assert coverage.estimate(PART, height).value[0].item() == pytest.approx(cells.nanmean().item(), rel=1e-12)
 
 
-def test_nothing_known_is_unknown_for_both():
-    frames, sums = torch.zeros(5, dtype=torch.int64), torch.zeros(2, 5, dtype=torch.float64)
-    assert known_mean(frames, sums).isnan().all()
-    assert completed_mean(frames, sums).isnan().all()
+def test_nothing_known_is_unknown():
+    assert known_mean(torch.zeros(5, dtype=torch.int64), torch.zeros(2, 5, dtype=torch.float64)).isnan().all()
 
 
-def test_no_more_cells_are_added_than_are_unknown():
-    assert unseen_cells(torch.tensor([1] * 10 + [0] * 3)) == 3
-    assert unseen_cells(torch.tensor([1, 1, 1, 2, 0, 0, 0])) == 3 * 2 / (2 * 2)
-    assert unseen_cells(torch.tensor([5, 1, 3, 0, 0])) == 0  # a single one says nothing
-
-
-def test_with_every_cell_seen_twice_there_is_nothing_to_complete():
-    frames, sums = torch.tensor([2, 3, 9, 0]), torch.rand(2, 4, dtype=torch.float64)
-    assert torch.equal(completed_mean(frames, sums), known_mean(frames, sums))
-
-
-def test_the_completed_mean_is_nearer_to_the_end_than_the_known_one():
-    """Cells that are seldom seen are the blind ones: the mean over those known so far flatters."""
-    random = np.random.default_rng(0)
-    seen = random.uniform(0.01, 0.4, 4000)
-    radius = torch.from_numpy(1 - 2 * seen)
-    in_the_end = radius.mean().item()
-    for steps in (4, 8, 16, 32):
-        frames = torch.from_numpy(random.binomial(steps, seen))
-        sums = (radius * frames)[None]
-        known, completed = known_mean(frames, sums).item(), completed_mean(frames, sums).item()
-        assert known < completed < 1.01 * in_the_end
-        assert abs(completed - in_the_end) < 0.85 * abs(known - in_the_end)
-
-
-def test_the_summary_has_both_with_their_errors():
+def test_the_summary_has_the_numbers_with_their_errors():
     coverage = metric_over(steps_of(64, points=6), blocks=16).compute()
-    row = coverage.summary([PART])[0]
-    completed = coverage.estimate(PART, "low", "completed")
-    assert row.unseen_cells == unseen_cells(coverage.probed_steps[0][PART.mask(GRID)])
-    assert row.completed["radius_m"].value == completed.value[0]
-    assert [row.completed[f"detection_{at}m"].error for at in (0.4, 0.8)] == completed.error[1:].tolist()
-    assert row.numbers["radius_m"].error == coverage.estimate(PART, "low").error[0]
+    row, estimate = coverage.summary([PART])[0], coverage.estimate(PART, "low")
+    assert list(row.numbers) == ["radius_m", "detection_0.4m", "detection_0.8m"]
+    assert [number.value for number in row.numbers.values()] == estimate.value.tolist()
+    assert [number.error for number in row.numbers.values()] == estimate.error.tolist()
     assert not math.isnan(row.numbers["radius_m"].error)
 
 

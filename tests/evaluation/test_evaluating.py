@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 import torchcover
 from torchcover import Coverage, Rig, Scenario
 from torchcover.coverage import Maximum
-from torchcover.data import Frame
+from torchcover.data import DEFAULT_REFERENCE, Frame
 from torchcover.evaluation import TargetError
 from torchcover.evaluation.omissions import HEAVY
 
@@ -70,7 +70,12 @@ def test_one_rig(tmp_path):
         "front_roof_32", "courtyard", 0, None
     )  # fmt: skip
     assert summary["rows"] == result.summary
-    assert summary["reference"] == {"sensor": "even", "rays_per_step": 1020, "every_s": 0.1}
+    assert summary["reference"] == {
+        "sensor": DEFAULT_REFERENCE,
+        "rays_per_step": result.run.counts["reference_rays"] // 2,
+        "every_s": 0.1,
+    }
+    assert 0.5 * SMALL["rays"] < summary["reference"]["rays_per_step"] < 1.5 * SMALL["rays"]
     loaded = Coverage.load(tmp_path / "new" / "out" / "coverage.npz")
     np.testing.assert_array_equal(loaded.radius, result.coverage.radius)
 

@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -50,15 +50,22 @@ Thresholds = Annotated[
 Reference = Annotated[
     str | None,
     typer.Option(
-        help="Reference sensor: `even`, rays spread over the regions and the grid (default); `paper`; or `surface`, "
-        "points with square metres, for numbers by area."
+        help="Reference sensor: `surface`, points drawn evenly on what can be seen (default); `even`, rays spread over "
+        "the regions and the grid; or `paper`."
     ),
 ]
 Rays = Annotated[
     int | None,
     typer.Option(
         min=1,
-        help="Rays of the reference sensor at each step (even: 262144; paper: 1048576, a square; surface: 16384).",
+        help="Rays of the reference sensor at each step (surface: 16384; even: 262144; paper: 1048576, a square).",
+    ),
+]
+Estimate = Annotated[
+    Literal["area", "known"] | None,
+    typer.Option(
+        help="What the number of a region is a mean over: `area`, its visible surface (default; needs `surface`), or "
+        "`known`, its known cells, as in the paper."
     ),
 ]
 Every = Annotated[

@@ -11,6 +11,7 @@ from torchcover.coverage.aggregations import (
     State,
     StepQuantiles,
 )
+from torchcover.coverage.estimate import Measure
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.metric import CoverageMetric
@@ -31,6 +32,7 @@ __all__ = [
     "Layer",
     "Maximum",
     "MeanOfMeans",
+    "Measure",
     "Number",
     "PooledMean",
     "Quantiles",

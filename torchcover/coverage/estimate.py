@@ -1,7 +1,5 @@
-"""The numbers of one region: over its visible surface, over its known cells, or over those it would know in the end."""
+"""The numbers of one region: over its visible surface, or over its known cells."""
 
-from collections.abc import Callable, Mapping
-from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 import torch
@@ -10,10 +8,8 @@ from torch import Tensor
 from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.errors import jackknife_error
 
-CellEstimator = Literal["known", "completed"]
-Estimator = Literal["known", "completed", "area"]
-# Those that a result may be headed by: "area" where the reference points have square metres.
-Measure = Literal["known", "area"]
+# What the number of a region is a mean over: its visible surface, or its known cells.
+Measure = Literal["area", "known"]
 
 
 class RegionEstimate(NamedTuple):
@@ -39,10 +35,8 @@ class RegionEstimate(NamedTuple):
         return RegionEstimate(self.value - other.value, self.left_out - other.left_out, self.steps)
 
 
-def estimate_region(
-    probed: Tensor, sums: Tensor, blocks: Blocks | None, band: int, cells: Tensor, estimator: CellEstimator
-) -> RegionEstimate:
-    """Estimate the numbers of a region, and what they become without each block.
+def estimate_known(probed: Tensor, sums: Tensor, blocks: Blocks | None, band: int, cells: Tensor) -> RegionEstimate:
+    """The unweighted means over the known cells of a region, and what they become without each block.
 
     Args:
         probed: (K,) steps that had a reference point in each cell of the region.
@@ -50,17 +44,18 @@ def estimate_region(
         blocks: The same in blocks, over the whole grid, if there are any.
         band: Number of the height band.
         cells: (Y, X) bool, the K cells of the region.
-        estimator: "known" for the unweighted mean over the known cells, "completed" for `completed_mean`.
+
+    Returns:
+        NaN where no cell is known.
     """
-    mean = ESTIMATORS[estimator]
-    whole = mean(probed, sums)
+    whole = known_mean(probed, sums)
     if blocks is None:
         return RegionEstimate(whole, whole.new_empty((0, len(whole))), whole.new_empty(0))
     left_out = []
     used = blocks.steps.nonzero().flatten().tolist()
     for block in used:
         own = blocks.sums[block, :, band][:, cells]
-        left_out.append(mean(probed - blocks.probed_steps[block, band][cells], sums - own))
+        left_out.append(known_mean(probed - blocks.probed_steps[block, band][cells], sums - own))
     return RegionEstimate(whole, torch.stack(left_out) if left_out else whole[None][:0], blocks.steps[used])
 
 
@@ -99,43 +94,3 @@ def known_mean(probed: Tensor, sums: Tensor) -> Tensor:
     """
     known = probed > 0
     return (sums[:, known] / probed[known]).mean(dim=1)
-
-
-def completed_mean(probed: Tensor, sums: Tensor) -> Tensor:
-    """Means over the known cells and those that more steps would make known, which are thought to be like the rarest.
-
-    As long as cells that can be seen are unknown, the known ones are the easy ones. How many are missing is the
-    question of how many species a sample has missed, and has its answer (Chao 1987, Biometrics 43, 783-791, in the
-    form without bias for few cells): f1 (f1 - 1) / (2 (f2 + 1)), where f1 and f2 cells were seen in one and in two
-    steps. They are given the mean of the cells that were seen in one step only, which are the likest to them.
-
-    Args:
-        probed: (K,) steps that had a reference point in each cell.
-        sums: (Q, K) sums over these steps.
-
-    Returns:
-        (Q,) means; NaN if no cell is known.
-
-    Example:
-        >>> probed = torch.tensor([9, 9, 1, 1, 1, 1, 2, 0, 0, 0])  # 12 / 4 = 3 more cells are like the singles
-        >>> radius = torch.where(probed == 1, 1.0, 0.0)
-        >>> completed_mean(probed, (radius * probed)[None]), known_mean(probed, (radius * probed)[None])
-        (tensor([0.7000]), tensor([0.5714]))
-    """
-    known, single = probed > 0, probed == 1
-    unseen = unseen_cells(probed)
-    if unseen == 0:
-        return known_mean(probed, sums)
-    total = (sums[:, known] / probed[known]).sum(dim=1) + unseen * sums[:, single].mean(dim=1)
-    return total / (known.sum() + unseen)
-
-
-def unseen_cells(probed: Tensor) -> float:
-    """About how many cells would become known with more steps; at most those that are unknown."""
-    once, twice = int((probed == 1).sum()), int((probed == 2).sum())
-    return min(once * (once - 1) / (2 * (twice + 1)), int((probed == 0).sum()))
-
-
-ESTIMATORS: Mapping[str, Callable[[Tensor, Tensor], Tensor]] = MappingProxyType(
-    {"known": known_mean, "completed": completed_mean}
-)

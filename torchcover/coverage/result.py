@@ -13,15 +13,9 @@ from torchcover.coverage.aggregations import MeanOfMeans
 from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
 from torchcover.coverage.errors import cell_errors
-from torchcover.coverage.estimate import (
-    Estimator,
-    Measure,
-    RegionEstimate,
-    estimate_area,
-    estimate_region,
-    unseen_cells,
-)
+from torchcover.coverage.estimate import Measure, RegionEstimate, estimate_area, estimate_known
 from torchcover.coverage.grid import BevGrid
+from torchcover.coverage.intervals import interval95
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import RADIUS, Quantity
 from torchcover.coverage.regions import Region, regions_within
@@ -78,7 +72,7 @@ class Coverage:
         self.counts = dict(counts)
         self.blocks = blocks
         self.area = area
-        self._estimates: dict[tuple[Region, str, Estimator], RegionEstimate] = {}
+        self._estimates: dict[tuple[Region, str, Measure], RegionEstimate] = {}
 
     def __repr__(self) -> str:
         known = float((self.probed_steps > 0).double().mean())
@@ -104,8 +98,8 @@ class Coverage:
         """Key of a quantity -> (H, Y, X) standard errors; NaN where too few blocks probed, empty without blocks."""
         if self.blocks is None:
             return {}
-        each = [cell_errors(sums, self.blocks) for sums in self.blocks.sums.unbind(dim=1)]
-        return {quantity.key: error for quantity, error in zip(self.quantities, each, strict=True)}
+        each = zip(self.quantities, self.blocks.sums.unbind(dim=1), strict=True)
+        return {quantity.key: cell_errors(sums, self.blocks, quantity.unit) for quantity, sums in each}
 
     @property
     def radius_error(self) -> Tensor | None:
@@ -142,39 +136,38 @@ class Coverage:
         """What its numbers are means over: "area" if the reference points had square metres, else "known"."""
         return "known" if self.area is None else "area"
 
-    def estimate(self, region: Region, height: str, estimator: Estimator | None = None) -> RegionEstimate:
+    def estimate(self, region: Region, height: str, measure: Measure | None = None) -> RegionEstimate:
         """The numbers of one region in one band with what they become without each block, for errors of differences.
 
         Args:
             region: A region within the grid.
             height: Name of the band.
-            estimator: "known", the paper's unweighted mean over the known cells; "completed", which adds those that
-                more steps would make known (`torchcover.coverage.estimate.completed_mean`); "area", the mean over the
-                visible surface (`torchcover.coverage.estimate.estimate_area`), for points that have square metres. Not
-                given: `measure`.
+            measure: "area", the mean over the visible surface (`torchcover.coverage.estimate.estimate_area`), for
+                points that have square metres, or "known", the paper's unweighted mean over the known cells. Not given:
+                that of this result.
 
         Raises:
             ValueError: A region that reaches beyond the grid, or holds no cell centre; no such band; "area" of points
                 without square metres.
         """
-        key = region, height, estimator or self.measure
+        key = region, height, measure or self.measure
         if key not in self._estimates:
             self._estimates[key] = self._estimate(*key)
         return self._estimates[key]
 
-    def _estimate(self, region: Region, height: str, estimator: Estimator) -> RegionEstimate:
+    def _estimate(self, region: Region, height: str, measure: Measure) -> RegionEstimate:
         cells = region.mask(self.grid).to(self.radius.device)
         if not cells.any():
             raise ValueError(f"region {region.name!r} holds no cell centre; the cell is {self.grid.cell:g} m")
         if height not in self.grid.heights:
             raise ValueError(f"height {height!r}: the grid has {', '.join(self.grid.heights)}")
         band = list(self.grid.heights).index(height)
-        if estimator == "area":
+        if measure == "area":
             return estimate_area(self._square_metres(), band, cells)
         probed = self.probed_steps[band][cells]
         means = torch.stack([self.layers[quantity.key].values[band][cells] for quantity in self.quantities])
         sums = (means * probed).where(probed > 0, 0.0)
-        return estimate_region(probed, sums, self.blocks, band, cells, estimator)
+        return estimate_known(probed, sums, self.blocks, band, cells)
 
     def _square_metres(self) -> AreaSums:
         if self.area is None:
@@ -242,11 +235,9 @@ class Coverage:
             height=height,
             cells=len(probed),
             known_cells=int((probed > 0).sum()),
-            unseen_cells=unseen_cells(probed),
             measure=self.measure,
             numbers=self._numbers(self.estimate(region, height)),
             known=self._numbers(self.estimate(region, height, "known")),
-            completed=self._numbers(self.estimate(region, height, "completed")),
             visible_m2=math.nan if self.area is None else self._visible_m2(self.area, band, cells),
         )
 
@@ -255,5 +246,9 @@ class Coverage:
         return total / self.counts["steps"] if self.counts["steps"] else math.nan
 
     def _numbers(self, estimate: RegionEstimate) -> dict[str, Number]:
-        numbers = map(Number, estimate.value.tolist(), estimate.error.tolist())
-        return {quantity.key: number for quantity, number in zip(self.quantities, numbers, strict=True)}
+        numbers, freedom = {}, len(estimate.steps) - 1
+        for quantity, value, error in zip(
+            self.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True
+        ):
+            numbers[quantity.key] = Number(value, error, *interval95(value, error, freedom, quantity.unit))
+        return numbers

@@ -1,5 +1,6 @@
 """The numbers of a region, as tables and loggers take them."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -8,10 +9,19 @@ from torchcover.coverage.estimate import Measure
 
 
 class Number(NamedTuple):
-    """A number in the unit of its quantity, and its standard error; NaN where it is not known."""
+    """A number in the unit of its quantity, its standard error and its 95 % interval; NaN where it is not known.
+
+    Args:
+        value: The number.
+        error: Its standard error.
+        low: Lower end of the interval, from `torchcover.coverage.intervals.interval95`.
+        high: Upper end.
+    """
 
     value: float
     error: float
+    low: float = math.nan
+    high: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -23,13 +33,10 @@ class RegionSummary:
         height: Name of the height band.
         cells: Number of cells in the region.
         known_cells: How many of them a reference point has probed.
-        unseen_cells: About how many more would become known with more steps.
         measure: What `numbers` are means over: "area", the visible surface, or "known", the known cells.
         numbers: Key of the quantity, such as `"radius_m"` or `"detection_0.4m"` -> its number; the error is NaN if it
             was not asked for, or if there are not enough steps.
         known: The numbers over the known cells, every cell weighing the same; `numbers` itself if that is its measure.
-        completed: These with the unseen cells, as far as can be told; less biased as long as there are many. See
-            `torchcover.coverage.estimate.completed_mean`.
         visible_m2: Mean over the steps of the square metres of the region's surface that the reference sees; NaN where
             its points have none.
     """
@@ -38,11 +45,9 @@ class RegionSummary:
     height: str
     cells: int
     known_cells: int
-    unseen_cells: float
     measure: Measure
     numbers: Mapping[str, Number]
     known: Mapping[str, Number]
-    completed: Mapping[str, Number]
     visible_m2: float
 
     @property

@@ -7,11 +7,15 @@ from torchcover.data.clouds import read_cloud
 from torchcover.data.frame import Frame, FrameBatch, collate_frames
 from torchcover.data.recorded import RecordedFrames
 from torchcover.data.recordings import FORMATS, RecordingFormat, open_recording
+from torchcover.data.reference import DEFAULT_REFERENCE, GRID_X_M, GRID_Y_M, reference_called
 from torchcover.data.simulated import SimulatedFrames
 from torchcover.data.source import FrameSource
 
 __all__ = [
+    "DEFAULT_REFERENCE",
     "FORMATS",
+    "GRID_X_M",
+    "GRID_Y_M",
     "Augmentation",
     "BadFrameError",
     "ChosenRigs",
@@ -25,6 +29,7 @@ __all__ = [
     "flip",
     "open_recording",
     "read_cloud",
+    "reference_called",
     "rotate",
     "scale",
 ]

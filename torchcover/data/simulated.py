@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from torchcover.data.frame import Frame
+from torchcover.data.reference import reference_called
 from torchcover.detection.boxes import Boxes, points_in_boxes
-from torchcover.simulation import Label, PaperReference, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
+from torchcover.simulation import Label, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
 
 
 class SimulatedFrames(Dataset[Frame]):
@@ -32,7 +33,8 @@ class SimulatedFrames(Dataset[Frame]):
         steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
             traffic, the same instants are seen again, which `Frame.instant` and `Frame.counts` say.
         seed: Seed of the traffic and of the reference sensor's poses.
-        reference_sensor: The reference sensor, such as `EvenReference`; the paper's if not given.
+        reference_sensor: The reference sensor, such as `PaperReference()`; `reference_called()`, a `SurfaceReference`,
+            if not given.
         every_s: Time between one frame and the next, a multiple of the scenario's time step; that step if not given.
             Steps that follow each other are alike: with the same number of frames, a longer time shows more, and in
             traffic, which starts anew, the frames are spread over more cities.
@@ -46,11 +48,9 @@ class SimulatedFrames(Dataset[Frame]):
             an actor that overlaps the ego.
 
     Example:
-        >>> frames = SimulatedFrames(
-        ...     "courtyard", "front_roof_128", steps=2, seed=0, reference_sensor=PaperReference(rows=16, columns=16)
-        ... )
-        >>> len(frames), frames[0].sensor.shape[1], frames[0].reference.dtype
-        (2, 3, torch.float32)
+        >>> frames = SimulatedFrames("courtyard", "front_roof_128", steps=2, seed=0)
+        >>> len(frames), frames[0].sensor.shape[1], frames[0].reference.dtype, frames[0].weight_kind
+        (2, 3, torch.float32, 'm2')
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class SimulatedFrames(Dataset[Frame]):
         self.simulator = Simulator(
             scenario if isinstance(scenario, Scenario) else Scenario.load(scenario),
             _rigs(rig, rigs),
-            reference_sensor or PaperReference(),
+            reference_called() if reference_sensor is None else reference_sensor,
             seed=seed,
             every_s=every_s,
         )

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
-from torchcover.coverage import Aggregation
+from torchcover.coverage import Aggregation, Measure
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.omissions import left_out
 from torchcover.evaluation.pipeline import observe
@@ -28,6 +28,7 @@ def evaluate(
     aggregations: Sequence[Aggregation] = (),
     reference_sensor: str | None = None,
     rays: int | None = None,
+    estimate: Measure | None = None,
     every_s: float | None = None,
     target_error: AnyTargetError | None = None,
     device: AnyDevice = "cpu",
@@ -48,9 +49,11 @@ def evaluate(
         cell_m: Side of a grid cell in metres.
         thresholds: Detection thresholds in metres, or a single one.
         aggregations: Maps beside the mean of means, as in `CoverageMetric`.
-        reference_sensor: Name of the reference sensor, as in `torchcover.simulation.REFERENCE_SENSORS`; "even" if not
-            given. Numbers are by area for one whose points have square metres.
+        reference_sensor: Name of the reference sensor, as in `torchcover.simulation.REFERENCE_SENSORS`; "surface" if
+            not given.
         rays: Its rays at each step; as many as it does best with if not given.
+        estimate: What the number of a region is a mean over: "area", its visible surface, or "known", its known cells.
+            Not given: the surface, if the reference points have square metres.
         every_s: Time between two steps in seconds; 10 in traffic if not given, else the scenario's own step.
         target_error: End once every number is this good: a `TargetError`, "0.1%", or ["0.1%", "0.02m"].
         device: Where the search and the sums run: "cpu", "cuda", ...
@@ -95,6 +98,7 @@ def compare(
     aggregations: Sequence[Aggregation] = (),
     reference_sensor: str | None = None,
     rays: int | None = None,
+    estimate: Measure | None = None,
     every_s: float | None = None,
     target_error: AnyTargetError | None = None,
     device: AnyDevice = "cpu",
@@ -118,6 +122,7 @@ def compare(
         aggregations: Maps beside the mean of means.
         reference_sensor: Name of the reference sensor.
         rays: Its rays at each step.
+        estimate: What the numbers are means over.
         every_s: Time between two steps in seconds.
         target_error: End once every number, and every difference, is this good.
         device: Where the search and the sums run.

@@ -5,9 +5,8 @@ from collections.abc import Iterator
 import numpy as np
 from matplotlib.figure import Figure
 
-from torchcover.data import SimulatedFrames
+from torchcover.data import GRID_X_M, GRID_Y_M, SimulatedFrames
 from torchcover.evaluation.sensor_drawings import sensor_views
-from torchcover.evaluation.settings import GRID_X_M, GRID_Y_M
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
 from torchcover.report import ActorMark, draw_depths, draw_rig, draw_scene

@@ -4,16 +4,16 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from numbers import Real
-from typing import Any, Self
+from typing import Any, Self, get_args
 
 import torch
 
-from torchcover.coverage import Aggregation, BevGrid, CoverageMetric, Region, forward_regions
+from torchcover.coverage import Aggregation, BevGrid, CoverageMetric, Measure, Region, forward_regions
+from torchcover.data import GRID_X_M, GRID_Y_M
 from torchcover.evaluation.target_error import AnyTargetError, TargetError
-from torchcover.simulation import REFERENCE_SENSORS, ReferenceSensor, Scenario, WeightKind
+from torchcover.simulation import Scenario, WeightKind
 
 DEFAULT_SCENARIO = "courtyard"
-DEFAULT_REFERENCE = "even"
 DEFAULT_STEPS = 64
 # With a target error; as many as the paper averages.
 MAX_STEPS = 4096
@@ -21,9 +21,6 @@ MAX_STEPS = 4096
 EVERY_S_IN_TRAFFIC = 10.0
 # For standard errors: at least half as many are in use at the end of a long run.
 BLOCKS = 16
-# Holds the paper's regions, and the space beside and behind the vehicle.
-GRID_X_M = (-40.0, 160.0)
-GRID_Y_M = (-40.0, 40.0)
 
 AnyThresholds = float | Iterable[float]
 AnyDevice = str | torch.device
@@ -34,7 +31,7 @@ class Settings:
     """What `evaluate` and `compare` let the user set, see there; None where the user gave nothing.
 
     Raises:
-        ValueError: A number of steps below 1.
+        ValueError: A number of steps below 1, an unknown measure.
     """
 
     steps: int | None = None
@@ -44,6 +41,7 @@ class Settings:
     aggregations: tuple[Aggregation, ...] = ()
     reference_sensor: str | None = None
     rays: int | None = None
+    estimate: Measure | None = None
     every_s: float | None = None
     target_error: TargetError | None = None
     device: str = "cpu"
@@ -53,6 +51,8 @@ class Settings:
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps: at least 1 is needed; got {self.steps}")
+        if self.estimate not in (None, *get_args(Measure)):
+            raise ValueError(f"estimate {self.estimate}: `area` or `known` is needed")
 
     @classmethod
     def among(cls, arguments: Mapping[str, Any]) -> Self:
@@ -95,9 +95,23 @@ class Settings:
 
         Args:
             weight_kind: What the weights of reference points are.
+
+        Raises:
+            ValueError: An estimate by area is wanted, and the weights are no square metres; a device that cannot be
+                used.
         """
-        device = usable_device(self.device)
-        return new_metric(self.cell_m, self.thresholds, device, aggregations=self.aggregations, weight_kind=weight_kind)
+        if self.estimate == "area" and weight_kind != "m2":
+            raise ValueError(
+                "estimate area: it needs the square metres of reference points, which only the surface reference of a "
+                "simulation gives; leave it out for means over the known cells"
+            )
+        return new_metric(
+            self.cell_m,
+            self.thresholds,
+            usable_device(self.device),
+            aggregations=self.aggregations,
+            square_metres=weight_kind == "m2" and self.estimate != "known",
+        )
 
 
 def usable_device(name: str) -> torch.device:
@@ -121,7 +135,7 @@ def new_metric(
     *,
     blocks: int = BLOCKS,
     aggregations: Sequence[Aggregation] = (),
-    weight_kind: WeightKind | None = None,
+    square_metres: bool = False,
 ) -> CoverageMetric:
     """An empty metric over the grid of every evaluation, with standard errors unless there is one block only.
 
@@ -136,7 +150,7 @@ def new_metric(
             max_radius=grid.diagonal_m,
             blocks=blocks,
             aggregations=aggregations,
-            square_metres=weight_kind == "m2",
+            square_metres=square_metres,
         ).to(device)
     except RuntimeError as error:  # what torch raises when there is no memory left
         raise ValueError(
@@ -165,32 +179,6 @@ def spread_s(scenario: Scenario, given_s: float | None) -> float:
     share = (math.sqrt(5) - 1) / 2 * scenario.instants
     each_once = (steps for steps in range(1, scenario.instants + 1) if math.gcd(steps, scenario.instants) == 1)
     return min(each_once, key=lambda steps: abs(steps - share)) * scenario.step_s
-
-
-def reference_called(name: str | None, rays: int | None) -> ReferenceSensor:
-    """A reference sensor by its name.
-
-    Args:
-        name: One of `REFERENCE_SENSORS`; None for the default. Asked about the paper's regions and the grid.
-        rays: About how many rays at each step; None for the sensor's own number.
-
-    Raises:
-        ValueError: Another name, or too few rays.
-    """
-    areas = (*((region.x, region.y) for region in forward_regions()), (GRID_X_M, GRID_Y_M))
-    return reference_kind(name or DEFAULT_REFERENCE).from_rays(areas, rays)
-
-
-def reference_kind(name: str) -> type[ReferenceSensor]:
-    """The class of a reference sensor.
-
-    Raises:
-        ValueError: There is none of this name.
-    """
-    kind = REFERENCE_SENSORS.get(name)
-    if kind is None:
-        raise ValueError(f"reference {name}: {' or '.join(f'`{known}`' for known in REFERENCE_SENSORS)} is needed")
-    return kind
 
 
 def _thresholds(given: Any) -> tuple[float, ...]:  # noqa: ANN401  (whatever the user gave)

@@ -113,8 +113,8 @@ def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
 
 
 def _point(runs: Sequence[Sample]) -> WorkPoint:
-    *squares, known = torch.stack([run.squared_errors for run in runs]).mean(dim=0).tolist()
-    radius, detection, completed_radius, completed_detection, cell_radius, cell_detection = (x**0.5 for x in squares)
+    squares = torch.stack([run.squared_errors for run in runs]).mean(dim=0)
+    radius, detection, cell_radius, cell_detection = squares.sqrt().tolist()
     return WorkPoint(
         reference=runs[0].trial.reference_sensor,
         rays=runs[0].trial.rays,
@@ -122,9 +122,6 @@ def _point(runs: Sequence[Sample]) -> WorkPoint:
         seconds=sum(run.seconds for run in runs) / len(runs),
         detection_error=detection,
         radius_error_m=radius,
-        completed_detection_error=completed_detection,
-        completed_radius_error_m=completed_radius,
         cell_detection_error=cell_detection,
         cell_radius_error_m=cell_radius,
-        known_share=known,
     )

@@ -6,8 +6,8 @@ from pathlib import Path
 import torch
 
 from torchcover.coverage import CoverageMetric
-from torchcover.data import SimulatedFrames
-from torchcover.evaluation.settings import DEFAULT_SCENARIO, new_metric, reference_called, reference_kind, spread_s
+from torchcover.data import SimulatedFrames, reference_called
+from torchcover.evaluation.settings import DEFAULT_SCENARIO, new_metric, spread_s
 from torchcover.simulation import Scenario
 
 # Seeds of the runs are next to each other; the long run's is far away.
@@ -63,7 +63,7 @@ class StudyPlan:
                 f"long_run_rays: no fewer than any run has are needed, {max(self.rays)}; got {self.long_run_rays}"
             )
         for name in self.references:
-            if reference_kind(name).weight_kind == "m2":
+            if reference_called(name).weight_kind == "m2":
                 raise ValueError(f"references: {name} measures by area, which the others do not")
 
     def frames(self, seed: int, steps: int) -> SimulatedFrames:

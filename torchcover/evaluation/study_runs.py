@@ -9,10 +9,9 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from torchcover.data import SimulatedFrames
+from torchcover.data import SimulatedFrames, reference_called
 from torchcover.evaluation.observers import CoverageObserver
 from torchcover.evaluation.progress import progress_of
-from torchcover.evaluation.settings import reference_called
 from torchcover.evaluation.study_plan import StudyPlan
 from torchcover.evaluation.study_truth import Truth
 from torchcover.neighbors import nearest

@@ -6,13 +6,10 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import Coverage, Region, forward_regions
-from torchcover.coverage.estimate import Estimator
 from torchcover.evaluation.observers import CoverageObserver
 from torchcover.evaluation.pipeline import observe
 from torchcover.evaluation.settings import BLOCKS
 from torchcover.evaluation.study_plan import StudyPlan
-
-ESTIMATORS: tuple[Estimator, ...] = ("known", "completed")
 
 
 @dataclass(frozen=True)
@@ -31,24 +28,17 @@ class Truth:
 
     @classmethod
     def from_coverage(cls, coverage: Coverage) -> "Truth":
-        """What a coverage says, its unknown cells completed."""
-        estimates = [coverage.estimate(region, height, "completed") for region, height in _places(coverage)]
+        """What a coverage says."""
+        estimates = [coverage.estimate(region, height) for region, height in _places(coverage)]
         values = torch.stack([estimate.value for estimate in estimates])
         return cls(coverage, values, torch.stack([estimate.error for estimate in estimates]))
 
     def squared_errors(self, coverage: Coverage) -> Tensor:
-        """(7,) mean squares of what a coverage is off by, and its mean known share.
-
-        Radius and detection over the known cells, with the others completed, and cell by cell; the regions' share.
-        """
-        squares = []
-        for estimator in ESTIMATORS:
-            values = torch.stack([coverage.estimate(*place, estimator).value for place in _places(coverage)])
-            # A region of which nothing is known yet has no distance.
-            squares.append((values - self.values).square().nanmean(dim=0))
-        squares.append(self._cell_errors(coverage, forward_regions()[-1]))
-        known = torch.tensor([row.known_share for row in coverage.summary(forward_regions())], dtype=torch.float64)
-        return torch.cat([*squares, known.mean()[None]])
+        """(4,) mean squares of what a coverage is off by: radius and detection of the regions, then of the cells."""
+        values = torch.stack([coverage.estimate(*place).value for place in _places(coverage)])
+        # A region of which nothing is known yet has no distance.
+        regions = (values - self.values).square().nanmean(dim=0)
+        return torch.cat([regions, self._cell_errors(coverage, forward_regions()[-1])])
 
     def _cell_errors(self, coverage: Coverage, region: Region) -> Tensor:
         cells, truth = region.mask(coverage.grid), self.coverage

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from torchcover.data import ChosenRigs, FrameSource, SimulatedFrames, open_recording
+from torchcover.data import ChosenRigs, FrameSource, SimulatedFrames, open_recording, reference_called
 from torchcover.evaluation.rig_names import AnyRig, distinct_names, given_as, is_document, loaded
-from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings, reference_called, spread_s
+from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings, spread_s
 from torchcover.simulation import Scenario, Sensor
 
 AnyScenario = Scenario | str | Path

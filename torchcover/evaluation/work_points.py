@@ -9,7 +9,7 @@ from typing import Any
 
 from rich.table import Table
 
-from torchcover.report import WorkPanel, error_words, json_record, percent, text_table
+from torchcover.report import WorkPanel, error_words, json_record, text_table
 
 
 @dataclass(frozen=True)
@@ -23,11 +23,8 @@ class WorkPoint:
         seconds: Time that they took, a mean over the runs.
         detection_error: Of the regions' detection, in [0, 1], over regions, bands and runs.
         radius_error_m: Of the regions' radius.
-        completed_detection_error: Of the detection with the cells that are still to be seen.
-        completed_radius_error_m: Of the radius with them.
         cell_detection_error: Of the detection of the cells that both know.
         cell_radius_error_m: Of their radius.
-        known_share: Known cells over all, a mean over regions, bands and runs.
     """
 
     reference: str
@@ -36,11 +33,8 @@ class WorkPoint:
     seconds: float
     detection_error: float
     radius_error_m: float
-    completed_detection_error: float
-    completed_radius_error_m: float
     cell_detection_error: float
     cell_radius_error_m: float
-    known_share: float
 
 
 # The errors whose fastest points are marked -> what the diagram calls them, and what it multiplies them with.
@@ -56,12 +50,9 @@ HEADINGS = (
     "steps",
     "time (s)",
     "detection\nerror (pp)",
-    "completed\n(pp)",
     "radius\nerror (m)",
-    "completed\n(m)",
     "cells:\ndet. (pp)",
     "cells:\nradius (m)",
-    "known\n(%)",
 )
 
 
@@ -74,7 +65,7 @@ def pareto_front(points: Sequence[WorkPoint], error: str) -> list[WorkPoint]:
 
     Example:
         >>> def point(seconds, error):
-        ...     return WorkPoint("even", 1, 1, seconds, error, 0, 0, 0, 0, 0, 1)
+        ...     return WorkPoint("even", 1, 1, seconds, error, 0, 0, 0)
         >>> front = pareto_front([point(1, 3), point(2, 4), point(3, 1)], "detection_error")
         >>> [one.seconds for one in front]
         [1, 3]
@@ -115,11 +106,10 @@ def _row(point: WorkPoint, *, is_best: bool) -> list[str]:
         f"{point.rays:,}",
         f"{point.steps:,}",
         f"{point.seconds:.1f}",
-        *(error_words(error, "share") for error in (point.detection_error, point.completed_detection_error)),
-        *(error_words(error, "m") for error in (point.radius_error_m, point.completed_radius_error_m)),
+        error_words(point.detection_error, "share"),
+        error_words(point.radius_error_m, "m"),
         error_words(point.cell_detection_error, "share"),
         error_words(point.cell_radius_error_m, "m"),
-        percent(point.known_share),
     ]
 
 

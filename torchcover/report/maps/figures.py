@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage, Quantity, check_paired
-from torchcover.coverage.errors import MIN_BLOCKS_OF_A_CELL
+from torchcover.coverage.blocks import MIN_BLOCKS
 from torchcover.report.maps.arrays import draw_map, draw_side_by_side
 from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, difference_scale, error_scale, scale_of
 from torchcover.report.maps.overlay import SensorView
@@ -57,7 +57,7 @@ def error_subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
     Args:
         coverages: As in `subjects_of`.
     """
-    unknown = f"probed in fewer than {MIN_BLOCKS_OF_A_CELL} blocks of steps"
+    unknown = f"probed in fewer than {MIN_BLOCKS} blocks of steps"
     first = _first(coverages)
     for key in first.errors:
         of = first.layers[key].quantity

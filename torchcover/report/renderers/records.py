@@ -26,8 +26,6 @@ def columns_of(table: CoverageTable) -> Columns:
         columns |= _numbers(key)
     for key in keys if table.measure == "area" else ():
         columns |= _known(key)
-    for key in keys:
-        columns |= _completed(key)
     columns |= _conditions(table)
     for key in keys if len(table.rigs) > 1 else ():
         columns |= _compared(key)
@@ -38,6 +36,8 @@ def _numbers(key: str) -> Columns:
     return {
         key: lambda row: row.summary.numbers[key].value,
         f"{key}_error": lambda row: row.summary.numbers[key].error,
+        f"{key}_low": lambda row: row.summary.numbers[key].low,
+        f"{key}_high": lambda row: row.summary.numbers[key].high,
     }
 
 
@@ -45,13 +45,6 @@ def _known(key: str) -> Columns:
     return {
         f"known_{key}": lambda row: row.summary.known[key].value,
         f"known_{key}_error": lambda row: row.summary.known[key].error,
-    }
-
-
-def _completed(key: str) -> Columns:
-    return {
-        f"completed_{key}": lambda row: row.summary.completed[key].value,
-        f"completed_{key}_error": lambda row: row.summary.completed[key].error,
     }
 
 
@@ -71,7 +64,6 @@ def _conditions(table: CoverageTable) -> Columns:
         "visible_m2": lambda row: row.summary.visible_m2,
         "known_share": lambda row: row.summary.known_share,
         "known_cells": lambda row: row.summary.known_cells,
-        "unseen_cells": lambda row: row.summary.unseen_cells,
         "cells": lambda row: row.summary.cells,
         "cell_m": lambda _: table.grid.cell,
         "steps": lambda row: table.conditions[row.rig].counts["steps"],
