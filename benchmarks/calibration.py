@@ -29,6 +29,7 @@ RIG, SCENARIO, SEED, EVERY_S = "front_roof_128", "urban", 77, 10.0
 GRID = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=0.25)
 REGIONS = forward_regions()
 PLACES = [(region, height) for region in REGIONS for height in GRID.heights]
+ALL = range(len(PLACES))
 UNITS = ("m", "share")
 NAMES = [f"{region.name} {height} {what}" for region, height in PLACES for what in ("radius", "detection")]
 # A cell has a truth if so many cities have probed it.
@@ -130,25 +131,26 @@ class Cities:
         length = 2 ** max(0, math.ceil(math.log2(len(cities) / BLOCKS)))
         return [np.concatenate(cities[at : at + length]) for at in range(0, len(cities), length)]
 
-    def numbers(self, blocks):
-        """Value, error and degrees of freedom of each of the twelve numbers."""
+    def numbers(self, blocks, places=ALL):
+        """Value, error and degrees of freedom of the radius and detection of each place."""
         sums = torch.stack([self.over_regions[block].sum(dim=0) for block in blocks])
         lengths = torch.tensor([len(block) for block in blocks])
         area = AreaSums(lengths, sums[:, None, None, :, 0], sums[..., 1:].movedim(2, 1)[:, :, None, None])
         found = []
-        for at in range(len(PLACES)):
+        for at in places:
             estimate = estimate_area(area, 0, torch.arange(len(PLACES))[None] == at)
             found += zip(estimate.value.tolist(), estimate.error.tolist(), strict=True)
         return [(value, error, len(blocks) - 1) for value, error in found]
 
-    def covers(self, numbers):
-        """Which of the twelve intervals hold the truth."""
-        ends = [interval95(*number, UNITS[at % 2]) for at, number in enumerate(numbers)]
-        return [low <= truth <= high for (low, high), truth in zip(ends, self.truth, strict=True)]
+    def covers(self, number, at):
+        """Whether the interval around a number holds the truth."""
+        low, high = interval95(*number, UNITS[at % 2])
+        return low <= self.truth[at] <= high
 
     def covered(self, random, steps, runs):
         """(12,) shares of the intervals that cover."""
-        return np.mean([self.covers(self.numbers(self.drawn(random, steps))) for _ in range(runs)], axis=0)
+        found = [self.numbers(self.drawn(random, steps)) for _ in range(runs)]
+        return np.mean([[self.covers(number, at) for at, number in enumerate(run)] for run in found], axis=0)
 
     def stopped(self, random, steps, runs):
         """(12,) as `covered`, of runs that ended when this number alone had the error of so many steps."""
@@ -161,11 +163,11 @@ class Cities:
         order = random.integers(len(self.steps), size=most // 6)
         steps, good = MIN_STEPS, 0
         while True:
-            numbers = self.numbers(self.drawn(_Replay(order), steps))
-            error = numbers[at][1]
+            number = self.numbers(self.drawn(_Replay(order), steps), [at // 2])[at % 2]
+            error = number[1]
             good = good + 1 if error <= target else 0
             if good == LOOKS_IN_A_ROW or steps == most:
-                return self.covers(numbers)[at]
+                return self.covers(number, at)
             needed = steps * max(1.0, error / target) ** 2
             steps = min(most, math.ceil(min(max(needed, MIN_GROWTH * steps), MAX_GROWTH * steps)))
 
