@@ -15,14 +15,14 @@ import torch
 
 from benchmarks.timing import table
 from torchcover import forward_regions, nearest
-from torchcover.coverage import BevGrid
+from torchcover.coverage import BevGrid, intervals
 from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.errors import cell_errors
 from torchcover.coverage.estimate import estimate_area
-from torchcover.coverage.intervals import interval95
 from torchcover.data import SimulatedFrames
-from torchcover.evaluation.settings import BLOCKS, GRID_X_M, GRID_Y_M
+from torchcover.data.reference import GRID_X_M, GRID_Y_M
+from torchcover.evaluation.settings import BLOCKS
 from torchcover.evaluation.target_error import LOOKS_IN_A_ROW, MAX_GROWTH, MIN_GROWTH, MIN_STEPS
 
 RIG, SCENARIO, SEED, EVERY_S = "front_roof_128", "urban", 77, 10.0
@@ -41,7 +41,9 @@ def main():
     parser.add_argument("--steps", type=int, default=720, help="steps to simulate, six a city")
     parser.add_argument("--runs", type=int, default=1000)
     parser.add_argument("--sums", type=Path, default=Path("out/calibration.npz"), help="simulated anew if missing")
+    parser.add_argument("--blind-side", type=float, default=intervals.BLIND_SIDE, help="to try another factor")
     options = parser.parse_args([] if __name__ != "__main__" else None)
+    intervals.BLIND_SIDE = options.blind_side
     if not options.sums.is_file():
         options.sums.parent.mkdir(parents=True, exist_ok=True)
         halves = [(0, options.steps // 2), (options.steps // 2, options.steps)]
@@ -144,7 +146,7 @@ class Cities:
 
     def covers(self, number, at):
         """Whether the interval around a number holds the truth."""
-        low, high = interval95(*number, UNITS[at % 2])
+        low, high = intervals.interval95(*number, UNITS[at % 2])
         return low <= self.truth[at] <= high
 
     def covered(self, random, steps, runs):
