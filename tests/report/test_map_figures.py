@@ -83,12 +83,15 @@ def test_there_is_a_figure_for_each_quantity_and_band(tmp_path):
 def test_every_aggregation_is_drawn_under_its_key():
     # What has a field has levels.
     aggregations = [kind(*((0.5,) for _ in fields(kind))) for kind in AGGREGATIONS]
-    metric = CoverageMetric(SMALL, aggregations=aggregations, square_metres=True)
     points = torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5]])
-    metric.update(torch.zeros(1, 3), points, weights=torch.ones(2))
-    coverage = metric.compute()
-    assert names({"a": coverage}) == [f"{key}_all" for key in coverage.layers]
-    assert len(coverage.layers) >= 4 + len(AGGREGATIONS)
+    for over_surface, others in ((False, ()), (True, ("radius_m", "detection_0.4m"))):
+        metric = CoverageMetric(SMALL, aggregations=aggregations, square_metres=over_surface)
+        metric.update(torch.zeros(1, 3), points, weights=torch.ones(2))
+        coverage = metric.compute()
+        shown = names({"a": coverage})
+        # The first are those of the measure; the other measure is in the files.
+        assert shown == [f"{key}_all" for key in coverage.layers if key not in others]
+        assert len(shown) >= 2 + len(AGGREGATIONS)
 
 
 @dataclass(frozen=True)
@@ -181,7 +184,7 @@ def test_a_map_of_errors_says_what_it_shows_in_which_unit_and_why_cells_are_unkn
     assert within.axes[1].get_ylabel() == "standard error of the detection within 0.4 m (percentage points)"
     assert within.axes[1].get_ylim()[1] >= 100 * float(coverage.errors["detection_0.4m"][0, 10, 20]) > 1
     # Two of the sixteen blocks probed x = 9.5 m: known, but without an error.
-    assert legend(radius)[0] == "unknown: probed in fewer than 4 blocks of steps (99.9 % of the cells)"
+    assert legend(radius)[0] == "unknown: probed in fewer than 8 blocks of steps (99.9 % of the cells)"
     assert legend(figures["radius_m_ground"])[0].startswith("unknown: never probed (99.8 %")
 
 

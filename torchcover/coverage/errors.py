@@ -10,6 +10,8 @@ from torchcover.coverage.quantity import Unit
 
 # Errors below come from rounding in sums of float64: the estimate is the same whichever block is left out.
 ROUND_OFF = 1e-12
+# A cell has an error if it was probed in at least as many blocks.
+MIN_BLOCKS_OF_A_CELL = 8
 # The radius of a cell in a block that was not seen, over its mean radius in those that were.
 IMAGINED_RADIUS = 5.0
 
@@ -75,4 +77,4 @@ def cell_errors(sums: Tensor, blocks: Blocks, unit: Unit) -> Tensor:
     seen_or_not = mean**2 + (1 - mean) ** 2 if unit == "share" else mean**2 + (IMAGINED_RADIUS * mean - mean) ** 2
     squares = (sums - mean * probed_steps).square().sum(dim=0) + imagined**2 * seen_or_not
     variance = squares * (probed + 2) / (probed + 1) / (steps + 2 * imagined) ** 2
-    return variance.sqrt().where((probed >= MIN_BLOCKS) & (variance > 0) & variance.isfinite(), math.nan)
+    return variance.sqrt().where((probed >= MIN_BLOCKS_OF_A_CELL) & (variance > 0) & variance.isfinite(), math.nan)

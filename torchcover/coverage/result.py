@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import MeanOfMeans
+from torchcover.coverage.area_errors import area_errors
 from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
 from torchcover.coverage.errors import cell_errors
@@ -17,7 +18,7 @@ from torchcover.coverage.estimate import Measure, RegionEstimate, estimate_area,
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.intervals import interval95
 from torchcover.coverage.layer import Layer
-from torchcover.coverage.quantity import RADIUS, Quantity
+from torchcover.coverage.quantity import RADIUS, Quantity, by_area
 from torchcover.coverage.regions import Region, regions_within
 from torchcover.coverage.summary import Number, RegionSummary
 
@@ -99,7 +100,11 @@ class Coverage:
         if self.blocks is None:
             return {}
         each = zip(self.quantities, self.blocks.sums.unbind(dim=1), strict=True)
-        return {quantity.key: cell_errors(sums, self.blocks, quantity.unit) for quantity, sums in each}
+        errors = {quantity.key: cell_errors(sums, self.blocks, quantity.unit) for quantity, sums in each}
+        if self.area is not None:
+            over_area = [area_errors(self.area.m2, sums) for sums in self.area.sums.unbind(dim=1)]
+            errors |= {by_area(one).key: error for one, error in zip(self.quantities, over_area, strict=True)}
+        return errors
 
     @property
     def radius_error(self) -> Tensor | None:
