@@ -34,7 +34,7 @@ def interval95(value: float, error: float, degrees_of_freedom: int, unit: Unit) 
         >>> [round(end, 3) for end in interval95(2.0, 0.1, 10, "m")]
         [1.789, 2.431]
         >>> [round(end, 3) for end in interval95(0.9, 0.02, 10, "share")]
-        [0.795, 0.937]
+        [0.791, 0.937]
     """
     if math.isnan(error):
         return math.nan, math.nan
