@@ -76,7 +76,7 @@ def test_a_few_instants_have_no_error_however_often_they_are_seen(drive):
 
 def test_where_nothing_moves_errors_are_about_the_reference_and_say_so():
     result = torchcover.evaluate(RIG, "courtyard", steps=9, **FEW)
-    assert (errors(result)[:4] > 0).all()
+    assert (errors(result)[:2] > 0).all()
     assert "All 9 steps show the same instant: ± is about the reference sensor's places only." in result.table.notes
 
 
