@@ -23,6 +23,7 @@ BENCHMARKS = (
     "calibration",
     "training_overhead",
     "known_boxes",
+    "mutated_files",
 )
 
 

@@ -14,7 +14,7 @@ COUNTED = (
     ("rays that end on the ego itself: known from the first scan", "sensor_self_hits_reused", "sensor_self_hits"),
 )
 # Packages that take long to import, and what would have needed them.
-HEAVY = {"kornia": "lenses with distortion", "lightning": "training", "pypcd4": "binary PCD files"}
+HEAVY = {"kornia": "lenses with distortion", "lightning": "training", "lzf": "compressed PCD files"}
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,20 @@
+"""What every reader of a file shares: its door, its error, the memory it may take, and NumPy's files."""
+
+from torchcover.files.bad_file import BadFileError, naming, reads
+from torchcover.files.budget import TooLargeError, check_memory
+from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, read_npy, read_npz
+from torchcover.files.text import decode, read_short_text
+
+__all__ = [
+    "DEFLATE_MAX_RATIO",
+    "BadFileError",
+    "NpyHeader",
+    "TooLargeError",
+    "check_memory",
+    "decode",
+    "naming",
+    "read_npy",
+    "read_npz",
+    "read_short_text",
+    "reads",
+]
