@@ -1,83 +1,206 @@
-"""Do the standard errors tell the truth? Their size beside the spread of the numbers over independent seeds.
+"""Do 95 % intervals cover? Runs are put together from simulated cities, again and again, and asked for the mean of all.
 
-40 runs over other cities, traffic and reference rays: the spread of a number over the runs is its true error, which
-the reported one should equal within a factor of 1.3. The same is asked of the differences between two rigs in the
-same frames. Spread-out steps and steps that follow each other are compared.
+Each run draws cities at random, with replacement, and goes through the six steps of each, 10 s apart, as an evaluation
+does. The truth is the number over all the cities; what is counted is how often the interval of a run holds it:
+of the twelve numbers of the regions at several lengths, of cells, and of runs that a target error has ended.
 """
 
 import argparse
-import json
 import math
 from concurrent.futures import ProcessPoolExecutor
-from itertools import product
 from pathlib import Path
 
+import numpy as np
 import torch
 
-from torchcover import BevGrid, CoverageMetric, forward_regions
+from benchmarks.timing import table
+from torchcover import forward_regions, nearest
+from torchcover.coverage import BevGrid, intervals
+from torchcover.coverage.binning import mean_per_cell
+from torchcover.coverage.blocks import AreaSums, Blocks
+from torchcover.coverage.errors import cell_errors
+from torchcover.coverage.estimate import estimate_area
 from torchcover.data import SimulatedFrames
-from torchcover.evaluation import CoverageObserver, observe
-from torchcover.simulation import EvenReference
+from torchcover.data.reference import GRID_X_M, GRID_Y_M
+from torchcover.evaluation.settings import BLOCKS
+from torchcover.evaluation.target_error import LOOKS_IN_A_ROW, MAX_GROWTH, MIN_GROWTH, MIN_STEPS
 
-RIG, OTHER = "front_roof_32", "front_roof_128"
-GRID = BevGrid(x=(0.0, 160.0), y=(-40.0, 40.0), cell=0.5)
+RIG, SCENARIO, SEED, EVERY_S = "front_roof_128", "urban", 77, 10.0
+GRID = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=0.25)
 REGIONS = forward_regions()
+PLACES = [(region, height) for region in REGIONS for height in GRID.heights]
+ALL = range(len(PLACES))
+UNITS = ("m", "share")
+NAMES = [f"{region.name} {height} {what}" for region, height in PLACES for what in ("radius", "detection")]
+# A cell has a truth if so many cities have probed it.
+CITIES_OF_A_CELL = 20
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, default=40)
-    parser.add_argument("--steps", type=int, default=128)
-    parser.add_argument("--rays", type=int, default=4096)
-    parser.add_argument("--every", type=float, nargs="+", default=[10.0, 0.1], help="seconds between steps")
-    parser.add_argument("--out", type=Path, default=Path("out/calibration.json"))
+    parser.add_argument("--steps", type=int, default=720, help="steps to simulate, six a city")
+    parser.add_argument("--runs", type=int, default=1000)
+    parser.add_argument("--sums", type=Path, default=Path("out/calibration.npz"), help="simulated anew if missing")
+    parser.add_argument("--blind-side", type=float, default=intervals.BLIND_SIDE, help="to try another factor")
     options = parser.parse_args([] if __name__ != "__main__" else None)
-    results = {}
-    for every_s in options.every:
-        jobs = [(seed, every_s, options.steps, options.rays) for seed in range(options.seeds)]
+    intervals.BLIND_SIDE = options.blind_side
+    if not options.sums.is_file():
+        options.sums.parent.mkdir(parents=True, exist_ok=True)
+        halves = [(0, options.steps // 2), (options.steps // 2, options.steps)]
         with ProcessPoolExecutor(2) as pool:
-            results[every_s] = list(pool.map(estimates, jobs))
-        print(f"\n{options.seeds} runs of {options.steps} steps, one every {every_s:g} s, {options.rays:,} rays\n")
-        for subject in results[every_s][0]:
-            print(f"{subject}:\n")
-            report([run[subject] for run in results[every_s]])
-    options.out.parent.mkdir(parents=True, exist_ok=True)
-    options.out.write_text(json.dumps(results) + "\n", encoding="utf-8")
-
-
-def estimates(job):
-    """One run: [value, error] of each region, band and quantity, for a rig and for the difference to it."""
-    seed, every_s, steps, rays = job
-    torch.set_num_threads(1)
-    reference = EvenReference(areas=tuple((region.x, region.y) for region in REGIONS), rays=rays)
-    rigs = {rig: rig for rig in (RIG, OTHER)}
-    frames = SimulatedFrames("urban", rigs=rigs, steps=steps, seed=seed, every_s=every_s, reference_sensor=reference)
-    observers = {
-        rig: CoverageObserver(CoverageMetric(GRID, max_radius=GRID.diagonal_m, blocks=16), rig) for rig in rigs
+            parts = list(pool.map(simulated, halves))
+        np.savez(options.sums, **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    with np.load(options.sums) as sums:
+        cities = Cities(**sums)
+    random = np.random.default_rng(0)
+    print(f"{len(cities.steps)} cities of {SCENARIO}, {RIG}, {options.runs} runs each: how many 95 % intervals cover\n")
+    lengths = {f"{steps} steps": cities.covered(random, steps, options.runs) for steps in (64, 256, 1024)}
+    stopped = {
+        f"stopped, target as at {steps}": cities.stopped(random, steps, options.runs // 4) for steps in (96, 192)
     }
-    observe(frames, observers.values())
-    coverages = {rig: observer.compute() for rig, observer in observers.items()}
-    subjects = {RIG: [], f"{OTHER} - {RIG}": []}
-    for region, height in product(REGIONS, GRID.heights):
-        own, other = (coverages[rig].estimate(region, height) for rig in (RIG, OTHER))
-        for rows, estimate in zip(subjects.values(), (own, other.minus(own)), strict=True):
-            rows.extend(zip(estimate.value.tolist(), estimate.error.tolist(), strict=True))
-    return subjects
+    columns = lengths | stopped
+    rows = [(name, *(f"{share[at]:.3f}" for share in columns.values())) for at, name in enumerate(NAMES)]
+    rows += [(f"**{f.__name__}**", *(f"{f(share):.3f}" for share in columns.values())) for f in (np.mean, np.min)]
+    table(("number", *columns), rows)
+    print("\nCells of 0.25 m, mean +- two errors:\n")
+    rows = [(steps, *cities.covered_cells(random, steps, runs=10)) for steps in (64, 256)]
+    table(("steps", "cells with an error", "radius", "detection", "errors of 0"), rows)
 
 
-def report(runs):
-    """The tables of docs/measured/error_bars.md: spread over the runs, root mean square of the errors, their ratio."""
-    print("| region | height | quantity | mean | spread | reported error | spread / error |")
-    print("|---|---|---|---|---|---|---|")
-    names = product([region.name for region in REGIONS], GRID.heights, ["radius (m)", "detection"])
-    ratios = []
-    for at, name in enumerate(names):
-        values, errors = torch.tensor([run[at] for run in runs], dtype=torch.float64).T
-        spread, error = values.std().item(), errors.square().mean().sqrt().item()
-        ratios.append(spread / error)
-        print(f"| {' | '.join(name)} | {values.mean():.4f} | {spread:.4f} | {error:.4f} | {ratios[-1]:.2f} |")
-    middle = math.exp(sum(map(math.log, ratios)) / len(ratios))
-    print(f"\nspread over error: {min(ratios):.2f} to {max(ratios):.2f}, geometric mean {middle:.2f}\n")
+def simulated(part):
+    """The sums of some steps: over each region and band, and the means of each cell."""
+    torch.set_num_threads(1)
+    first, last = part
+    frames = SimulatedFrames(SCENARIO, RIG, steps=last, seed=SEED, every_s=EVERY_S)
+    city, over_regions, cells = [], [], []
+    for index in range(first, last):
+        frame = frames[index]
+        points, m2 = frame.reference.double(), frame.reference_weights.double()
+        radius = nearest(frame.reference, frame.sensor, max_distance=GRID.diagonal_m).distance.double()
+        each = torch.stack([radius.clamp(max=GRID.diagonal_m), (radius <= 0.4).double()])
+        city.append(frame.place_in_time)
+        over_regions.append([_sums(points, m2, each, *place) for place in PLACES])
+        cell = GRID.cell_of(frame.reference)
+        inside = cell >= 0
+        means = mean_per_cell(cell[inside], each[:, inside], GRID.cells, m2[inside])
+        cells.append(np.column_stack([np.full(len(means.cell), index), means.cell, *means.mean]))
+    return {"city": np.array(city), "over_regions": np.array(over_regions), "cells": np.concatenate(cells)}
+
+
+def _sums(points, m2, each, region, height):
+    """Square metres, and the sums of radius and detection over them."""
+    x, y, z = points.T
+    inside = torch.ones_like(x, dtype=torch.bool)
+    for along, (low, high) in ((x, region.x), (y, region.y), (z, GRID.heights[height])):
+        inside &= (along >= low) & (along < high)
+    return [float(m2[inside].sum()), *(each[:, inside] * m2[inside]).sum(dim=1).tolist()]
+
+
+class Cities:
+    """The sums of simulated steps, city by city.
+
+    Args:
+        city: (n,) city of each step.
+        over_regions: (n, 6, 3) square metres, and the sums of radius and detection.
+        cells: (k, 4) step, cell, mean radius and mean detection of what was probed.
+    """
+
+    def __init__(self, city, over_regions, cells):
+        self.over_regions = torch.from_numpy(over_regions)
+        steps = [np.flatnonzero(city == one) for one in np.unique(city)]
+        self.steps = [one for one in steps if len(one) >= 6]
+        all_of_them = self.over_regions[np.concatenate(self.steps)].sum(dim=0)
+        self.truth = (all_of_them[:, 1:] / all_of_them[:, :1]).flatten().tolist()
+        self._index_cells(city, cells)
+
+    def _index_cells(self, city, cells):
+        """Keep the cells that enough cities have probed, and number them."""
+        pairs = np.unique(np.column_stack([city[cells[:, 0].astype(int)], cells[:, 1]]), axis=0)
+        known, probed_by = np.unique(pairs[:, 1], return_counts=True)
+        known = known[probed_by >= CITIES_OF_A_CELL]
+        cells = cells[np.isin(cells[:, 1], known) & np.isin(cells[:, 0], np.concatenate(self.steps))]
+        number = np.searchsorted(known, cells[:, 1])
+        self.cell_sums = np.zeros((len(city), 3, len(known)), dtype=np.float32)  # steps, radius, detection
+        self.cell_sums[cells[:, 0].astype(int), :, number] = np.column_stack([np.ones(len(cells)), cells[:, 2:]])
+        total = self.cell_sums.sum(axis=0, dtype=np.float64)
+        self.cell_truth = torch.from_numpy(total[1:] / total[0])
+
+    def drawn(self, random, steps):
+        """The blocks of a run: steps of whole cities, as a metric with 16 blocks has them."""
+        cities = [self.steps[one] for one in random.integers(len(self.steps), size=steps // 6 + 1)]
+        cities = np.split(np.concatenate(cities)[:steps], np.cumsum([len(city) for city in cities])[:-1])
+        cities = [city for city in cities if len(city)]
+        length = 2 ** max(0, math.ceil(math.log2(len(cities) / BLOCKS)))
+        return [np.concatenate(cities[at : at + length]) for at in range(0, len(cities), length)]
+
+    def numbers(self, blocks, places=ALL):
+        """Value, error and degrees of freedom of the radius and detection of each place."""
+        sums = torch.stack([self.over_regions[block].sum(dim=0) for block in blocks])
+        lengths = torch.tensor([len(block) for block in blocks])
+        area = AreaSums(lengths, sums[:, None, None, :, 0], sums[..., 1:].movedim(2, 1)[:, :, None, None])
+        found = []
+        for at in places:
+            estimate = estimate_area(area, 0, torch.arange(len(PLACES))[None] == at)
+            found += zip(estimate.value.tolist(), estimate.error.tolist(), strict=True)
+        return [(value, error, len(blocks) - 1) for value, error in found]
+
+    def covers(self, number, at):
+        """Whether the interval around a number holds the truth."""
+        low, high = intervals.interval95(*number, UNITS[at % 2])
+        return low <= self.truth[at] <= high
+
+    def covered(self, random, steps, runs):
+        """(12,) shares of the intervals that cover."""
+        found = [self.numbers(self.drawn(random, steps)) for _ in range(runs)]
+        return np.mean([[self.covers(number, at) for at, number in enumerate(run)] for run in found], axis=0)
+
+    def stopped(self, random, steps, runs):
+        """(12,) as `covered`, of runs that ended when this number alone had the error of so many steps."""
+        errors = [[error for _, error, _ in self.numbers(self.drawn(random, steps))] for _ in range(runs)]
+        targets = np.sqrt(np.square(errors).mean(axis=0))
+        return np.array([np.mean([self._stops(random, *one) for _ in range(runs)]) for one in enumerate(targets)])
+
+    def _stops(self, random, at, target, most=1536):
+        """Whether the interval of a number covers when its error has made the run end, as `TargetWatch` does."""
+        order = random.integers(len(self.steps), size=most // 6)
+        steps, good = MIN_STEPS, 0
+        while True:
+            number = self.numbers(self.drawn(_Replay(order), steps), [at // 2])[at % 2]
+            error = number[1]
+            good = good + 1 if error <= target else 0
+            if good == LOOKS_IN_A_ROW or steps == most:
+                return self.covers(number, at)
+            needed = steps * max(1.0, error / target) ** 2
+            steps = min(most, math.ceil(min(max(needed, MIN_GROWTH * steps), MAX_GROWTH * steps)))
+
+    def covered_cells(self, random, steps, runs):
+        """How many cells had an error, and how many of their radii and detections two errors cover; errors of 0."""
+        cells, covered, zero = 0, np.zeros(2), 0
+        for _ in range(runs):
+            drawn = self.drawn(random, steps)
+            sums = torch.from_numpy(np.stack([self.cell_sums[block].sum(axis=0, dtype=np.float64) for block in drawn]))
+            sums = sums[:, :, None, None]  # a grid of one row
+            lengths = torch.tensor([len(block) for block in drawn])
+            blocks = Blocks(lengths, sums[:, 0].long(), sums[:, 1:])
+            for at, unit in enumerate(UNITS):
+                error = cell_errors(blocks.sums[:, at], blocks, unit).flatten()
+                mean = (sums[:, 1 + at].sum(dim=0) / sums[:, 0].sum(dim=0)).flatten()
+                known = error.isfinite()
+                holds = (mean - self.cell_truth[at]).abs()[known] <= 2 * error[known]
+                covered[at] += int(holds.sum())
+                zero += int((error == 0).sum())
+            cells += int(known.sum())
+        return cells, *(f"{share:.3f}" for share in covered / cells), zero
+
+
+class _Replay:
+    """Draws what was drawn before, for a run that grows."""
+
+    def __init__(self, order):
+        self.order = order
+
+    def integers(self, _, size):
+        return self.order[:size]
 
 
 if __name__ == "__main__":

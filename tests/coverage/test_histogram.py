@@ -42,6 +42,16 @@ def test_quantiles_are_linear_within_a_bin():
     assert found.flatten().tolist() == [1.0, 1.5, 2.0, 3.0, math.inf, math.inf]
 
 
+@pytest.mark.parametrize("weights", [(0.1, 0.2, 0.3, 0.6), (1, 2, 3, 6), (0.7, 0.1, 0.8), (1 / 3, 1 / 3, 2 / 3)])
+@pytest.mark.parametrize("scale", [1e-9, 0.1, 0.3, 1.0, 7e9])
+def test_a_tie_stays_where_it_is_however_the_weights_are_rounded(weights, scale):
+    """Half of the weight lies below 1, and the other half from 10 on: the median is 1, and never 10."""
+    *below, above = weights
+    edges = torch.tensor([*torch.linspace(0, 1, len(below) + 1), 10.0, 11.0], dtype=torch.float64)
+    histogram = scale * torch.tensor([*below, 0.0, above], dtype=torch.float64)[:, None]
+    assert histogram_quantiles(histogram, edges, (0.5,)).item() == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("levels", [(), (0.5, 1.1), (math.nan,), (-0.1,), (0.5, 0.5), (0.5, 0.5000001)])
 def test_levels_that_make_no_sense_are_refused(levels):
     with pytest.raises(ValueError, match=r"levels: different numbers in \[0, 1\] are needed; got"):

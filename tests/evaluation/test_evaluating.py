@@ -123,8 +123,8 @@ def test_any_source_of_frames_will_do():
 
 def test_a_target_error_is_an_object_here():
     result = torchcover.evaluate(frames=Single(), cell_m=4.0, target_error=TargetError(radius_m=10.0))
-    assert result.run.steps == 32
-    assert result.target_lines[0] == "Target error reached after 32 steps."
+    assert result.run.steps == 71
+    assert result.target_lines[0] == "Target error reached after 71 steps."
 
 
 class Single(Source):

@@ -184,7 +184,7 @@ def test_a_map_of_errors_says_what_it_shows_in_which_unit_and_why_cells_are_unkn
     assert within.axes[1].get_ylabel() == "standard error of the detection within 0.4 m (percentage points)"
     assert within.axes[1].get_ylim()[1] >= 100 * float(coverage.errors["detection_0.4m"][0, 10, 20]) > 1
     # Two of the sixteen blocks probed x = 9.5 m: known, but without an error.
-    assert legend(radius)[0] == "unknown: probed in fewer than 4 blocks of steps (99.9 % of the cells)"
+    assert legend(radius)[0] == "unknown: probed in fewer than 8 blocks of steps (99.9 % of the cells)"
     assert legend(figures["radius_m_ground"])[0].startswith("unknown: never probed (99.8 %")
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from torchcover.data import SimulatedFrames
 from torchcover.geometry import BoundingBox
-from torchcover.simulation import EvenReference, PaperReference
+from torchcover.simulation import EvenReference, PaperReference, Scenario, Simulator
 from torchcover.simulation.paper_reference import paper_density
 from torchcover.simulation.rays import into_tiles
 
@@ -42,6 +42,23 @@ def test_rays_that_reach_the_ground_are_even_over_each_area():
     assert counts.sum() == 3200
     # One ray a patch of a quarter metre; float32 directions may take one across a border.
     assert (counts == 1).mean() > 0.99
+
+
+@pytest.mark.parametrize("tilt", [{}, {"pitch_deg": 1.5}, {"pitch_deg": -1.5}, {"yaw_deg": 70.0, "roll_deg": 1.5}])
+def test_rays_aim_at_the_level_ground_however_the_vehicle_is_tilted(tilt):
+    """At 160 m a degree is 2.8 m: aimed along the vehicle's own plane, rays end short of the far half or above it."""
+    document = {
+        "name": "tilted",
+        "ego": {"shape": {"type": "box", "size_m": [4, 2, 1.5]}, "pose": {"z_m": 0.2, **tilt}},
+        "bodies": [{"name": "ground", "shape": {"type": "plane", "size_m": [900, 900]}, "poses": [{"z_m": 0.2}]}],
+    }
+    sensor = EvenReference((FAR,), rays=8000)
+    seen = Simulator(Scenario.model_validate(document), {}, sensor).step(0)
+    x, y, z = seen.reference[:3900].T.astype(float)  # of the first half, which reaches the ground
+    counts, _, _ = np.histogram2d(x, y, bins=[np.linspace(0, 160, 5), np.linspace(-40, 40, 5)])
+    np.testing.assert_allclose(counts[1:], 250, rtol=0.1)  # nearer the ego is in the way
+    assert (np.abs(z).max() > 1.0) == bool(tilt)
+    assert (seen.reference_weights > 0).all()
 
 
 def test_every_area_gets_as_many_rays():

@@ -18,7 +18,7 @@ def area_errors(m2: Tensor, sums: Tensor) -> Tensor:
         sums: (B, ...) sums s_j of a quantity times them.
 
     Returns:
-        (...) standard errors; NaN where fewer than 4 blocks saw anything, and where all blocks agree: a few equal
+        (...) standard errors; NaN where fewer than 8 blocks saw anything, and where all blocks agree: a few equal
         numbers do not say that a number is exact.
 
     Example:

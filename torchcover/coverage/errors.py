@@ -6,11 +6,14 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.blocks import MIN_BLOCKS, Blocks
+from torchcover.coverage.quantity import Unit
 
 # Errors below come from rounding in sums of float64: the estimate is the same whichever block is left out.
 ROUND_OFF = 1e-12
 # A cell has an error if it was probed in at least as many blocks.
-MIN_BLOCKS_OF_A_CELL = 4
+MIN_BLOCKS_OF_A_CELL = 8
+# The radius of a cell in a block that was not seen, over its mean radius in those that were.
+IMAGINED_RADIUS = 5.0
 
 
 def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor) -> Tensor:
@@ -46,22 +49,32 @@ def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor) -> Tensor:
     return error.where(whole.isfinite(), math.nan)
 
 
-def cell_errors(sums: Tensor, blocks: Blocks) -> Tensor:
+def cell_errors(sums: Tensor, blocks: Blocks, unit: Unit) -> Tensor:
     """Standard error of the mean over steps in each cell.
 
     The mean is a ratio, R = S / N, of sums over the blocks; to first order its variance is that of the sum of
     s_j - R n_j over the blocks, divided by N^2 (Cochran 1977, Sampling Techniques, section 6.4).
 
+    A few blocks that all say the same do not prove that others would. Therefore two more are imagined, each with as
+    many steps as the others have on average: in one the rig sees all of the cell, in the other next to nothing of it,
+    as Agresti & Coull (1998, The American Statistician 52, 119-126) add successes and failures. No error is 0, and the
+    mean plus and minus two errors covers the truth in at least 93 % of the cells (docs/measured/error_bars.md).
+
     Args:
         sums: (B, H, Y, X) sum of each block, as in `blocks`.
         blocks: The blocks.
+        unit: "share", so that the imagined means are 1 and 0; or "m": 0 and five times the mean.
 
     Returns:
-        (H, Y, X) standard errors; NaN in cells that were probed in fewer than 4 blocks.
+        (H, Y, X) standard errors; NaN in cells that were probed in fewer than 8 blocks, or that nothing is known of but
+        a radius of 0.
     """
     probed_steps = blocks.probed_steps.double()
-    steps = probed_steps.sum(dim=0)
-    residual = sums - sums.sum(dim=0) / steps.clamp(min=1) * probed_steps
+    steps = probed_steps.sum(dim=0).clamp(min=1)
+    mean = sums.sum(dim=0) / steps
     probed = (blocks.probed_steps > 0).sum(dim=0)
-    variance = residual.square().sum(dim=0) * probed / (probed - 1).clamp(min=1) / steps.clamp(min=1) ** 2
-    return variance.sqrt().where((probed >= MIN_BLOCKS_OF_A_CELL) & variance.isfinite(), math.nan)
+    imagined = steps / probed.clamp(min=1)
+    seen_or_not = mean**2 + (1 - mean) ** 2 if unit == "share" else mean**2 + (IMAGINED_RADIUS * mean - mean) ** 2
+    squares = (sums - mean * probed_steps).square().sum(dim=0) + imagined**2 * seen_or_not
+    variance = squares * (probed + 2) / (probed + 1) / (steps + 2 * imagined) ** 2
+    return variance.sqrt().where((probed >= MIN_BLOCKS_OF_A_CELL) & (variance > 0) & variance.isfinite(), math.nan)

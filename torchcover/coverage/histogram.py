@@ -6,6 +6,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+# A sum of weights that misses its target by rounding has reached it: 0.1 + 0.2 + 0.3 is half of 1.2.
+ROUNDED_DOWN = 1 - 1e-9
 # Bins of radii: 20 a decade from 1 cm to 100 m, and one beyond each end.
 RADIUS_EDGES_M = torch.cat([torch.tensor([0.0]), torch.logspace(-2, 2, 81), torch.tensor([math.inf])]).double()
 
@@ -45,7 +47,7 @@ def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float
     for level in levels:
         target = total * level
         # The second condition matters at level 0: the least value lies in the first bin that has any weight.
-        at = ((cumulative < target) | (cumulative == 0)).sum(dim=0).clamp(max=len(histogram) - 1)
+        at = ((cumulative < target * ROUNDED_DOWN) | (cumulative == 0)).sum(dim=0).clamp(max=len(histogram) - 1)
         weight = histogram.gather(0, at[None])[0]
         below = cumulative.gather(0, at[None])[0] - weight
         share = ((target - below) / weight).nan_to_num(0.0).clamp(0, 1)

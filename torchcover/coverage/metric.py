@@ -151,8 +151,9 @@ class CoverageMetric(MergeableMetric):
             weights: (M,) weight of each reference point in the mean over its cell in its step, or a list of the same
                 length. For reference sensors whose density within a cell is not the one that is asked for: the
                 weights are the second divided by the first. Not given: every point weighs the same.
-            index: Number of the step in time, or a list of the same length; it decides about the block. Not given:
-                counted on from the steps so far.
+            index: Number of the step in time, or a list of the same length; it decides about the block, so that steps
+                of one number, as of an instant that is seen again, share one. Not given: counted on from the steps so
+                far.
 
         Raises:
             ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights

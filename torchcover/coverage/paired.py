@@ -7,11 +7,9 @@ from typing import NamedTuple
 import torch
 
 from torchcover.coverage.errors import ROUND_OFF
+from torchcover.coverage.intervals import student_t95
 from torchcover.coverage.regions import Region
 from torchcover.coverage.result import Coverage
-
-# Of the standard normal distribution, exceeded to either side with 5 %.
-NORMAL_QUANTILE = 1.959963984540054
 
 
 def check_paired(coverages: Mapping[str, Coverage]) -> None:
@@ -106,27 +104,3 @@ def is_significant(difference: float, error: float, degrees_of_freedom: int) -> 
     if math.isnan(error):
         return None
     return abs(difference) > max(student_t95(degrees_of_freedom) * error, ROUND_OFF)
-
-
-def student_t95(degrees_of_freedom: int) -> float:
-    """The t that is exceeded to either side with 5 %, by Fisher's expansion around the normal distribution.
-
-    Abramowitz & Stegun 1964, equation 26.7.5; from 7 degrees of freedom on, which 8 blocks have, the error is below
-    0.0001.
-
-    Args:
-        degrees_of_freedom: 7 or more.
-
-    Example:
-        >>> round(student_t95(7), 3), round(student_t95(15), 3), round(student_t95(1000), 3)
-        (2.365, 2.131, 1.962)
-    """
-    z: float = NORMAL_QUANTILE
-    terms: tuple[float, ...] = (
-        z,
-        (z**3 + z) / 4,
-        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
-        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
-        (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
-    )
-    return sum(term / float(degrees_of_freedom) ** power for power, term in enumerate(terms))

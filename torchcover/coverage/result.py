@@ -16,6 +16,7 @@ from torchcover.coverage.coverage_file import CoverageParts, read_coverage, writ
 from torchcover.coverage.errors import cell_errors
 from torchcover.coverage.estimate import Measure, RegionEstimate, estimate_area, estimate_known
 from torchcover.coverage.grid import BevGrid
+from torchcover.coverage.intervals import interval95
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import RADIUS, Quantity, by_area
 from torchcover.coverage.regions import Region, regions_within
@@ -98,11 +99,11 @@ class Coverage:
         """Key of a quantity -> (H, Y, X) standard errors; NaN where too few blocks probed, empty without blocks."""
         if self.blocks is None:
             return {}
-        each = [cell_errors(sums, self.blocks) for sums in self.blocks.sums.unbind(dim=1)]
-        errors = {quantity.key: error for quantity, error in zip(self.quantities, each, strict=True)}
+        each = zip(self.quantities, self.blocks.sums.unbind(dim=1), strict=True)
+        errors = {quantity.key: cell_errors(sums, self.blocks, quantity.unit) for quantity, sums in each}
         if self.area is not None:
-            each = [area_errors(self.area.m2, sums) for sums in self.area.sums.unbind(dim=1)]
-            errors |= {by_area(quantity).key: error for quantity, error in zip(self.quantities, each, strict=True)}
+            over_area = [area_errors(self.area.m2, sums) for sums in self.area.sums.unbind(dim=1)]
+            errors |= {by_area(one).key: error for one, error in zip(self.quantities, over_area, strict=True)}
         return errors
 
     @property
@@ -251,5 +252,9 @@ class Coverage:
         return total / self.counts["steps"] if self.counts["steps"] else math.nan
 
     def _numbers(self, estimate: RegionEstimate) -> dict[str, Number]:
-        numbers = map(Number, estimate.value.tolist(), estimate.error.tolist())
-        return {quantity.key: number for quantity, number in zip(self.quantities, numbers, strict=True)}
+        numbers, freedom = {}, len(estimate.steps) - 1
+        for quantity, value, error in zip(
+            self.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True
+        ):
+            numbers[quantity.key] = Number(value, error, *interval95(value, error, freedom, quantity.unit))
+        return numbers

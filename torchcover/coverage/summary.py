@@ -1,5 +1,6 @@
 """The numbers of a region, as tables and loggers take them."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -8,10 +9,19 @@ from torchcover.coverage.estimate import Measure
 
 
 class Number(NamedTuple):
-    """A number in the unit of its quantity, and its standard error; NaN where it is not known."""
+    """A number in the unit of its quantity, its standard error and its 95 % interval; NaN where it is not known.
+
+    Args:
+        value: The number.
+        error: Its standard error.
+        low: Lower end of the interval, from `torchcover.coverage.intervals.interval95`.
+        high: Upper end.
+    """
 
     value: float
     error: float
+    low: float = math.nan
+    high: float = math.nan
 
 
 @dataclass(frozen=True)

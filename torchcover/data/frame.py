@@ -25,6 +25,8 @@ class Frame:
         weight_kind: What the weights are: "density", good for means within a cell, or "m2", the visible square metres
             that each point stands for; None if there are none, or nobody knows.
         boxes: The objects of that instant; None if nobody looked for them, which is not the same as none being there.
+        instant: Number in time of what it shows, for standard errors: frames that share it, as of an instant that is
+            seen again or of one city, do not count as independent. None: `index`, every frame is its own.
     """
 
     clouds: Mapping[str, Tensor]
@@ -35,6 +37,12 @@ class Frame:
     reference_weights: Tensor | None = None
     weight_kind: WeightKind | None = None
     boxes: Boxes | None = None
+    instant: int | None = None
+
+    @property
+    def place_in_time(self) -> int:
+        """Number of what it shows; `CoverageMetric.update` takes it as `index`."""
+        return self.index if self.instant is None else self.instant
 
     @property
     def sensor(self) -> Tensor:
@@ -111,8 +119,8 @@ class FrameBatch:
 
     @property
     def index(self) -> list[int]:
-        """The number of each frame in its dataset."""
-        return [frame.index for frame in self.frames]
+        """The place in time of each frame."""
+        return [frame.place_in_time for frame in self.frames]
 
     @property
     def boxes(self) -> list[Boxes]:

@@ -30,7 +30,8 @@ class SimulatedFrames(Dataset[Frame]):
         scenario: The world, the name of a built-in one, or the path of a YAML file.
         rig: The sensors, the name of a built-in rig, or the path of a YAML file.
         rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds.
-        steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers.
+        steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
+            traffic, the same instants are seen again, which `Frame.instant` and `Frame.counts` say.
         seed: Seed of the traffic and of the reference sensor's poses.
         reference_sensor: The reference sensor, such as `PaperReference()`. If not given, a `SurfaceReference`:
             `reference_called()`, and `reference_of_objects()` with boxes, at up to twice the time.
@@ -153,6 +154,7 @@ class SimulatedFrames(Dataset[Frame]):
             name=f"{self.scenario.name} step {index}",
             counts=seen.counts,
             boxes=_boxes(self.simulator.labels(index), clouds, seen.drawn) if self.boxes else None,
+            instant=self.simulator.place_in_time(index),
         )
 
 

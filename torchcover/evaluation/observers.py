@@ -72,7 +72,7 @@ class CoverageObserver:
                 "square_metres=True"
             )
         sensor = frame.sensor if self.rig is None else frame.cloud_of(self.rig)
-        self.metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.index)
+        self.metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.place_in_time)
 
     def compute(self) -> Coverage:
         """The coverage so far."""

@@ -181,7 +181,18 @@ class Result:
         if record is None:
             return []
         rays, every_s = record["rays_per_step"], record["every_s"]
-        return [f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."]
+        sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
+        return [sensor, *self._on_repetitions]
+
+    @property
+    def _on_repetitions(self) -> list[str]:
+        """That a scenario was seen again, which is no news; nothing where every step showed an instant of its own."""
+        steps, again = (self.run.steps, self.run.counts["repeated_instants"]) if self.run else (0, 0)
+        if not again:
+            return []
+        if steps - again == 1:
+            return [f"All {steps:,} steps show the same instant: ± is about the reference sensor's places only."]
+        return [f"{steps - again:,} different instants in {steps:,} steps: the scenario was seen again, which ± knows."]
 
     def __repr__(self) -> str:
         cut_short = ", cut short" if self.run is not None and not self.run.complete else ""

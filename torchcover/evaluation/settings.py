@@ -1,5 +1,6 @@
 """What an evaluation is done with, unless the user says otherwise."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from numbers import Real
@@ -158,9 +159,26 @@ def new_metric(
         ) from error
 
 
-def spread_s(scenario: Scenario, given_s: float | None) -> float | None:
-    """Time between two steps: what was given, else 10 s in traffic; None for the scenario's own time step."""
-    return EVERY_S_IN_TRAFFIC if given_s is None and scenario.traffic is not None else given_s
+def spread_s(scenario: Scenario, given_s: float | None) -> float:
+    """Time between two steps: what was given, else 10 s in traffic, else what spreads the steps over the scenario.
+
+    That is the golden share of its instants, round and round: any number of steps lies evenly over all of it, and no
+    instant comes again before all have been seen.
+
+    Example:
+        >>> drive = {"name": "drive", "ego": {"shape": {"type": "box", "size_m": [4, 2, 2]}, "trajectory": "drive.csv"}}
+        >>> ground = {"bodies": [{"name": "ground", "shape": {"type": "plane", "size_m": [99, 99]}}], "duration_s": 30}
+        >>> every_s = spread_s(Scenario.model_validate({**drive, **ground}), None)
+        >>> [round(step * every_s % 30.1, 1) for step in range(6)]
+        [0.0, 18.6, 7.1, 25.7, 14.2, 2.7]
+    """
+    if given_s is not None:
+        return given_s
+    if scenario.instants is None:
+        return EVERY_S_IN_TRAFFIC
+    share = (math.sqrt(5) - 1) / 2 * scenario.instants
+    each_once = (steps for steps in range(1, scenario.instants + 1) if math.gcd(steps, scenario.instants) == 1)
+    return min(each_once, key=lambda steps: abs(steps - share)) * scenario.step_s
 
 
 def _thresholds(given: Any) -> tuple[float, ...]:  # noqa: ANN401  (whatever the user gave)

@@ -8,8 +8,10 @@ from dataclasses import dataclass
 from torchcover.coverage import Coverage, Region
 from torchcover.evaluation.observers import Observer
 
-# An error from fewer steps is not believed, though they may fill enough blocks.
-MIN_STEPS = 32
+# An error from fewer steps is not believed, though they may fill enough blocks; nor is one that is small enough once,
+# for the looks at which it happens to be too small are those that would end the run.
+MIN_STEPS = 64
+LOOKS_IN_A_ROW = 2
 # Errors are looked at when they should have become small enough, but after 10 to 50 % more steps: some 20 times in
 # 4096 steps.
 MIN_GROWTH, MAX_GROWTH = 1.1, 1.5
@@ -167,6 +169,7 @@ class TargetWatch:
         self.regions = regions
         self.next_look = MIN_STEPS
         self.worst: Standing | None = None
+        self._good_looks = 0
 
     def is_reached(self, steps: int) -> bool:
         """Whether the run may end after so many steps. Between two looks: no."""
@@ -175,7 +178,8 @@ class TargetWatch:
         coverages = {name: observer.compute() for name, observer in self.observers.items()}
         found = standings(self.target, coverages, self.regions)
         self.worst = max(found, key=lambda standing: standing.excess, default=None)
-        if self.worst is not None and self.worst.reached:
+        self._good_looks = self._good_looks + 1 if self.worst is not None and self.worst.reached else 0
+        if self._good_looks >= LOOKS_IN_A_ROW:
             return True
         needed = math.inf if self.worst is None else self.worst.steps_needed or math.inf
         self.next_look = math.ceil(min(max(needed, MIN_GROWTH * steps), MAX_GROWTH * steps))

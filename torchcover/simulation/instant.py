@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -63,6 +63,7 @@ class Instant:
         moving: The bodies that move and are near.
         ego: Number of the ego.
         out_of_range: How many bodies that move are not near, or not there.
+        vehicle_R_level: (3, 3) from axes that do not pitch and roll with the vehicle, x ahead and z up in the world.
     """
 
     static: RayCaster
@@ -70,6 +71,7 @@ class Instant:
     moving: tuple[Part, ...]
     ego: int
     out_of_range: int = 0
+    vehicle_R_level: Matrix = field(default_factory=lambda: np.eye(3))
 
     def scan(
         self,

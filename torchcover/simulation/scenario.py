@@ -130,6 +130,19 @@ class Scenario(Document):
         return (episode if self.traffic else 0), step
 
     @property
+    def instants(self) -> int | None:
+        """How many different instants it can show: one if nothing moves; None for traffic, which never repeats itself.
+
+        Example:
+            >>> Scenario.load("courtyard").instants
+            1
+        """
+        if self.traffic is not None:
+            return None
+        moves = self.boxes is not None or any(mover and mover.trajectory for mover in (self.ego, *self.actors))
+        return steps_of(self.duration_s, self.time_step_s) if moves else 1
+
+    @property
     def step_s(self) -> float:
         """Its time step, be it given or that of the traffic."""
         return (self.traffic or self).time_step_s

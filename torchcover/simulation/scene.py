@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox, invert, overlap, transform
+from torchcover.geometry import BoundingBox, euler_from_rotation, invert, overlap, rotation_from_euler, transform
 from torchcover.simulation.culling import SLACK_M, SLACK_SHARE
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant, Part, rotate
 from torchcover.simulation.patches import Bounds
@@ -129,7 +129,8 @@ class Scene:
             static_T_vehicle, ego = invert(self._world_T_local) @ world_T_vehicle, first
         else:
             static_T_vehicle, ego = np.eye(4), 0
-        return Instant(self._static, static_T_vehicle, moving, ego, out_of_range=len(self._moving) - len(moving))
+        out_of_range = len(self._moving) - len(moving)
+        return Instant(self._static, static_T_vehicle, moving, ego, out_of_range, level_axes(world_T_vehicle))
 
     @property
     def _first_moving(self) -> int:
@@ -196,6 +197,15 @@ class Scene:
         solid = self._solids[id(actor.mesh)]
         *corners_m, centre_m = transform(vehicle_T_actor, solid.outline_m)
         return Part(solid.caster, invert(vehicle_T_actor), body, np.array(corners_m), centre_m, solid.radius_m)
+
+
+def level_axes(world_T_vehicle: Matrix) -> Matrix:
+    """(3, 3) rotation `vehicle_R_level`, from the axes that the vehicle would have if it did not pitch and roll."""
+    yaw_deg, *tilt_deg = euler_from_rotation(world_T_vehicle[:3, :3])
+    if not np.any(tilt_deg):
+        return np.eye(3)
+    vehicle_R_level: Matrix = world_T_vehicle[:3, :3].T @ rotation_from_euler(yaw_deg, 0.0, 0.0)
+    return vehicle_R_level
 
 
 def _solid(mesh: Mesh) -> Solid:

@@ -1,6 +1,7 @@
 """The simulator: what rigs and a reference sensor see of a scenario, step by step."""
 
 import copy
+import math
 from collections.abc import Mapping, Sequence
 from typing import Self
 
@@ -29,7 +30,7 @@ class Simulator:
     are cast on as many threads as torch uses (`torch.set_num_threads`).
 
     Args:
-        scenario: The world. Beyond its end its traffic starts anew with other random numbers.
+        scenario: The world. Beyond its end a given one plays again; traffic starts anew with other random numbers.
         rigs: The sensors, by the name under which `Observation.clouds` has their points.
         reference_sensor: The reference sensor.
         seed: Seed of the traffic, of the reference sensor, and of noise and drop-out.
@@ -70,6 +71,24 @@ class Simulator:
         """Time between one step and the next."""
         return self._every_steps * self.scenario.step_s
 
+    @property
+    def distinct_steps(self) -> int | None:
+        """How many steps show an instant for the first time; all later ones repeat them. None: no step ever does."""
+        instants = self.scenario.instants
+        return None if instants is None else instants // math.gcd(instants, self._every_steps)
+
+    def place_in_time(self, index: int) -> int:
+        """The number by which standard errors tell a step from others; steps that share it are alike.
+
+        In traffic that is the number of the run: its steps share a city. In a given world it is the instant, be it seen
+        for the first time or again. Where there is a single instant only the reference sensor's draw differs, and every
+        step has a number of its own.
+        """
+        if self.scenario.instants == 1:
+            return index
+        run, step = self.scenario.locate(index * self._every_steps)
+        return step if self.scenario.traffic is None else run
+
     def with_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
         """The same instants as another reference sensor sees them; the geometry is built once for both."""
         other = copy.copy(self)
@@ -98,7 +117,10 @@ class Simulator:
             reference_weights=reference.weights,
             weight_kind=reference.weight_kind,
             drawn=reference.drawn,
-            counts=counts_of(stage.scene, instant, of_all_rigs, reference),
+            counts={
+                **counts_of(stage.scene, instant, of_all_rigs, reference),
+                "repeated_instants": int(self.distinct_steps is not None and index >= self.distinct_steps),
+            },
         )
 
     def labels(self, index: int) -> list[Label]:

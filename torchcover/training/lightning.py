@@ -134,7 +134,7 @@ class CoverageCallback(Callback):
             [sensor_of(frame, self.rig) for frame in new.frames],
             new.reference,
             weights=new.weights,
-            index=None if UNKNOWN_INDEX in indices else indices,
+            index=None if UNKNOWN_INDEX in indices else new.index,
         )
 
     def _shard(self, trainer: Trainer, loader_index: int) -> Shard | None:

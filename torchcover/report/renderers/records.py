@@ -36,6 +36,8 @@ def _numbers(key: str) -> Columns:
     return {
         key: lambda row: row.summary.numbers[key].value,
         f"{key}_error": lambda row: row.summary.numbers[key].error,
+        f"{key}_low": lambda row: row.summary.numbers[key].low,
+        f"{key}_high": lambda row: row.summary.numbers[key].high,
     }
 
 

@@ -1,0 +1,113 @@
+"""A scenario that is seen again says nothing new: distinct instants are counted, and errors know no others."""
+
+import math
+
+import numpy as np
+import pytest
+
+import torchcover
+from torchcover import Rig, Scenario
+from torchcover.data import SimulatedFrames
+from torchcover.evaluation.settings import spread_s
+from torchcover.simulation import PaperReference
+
+RIG = Rig.model_validate(
+    {
+        "name": "top",
+        "sensors": [
+            {
+                "name": "top",
+                "mount": {"z_m": 1.8},
+                "channels": 8,
+                "vertical_fov_deg": (-30, 0),
+                "horizontal_fov_deg": 360,
+                "columns": 90,
+                "max_range_m": 80,
+            }
+        ],
+    }
+)
+FEW = {"cell_m": 4.0, "rays": 64, "reference_sensor": "even"}
+
+
+@pytest.fixture
+def drive(tmp_path):
+    """(number of instants) -> a scenario that the ego drives through, past walls at ever larger distances."""
+
+    def make(instants):
+        (tmp_path / "drive.csv").write_text(f"t,x,y,z,roll,pitch,yaw\n0,0,0,0,0,0,0\n{instants},120,0,0,0,0,0\n")
+        walls = [{"x_m": x, "y_m": 4 + x / 8} for x in (5, 15, 35, 75)]
+        return Scenario.model_validate(
+            {
+                "name": "drive",
+                "ego": {"shape": {"type": "box", "size_m": [4, 2, 1.5]}, "trajectory": str(tmp_path / "drive.csv")},
+                "bodies": [
+                    {"name": "ground", "shape": {"type": "plane", "size_m": [600, 600]}},
+                    {"name": "wall", "shape": {"type": "box", "size_m": [6, 1, 3]}, "poses": walls},
+                ],
+                "time_step_s": 1.0,
+                "duration_s": instants - 1.0,
+            }
+        )
+
+    return make
+
+
+def errors(result):
+    return np.array([row[key] for row in result.summary for key in row if key.endswith("_error")], dtype=float)
+
+
+def test_going_round_again_makes_no_error_smaller(drive):
+    once, often = (torchcover.evaluate(RIG, drive(8), steps=steps, **FEW) for steps in (8, 8 * 4))
+    # What becomes less is the scatter of the reference's own draws; four rounds of new data would have half the error.
+    known = errors(once) > 0
+    assert np.median(errors(often)[known] / errors(once)[known]) > 0.75
+    assert often.coverage.blocks.steps.tolist() == [4] * 8 + [0] * 8
+    assert often.record["frame_counts"]["repeated_instants"] == 8 * 3
+    assert "8 different instants in 32 steps: the scenario was seen again, which ± knows." in often.table.notes
+    assert "seen again" not in " ".join(once.table.notes)
+
+
+def test_a_few_instants_have_no_error_however_often_they_are_seen(drive):
+    result = torchcover.evaluate(RIG, drive(3), steps=24, **FEW)
+    assert np.isnan(errors(result)).all()
+    assert result.coverage.blocks.steps.tolist()[:4] == [8, 8, 8, 0]
+
+
+def test_where_nothing_moves_errors_are_about_the_reference_and_say_so():
+    result = torchcover.evaluate(RIG, "courtyard", steps=9, **FEW)
+    assert (errors(result)[:2] > 0).all()
+    assert "All 9 steps show the same instant: ± is about the reference sensor's places only." in result.table.notes
+
+
+def test_the_steps_of_a_city_are_never_in_two_blocks():
+    city = {"name": "urban", "traffic": {"type": "urban", "duration_s": 2.0, "time_step_s": 0.5}}
+    few = PaperReference(rows=2, columns=2)
+    frames = SimulatedFrames(Scenario.model_validate(city), RIG, steps=12, every_s=1.0, reference_sensor=few)
+    places = [frames.simulator.place_in_time(index) for index in range(12)]
+    assert places == [0, 0, 0, 1, 1, 2, 2, 2, 3, 3, 4, 4]
+    assert (frames[3].place_in_time, frames[3].counts["repeated_instants"]) == (1, 0)
+
+
+@pytest.mark.parametrize("every_steps", [1, 2, 3, 7, 12])
+def test_distinct_instants_are_those_that_were_seen(drive, every_steps):
+    frames = SimulatedFrames(drive(12), RIG, steps=30, every_s=every_steps * 1.0)
+    seen = [frames.simulator.place_in_time(index) for index in range(30)]
+    assert seen == [index * every_steps % 12 for index in range(30)]
+    assert frames.simulator.distinct_steps == len(set(seen)) == 12 // math.gcd(12, every_steps)
+
+
+@pytest.mark.parametrize("instants", [1, 2, 3, 4, 5, 8, 13, 60, 64, 100, 301, 602, 3001])
+def test_any_number_of_steps_lies_evenly_over_a_given_scenario(drive, instants):
+    every = round(spread_s(drive(instants), None))
+    seen = np.arange(2 * instants) * every % instants
+    assert len(set(seen[:instants].tolist())) == instants
+    for steps in {min(count, instants) for count in (5, 20, 64, 200)}:
+        gaps = np.diff(np.sort(np.append(seen[:steps], seen[:steps] + instants)))
+        assert gaps.max() <= 3 * instants / steps + 1
+
+
+def test_a_time_that_is_given_is_kept_and_traffic_has_its_own():
+    assert spread_s(Scenario.load("courtyard"), 0.3) == 0.3
+    assert spread_s(Scenario.load("urban"), None) == 10.0
+    assert spread_s(Scenario.load("courtyard"), None) == 0.1
