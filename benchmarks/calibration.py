@@ -25,7 +25,7 @@ from torchcover.data.reference import GRID_X_M, GRID_Y_M
 from torchcover.evaluation.settings import BLOCKS
 from torchcover.evaluation.target_error import LOOKS_IN_A_ROW, MAX_GROWTH, MIN_GROWTH, MIN_STEPS
 
-RIG, SCENARIO, SEED, EVERY_S = "front_roof_128", "urban", 77, 10.0
+RIG, EVERY_S = "front_roof_128", 10.0
 GRID = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=0.25)
 REGIONS = forward_regions()
 PLACES = [(region, height) for region in REGIONS for height in GRID.heights]
@@ -38,6 +38,8 @@ CITIES_OF_A_CELL = 20
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenario", default="urban")
+    parser.add_argument("--seed", type=int, default=77)
     parser.add_argument("--steps", type=int, default=720, help="steps to simulate, six a city")
     parser.add_argument("--runs", type=int, default=1000)
     parser.add_argument("--sums", type=Path, default=Path("out/calibration.npz"), help="simulated anew if missing")
@@ -46,14 +48,14 @@ def main():
     intervals.BLIND_SIDE = options.blind_side
     if not options.sums.is_file():
         options.sums.parent.mkdir(parents=True, exist_ok=True)
-        halves = [(0, options.steps // 2), (options.steps // 2, options.steps)]
+        halves = [range(options.steps // 2), range(options.steps // 2, options.steps)]
         with ProcessPoolExecutor(2) as pool:
-            parts = list(pool.map(simulated, halves))
+            parts = list(pool.map(simulated, halves, [options.scenario] * 2, [options.seed] * 2))
         np.savez(options.sums, **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
     with np.load(options.sums) as sums:
         cities = Cities(**sums)
     random = np.random.default_rng(0)
-    print(f"{len(cities.steps)} cities of {SCENARIO}, {RIG}, {options.runs} runs each: how many 95 % intervals cover\n")
+    print(f"{len(cities.steps)} cities of {options.scenario}, {RIG}; of {options.runs} runs, how many intervals cover\n")
     lengths = {f"{steps} steps": cities.covered(random, steps, options.runs) for steps in (64, 256, 1024)}
     stopped = {
         f"stopped, target as at {steps}": cities.stopped(random, steps, options.runs // 4) for steps in (96, 192)
@@ -67,13 +69,12 @@ def main():
     table(("steps", "cells with an error", "radius", "detection", "errors of 0"), rows)
 
 
-def simulated(part):
+def simulated(steps, scenario, seed):
     """The sums of some steps: over each region and band, and the means of each cell."""
     torch.set_num_threads(1)
-    first, last = part
-    frames = SimulatedFrames(SCENARIO, RIG, steps=last, seed=SEED, every_s=EVERY_S)
+    frames = SimulatedFrames(scenario, RIG, steps=steps.stop, seed=seed, every_s=EVERY_S)
     city, over_regions, cells = [], [], []
-    for index in range(first, last):
+    for index in steps:
         frame = frames[index]
         points, m2 = frame.reference.double(), frame.reference_weights.double()
         radius = nearest(frame.reference, frame.sensor, max_distance=GRID.diagonal_m).distance.double()
