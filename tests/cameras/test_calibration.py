@@ -62,7 +62,7 @@ def test_ros_message(tmp_path):
         (ROS_MESSAGE.replace("height", "hight"), "image_height or height is missing"),
         (ROS_MESSAGE.replace("plumb_bob", "wide"), "'wide' is unknown; allowed: plumb_bob"),
         ("- 1", "a mapping of names to values is needed; got list"),
-        ("a: [1", "not readable as YAML"),
+        ("a: [1", "not a YAML file"),
     ],
 )
 def test_ros_files_that_are_none(tmp_path, text, message):

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike
 
+from torchcover.files import parse_yaml
 from torchcover.geometry import check_rigid, invert, rigid, rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 
@@ -220,25 +220,11 @@ def read_nuscenes(
     return Calibration(width, height, *split_matrix(matrix, channel), vehicle_T_camera=pose, name=channel)
 
 
-class _Loader(yaml.SafeLoader):
-    """Knows OpenCV's tag for matrices."""
-
-
-def _construct_matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> Any:  # noqa: ANN401  (YAML knows no types)
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _construct_matrix)
-
-
 def _read_yaml(path: str | Path) -> dict[str, Any]:
-    text = Path(path).read_text()
-    if text.startswith("%YAML:"):  # OpenCV's directive has a colon that YAML does not allow
-        text = text.split("\n", 1)[1]
     try:
-        content = yaml.load(text, _Loader)  # a SafeLoader with one more tag
-    except yaml.YAMLError as error:
-        raise ValueError(f"{path}: not readable as YAML: {error}") from error
+        content = parse_yaml(Path(path).read_text())
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path}: a mapping of names to values is needed; got {type(content).__name__}")
     return content

@@ -2,22 +2,22 @@
 
 from pathlib import Path
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from torchcover.files import parse_yaml
 from torchcover.geometry.rigid import Matrix, check_rigid
 
 ALLOWED = "allowed are sensor, or rigs by name, and reference, each with a 4x4 vehicle_T_sensor"
 
 
 class _Pose(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
     vehicle_T_sensor: list[list[float]]
 
 
 class _Poses(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
     sensor: _Pose | None = None
     rigs: dict[str, _Pose] = Field(default_factory=dict)
@@ -39,9 +39,11 @@ def read_poses(path: Path) -> dict[str, Matrix]:
     if not path.exists():
         return {}
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise ValueError(f"{path}: not a YAML file ({' '.join(str(error).split())})") from error
+        content = parse_yaml(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not a YAML file ({error})") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path}: got {type(content).__name__}, not a mapping; {ALLOWED}")
     try:

@@ -43,8 +43,8 @@ class SimulatedFrames(Dataset[Frame]):
     Raises:
         FileNotFoundError: An unknown name or file.
         ValueError: A document that is not valid, neither or both of `rig` and `rigs`, a number of steps below 1, a
-            negative seed, a time that is no multiple of the time step. From indexing: a sensor inside the ego's body,
-            an actor that overlaps the ego.
+            negative seed, a time that is no multiple of the time step. From indexing: a sensor inside a body or
+            below the ground, an actor that overlaps the ego.
 
     Example:
         >>> frames = SimulatedFrames("courtyard", "front_roof_128", steps=2, seed=0)

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from torchcover.geometry import BoundingBox
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, mover_mesh
-from torchcover.simulation.documents import Document, Pose, beside, load_document
+from torchcover.simulation.documents import Document, PathBeside, Pose, load_document
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.tracks import read_boxes, read_trajectory
 from torchcover.simulation.traffic import Highway, Parking, Urban
@@ -34,9 +34,7 @@ class Mover(Document):
 
     shape: Shape
     pose: Pose | None = None
-    trajectory: Path | None = None
-
-    _path_beside = field_validator("trajectory")(beside)
+    trajectory: PathBeside | None = None
 
     @model_validator(mode="after")
     def _check_one_of(self) -> Self:
@@ -89,12 +87,10 @@ class Scenario(Document):
     ego: Mover | None = None
     bodies: tuple[Body, ...] = ()
     actors: tuple[NamedMover, ...] = ()
-    boxes: Path | None = None
+    boxes: PathBeside | None = None
     time_step_s: PositiveFloat = 0.1
     duration_s: NonNegativeFloat = 0.0
     traffic: Traffic | None = None
-
-    _path_beside = field_validator("boxes")(beside)
 
     @model_validator(mode="after")
     def _check_given_or_procedural(self) -> Self:

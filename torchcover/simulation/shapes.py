@@ -1,15 +1,14 @@
 """Shapes: primitives, and meshes from files."""
 
 import warnings
-from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PositiveFloat, field_validator
+from pydantic import Field, PositiveFloat
 
 from torchcover.geometry import transform
-from torchcover.simulation.documents import Document, beside
+from torchcover.simulation.documents import Document, PathBeside
 
 CYLINDER_SIDES = 24
 ELLIPSOID_SIDES = 12  # around the z axis; half as many bands from pole to pole
@@ -136,10 +135,8 @@ class MeshFile(Document):
     """
 
     type: Literal["mesh"]
-    path: Path
+    path: PathBeside
     metres_per_unit: PositiveFloat = 1.0
-
-    _path_beside = field_validator("path")(beside)
 
     def mesh(self) -> Mesh:
         """All geometry of the file in one mesh; a warning if it is not closed.

@@ -84,11 +84,12 @@ class Simulator:
 
         Raises:
             FileNotFoundError: A mesh, vehicle or trajectory file is missing.
-            ValueError: A negative index, a sensor inside the ego's body, an actor that overlaps the ego, an ego below
-                the ground.
+            ValueError: A negative index, a sensor inside a body or below the ground, an actor that overlaps the ego, an
+                ego below the ground.
         """
         stage, step = self._stage(index)
         instant = stage.scene.at(step, within_m=self._reach_m(stage.scene.ego_box))
+        stage.check_mounts(instant)
         scans = {name: self._scan_rig(sensors, instant, index) for name, sensors in stage.mounted.items()}
         reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
