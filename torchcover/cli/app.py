@@ -39,6 +39,10 @@ def main() -> None:
         _fail(error.format_message())  # type: ignore[attr-defined]  # the typed name is private
     except (ValueError, TypeError, OSError) as error:
         _fail(str(error))
+    except MemoryError as error:
+        _fail(f"there is not enough memory ({error or 'for what was asked'}); ask for less, or use a larger machine")
+    except (OverflowError, RecursionError) as error:
+        _fail(f"a number is too large, or a file nested too deeply ({error})")
     except (KeyboardInterrupt, typer.Abort):
         sys.exit(130)
     sys.exit(code if isinstance(code, int) else 0)

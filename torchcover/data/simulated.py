@@ -16,6 +16,9 @@ from torchcover.data.reference import reference_called
 from torchcover.detection.boxes import Boxes, points_in_boxes
 from torchcover.simulation import Label, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
 
+# What takes years.
+MAX_STEPS = 1_000_000_000
+
 
 class SimulatedFrames(Dataset[Frame]):
     """What a rig and the random reference sensor see of a scenario, step by step. A map-style torch Dataset.
@@ -64,8 +67,8 @@ class SimulatedFrames(Dataset[Frame]):
         every_s: float | None = None,
         boxes: bool = False,
     ) -> None:
-        if steps < 1:
-            raise ValueError(f"steps: at least 1 is needed; got {steps}")
+        if not 1 <= steps <= MAX_STEPS:
+            raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
         self.simulator = Simulator(
             scenario if isinstance(scenario, Scenario) else Scenario.load(scenario),
             _rigs(rig, rigs),

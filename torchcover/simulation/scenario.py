@@ -94,6 +94,8 @@ class Scenario(Document):
 
     @model_validator(mode="after")
     def _check_given_or_procedural(self) -> Self:
+        times = self.traffic or self
+        steps_of(times.duration_s, times.time_step_s)
         if self.traffic is None:
             missing = [key for key in ("ego", "bodies") if not getattr(self, key)]
             if missing:
@@ -137,7 +139,7 @@ class Scenario(Document):
             ValueError: It is not a positive multiple of the time step.
         """
         time_step_s = self.step_s
-        steps = round(time_s / time_step_s) if math.isfinite(time_s) else 0
+        steps = round(time_s / time_step_s) if math.isfinite(time_s / time_step_s) else 0
         if steps < 1 or not math.isclose(steps * time_step_s, time_s, rel_tol=1e-6):
             raise ValueError(
                 f"every_s: a positive multiple of the time step of {self.name!r}, {time_step_s:g} s, is needed; "

@@ -11,6 +11,7 @@ from torchcover.geometry import transform
 from torchcover.simulation.documents import Document, PathBeside
 
 CYLINDER_SIDES = 24
+MAX_SIDES = 10_000
 ELLIPSOID_SIDES = 12  # around the z axis; half as many bands from pole to pole
 # Nothing on a road is longer; no building, and no terrain within a sensor's range, is higher.
 MAX_VEHICLE_LENGTH_M = 100.0
@@ -95,7 +96,7 @@ class Cylinder(Document):
     type: Literal["cylinder"]
     radius_m: Length
     height_m: Length
-    sides: Annotated[int, Field(ge=3)] = CYLINDER_SIDES
+    sides: Annotated[int, Field(ge=3, le=MAX_SIDES)] = CYLINDER_SIDES
 
     def mesh(self) -> Mesh:
         """A closed prism."""

@@ -11,6 +11,7 @@ from torchcover.geometry import BoundingBox
 from torchcover.simulation.disturbance import disturb
 from torchcover.simulation.instant import Instant, Scan
 from torchcover.simulation.labels import Label, labels
+from torchcover.simulation.memory import check_fits
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.observation import Observation, counts_of
 from torchcover.simulation.reference_sensor import ReferenceSensor
@@ -19,6 +20,9 @@ from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.stage import Stage, Stages
 from torchcover.simulation.surroundings import Surroundings
+
+# What a step takes at its largest, measured for each kind of sensor.
+BYTES_PER_RAY = 300
 
 
 class Simulator:
@@ -36,7 +40,7 @@ class Simulator:
         every_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
 
     Raises:
-        ValueError: A negative seed, a time that is no multiple of the time step.
+        ValueError: A negative seed, a time that is no multiple of the time step, more rays than the memory has room for.
 
     Example:
         >>> from torchcover.simulation import PaperReference
@@ -64,6 +68,7 @@ class Simulator:
         self.seed = seed
         self._every_steps = 1 if every_s is None else scenario.steps_in(every_s)
         self._stages = Stages(scenario, rigs, seed)
+        self._check_size()
 
     @property
     def every_s(self) -> float:
@@ -74,6 +79,7 @@ class Simulator:
         """The same instants as another reference sensor sees them; the geometry is built once for both."""
         other = copy.copy(self)
         other.reference_sensor = reference_sensor
+        other._check_size()
         return other
 
     def step(self, index: int) -> Observation:
@@ -101,6 +107,20 @@ class Simulator:
             counts=counts_of(stage.scene, instant, of_all_rigs, reference),
         )
 
+    def check_apart(self, steps: int) -> None:
+        """Refuse a run in which an actor meets the ego, before its first step; traffic keeps all apart by itself.
+
+        Args:
+            steps: How many steps the run has.
+
+        Raises:
+            ValueError: At one of them an actor overlaps the ego.
+        """
+        if self.scenario.traffic is None:
+            scene, _ = self.scene_of(0)
+            indices = np.arange(min(steps, scene.world.steps), dtype=np.int64)  # then they repeat themselves
+            scene.check_apart(np.unique(indices * self._every_steps % scene.world.steps))
+
     def labels(self, index: int) -> list[Label]:
         """The objects within the reference sensor's range at one step; names are an object's own within a run."""
         scene, step = self.scene_of(index)
@@ -113,6 +133,15 @@ class Simulator:
         """
         stage, step = self._stage(index)
         return stage.scene, step
+
+    def _check_size(self) -> None:
+        of_rigs = sum(sensor.rays for rig in self.rigs.values() for sensor in rig.sensors)
+        rays = of_rigs + self.reference_sensor.rays
+        check_fits(
+            f"{rays:,} rays a step ({of_rigs:,} of the rig's sensors, {self.reference_sensor.rays:,} of the reference)",
+            BYTES_PER_RAY * rays,
+            "use fewer rays, rows or columns",
+        )
 
     def _stage(self, index: int) -> tuple[Stage, int]:
         if index < 0:
