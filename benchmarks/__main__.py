@@ -22,6 +22,7 @@ BENCHMARKS = (
     "calibration",
     "training_overhead",
     "known_boxes",
+    "hostile_documents",
 )
 
 

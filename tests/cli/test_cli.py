@@ -194,7 +194,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["evaluate", "kitti", "--scenario", "courtyard", "--frames", "recording"], "exclude each other"),
         (["evaluate", "front_roof_128", "--cell", "0.3"], "not a multiple of the cell of 0.3 m"),
         (["evaluate", "front_roof_128", "--cell", "-1"], "cell: a positive length"),
-        (["evaluate", "front_roof_128", "--threshold", "-1"], "thresholds: distances >= 0"),
+        (["evaluate", "front_roof_128", "--threshold", "-1"], "thresholds: finite distances >= 0"),
         (["evaluate", "front_roof_128", "--steps", "0"], "--steps"),
         (["evaluate", "front_roof_128", "--steps", "many"], "--steps"),
         (["evaluate", "front_roof_128", "--seed", "-1"], "--seed"),

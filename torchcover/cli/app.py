@@ -25,6 +25,9 @@ app = typer.Typer(
 # What is raised for any mistake in options and arguments. Typer names only descendants of it.
 USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
 
+# Of what a mistake is told in: whoever gave a name of thousands does not want it back.
+MAX_LINE_CHARS = 2000
+
 
 def main() -> None:
     """Run the command line; a user's mistake ends in one line on stderr and exit code 2, a warning is one line too."""
@@ -244,5 +247,6 @@ def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  
 
 
 def _fail(message: str) -> None:
-    typer.echo(f"torchcover: {' '.join(message.split())}", err=True)
+    line = " ".join(message.split())
+    typer.echo(f"torchcover: {line if len(line) <= MAX_LINE_CHARS else line[:MAX_LINE_CHARS] + ' ...'}", err=True)
     sys.exit(2)

@@ -66,7 +66,7 @@ class BevGrid:
             _check_multiple(axis, bounds, self.cell)
         _check_heights(self.heights)
         if math.prod(self.shape) > MAX_CELLS:
-            raise ValueError(f"the grid has {math.prod(self.shape):.6g} cells, over {MAX_CELLS:,}: use larger cells")
+            raise ValueError(f"the grid has {math.prod(self.shape):,} cells, over {MAX_CELLS:,}: use larger cells")
         self._normalise()
 
     def _normalise(self) -> None:

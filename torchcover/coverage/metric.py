@@ -56,8 +56,8 @@ class CoverageMetric(MergeableMetric):
         kwargs: For `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
 
     Raises:
-        ValueError: A threshold that is negative, not finite, over `max_radius`, or given twice; a `max_radius` that is not
-            positive; a number of blocks that is neither 1 nor even and 8 or more; two aggregations of one kind.
+        ValueError: A threshold that is negative, not finite, over `max_radius`, or given twice; a `max_radius` that is
+            not positive; a number of blocks that is neither 1 nor even and 8 or more; two aggregations of one kind.
 
     Example:
         >>> metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)}))

@@ -24,7 +24,7 @@ def check_drawable(sensors: Sequence[Sensor]) -> None:
     """Find out before a run, not after it, whether its maps can show the sensors.
 
     Raises:
-        ValueError: A sensor that sees nothing in the middle of its field of view, so that nobody knows how wide that is.
+        ValueError: A sensor none of whose rays in the middle row is one, so that nobody knows how wide it sees.
     """
     for sensor in sensors:
         if not 0 < sensor.horizontal_fov_deg <= 360:

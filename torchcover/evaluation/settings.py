@@ -7,6 +7,7 @@ from numbers import Real
 from typing import Any, Self, get_args
 
 import torch
+from torch import Tensor
 
 from torchcover.coverage import Aggregation, BevGrid, CoverageMetric, Measure, Region, check_regions, forward_regions
 from torchcover.data import GRID_X_M, GRID_Y_M
@@ -146,8 +147,8 @@ def new_metric(
     """An empty metric over the grid of every evaluation, with standard errors unless there is one block only.
 
     Raises:
-        ValueError: A cell or a threshold that makes no sense, a region without a cell, or more cells than the memory has
-            room for.
+        ValueError: A cell or a threshold that makes no sense, a region without a cell, or more cells than there is
+            memory for.
     """
     grid = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=cell_m)
     check_regions(forward_regions(), grid)
@@ -161,7 +162,7 @@ def new_metric(
         square_metres=square_metres,
     )
     with torch.device("meta"):  # where tensors have a size and take no memory
-        state_bytes = sum(state.nbytes for state in build().metric_state.values())
+        state_bytes = sum(state.nbytes for state in build().metric_state.values() if isinstance(state, Tensor))
     check_fits(f"the sums of {grid.cells:,} cells in {blocks} blocks", STATE_COPIES * state_bytes, "use larger cells")
     try:
         return build().to(device)

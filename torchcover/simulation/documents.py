@@ -9,7 +9,7 @@ from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, ValidationInfo, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 from pydantic_core import ErrorDetails
 
 from torchcover.files import parse_yaml
@@ -40,6 +40,11 @@ class Document(BaseModel):
         return {key: _kept(value) for key, value in content.items()}
 
 
+# Farther away rays know no place any more.
+FARTHEST_M = 1e9
+Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
+
+
 class Pose(Document):
     """Where a frame lies in another: `destination_T_source` as people write it.
 
@@ -57,9 +62,9 @@ class Pose(Document):
         array([-1. , -0. ,  0. ,  1.5])
     """
 
-    x_m: float = 0.0
-    y_m: float = 0.0
-    z_m: float = 0.0
+    x_m: Coordinate = 0.0
+    y_m: Coordinate = 0.0
+    z_m: Coordinate = 0.0
     yaw_deg: float = 0.0
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
