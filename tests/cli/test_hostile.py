@@ -1,4 +1,4 @@
-"""Documents and options that nobody should write end at once, in one line. All of them: `benchmarks hostile_documents`."""
+"""Documents and options that nobody should write end at once, in one line; `benchmarks hostile_documents` has all."""
 
 import time
 from itertools import chain

@@ -130,3 +130,7 @@ def test_an_actor_that_will_get_into_the_ego_is_known_before_the_run(tmp_path):
     every_third.check_run(3)
     with pytest.raises(ValueError, match=r"at t = 9 s"):
         every_third.check_run(4)
+
+
+def test_traffic_has_two_instants_however_short_it_is():
+    assert len(Highway(duration_s=1e-320).world(0).ego.trajectory.times_s) == 2

@@ -49,7 +49,7 @@ class Procedural(Document):
         """
         generator = np.random.default_rng(seed)
         fleet = Fleet(load_bodies() if bodies is None else bodies, ego, generator)
-        steps = int(np.ceil(self.duration_s / self.time_step_s - 1e-9))
+        steps = max(1, int(np.ceil(self.duration_s / self.time_step_s - 1e-9)))
         times_s = self.time_step_s * np.arange(steps + 1, dtype=np.float64)
         static, driver, others = self._build(fleet, times_s, generator)
         return World(static, driver, others, self.time_step_s, self.duration_s, tuple(fleet.parked))
