@@ -19,6 +19,7 @@ BENCHMARKS = (
     "metric_omissions",
     "even_reference",
     "ray_budget",
+    "recorded_measure",
     "calibration",
     "training_overhead",
     "known_boxes",

@@ -47,6 +47,34 @@ def test_projection_by_intrinsics_coefficients_and_points(lens):
     assert torch.autograd.gradcheck(lambda i, k, p: build(i, k).project(p)[0], (intrinsics, coefficients, points))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_point_in_the_lens_itself_poisons_no_gradient(lens, dtype):
+    """As a return at range 0 is: it has no pixel, and every other point keeps its share of the gradient."""
+    build, intrinsics, coefficients = lens
+    point = torch.tensor([[0.3, -0.2, 1.0]], dtype=dtype)
+    nothing = torch.tensor([[0.0, 0.0, 0.0], [0.0, 0.0, -0.0], [1e-30, 0.0, 0.0]], dtype=dtype)
+    gradients = []
+    for points in (point, torch.cat([nothing, point])):
+        given = [intrinsics, coefficients, points.requires_grad_()]
+        pixels, valid = build(intrinsics, coefficients).project(points)
+        assert valid.tolist() == [False] * (len(points) - 1) + [True]
+        of_all = torch.autograd.grad(pixels.sum(), [x for x in given if x.requires_grad], retain_graph=True)
+        assert all(gradient.isfinite().all() for gradient in of_all)
+        *of_lens, of_points = torch.autograd.grad(pixels[valid].sum(), [x for x in given if x.requires_grad])
+        gradients.append([*of_lens, of_points[-1:]])
+        assert (of_points[:-1] == 0).all()
+    for alone, among in zip(*gradients, strict=True):
+        torch.testing.assert_close(among, alone)
+
+
+def test_projection_close_to_the_lens_by_points(lens):
+    build, intrinsics, coefficients = lens
+    scale = 1e-3
+    points = (torch.tensor([[0.3, -0.2, 1.0], [0.05, 0.1, 0.9]], dtype=torch.float64) * scale).requires_grad_()
+    camera = build(intrinsics.detach(), coefficients.detach())
+    assert torch.autograd.gradcheck(lambda p: camera.project(p)[0], points, eps=1e-6 * scale, rtol=1e-3)
+
+
 def test_unprojection_by_depth_and_calibration():
     depth = torch.tensor([[2.0, 3.0, 7.0], [4.0, 5.0, 6.0]], dtype=torch.float64, requires_grad=True)
 

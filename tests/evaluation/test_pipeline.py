@@ -156,6 +156,40 @@ def test_without_a_good_frame_there_is_no_result(frames):
         observe(Spoiled(frames, set(range(6))), [Names()], skip_bad_frames=True)
 
 
+def test_an_error_of_the_last_observer_costs_no_step_of_the_others(frames):
+    names = Names()
+    run = observe(frames, [names, Names(then=lambda: 1 / (4 - run_so_far(names)))], keep_partial=True)
+    assert (run.steps, names.names, run.complete) == (3, ["f0", "f1", "f2", "f3"], False)
+    with pytest.raises(ZeroDivisionError):
+        run.raise_failure()
+    with pytest.raises(ZeroDivisionError):
+        observe(frames, [Names(then=lambda: 1 / 0)], keep_partial=True)  # nothing to keep
+
+
+def run_so_far(names):
+    return len(names.names)
+
+
+class Deadly(Spoiled):
+    """A dataset in which some frames end the process that makes them, as a want of memory would."""
+
+    def __getitem__(self, index):
+        if index in self.bad:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return self.frames[index]
+
+
+# torch may find out about the worker once more when its iterator is taken down.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_what_there_is_outlives_a_worker_that_is_killed(frames):
+    names = Names()
+    run = observe(Deadly(frames, {5}), [names], workers=1, keep_partial=True)
+    assert (run.steps, run.complete) == (len(names.names), False)
+    assert names.names == ["f0", "f1", "f2", "f3", "f4"][: len(names.names)]
+    with pytest.raises(ChildProcessError, match=r"a worker was killed, .*; use fewer workers"):
+        run.raise_failure()
+
+
 def test_ctrl_c_within_a_frame_waits_for_all_observers(frames):
     calls = []
 
@@ -167,7 +201,7 @@ def test_ctrl_c_within_a_frame_waits_for_all_observers(frames):
     before, first, last = signal.getsignal(signal.SIGINT), Names(press), Names()
     run = observe(frames, [first, last], keep_partial=True)
     assert first.names == last.names == ["f0", "f1", "f2"]
-    assert (run.steps, run.interrupted, run.complete) == (3, True, False)
+    assert (run.steps, type(run.failure), run.complete) == (3, KeyboardInterrupt, False)
     assert signal.getsignal(signal.SIGINT) is before
     with pytest.raises(KeyboardInterrupt):
         run.raise_failure()

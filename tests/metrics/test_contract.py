@@ -123,6 +123,30 @@ def test_reset_forgets_every_step(case):
 # What the state is.
 
 
+BEFORE = {
+    "nothing": lambda case, metric: None,
+    "reset": lambda case, metric: metric.reset(),
+    "forward": lambda case, metric: (metric(**case.steps[0]), metric.reset()),
+    "move": lambda case, metric: metric.to("cpu"),
+    "load": lambda case, metric: metric.load_state_dict(case.make().state_dict()),
+    "merge": lambda case, metric: metric.merge_state(case.make()),
+    "compute": lambda case, metric: (metric.update(**case.steps[0]), metric.compute(), metric.reset()),
+}
+
+
+@EVERY
+@pytest.mark.parametrize("before", BEFORE.values(), ids=list(BEFORE))
+def test_steps_are_added_under_inference_mode_and_after_it(case, before):
+    metric = case.make()
+    with torch.inference_mode():
+        before(case, metric)
+        metric.update(**case.steps[0])
+        metric(**case.steps[1])
+    for step in case.steps[2:]:
+        metric.update(**step)
+    assert_same(metric.compute(), case.over(case.steps).compute())
+
+
 @EVERY
 def test_the_state_has_a_fixed_size(case):
     metric = case.make()

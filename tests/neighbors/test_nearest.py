@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pykdtree.kdtree import KDTree
 
 from torchcover import blind_spot_radius, nearest
 from torchcover.neighbors import BACKENDS, check_cloud
@@ -97,6 +98,31 @@ def test_duplicates_among_other_points(backend):
     distance, index = nearest(points, points, backend=backend)
     assert (distance == 0).all()
     assert torch.equal(points[index], points)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_a_tree_is_built_of_distinct_points_where_many_are_equal(monkeypatch, dtype):
+    """It cannot split equal points, and queries near them would look through all of them."""
+    built = []
+
+    def noted(points):
+        built.append(len(points))
+        return KDTree(points)
+
+    monkeypatch.setattr("torchcover.neighbors.kdtree.KDTree", noted)
+    random = torch.Generator().manual_seed(4)
+    query, distinct = (torch.rand(count, 3, generator=random, dtype=dtype) - 0.5 for count in (300, 2000))
+    zeros = torch.zeros(3000, 3, dtype=dtype)
+    zeros[1::2] = -0.0
+    points = torch.cat([zeros, distinct, zeros])
+    expected = nearest(query, points, backend="cdist").distance
+    found = nearest(query, points, backend="kdtree")
+    assert torch.equal(found.distance, expected)
+    assert torch.equal((query.double() - points[found.index].double()).norm(dim=1).to(dtype), expected)
+    near = nearest(query, points, max_distance=0.05, backend="kdtree")
+    assert torch.equal(near.index >= 0, expected <= 0.05)
+    nearest(query, distinct, backend="kdtree")
+    assert built == [2001, 2001, 2000]
 
 
 @backends

@@ -281,6 +281,17 @@ def test_the_histogram_says_no_point_where_the_maps_say_unknown():
     assert entries == ["no point of the rig in any step", "unknown: never probed (10.0 % of the cells)", "ego"]
 
 
+def test_radii_over_little_surface_are_pale_and_named():
+    opacity = torch.ones(GRID.shape)
+    opacity[1] = 0.3
+    picture = four_views(opacity=opacity, unknown="no visible surface found", sensors=[])
+    ground, obstacle = (np.ptp(picture.at(axes, -8.1, 4.1)) for axes in (2, 3))
+    assert 0 < obstacle < 0.5 * ground
+    entries = [text.get_text() for text in picture.figure.axes[2].get_legend().get_texts()]
+    assert entries[0] == "unknown: no visible surface found (0 % of the cells)"
+    assert entries[1].startswith("paler: ")
+
+
 def test_a_rig_without_a_point_is_drawn_too():
     assert len(four_views(torch.full(GRID.shape, float("nan")), torch.zeros(GRID.shape[1:])).figure.axes) >= 4
 
@@ -290,6 +301,7 @@ def test_a_rig_without_a_point_is_drawn_too():
     [
         ({"radius": torch.zeros(2, 3, 4)}, r"radius: shape \(2, 32, 40\)"),
         ({"points": torch.zeros(3, 4)}, "points: shape"),
+        ({"opacity": torch.zeros(3, 4)}, "opacity: shape"),
     ],
 )
 def test_arrays_of_another_grid_are_refused(arguments, message):

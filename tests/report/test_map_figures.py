@@ -83,12 +83,15 @@ def test_there_is_a_figure_for_each_quantity_and_band(tmp_path):
 def test_every_aggregation_is_drawn_under_its_key():
     # What has a field has levels.
     aggregations = [kind(*((0.5,) for _ in fields(kind))) for kind in AGGREGATIONS]
-    metric = CoverageMetric(SMALL, aggregations=aggregations, square_metres=True)
     points = torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5]])
-    metric.update(torch.zeros(1, 3), points, weights=torch.ones(2))
-    coverage = metric.compute()
-    assert names({"a": coverage}) == [f"{key}_all" for key in coverage.layers]
-    assert len(coverage.layers) >= 4 + len(AGGREGATIONS)
+    for over_surface, others in ((False, ()), (True, ("radius_m", "detection_0.4m"))):
+        metric = CoverageMetric(SMALL, aggregations=aggregations, square_metres=over_surface)
+        metric.update(torch.zeros(1, 3), points, weights=torch.ones(2))
+        coverage = metric.compute()
+        shown = names({"a": coverage})
+        # The first are those of the measure; the other measure is in the files.
+        assert shown == [f"{key}_all" for key in coverage.layers if key not in others]
+        assert len(shown) >= 2 + len(AGGREGATIONS)
 
 
 @dataclass(frozen=True)

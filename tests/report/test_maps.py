@@ -15,7 +15,7 @@ from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.report import ColourScale, SensorView, draw_map, scale_of
-from torchcover.report.maps.colours import INFINITE
+from torchcover.report.maps.colours import INFINITE, UNKNOWN
 
 SCALE = ColourScale("blind spot radius", "m", "viridis_r", 0.0, 1.0)
 SQUARE = BevGrid(x=(-20.0, 20.0), y=(-10.0, 10.0), cell=1.0)
@@ -251,7 +251,33 @@ def test_drawing_leaves_the_global_state_of_matplotlib_alone():
     assert pyplot.get_fignums() == []
 
 
+def test_less_opaque_cells_are_nearer_to_the_grey_of_unknown_ones():
+    values, opacity = flat(1.0), torch.linspace(0.0, 1.0, 40).expand(20, 40)
+    picture = draw(values, opacity=opacity)
+    grey, pale, full = (picture.at(x_m, 3.3) for x_m in (-19.6, 0.5, 19.5))
+    assert grey == pytest.approx(to_rgb(UNKNOWN["facecolor"]), abs=0.1)
+    assert full == pytest.approx(draw(values).at(19.5, 3.3))
+    # The hatch of the ground shows through: by less than what is compared.
+    greens = picture.map[40, 10:-10, 1]
+    assert greens[:300].mean() > greens[300:600].mean() > greens[600:900].mean()
+    assert full[1] < pale[1] < grey[1]
+    assert any(entry.startswith("paler") for entry in picture.legend)
+    assert not any(entry.startswith("paler") for entry in draw(values).legend)
+
+
+def test_what_is_unknown_or_infinite_is_so_whatever_its_opacity():
+    values = flat(0.5)
+    values[:, :10], values[:, 30:] = math.nan, math.inf
+    opaque, none = torch.ones(20, 40), torch.zeros(20, 40)
+    assert draw(values, opacity=opaque).at(-15.3, 3.3) == pytest.approx(draw(values).at(-15.3, 3.3))
+    assert draw(values, opacity=opaque).at(15.5, 3.3) == pytest.approx(to_rgb(INFINITE), abs=0.01)
+    for x_m in (-15.3, 0.5, 15.5):
+        assert np.ptp(draw(values, opacity=none).at(x_m, 3.3)) < 0.01
+
+
 def test_wrong_shapes_are_refused_with_what_arrived():
+    with pytest.raises(ValueError, match=r"opacity: shape \(20, 40\) is needed.*got \(40, 20\)"):
+        draw(flat(), opacity=flat().T)
     with pytest.raises(ValueError, match=r"shape \(20, 40\) is needed.*got \(40, 20\)"):
         draw(flat().T)
     for outline, shape in ((EGO[:2], r"\(2, 2\)"), (EGO[0], r"\(2,\)"), (np.zeros((4, 3)), r"\(4, 3\)")):

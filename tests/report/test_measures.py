@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.report import RENDERERS, CoverageTable, map_figures, parts_of, remarks_on
+from torchcover.report import RENDERERS, CoverageTable, band_figures, map_figures, notes_on, parts_of, remarks_on
 
 KEYS = ("radius_m", "detection_0.4m")
 SURFACE, CELLS = "Means over the square metres that the reference sees.", "Means over the known cells only"
@@ -91,9 +91,34 @@ def test_without_a_region_no_measure_is_told(surface_pair):
     assert SURFACE not in RENDERERS["text"](table)
 
 
-def test_both_measures_are_drawn_and_cells_without_a_square_metre_are_unknown():
+def test_what_rigs_share_is_said_in_the_words_of_the_measure(table, trio, regions):
+    surface, known = notes_on(table)[0], notes_on(CoverageTable.of(trio, regions))[0]
+    assert surface.endswith("so they are asked about the same square metres.")
+    assert known.endswith("so they know the same cells.")
+
+
+def test_maps_are_those_of_the_measure_and_name_what_is_unknown():
     figures = dict(map_figures({"rig": two_cells()}))
-    assert {"radius_m_all", "radius_area_m_all", "detection_area_0.4m_all"} <= set(figures)
+    assert list(figures) == ["radius_area_m_all", "detection_area_0.4m_all"]
     for figure in figures.values():
         (legend,) = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
-        assert legend.get_texts()[0].get_text().endswith("(33.3 % of the cells)")
+        assert [text.get_text() for text in legend.get_texts()] == [
+            "unknown: no visible surface found (33.3 % of the cells)",
+            "paler: less visible surface in a step than open ground has",
+        ]
+    title, conditions = (text.get_text() for text in figures["radius_area_m_all"].axes[0].texts)
+    assert title == "Mean blind spot radius, by area, all"
+    assert conditions == "z -1 to 1 m; 2 steps, cells of 1 m, larger where points are few"
+    assert figures["detection_area_0.4m_all"].axes[1].get_ylabel() == "detection within 0.4 m, by area (%)"
+
+
+def test_the_bands_of_loggers_are_those_of_the_measure():
+    assert [name for name, _ in band_figures(two_cells())] == ["radius_area_m", "detection_area_0.4m"]
+
+
+@pytest.mark.usefixtures("blank_maps")
+def test_errors_and_differences_are_those_of_the_measure(surface_pair):
+    names = [name for name, _ in map_figures(surface_pair, errors=True)]
+    assert len(names) == 2 * 2 * 3
+    assert all("_area_" in name for name in names)
+    assert {"radius_area_m_error_ground", "difference_radius_area_m_ground_many_minus_few"} <= set(names)

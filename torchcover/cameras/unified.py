@@ -14,12 +14,13 @@ from torchcover.cameras.lens import Scalar, number
 
 
 def _norm(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    return torch.sqrt(x * x + y * y + z * z)
+    return _root(x * x + y * y + z * z)
 
 
 def _root(value: Tensor) -> Tensor:
-    """Square root of what rounding may have pushed below 0 at the rim."""
-    return torch.sqrt(value.clamp(min=0.0))
+    """Square root of what rounding may have pushed below 0 at the rim; its gradient at 0 is 0, not infinite."""
+    positive = value > 0
+    return torch.where(positive, torch.sqrt(torch.where(positive, value, 1.0)), 0.0)
 
 
 def _unit(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
@@ -82,7 +83,7 @@ class ExtendedChart:
     def draw(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Directions before the fold."""
         alpha = number(self.alpha)
-        d = torch.sqrt(self.beta * (x * x + y * y) + z * z)
+        d = _root(self.beta * (x * x + y * y) + z * z)
         shown = z > -d * (min(alpha, 1.0 - alpha) / max(alpha, 1.0 - alpha))
         return _over(x, y, self.alpha * d + (1.0 - self.alpha) * z, shown)
 

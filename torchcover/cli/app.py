@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchcover.cli import options
+from torchcover.evaluation.interrupt import terminable
 
 if TYPE_CHECKING:
     from torchcover.data import FrameSource
@@ -21,6 +22,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+# Exit codes; those of signals are 128 and their number.
+MISTAKE, INTERRUPTED, TERMINATED = 2, 130, 143
 
 # What is raised for any mistake in options and arguments. Typer names only descendants of it.
 USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
@@ -35,9 +39,10 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # where there is no ±, a result with ? is better than none
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), terminable() as terminated:
             warnings.showwarning = _warn
             code = typer.main.get_command(app).main(standalone_mode=False)
+        sys.stdout.flush()
     except USAGE_ERROR as error:
         _fail(error.format_message())  # type: ignore[attr-defined]  # the typed name is private
     except (ValueError, TypeError, OSError) as error:
@@ -46,8 +51,8 @@ def main() -> None:
         _fail(f"there is not enough memory ({error or 'for what was asked'}); ask for less, or use a larger machine")
     except (OverflowError, RecursionError) as error:
         _fail(f"a number is too large, or a file nested too deeply ({error})")
-    except (KeyboardInterrupt, typer.Abort):
-        sys.exit(130)
+    if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
+        _fail(*("terminated", TERMINATED) if terminated else ("interrupted", INTERRUPTED))
     sys.exit(code if isinstance(code, int) else 0)
 
 
@@ -84,27 +89,28 @@ def evaluate(
     skip_bad_frames: options.SkipBadFrames = False,
 ) -> None:
     """Measure the coverage of a rig: a table, maps, and files to compare and to log."""
-    from torchcover.evaluation import evaluate
+    from torchcover.evaluation import claimed, evaluate
 
-    result = evaluate(
-        rig,
-        scenario,
-        frames=_opened(frames, recording_format),
-        steps=steps,
-        seed=seed,
-        cell_m=cell,
-        thresholds=threshold or (0.4,),
-        reference_sensor=reference,
-        rays=rays,
-        estimate=estimate,
-        every_s=every,
-        target_error=target_error,
-        device=device,
-        workers=workers,
-        skip_bad_frames=skip_bad_frames,
-        progress=True,
-    )
-    _finish(result, out, error_maps=error_maps, explain=explain)
+    with claimed(out):
+        result = evaluate(
+            rig,
+            scenario,
+            frames=_opened(frames, recording_format),
+            steps=steps,
+            seed=seed,
+            cell_m=cell,
+            thresholds=threshold or (0.4,),
+            reference_sensor=reference,
+            rays=rays,
+            estimate=estimate,
+            every_s=every,
+            target_error=target_error,
+            device=device,
+            workers=workers,
+            skip_bad_frames=skip_bad_frames,
+            progress=True,
+        )
+        _finish(result, out, error_maps=error_maps, explain=explain)
 
 
 @app.command()
@@ -130,27 +136,28 @@ def compare(
     skip_bad_frames: options.SkipBadFrames = False,
 ) -> None:
     """Compare rigs in the same frames: a table with the better values marked, maps side by side, differences."""
-    from torchcover.evaluation import compare
+    from torchcover.evaluation import claimed, compare
 
-    result = compare(
-        rigs or (),
-        scenario,
-        frames=_opened(frames, recording_format),
-        steps=steps,
-        seed=seed,
-        cell_m=cell,
-        thresholds=threshold or (0.4,),
-        reference_sensor=reference,
-        rays=rays,
-        estimate=estimate,
-        every_s=every,
-        target_error=target_error,
-        device=device,
-        workers=workers,
-        skip_bad_frames=skip_bad_frames,
-        progress=True,
-    )
-    _finish(result, out, error_maps=error_maps, explain=explain)
+    with claimed(out):
+        result = compare(
+            rigs or (),
+            scenario,
+            frames=_opened(frames, recording_format),
+            steps=steps,
+            seed=seed,
+            cell_m=cell,
+            thresholds=threshold or (0.4,),
+            reference_sensor=reference,
+            rays=rays,
+            estimate=estimate,
+            every_s=every,
+            target_error=target_error,
+            device=device,
+            workers=workers,
+            skip_bad_frames=skip_bad_frames,
+            progress=True,
+        )
+        _finish(result, out, error_maps=error_maps, explain=explain)
 
 
 @app.command()
@@ -177,7 +184,7 @@ def study(
 ) -> None:
     """Measure error against run time for reference sensors and numbers of steps, and recommend a setting."""
     from torchcover.cli.printing import print_study
-    from torchcover.evaluation import StudyPlan, error_against_time
+    from torchcover.evaluation import StudyPlan, claimed, error_against_time
 
     plan = StudyPlan(
         rig=rig,
@@ -192,9 +199,10 @@ def study(
         cell_m=cell,
         threshold_m=threshold,
     )
-    found = error_against_time(plan, progress=True)
-    found.save(out)
-    print_study(found, out)
+    with claimed(out):
+        found = error_against_time(plan, progress=True)
+        found.save(out)
+        print_study(found, out)
 
 
 @app.command()
@@ -246,7 +254,7 @@ def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  
     typer.echo(f"torchcover: warning: {' '.join(str(message).split())}", err=True)
 
 
-def _fail(message: str) -> None:
+def _fail(message: str, code: int = MISTAKE) -> None:
     line = " ".join(message.split())
     typer.echo(f"torchcover: {line if len(line) <= MAX_LINE_CHARS else line[:MAX_LINE_CHARS] + ' ...'}", err=True)
-    sys.exit(2)
+    sys.exit(code)

@@ -1,6 +1,6 @@
 """What a number is: its one key, its title, its unit, and which direction is better."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 # "m" is metres; a "share" lies in [0, 1], and tables and maps show it in percent.
@@ -53,6 +53,20 @@ def detection(threshold_m: float) -> Quantity:
     return Quantity(
         f"detection_{threshold_m:g}m", f"detection within {threshold_m:g} m", "share", lower_is_better=False
     )
+
+
+def by_area(quantity: Quantity) -> Quantity:
+    """The same over the surface that the reference sees, where every square metre weighs the same.
+
+    Args:
+        quantity: That of the mean of means.
+
+    Example:
+        >>> by_area(detection(0.4)).key, by_area(RADIUS).title
+        ('detection_area_0.4m', 'mean blind spot radius, by area')
+    """
+    kind, unit = quantity.key.split("_", 1)
+    return replace(quantity, key=f"{kind}_area_{unit}", title=f"{quantity.title}, by area")
 
 
 RADIUS = radius()

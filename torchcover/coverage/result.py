@@ -10,13 +10,14 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import MeanOfMeans
+from torchcover.coverage.area_errors import area_errors
 from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
 from torchcover.coverage.errors import cell_errors
 from torchcover.coverage.estimate import Measure, RegionEstimate, estimate_area, estimate_known
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
-from torchcover.coverage.quantity import RADIUS, Quantity
+from torchcover.coverage.quantity import RADIUS, Quantity, by_area
 from torchcover.coverage.regions import Region, check_regions, regions_within
 from torchcover.coverage.summary import Number, RegionSummary
 
@@ -98,7 +99,11 @@ class Coverage:
         if self.blocks is None:
             return {}
         each = [cell_errors(sums, self.blocks) for sums in self.blocks.sums.unbind(dim=1)]
-        return {quantity.key: error for quantity, error in zip(self.quantities, each, strict=True)}
+        errors = {quantity.key: error for quantity, error in zip(self.quantities, each, strict=True)}
+        if self.area is not None:
+            each = [area_errors(self.area.m2, sums) for sums in self.area.sums.unbind(dim=1)]
+            errors |= {by_area(quantity).key: error for quantity, error in zip(self.quantities, each, strict=True)}
+        return errors
 
     @property
     def radius_error(self) -> Tensor | None:

@@ -131,12 +131,11 @@ class RecallByVisibility(MergeableMetric):
         object_bin = self._bin(frame.truth, frame.share)
         detection_bin = self._bin(frame.detections, frame.detection_share)
         counts = [frame.scores >= score for score in self.score_thresholds]
-        # Not in place: a state that was reset under `torch.inference_mode` could not be added to outside of it.
-        self.objects = self.objects + self._counted([object_bin])[0]
-        self.found = self.found + self._counted([object_bin[found_at >= score] for score in self.score_thresholds])
-        self.detections = self.detections + self._counted([detection_bin[some] for some in counts])
-        self.true_detections = self.true_detections + self._counted([detection_bin[some & hit] for some in counts])
-        self.steps = self.steps + 1
+        self.objects += self._counted([object_bin])[0]
+        self.found += self._counted([object_bin[found_at >= score] for score in self.score_thresholds])
+        self.detections += self._counted([detection_bin[some] for some in counts])
+        self.true_detections += self._counted([detection_bin[some & hit] for some in counts])
+        self.steps += 1
 
     def _bin(self, rows: Tensor, share: Tensor) -> Tensor:
         distance = torch.linalg.vector_norm(rows[:, :2].double(), dim=1)

@@ -9,6 +9,7 @@ from .pipeline import StoppingRule as StoppingRule
 from .pipeline import observe as observe
 from .progress import Progress as Progress
 from .result import Result as Result
+from .result_files import claimed as claimed
 from .scene_pictures import cameras_of as cameras_of
 from .scene_pictures import rig_pictures as rig_pictures
 from .scene_pictures import scenario_picture as scenario_picture

@@ -64,8 +64,8 @@ def evaluate(
         progress: Whether to show a bar.
 
     Returns:
-        Numbers, maps, and how the run went. Ctrl-C, or a bad frame, ends the run and not the evaluation: see
-        `result.run.complete`.
+        Numbers, maps, and how the run went. Whatever ends it after the first step, a bad frame, Ctrl-C or an error, is
+        noted in `result.run.failure`, and what was measured until then is there.
 
     Raises:
         ValueError: Settings that make no sense, or not a single good frame.
@@ -187,6 +187,8 @@ def _measured(task: Task, settings: Settings, others: Observers, *, progress: bo
         keep_partial=True,
     )
     coverages = {name: observer.compute() for name, observer in observers.items()}
+    if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
+        run.raise_failure()  # within a step: the rigs have not seen the same
     return Result(
         coverages=coverages,
         regions=regions,

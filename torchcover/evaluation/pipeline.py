@@ -4,6 +4,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from traceback import clear_frames
 from typing import Protocol
 
 import torch
@@ -25,34 +26,26 @@ class Run:
         steps: Frames that all observers have seen.
         counts: Sums of the frames' counts.
         skipped: What was wrong with the frames that were skipped.
-        failure: The bad frame that ended it, if one did.
-        interrupted: Whether Ctrl-C ended it.
+        failure: What ended it before its time, if anything did: a bad frame, Ctrl-C, a worker that was killed, an error
+            of an observer.
         seconds: How long it took.
     """
 
     steps: int = 0
     counts: Counter[str] = field(default_factory=Counter)
     skipped: list[str] = field(default_factory=list)
-    failure: BadFrameError | None = None
-    interrupted: bool = False
+    failure: Exception | KeyboardInterrupt | None = None
     seconds: float = 0.0
 
     @property
     def complete(self) -> bool:
         """Whether nothing but the end of the frames, or of what was waited for, ended it."""
-        return self.failure is None and not self.interrupted
+        return self.failure is None
 
     def raise_failure(self) -> None:
-        """End as the run ended, once what was computed is safe.
-
-        Raises:
-            BadFrameError: A bad frame ended it.
-            KeyboardInterrupt: Ctrl-C ended it.
-        """
+        """End as the run ended, once what was computed is safe: raise what ended it, if anything did."""
         if self.failure is not None:
             raise self.failure
-        if self.interrupted:
-            raise KeyboardInterrupt
 
 
 class StoppingRule(Protocol):
@@ -85,9 +78,9 @@ def observe(
     title: str = "steps",
     keep_partial: bool = False,
 ) -> Run:
-    """Feed observers with frames. If a bad frame or Ctrl-C ends the run, all of them have seen the same frames.
+    """Feed observers with frames. Whatever ends the run, all of them have seen the same frames.
 
-    What an observer itself raises ends the run as it is, and those before it have seen one frame more.
+    But for an error of an observer itself: those before it have seen one frame more.
 
     Args:
         frames: A source of frames, or any map-style dataset or list of them.
@@ -99,7 +92,7 @@ def observe(
         until: Ends the run early.
         progress: Whether to show a bar.
         title: What stands before the bar.
-        keep_partial: After the first step, a bad frame or Ctrl-C is noted in the run and not raised: for who looks at
+        keep_partial: After the first step, what ends the run is noted in it and not raised: for who looks at
             `Run.complete`.
 
     Returns:
@@ -108,6 +101,7 @@ def observe(
     Raises:
         BadFrameError: The frame that ended it.
         ValueError: Not a single frame could be used.
+        ChildProcessError: A worker was killed.
         KeyboardInterrupt: Ctrl-C.
 
     Example:
@@ -128,8 +122,8 @@ def observe(
     run, observers = Run(), list(observers)
     most = len(frames) if steps is None else min(steps, len(frames))  # type: ignore[arg-type]  # map-style: has one
     start = time.perf_counter()
-    with progress_of(most, title, shown=progress) as bar:
-        try:
+    try:
+        with progress_of(most, title, shown=progress) as bar:
             for batch in _batches(frames, most, workers, run, skip_bad_frames=skip_bad_frames):
                 (frame,) = batch.to(device).frames
                 with held_back():
@@ -139,14 +133,25 @@ def observe(
                 bar.advance(expected, until.words if until else "")
                 if reached:
                     break
-        except KeyboardInterrupt:
-            run.interrupted = True
+    except (Exception, KeyboardInterrupt) as error:  # hours of work are not lost to any of them
+        clear_frames(error.__traceback__)  # which would keep the workers alive
+        run.failure = _killed_worker(error, workers) or error
     run.seconds = time.perf_counter() - start
     if not (keep_partial and run.steps):
         run.raise_failure()
     if not run.steps:
         raise ValueError("no frame could be used, so there is no result")
     return run
+
+
+def _killed_worker(error: BaseException, workers: int) -> ChildProcessError | None:
+    """What torch says, wherever this process is, when a worker dies; as an error that a user can do something about."""
+    told = isinstance(error, RuntimeError) and str(error).startswith("DataLoader worker (pid")
+    # Or its last frame could not be fetched; what a worker itself raises is "Caught ... in DataLoader worker process".
+    cut_off = workers > 0 and isinstance(error, EOFError | ConnectionError) and not str(error).startswith("Caught ")
+    if not (told or cut_off):
+        return None
+    return ChildProcessError(f"a worker was killed, perhaps for want of memory; use fewer workers ({error!r})")
 
 
 def _feed(frame: Frame, observers: Sequence[AnyObserver], run: Run) -> None:
@@ -157,7 +162,7 @@ def _feed(frame: Frame, observers: Sequence[AnyObserver], run: Run) -> None:
 
 
 def _batches(frames: Frames, most: int, workers: int, run: Run, *, skip_bad_frames: bool) -> Iterator[FrameBatch]:
-    """One frame at a time; notes bad ones, and ends at the first unless they are to be skipped."""
+    """One frame at a time; notes bad ones if they are to be skipped."""
     first: Dataset[Frame] = Subset(frames, range(most))  # type: ignore[arg-type]  # has a length and items
     iterator = iter(DataLoader(first, batch_size=1, collate_fn=collate_frames, num_workers=workers))
     while True:
@@ -167,6 +172,5 @@ def _batches(frames: Frames, most: int, workers: int, run: Run, *, skip_bad_fram
             return
         except BadFrameError as error:
             if not skip_bad_frames:
-                run.failure = error
-                return
+                raise
             run.skipped.append(str(error))

@@ -2,21 +2,55 @@
 
 import json
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, Self
 
+from filelock import FileLock, Timeout
+
 # Written last, and taken away first: without it the folder is not complete.
 SUMMARY = "summary.json"
+LOCK = ".lock"
+
+
+@contextmanager
+def claimed(folder: Path) -> Iterator[None]:
+    """Keep the runs of other processes out of a folder; a process that dies lets go of it.
+
+    Args:
+        folder: Made if it does not exist, and taken away again if nothing is written to it.
+
+    Raises:
+        ValueError: Another process has claimed it.
+    """
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / LOCK, timeout=0, is_singleton=True)  # one for the whole process: it may claim it twice
+    try:
+        with lock:
+            try:
+                yield
+            finally:
+                if lock.lock_counter == 1:
+                    (folder / LOCK).unlink(missing_ok=True)
+    except Timeout as error:
+        raise ValueError(
+            f"{folder}: another run is writing there; wait for its end, or choose another folder"
+        ) from error
+    finally:
+        with suppress(OSError):
+            for place in made:
+                place.rmdir()
 
 
 class ResultFiles:
     """Writes the files of a run into a folder, each of them whole or not at all. A context manager.
 
     What an earlier run has written here, as its `summary.json` lists it, and this one does not write, is deleted at the
-    end. If it is left by an error, that stays, and there is no `summary.json`.
+    end. If it is left by an error, that stays, and there is no `summary.json`. See `claimed`, too.
 
     Args:
         folder: Where to write; made if it does not exist.
@@ -28,10 +62,12 @@ class ResultFiles:
         self._earlier = _listed(folder / SUMMARY)
 
     def __enter__(self) -> Self:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        (self.folder / SUMMARY).unlink(missing_ok=True)
-        # In the folder itself, so that what is done can be renamed.
-        self._partial = TemporaryDirectory(dir=self.folder, prefix=".partial_")
+        with ExitStack() as stack:
+            stack.enter_context(claimed(self.folder))
+            (self.folder / SUMMARY).unlink(missing_ok=True)
+            # In the folder itself, so that what is done can be renamed.
+            self._partial = Path(stack.enter_context(TemporaryDirectory(dir=self.folder, prefix=".partial_")))
+            self._until_exit = stack.pop_all()
         return self
 
     def add(self, name: str, write: Callable[[Path], object]) -> None:
@@ -42,7 +78,7 @@ class ResultFiles:
             write: Writes it to the path that it is given.
         """
         path = self.folder / name
-        partial = Path(self._partial.name) / path.name
+        partial = self._partial / path.name
         write(partial)
         path.parent.mkdir(exist_ok=True)
         os.replace(partial, path)
@@ -60,7 +96,7 @@ class ResultFiles:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
     ) -> None:
-        self._partial.cleanup()
+        self._until_exit.close()
 
 
 def _listed(summary: Path) -> list[str]:

@@ -20,6 +20,7 @@ class MergeableMetric(Metric):
       `MetricCollection` from sharing the sums of metrics that happen to agree after the first step.
     * States are copies: nothing that is loaded or merged is written to later.
     * `.to(torch.float16)` moves the sums but does not round them.
+    * Under `torch.inference_mode` everything works as outside of it, and steps may be added outside afterwards.
 
     A metric passes its parameters to `__init__`, adds its states with `add_sum` and `add_maximum`, and counts `steps`.
 
@@ -73,6 +74,17 @@ class MergeableMetric(Metric):
         lowest = torch.full(shape, -math.inf, dtype=torch.float64)
         self.add_state(name, lowest, dist_reduce_fx="max", persistent=True)
 
+    @torch.inference_mode(False)  # here and below: a tensor made under it could not be added to outside of it
+    def reset(self) -> None:
+        """Forget every step."""
+        super().reset()
+
+    @torch.inference_mode(False)
+    def forward(self, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401  (what `update` takes, and what `compute` gives)
+        """Add steps as `update` does, and return what `compute` gives for these steps alone."""
+        return super().forward(*args, **kwargs)
+
+    @torch.inference_mode(False)
     def merge_state(self, incoming_state: "dict[str, Any] | Metric") -> None:
         """Add the steps of another metric with the same parameters, which is left as it was.
 
@@ -115,6 +127,7 @@ class MergeableMetric(Metric):
     def _align_ranks(self, dist_sync_fn: Callable[..., Any], process_group: Any) -> None:  # noqa: ANN401
         """Bring the states of all ranks into a form in which they can be added up."""
 
+    @torch.inference_mode(False)
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *args: Any) -> None:  # noqa: ANN401
         # torchmetrics would keep the very tensors it is given, of any shape, and pass over those that are missing.
         given = {name: state_dict[prefix + name] for name in self._defaults if prefix + name in state_dict}
@@ -152,6 +165,7 @@ class MergeableMetric(Metric):
         self._computed = None
         self._update_count = int(self.steps)
 
+    @torch.inference_mode(False)
     def _apply(self, fn: Callable[[Tensor], Tensor], *args: Any, **kwargs: Any) -> "MergeableMetric":  # noqa: ANN401
         """Move the state to another device, but leave its type."""
 

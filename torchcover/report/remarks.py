@@ -79,7 +79,8 @@ def notes_on(table: CoverageTable) -> list[str]:
     by_rig = {rig: _of_rig(table, rig) for rig in table.rigs}
     common = [note for note in by_rig[table.rigs[0]] if all(note in notes for notes in by_rig.values())]
     own = [f"{rig}: {note}" for rig, notes in by_rig.items() for note in notes if note not in common]
-    paired = ["All rigs were measured against the same reference points, so they know the same cells."]
+    shared = {"known": "they know the same cells", "area": "they are asked about the same square metres"}[table.measure]
+    paired = [f"All rigs were measured against the same reference points, so {shared}."]
     return [*(paired if len(table.rigs) > 1 else []), *common, *own, *table.notes]
 
 

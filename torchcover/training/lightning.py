@@ -105,8 +105,7 @@ class CoverageCallback(Callback):
 
     def _start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         # The sums live where the processes can exchange them; Apple's GPUs have no float64.
-        with torch.inference_mode(False):
-            self.metric.to("cpu" if pl_module.device.type == "mps" else pl_module.device)
+        self.metric.to("cpu" if pl_module.device.type == "mps" else pl_module.device)
         if self._epoch == trainer.current_epoch:
             return
         due = trainer.state.fn != "fit" or (trainer.current_epoch + 1) % self.every_n_epochs == 0
@@ -118,8 +117,7 @@ class CoverageCallback(Callback):
         else:
             self._once.start_epoch()
             self._logged, self._added = {}, True
-            with torch.inference_mode(False):  # or the sums could not be added to outside a validation
-                self.metric.reset()
+            self.metric.reset()
 
     def _add(self, trainer: Trainer, pl_module: LightningModule, batch: object, loader_index: int) -> None:
         # After a checkpoint at the last batch of an epoch, Lightning leaves out the hook for its start.
@@ -132,13 +130,12 @@ class CoverageCallback(Callback):
             return
         self._added = True
         indices = [frame.index for frame in new.frames]
-        with torch.inference_mode(False):
-            self.metric.update(
-                [sensor_of(frame, self.rig) for frame in new.frames],
-                new.reference,
-                weights=new.weights,
-                index=None if UNKNOWN_INDEX in indices else indices,
-            )
+        self.metric.update(
+            [sensor_of(frame, self.rig) for frame in new.frames],
+            new.reference,
+            weights=new.weights,
+            index=None if UNKNOWN_INDEX in indices else indices,
+        )
 
     def _shard(self, trainer: Trainer, loader_index: int) -> Shard | None:
         loaders: Any = trainer.train_dataloader if self.stage == "train" else trainer.val_dataloaders
@@ -167,9 +164,8 @@ class CoverageCallback(Callback):
         pl_module.log_dict(self._logged, on_step=False, on_epoch=True, sync_dist=True, reduce_fx="max")
 
     def _compute(self) -> Coverage:
-        with torch.inference_mode(False):
-            self.metric.update([], [])  # a process that was dealt nothing but padding has not updated yet
-            coverage: Coverage = self.metric.compute()
+        self.metric.update([], [])  # a process that was dealt nothing but padding has not updated yet
+        coverage: Coverage = self.metric.compute()
         self.coverage = coverage
         if not bool((coverage.probed_steps > 0).any()):
             self._warn_once("no reference point lies in the grid: the coverage of these frames is unknown (NaN)")

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, State
 from torchcover.coverage.layer import Layer
-from torchcover.coverage.quantity import Quantity, detection, radius
+from torchcover.coverage.quantity import RADIUS, Quantity, by_area, detection
 
 
 @dataclass(frozen=True)
@@ -36,12 +36,7 @@ class VisibleArea(Aggregation):
     @property
     def quantities(self) -> tuple[Quantity, ...]:
         """The radius, then the detection at each threshold."""
-        detections = map(detection, self.thresholds)
-        over_area = [
-            Quantity(key.key.replace("detection_", "detection_area_"), f"{key.title}, by area", "share", False)
-            for key in detections
-        ]
-        return (radius("area", "mean by area of the"), *over_area)
+        return tuple(map(by_area, (RADIUS, *map(detection, self.thresholds))))
 
     def states(self, cells: int) -> dict[str, State]:
         """`m2` (B, C): square metres in the steps of a block; `sums` (B, Q, C): each quantity times them."""

@@ -11,7 +11,15 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS
-from torchcover.report.maps.colours import ColourScale, cell_entries, draw_cells, draw_colour_bar, scale_of
+from torchcover.report.maps.colours import (
+    NEVER_PROBED,
+    ColourScale,
+    cell_entries,
+    draw_cells,
+    draw_colour_bar,
+    paler_entry,
+    scale_of,
+)
 from torchcover.report.maps.overlay import SensorView, draw_ego, draw_sectors, draw_sensors
 from torchcover.report.maps.sheet import (
     HEADING_POINTS,
@@ -39,6 +47,8 @@ def draw_four_views(
     title: str,
     ego_outline_m: NDArray[np.floating],
     sensors: Sequence[SensorView],
+    unknown: str = NEVER_PROBED,
+    opacity: Tensor | None = None,
 ) -> Figure:
     """Draw what geometry alone says of a rig, what its points alone say, and what it sees of what there is to be seen.
 
@@ -50,16 +60,19 @@ def draw_four_views(
         title: First line.
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: The rig.
+        unknown: Why a cell has no radius, for the legend.
+        opacity: (H, Y, X) that of the radius, as in `draw_map`.
 
     Returns:
         A figure of its own, outside pyplot: sectors and histogram, and below them the blind spot radius in every band;
         four panels for two bands. All have the same frame, extent and axes.
 
     Raises:
-        ValueError: `radius`, `points` or the outline have another shape.
+        ValueError: `radius`, `points`, the opacity or the outline have another shape.
     """
-    for name, array, shape in (("radius", radius, grid.shape), ("points", points, grid.shape[1:])):
-        if tuple(array.shape) != shape:
+    expected = ("radius", radius, grid.shape), ("points", points, grid.shape[1:]), ("opacity", opacity, grid.shape)
+    for name, array, shape in expected:
+        if array is not None and tuple(array.shape) != shape:
             raise ValueError(f"{name}: shape {shape} is needed, as of the grid; got {tuple(array.shape)}")
     sectors, histogram, *maps = lay_out(grid, 2 + len(grid.heights), across=2)
     entries = draw_sectors(sectors, sensors)
@@ -68,10 +81,13 @@ def draw_four_views(
     write_heading(histogram.axes, "points of the rig in each cell")
     scale = scale_of(RADIUS, radius)
     together = radius.cpu().double().numpy()
-    for sheet, values, (name, band) in zip(maps, together, grid.heights.items(), strict=True):
-        draw_colour_bar(sheet, draw_cells(sheet.axes, values, scale), together, scale)
+    opaque = [None] * len(maps) if opacity is None else list(opacity.cpu().double().numpy())
+    for sheet, values, shown, (name, band) in zip(maps, together, opaque, grid.heights.items(), strict=True):
+        draw_colour_bar(sheet, draw_cells(sheet.axes, values, scale, opacity=shown), together, scale)
         write_heading(sheet.axes, f"blind spot radius, {name}: z {span(band)}")
-    entries += cell_entries(together)
+    entries += cell_entries(together, unknown)
+    if opacity is not None:
+        entries.append(paler_entry())
     for sheet in (histogram, *maps):
         entries += draw_sensors(sheet, sensors, named=False)
     for sheet in (sectors, histogram, *maps):

@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import BevGrid
-from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, cell_entries, draw_cells, draw_colour_bar
+from torchcover.report.maps.colours import (
+    NEVER_PROBED,
+    ColourScale,
+    cell_entries,
+    draw_cells,
+    draw_colour_bar,
+    paler_entry,
+)
 from torchcover.report.maps.overlay import SensorView, draw_ego, draw_sensors
 from torchcover.report.maps.sheet import (
     HEADING_POINTS,
@@ -31,6 +38,7 @@ def draw_map(
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Sequence[SensorView] = (),
     unknown: str = NEVER_PROBED,
+    opacity: Tensor | None = None,
 ) -> Figure:
     """Draw one array over a grid, seen from above: x forward to the right, y left upwards.
 
@@ -44,12 +52,13 @@ def draw_map(
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark.
         unknown: Why a cell is, for the legend.
+        opacity: (Y, X) in [0, 1], less where less of the surface is seen in a step; all cells alike if not given.
 
     Returns:
         A figure of its own, outside pyplot: `figure.savefig(path)`, or hand it to a logger.
 
     Raises:
-        ValueError: `values` or the outline have another shape.
+        ValueError: `values`, the opacity or the outline have another shape.
 
     Example:
         >>> import torch
@@ -59,14 +68,18 @@ def draw_map(
         >>> draw_map(change, grid, scale, title="Rig B against rig A").axes[0].get_xlabel()
         'x forward (m)'
     """
-    if tuple(values.shape) != grid.shape[1:]:
-        raise ValueError(
-            f"values: shape {grid.shape[1:]} is needed, as of a band of the grid; got {tuple(values.shape)}"
-        )
-    array = values.detach().cpu().double().numpy()
+    for name, given in (("values", values), ("opacity", opacity)):
+        if given is not None and tuple(given.shape) != grid.shape[1:]:
+            raise ValueError(
+                f"{name}: shape {grid.shape[1:]} is needed, as of a band of the grid; got {tuple(given.shape)}"
+            )
+    array = _array(values)
     (sheet,) = lay_out(grid)
-    draw_colour_bar(sheet, draw_cells(sheet.axes, array, scale), array, scale)
+    cells = draw_cells(sheet.axes, array, scale, opacity=None if opacity is None else _array(opacity))
+    draw_colour_bar(sheet, cells, array, scale)
     entries = cell_entries(array, unknown)
+    if opacity is not None:
+        entries.append(paler_entry())
     if ego_outline_m is not None:
         entries += draw_ego(sheet.axes, ego_outline_m)
     entries += draw_sensors(sheet, sensors)
@@ -86,6 +99,7 @@ def draw_side_by_side(
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Mapping[str, Sequence[SensorView]] | None = None,
     unknown: str = NEVER_PROBED,
+    opacity: Mapping[str, Tensor] | None = None,
 ) -> Figure:
     """Draw several arrays over one grid, with one colour bar.
 
@@ -98,6 +112,7 @@ def draw_side_by_side(
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark, by the headings.
         unknown: Why a cell is, for the legend.
+        opacity: As in `draw_map`, by the headings.
 
     Returns:
         A figure of its own, outside pyplot.
@@ -105,12 +120,18 @@ def draw_side_by_side(
     Raises:
         ValueError: An outline of another shape.
     """
-    arrays = [value.detach().cpu().double().numpy() for value in values.values()]
+    arrays = {name: _array(value) for name, value in values.items()}
+    opaque = {name: _array(value) for name, value in (opacity or {}).items()}
     sheets = lay_out(grid, len(arrays))
-    images = [draw_cells(sheet.axes, array, scale) for sheet, array in zip(sheets, arrays, strict=True)]
-    together = np.stack(arrays)
+    images = [
+        draw_cells(sheet.axes, array, scale, opacity=opaque.get(name))
+        for sheet, (name, array) in zip(sheets, arrays.items(), strict=True)
+    ]
+    together = np.stack(list(arrays.values()))
     draw_colour_bar(sheets[0], images[0], together, scale)
     entries = cell_entries(together, unknown)
+    if opacity:
+        entries.append(paler_entry())
     for sheet, name in zip(sheets, values, strict=True):
         write_heading(sheet.axes, name)
         if ego_outline_m is not None:
@@ -120,3 +141,7 @@ def draw_side_by_side(
     write_legend(lower_left(sheets), entries, sheets[0].legend_columns)
     fit_paper(sheets[0].figure)
     return sheets[0].figure
+
+
+def _array(values: Tensor) -> NDArray[np.float64]:
+    return values.detach().cpu().double().numpy()

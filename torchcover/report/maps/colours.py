@@ -1,6 +1,7 @@
 """Colours: how the numbers of a map become colours, and what says what they mean.
 
-Dark means blind. In a difference blue means better, red means worse. Unknown cells are hatched.
+Dark means blind. In a difference blue means better, red means worse. Unknown cells are hatched, and show through those
+where little surface is seen.
 """
 
 import math
@@ -12,6 +13,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm, Normalize
 from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -25,6 +27,7 @@ ROBUST_PERCENTILE = 98
 UNKNOWN: dict[str, Any] = {"facecolor": "#c4c4c4", "edgecolor": "#b2b2b2", "hatch": "////"}
 INFINITE = "#d55e00"
 NEVER_PROBED = "never probed"
+PALER = "paler: less visible surface in a step than open ground has"
 
 
 @dataclass(frozen=True)
@@ -118,13 +121,21 @@ def _round_up(value: float) -> float:
     return float(f"{math.ceil(value / step - 1e-9) * step:.2g}")
 
 
-def draw_cells(axes: Axes, array: NDArray[np.float64], scale: ColourScale, *, infinite: str = INFINITE) -> AxesImage:
+def draw_cells(
+    axes: Axes,
+    array: NDArray[np.float64],
+    scale: ColourScale,
+    *,
+    opacity: NDArray[np.float64] | None = None,
+    infinite: str = INFINITE,
+) -> AxesImage:
     """Colour each cell; unknown ones are hatched grey, infinite ones have a colour of their own.
 
     Args:
         axes: Axes of a map, with limits set to the grid's bounds.
         array: (Y, X) values, NaN where unknown.
         scale: What the colours mean.
+        opacity: (Y, X) in [0, 1] of each cell; all are opaque if not given.
         infinite: Colour of infinite cells.
 
     Returns:
@@ -133,10 +144,10 @@ def draw_cells(axes: Axes, array: NDArray[np.float64], scale: ColourScale, *, in
     # Unknown cells are holes through which the ground of the axes shows.
     axes.patch.set(**UNKNOWN, linewidth=0)
     norm = (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
-    image = _draw_image(axes, np.ma.masked_invalid(array), cmap=scale.colormap, norm=norm)
+    image = _draw_image(axes, np.ma.masked_invalid(array), alpha=opacity, cmap=scale.colormap, norm=norm)
     endless = np.isinf(array)
     if endless.any():
-        _draw_image(axes, np.ma.masked_where(~endless, endless), cmap=ListedColormap([infinite]))
+        _draw_image(axes, np.ma.masked_where(~endless, endless), alpha=opacity, cmap=ListedColormap([infinite]))
     return image
 
 
@@ -154,6 +165,11 @@ def cell_entries(array: NDArray[np.float64], unknown: str = NEVER_PROBED) -> lis
         label = f"infinite: a step saw nothing ({percent(float(infinite.mean()))} % of the cells)"
         entries.append(Patch(facecolor=INFINITE, label=label))
     return entries
+
+
+def paler_entry() -> Artist:
+    """The legend entry for cells that are not opaque: words only, as it is about every colour."""
+    return Line2D([], [], linestyle="none", label=PALER)
 
 
 def draw_colour_bar(sheet: Sheet, image: AxesImage, array: NDArray[np.float64], scale: ColourScale) -> None:

@@ -11,68 +11,15 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.coverage import BevGrid, Coverage, Quantity, check_paired
-from torchcover.coverage.errors import MIN_BLOCKS_OF_A_CELL
+from torchcover.coverage import BevGrid, Coverage, check_paired
 from torchcover.report.maps.arrays import draw_map, draw_side_by_side
-from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, difference_scale, error_scale, scale_of
+from torchcover.report.maps.colours import difference_scale
 from torchcover.report.maps.overlay import SensorView
-from torchcover.report.wording import UNITS, capitalised, span, steps_and_cell
+from torchcover.report.maps.subjects import Subject, error_subjects_of, subjects_of
+from torchcover.report.wording import capitalised, span
 
 MAX_FILE_NAME = 48
 Named = tuple[str, Figure]
-
-
-@dataclass(frozen=True)
-class Subject:
-    """What some maps show: one quantity of every rig in every band.
-
-    Args:
-        quantity: What the values are.
-        values: Name of the rig -> (H, Y, X) in the unit that is shown.
-        scale: What the colours mean: the same for all bands and rigs.
-        unknown: Why a cell has no number, for the legend.
-    """
-
-    quantity: Quantity
-    values: Mapping[str, Tensor]
-    scale: ColourScale
-    unknown: str
-
-
-def subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
-    """All that was measured.
-
-    Args:
-        coverages: By the name of the rig; one, or several that are paired.
-    """
-    for key, layer in _first(coverages).layers.items():
-        values = _shown(layer.quantity, [coverage.layers[key].values for coverage in coverages.values()])
-        named = dict(zip(coverages, values, strict=True))
-        yield Subject(layer.quantity, named, scale_of(layer.quantity, torch.stack(values)), NEVER_PROBED)
-
-
-def error_subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
-    """The standard errors of what has any.
-
-    Args:
-        coverages: As in `subjects_of`.
-    """
-    unknown = f"probed in fewer than {MIN_BLOCKS_OF_A_CELL} blocks of steps"
-    first = _first(coverages)
-    for key in first.errors:
-        of = first.layers[key].quantity
-        quantity = Quantity(of.error_key, f"standard error of the {of.title}", of.unit, lower_is_better=True)
-        values = _shown(quantity, [coverage.errors[key] for coverage in coverages.values()])
-        named = dict(zip(coverages, values, strict=True))
-        yield Subject(quantity, named, error_scale(quantity, torch.stack(values)), unknown)
-
-
-def _first(coverages: Mapping[str, Coverage]) -> Coverage:
-    return next(iter(coverages.values()))
-
-
-def _shown(quantity: Quantity, values: Sequence[Tensor]) -> list[Tensor]:
-    return [UNITS[quantity.unit].factor * each for each in values]
 
 
 def map_figures(
@@ -82,11 +29,12 @@ def map_figures(
     sensors: Mapping[str, Sequence[SensorView]] | None = None,
     errors: bool = False,
 ) -> Iterator[Named]:
-    """Draw everything that was measured in every height band, for one rig or for several.
+    """Draw what was measured in every height band, for one rig or for several.
 
-    The bands of a quantity share their colours, so that they can be compared by eye, and so do the rigs, which lie
-    side by side. For every rig but the first there is a figure of its difference to the first too; the differences of
-    a quantity share their colours.
+    Results over the visible surface are drawn as the ratio of each cell, or of a larger square where points are few;
+    paler where little surface is seen in a step. The bands of a quantity share their colours, so that they can be
+    compared by eye, and so do the rigs, which lie side by side. For every rig but the first there is a figure of its
+    difference to the first too; the differences of a quantity share their colours.
 
     Args:
         coverages: What `CoverageMetric.compute` returned, by the name of the rig; several from the same frames.
@@ -96,7 +44,7 @@ def map_figures(
 
     Returns:
         Pairs, drawn one by one, of a name that is fit for a file and a figure: `radius_m_ground`,
-        `detection_0.4m_obstacle`, `radius_m_error_ground`, `difference_radius_m_ground_RIG_minus_FIRST`.
+        `detection_area_0.4m_obstacle`, `radius_m_error_ground`, `difference_radius_m_ground_RIG_minus_FIRST`.
 
     Raises:
         ValueError: Several coverages that are not paired, as in `check_paired`; while drawing, an outline of another
@@ -115,17 +63,23 @@ def map_figures(
 
 
 def band_figures(coverage: Coverage) -> Iterator[Named]:
-    """Draw everything that was measured, the bands of a quantity side by side: `radius_m`, `detection_0.4m`, ...
+    """Draw what was measured, the bands of a quantity side by side: `radius_m`, `detection_0.4m`, ...
 
     Args:
         coverage: What `CoverageMetric.compute` returned.
     """
-    grid, conditions = coverage.grid, steps_and_cell(coverage.counts["steps"], coverage.grid)
-    headings = [f"{name}, z {span(band)}" for name, band in grid.heights.items()]
+    headings = [f"{name}, z {span(band)}" for name, band in coverage.grid.heights.items()]
     for subject in subjects_of({"": coverage}):
-        bands = dict(zip(headings, subject.values[""], strict=True))
-        title = capitalised(subject.quantity.title)
-        yield subject.quantity.key, draw_side_by_side(bands, grid, subject.scale, title=title, subtitle=conditions)
+        figure = draw_side_by_side(
+            dict(zip(headings, subject.values[""], strict=True)),
+            coverage.grid,
+            subject.scale,
+            title=capitalised(subject.quantity.title),
+            subtitle=subject.conditions,
+            unknown=subject.unknown,
+            opacity=None if subject.opacity is None else dict(zip(headings, subject.opacity, strict=True)),
+        )
+        yield subject.quantity.key, figure
 
 
 def write_figures(figures: Iterable[Named], folder: str | Path) -> list[Path]:
@@ -178,12 +132,20 @@ class _Band:
     number: int
     name: str
     stem: str
-    subtitle: str
+    z: str
+
+    def subtitle(self, subject: Subject) -> str:
+        """Where it is, and under which conditions a subject was measured."""
+        return f"{self.z}; {subject.conditions}"
+
+    def opacity(self, subject: Subject) -> Tensor | None:
+        """(Y, X) that of a subject in this band."""
+        return None if subject.opacity is None else subject.opacity[self.number]
 
 
 def _figures(coverages: Mapping[str, Coverage], setting: _Setting, *, errors: bool) -> Iterator[Named]:
     first = next(iter(coverages.values()))
-    bands = _bands(first.grid, first.counts["steps"])
+    bands = _bands(first.grid)
     draw_rigs = _draw_one if len(coverages) == 1 else _draw_several
     for subject in subjects_of(coverages):
         yield from draw_rigs(subject, first.grid, bands, setting)
@@ -192,10 +154,9 @@ def _figures(coverages: Mapping[str, Coverage], setting: _Setting, *, errors: bo
         yield from draw_rigs(subject, first.grid, bands, setting)
 
 
-def _bands(grid: BevGrid, steps: int) -> list[_Band]:
-    conditions = steps_and_cell(steps, grid)
+def _bands(grid: BevGrid) -> list[_Band]:
     named = zip(grid.heights.items(), file_stems(list(grid.heights)), strict=True)
-    return [_Band(at, name, stem, f"z {span(z)}; {conditions}") for at, ((name, z), stem) in enumerate(named)]
+    return [_Band(at, name, stem, f"z {span(z)}") for at, ((name, z), stem) in enumerate(named)]
 
 
 def _draw_one(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[Named]:
@@ -206,10 +167,11 @@ def _draw_one(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: 
             grid,
             subject.scale,
             title=f"{capitalised(subject.quantity.title)}, {band.name}",
-            subtitle=band.subtitle,
+            subtitle=band.subtitle(subject),
             ego_outline_m=setting.ego_outline_m,
             sensors=setting.sensors.get(rig, ()),
             unknown=subject.unknown,
+            opacity=band.opacity(subject),
         )
         yield f"{subject.quantity.key}_{band.stem}", figure
 
@@ -221,10 +183,11 @@ def _draw_several(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setti
             grid,
             subject.scale,
             title=f"{capitalised(subject.quantity.title)}, {band.name}",
-            subtitle=band.subtitle,
+            subtitle=band.subtitle(subject),
             ego_outline_m=setting.ego_outline_m,
             sensors=setting.sensors,
             unknown=subject.unknown,
+            opacity=None if subject.opacity is None else dict.fromkeys(subject.values, subject.opacity[band.number]),
         )
         yield f"{subject.quantity.key}_{band.stem}", figure
 
@@ -245,7 +208,9 @@ def _draw_differences(subject: Subject, grid: BevGrid, bands: Sequence[_Band], s
                 grid,
                 scale,
                 title=f"{rig} minus {first}: {subject.quantity.title}, {band.name}",
-                subtitle=f"blue: {rig} is better, red: {first} is better; {band.subtitle}",
+                subtitle=f"blue: {rig} is better, red: {first} is better; {band.subtitle(subject)}",
                 ego_outline_m=setting.ego_outline_m,
+                unknown=subject.unknown,
+                opacity=band.opacity(subject),
             )
             yield f"difference_{subject.quantity.key}_{band.stem}_{stem}_minus_{first_stem}", figure

@@ -1,0 +1,151 @@
+"""Maps of the visible surface: ratios of sums over cells, or over squares where points are few, and their opacity."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover.coverage import BevGrid, CoverageMetric, Region
+from torchcover.coverage.blocks import AreaSums
+from torchcover.report.maps.surface import (
+    FAINTEST,
+    MIN_POINTS,
+    opacity_of,
+    over_squares,
+    ratio_errors,
+    ratios,
+    square_sides,
+)
+
+CELL_M = 0.25
+# Neither a whole number of squares wide nor high.
+GRID = BevGrid(x=(0.0, 5.75), y=(0.0, 3.25), cell=CELL_M, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)})
+ALL = Region("all", GRID.x, GRID.y)
+
+
+def measured(steps: int = 16, points: int = 400):
+    """Points that crowd in a corner and leave another empty, and weigh from 0.001 to 1 m2."""
+    metric = CoverageMetric(GRID, (0.1, 0.2), blocks=16, square_metres=True)
+    for index in range(steps):
+        random = torch.Generator().manual_seed(index)
+        size = torch.tensor([5.75, 3.25, 2.0])
+        reference = torch.rand(points, 3, generator=random) ** torch.tensor([3.0, 3.0, 1.0]) * size
+        reference[:, 0] *= 0.6
+        m2 = 10 ** (-3 * torch.rand(points, generator=random))
+        metric.update(torch.rand(60, 3, generator=random) * size, reference, weights=m2, index=index)
+    return metric.compute()
+
+
+@pytest.fixture(scope="module")
+def coverage():
+    """Some cells with many points, and some with few or none."""
+    return measured()
+
+
+@pytest.fixture(scope="module")
+def sides(coverage):
+    """How its maps are cut."""
+    return square_sides(coverage.points, CELL_M)
+
+
+def cut(points: np.ndarray, sides: np.ndarray, y: int, x: int, side: int) -> None:
+    """A slow twin: cut one square, then its quarters."""
+    quarters = [(y + dy, x + dx, side // 2) for dy in (0, side // 2) for dx in (0, side // 2)]
+    inside = [points[qy : qy + half, qx : qx + half].sum() for qy, qx, half in quarters]
+    if side > 1 and all(found == 0 or found >= MIN_POINTS for found in inside):
+        for quarter in quarters:
+            cut(points, sides, *quarter)
+    else:
+        sides[y : y + side, x : x + side] = side
+
+
+def test_squares_are_cut_where_every_quarter_has_points_enough_or_none(coverage, sides):
+    expected = np.zeros(GRID.shape, dtype=int)
+    for band in range(2):
+        for y in range(0, GRID.shape[1], 8):
+            for x in range(0, GRID.shape[2], 8):
+                cut(coverage.points[band].numpy(), expected[band], y, x, 8)
+    assert set(sides.unique().tolist()) == {1, 2, 4, 8}
+    np.testing.assert_array_equal(sides, expected)
+
+
+@pytest.mark.parametrize(("cell_m", "largest"), [(0.25, 8), (0.3, 4), (1.0, 2), (2.0, 1), (5.0, 1)])
+def test_no_square_is_larger_than_two_metres_unless_the_cell_is(cell_m, largest):
+    points = torch.zeros(1, 20, 20, dtype=torch.int64)
+    points[0, 9, 9] = 1
+    square = square_sides(points, cell_m) == largest
+    # What is empty is cut to cells.
+    assert int(square.sum()) == (400 if largest == 1 else largest**2)
+    assert square[0, 9, 9]
+
+
+def test_where_points_are_many_a_cell_has_its_own_ratio(coverage, sides):
+    alone = (sides == 1) & (coverage.points > 0)
+    assert int(alone.sum()) > 40
+    for found, key in zip(ratios(coverage.area, sides), list(coverage.layers)[3:], strict=True):
+        assert torch.equal(found[alone], coverage.layers[key].values[alone])
+
+
+def test_a_square_has_the_ratio_of_the_sums_of_its_cells(coverage, sides):
+    m2, sums = coverage.area.m2.sum(dim=0).numpy(), coverage.area.sums.sum(dim=0).numpy()
+    found = ratios(coverage.area, sides).numpy()
+    for band, y, x in zip(*(sides == 4).numpy().nonzero(), strict=True):
+        rows, columns = (slice(at // 4 * 4, at // 4 * 4 + 4) for at in (y, x))
+        expected = sums[:, band, rows, columns].sum(axis=(1, 2)) / m2[band, rows, columns].sum()
+        np.testing.assert_allclose(found[:, band, y, x], expected, rtol=1e-12)
+
+
+def test_what_is_drawn_weighs_as_much_as_the_region_has(coverage, sides):
+    m2 = over_squares(coverage.area.m2.sum(dim=0), sides)
+    each = m2 / over_squares(torch.ones_like(m2), sides)
+    for band, height in enumerate(GRID.heights):
+        weighted = (ratios(coverage.area, sides)[:, band] * each[band]).nansum(dim=(1, 2)) / each[band].sum()
+        torch.testing.assert_close(weighted, coverage.estimate(ALL, height).value, rtol=1e-12, atol=0)
+
+
+def test_a_place_without_a_square_metre_is_unknown_and_has_no_opacity(coverage, sides):
+    seen = over_squares(coverage.area.m2.sum(dim=0), sides) > 0
+    assert 0 < int(seen.sum()) < seen.numel()
+    assert torch.equal(ratios(coverage.area, sides).isfinite(), seen.expand(3, -1, -1, -1))
+    opacity = opacity_of(coverage.area, 16, sides, CELL_M)
+    assert torch.equal(opacity == 0, ~seen)
+    assert opacity[seen].min() > FAINTEST
+    assert opacity.max() <= 1
+
+
+def sums_of(m2: torch.Tensor) -> AreaSums:
+    return AreaSums(torch.tensor([10]), m2[None], torch.zeros(1, 1, *m2.shape))
+
+
+def test_opacity_grows_with_the_surface_up_to_that_of_open_ground():
+    m2 = torch.tensor([0.0, 1e-9, 0.01, 0.1, 10 * CELL_M**2, 50.0]).double()[None, None]
+    one = torch.ones(m2.shape, dtype=torch.int64)
+    nothing, *rising, full, more = opacity_of(sums_of(m2), 10, one, CELL_M).flatten().tolist()
+    assert nothing == 0 < FAINTEST < rising[0] < rising[1] < rising[2] < full == more == 1
+
+
+def test_open_ground_is_opaque_in_squares_that_the_grid_cuts_off_too():
+    ground = torch.full((1, 5, 5), 10 * CELL_M**2).double()
+    for side in (1, 2, 4, 8):
+        opacity = opacity_of(sums_of(ground), 10, torch.full((1, 5, 5), side), CELL_M)
+        torch.testing.assert_close(opacity, torch.ones_like(opacity), rtol=1e-12, atol=0)
+        quarter = opacity_of(sums_of(ground / 4), 10, torch.full((1, 5, 5), side), CELL_M)
+        torch.testing.assert_close(quarter, torch.full_like(quarter, (1 + FAINTEST) / 2), rtol=1e-12, atol=0)
+
+
+def test_errors_are_those_of_cells_where_squares_are_cells(coverage, sides):
+    alone = sides == 1
+    keys = list(coverage.layers)[3:]
+    for key, found in zip(keys, ratio_errors(coverage.area, sides), strict=True):
+        expected = coverage.errors[key][alone]
+        torch.testing.assert_close(found[alone], expected, rtol=1e-12, atol=0, equal_nan=True)
+        assert int(expected.isfinite().sum()) > 10
+
+
+def test_infinity_stays_in_its_square():
+    sums = torch.zeros(1, 1, 1, 4, 4).double()
+    sums[..., 0, 0] = math.inf
+    area = AreaSums(torch.tensor([1]), torch.ones(1, 1, 4, 4).double(), sums)
+    (found,) = ratios(area, torch.full((1, 4, 4), 2))
+    assert torch.equal(found.isinf()[0], torch.tensor([[True, True, False, False]] * 2 + [[False] * 4] * 2))

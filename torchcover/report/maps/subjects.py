@@ -1,0 +1,113 @@
+"""What the maps of a run show: the quantities of its measure, and those of the aggregations beside it."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchcover.coverage import Coverage, Quantity
+from torchcover.coverage.blocks import AreaSums
+from torchcover.coverage.errors import MIN_BLOCKS_OF_A_CELL
+from torchcover.coverage.quantity import by_area
+from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, error_scale, scale_of
+from torchcover.report.maps.surface import opacity_of, ratio_errors, ratios, square_sides
+from torchcover.report.wording import UNITS, steps_and_cell
+
+LARGER = ", larger where points are few"
+NOTHING_FOUND = "no visible surface found"
+TOO_FEW_BLOCKS = f"probed in fewer than {MIN_BLOCKS_OF_A_CELL} blocks of steps"
+TOO_FEW_OR_EQUAL_BLOCKS = f"seen in fewer than {MIN_BLOCKS_OF_A_CELL} blocks of steps, or the same in all"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What some maps show: one quantity of every rig in every band.
+
+    Args:
+        quantity: What the values are.
+        values: Name of the rig -> (H, Y, X) in the unit that is shown.
+        scale: What the colours mean: the same for all bands and rigs.
+        unknown: Why a cell has no number, for the legend.
+        conditions: How much was measured, and how finely.
+        opacity: (H, Y, X) in [0, 1] how opaque each cell is drawn; None if all are alike.
+    """
+
+    quantity: Quantity
+    values: Mapping[str, Tensor]
+    scale: ColourScale
+    unknown: str
+    conditions: str
+    opacity: Tensor | None = None
+
+
+def subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
+    """The quantities of the measure that the results have, then those of other aggregations.
+
+    Args:
+        coverages: By the name of the rig; one, or several that are paired.
+    """
+    first = next(iter(coverages.values()))
+    of_cells = [quantity.key for quantity in first.quantities]
+    of_surface = [by_area(quantity).key for quantity in first.quantities]
+    others = [key for key in first.layers if key not in (*of_cells, *of_surface)]
+    if first.measure == "area":
+        yield from _of_surface(coverages)
+    for key in others if first.measure == "area" else (*of_cells, *others):
+        values = {name: coverage.layers[key].values for name, coverage in coverages.items()}
+        yield _subject(first.layers[key].quantity, values, scale_of, NEVER_PROBED, _conditions(first))
+
+
+def error_subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
+    """The standard errors of the quantities of the measure; none without blocks.
+
+    Args:
+        coverages: As in `subjects_of`.
+    """
+    first = next(iter(coverages.values()))
+    if first.blocks is None:
+        return
+    if first.measure == "area":
+        sides = square_sides(first.points, first.grid.cell)
+        each = {name: ratio_errors(area, sides) for name, area in _areas(coverages).items()}
+        quantities = [by_area(quantity) for quantity in first.quantities]
+        unknown, conditions = TOO_FEW_OR_EQUAL_BLOCKS, _conditions(first) + LARGER
+    else:
+        each = {name: list(coverage.errors.values()) for name, coverage in coverages.items()}
+        quantities, unknown, conditions = list(first.quantities), TOO_FEW_BLOCKS, _conditions(first)
+    for at, of in enumerate(quantities):
+        quantity = Quantity(of.error_key, f"standard error of the {of.title}", of.unit, lower_is_better=True)
+        errors = {name: errors[at] for name, errors in each.items()}
+        yield _subject(quantity, errors, error_scale, unknown, conditions)
+
+
+def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
+    first, areas = next(iter(coverages.values())), _areas(coverages)
+    sides = square_sides(first.points, first.grid.cell)
+    # The rigs share the reference points, and so the square metres.
+    opacity = opacity_of(next(iter(areas.values())), first.counts["steps"], sides, first.grid.cell)
+    each = {name: ratios(area, sides) for name, area in areas.items()}
+    for at, quantity in enumerate(map(by_area, first.quantities)):
+        values = {name: values[at] for name, values in each.items()}
+        yield _subject(quantity, values, scale_of, NOTHING_FOUND, _conditions(first) + LARGER, opacity)
+
+
+def _areas(coverages: Mapping[str, Coverage]) -> dict[str, AreaSums]:
+    return {name: coverage.area for name, coverage in coverages.items() if coverage.area is not None}
+
+
+def _conditions(coverage: Coverage) -> str:
+    return steps_and_cell(coverage.counts["steps"], coverage.grid)
+
+
+def _subject(
+    quantity: Quantity,
+    values: Mapping[str, Tensor],
+    scale: Callable[[Quantity, Tensor], ColourScale],
+    unknown: str,
+    conditions: str,
+    opacity: Tensor | None = None,
+) -> Subject:
+    """With the values in the unit that is shown, and one scale for all."""
+    shown = {name: UNITS[quantity.unit].factor * each for name, each in values.items()}
+    return Subject(quantity, shown, scale(quantity, torch.stack(list(shown.values()))), unknown, conditions, opacity)

@@ -1,0 +1,107 @@
+"""Maps of the visible surface: cells where points are many, larger squares where they are few; paler the less is seen.
+
+The measure is a ratio of sums, so that a square of several cells has the ratio of their sums, and the squares of a
+region together have its number.
+"""
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from torchcover.coverage.area_errors import area_errors
+from torchcover.coverage.blocks import AreaSums
+
+# A detection from 8 points is off by 18 percentage points at most: 1 / sqrt(4 * 8).
+MIN_POINTS = 8
+LARGEST_M = 2.0
+# Of what is seen at all.
+FAINTEST = 0.3
+
+
+def square_sides(points: Tensor, cell_m: float) -> Tensor:
+    """Cut a grid into squares of cells: a square is cut in four if each quarter has 8 points at least, or none at all.
+
+    Args:
+        points: (H, Y, X) reference points in each cell.
+        cell_m: Side of a cell in metres.
+
+    Returns:
+        (H, Y, X) int64 how many cells wide the square is that each cell lies in: a power of 2, at most 2 m. Squares
+        begin at the lower corner of the grid; those at the upper ends may be cut off.
+
+    Example:
+        >>> square_sides(torch.tensor([[[9, 9, 1, 0], [9, 0, 0, 0]]]), cell_m=1.0)
+        tensor([[[1, 1, 2, 2],
+                 [1, 1, 2, 2]]])
+    """
+    side = 2 ** max(0, math.floor(math.log2(LARGEST_M / cell_m)))
+    sides = torch.full_like(points, side)
+    is_cut = torch.ones_like(points, dtype=torch.bool)
+    while side > 1:
+        side //= 2
+        inside = _pooled(points, side)
+        too_few = (inside > 0) & (inside < MIN_POINTS)
+        is_cut &= _spread(_pooled(too_few, 2) == 0, 2 * side, points.shape)
+        sides[is_cut] = side
+    return sides
+
+
+def over_squares(values: Tensor, sides: Tensor) -> Tensor:
+    """The sum over the square that each cell lies in.
+
+    Args:
+        values: (..., H, Y, X) what is added up.
+        sides: (H, Y, X) as from `square_sides`.
+
+    Returns:
+        (..., H, Y, X) float64.
+    """
+    sums, side = values.double(), 2
+    while side <= int(sides.max()):
+        sums = _spread(_pooled(values, side), side, values.shape).where(sides == side, sums)
+        side *= 2
+    return sums
+
+
+def ratios(area: AreaSums, sides: Tensor) -> Tensor:
+    """(Q, H, Y, X) the radius in metres, then the detection at each threshold; NaN where nothing was seen."""
+    return over_squares(area.sums.sum(dim=0), sides) / over_squares(area.m2.sum(dim=0), sides)
+
+
+def ratio_errors(area: AreaSums, sides: Tensor) -> list[Tensor]:
+    """(H, Y, X) standard errors of each of the `ratios`."""
+    m2 = over_squares(area.m2, sides)
+    return [area_errors(m2, over_squares(sums, sides)) for sums in area.sums.unbind(dim=1)]
+
+
+def opacity_of(area: AreaSums, steps: int, sides: Tensor, cell_m: float) -> Tensor:
+    """How opaque a place is drawn, by how much surface is seen there in a step.
+
+    Args:
+        area: The sums.
+        steps: How many steps.
+        sides: (H, Y, X) as from `square_sides`.
+        cell_m: Side of a cell in metres.
+
+    Returns:
+        (H, Y, X) in [0, 1]: 0 where nothing was seen, 1 where as much as open ground has, which is the footprint of the
+        square, or more; between them the root of the share, from 0.3 on.
+    """
+    m2 = over_squares(area.m2.sum(dim=0), sides)
+    footprint_m2 = over_squares(torch.full_like(m2, cell_m**2), sides)
+    share = (m2 / (max(steps, 1) * footprint_m2)).clamp(max=1)
+    return (FAINTEST + (1 - FAINTEST) * share.sqrt()).where(m2 > 0, 0.0)
+
+
+def _pooled(values: Tensor, side: int) -> Tensor:
+    """(..., ceil(Y / side), ceil(X / side)) float64 sums over squares."""
+    flat = values.double().reshape(1, -1, *values.shape[-2:])
+    pooled = avg_pool2d(flat, side, ceil_mode=True, divisor_override=1)
+    return pooled.view(*values.shape[:-2], *pooled.shape[-2:])
+
+
+def _spread(pooled: Tensor, side: int, shape: torch.Size) -> Tensor:
+    """Each number to all cells of its square."""
+    return pooled.repeat_interleave(side, -2).repeat_interleave(side, -1)[..., : shape[-2], : shape[-1]]
