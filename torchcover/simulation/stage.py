@@ -48,7 +48,7 @@ def _check_place(sensor: str, place_m: NDArray[np.float64], instant: Instant) ->
     if instant.buried(place_m + LIFT_M if on_a_face else place_m):
         raise ValueError(
             f"{where} lies below the ground, or inside a wall or another body, so that it sees what is none; "
-            "is the sign of z_m right, and do the faces of meshes point outwards?"
+            "is the sign of z_m right, does the ego stand on the ground, and do faces point outwards?"
         )
     if on_a_face:
         warnings.warn(
