@@ -91,7 +91,8 @@ def test_an_index_outside_is_an_index_error(index):
 
 
 @pytest.mark.parametrize(
-    ("changes", "message"), [({"steps": 0}, "steps: a number from 1 to 1,000,000,000 is needed; got 0"), ({"seed": -1}, "seed: .* got -1")]
+    ("changes", "message"),
+    [({"steps": 0}, "steps: a number from 1 to 1,000,000,000 is needed; got 0"), ({"seed": -1}, "seed: .* got -1")],
 )
 def test_impossible_requests_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
