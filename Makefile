@@ -2,7 +2,6 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-RAYS ?= 16384
 
 .PHONY: demo test lint types doctest smoke bench paper clean
 
@@ -30,9 +29,11 @@ smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the r
 bench: $(VENV)/.ready  ## the speed and memory figures of docs/measured/performance.md
 	$(BIN)/python -m benchmarks
 
-paper: STEPS ?= 4096
-paper: $(VENV)/.ready  ## the paper's three experiments and Figure 2: make paper STEPS=256 (docs/measured/paper.md: STEPS=4096)
-	$(BIN)/python -m examples.paper --steps $(STEPS) --rays $(RAYS)
+paper: STEPS ?= 128
+paper: $(VENV)/.ready  ## the paper's experiments, with the assumed LiDARs and both fits (docs/measured/paper.md)
+	$(BIN)/python -m examples.paper --steps $(STEPS)
+	$(BIN)/python -m examples.paper tables --rigs 'paper_fit_b_{}' --reference-range 120 --origin -1.4 \
+	  --steps $(STEPS) --out out/paper_b
 
 clean:
 	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis

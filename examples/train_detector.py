@@ -30,7 +30,7 @@ from torch.utils.data import DataLoader
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.data import Augmentation, SimulatedFrames, collate_frames
 from torchcover.detection import RecallByVisibility, box_visibility, match
-from torchcover.simulation import EvenReference, PaperReference
+from torchcover.simulation import PaperReference, SurfaceReference
 from torchcover.training import CoverageCallback
 
 RIGS = ("front_roof_128", "front_roof_32")
@@ -68,14 +68,9 @@ def thinned(cloud):
 
 def simulate(steps, seed, reference, name, keep_clouds):
     """Frames with both rigs, 4 from each drive of a minute; `network RIG` is what the detector is fed."""
+    rigs = {rig: rig for rig in RIGS}
     frames = SimulatedFrames(
-        "urban",
-        rigs={rig: rig for rig in RIGS},
-        steps=steps,
-        seed=seed,
-        every_s=15.0,
-        reference_sensor=reference,
-        boxes=True,
+        "urban", rigs=rigs, steps=steps, seed=seed, every_s=15.0, reference_sensor=reference, boxes=True
     )
     kept = []
     for index in track(range(steps), description=f"simulating {name}"):
@@ -256,7 +251,7 @@ class Training(lightning.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def train(rig, training_frames, validation_frames, visibility, options, console):
+def train(rig, training_frames, validation_frames, options, console):
     """Train one rig's detector; its module, and its coverage by region."""
     lightning.seed_everything(options.seed, verbose=False)
     loaders = [
@@ -265,8 +260,12 @@ def train(rig, training_frames, validation_frames, visibility, options, console)
     ]
     grid = BevGrid(x=X_M, y=Y_M, cell=1.6, heights={"body": (0.3, 2.0)})
     # As many blocks as drives, with the defaults: errors of drives that know nothing of each other.
-    metric = CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=16)
+    metric = CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=16, square_metres=True)
     coverage = CoverageCallback(metric, regions=REGIONS, rig=rig, fixed_frames=True)
+    visibility = {
+        f.index: box_visibility(f.clouds[rig], f.reference, f.boxes, reference_weights=f.reference_weights)
+        for f in validation_frames
+    }
     module = Training(rig, visibility, steps=options.epochs * len(loaders[0]), seed=options.seed)
     profiler = SimpleProfiler(dirpath=options.out, filename=f"profile-{rig}")
     trainer = lightning.Trainer(
@@ -335,14 +334,16 @@ def report(results, console):
     row = SCORES.index(OPERATING_SCORE)
     for rig, (module, coverage) in results.items():
         curve = module.counts.overall()
-        lines = [(line.numbers["detection_0.4m"], line.known_share) for line in coverage.summary(REGIONS)]
-        seen = [f"{number.value:.3f} ± {number.error:.3f} ({known:.0%} known)" for number, known in lines]
+        numbers = [line.numbers["detection_0.4m"] for line in coverage.summary(REGIONS)]
+        seen = [f"{number.value:.3f} ± {number.error:.3f}" for number in numbers]
         shares = [f"{ratio.value[row, 0]:.3f}" for ratio in (curve.recall, curve.precision)]
         table.add_row(rig, f"{average_precision(module.counts):.3f}", *seen, *shares)
     console.print(table)
     for rig, (module, _) in results.items():
         objects = torch.cat(module.objects).double().numpy()
-        objects = objects[np.isfinite(objects[:, 3])]
+        known = np.isfinite(objects[:, 3])
+        console.print(f"{rig}: {known.sum()} of {len(known)} cars have a known visibility")
+        objects = objects[known]
         distance = np.hypot(objects[:, 1], objects[:, 2])
         parts = {"all": distance >= 0, "0-25 m": distance < 25.0, "over 25 m": distance >= 25.0}
         for name, part in parts.items():
@@ -363,7 +364,8 @@ def draw(results, path):
             error = np.abs(np.stack([value - low, high - value]))
             ax.errorbar(np.arange(len(value)) + shift, value, error, fmt="o-", capsize=3, label=rig)
         cars = torch.stack([curve.recall.trials[row] for curve in curves], dim=1).tolist()
-        labels = ["\n".join(map(str, [name, *counts])) for name, counts in zip(curves[0].bins, cars, strict=True)]
+        names = [name.replace(" ", "\n", axis == "visibility") for name in curves[0].bins]
+        labels = ["\n".join(map(str, [name, *counts])) for name, counts in zip(names, cars, strict=True)]
         ax.set_xticks(range(len(labels)), labels)
         ax.set(xlabel=f"{axis} of the car; below, cars for each rig, in order", ylabel="recall", ylim=(0, 1))
     for shift, (rig, (module, coverage)) in zip((-0.2, 0.2), results.items(), strict=True):
@@ -392,15 +394,12 @@ def main():
 
     console = Console()
     unused = PaperReference(rows=1, columns=1)
-    even = EvenReference((((X_M[0], X_M[1]), (Y_M[0], Y_M[1])),), rays=65_536)
+    surface = SurfaceReference(((X_M, Y_M),), max_range_m=65.0, object_points=64)
     training_frames = simulate(options.train, options.seed, unused, "training frames", keep_clouds=False)
-    validation_frames = simulate(options.validate, options.seed + 1, even, "validation frames", keep_clouds=True)
+    validation_frames = simulate(options.validate, options.seed + 1, surface, "validation frames", keep_clouds=True)
     results = {}
     for rig in RIGS:
-        visibility = {
-            frame.index: box_visibility(frame.clouds[rig], frame.reference, frame.boxes) for frame in validation_frames
-        }
-        results[rig] = train(rig, training_frames, validation_frames, visibility, options, console)
+        results[rig] = train(rig, training_frames, validation_frames, options, console)
     report(results, console)
     draw(results, options.out / "detector.png")
     console.print(f"Wrote {options.out / 'detector.png'} and event files for TensorBoard beside it")

@@ -1,82 +1,361 @@
-"""`python -m examples.paper`: one pass for all, and tables that the documentation can take as they are."""
+"""`python -m examples.paper`: the paper's tables, how far a run is from them, and runs in pieces that merge."""
 
 import json
 import sys
+from argparse import Namespace
 from importlib import import_module
-from itertools import islice
+from itertools import combinations, islice, product
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from matplotlib.image import imread
 
-from torchcover import Coverage
+from torchcover import BevGrid, Coverage, CoverageMetric, Region, forward_regions
+from torchcover.data import SimulatedFrames
 from torchcover.report import write_figures
+from torchcover.simulation import PaperReference, Scenario
 
 ROOT = Path(__file__).parents[1]
+NAMES = ("__main__", "cameras", "comparison", "measuring", "pieces", "published", "score", "tables", "thinning")
+
+
+class Example:
+    """Its modules, by name."""
 
 
 @pytest.fixture(scope="module")
 def paper():
-    """The example as a module."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(ROOT)
-        yield import_module("examples.paper.__main__")
+        example = Example()
+        for name in NAMES:
+            setattr(example, name, import_module(f"examples.paper.{name}"))
+        yield example
 
 
 @pytest.fixture(scope="module")
-def out(paper, tmp_path_factory):
-    """The folder of a run of two steps; of the maps of each experiment, only the first is drawn."""
+def published(paper):
+    return paper.published.published()
+
+
+# The paper's tables
+
+
+def test_the_tables_have_60_numbers_of_which_12_stand_in_both(paper, published):
+    lines = paper.published.TABLES.read_text(encoding="utf-8").splitlines()[1:]
+    roof = [line.split(",", 1) for line in lines if ",roof_128," in line]
+    assert len(lines) == 60
+    assert len(published) == 48
+    assert sorted(rest for table, rest in roof if table == "1") == sorted(rest for table, rest in roof if table == "2")
+    named = product(
+        paper.published.QUANTITIES, paper.published.LIDARS, paper.published.REGIONS, paper.published.HEIGHTS
+    )
+    assert set(published) == set(map(paper.published.Place._make, named))
+
+
+def test_what_the_pages_say_of_the_tables_stands_in_them(published):
+    def number(quantity, lidar, region, height):
+        return next(value for place, value in published.items() if place == (quantity, lidar, region, height))
+
+    of_ground = [place for place in published if place.height == "ground"]
+    higher = {place: published[place._replace(height="obstacle")] > published[place] for place in of_ground}
+    assert len(higher) == 24
+    assert all(higher.values())  # of radii and of detections
+    grilles = [place for place in published if place.lidar == "grille_128"]
+    better = {
+        place: (published[place] > published[place._replace(lidar="roof_128")]) == (place.quantity == "radius_m")
+        for place in grilles
+    }
+    assert [place[2:] for place, roof_is_better in better.items() if not roof_is_better] == [("20m", "ground")]
+    assert number("radius_m", "grille_128", "20m", "ground") == 1.41
+    assert number("radius_m", "roof_128", "20m", "ground") == 1.93
+
+
+def test_tables_that_contradict_each_other_are_refused(paper, monkeypatch, tmp_path):
+    copy = tmp_path / "tables.csv"
+    copy.write_text(
+        paper.published.TABLES.read_text().replace(
+            "2,roof_128,radius_m,20m,ground,1.93", "2,roof_128,radius_m,20m,ground,1.41"
+        )
+    )
+    monkeypatch.setattr(paper.published, "TABLES", copy)
+    with pytest.raises(ValueError, match=r"1.41 and 1.93 for radius_m roof_128 20m ground"):
+        paper.published.published.__wrapped__()
+
+
+# The distance of a run to them
+
+
+def slow_score(run, paper):
+    """The same, one pair after the other."""
+    counted = {"rows": [0, 0], "all": [0, 0]}
+    for one, other in combinations(paper, 2):
+        if one.quantity != other.quantity or paper[one] == paper[other]:
+            continue
+        held = run[one] > run[other] if paper[one] > paper[other] else run[one] < run[other]
+        counted["all"][0] += held
+        counted["all"][1] += 1
+        if one[2:] == other[2:]:
+            counted["rows"][0] += held
+            counted["rows"][1] += 1
+
+    def rank(values, value):
+        return sum(each < value for each in values) + sum(each == value for each in values) / 2
+
+    def spearman(quantity):
+        pairs = [(run[place], paper[place]) for place in paper if place.quantity == quantity]
+        ranks = [[rank(values, value) for value in values] for values in zip(*pairs, strict=True)]
+        return np.corrcoef(ranks)[0, 1]
+
+    off = [run[place] - paper[place] for place in paper if place.quantity == "detection_percent"]
+    logs = [np.log(run[place] / paper[place]) for place in paper if place.quantity == "radius_m"]
+    return (
+        np.sqrt(sum(each**2 for each in off) / len(off)),
+        np.exp(np.sqrt(sum(each**2 for each in logs) / len(logs))),
+        *counted["rows"],
+        *counted["all"],
+        spearman("detection_percent"),
+        spearman("radius_m"),
+        0,
+    )
+
+
+@pytest.mark.parametrize("decimals", [6, 0])
+def test_the_score_is_that_of_a_slow_twin_with_and_without_ties(paper, published, decimals):
+    random = np.random.default_rng(decimals)
+    run = {place: max(round(value * random.uniform(0.3, 3.0), decimals), 0.5) for place, value in published.items()}
+    rounded = {place: max(round(value, decimals), 0.5) for place, value in published.items()}
+    for tables in (published, rounded):
+        assert paper.score.score(run, tables) == pytest.approx(slow_score(run, tables), rel=1e-12)
+
+
+def test_the_paper_agrees_with_itself_in_72_and_552_orderings(paper, published):
+    assert paper.score.score(published, published) == (0.0, 1.0, 72, 72, 552, 552, 1.0, 1.0, 0)
+
+
+def test_what_moves_all_numbers_alike_moves_distances_only(paper, published):
+    run = {place: 2 * value if place.quantity == "radius_m" else value - 3 for place, value in published.items()}
+    assert paper.score.score(run, published) == pytest.approx((3.0, 2.0, 72, 72, 552, 552, 1.0, 1.0, 0))
+
+
+def test_numbers_in_the_opposite_order_hold_no_ordering(paper, published):
+    run = {place: 1 / value for place, value in published.items()}
+    found = paper.score.score(run, published)
+    assert (found.rows_held, found.pairs_held) == (0, 0)
+    assert (found.spearman_detection, found.spearman_radius) == pytest.approx((-1.0, -1.0))
+
+
+def test_a_rig_that_is_the_same_everywhere_holds_no_ordering(paper, published):
+    found = paper.score.score(dict.fromkeys(published, 5.0), published)
+    assert (found.rows_held, found.pairs_held) == (0, 0)
+    assert np.isnan([found.spearman_detection, found.spearman_radius]).all()
+
+
+def test_an_unknown_number_is_no_good_score(paper, published):
+    place = next(place for place in published if place.quantity == "radius_m")
+    found = paper.score.score({**published, place: float("nan")}, published)
+    assert found.unknown == 1
+    assert (found.rows_held, found.pairs_held) == (72 - 3, 552 - 23)
+    assert np.isnan([found.factor, found.spearman_radius]).all()
+    assert (found.points, found.spearman_detection) == (0.0, 1.0)
+    assert str(found).endswith("; 1 numbers are unknown")
+
+
+# Pieces
+
+
+def test_thinning_keeps_at_most_so_many_points_of_each_cell_and_none_of_another(paper):
+    grid = BevGrid(x=(0.0, 4.0), y=(-2.0, 2.0), cell=1.0)
+    points = torch.rand((500, 3), generator=torch.Generator().manual_seed(0)) * 6 - torch.tensor([1.0, 3.0, 1.0])
+    kept = paper.thinning.thinned(points, grid, 3, seed=1)
+    before, after = (
+        torch.bincount(cell[cell >= 0], minlength=grid.cells) for cell in map(grid.cell_of, (points, kept))
+    )
+    assert after.equal(before.clamp(max=3))
+    assert int(after.sum()) == len(kept)
+    assert {tuple(point) for point in kept.tolist()} <= {tuple(point) for point in points.tolist()}
+    assert kept.equal(paper.thinning.thinned(points, grid, 3, seed=1))
+    assert len(paper.thinning.thinned(points[:0], grid, 3, seed=1)) == 0
+
+
+def test_thinning_keeps_the_expectation_of_the_mean_of_a_cell(paper):
+    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0)
+    points = torch.linspace(0.0, 0.99, 40)[:, None].expand(-1, 3)
+    means = [float(paper.thinning.thinned(points, grid, 4, seed)[:, 0].mean()) for seed in range(400)]
+    assert np.mean(means) == pytest.approx(float(points[:, 0].mean()), abs=4 * np.std(means) / 20)
+
+
+@pytest.mark.parametrize("square_metres", [False, True])
+def test_pieces_merge_to_what_one_run_with_a_block_for_each_says(paper, square_metres, tmp_path):
+    grid = BevGrid(x=(0.0, 4.0), y=(-2.0, 2.0), cell=1.0)
+    random = torch.Generator().manual_seed(0)
+    whole = CoverageMetric(grid, max_radius=10.0, blocks=8, square_metres=square_metres)
+    pieces = []
+    for first in range(0, 16, 2):
+        piece = CoverageMetric(grid, max_radius=10.0, square_metres=square_metres)
+        for index in range(first, first + 2):
+            clouds = [4 * torch.rand((count, 3), generator=random) - torch.tensor([0, 2, 0.5]) for count in (3, 9)]
+            weights = torch.rand(9, generator=random) + 0.1
+            for metric in (whole, piece):
+                metric.update(*clouds, weights=weights, index=index)
+        folder = tmp_path / f"{first:05d}"
+        paper.pieces.save_piece(folder, {("my/rig.yaml", "known"): piece.compute()})
+        pieces.append(folder)
+    expected, merged = whole.compute(), paper.pieces.load_merged(pieces, "my/rig.yaml", "known")
+    assert merged.counts == expected.counts
+    assert merged.measure == ("area" if square_metres else "known")
+    assert merged.points.equal(expected.points)
+    assert merged.radius.allclose(expected.radius, rtol=1e-12, equal_nan=True)
+    for region, height in product(
+        (Region("all", grid.x, grid.y), Region("one", (0.0, 1.0), (-2.0, -1.0))), grid.heights
+    ):
+        one, other = (coverage.estimate(region, height) for coverage in (merged, expected))
+        assert one.value.allclose(other.value, rtol=1e-12, equal_nan=True)
+        assert one.error.allclose(other.error, rtol=1e-9, equal_nan=True)
+
+
+def test_a_piece_that_was_interrupted_while_written_is_none(paper, tmp_path):
+    class Full:
+        def save(self, path):
+            raise OSError("no space left")
+
+    with pytest.raises(OSError, match="no space left"):
+        paper.pieces.save_piece(tmp_path / "00000", {("rig", "known"): Full()})
+    assert not (tmp_path / "00000").exists()
+
+
+def test_pieces_of_another_run_are_refused(paper, tmp_path):
+    paper.pieces.check_conditions(tmp_path / "pieces", {"seed": 1})
+    paper.pieces.check_conditions(tmp_path / "pieces", {"seed": 1})
+    with pytest.raises(ValueError, match=r"conditions.json says \{'seed': 1\}, this run is \{'seed': 2\}.*--out"):
+        paper.pieces.check_conditions(tmp_path / "pieces", {"seed": 2})
+
+
+@pytest.mark.parametrize(("pieces", "counts"), [(1, [1]), (4, [1, 4]), (16, [1, 4, 16]), (20, [1, 4, 16, 20])])
+def test_scores_are_given_for_four_times_as_many_steps_each_time(paper, pieces, counts):
+    assert paper.tables.growing(pieces) == counts
+
+
+# The reference
+
+
+def test_the_ego_gives_points_if_they_are_wanted_and_nothing_else_changes():
+    frames = SimulatedFrames("courtyard", "front_roof_32", steps=1, reference_sensor=PaperReference(32, 32))
+    without, with_ego = frames[0], frames.with_reference_sensor(PaperReference(32, 32, ego_points=True))[0]
+    assert len(with_ego.reference) == len(without.reference) + without.counts["reference_self_hits"]
+    others = {tuple(point) for point in without.reference.tolist()}
+    own = torch.tensor([point for point in with_ego.reference.tolist() if tuple(point) not in others])
+    box = Scenario.load("courtyard").ego_box()
+    assert len(own) == without.counts["reference_self_hits"] > 50
+    assert (own >= torch.tensor(box.lower_m) - 1e-3).all()
+    assert (own <= torch.tensor(box.upper_m) + 1e-3).all()
+
+
+def test_both_references_have_the_range_that_is_asked_for(paper):
+    options = Namespace(
+        scenario="courtyard", steps=1, seed=0, every=0.1, rays=100, reference_range=120.0, ego_points=True
+    )
+    asked = paper.measuring.Measurement(
+        {"rig": "front_roof_32"}, BevGrid((0, 160), (-40, 40)), forward_regions(), options
+    )
+    assert asked.frames.reference_sensor == PaperReference(10, 10, max_range_m=120.0, ego_points=True)
+    assert asked.surface_frames.reference_sensor.max_range_m == 120.0
+    assert asked.surface_frames.reference_sensor.areas == tuple((region.x, region.y) for region in forward_regions())
+
+
+# The command
+
+
+@pytest.fixture(scope="module")
+def options(tmp_path_factory):
     out = tmp_path_factory.mktemp("paper")
-    options = ["--steps", "2", "--rays", "64", "--scenario", "courtyard", "--out", str(out)]
+    run = ["--steps", "2", "--piece", "1", "--every", "0.1", "--rays", "1024", "--scenario", "courtyard"]
+    return [*run, "--rigs", "paper_fit_b_{}", "--origin", "-1.4", "--reference-range", "120", "--out", str(out)]
+
+
+@pytest.fixture(scope="module")
+def out(paper, options):
+    """The folder of a run of two steps; of the maps, only the first of each is drawn."""
 
     def write_first(figures, folder):
         paths = write_figures(islice(figures, 1), folder)
         assert [path.stat().st_size > 10_000 for path in paths] == [True]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(paper, "write_figures", write_first)
+        for module in (paper.tables, paper.cameras):
+            patch.setattr(module, "write_figures", write_first)
         patch.setattr(sys, "argv", ["paper", *options])
-        paper.main()
-    return out
+        paper.__main__.main()
+    return Path(options[-1])
 
 
-def test_every_experiment_leaves_tables_numbers_coverage_and_maps(out):
-    assert sorted(path.name for path in out.iterdir()) == ["cameras", "figure", "mounting", "resolution"]
-    for name, rigs in {"cameras": 1, "mounting": 2, "resolution": 3}.items():
-        summary = json.loads((out / name / "summary.json").read_text())
-        assert summary["options"]["steps"] == 2
-        assert len({row["rig"] for row in summary["rows"]}) == len(list((out / name).glob("*.npz"))) == rigs
-        assert list((out / name / "maps").glob("*.png"))
-    assert min(imread(out / "figure" / "figure_2.png").shape[:2]) > 1000
+def test_a_run_leaves_tables_scores_coverage_and_maps(out):
+    found = json.loads((out / "tables.json").read_text())
+    assert found["options"]["origin"] == -1.4
+    assert [(each["measure"], each["steps"]) for each in found["results"]] == [
+        (measure, steps) for measure in ("known", "area") for steps in (1, 2)
+    ]
+    assert {len(each["numbers"]) for each in found["results"]} == {48}
+    assert len(list((out / "maps").glob("*/*.png"))) == 1
+    pieces = list((out / "pieces").glob("0000[01]/*_*.npz"))
+    assert len(pieces) == 2 * 4 * 2
+    assert {Coverage.load(piece).grid.x for piece in pieces} == {(-1.4, 158.6)}
+    assert sorted(path.name for path in (out / "cameras").iterdir()) == [
+        "figure_2.png",
+        "maps",
+        "table.md",
+        "three_cameras_area.npz",
+        "three_cameras_known.npz",
+    ]
+    assert min(imread(out / "cameras" / "figure_2.png").shape[:2]) > 1000
 
 
-def test_a_rig_of_two_experiments_is_measured_once(out):
-    first, second = (Coverage.load(out / name / "front_roof_128.npz") for name in ("mounting", "resolution"))
-    assert first.radius.equal(second.radius) or first.radius.allclose(second.radius, rtol=0, equal_nan=True)
-    assert first.counts["steps"] == 2
-
-
-@pytest.mark.parametrize(("name", "rows"), [("mounting", 6), ("resolution", 6), ("cameras", 4)])
-def test_the_tables_are_markdown_with_the_numbers_of_the_summary(out, name, rows):
-    lines = (out / name / "table.md").read_text().splitlines()
-    start = next(at for at, line in enumerate(lines) if line.startswith("| region"))
-    headings, rule, *body = (line.strip("| ").split(" | ") for line in lines[start : start + 2 + rows])
+def test_the_tables_are_markdown_with_the_numbers_of_the_json(out):
+    lines = (out / "tables.md").read_text().splitlines()
+    headings, rule, *body = (line.strip("| ").split(" | ") for line in lines if line.startswith("|"))
     assert len(headings) == len(rule)
-    assert {len(row) for row in body} == {len(headings)}
-    assert headings[:2] == ["region", "height"]
-    assert headings[-1] == "paper (m)"
-    rig = headings[2] if name != "cameras" else "three_cameras"
-    numbers = json.loads((out / name / "summary.json").read_text())["rows"]
-    for row, record in zip(body, [record for record in numbers if record["rig"] == rig], strict=True):
-        assert (row[0], row[1]) == (record["region"], record["height"])
-        shown = row[2].strip("*").split()[0]
-        assert shown == "unknown" or float(shown) == pytest.approx(record["radius_m"], abs=0.006)
-    published = {row[-1] for row in body}
-    assert published == ({"grille 1.41, roof 1.93", "–"} if name == "mounting" else {"–"})
+    assert {len(row) for row in body[:24]} == {len(headings)}
+    known, area = (
+        {
+            (number["quantity"], number["region"], number["height"], number["lidar"]): number
+            for number in each["numbers"]
+        }
+        for each in json.loads((out / "tables.json").read_text())["results"]
+        if each["steps"] == 2
+    )
+    for row in body[:24]:
+        for quantity, shown in (("detection_percent", row[3:7]), ("radius_m", row[7:11])):
+            one = known[quantity, *row[:3]]
+            expected = [one["value"], one["paper"], one["value"] / one["paper"], area[quantity, *row[:3]]["value"]]
+            numbers = [float("nan") if cell == "unknown" else float(cell.split()[0]) for cell in shown]
+            assert numbers == pytest.approx(expected, abs=0.0051, nan_ok=True)
+    assert sum(line.startswith(("known cells: ", "by area: ")) for line in lines) == 2
 
 
-def test_an_unknown_experiment_is_a_mistake(paper, monkeypatch, capsys):
-    monkeypatch.setattr(sys, "argv", ["paper", "moon"])
+def test_pieces_that_are_there_are_not_measured_again(paper, out, options, monkeypatch):
+    measured = []
+    monkeypatch.setattr(paper.measuring.Measurement, "run", lambda self, steps: measured.append(steps) or {})
+    monkeypatch.setattr(paper.tables, "write_figures", lambda figures, folder: None)
+    monkeypatch.setattr(sys, "argv", ["paper", "tables", *options])
+    paper.__main__.main()
+    assert measured == []
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["moon"], "no experiment moon; there are tables, cameras"),
+        (["--steps", "10"], "steps: a multiple of the piece of 16 is needed; got 10"),
+        (["--rigs", "mine"], "rigs: {} must stand where the LiDARs differ; got mine"),
+        (["--rigs", "mine_{}"], "'mine_grille_128' is neither a .yaml file nor one of the built-in rigs"),
+        (["--rays", "-1"], "nonnegative"),
+        (["--every", "0.15"], "every_s: a positive multiple of the time step"),
+    ],
+)
+def test_a_mistake_is_said_in_a_line(paper, monkeypatch, capsys, given, message):
+    monkeypatch.setattr(sys, "argv", ["paper", *given])
     with pytest.raises(SystemExit, match="2"):
-        paper.main()
-    assert "no experiment moon; there are cameras, mounting, resolution, figure" in capsys.readouterr().err
+        paper.__main__.main()
+    assert message in capsys.readouterr().err

@@ -1,21 +1,38 @@
-"""What is known of the paper's tables, beside the numbers that were measured."""
+"""Tables 1 and 2 of the paper."""
 
-from torchcover.report import CoverageTable, as_markdown, parts_of
+import csv
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
 
-# Experiment, region and height -> mean blind spot radius.
-PUBLISHED_RADIUS = {("mounting", "20m", "ground"): "grille 1.41, roof 1.93"}
-NOT_KNOWN = "–"
-
-
-def with_published(experiment: str, table: CoverageTable) -> str:
-    """The table of an experiment as Markdown, with a column for what the paper states beside the radii."""
-    places = [(experiment, row.summary.region, row.summary.height) for row, *_ in table.places]
-    published = [PUBLISHED_RADIUS.get(place, NOT_KNOWN) for place in places]
-    return as_markdown(
-        table,
-        [part.with_column("paper (m)", published) if _has_radii(part) else part for part in parts_of(table)],
-    )
+TABLES = Path(__file__).with_name("tables.csv")
+# One LiDAR: where it is mounted, and how many rows it has.
+LIDARS = ("grille_128", "roof_128", "roof_64", "roof_32")
+REGIONS = ("20m", "80m", "160m")
+HEIGHTS = ("ground", "obstacle")
+QUANTITIES = ("detection_percent", "radius_m")
 
 
-def _has_radii(part):
-    return not part.of_differences and any(quantity.key == "radius_m" for quantity in part.quantities)
+class Place(NamedTuple):
+    """What a number of the tables is about: one of each of the above."""
+
+    quantity: str
+    lidar: str
+    region: str
+    height: str
+
+
+@lru_cache
+def published():
+    """Place -> number. Of the 60 there are 48: both tables have the LiDAR with 128 rows on the roof, and agree on it.
+
+    Raises:
+        ValueError: Two numbers for one place.
+    """
+    numbers = {}
+    with TABLES.open(encoding="utf-8", newline="") as file:
+        for row in csv.DictReader(file):
+            place, value = Place(*(row[name] for name in Place._fields)), float(row["value"])
+            if numbers.setdefault(place, value) != value:
+                raise ValueError(f"{TABLES}: {value} and {numbers[place]} for {' '.join(place)}")
+    return numbers

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from torchcover.cameras import Camera, carla_pose
+from torchcover.files import BadFileError
 from torchcover.geometry import invert, rotation_from_euler, transform
 
 MATRIX = np.array([[520.0, 0.0, 318.0], [0.0, 510.0, 242.0], [0.0, 0.0, 1.0]])
@@ -61,14 +62,41 @@ def test_ros_message(tmp_path):
     [
         (ROS_MESSAGE.replace("height", "hight"), "image_height or height is missing"),
         (ROS_MESSAGE.replace("plumb_bob", "wide"), "'wide' is unknown; allowed: plumb_bob"),
+        (ROS_MESSAGE.replace("plumb_bob", "[a, b]"), "distortion_model a list is unknown"),
+        (ROS_MESSAGE.replace("480", "480.5"), "height: a whole number is needed; got 480.5"),
+        (ROS_MESSAGE.replace("480", "-480"), "height must be a positive integer; got -480"),
+        (ROS_MESSAGE.replace("k: [520.0, ", "k: ["), "the camera matrix has 9 numbers; got 8"),
+        (ROS_MESSAGE.replace("k: [520.0", "k: [.nan"), "k: a list of finite numbers is needed; got a list"),
+        (ROS_MESSAGE.replace("k: [520.0", "k: [0.0"), r"fx and fy must be positive; got \[0.0, 510.0\]"),
+        (ROS_MESSAGE.replace("-0.2", "[1, [2, 3]]"), "d: a list of finite numbers is needed; got a list"),
+        (ROS_MESSAGE.replace("-0.2, 0.1, ", ""), "takes 4 or 5 .* coefficients"),
+        (
+            ROS_FILE.replace("rows: 3", "rows: 4") % ("plumb_bob", 4, [0.0] * 4),
+            "4 rows and 3 columns are not 9 numbers",
+        ),
+        (
+            ROS_FILE.replace("cols: 3", "cols: a") % ("plumb_bob", 4, [0.0] * 4),
+            "cols: a whole number is needed; got 'a'",
+        ),
         ("- 1", "a mapping of names to values is needed; got list"),
         ("a: [1", "not a YAML file"),
+        ("", "an empty file"),
     ],
 )
 def test_ros_files_that_are_none(tmp_path, text, message):
     (tmp_path / "info.yaml").write_text(text)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(BadFileError, match=rf"info\.yaml: .*({message})"):
         Camera.from_ros(tmp_path / "info.yaml")
+
+
+def test_a_calibration_that_laughs_is_not_written_out(tmp_path):
+    """Nested aliases: 9^11 numbers, of which nobody may ask."""
+    laughs = "a0: &a0 [1.0, 1.0]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 12))
+    for key in ("distortion_model", "d", "k", "width"):
+        lines = [line for line in ROS_MESSAGE.splitlines() if not line.startswith(f"{key}:")]
+        (tmp_path / "info.yaml").write_text(laughs + "\n".join([*lines, f"{key}: *a11"]))
+        with pytest.raises(BadFileError, match="more than 200,000 values, those of aliases included"):
+            Camera.from_ros(tmp_path / "info.yaml")
 
 
 def write_opencv(path, **entries):
@@ -140,8 +168,24 @@ def test_kitti_places_the_camera_through_the_lidar(tmp_path):
     pose[:3, 3] = [0.76, 0.0, 1.73]
     camera = Camera.from_kitti(tmp_path / "c.txt", 0, width=640, height=480, vehicle_T_lidar=pose)
     np.testing.assert_allclose(camera.vehicle_T_camera, pose)
-    with pytest.raises(ValueError, match=r"P2 with 12 numbers is needed; the file holds P0, Tr"):
+    with pytest.raises(ValueError, match=r"P2 with 12 numbers is needed; got nothing; the file holds P0, Tr"):
         Camera.from_kitti(tmp_path / "c.txt", 2, width=640, height=480)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (("P0: 5", "P0: a"), r"P0 with 12 numbers is needed; got a\.2"),
+        (("P0: 5", "P0: nan 5"), "P0 with 12 numbers is needed; got nan"),
+        (("P0: 5.200000000000e+02", "P0: 0"), "P0 has no focal length"),
+        (("Tr: 1.0", "Tr: 2.0"), "P0 from the lidar: not a rigid transform"),
+        (("Tr", "Ts"), "Tr with 12 numbers is needed; got nothing; the file holds P0, Ts"),
+    ],
+)
+def test_kitti_files_that_are_none(tmp_path, change, message):
+    (tmp_path / "c.txt").write_text(f"P0: {row(MATRIX @ np.eye(3, 4))}\nTr: {row(np.eye(3, 4))}\n".replace(*change))
+    with pytest.raises(BadFileError, match=rf"c\.txt: {message}"):
+        Camera.from_kitti(tmp_path / "c.txt", 0, width=640, height=480)
 
 
 def write_nuscenes(folder, *calibrations):
@@ -177,6 +221,42 @@ def test_nuscenes_vehicles_are_told_apart(tmp_path):
     for channel in ("CAM_BACK", "LIDAR_TOP"):
         with pytest.raises(ValueError, match=r"no calibrated camera .*channels: \['CAM_FRONT', 'LIDAR_TOP'\]"):
             Camera.from_nuscenes(tmp_path, channel)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("sensor.json", "]", "", r"sensor\.json: not JSON"),
+        (
+            "sensor.json",
+            '"s1"',
+            "1",
+            r"sensor\.json: a list of objects is needed, each with the texts token and channel",
+        ),
+        ("sensor.json", "[", "[" * 100_000, r"sensor\.json: not readable as a nuScenes table \(RecursionError"),
+        (
+            "calibrated_sensor.json",
+            '"sensor_token"',
+            '"other"',
+            r"calibrated_sensor\.json: a list of objects is needed",
+        ),
+        (
+            "calibrated_sensor.json",
+            "[1.7, 0.0, 1.5]",
+            "[1.7]",
+            "needs a rotation of four numbers and a translation of three",
+        ),
+        ("calibrated_sensor.json", "[0.5, -0.5, 0.5, -0.5]", "[0, 0, 0, 0]", "a quaternion of norm 0"),
+        ("calibrated_sensor.json", "[520.0, 0.0, 318.0]", "5", "has three rows of three numbers; got a list"),
+    ],
+)
+def test_nuscenes_tables_that_are_none(tmp_path, file, old, new, message):
+    write_nuscenes(tmp_path, calibrated("a", 1.7))
+    content = (tmp_path / file).read_text()
+    assert old in content
+    (tmp_path / file).write_text(content.replace(old, new))
+    with pytest.raises(BadFileError, match=rf"{tmp_path}.*{message}"):
+        Camera.from_nuscenes(tmp_path, "CAM_FRONT")
 
 
 def test_a_matrix(tmp_path):

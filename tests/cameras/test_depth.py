@@ -1,6 +1,8 @@
 """Depth encodings."""
 
 import builtins
+import struct
+import zlib
 
 import numpy as np
 import OpenEXR
@@ -11,6 +13,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from torchcover.cameras import decode_carla, read_depth
+from torchcover.files import BadFileError
 
 
 def encode_carla(metres, order):
@@ -71,9 +74,47 @@ def test_exr_without_its_package(tmp_path, monkeypatch):
             raise ImportError(name)
         return plain(name, *args, **kwargs)
 
+    (tmp_path / "depth.exr").write_bytes(b"v/1")
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(ImportError, match=r"torchcover\[exr\]"):
         read_depth(tmp_path / "depth.exr")
+
+
+def png_header(width, height, bits=8, colour=6):
+    body = b"IHDR" + struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + body + struct.pack(">I", zlib.crc32(body))
+
+
+def test_an_image_is_not_larger_than_its_file_can_be_nor_than_is_granted(tmp_path, monkeypatch):
+    path = tmp_path / "depth.png"
+    path.write_bytes(png_header(30_000, 30_000))
+    with pytest.raises(BadFileError, match=r"depth\.png: truncated: the header claims 30000x30000 pixels"):
+        read_depth(path)
+    path.write_bytes(png_header(30_000, 30_000) + bytes(4_000_000))
+    with pytest.raises(BadFileError, match=r"depth\.png: reading it takes 28\.8 GB of memory"):
+        read_depth(path)
+    for name in ("d.png", "d.npy", "d.exr"):
+        path = tmp_path / name
+        if name == "d.exr":
+            OpenEXR.File({}, {"Z": np.ones((100, 100), np.float32)}).write(str(path))
+        else:
+            save(path, np.ones((100, 100), np.uint16))
+        scale = None if name == "d.exr" else 0.5
+        assert read_depth(path, metres_per_unit=scale).shape == (100, 100)
+        with monkeypatch.context() as context:
+            context.setenv("TORCHCOVER_MAX_FILE_GB", "0.0003")
+            with pytest.raises(BadFileError, match=rf"{name}: reading it takes 0\.00032 GB"):
+                read_depth(path, metres_per_unit=scale)
+
+
+def test_a_truncated_image_is_named(tmp_path):
+    save(tmp_path / "d.png", np.random.default_rng(0).integers(0, 255, (40, 40, 3), dtype=np.uint8))
+    OpenEXR.File({}, {"Z": np.ones((40, 40), np.float32)}).write(str(tmp_path / "d.exr"))
+    for name in ("d.png", "d.exr"):
+        path = tmp_path / name
+        path.write_bytes(path.read_bytes()[:-40])
+        with pytest.raises(BadFileError, match=rf"{name}: (not readable as a depth image|truncated or damaged)"):
+            read_depth(path)
 
 
 def save(path, array):
@@ -96,7 +137,7 @@ def save(path, array):
 )
 def test_what_cannot_be_depth_is_refused(tmp_path, name, array, scale, message):
     save(tmp_path / name, array)
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(BadFileError, match=rf"{name}: .*{message}"):
         read_depth(tmp_path / name, metres_per_unit=scale)
 
 

@@ -76,7 +76,7 @@ def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
     *_, out = compare(torchcover, worlds, "low", "both")
     assert sorted(path.name for path in (out / "maps").iterdir()) == sorted(
         f"{prefix}{metric}_{band}{suffix}.png"
-        for metric in ("radius_m", "detection_2m", "radius_area_m", "detection_area_2m")
+        for metric in ("radius_area_m", "detection_area_2m")
         for band in ("ground", "obstacle")
         for prefix, suffix in (("", ""), ("difference_", "_both_minus_low"))
     )
@@ -85,7 +85,7 @@ def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
 def test_errors_are_drawn_if_asked_for_and_differences_come_with_theirs(torchcover, worlds):
     *_, out = compare(torchcover, worlds, "low", "both", steps=9, options=["--error-maps"])
     names = {path.name for path in (out / "maps").iterdir()}
-    keys = ("radius_m", "detection_2m")
+    keys = ("radius_area_m", "detection_area_2m")
     errors = {f"{key}_error_{band}.png" for key in keys for band in ("ground", "obstacle")}
     assert {name for name in names if "error" in name} == errors
     summary = json.loads((out / "summary.json").read_text())

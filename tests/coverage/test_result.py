@@ -11,6 +11,7 @@ import torch
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.coverage import Layer, Maximum, MeanOfMeans, PooledMean, Quantiles, StepQuantiles, differences
+from torchcover.files import BadFileError
 
 GRID = BevGrid(x=(-1.0, 20.0), y=(-5.0, 5.0), cell=0.5)
 EVERY_AGGREGATION = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), StepQuantiles((0.9,)))
@@ -192,9 +193,10 @@ def test_a_result_survives_pickling():
 
 
 def test_a_file_that_is_not_there_is_said_to_be_missing(tmp_path):
-    for path in (tmp_path / "missing.npz", tmp_path):
-        with pytest.raises(FileNotFoundError, match=f"{path.name}: no such coverage file"):
-            Coverage.load(path)
+    with pytest.raises(FileNotFoundError, match=r"missing\.npz: no such file; a saved coverage is needed"):
+        Coverage.load(tmp_path / "missing.npz")
+    with pytest.raises(IsADirectoryError, match="a folder; a saved coverage is one file"):
+        Coverage.load(tmp_path)
 
 
 @pytest.fixture
@@ -204,7 +206,7 @@ def saved(tmp_path):
     return path
 
 
-NOT_ONE = r"coverage\.npz: not a coverage file as Coverage\.save writes it \(.+\)"
+NOT_ONE = r"coverage\.npz: (not a coverage file as Coverage\.save writes it \(.+\)|an empty file)"
 
 
 @pytest.mark.parametrize("content", [b"", b"hello world", b"PK\x03\x04" + bytes(100), pickle.dumps([1, 2, 3])])
@@ -257,6 +259,46 @@ def test_a_file_with_wrong_parts_is_refused(saved, change):
     rewrite(saved, **change)
     with pytest.raises(ValueError, match=NOT_ONE):
         Coverage.load(saved)
+
+
+@pytest.fixture
+def saved_in_blocks(tmp_path):
+    grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=0.5)
+    metric = CoverageMetric(grid, blocks=8, max_radius=9.0, square_metres=True)
+    for _ in range(8):
+        reference = torch.rand(20, 3)
+        metric.update(reference[:3], reference, weights=torch.ones(20))
+    metric.compute().save(tmp_path / "coverage.npz")
+    return tmp_path / "coverage.npz"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"header": lambda old: json.dumps({**old, "blocks": 10**9})}, "the steps of 1000000000 blocks have shape"),
+        ({"header": lambda old: json.dumps({**old, "blocks": -8})}, "the steps of -8 blocks have shape"),
+        ({"block_cell": lambda old: old.astype(np.int64) - 1000}, "cells do not fit into"),
+        ({"area_cell": lambda old: old + 8 * 16}, "cells do not fit into"),
+        ({"area_cell": lambda old: old[1:]}, "cells do not fit into"),
+        ({"block_sums": lambda old: old[:, :1]}, "cells do not fit into"),
+    ],
+)
+def test_blocks_that_do_not_fit_are_refused(saved_in_blocks, change, message):
+    Coverage.load(saved_in_blocks)
+    with np.load(saved_in_blocks) as file:
+        arrays = {name: make(file[name]) for name, make in change.items() if name != "header"}
+    rewrite(saved_in_blocks, header=change.get("header"), **arrays)
+    with pytest.raises(BadFileError, match=rf"coverage\.npz: .*{message}"):
+        Coverage.load(saved_in_blocks)
+
+
+def test_zeros_between_the_listed_cells_count_as_memory(saved_in_blocks, monkeypatch):
+    """A million blocks are some kB in a file and 0.8 GB in memory."""
+    many = np.zeros(1_000_000, np.int64)
+    rewrite(saved_in_blocks, lambda old: json.dumps({**old, "blocks": len(many)}), block_steps=many, area_steps=many)
+    monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.5")
+    with pytest.raises(BadFileError, match=r"coverage\.npz: reading it takes 0\.784 GB .* more than the 0\.5 GB"):
+        Coverage.load(saved_in_blocks)
 
 
 def test_an_array_file_is_no_coverage_file(saved):

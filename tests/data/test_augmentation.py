@@ -78,13 +78,23 @@ def test_overlap_of_boxes_stays_under_all_of_them():
 def test_visibility_stays_under_flip_and_rotation():
     frame = make_frame()
     frame = replace(frame, reference=frame.clouds["a"] + 0.3 * torch.randn(900, 3))
-    before = box_visibility(frame.clouds["b"], frame.reference, frame.boxes, threshold=3.0)
+    before = box_visibility(frame.clouds["b"], frame.reference, frame.boxes, threshold=3.0, reference_weights=None)
     for move in (flip, MOVES["rotate"][0]):
         moved = move(frame)
-        after = box_visibility(moved.clouds["b"], moved.reference, moved.boxes, threshold=3.0)
+        after = box_visibility(moved.clouds["b"], moved.reference, moved.boxes, threshold=3.0, reference_weights=None)
         # A point on a border may change sides by rounding.
         assert (after.reference_points - before.reference_points).abs().max() <= 1
         torch.testing.assert_close(after.mean_radius_m, before.mean_radius_m, atol=0.05, rtol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize(("move", "factor"), MOVES.values(), ids=MOVES)
+def test_square_metres_scale_with_a_scaling_and_other_weights_and_counts_stay(move, factor):
+    frame = make_frame()
+    frame = replace(frame, boxes=replace(frame.boxes, drawn_points=torch.arange(9)), reference_weights=torch.rand(700))
+    for kind, grown in {"m2": factor**2, "density": 1.0}.items():
+        moved = move(replace(frame, weight_kind=kind))
+        torch.testing.assert_close(moved.reference_weights, grown * frame.reference_weights)
+        assert torch.equal(moved.boxes.drawn_points, torch.arange(9))
 
 
 def test_twice_a_flip_and_back_and_forth_is_nothing():

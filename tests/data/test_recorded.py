@@ -167,7 +167,9 @@ MATRIX = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", r"got NoneType, not a mapping; allowed are sensor, or rigs"),
+        ("", r"an empty file \(0 bytes\); a file of poses is needed"),
+        ("{", r"not a YAML file"),
+        ("# nothing", r"got NoneType, not a mapping; allowed are sensor, or rigs"),
         ("- 1", r"got list, not a mapping"),
         ("sensor: {", r"not a YAML file: .*line 1"),
         ("\x00", r"not a YAML file"),
@@ -208,7 +210,7 @@ def test_a_bad_frame_says_which_it_is_and_leaves_the_others(tmp_path):
 def test_a_file_that_vanishes_is_a_bad_frame(tmp_path):
     frames = RecordedFrames(record(tmp_path, ["a"]))
     (tmp_path / "sensor" / "a.npy").unlink()
-    with pytest.raises(BadFrameError, match=r"^a \(frame 0\): .*a\.npy: no such file$"):
+    with pytest.raises(BadFrameError, match=r"^a \(frame 0\): .*a\.npy: no such file; a point cloud is needed$"):
         frames[0]
 
 

@@ -1,6 +1,7 @@
 """The visibility of a box is the coverage of the reference points in it."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +13,9 @@ from torchcover.detection import Boxes, box_visibility
 from torchcover.simulation import PaperReference
 
 TWO = Boxes.from_rows(torch.tensor([[10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0], [30.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.6]]))
+
+
+unweighted = partial(box_visibility, reference_weights=None)
 
 
 def slow_visibility(sensor, reference, boxes, threshold, weights):
@@ -49,7 +53,7 @@ def test_against_a_slow_twin(weighted):
 
 def test_weights_that_are_all_equal_change_nothing():
     sensor, reference = torch.rand(50, 3) * 4, torch.rand(300, 3) * 4 + torch.tensor([8.0, -2.0, 0.0])
-    plain = box_visibility(sensor, reference, TWO)
+    plain = box_visibility(sensor, reference, TWO, reference_weights=None)
     weighted = box_visibility(sensor, reference, TWO, reference_weights=torch.full((300,), 7.0))
     torch.testing.assert_close(plain.mean_radius_m, weighted.mean_radius_m, equal_nan=True)
     torch.testing.assert_close(plain.share, weighted.share, equal_nan=True)
@@ -57,7 +61,7 @@ def test_weights_that_are_all_equal_change_nothing():
 
 def test_a_box_without_reference_points_is_unknown_whatever_the_rig_saw_in_it():
     sensor, reference = torch.tensor([[30.0, 0.0, 1.0]] * 5), torch.tensor([[10.0, 0.0, 1.0]])
-    seen = box_visibility(sensor, reference, TWO)
+    seen = unweighted(sensor, reference, TWO)
     assert seen.share[0] == 0.0
     assert seen.mean_radius_m[0] == 20.0
     assert seen.share[1].isnan()
@@ -69,31 +73,46 @@ def test_a_box_without_reference_points_is_unknown_whatever_the_rig_saw_in_it():
 
 def test_the_nearest_sensor_point_may_lie_outside_the_box():
     """At 0.3 m in front of the box, below the threshold: seen, although no point of the rig is in the box."""
-    seen = box_visibility(torch.tensor([[7.7, 0.0, 1.0]]), torch.tensor([[8.0, 0.0, 1.0]]), TWO)
+    seen = unweighted(torch.tensor([[7.7, 0.0, 1.0]]), torch.tensor([[8.0, 0.0, 1.0]]), TWO)
     assert seen.share[0] == 1.0
     assert seen.mean_radius_m[0] == pytest.approx(0.3, abs=1e-6)
     assert seen.sensor_points[0] == 0
 
 
 def test_a_radius_of_exactly_the_threshold_counts_as_seen():
-    seen = box_visibility(torch.tensor([[8.5, 0.0, 1.0]]), torch.tensor([[8.0, 0.0, 1.0]]), TWO, threshold=0.5)
+    seen = unweighted(torch.tensor([[8.5, 0.0, 1.0]]), torch.tensor([[8.0, 0.0, 1.0]]), TWO, threshold=0.5)
     assert seen.share[0] == 1.0
 
 
 def test_a_rig_that_saw_nothing_is_blind():
-    seen = box_visibility(torch.empty(0, 3), torch.tensor([[10.0, 0.0, 1.0]]), TWO)
+    seen = unweighted(torch.empty(0, 3), torch.tensor([[10.0, 0.0, 1.0]]), TWO)
     assert seen.share[0] == 0.0
     assert seen.mean_radius_m[0] == math.inf
 
 
 def test_no_boxes_give_an_empty_answer():
-    seen = box_visibility(torch.rand(5, 3), torch.rand(5, 3), Boxes.from_rows(torch.empty(0, 7)))
+    seen = unweighted(torch.rand(5, 3), torch.rand(5, 3), Boxes.from_rows(torch.empty(0, 7)))
     assert len(seen) == 0
     assert seen.share.dtype == torch.float64
 
 
+def test_a_box_that_points_were_drawn_on_and_none_seen_is_hidden_and_one_without_is_not_sampled():
+    boxes = Boxes.from_rows(TWO.rows.repeat(2, 1), drawn_points=torch.tensor([0, 7, 9, 0]))
+    seen = unweighted(torch.rand(5, 3), torch.tensor([[10.0, 0.0, 1.0]]), boxes)
+    assert seen.known.tolist() == [True, False, True, False]
+    assert seen.hidden.tolist() == [False, True, False, False]
+    assert seen.select(torch.tensor([3, 1])).hidden.tolist() == [False, True]
+    # Where nobody says anything about drawing, as in a recording, nothing is known to be hidden.
+    assert not unweighted(torch.rand(5, 3), torch.empty(0, 3), TWO).hidden.any()
+
+
+def test_weights_cannot_be_forgotten():
+    with pytest.raises(TypeError, match="reference_weights"):
+        box_visibility(torch.rand(5, 3), torch.rand(5, 3), TWO)
+
+
 def test_selecting_keeps_the_columns_together():
-    seen = box_visibility(torch.rand(5, 3), torch.tensor([[10.0, 0.0, 1.0]]), TWO)
+    seen = unweighted(torch.rand(5, 3), torch.tensor([[10.0, 0.0, 1.0]]), TWO)
     one = seen.select(seen.known)
     assert len(one) == 1
     assert one.reference_points.tolist() == [1]
@@ -101,16 +120,16 @@ def test_selecting_keeps_the_columns_together():
 
 def test_a_frame_in_which_nobody_looked_for_objects_is_an_error_that_says_what_to_do():
     with pytest.raises(TypeError, match=r"boxes: Boxes are needed, .* got NoneType; SimulatedFrames\(.*boxes=True"):
-        box_visibility(torch.rand(5, 3), torch.rand(5, 3), None)
+        unweighted(torch.rand(5, 3), torch.rand(5, 3), None)
 
 
 def test_a_frame_without_a_reference_is_an_error_that_says_what_to_do():
     with pytest.raises(ValueError, match="reference: the frame has none, and visibility is measured against it; use"):
-        box_visibility(torch.rand(5, 3), None, TWO)
+        unweighted(torch.rand(5, 3), None, TWO)
 
 
 def test_without_a_reference_point_every_box_is_unknown_and_the_points_of_the_rig_count():
-    seen = box_visibility(TWO.centre_m[:1].repeat(5, 1), torch.empty(0, 3), TWO)
+    seen = unweighted(TWO.centre_m[:1].repeat(5, 1), torch.empty(0, 3), TWO)
     assert seen.share.isnan().all()
     assert seen.mean_radius_m.isnan().all()
     assert seen.reference_points.tolist() == [0] * len(TWO)
@@ -130,7 +149,7 @@ def test_without_a_reference_point_every_box_is_unknown_and_the_points_of_the_ri
     ],
 )
 def test_bad_input_is_refused(changes, message):
-    good = {"sensor": torch.rand(5, 3), "reference": torch.rand(5, 3), "boxes": TWO}
+    good = {"sensor": torch.rand(5, 3), "reference": torch.rand(5, 3), "boxes": TWO, "reference_weights": None}
     with pytest.raises(ValueError, match=message):
         box_visibility(**{**good, **changes})
 
@@ -139,7 +158,7 @@ def test_in_a_simulated_frame_what_lies_behind_the_rig_is_blind_and_what_is_seen
     # Level, it sees all around.
     reference = PaperReference(rows=512, columns=512, max_tilt_deg=0.0)
     frame = SimulatedFrames("highway", "front_roof_128", steps=1, seed=1, reference_sensor=reference, boxes=True)[0]
-    seen = box_visibility(frame.sensor, frame.reference, frame.boxes)
+    seen = unweighted(frame.sensor, frame.reference, frame.boxes)
     known = seen.known
     assert known.sum() >= 5
     assert torch.equal(seen.sensor_points, frame.boxes.hits["front_roof_128"])

@@ -118,6 +118,7 @@ def rows(**changes):
         ({"centre_m": torch.zeros(3, 3)}, ValueError, r"centre_m: shape \(2, 3\) is needed for 2 boxes; got \(3, 3\)"),
         ({"velocity_mps": torch.zeros(2, 3)}, ValueError, r"velocity_mps: shape \(2, 2\) is needed"),
         ({"ids": ("a",)}, ValueError, "ids: one entry for each of 2 boxes is needed; got 1"),
+        ({"drawn_points": torch.zeros(3)}, ValueError, r"drawn_points: shape \(2,\) is needed"),
         ({"hits": {"roof": torch.zeros(3)}}, ValueError, r"hits\['roof'\]: one entry for each of 2 boxes"),
         ({"yaw_rad": torch.zeros(2, dtype=torch.int64)}, TypeError, "yaw_rad: a floating-point torch tensor is needed"),
         ({"centre_m": [[0.0] * 3] * 2}, TypeError, "centre_m: a floating-point torch tensor is needed; got list"),
@@ -143,10 +144,11 @@ def test_a_yaw_in_degrees_is_warned_about_once_at_a_place():
     rows(yaw_rad=torch.tensor([-2 * math.pi, 2 * math.pi]))  # a full turn is none
 
 
-def test_unknown_velocities_are_nan_and_unknown_names_empty():
+def test_unknown_velocities_are_nan_unknown_names_empty_and_nothing_was_drawn():
     made = rows()
     assert made.velocity_mps.isnan().all()
     assert made.ids == made.categories == ("", "")
+    assert made.drawn_points.tolist() == [0, 0]
 
 
 def test_selecting_keeps_everything_together():
@@ -155,10 +157,12 @@ def test_selecting_keeps_everything_together():
         ids=("a", "b"),
         categories=("car", "bus"),
         hits={"r": torch.tensor([3, 4])},
+        drawn_points=torch.tensor([5, 6]),
     )
     for chosen in (made.select(torch.tensor([False, True])), made.select(torch.tensor([1])), made.of_category("bus")):
         assert (chosen.ids, chosen.categories, chosen.hits["r"].tolist()) == (("b",), ("bus",), [4])
         assert chosen.centre_m.tolist() == [[3.0, 4.0, 5.0]]
+        assert chosen.drawn_points.tolist() == [6]
     assert len(made.of_category("tram")) == 0
     assert len(NONE.of_category("car")) == 0
 
@@ -177,7 +181,7 @@ def frames():
 
 
 def same(a, b):
-    tensors = ("centre_m", "size_m", "yaw_rad", "velocity_mps")
+    tensors = ("centre_m", "size_m", "yaw_rad", "velocity_mps", "drawn_points")
     alike = all(torch.equal(getattr(a, name), getattr(b, name)) for name in tensors)
     return alike and a.ids == b.ids and a.categories == b.categories and torch.equal(a.hits["r"], b.hits["r"])
 
@@ -262,7 +266,9 @@ def test_a_world_without_objects_has_no_boxes_which_is_not_the_same_as_none():
     assert frame.boxes.hits["front_roof_32"].shape == (0,)
 
 
-MOVING = rows(velocity_mps=torch.ones(2, 2), ids=("a", "b"), hits={"r": torch.tensor([1, 2])})
+MOVING = rows(
+    velocity_mps=torch.ones(2, 2), ids=("a", "b"), hits={"r": torch.tensor([1, 2])}, drawn_points=torch.tensor([3, 4])
+)
 
 
 def test_boxes_move_with_their_frame():

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.stats import binomtest
 
-from torchcover.detection import Boxes, RecallByVisibility, bev_iou, match
+from torchcover.detection import Boxes, BoxVisibility, RecallByVisibility, bev_iou, match
 from torchcover.detection.recall_curve import Ratio
 
 VISIBILITY, DISTANCE = (0.2, 0.4, 0.6, 0.8), (20.0, 40.0, 60.0)
@@ -160,32 +160,35 @@ def random_frame(seed):
     false = torch.rand(4, 7, generator=generator) * torch.tensor([120.0, 60, 1, 4, 2, 1, 6]) + 0.3
     detections = torch.cat([truth + jitter, false])
     share = torch.rand(count, generator=generator).double()
-    share[torch.rand(count, generator=generator) < 0.2] = math.nan
+    share[torch.rand(count, generator=generator) < 0.3] = math.nan
+    drawn = torch.randint(0, 3, (count,), generator=generator)
+    seen = BoxVisibility(share, share, (~share.isnan()).long(), drawn, drawn, 0.4)
     own = torch.rand(count + 4, generator=generator).double()
-    return detections, Boxes.from_rows(truth), share, torch.rand(count + 4, generator=generator), own
+    return detections, Boxes.from_rows(truth), seen, torch.rand(count + 4, generator=generator), own
 
 
 def slow_counts(frames, scores_at):
     """Counts in nested loops."""
 
-    def cell(x, y, share):
-        line = 5 if math.isnan(share) else sum(share >= border for border in VISIBILITY)
+    def cell(x, y, share, drawn=0):
+        line = (5 if drawn else 6) if math.isnan(share) else sum(share >= border for border in VISIBILITY)
         return line, sum(math.hypot(x, y) >= border for border in DISTANCE)
 
-    objects = np.zeros((6, 4), dtype=int)
-    found, detected, true = (np.zeros((len(scores_at), 6, 4), dtype=int) for _ in range(3))
-    for detections, boxes, share, scores, own in frames:
+    objects = np.zeros((7, 4), dtype=int)
+    found, detected, true = (np.zeros((len(scores_at), 7, 4), dtype=int) for _ in range(3))
+    for detections, boxes, seen, scores, own in frames:
+        objects_seen = list(zip(seen.share.tolist(), seen.drawn_points.tolist(), strict=True))
         truth = boxes.rows.double().tolist()
         chosen = slow_match(detections.double().tolist(), scores.tolist(), truth, "distance", 2.0)
         for k, box in enumerate(truth):
-            objects[cell(*box[:2], float(share[k]))] += 1
+            objects[cell(*box[:2], *objects_seen[k])] += 1
         for n, box in enumerate(detections.double().tolist()):
             for s, least in enumerate(scores_at):
                 if float(scores[n]) >= least:
                     detected[s][cell(*box[:2], float(own[n]))] += 1
                     if chosen[n] >= 0:
                         true[s][cell(*box[:2], float(own[n]))] += 1
-                        found[s][cell(*truth[chosen[n]][:2], float(share[chosen[n]]))] += 1
+                        found[s][cell(*truth[chosen[n]][:2], *objects_seen[chosen[n]])] += 1
     return objects, found, detected, true
 
 
@@ -251,8 +254,8 @@ def test_bins_are_half_open_and_the_last_ones_reach_to_one_and_to_infinity():
     boxes = Boxes.from_rows(torch.tensor([row(10.0, 0.0), row(0.0, -9.99), row(6.0, 8.0), row(500.0, 0.0)]))
     metric.update(torch.empty(0, 7), boxes, torch.tensor([0.5, 0.499999, 1.0, math.nan]))
     result = metric.compute()
-    assert result.objects.tolist() == [[1, 0], [0, 2], [0, 1]]
-    assert result.visibility_bins == ("0-0.5", "0.5-1", "unknown")
+    assert result.objects.tolist() == [[1, 0], [0, 2], [0, 0], [0, 1]]
+    assert result.visibility_bins == ("0-0.5", "0.5-1", "hidden", "not sampled")
     assert result.distance_bins == ("0-10 m", "over 10 m")
 
 
@@ -261,7 +264,7 @@ def test_without_visibility_of_detections_their_precision_is_known_over_distance
     detections, boxes, share, scores, _ = FRAMES[1]
     metric.update(detections, boxes, share, scores)
     result = metric.compute()
-    assert result.over("visibility").precision.trials[0].tolist() == [0, 0, 0, 0, 0, len(detections)]
+    assert result.over("visibility").precision.trials[0].tolist() == [0] * 6 + [len(detections)]
     assert result.over("visibility").precision.value[0, :-1].isnan().all()
     assert result.over("distance").precision.trials.sum() == len(detections)
 

@@ -61,7 +61,7 @@ def test_one_rig(tmp_path):
     assert "front_roof_32: 2 steps" in repr(result)
     assert "mean blind spot" in repr(result)
     stem, figure = next(iter(result.maps()))
-    assert (stem, isinstance(figure, Figure)) == ("radius_m_ground", True)
+    assert (stem, isinstance(figure, Figure)) == ("radius_area_m_ground", True)
     files = result.save(tmp_path / "new" / "out")
     assert files[-1].name == "summary.json"
     assert all(path.is_file() for path in files)

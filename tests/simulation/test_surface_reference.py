@@ -13,18 +13,7 @@ from torchcover.data import SimulatedFrames, collate_frames
 from torchcover.simulation import Scenario, Simulator, SurfaceReference
 from torchcover.simulation.shapes import Mesh
 
-AHEAD = ((4.0, 24.0), (-5.0, 5.0))
-ALL_HEIGHTS = ((-3.0, 3.0),)
-EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
-FLOOR = {"name": "floor", "shape": {"type": "plane", "size_m": [400, 400]}}
-
-
-def box(size_m, **pose):
-    return {"name": "box", "shape": {"type": "box", "size_m": size_m}, "poses": [pose]}
-
-
-def scenario(*bodies, ego=EGO, **keys):
-    return Scenario.model_validate({"name": "s", "ego": ego, "bodies": bodies, **keys})
+from .small_worlds import AHEAD, ALL_HEIGHTS, EGO, FLOOR, agrees, box, scenario, sums
 
 
 def sheet_file(folder, triangles, name="sheet.ply"):
@@ -38,32 +27,6 @@ def sheet_file(folder, triangles, name="sheet.ply"):
 def rectangle(x, y, z=0.0):
     (x0, x1), (y0, y1) = x, y
     return [[[x0, y0, z], [x1, y0, z], [x1, y1, z]], [[x0, y0, z], [x1, y1, z], [x0, y1, z]]]
-
-
-@pytest.fixture
-def at(monkeypatch):
-    """Let every place be this one."""
-
-    def put(place_m):
-        monkeypatch.setattr(
-            "torchcover.simulation.surface_reference.position_in_shell", lambda *_: np.array(place_m, dtype=np.float64)
-        )
-
-    return put
-
-
-def sums(made, sensor, value=lambda points: np.ones(len(points)), steps=40, first=0):
-    """(steps,) sum over the points of weight times a value of them."""
-    simulator = Simulator(made, {}, sensor)
-    seen = [simulator.step(index) for index in range(first, first + steps)]
-    return np.array([(step.reference_weights.astype(np.float64) * value(step.reference)).sum() for step in seen])
-
-
-def agrees(samples, exact, within=0.02):
-    """The mean is the exact value within 4 standard errors, and these are small."""
-    error = samples.std(ddof=1) / math.sqrt(len(samples))
-    assert error <= within * abs(exact)
-    assert abs(samples.mean() - exact) <= 4 * error + 1e-5 * abs(exact), (samples.mean(), exact, error)
 
 
 def along_x(points):
@@ -205,8 +168,8 @@ def test_huge_faces_needles_and_faces_without_area_are_taken_as_they_are(at, tmp
 
 def test_threads_workers_and_pickling_change_nothing():
     made = Scenario.model_validate({"name": "u", "traffic": {"type": "urban", "duration_s": 1.0, "time_step_s": 0.5}})
-    sensor = SurfaceReference((AHEAD, ((0.0, 80.0), (-20.0, 20.0))), rays=30_000, places=2)
-    frames = SimulatedFrames(made, "front_roof_32", steps=4, seed=2, reference_sensor=sensor)
+    sensor = SurfaceReference((AHEAD, ((0.0, 80.0), (-20.0, 20.0))), rays=30_000, places=2, object_points=8)
+    frames = SimulatedFrames(made, "front_roof_32", steps=4, seed=2, reference_sensor=sensor, boxes=True)
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
@@ -221,6 +184,7 @@ def test_threads_workers_and_pickling_change_nothing():
         for other in others:
             assert torch.equal(frame.reference, other.reference)
             assert torch.equal(frame.reference_weights, other.reference_weights)
+            assert torch.equal(frame.boxes.drawn_points, other.boxes.drawn_points)
             assert frame.counts == other.counts
 
 
@@ -249,6 +213,7 @@ def test_the_surface_is_cut_once_a_world(monkeypatch):
         ({"bands_m": ((0.0, math.inf),)}, "bands_m: at least one"),
         ({"rays": 0}, "rays: at least 1 is needed; got 0"),
         ({"places": 0}, "places: at least 1 is needed; got 0"),
+        ({"object_points": -1}, "object_points: a number >= 0 is needed; got -1"),
         ({"shell_m": 0.0}, "shell_m: a positive thickness"),
         ({"max_range_m": math.nan}, "max_range_m: a positive distance"),
     ],

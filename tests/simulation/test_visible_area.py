@@ -41,7 +41,7 @@ def _scene(world, step):
     vehicle_T_world = invert(world.ego.trajectory.at(time_s))
     scene = EmbreeScene(robust=True)
     meshes = [world.ego.mesh, *(mesh.moved(vehicle_T_world) for mesh in world.static)]
-    meshes += [actor.mesh.moved(vehicle_T_world @ actor.trajectory.at(time_s)) for actor in world.actors]
+    meshes += [actor.mesh.moved(vehicle_T_world @ actor.trajectory.at(time_s)) for actor in world.objects]
     for mesh in meshes:
         TriangleMesh(scene, mesh.vertices_m.astype(np.float32), mesh.faces.astype(np.int32))
     return scene, 0

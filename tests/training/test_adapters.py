@@ -114,6 +114,12 @@ def test_a_data_batch_of_mmdetection3d():
         frames_of_data_batch(inputs, samples, vehicle_T_lidar=torch.eye(3))
 
 
+def test_by_area_too_a_process_that_was_dealt_nothing_evaluates():
+    metric = MMEngineCoverage({"grid": GRID, "square_metres": True})
+    assert all(math.isnan(value) for name, value in metric.evaluate(0).items() if "radius_m" in name)
+    assert metric.coverage.measure == "area"
+
+
 def test_mmengine_evaluates_it_as_any_of_its_metrics():
     """Built from a config by the registry, run by the real `Evaluator`, twice."""
     config = {

@@ -159,7 +159,9 @@ def random_frames(steps, seed, reference, name, keep_clouds):
         hits = {rig: points_in_boxes(cloud, boxes).box.bincount(minlength=8) for rig, cloud in sensors.items()}
         boxes = Boxes.from_rows(rows, categories=("car",) * 8, hits=hits)
         clouds = {**sensors, **{f"network {rig}": cloud for rig, cloud in sensors.items()}}
-        frames.append(Frame(clouds, points[:, 40:].reshape(-1, 3), index, f"frame {index}", boxes=boxes))
+        weights = torch.rand(160, generator=generator) + 0.1
+        reference = points[:, 40:].reshape(-1, 3)
+        frames.append(Frame(clouds, reference, index, "f", reference_weights=weights, weight_kind="m2", boxes=boxes))
     return frames
 
 

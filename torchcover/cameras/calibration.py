@@ -1,7 +1,7 @@
 """Reading calibrations: each reader turns one kind of source into a `Calibration`, from which a `Camera` is made."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from torchcover.files import parse_yaml
+from torchcover.cameras.entries import first, has_numbers, numbers, numbers_of, told, whole
+from torchcover.cameras.models import as_vector, check_image, check_model
+from torchcover.files import check_memory, decode, naming, parse_yaml, read_short_text, reads
 from torchcover.geometry import check_rigid, invert, rigid, rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 
@@ -23,11 +25,13 @@ _MODEL_NAMES = {
     "equidistant": "kannala_brandt",
     "fisheye": "kannala_brandt",
 }
+# Bytes in memory for each of the file.
+_JSON_GROWTH = 20
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What is known about a camera before it is checked: the arguments of `Camera`."""
+    """What is known about a camera: the arguments of `Camera`."""
 
     width: int
     height: int
@@ -87,7 +91,8 @@ def carla_pose(
     return rigid(rotation_from_euler(-yaw_deg, -pitch_deg, roll_deg), [x, -y, z]) @ LOOKING_FORWARD
 
 
-def read_ros(path: str | Path) -> Calibration:
+@reads("a camera_info file")
+def read_ros(path: Path) -> Calibration:
     """Read a ROS `camera_info` file, as camera_calibration writes it or as `topic echo` prints the message.
 
     Args:
@@ -98,25 +103,27 @@ def read_ros(path: str | Path) -> Calibration:
         The calibration; a file without coefficients is a pinhole.
 
     Raises:
-        ValueError: An entry is missing, or the distortion model is none of `plumb_bob`, `rational_polynomial`,
-            `equidistant` and `fisheye`.
+        FileNotFoundError: There is no such file.
+        BadFileError: An entry is missing or makes no camera, or the distortion model is none of `plumb_bob`,
+            `rational_polynomial`, `equidistant` and `fisheye`.
     """
     content = _read_yaml(path)
-    try:
-        size = int(_first(content, "image_width", "width")), int(_first(content, "image_height", "height"))
-        matrix = _numbers(_first(content, "camera_matrix", "k", "K"))
-        distortion = _numbers(_first(content, "distortion_coefficients", "d", "D"))
-        model = str(_first(content, "distortion_model"))
-    except KeyError as error:
-        raise ValueError(f"{path}: not a camera_info file: {error.args[0]} is missing") from error
-    if model not in _MODEL_NAMES:
-        raise ValueError(f"{path}: distortion_model {model!r} is unknown; allowed: {', '.join(_MODEL_NAMES)}")
-    name = str(content.get("camera_name", Path(path).stem))
-    return _distorted(name, size, matrix.reshape(3, 3), _MODEL_NAMES[model], distortion)
+    size = whole(content, "image_width", "width"), whole(content, "image_height", "height")
+    matrix = numbers(content, "camera_matrix", "k", "K")
+    if matrix.size != 9:
+        raise ValueError(f"the camera matrix has 9 numbers; got {matrix.size}")
+    distortion = numbers(content, "distortion_coefficients", "d", "D")
+    _, model = first(content, "distortion_model")
+    if not isinstance(model, str) or model not in _MODEL_NAMES:
+        raise ValueError(f"distortion_model {told(model)} is unknown; allowed: {', '.join(_MODEL_NAMES)}")
+    name = content.get("camera_name")
+    name = name if isinstance(name, str) else path.stem
+    return _distorted(name, size, matrix.reshape(3, 3), _MODEL_NAMES[model], distortion.ravel())
 
 
+@reads("an OpenCV calibration")
 def read_opencv(
-    path: str | Path,
+    path: Path,
     *,
     matrix_key: str = "camera_matrix",
     distortion_key: str = "distortion_coefficients",
@@ -136,21 +143,23 @@ def read_opencv(
         The calibration.
 
     Raises:
-        ValueError: An entry is missing; the message lists those that the file has.
+        FileNotFoundError: There is no such file.
+        BadFileError: An entry is missing, and the message lists those that the file has; or makes no camera.
     """
     content = _read_yaml(path)
     wanted = [matrix_key, distortion_key] + ([] if size else ["image_width", "image_height"])
     missing = [key for key in wanted if key not in content]
     if missing:
-        raise ValueError(f"{path}: {', '.join(missing)} not in the file; it holds {', '.join(content)}")
-    size = size or (int(content["image_width"]), int(content["image_height"]))
+        raise ValueError(f"{', '.join(missing)} not in the file; it holds {', '.join(map(str, content))}")
+    size = size or (whole(content, "image_width"), whole(content, "image_height"))
     model = model or ("kannala_brandt" if content.get("fisheye_model") else "brown_conrady")
-    matrix, distortion = _matrix(content[matrix_key]), _matrix(content[distortion_key])
-    return _distorted(Path(path).stem, size, matrix, model, distortion.ravel())
+    matrix, distortion = numbers(content, matrix_key), numbers(content, distortion_key)
+    return _distorted(path.stem, size, matrix, model, distortion.ravel())
 
 
+@reads("a KITTI calibration")
 def read_kitti(
-    path: str | Path, camera: int, *, width: int, height: int, vehicle_T_lidar: ArrayLike | None = None
+    path: Path, camera: int, *, width: int, height: int, vehicle_T_lidar: ArrayLike | None = None
 ) -> Calibration:
     """Read one camera of a KITTI object or odometry calibration file. Its images are rectified: a pinhole.
 
@@ -166,23 +175,24 @@ def read_kitti(
         The calibration.
 
     Raises:
-        ValueError: An entry is missing or has another length.
+        FileNotFoundError: There is no such file.
+        BadFileError: An entry is missing, has another length, or makes no camera.
     """
-    lines = (line.split(":", 1) for line in Path(path).read_text().splitlines() if ":" in line)
+    lines = (line.split(":", 1) for line in read_short_text(path).splitlines() if ":" in line)
     table = {key.strip(): value.split() for key, value in lines}
-    lidar_key = "Tr_velo_to_cam" if "Tr_velo_to_cam" in table else "Tr"
-    for key in (f"P{camera}", lidar_key):
-        if len(table.get(key, [])) != 12:
-            raise ValueError(f"{path}: {key} with 12 numbers is needed; the file holds {', '.join(table)}")
-    P = np.array(table[f"P{camera}"], dtype=np.float64).reshape(3, 4)
+    P = numbers_of(table, f"P{camera}", 12).reshape(3, 4)
+    intrinsics = split_matrix(P[:, :3], f"P{camera}")
+    if 0.0 in intrinsics[:2]:
+        raise ValueError(f"P{camera} has no focal length; got {table[f'P{camera}']}")
     # P = K [I | t]: the rectified cameras differ from each other by a translation only.
     camera_T_rectified = rigid(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3]))
-    rotation = np.array(table.get("R0_rect", np.eye(3).ravel()), dtype=np.float64).reshape(3, 3)
-    reference_T_lidar = np.vstack([np.array(table[lidar_key], dtype=np.float64).reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
+    rotation = numbers_of(table, "R0_rect", 9).reshape(3, 3) if "R0_rect" in table else np.eye(3)
+    lidar = numbers_of(table, "Tr_velo_to_cam" if "Tr_velo_to_cam" in table else "Tr", 12)
+    reference_T_lidar = np.vstack([lidar.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])
     camera_T_lidar = camera_T_rectified @ rigid(rotation, np.zeros(3)) @ reference_T_lidar
     vehicle_T_lidar = check_rigid(np.eye(4) if vehicle_T_lidar is None else vehicle_T_lidar, "vehicle_T_lidar")
-    pose = vehicle_T_lidar @ invert(check_rigid(camera_T_lidar, f"{path}: P{camera} from the lidar"))
-    return Calibration(width, height, *split_matrix(P[:, :3], str(path)), vehicle_T_camera=pose, name=f"P{camera}")
+    pose = vehicle_T_lidar @ invert(check_rigid(camera_T_lidar, f"P{camera} from the lidar"))
+    return _checked(Calibration(width, height, *intrinsics, vehicle_T_camera=pose, name=f"P{camera}"))
 
 
 def read_nuscenes(
@@ -201,55 +211,63 @@ def read_nuscenes(
         The calibration, placed in nuScenes' ego frame, whose origin lies under the rear axle.
 
     Raises:
-        ValueError: No such camera, or several that differ.
+        FileNotFoundError: One of the tables is missing.
+        BadFileError: Not such tables, no such camera, several that differ, or one that cannot be.
     """
     folder = Path(folder)
-    channels = {row["token"]: row["channel"] for row in json.loads((folder / "sensor.json").read_text())}
-    table = json.loads((folder / "calibrated_sensor.json").read_text())
-    rows = [row for row in table if channels.get(row["sensor_token"]) == channel and token in (None, row["token"])]
-    if not rows or not rows[0]["camera_intrinsic"]:
-        raise ValueError(
-            f"{folder}: no calibrated camera {channel!r}, token {token}; channels: {sorted(channels.values())}"
-        )
-    keys = ("camera_intrinsic", "rotation", "translation")
-    if any(row[key] != rows[0][key] for row in rows for key in keys):
-        tokens = ", ".join(row["token"] for row in rows)
-        raise ValueError(f"{folder}: {len(rows)} calibrations of {channel!r}; pass the token of one of them: {tokens}")
-    matrix, rotation, translation = (rows[0][key] for key in keys)
-    pose = rigid(rotation_from_quaternion(rotation), translation)
-    return Calibration(width, height, *split_matrix(matrix, channel), vehicle_T_camera=pose, name=channel)
+    table = _read_table(folder / "calibrated_sensor.json", ("token", "sensor_token"))
+    channels = {row["token"]: row["channel"] for row in _read_table(folder / "sensor.json", ("token", "channel"))}
+    with naming(folder, "nuScenes' tables"):
+        rows = [row for row in table if channels.get(row["sensor_token"]) == channel and token in (None, row["token"])]
+        if not rows or not rows[0].get("camera_intrinsic"):
+            raise ValueError(f"no calibrated camera {channel!r}, token {token}; channels: {sorted(channels.values())}")
+        keys = ("camera_intrinsic", "rotation", "translation")
+        if any(row.get(key) != rows[0].get(key) for row in rows for key in keys):
+            tokens = ", ".join(row["token"] for row in rows)
+            raise ValueError(f"{len(rows)} calibrations of {channel!r}; pass the token of one of them: {tokens}")
+        matrix, rotation, translation = (rows[0].get(key) for key in keys)
+        if not (isinstance(matrix, list) and len(matrix) == 3 and all(has_numbers(row, 3) for row in matrix)):
+            raise ValueError(f"the camera_intrinsic of {channel!r} has three rows of three numbers; got {told(matrix)}")
+        if not (has_numbers(rotation, 4) and has_numbers(translation, 3)):
+            raise ValueError(
+                f"{channel!r} needs a rotation of four numbers and a translation of three; "
+                f"got {told(rotation)}, {told(translation)}"
+            )
+        pose = check_rigid(rigid(rotation_from_quaternion(rotation), translation), f"{channel!r}")
+        intrinsics = split_matrix(matrix, channel)
+        return _checked(Calibration(width, height, *intrinsics, vehicle_T_camera=pose, name=channel))
 
 
-def _read_yaml(path: str | Path) -> dict[str, Any]:
-    try:
-        content = parse_yaml(Path(path).read_text())
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+def _read_yaml(path: Path) -> dict[str, Any]:
+    content = parse_yaml(read_short_text(path))
     if not isinstance(content, dict):
-        raise ValueError(f"{path}: a mapping of names to values is needed; got {type(content).__name__}")
+        raise ValueError(f"a mapping of names to values is needed; got {type(content).__name__}")
     return content
 
 
-def _first(content: Mapping[str, Any], *names: str) -> Any:  # noqa: ANN401
-    for name in names:
-        if name in content:
-            return content[name]
-    raise KeyError(" or ".join(names))
+@reads("a nuScenes table")
+def _read_table(path: Path, keys: Sequence[str]) -> list[dict[str, Any]]:
+    """Rows of a table, each with these keys, whose values are text."""
+    check_memory(_JSON_GROWTH * path.stat().st_size)
+    try:
+        table = json.loads(decode(path.read_bytes()))
+    except json.JSONDecodeError as error:
+        raise ValueError(f"not JSON: {error}") from error
+    rows = table if isinstance(table, list) else [table]
+    if not all(isinstance(row, dict) and all(isinstance(row.get(key), str) for key in keys) for row in rows):
+        raise ValueError(f"a list of objects is needed, each with the texts {' and '.join(keys)}")
+    return rows
 
 
-def _numbers(value: Any) -> Any:  # noqa: ANN401
-    """The list of a matrix that is written as {rows, cols, data}, or as the list itself."""
-    return np.asarray(value["data"] if isinstance(value, dict) else value, dtype=np.float64)
-
-
-def _matrix(value: Any) -> Any:  # noqa: ANN401
-    numbers = _numbers(value)
-    return numbers.reshape(value["rows"], value["cols"]) if isinstance(value, dict) else numbers
-
-
-def _distorted(
-    name: str, size: tuple[int, int], matrix: ArrayLike, model: str, coefficients: Sequence[float]
-) -> Calibration:
+def _distorted(name: str, size: tuple[int, int], matrix: Matrix, model: str, coefficients: Matrix) -> Calibration:
     """A distorted camera; a file without any coefficient means a pinhole."""
     values = tuple(float(value) for value in coefficients)
-    return Calibration(*size, *split_matrix(matrix, name), model if values else "pinhole", values, name=name)
+    model = model if values else "pinhole"
+    return _checked(Calibration(*size, *split_matrix(matrix, name), model, values, name=name))
+
+
+def _checked(source: Calibration) -> Calibration:
+    """Refuse what no camera can be made of, here, where the file is known."""
+    check_image(source.name, source.width, source.height, as_vector([source.fx, source.fy, source.cx, source.cy]))
+    check_model(source.model, source.coefficients)
+    return source

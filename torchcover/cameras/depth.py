@@ -3,6 +3,7 @@
 Every reader returns metres as float32, with infinity where nothing was hit within the sensor's range.
 """
 
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchcover.files import DEFLATE_MAX_RATIO, NpyHeader, check_memory, read_npy, reads
+
 CARLA_FAR_M = 1000.0
 _CARLA_FULL_CODE = 2**24 - 1
 _CHANNELS = ("BGRA", "RGBA", "BGR", "RGB")
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+# Bits of a channel and colour type -> bytes of a pixel.
+_PNG_BYTES = {(8, 2): 3, (8, 6): 4, (16, 0): 2}
+# At its largest: as stored and copied, the code, float64 and float32 metres.
+_BYTES_PER_PIXEL = 32
 
 
 def decode_carla(image: NDArray[np.uint8], order: str) -> Tensor:
@@ -42,13 +49,16 @@ def decode_carla(image: NDArray[np.uint8], order: str) -> Tensor:
             f"CARLA depth in order {order!r} is an (H, W, {len(order)}) uint8 image; "
             f"got shape {image.shape}, dtype {image.dtype}"
         )
-    red, green, blue = (image[..., order.index(channel)].astype(np.int64) for channel in "RGB")
-    code = red + 256 * green + 65536 * blue
-    metres = np.where(code == _CARLA_FULL_CODE, np.inf, code * (CARLA_FAR_M / _CARLA_FULL_CODE))
+    code = np.zeros(image.shape[:2], dtype=np.int32)
+    for bits, channel in enumerate("RGB"):
+        code += image[..., order.index(channel)].astype(np.int32) << 8 * bits
+    metres = code * (CARLA_FAR_M / _CARLA_FULL_CODE)
+    metres[code == _CARLA_FULL_CODE] = np.inf
     return torch.from_numpy(metres.astype(np.float32))
 
 
-def read_depth(path: str | Path, *, metres_per_unit: float | None = None) -> Tensor:
+@reads("a depth image")
+def read_depth(path: Path, *, metres_per_unit: float | None = None) -> Tensor:
     """Read a depth image.
 
     Args:
@@ -60,57 +70,74 @@ def read_depth(path: str | Path, *, metres_per_unit: float | None = None) -> Ten
         (H, W) float32 depth in metres. The largest code of an integer image means "out of range" and becomes infinity.
 
     Raises:
-        ValueError: An encoding that is not one of these, a missing or superfluous scale, or not one channel.
+        FileNotFoundError: There is no such file.
+        IsADirectoryError: A folder.
+        BadFileError: An encoding that is not one of these, a missing or superfluous scale, not one channel, damage, or
+            an image that takes more memory than `TORCHCOVER_MAX_FILE_GB` allows.
         ImportError: An EXR file without the optional package `OpenEXR`.
     """
-    path = Path(path)
     if path.suffix.lower() not in _READERS:
-        raise ValueError(f"{path}: a depth image is one of {', '.join(_READERS)}; got {path.suffix!r}")
+        raise ValueError(f"a depth image is one of {', '.join(_READERS)}; got {path.suffix!r}")
     values = _READERS[path.suffix.lower()](path)
     if values.ndim == 3 and values.dtype == np.uint8:
-        _refuse_scale(path, metres_per_unit, "CARLA's 24-bit encoding")
+        _refuse_scale(metres_per_unit, "CARLA's 24-bit encoding")
         return decode_carla(values, "RGBA" if values.shape[2] == 4 else "RGB")
-    if values.ndim != 2:
-        raise ValueError(f"{path}: a depth image has shape (H, W); got {values.shape}")
+    _check_shape(values.shape)
     if np.issubdtype(values.dtype, np.floating):
-        _refuse_scale(path, metres_per_unit, f"{values.dtype} metres")
+        _refuse_scale(metres_per_unit, f"{values.dtype} metres")
         return torch.from_numpy(values.astype(np.float32))
-    return _scaled(path, values, metres_per_unit)
+    return _scaled(values, metres_per_unit)
 
 
-def _refuse_scale(path: Path, scale: float | None, encoding: str) -> None:
+def _refuse_scale(scale: float | None, encoding: str) -> None:
     if scale is not None:
-        raise ValueError(f"{path}: holds {encoding}, which takes no metres_per_unit; got {scale}")
+        raise ValueError(f"holds {encoding}, which takes no metres_per_unit; got {scale}")
 
 
-def _scaled(path: Path, values: NDArray[Any], scale: float | None) -> Tensor:
+def _check_shape(shape: tuple[int, ...]) -> None:
+    if len(shape) != 2 or 0 in shape:
+        raise ValueError(f"a depth image has shape (H, W); got {shape}")
+
+
+def _scaled(values: NDArray[Any], scale: float | None) -> Tensor:
     if not np.issubdtype(values.dtype, np.integer):
-        raise ValueError(f"{path}: depths are integers or floats; got {values.dtype}")
+        raise ValueError(f"depths are integers or floats; got {values.dtype}")
     if scale is None or not 0.0 < scale < np.inf:
-        raise ValueError(f"{path}: {values.dtype} depth needs metres_per_unit > 0 (0.001 for millimetres); got {scale}")
+        raise ValueError(f"{values.dtype} depth needs metres_per_unit > 0 (0.001 for millimetres); got {scale}")
     metres = values.astype(np.float64) * scale
-    return torch.from_numpy(np.where(values == np.iinfo(values.dtype).max, np.inf, metres).astype(np.float32))
+    metres[values == np.iinfo(values.dtype).max] = np.inf
+    return torch.from_numpy(metres.astype(np.float32))
 
 
 def _read_png(path: Path) -> NDArray[Any]:
     """(H, W, 3 or 4) uint8 or (H, W) uint16; the header decides, because Pillow would narrow 16-bit colour silently."""
     from PIL import Image
 
-    header = path.read_bytes()[:26]
-    bits, colour = (header[24], header[25]) if len(header) == 26 and header.startswith(_PNG_SIGNATURE) else (0, 0)
-    if (bits, colour) not in ((8, 2), (8, 6), (16, 0)):
+    with path.open("rb") as file:
+        header = file.read(26)
+    known = len(header) == 26 and header.startswith(_PNG_SIGNATURE)
+    width, height, bits, colour = struct.unpack(">IIBB", header[16:]) if known else (0, 0, 0, 0)
+    if (bits, colour) not in _PNG_BYTES:
         raise ValueError(
-            f"{path}: a depth PNG is 8-bit RGB or RGBA (CARLA) or 16-bit grey; got {bits} bits, colour type {colour} "
+            f"a depth PNG is 8-bit RGB or RGBA (CARLA) or 16-bit grey; got {bits} bits, colour type {colour} "
             "(CARLA's logarithmic 8-bit images are for the eye and hold no depth)"
         )
+    claimed_bytes, file_bytes = width * height * _PNG_BYTES[bits, colour], path.stat().st_size
+    if claimed_bytes > DEFLATE_MAX_RATIO * file_bytes:
+        raise ValueError(f"truncated: the header claims {width}x{height} pixels, of which {file_bytes} bytes are not")
+    check_memory(width * height * _BYTES_PER_PIXEL)
     with Image.open(path) as image:
         return np.asarray(image).astype(np.uint8 if bits == 8 else np.uint16)
 
 
 def _read_npy(path: Path) -> NDArray[Any]:
-    values: NDArray[Any] = np.load(path, allow_pickle=False)
-    if values.ndim != 2:
-        raise ValueError(f"{path}: a depth image has shape (H, W); got {values.shape}")
+    def check(header: NpyHeader) -> None:
+        _check_shape(header.shape)
+        if header.dtype.kind not in "fiu":
+            raise ValueError(f"depths are integers or floats; got {header.dtype}")
+
+    values = read_npy(path, check)
+    check_memory(values.size * _BYTES_PER_PIXEL)
     return values
 
 
@@ -119,11 +146,21 @@ def _read_exr(path: Path) -> NDArray[Any]:
         import OpenEXR  # type: ignore[import-not-found, unused-ignore]
     except ImportError as error:
         raise ImportError(f"{path}: reading EXR needs the package OpenEXR: pip install 'torchcover[exr]'") from error
-    with OpenEXR.File(str(path)) as file:
-        channels = file.channels()
+    # The header alone first: with the pixels, memory is reserved for as many as it claims.
+    with OpenEXR.File(str(path), header_only=True) as file:
+        headers = [file.header(part) for part in range(len(file.parts))]
+        channels = [channel.name for header in headers for channel in header["channels"]]
         if len(channels) != 1:
-            raise ValueError(f"{path}: a depth EXR has one channel; got {', '.join(channels)}")
-        return np.array(next(iter(channels.values())).pixels)
+            raise ValueError(f"a depth EXR has one channel; got {', '.join(channels)[:80] or 'none'}")
+        low, high = headers[0]["dataWindow"]
+        width, height = (int(last) - int(first) + 1 for first, last in zip(low, high, strict=True))
+    check_memory(width * height * _BYTES_PER_PIXEL)
+    with OpenEXR.File(str(path)) as file:
+        # It prints what is wrong with the pixels, and leaves them out.
+        values = [np.array(channel.pixels) for part in file.parts for channel in part.channels.values()]
+    if len(values) != 1 or values[0].shape != (height, width):
+        raise ValueError(f"truncated or damaged: {width}x{height} pixels are claimed and cannot be read")
+    return values[0]
 
 
 _READERS: dict[str, Callable[[Path], NDArray[Any]]] = {".png": _read_png, ".npy": _read_npy, ".exr": _read_exr}

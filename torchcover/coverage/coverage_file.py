@@ -5,6 +5,7 @@ no step of theirs has probed, are lists of what was probed.
 """
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -19,9 +20,11 @@ from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import Quantity
+from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads
 
 FORMAT_VERSION = 3
 Arrays = dict[str, NDArray[Any]]
+SPREAD = ("block_probed_steps", "block_sums", "area_m2", "area_sums")
 
 
 class CoverageParts(TypedDict):
@@ -67,25 +70,35 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
 
 
+@reads("a saved coverage")
 def read_coverage(path: Path) -> CoverageParts:
     """Read what `write_coverage` wrote.
 
     Raises:
         FileNotFoundError: No such file.
-        ValueError: Not a coverage file, a damaged one, or one of another version.
+        IsADirectoryError: A folder.
+        BadFileError: Not a coverage file, a damaged one, one of another version, or one that takes more memory than
+            `TORCHCOVER_MAX_FILE_GB` allows.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such coverage file")
     try:
-        header, arrays = _read_npz(path)
+        arrays = read_npz(path, _check_kind)
+        header: dict[str, Any] = json.loads(str(arrays.pop("header")))
         version = header.pop("format")
         parts = _parts(header, arrays) if version == FORMAT_VERSION else None
+    except (TooLargeError, MemoryError):
+        raise
     except Exception as error:  # damage shows anywhere: in the zip, zlib, NumPy, JSON, or as a missing part
         reason = str(error) or type(error).__name__
-        raise ValueError(f"{path}: not a coverage file as Coverage.save writes it ({reason})") from error
+        raise ValueError(f"not a coverage file as Coverage.save writes it ({reason})") from error
     if parts is None:
-        raise ValueError(f"{path}: coverage format {version}; this torchcover reads format {FORMAT_VERSION}")
+        raise ValueError(f"coverage format {version}; this torchcover reads format {FORMAT_VERSION}")
     return parts
+
+
+def _check_kind(header: NpyHeader) -> None:
+    """Numbers, and one text: the header."""
+    if header.dtype.kind not in "fiuU":
+        raise ValueError(f"an array of {header.dtype}")
 
 
 def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
@@ -96,6 +109,7 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
     for name in ("probed_steps", "points", *(quantity.key for quantity in quantities)):
         if arrays[name].shape != grid.shape:
             raise ValueError(f"{name} has shape {arrays[name].shape}, the grid {grid.shape}")
+    _check_spread(grid, arrays)
     return {
         "grid": grid,
         "thresholds": tuple(header["thresholds"]),
@@ -122,14 +136,10 @@ def _listed(blocks: Blocks) -> Arrays:
 
 
 def _blocks(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> Blocks:
-    shape = (header["blocks"], *grid.shape)
-    where = torch.from_numpy(arrays["block_cell"].astype(np.int64))
-    listed = torch.from_numpy(arrays["block_sums"])
-    probed_steps = torch.zeros(shape, dtype=torch.int64)
-    probed_steps.view(-1)[where] = torch.from_numpy(arrays["block_probed_steps"])
-    sums = torch.zeros((len(listed), *shape), dtype=torch.float64)
-    sums.view(len(listed), -1)[:, where] = listed
-    return Blocks(torch.from_numpy(arrays["block_steps"]), probed_steps, sums.movedim(0, 1))
+    steps, cells = _block_steps(header, arrays["block_steps"]), arrays["block_cell"]
+    shape = (len(steps), *grid.shape)
+    sums = _spread(cells, arrays["block_sums"], shape)
+    return Blocks(steps, _spread(cells, arrays["block_probed_steps"], shape), sums.movedim(0, 1))
 
 
 def _listed_area(area: AreaSums) -> Arrays:
@@ -144,16 +154,35 @@ def _listed_area(area: AreaSums) -> Arrays:
 
 
 def _area(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> AreaSums:
-    shape = (header["blocks"], *grid.shape)
-    where, listed = torch.from_numpy(arrays["area_cell"]), torch.from_numpy(arrays["area_sums"])
-    m2, sums = (torch.zeros(size, dtype=torch.float64) for size in (shape, (len(listed), *shape)))
-    m2.view(-1)[where] = torch.from_numpy(arrays["area_m2"])
-    sums.view(len(listed), -1)[:, where] = listed
-    return AreaSums(torch.from_numpy(arrays["area_steps"]), m2, sums.movedim(0, 1))
+    steps, cells = _block_steps(header, arrays["area_steps"]), arrays["area_cell"]
+    shape = (len(steps), *grid.shape)
+    sums = _spread(cells, arrays["area_sums"], shape)
+    return AreaSums(steps, _spread(cells, arrays["area_m2"], shape), sums.movedim(0, 1))
 
 
-def _read_npz(path: Path) -> tuple[dict[str, Any], Arrays]:
-    with path.open("rb") as file, np.load(file, allow_pickle=False) as parts:
-        arrays = dict(parts)
-    header: dict[str, Any] = json.loads(str(arrays.pop("header")))
-    return header, arrays
+def _block_steps(header: dict[str, Any], steps: NDArray[Any]) -> Tensor:
+    if steps.shape != (header["blocks"],):
+        raise ValueError(f"the steps of {header['blocks']} blocks have shape {steps.shape}")
+    return torch.from_numpy(steps)
+
+
+def _check_spread(grid: BevGrid, arrays: Arrays) -> None:
+    """The lists of the blocks become arrays over all cells of all blocks."""
+    blocks = max((len(arrays[name]) for name in ("block_steps", "area_steps") if name in arrays), default=0)
+    listed = [arrays[name] for name in SPREAD if name in arrays]
+    spread_bytes = blocks * grid.cells * sum(math.prod(one.shape[:-1]) * one.itemsize for one in listed)
+    check_memory(spread_bytes + sum(array.nbytes for array in arrays.values()))
+
+
+def _spread(cells: NDArray[Any], listed: NDArray[Any], shape: tuple[int, ...]) -> Tensor:
+    """(..., *shape): `listed` (..., N) at the N cells of blocks that it belongs to, and zeros elsewhere."""
+    leading = listed.shape[:-1]
+    if (
+        cells.ndim != 1
+        or listed.shape[-1] != len(cells)
+        or not 0 <= cells.min(initial=0) <= cells.max(initial=0) < math.prod(shape)
+    ):
+        raise ValueError(f"sums of shape {listed.shape} at {cells.shape} cells do not fit into {shape}")
+    spread = np.zeros((*leading, math.prod(shape)), listed.dtype)
+    spread[..., cells] = listed
+    return torch.from_numpy(spread.reshape(*leading, *shape))

@@ -226,9 +226,10 @@ class Coverage:
 
         Raises:
             FileNotFoundError: No such file.
-            ValueError: Not a coverage file, a damaged one, or one of another version.
+            IsADirectoryError: A folder.
+            BadFileError: Not a coverage file, a damaged one, one of another version, or too large a one.
         """
-        return cls(**read_coverage(Path(path)))
+        return cls(**read_coverage(path))
 
     def _summarise(self, region: Region, height: str) -> RegionSummary:
         cells, band = region.mask(self.grid), list(self.grid.heights).index(height)

@@ -7,7 +7,7 @@ from torchcover.data.clouds import read_cloud
 from torchcover.data.frame import Frame, FrameBatch, collate_frames
 from torchcover.data.recorded import RecordedFrames
 from torchcover.data.recordings import FORMATS, RecordingFormat, open_recording
-from torchcover.data.reference import DEFAULT_REFERENCE, GRID_X_M, GRID_Y_M, reference_called
+from torchcover.data.reference import DEFAULT_REFERENCE, GRID_X_M, GRID_Y_M, reference_called, reference_of_objects
 from torchcover.data.simulated import SimulatedFrames
 from torchcover.data.source import FrameSource
 
@@ -30,6 +30,7 @@ __all__ = [
     "open_recording",
     "read_cloud",
     "reference_called",
+    "reference_of_objects",
     "rotate",
     "scale",
 ]

@@ -37,7 +37,9 @@ def rotate(frame: Frame, yaw_rad: float) -> Frame:
 
 
 def scale(frame: Frame, factor: float) -> Frame:
-    """Make everything larger about the vehicle's origin: places, sizes, velocities. Blind spot radii grow as well.
+    """Make everything larger about the vehicle's origin: places, sizes, velocities, weights in square metres.
+
+    Blind spot radii grow as well.
 
     Example:
         >>> frame = Frame({"rig": torch.tensor([[5.0, 0.0, 1.0]])}, torch.zeros(1, 3), index=0, name="a")
@@ -107,10 +109,14 @@ class Augmentation:
 
 def _moved(frame: Frame, similarity: Tensor) -> Frame:
     """Apply a (3, 3) float64 matrix that keeps shapes and z upright: a rotation about z, a mirror, a scale."""
+    weights = frame.reference_weights
+    if weights is not None and frame.weight_kind == "m2":
+        weights = weights * float(similarity[2, 2]) ** 2
     return replace(
         frame,
         clouds={name: _times(similarity, cloud) for name, cloud in frame.clouds.items()},
         reference=_times(similarity, frame.reference),
+        reference_weights=weights,
         boxes=None if frame.boxes is None else _moved_boxes(frame.boxes, similarity),
     )
 

@@ -1,24 +1,21 @@
 """Read one point cloud from one file, whatever its format."""
 
-import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from torchcover.data.formats.arrays import Points, read_npy, read_npz, read_records
+from torchcover.data.formats.arrays import Points, read_archive, read_array, read_records
 from torchcover.data.formats.pcd import read_pcd
 from torchcover.data.formats.ply import read_ply
 from torchcover.data.formats.text import read_text
-
-# zipfile and NumPy quote what they choke on, which may be the whole file.
-MAX_REASON_CHARS = 500
+from torchcover.files import reads
 
 # Suffix -> reader. A reader returns (N, 3) float32 or float64 and raises ValueError without naming the file.
 READERS: dict[str, Callable[[Path], Points]] = {
-    ".npy": read_npy,
-    ".npz": read_npz,
+    ".npy": read_array,
+    ".npz": read_archive,
     ".bin": partial(read_records, columns=4),  # KITTI: x y z intensity
     ".pcd.bin": partial(read_records, columns=5),  # nuScenes: x y z intensity ring; no PCD despite its name
     ".pcd": read_pcd,
@@ -39,7 +36,8 @@ def split_name(name: str) -> tuple[str, str]:
     return name[: len(name) - len(suffix)], suffix
 
 
-def read_cloud(path: str | os.PathLike[str]) -> Points:
+@reads("a point cloud")
+def read_cloud(path: Path) -> Points:
     """Read a point cloud; the suffix says how.
 
     `.npy`; `.npz` (the array `points`, or the only one); `.bin` (KITTI: x y z intensity, float32); `.pcd.bin`
@@ -57,8 +55,10 @@ def read_cloud(path: str | os.PathLike[str]) -> Points:
     Raises:
         FileNotFoundError: There is no such file.
         IsADirectoryError: A folder.
-        ValueError: Not a cloud: an unknown suffix, an empty or truncated file, other content than the suffix says, a
-            header that claims more than the file holds, another shape or type, or points of which none is finite.
+        BadFileError: Not a cloud: an unknown suffix, an empty or truncated file, other content than the suffix says,
+            rows of different width, a header that claims more or less than the file holds, another shape or type, more
+            memory than `TORCHCOVER_MAX_FILE_GB` allows, or points of which none is finite. `.bin` and `.pcd.bin` have
+            no header: only numbers that cannot be coordinates, or bytes left over, give a wrong one away.
 
     Example:
         >>> import tempfile
@@ -68,21 +68,11 @@ def read_cloud(path: str | os.PathLike[str]) -> Points:
         ...     read_cloud(path).tolist()
         [[513248.125, 5403655.25, 12.5]]
     """
-    path = Path(path)
-    if path.is_dir():
-        raise IsADirectoryError(f"{path}: a folder; a cloud is one file ({', '.join(READERS)})")
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: no such file")
     _, suffix = split_name(path.name)
     if not suffix:
-        raise ValueError(f"{path}: no reader for this suffix; allowed are {', '.join(READERS)}")
-    if path.stat().st_size == 0:
-        raise ValueError(f"{path}: an empty file (0 bytes); a cloud without points needs at least a header")
-    try:
-        points = READERS[suffix](path)
-    except ValueError as error:
-        raise ValueError(f"{path}: {' '.join(str(error).split())[:MAX_REASON_CHARS]}") from error
+        raise ValueError(f"no reader for this suffix; allowed are {', '.join(READERS)}")
+    points = READERS[suffix](path)
     if len(points) and not np.isfinite(points).all(axis=1).any():
-        raise ValueError(f"{path}: none of the {len(points)} points is finite; at least one has to be")
+        raise ValueError(f"none of the {len(points)} points is finite; at least one has to be")
     # Native byte order, contiguous and the caller's own: readers hand out views of buffers.
     return np.array(points, dtype=points.dtype.newbyteorder("="), order="C")

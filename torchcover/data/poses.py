@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from torchcover.files import parse_yaml
+from torchcover.files import parse_yaml, read_short_text, reads
 from torchcover.geometry.rigid import Matrix, check_rigid
 
 ALLOWED = "allowed are sensor, or rigs by name, and reference, each with a 4x4 vehicle_T_sensor"
@@ -34,27 +34,25 @@ def read_poses(path: Path) -> dict[str, Matrix]:
         `sensor`, `rigs/NAME` or `reference` -> (4, 4) vehicle_T_sensor, of those that are given.
 
     Raises:
-        ValueError: Not such a file, or not a rigid transform; the message names file and field.
+        BadFileError: Not such a file, or not a rigid transform; the message names file and field.
     """
-    if not path.exists():
-        return {}
-    try:
-        content = parse_yaml(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not a YAML file ({error})") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    return _read(path) if path.exists() else {}
+
+
+@reads("a file of poses")
+def _read(path: Path) -> dict[str, Matrix]:
+    content = parse_yaml(read_short_text(path))
     if not isinstance(content, dict):
-        raise ValueError(f"{path}: got {type(content).__name__}, not a mapping; {ALLOWED}")
+        raise ValueError(f"got {type(content).__name__}, not a mapping; {ALLOWED}")
     try:
         poses = _Poses.model_validate(content)
     except ValidationError as error:
         complaints = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
-        raise ValueError(f"{path}: {'; '.join(complaints)}; {ALLOWED}") from error
+        raise ValueError(f"{'; '.join(complaints)}; {ALLOWED}") from error
     given = {"sensor": poses.sensor, "reference": poses.reference}
     given |= {f"rigs/{name}": pose for name, pose in poses.rigs.items()}
     return {
-        name: check_rigid(pose.vehicle_T_sensor, f"{path}: {name.replace('/', '.')}.vehicle_T_sensor")
+        name: check_rigid(pose.vehicle_T_sensor, f"{name.replace('/', '.')}.vehicle_T_sensor")
         for name, pose in given.items()
         if pose is not None
     }

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from torchcover.data.frame import Frame
-from torchcover.data.reference import reference_called
+from torchcover.data.reference import reference_called, reference_of_objects
 from torchcover.detection.boxes import Boxes, points_in_boxes
 from torchcover.simulation import Label, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
 
@@ -35,13 +35,14 @@ class SimulatedFrames(Dataset[Frame]):
         rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds.
         steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers.
         seed: Seed of the traffic and of the reference sensor's poses.
-        reference_sensor: The reference sensor, such as `PaperReference()`; `reference_called()`, a `SurfaceReference`,
-            if not given.
+        reference_sensor: The reference sensor, such as `PaperReference()`. If not given, a `SurfaceReference`:
+            `reference_called()`, and `reference_of_objects()` with boxes, at up to twice the time.
         every_s: Time between one frame and the next, a multiple of the scenario's time step; that step if not given.
             Steps that follow each other are alike: with the same number of frames, a longer time shows more, and in
             traffic, which starts anew, the frames are spread over more cities.
         boxes: Whether frames have `boxes`: one for each object within the reference's range, with how many points each
-            rig has in it. An object's name is its own within a run of the scenario.
+            rig has in it, and how many the reference drew on it. An object's name is its own within a run of the
+            scenario.
 
     Raises:
         FileNotFoundError: An unknown name or file.
@@ -69,10 +70,12 @@ class SimulatedFrames(Dataset[Frame]):
     ) -> None:
         if not 1 <= steps <= MAX_STEPS:
             raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
+        if reference_sensor is None:
+            reference_sensor = reference_of_objects() if boxes else reference_called()
         self.simulator = Simulator(
             scenario if isinstance(scenario, Scenario) else Scenario.load(scenario),
             _rigs(rig, rigs),
-            reference_called() if reference_sensor is None else reference_sensor,
+            reference_sensor,
             seed=seed,
             every_s=every_s,
         )
@@ -152,7 +155,7 @@ class SimulatedFrames(Dataset[Frame]):
             index=index,
             name=f"{self.scenario.name} step {index}",
             counts=seen.counts,
-            boxes=_boxes(self.simulator.labels(index), clouds) if self.boxes else None,
+            boxes=_boxes(self.simulator.labels(index), clouds, seen.drawn) if self.boxes else None,
         )
 
 
@@ -170,13 +173,14 @@ def _load(rig: Rig | str | Path) -> Rig:
     return rig if isinstance(rig, Rig) else Rig.load(rig)
 
 
-def _boxes(found: Sequence[Label], clouds: Mapping[str, torch.Tensor]) -> Boxes:
+def _boxes(found: Sequence[Label], clouds: Mapping[str, torch.Tensor], drawn: NDArray[np.int64] | None) -> Boxes:
     rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
     boxes = Boxes.from_rows(
         torch.tensor(rows, dtype=torch.float32).view(-1, 7),
         velocity_mps=torch.tensor(np.array([label.velocity_mps for label in found]), dtype=torch.float32).view(-1, 2),
         ids=tuple(label.name for label in found),
         categories=tuple(label.category for label in found),
+        drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
     )
     inside = {name: points_in_boxes(cloud, boxes).box for name, cloud in clouds.items()}
     return replace(boxes, hits={name: torch.bincount(box, minlength=len(boxes)) for name, box in inside.items()})

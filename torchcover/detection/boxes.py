@@ -26,6 +26,8 @@ class Boxes:
         ids: K names, the same for an object in all frames of a run; empty strings where unknown.
         categories: K categories ("car", "pedestrian", ...); empty strings where unknown.
         hits: Name of a rig -> (K,) int64 how many of its points lie in each box.
+        drawn_points: (K,) int64 how many points the reference drew on each object, to ask whether they are seen; zeros
+            where none were, as in recordings.
 
     Raises:
         ValueError: Shapes that do not fit, NaN or infinite places, a length, width or height that is not positive.
@@ -47,6 +49,7 @@ class Boxes:
     ids: tuple[str, ...] = ()
     categories: tuple[str, ...] = ()
     hits: Mapping[str, Tensor] = field(default_factory=dict)
+    drawn_points: Tensor = None  # type: ignore[assignment]  # nor this
 
     def __post_init__(self) -> None:
         for name in ("centre_m", "size_m", "yaw_rad"):
@@ -56,6 +59,7 @@ class Boxes:
             "velocity_mps": self.centre_m.new_full((count, 2), math.nan),
             "ids": ("",) * count,
             "categories": ("",) * count,
+            "drawn_points": torch.zeros(count, dtype=torch.int64, device=self.yaw_rad.device),
         }
         for name, unknown in fill.items():
             given = getattr(self, name)
@@ -76,6 +80,7 @@ class Boxes:
 
     def _check_shapes(self, count: int) -> None:
         expected = {"centre_m": (count, 3), "size_m": (count, 3), "yaw_rad": (count,), "velocity_mps": (count, 2)}
+        expected["drawn_points"] = (count,)
         for name, shape in expected.items():
             if tuple(getattr(self, name).shape) != shape:
                 raise ValueError(
@@ -96,7 +101,7 @@ class Boxes:
 
         Args:
             rows: Metres and radians; further columns are not allowed.
-            others: `velocity_mps`, `ids`, `categories`, `hits`.
+            others: `velocity_mps`, `ids`, `categories`, `hits`, `drawn_points`.
 
         Raises:
             ValueError: Another shape, or as the constructor.
@@ -130,6 +135,7 @@ class Boxes:
             ids=tuple(self.ids[number] for number in numbers),
             categories=tuple(self.categories[number] for number in numbers),
             hits={rig: count[which] for rig, count in self.hits.items()},
+            drawn_points=self.drawn_points[which],
         )
 
     def of_category(self, *categories: str) -> "Boxes":
@@ -152,6 +158,7 @@ class Boxes:
             yaw_rad=move(self.yaw_rad),
             velocity_mps=move(self.velocity_mps),
             hits={rig: move(count) for rig, count in self.hits.items()},
+            drawn_points=move(self.drawn_points),
         )
 
 

@@ -46,6 +46,7 @@ class DetectedFrame:
             )
         self.truth = boxes.rows.detach().cpu().double()
         self.share = _shares(visibility, len(boxes), "visibility")
+        self.hidden = _hidden(visibility, len(boxes))
         given = torch.zeros(len(bad)) if scores is None else scores.detach().cpu()
         if given.shape != (len(bad),) or given.isnan().any():
             raise ValueError(
@@ -57,6 +58,7 @@ class DetectedFrame:
         unknown = torch.full((len(bad),), math.nan)
         own = unknown if detection_visibility is None else detection_visibility
         self.detection_share = _shares(own, len(bad), "detection_visibility")
+        self.detection_hidden = _hidden(own, len(bad))
 
 
 def _shares(visibility: BoxVisibility | Tensor, count: int, name: str) -> Tensor:
@@ -68,3 +70,8 @@ def _shares(visibility: BoxVisibility | Tensor, count: int, name: str) -> Tensor
             f"{int(((share < 0) | (share > 1)).sum())} of them outside"
         )
     return share
+
+
+def _hidden(visibility: BoxVisibility | Tensor, count: int) -> Tensor:
+    """(count,) whether the reference's places were asked, and saw nothing; of mere shares nobody knows."""
+    return visibility.hidden.cpu() if isinstance(visibility, BoxVisibility) else torch.zeros(count, dtype=torch.bool)

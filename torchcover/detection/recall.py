@@ -23,7 +23,8 @@ class RecallByVisibility(MergeableMetric):
 
     Detections are matched to objects by `torchcover.detection.match`. An object's visibility is its share from
     `box_visibility`, and its distance that of its centre from the vehicle's origin, over ground. Bins are half-open
-    [lo, hi), the last ones closed by 1 and open to infinity; objects of unknown visibility have a bin of their own.
+    [lo, hi), the last ones closed by 1 and open to infinity. Objects of unknown visibility have two bins of their own:
+    those "hidden" from the reference's places too, and those "not sampled"; see `BoxVisibility.hidden`.
 
     A false detection has no object, so precision goes by the visibility and distance of the detection's own box; see
     `update`. All objects and detections count, whatever their category: give one category at a time for figures by
@@ -48,8 +49,10 @@ class RecallByVisibility(MergeableMetric):
         >>> metric = RecallByVisibility(visibility_borders=(0.5,), distance_borders=(20.0,))
         >>> metric.update(truth.rows[:1], truth, torch.tensor([0.9, 0.1]))
         >>> curve = metric.compute().over("visibility")
-        >>> curve.bins, curve.recall.value, curve.recall.trials
-        (('0-0.5', '0.5-1', 'unknown'), tensor([[0., 1., nan]], dtype=torch.float64), tensor([[1, 1, 0]]))
+        >>> curve.bins, curve.recall.trials
+        (('0-0.5', '0.5-1', 'hidden', 'not sampled'), tensor([[1, 1, 0, 0]]))
+        >>> curve.recall.value
+        tensor([[0., 1., nan, nan]], dtype=torch.float64)
     """
 
     objects: Tensor
@@ -80,7 +83,7 @@ class RecallByVisibility(MergeableMetric):
         self.visibility_borders = borders["visibility_borders"]
         self.distance_borders = borders["distance_borders"]
         self.score_thresholds = scores
-        bins = (len(self.visibility_borders) + 2, len(self.distance_borders) + 1)
+        bins = (len(self.visibility_borders) + 3, len(self.distance_borders) + 1)
         self.add_sum("objects", bins, torch.int64)
         for name in ("found", "detections", "true_detections"):
             self.add_sum(name, (len(self.score_thresholds), *bins), torch.int64)
@@ -98,10 +101,10 @@ class RecallByVisibility(MergeableMetric):
         Args:
             detections: (N, 7) x, y, z of the centre, length, width, height, yaw; further columns are ignored.
             boxes: The K objects.
-            visibility: What `box_visibility` said of them, or (K,) shares, NaN where unknown.
+            visibility: What `box_visibility` said of them, or (K,) shares, NaN where they were not sampled.
             scores: (N,) scores; without them, detections choose their objects in the order given and all count.
             detection_visibility: What `box_visibility` says of the detections' boxes, or (N,) shares. Without it,
-                precision is known over distance only: detections are in the bin of unknown visibility.
+                precision is known over distance only: detections are in the bin of what was not sampled.
 
         Raises:
             ValueError: Lists of different lengths, shapes that do not fit, NaN in detections or scores, a negative
@@ -128,8 +131,8 @@ class RecallByVisibility(MergeableMetric):
         # The score at which an object is found; NaN, at no threshold, if it is not.
         found_at = torch.full((len(frame.truth),), math.nan, dtype=torch.float64)
         found_at[chosen[hit]] = frame.scores[hit]
-        object_bin = self._bin(frame.truth, frame.share)
-        detection_bin = self._bin(frame.detections, frame.detection_share)
+        object_bin = self._bin(frame.truth, frame.share, frame.hidden)
+        detection_bin = self._bin(frame.detections, frame.detection_share, frame.detection_hidden)
         counts = [frame.scores >= score for score in self.score_thresholds]
         self.objects += self._counted([object_bin])[0]
         self.found += self._counted([object_bin[found_at >= score] for score in self.score_thresholds])
@@ -137,11 +140,12 @@ class RecallByVisibility(MergeableMetric):
         self.true_detections += self._counted([detection_bin[some & hit] for some in counts])
         self.steps += 1
 
-    def _bin(self, rows: Tensor, share: Tensor) -> Tensor:
+    def _bin(self, rows: Tensor, share: Tensor, hidden: Tensor) -> Tensor:
         distance = torch.linalg.vector_norm(rows[:, :2].double(), dim=1)
         column = torch.bucketize(distance, torch.tensor(self.distance_borders, dtype=torch.float64), right=True)
         line = torch.bucketize(share, torch.tensor(self.visibility_borders, dtype=torch.float64), right=True)
-        line[share.isnan()] = len(self.visibility_borders) + 1
+        line[share.isnan()] = len(self.visibility_borders) + 2
+        line[hidden] = len(self.visibility_borders) + 1
         return line * (len(self.distance_borders) + 1) + column
 
     def _counted(self, lists: list[Tensor]) -> Tensor:
@@ -157,7 +161,7 @@ class RecallByVisibility(MergeableMetric):
             found=self.found.clone(),
             detections=self.detections.clone(),
             true_detections=self.true_detections.clone(),
-            visibility_bins=(*(f"{a:g}-{b:g}" for a, b in pairwise(visibility)), "unknown"),
+            visibility_bins=(*(f"{a:g}-{b:g}" for a, b in pairwise(visibility)), "hidden", "not sampled"),
             distance_bins=(
                 *(f"{a:g}-{b:g} m" for a, b in pairwise(distance)),
                 f"over {distance[-1]:g} m",

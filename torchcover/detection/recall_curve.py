@@ -48,7 +48,7 @@ class Curve:
     """Recall and precision over bins, (S, B) for S score thresholds and B bins.
 
     Args:
-        bins: What each bin holds, in words: "0.2-0.4", "unknown".
+        bins: What each bin holds, in words: "0.2-0.4", "hidden", "not sampled".
         recall: Objects found, of the objects of the bin.
         precision: Detections that found an object, of the detections of the bin.
     """
@@ -59,7 +59,7 @@ class Curve:
 
 
 class DetectionCounts:
-    """What was there and what was found, by visibility and distance: V bins, of which the last is unknown, and D bins.
+    """What was there and what was found, by visibility and distance: V bins, the last two unknown, and D bins.
 
     Args:
         objects: (V, D) int64 objects.

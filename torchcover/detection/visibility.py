@@ -15,9 +15,10 @@ class BoxVisibility:
     """What the rig saw of each of K boxes, in float64. A box without a reference point is unknown: NaN.
 
     Args:
-        share: (K,) share of the reference points in the box whose blind spot radius is within the threshold.
-        mean_radius_m: (K,) mean blind spot radius of the reference points in the box.
+        share: (K,) share of what the reference saw in the box whose blind spot radius is within the threshold.
+        mean_radius_m: (K,) mean blind spot radius of what the reference saw in the box.
         reference_points: (K,) int64 reference points in the box.
+        drawn_points: (K,) int64 points that the reference drew on the object, from `Boxes`.
         sensor_points: (K,) int64 points of the rig in the box.
         threshold_m: The threshold.
     """
@@ -25,6 +26,7 @@ class BoxVisibility:
     share: Tensor
     mean_radius_m: Tensor
     reference_points: Tensor
+    drawn_points: Tensor
     sensor_points: Tensor
     threshold_m: float
 
@@ -33,12 +35,20 @@ class BoxVisibility:
         """(K,) bool whether any reference point fell into the box."""
         return self.reference_points > 0
 
+    @property
+    def hidden(self) -> Tensor:
+        """(K,) bool whether points were drawn on the object, and the reference's places saw none: unknown, too.
+
+        What is neither known nor hidden was not sampled: nobody asked whether it can be seen.
+        """
+        return ~self.known & (self.drawn_points > 0)
+
     def __len__(self) -> int:
         return len(self.share)
 
     def select(self, which: Tensor) -> "BoxVisibility":
         """Some of them, as `Boxes.select` does."""
-        names = ("share", "mean_radius_m", "reference_points", "sensor_points")
+        names = ("share", "mean_radius_m", "reference_points", "drawn_points", "sensor_points")
         return replace(self, **{name: getattr(self, name)[which.to(self.share.device)] for name in names})
 
 
@@ -49,19 +59,21 @@ def box_visibility(
     boxes: Boxes,
     threshold: float = 0.4,
     *,
-    reference_weights: Tensor | None = None,
+    reference_weights: Tensor | None,
 ) -> BoxVisibility:
-    """Share of each box's reference points that the rig saw, and their mean blind spot radius.
+    """Share of what the reference saw of each box that the rig saw too, and its mean blind spot radius.
 
         share[k]       = sum over q in box k of w(q) 1(r(q) <= threshold) / sum over q in box k of w(q)
         mean_radius[k] = sum over q in box k of w(q) r(q) / sum over q in box k of w(q)
 
-    with r(q) from `torchcover.blind_spot_radius`, and every point of the same weight unless `reference_weights` says
-    otherwise. The nearest sensor point may lie outside the box: an object right beside a wall that is seen counts as
-    seen as far as the threshold reaches. `sensor_points` are those in the box itself; see `points_in_boxes`.
+    with r(q) from `torchcover.blind_spot_radius`. With weights in square metres it is the share of the surface that the
+    rig covers, of that which the reference's places see. The nearest sensor point may lie outside the box: an object
+    right beside a wall that is seen counts as seen as far as the threshold reaches. `sensor_points` are those in the
+    box itself; see `points_in_boxes`.
 
     The reference sensor is itself occluded: it looks from beside the ego, so a box that nothing can see from there is
-    unknown, and of a box that is known the far side is missing.
+    unknown, and of a box that is known the far side is missing. `SurfaceReference(object_points=...)` asks about every
+    object, so that such a box is `hidden`; other references leave it open.
 
     Args:
         sensor: (N, 3) points of the rig in the vehicle frame in metres, all of them. N = 0: nothing was seen, so the
@@ -69,7 +81,8 @@ def box_visibility(
         reference: (M, 3) points of the reference sensor in the same frame. M = 0: every box is unknown.
         boxes: K objects of the same instant; K = 0 gives an empty result.
         threshold: Radius in metres up to which a point counts as seen.
-        reference_weights: (M,) weight of each reference point, positive; of its area, say.
+        reference_weights: (M,) weight of each reference point, positive: `frame.reference_weights`. None if they weigh
+            the same, as those of a frame that has none do.
 
     Returns:
         `BoxVisibility` on the device of `reference`.
@@ -81,9 +94,10 @@ def box_visibility(
     Example:
         >>> boxes = Boxes.from_rows(torch.tensor([[10.0, 0, 1, 4, 2, 2, 0], [30.0, 0, 1, 4, 2, 2, 0]]))
         >>> reference = torch.tensor([[8.0, 0.0, 0.5], [8.0, 0.0, 1.5]])
-        >>> seen = box_visibility(sensor=torch.tensor([[8.0, 0.0, 0.6]]), reference=reference, boxes=boxes)
+        >>> sensor = torch.tensor([[8.0, 0.0, 0.6]])
+        >>> seen = box_visibility(sensor, reference, boxes, reference_weights=torch.tensor([1.0, 3.0]))
         >>> seen.share, seen.reference_points
-        (tensor([0.5000,    nan], dtype=torch.float64), tensor([2, 0]))
+        (tensor([0.2500,    nan], dtype=torch.float64), tensor([2, 0]))
     """
     check_boxes(boxes)
     _check(sensor, reference, threshold, reference_weights)
@@ -103,6 +117,7 @@ def box_visibility(
         share=(sum_by_box(weight * (radius <= threshold)) / total).clamp(max=1.0),
         mean_radius_m=sum_by_box(weight * radius) / total,
         reference_points=count,
+        drawn_points=boxes.drawn_points,
         sensor_points=torch.bincount(points_in_boxes(sensor, boxes).box, minlength=len(boxes)),
         threshold_m=float(threshold),
     )

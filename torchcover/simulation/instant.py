@@ -79,9 +79,10 @@ class Instant:
         min_range_m: float = 0.0,
         max_range_m: float = np.inf,
         own_m: Sequence[Float32] = (),
+        ego_points: bool = False,
         threads: int = 1,
     ) -> Scan:
-        """Cast the rays of one sensor. The ego occludes, but its own points are left out.
+        """Cast the rays of one sensor. The ego occludes, but its own points are left out unless they are wanted.
 
         Args:
             vehicle_T_sensor: (4, 4) pose of the sensor.
@@ -90,6 +91,7 @@ class Instant:
             max_range_m: Farther hits give no point.
             own_m: Of a sensor that is fixed to the ego: where the ego's body ends the rays of each tile, from
                 `Scene.own_m`. They are not cast at it again. The result is the same.
+            ego_points: Whether hits on the ego give points too.
             threads: Number of threads; the result does not depend on it.
 
         Returns:
@@ -99,7 +101,7 @@ class Instant:
 
         def scan_tile(tile: Tile, own_m: Float32 | None) -> tuple[Float32, NDArray[np.bool_], int, int]:
             directions, hits, casts = self.cast(vehicle_T_sensor, tile, _limit(tile, max_range_m), bodies, own_m)
-            seen = (hits.body >= 0) & (hits.body != self.ego)
+            seen = (hits.body >= 0) & (ego_points | (hits.body != self.ego))
             if min_range_m > 0:
                 seen &= hits.range_m >= min_range_m
             points = _points(vehicle_T_sensor[:3, 3], directions, hits.range_m, seen)

@@ -12,8 +12,12 @@ Matrix = NDArray[np.float64]
 
 
 class Label(NamedTuple):
-    """An object in the vehicle frame: the box of its body, its yaw, and its velocity over ground along x and y."""
+    """An object in the vehicle frame: the box of its body, its yaw, and its velocity over ground along x and y.
 
+    `number` is its place in `World.objects`.
+    """
+
+    number: int
     name: str
     category: str
     centre_m: Matrix
@@ -38,19 +42,20 @@ def labels(world: World, step: int, within_m: float) -> list[Label]:
     world_T_vehicle = world.ego.trajectory.at(time_s)
     vehicle_T_world = invert(world_T_vehicle)
     found = []
-    for actor in (*world.actors, *world.parked):
+    for number, actor in enumerate(world.objects):
         position_m = actor.trajectory.positions_at(np.array([time_s]))[0]
         # Not near, too, if absent: NaN.
         if np.hypot(*(position_m - world_T_vehicle[:3, 3])[:2]) <= within_m:
-            found.append(_label(actor, vehicle_T_world, time_s))
+            found.append(_label(number, actor, vehicle_T_world, time_s))
     return found
 
 
-def _label(actor: Actor, vehicle_T_world: Matrix, time_s: float) -> Label:
+def _label(number: int, actor: Actor, vehicle_T_world: Matrix, time_s: float) -> Label:
     vehicle_T_actor = vehicle_T_world @ actor.trajectory.at(time_s)
     box = BoundingBox.around(actor.mesh.vertices_m)
     middle_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
     return Label(
+        number,
         actor.name,
         actor.category,
         centre_m=transform(vehicle_T_actor, middle_m[None])[0],

@@ -22,6 +22,7 @@ class Observation:
         reference: (M, 3) float32 points of the reference sensor.
         reference_weights: (M,) float32 weight of each of them; None if they weigh the same.
         weight_kind: What the weights are, from `ReferenceScan`.
+        drawn: (objects,) how many points the reference drew on each of `World.objects`, from `ReferenceScan`.
         counts: How many rays there were, how many of them the ego took, and what was left out, by name.
     """
 
@@ -29,6 +30,7 @@ class Observation:
     reference: Float32
     reference_weights: Float32 | None
     weight_kind: WeightKind | None
+    drawn: NDArray[np.int64] | None
     counts: Mapping[str, int]
 
 

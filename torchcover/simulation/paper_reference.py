@@ -38,6 +38,7 @@ class PaperReference:
         shell_m: Thickness of the shell.
         max_tilt_deg: Bound of pitch and roll.
         max_range_m: Farther hits give no point. The default reaches every corner of the paper's regions.
+        ego_points: Whether hits on the ego give points; the paper does not say.
 
     Raises:
         ValueError: A number of rows or columns below 1, a shell without thickness, a tilt outside 0 to 90 degrees,
@@ -58,6 +59,7 @@ class PaperReference:
     shell_m: float = 0.5
     max_tilt_deg: float = MAX_TILT_DEG
     max_range_m: float = 250.0
+    ego_points: bool = False
 
     def __post_init__(self) -> None:
         if self.rows < 1 or self.columns < 1:
@@ -91,7 +93,7 @@ class PaperReference:
 
     def scan(self, surroundings: Surroundings) -> ReferenceScan:
         """What its rays hit at one step; see `ReferenceSensor.scan`."""
-        return cast_pattern(self, surroundings)
+        return cast_pattern(self, surroundings, ego_points=self.ego_points)
 
     def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the sensor's frame."""

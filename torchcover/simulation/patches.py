@@ -12,9 +12,12 @@ from torchcover.simulation.shapes import Mesh
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Int32 = NDArray[np.int32]
 
-# No edge of a patch is longer.
+# No edge of a patch is longer,
 LONGEST_M = 4.0
+# except where all of a mesh is wanted, however large it is: then this share of its extent may be.
+LONGEST_SHARE = 1 / 64
 # A triangle with less area is a line: no point will ever be drawn from it.
 SMALLEST_M2 = 1e-10
 
@@ -38,39 +41,40 @@ class Patches(NamedTuple):
 
     `corner_m`, `first_m` and `second_m` (3, N) float32: one corner, and the edges from there to the other two; float64
     would say no more, for rays meet float32 triangles. `outward` (N,): whether they are seen from the side only to
-    which first x second points.
+    which first x second points. `of_object` (N,) int32: number of the object that they belong to, -1 for none.
     """
 
     corner_m: Float32
     first_m: Float32
     second_m: Float32
     outward: Bools
+    of_object: Int32
 
     @classmethod
     def of(cls, mesh: Mesh, bounds: Bounds | None = None) -> Self:
         """Cut a mesh.
 
         Args:
-            mesh: Any; faces without an area are left out.
-            bounds: What lies outside of these boxes is left out.
+            mesh: Any, of no object; faces without an area are left out.
+            bounds: What lies outside of these boxes is left out; all is wanted if not given.
         """
-        triangles, face = _cut(mesh.vertices_m[mesh.faces], bounds)
+        extent_m = 0.0 if bounds is not None else float(np.ptp(mesh.vertices_m, axis=0).max())
+        triangles, face = _cut(mesh.vertices_m[mesh.faces], bounds, max(LONGEST_M, LONGEST_SHARE * extent_m))
         corner, second, third = triangles.transpose(1, 2, 0)
         first_m, second_m = (second - corner).astype(np.float32), (third - corner).astype(np.float32)
-        return cls(corner.astype(np.float32), first_m, second_m, outward_faces(mesh)[face])
+        nobodys = np.full(len(face), -1, dtype=np.int32)
+        return cls(corner.astype(np.float32), first_m, second_m, outward_faces(mesh)[face], nobodys)
 
     @classmethod
     def joined(cls, parts: "list[Patches]") -> Self:
         """Those of several, one after the other."""
         none = np.empty((3, 0), dtype=np.float32)
-        parts = [Patches(none, none, none, np.empty(0, dtype=bool)), *parts]
-        corner_m, first_m, second_m = (np.concatenate([part[k] for part in parts], axis=1) for k in range(3))
-        return cls(corner_m, first_m, second_m, np.concatenate([part.outward for part in parts]))
+        parts = [Patches(none, none, none, np.empty(0, dtype=bool), np.empty(0, dtype=np.int32)), *parts]
+        return cls._make(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
 
     def taken(self, numbers: NDArray[np.int64]) -> Self:
         """Some of them."""
-        corner_m, first_m, second_m = (part.take(numbers, axis=1) for part in self[:3])
-        return type(self)(corner_m, first_m, second_m, self.outward[numbers])
+        return type(self)._make(column.take(numbers, axis=-1) for column in self)
 
     def moved(self, destination_T_source: Float64) -> Self:
         """Them in another frame. What becomes of one does not depend on the others."""
@@ -78,7 +82,11 @@ class Patches(NamedTuple):
         # The corner may be a kilometre away, in either frame.
         corner_m = np.einsum("ij,jn->in", rotation, self.corner_m.astype(np.float64)) + destination_T_source[:3, 3:]
         first_m, second_m = rotate(rotation, self.first_m), rotate(rotation, self.second_m)
-        return type(self)(corner_m.astype(np.float32), first_m, second_m, self.outward)
+        return self._replace(corner_m=corner_m.astype(np.float32), first_m=first_m, second_m=second_m)
+
+    def given_to(self, number: int) -> Self:
+        """Them as those of an object."""
+        return self._replace(of_object=np.full_like(self.of_object, number))
 
     @property
     def lower_m(self) -> Float32:
@@ -100,7 +108,7 @@ class Patches(NamedTuple):
         return normals
 
 
-def _cut(triangles: Float64, bounds: Bounds | None) -> tuple[Float64, NDArray[np.int64]]:
+def _cut(triangles: Float64, bounds: Bounds | None, longest_m: float) -> tuple[Float64, NDArray[np.int64]]:
     """(N, 3, 3) triangles with short edges, and (N,) of which one of those given each is a part."""
     face, done, done_face = np.arange(len(triangles)), [np.empty((0, 3, 3))], [np.empty(0, dtype=np.int64)]
     while len(triangles):
@@ -109,7 +117,7 @@ def _cut(triangles: Float64, bounds: Bounds | None) -> tuple[Float64, NDArray[np
             kept &= bounds.meet(triangles.min(axis=1), triangles.max(axis=1))
         triangles, face = triangles[kept], face[kept]
         edges_m = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
-        small = (edges_m <= LONGEST_M).all(axis=1)
+        small = (edges_m <= longest_m).all(axis=1)
         done.append(triangles[small])
         done_face.append(face[small])
         triangles, face = _halved(triangles[~small], edges_m[~small].argmax(axis=1)), np.tile(face[~small], 2)

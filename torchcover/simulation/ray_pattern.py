@@ -59,11 +59,13 @@ class RayPattern(Protocol):
         ...
 
 
-def cast_pattern(pattern: RayPattern, surroundings: Surroundings) -> ReferenceScan:
-    """What a pattern of rays sees: every ray that hits something but the ego makes a point."""
+def cast_pattern(pattern: RayPattern, surroundings: Surroundings, *, ego_points: bool = False) -> ReferenceScan:
+    """What a pattern of rays sees: every ray that hits something makes a point, one that hits the ego if wanted."""
     pose, redrawn = surroundings.free_pose(pattern.vehicle_T_reference)
     tiles = pattern.tiles(pose, surroundings.generator)
-    scan = surroundings.instant.scan(pose, tiles, max_range_m=pattern.max_range_m, threads=surroundings.threads)
+    scan = surroundings.instant.scan(
+        pose, tiles, max_range_m=pattern.max_range_m, ego_points=ego_points, threads=surroundings.threads
+    )
     weights = pattern.weights(pose, tiles, scan.ray)
     return ReferenceScan(
         points=scan.points,

@@ -28,6 +28,8 @@ class ReferenceScan(NamedTuple):
         self_hits: How many of them the ego took.
         body_casts: At how many pairs of a ray and a moving body; the other pairs could not meet.
         redrawn: How often its place was drawn again, because it lay inside a body.
+        drawn: (objects,) int64 how many points were drawn on each of `World.objects`, be they seen or not; None from a
+            sensor that draws none.
     """
 
     points: NDArray[np.float32]
@@ -37,6 +39,7 @@ class ReferenceScan(NamedTuple):
     self_hits: int
     body_casts: int
     redrawn: int
+    drawn: NDArray[np.int64] | None = None
 
 
 class ReferenceSensor(Protocol):

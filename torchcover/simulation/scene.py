@@ -56,7 +56,7 @@ class Scene:
     def __init__(self, world: World) -> None:
         self.world = world
         self.ego_box = BoundingBox.around(world.ego.mesh.vertices_m)
-        bodies = (world.ego, *world.actors)
+        bodies = (world.ego, *world.objects)
         self._resting = [actor for actor in bodies if not actor.trajectory.moves]
         self._moving = [actor for actor in bodies if actor.trajectory.moves]
         # One solid for each mesh object, however many actors share it.
@@ -73,13 +73,15 @@ class Scene:
         self._reach_m = np.array([self._solids[id(actor.mesh)].reach_m for actor in self._resting + self._moving])
         # Subtracted in float64: world coordinates may be of UTM size. Where the ego rests, this frame is its own.
         self._world_T_local = world.ego.trajectory.at(0.0)
-        self._static = RayCaster(self._static_meshes(self._resting))
+        resting = [actor.mesh.moved(self._local_T_resting(actor)) for actor in self._resting]
+        self._static = RayCaster(resting + self._scenery())
         self._surfaces: dict[tuple[float, ...], Surface] = {}
 
-    def _static_meshes(self, resting: Sequence[Actor]) -> list[Mesh]:
-        local_T_world = invert(self._world_T_local)
-        meshes = [actor.mesh.moved(local_T_world @ actor.trajectory.at(0.0)) for actor in resting]
-        return meshes + [mesh.moved(local_T_world) for mesh in self.world.static]
+    def _scenery(self) -> list[Mesh]:
+        return [mesh.moved(invert(self._world_T_local)) for mesh in self.world.static]
+
+    def _local_T_resting(self, actor: Actor) -> Matrix:
+        return invert(self._world_T_local) @ actor.trajectory.at(0.0)
 
     def surface(self, lower_m: Matrix, upper_m: Matrix) -> Surface:
         """The surface of everything but the ego, for questions about a box that the vehicle carries along.
@@ -97,10 +99,13 @@ class Scene:
             bounds = bounds_along(
                 np.stack([invert(self._world_T_local) @ pose for pose in poses]), Bounds(lower_m[None], upper_m[None])
             )
-            first = len(self._resting) + len(self.world.static)
+            objects = self.world.objects
+            number = {id(actor): k for k, actor in enumerate(objects)}
             self._surfaces[box] = Surface(
-                self._static_meshes([actor for actor in self._resting if actor is not ego]),
-                {first + k: actor.mesh for k, actor in enumerate(self._moving) if actor is not ego},
+                self._scenery(),
+                [actor.mesh for actor in objects],
+                {number[id(actor)]: self._local_T_resting(actor) for actor in self._resting if actor is not ego},
+                {self._first_moving + k: number[id(actor)] for k, actor in enumerate(self._moving) if actor is not ego},
                 bounds,
             )
         return self._surfaces[box]
@@ -123,7 +128,7 @@ class Scene:
         vehicle_T_world = invert(world_T_vehicle)
         distance_m = self._distance_m(step, world_T_vehicle)
         self._check_overlap(time_s, vehicle_T_world, distance_m)
-        resting, first = len(self._resting), len(self._resting) + len(self.world.static)
+        resting, first = len(self._resting), self._first_moving
         moving = tuple(
             self._place(first + k, self._moving[k], vehicle_T_world, time_s)
             for k in np.flatnonzero(distance_m[resting:] < within_m).tolist()
@@ -155,6 +160,11 @@ class Scene:
         """(bodies,) how far each is from the vehicle at least."""
         distance_m: Matrix = np.linalg.norm(self._positions_m[step] - world_T_vehicle[:3, 3], axis=1) - self._reach_m
         return distance_m
+
+    @property
+    def _first_moving(self) -> int:
+        """Number of the first body that moves."""
+        return len(self._resting) + len(self.world.static)
 
     @property
     def moves(self) -> bool:

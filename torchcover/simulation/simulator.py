@@ -104,6 +104,7 @@ class Simulator:
             reference=reference.points,
             reference_weights=reference.weights,
             weight_kind=reference.weight_kind,
+            drawn=reference.drawn,
             counts=counts_of(stage.scene, instant, of_all_rigs, reference),
         )
 

@@ -1,6 +1,7 @@
 """The surface of a world, cut small once; what is near the vehicle is looked up at every step."""
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,49 +23,75 @@ STRETCH_M = 100.0
 SLACK_M = 0.01
 
 
-class Cells(NamedTuple):
-    """C groups of neighbouring patches.
+class Groups(NamedTuple):
+    """G groups of patches that follow each other.
 
-    `first` (C + 1,) number of the first patch of each, and of all; `bounds` (C boxes) what they fill.
+    `first` (G + 1,) number of the first patch of each, and of all; `bounds` (G boxes) what they fill.
     """
 
     first: Numbers
     bounds: Bounds
 
+    def members(self, groups: Numbers) -> Numbers:
+        """The numbers of the patches of some groups, one after the other."""
+        first, count = self.first[groups], np.diff(self.first)[groups]
+        return np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
+
 
 class Surface:
-    """The surface of what never moves, in the order of places on the ground, and of each body that moves.
+    """The surface of what never moves, in the order of places on the ground, and of each object that moves.
 
     Args:
-        static: What never moves, without the ego, in the frame of the ray caster of it.
-        moving: The bodies that move, by number, in their own frames; bodies of one kind share one mesh object.
-        bounds: Boxes in the frame of what never moves, outside of which it is never asked for.
+        scenery: What never moves and is no object, in the frame of the ray caster of what never moves.
+        objects: The objects by number, in their own frames; those of one kind share one mesh.
+        resting: By number, `static_T_object` of those that never move.
+        moving: Of the others the number of the object, by that of the body in an instant.
+        bounds: Boxes in the frame of what never moves, outside of which no scenery is ever asked for.
     """
 
-    def __init__(self, static: Sequence[Mesh], moving: dict[int, Mesh], bounds: Bounds) -> None:
-        patches = Patches.joined([Patches.of(mesh, bounds) for mesh in static])
+    def __init__(
+        self,
+        scenery: Sequence[Mesh],
+        objects: Sequence[Mesh],
+        resting: Mapping[int, Float64],
+        moving: Mapping[int, int],
+        bounds: Bounds,
+    ) -> None:
+        kinds = {id(mesh): Patches.of(mesh) for mesh in {id(mesh): mesh for mesh in objects}.values()}
+        self._moving = {body: (kinds[id(objects[number])], number) for body, number in moving.items()}
+        placed = [kinds[id(objects[number])].moved(pose).given_to(number) for number, pose in resting.items()]
+        patches = Patches.joined([Patches.of(mesh, bounds) for mesh in scenery] + placed)
         order, cell = _by_place(patches)
         self._static = patches.taken(order)
-        self._cells = _cells(self._static, cell)
-        kinds = {id(mesh): Patches.of(mesh) for mesh in {id(mesh): mesh for mesh in moving.values()}.values()}
-        self._moving = {body: kinds[id(mesh)] for body, mesh in moving.items()}
+        self._cells = _groups(self._static, cell)
+        of_objects = np.flatnonzero(self._static.of_object >= 0)
+        self._resting = of_objects[np.argsort(self._static.of_object[of_objects], kind="stable")]
+        self._objects = _groups(self._static.taken(self._resting), self._static.of_object[self._resting])
 
-    def near(self, instant: Instant, boxes: Bounds) -> Patches:
+    def near(self, instant: Instant, boxes: Bounds, objects_within_m: float = -np.inf) -> Patches:
         """The patches that may meet boxes of the vehicle frame, in that frame, and some that do not.
 
         Args:
             instant: The scene at one time.
             boxes: In the vehicle frame.
+            objects_within_m: All patches of an object are there, too, if it may come this near to the vehicle's origin.
         """
         vehicle_T_static = invert(instant.static_T_vehicle)
-        cells = np.flatnonzero(boxes.meet(*_moved_bounds(vehicle_T_static, self._cells.bounds)))
-        near = [self._static.taken(_ranges(self._cells.first[cells], self._cells.first[cells + 1]))]
-        near[0] = near[0].moved(vehicle_T_static)
+        wanted = np.zeros(len(self._static.outward), dtype=bool)
+        cells = boxes.meet(*_moved_bounds(vehicle_T_static, self._cells.bounds))
+        wanted[self._cells.members(np.flatnonzero(cells))] = True
+        lower_m, upper_m = _moved_bounds(vehicle_T_static, self._objects.bounds)
+        objects = np.linalg.norm(np.clip(0.0, lower_m, upper_m), axis=1) <= objects_within_m
+        wanted[self._resting[self._objects.members(np.flatnonzero(objects))]] = True
+        near = [self._static.taken(np.flatnonzero(wanted)).moved(vehicle_T_static)]
         bodies = [part for part in instant.moving if part.body != instant.ego]
         centres_m = np.array([part.centre_m for part in bodies]).reshape(-1, 3)
         radii_m = np.array([part.radius_m for part in bodies])[:, None]
-        for k in np.flatnonzero(boxes.meet(centres_m - radii_m, centres_m + radii_m)).tolist():
-            near.append(self._moving[bodies[k].body].moved(invert(bodies[k].part_T_vehicle)))
+        meets = boxes.meet(centres_m - radii_m, centres_m + radii_m)
+        meets |= np.linalg.norm(centres_m, axis=1) - radii_m[:, 0] <= objects_within_m
+        for part in itertools.compress(bodies, meets):
+            patches, number = self._moving[part.body]
+            near.append(patches.moved(invert(part.part_T_vehicle)).given_to(number))
         return Patches.joined(near)
 
 
@@ -107,19 +134,14 @@ def _interleaved(place: Numbers) -> Numbers:
     return interleaved
 
 
-def _cells(patches: Patches, cell: Numbers) -> Cells:
-    first = np.flatnonzero(np.diff(cell, prepend=-1))
+def _groups(patches: Patches, group: Numbers | NDArray[np.int32]) -> Groups:
+    """The groups of (N,) patches that are in their order."""
+    first = np.flatnonzero(np.diff(group, prepend=-1))
     if len(first) == 0:
-        return Cells(np.zeros(1, dtype=np.int64), Bounds(np.empty((0, 3)), np.empty((0, 3))))
+        return Groups(np.zeros(1, dtype=np.int64), Bounds(np.empty((0, 3)), np.empty((0, 3))))
     lower_m = np.minimum.reduceat(patches.lower_m, first, axis=1).T.astype(np.float64)
     upper_m = np.maximum.reduceat(patches.upper_m, first, axis=1).T.astype(np.float64)
-    return Cells(np.append(first, len(cell)), Bounds(lower_m - SLACK_M, upper_m + SLACK_M))
-
-
-def _ranges(first: Numbers, end: Numbers) -> Numbers:
-    """The numbers from each first to before each end, one range after the other."""
-    count = end - first
-    return np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
+    return Groups(np.append(first, len(group)), Bounds(lower_m - SLACK_M, upper_m + SLACK_M))
 
 
 def _moved_bounds(destination_T_source: Float64, bounds: Bounds) -> tuple[Float64, Float64]:

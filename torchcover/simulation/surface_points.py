@@ -1,4 +1,4 @@
-"""Points drawn evenly over a surface, stratified by boxes."""
+"""Points drawn evenly over a surface, stratified by boxes and by objects."""
 
 from typing import NamedTuple
 
@@ -10,6 +10,7 @@ from torchcover.simulation.patches import Bounds, Patches
 Bools = NDArray[np.bool_]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
+Int32 = NDArray[np.int32]
 Numbers = NDArray[np.int64]
 
 # Patches are looked up with this much to spare: drawn points are rounded to float32.
@@ -24,12 +25,14 @@ class SurfacePoints(NamedTuple):
     """K points of a surface.
 
     `points_m` (K, 3) where; `normals` (K, 3) of length one on the side from which they are looked at; `per_m2` (K,) how
-    many points a square metre was given there, from all strata together.
+    many points a square metre was given there, from all strata together; `of_object` (K,) number of the object that
+    they are on, -1 for none.
     """
 
     points_m: Float32
     normals: Float32
     per_m2: Float64
+    of_object: Int32
 
 
 class Stratum(NamedTuple):
@@ -43,12 +46,24 @@ class Stratum(NamedTuple):
     inside_m2: Float64
 
 
+class Objects(NamedTuple):
+    """The patches that belong to objects: `patch` (K,) numbers, object by object; `m2` (K,) their areas.
+
+    `number` (J,) of each object, and `first` (J,) of its patches among these.
+    """
+
+    patch: Numbers
+    m2: Float64
+    number: Int32
+    first: Numbers
+
+
 class SurfaceStrata:
-    """A surface, ready to draw points from: evenly within each of some boxes, which may overlap.
+    """A surface, ready to draw points from: evenly within each of some boxes, which may overlap, and on each object.
 
     Args:
         patches: The surface in the frame of the boxes.
-        boxes: The strata, half-open: lower bounds belong to them.
+        boxes: Strata, half-open: lower bounds belong to them.
     """
 
     def __init__(self, patches: Patches, boxes: Bounds) -> None:
@@ -63,41 +78,50 @@ class SurfaceStrata:
             _stratum(twice_m2 / 2, lower_m, upper_m, low.tolist(), high.tolist())
             for low, high in zip(*boxes, strict=True)
         ]
+        self._objects = _objects(patches.of_object, twice_m2 / 2)
 
-    def draw(self, place_m: Float64, each: float, generator: np.random.Generator) -> SurfacePoints:
+    def draw(
+        self, place_m: Float64, each: float, generator: np.random.Generator, *, on_objects: int = 0
+    ) -> SurfacePoints:
         """Points on the patches that a place is in front of.
 
         Args:
             place_m: (3,) the place.
-            each: About how many points each stratum gets; if it is below 1, one with this probability.
+            each: About how many points each box gets; if it is below 1, one with this probability.
             generator: Source of the random numbers.
+            on_objects: How many more each object gets, wherever it is. One that turns no face to the place gets them
+                on the outer side of all its faces, which hide them.
         """
         x, y, z = place_m.tolist()
         height_m = x * self._normals[0] + y * self._normals[1] + z * self._normals[2] - self._plane_m
         front = (height_m > 0) | (~self._patches.outward & (height_m < 0))
         drawn = [_drawn(stratum, front, each, generator) for stratum in self._strata]
         number = np.repeat(np.arange(len(drawn)), [len(patch) for patch, _ in drawn])
-        per_m2 = np.array([density for _, density in drawn])
-        return self._points(np.concatenate([patch for patch, _ in drawn]), number, per_m2, height_m, generator)
+        of_objects, object_per_m2 = _drawn_on_objects(self._objects, front, on_objects, generator)
+        patch = np.concatenate([*(patch for patch, _ in drawn), of_objects])
+        points_m = self._points(patch, generator)
+        inside = np.stack([_inside(points_m, low, high) for low, high in zip(*self._boxes, strict=True)])
+        kept = np.ones(len(patch), dtype=bool)
+        kept[: len(number)] = inside[number, np.arange(len(number))]
+        patch, of_object = patch[kept], self._patches.of_object[patch[kept]]
+        # A face of something closed is looked at from its outer side only, whatever side the place is on.
+        side = np.where(self._patches.outward[patch], np.float32(1), np.sign(height_m[patch]))
+        return SurfacePoints(
+            np.ascontiguousarray(points_m[:, kept].T),
+            (self._normals[:, patch] * side).T,
+            np.array([density for _, density in drawn]) @ inside[:, kept] + object_per_m2[of_object],
+            of_object,
+        )
 
-    def _points(
-        self, patch: Numbers, stratum: Numbers, per_m2: Float64, height_m: Float32, generator: np.random.Generator
-    ) -> SurfacePoints:
-        """One point on each of the patches, if it lies in its stratum."""
+    def _points(self, patch: Numbers, generator: np.random.Generator) -> Float32:
+        """(3, K) one point on each of the patches."""
         start = generator.random((2, 1))
         a, b = ((start + np.arange(len(patch)) * np.array(PLANE_STEPS)[:, None]) % 1).astype(np.float32)
         beyond = a + b > 1
         a, b = np.where(beyond, 1 - a, a), np.where(beyond, 1 - b, b)
-        corner_m, first_m, second_m, _ = self._patches.taken(patch)
-        points_m = corner_m + a * first_m + b * second_m
-        inside = np.stack([_inside(points_m, low, high) for low, high in zip(*self._boxes, strict=True)])
-        kept = np.flatnonzero(inside[stratum, np.arange(len(patch))])
-        patch = patch[kept]
-        return SurfacePoints(
-            np.ascontiguousarray(points_m[:, kept].T),
-            (self._normals[:, patch] * np.sign(height_m[patch])).T,
-            per_m2 @ inside[:, kept],
-        )
+        taken = self._patches.taken(patch)
+        points_m: Float32 = taken.corner_m + a * taken.first_m + b * taken.second_m
+        return points_m
 
 
 def _inside(points_m: Float32, low: Float64, high: Float64) -> Bools:
@@ -136,3 +160,34 @@ def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Gen
     # Rounding must not take the last one beyond the end, where patches may follow that are not seen.
     number = np.searchsorted(up_to_m2, np.minimum(at_m2, np.nextafter(whole_m2, 0.0)), side="right")
     return stratum.patch[number], expected / whole_m2
+
+
+def _objects(of_object: Int32, m2: Float32) -> Objects:
+    patch = np.flatnonzero(of_object >= 0)
+    patch = patch[np.argsort(of_object[patch], kind="stable")]
+    number, first = np.unique(of_object[patch], return_index=True)
+    return Objects(patch, m2[patch].astype(np.float64), number, first)
+
+
+def _drawn_on_objects(
+    objects: Objects, front: Bools, each: int, generator: np.random.Generator
+) -> tuple[Numbers, Float64]:
+    """Patches, `each` for every object, drawn by their area, and points per square metre by the object's number.
+
+    The last density is for what is no object.
+    """
+    per_m2 = np.zeros(objects.number.max(initial=-1) + 2)
+    if each == 0 or len(objects.number) == 0:
+        return np.empty(0, dtype=np.int64), per_m2
+    facing = front[objects.patch]
+    away = ~np.logical_or.reduceat(facing, objects.first)
+    facing |= away.repeat(np.diff(objects.first, append=len(facing)))
+    up_to_m2 = np.cumsum(objects.m2 * facing)
+    end_m2 = up_to_m2[np.append(objects.first[1:], len(facing)) - 1]
+    start_m2 = np.append(0.0, end_m2[:-1])
+    per_m2[objects.number] = each / (end_m2 - start_m2)
+    # One in each of as many equal parts of the object's area; rounding must not take the last one to the next object.
+    parts = (np.arange(each) + generator.random((len(end_m2), each))) / each
+    at_m2 = start_m2[:, None] + parts * (end_m2 - start_m2)[:, None]
+    at_m2 = np.minimum(at_m2, np.nextafter(end_m2, 0.0)[:, None])
+    return objects.patch[np.searchsorted(up_to_m2, at_m2.ravel(), side="right")], per_m2

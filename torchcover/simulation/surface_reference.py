@@ -33,13 +33,15 @@ class SurfaceReference:
 
     The place is that of the paper's sensor: uniform in the shell between the ego's bounding box and that box grown
     sideways and upwards. In every area and height band about the same number of points is drawn, evenly over the
-    surface of everything but the ego, and a ray from the place asks whether each is seen. A point's weight is the
-    square metres that it stands for, so that the sum of w f over the points has the expectation
+    surface of everything but the ego, and a ray from the place asks whether each is seen. Objects may get points of
+    their own beside these. A point's weight is the square metres that it stands for, given all the points that were
+    drawn, so that the sum of w f over the points has the expectation
 
         E_place[ integral of f over the surface that the place sees ],
 
     whatever the number of rays and of places. A face of a closed body is seen from its outer side; a face of anything
-    open, such as a plane, from both. Where two faces coincide and look the same way, both count.
+    open, such as a plane, from both. Where two faces coincide and look the same way, both count. Outside of all areas
+    and bands there are points on objects only.
 
     Args:
         areas: Rectangles x, y in the vehicle frame in metres, ((x_low, x_high), (y_low, y_high)) each. They may
@@ -49,10 +51,13 @@ class SurfaceReference:
         bands_m: Height bands (low, high) in metres; half-open, as areas are. They may overlap too.
         shell_m: Thickness of the shell around the ego in which the places are.
         max_range_m: Farther points are not seen.
+        object_points: How many more points at least are drawn on each object (`World.objects`) whose surface lies
+            within that range of the places, in any area and at any height, from all places together; in addition to
+            `rays`.
 
     Raises:
         ValueError: No area or no band, one with inverted or infinite bounds, no ray, no place, a shell or a range that
-            is not positive.
+            is not positive, fewer than no points on objects.
 
     Example:
         >>> from torchcover.simulation import Scenario, Simulator
@@ -71,6 +76,7 @@ class SurfaceReference:
     bands_m: Bands = PAPER_BANDS_M
     shell_m: float = 0.5
     max_range_m: float = 250.0
+    object_points: int = 0
 
     def __post_init__(self) -> None:
         check_areas(self.areas)
@@ -80,6 +86,8 @@ class SurfaceReference:
             raise ValueError(f"rays: at least 1 is needed; got {self.rays}")
         if self.places < 1:
             raise ValueError(f"places: at least 1 is needed; got {self.places}")
+        if self.object_points < 0:
+            raise ValueError(f"object_points: a number >= 0 is needed; got {self.object_points}")
         check_reach(self.shell_m, self.max_range_m)
 
     @classmethod
@@ -100,16 +108,19 @@ class SurfaceReference:
         boxes = self._boxes()
         instant = surroundings.instant
         surface = surroundings.scene.surface(boxes.lower_m.min(axis=0), boxes.upper_m.max(axis=0))
-        strata = SurfaceStrata(surface.near(instant, boxes), boxes)
-        above_m = max(ABOVE_M, ABOVE_SHARE * float(np.abs(instant.static_T_vehicle[:3, 3]).max()))
         # All places before the first point: they are the same for any number of rays.
         drawn = [surroundings.free_pose(self._pose) for _ in range(self.places)]
-        looks = []
-        for place_m in (pose[:3, 3] for pose, _ in drawn):
-            found = self._in_range(strata.draw(place_m, self._rays_each, surroundings.generator), place_m)
+        places_m = [pose[:3, 3] for pose, _ in drawn]
+        strata = SurfaceStrata(surface.near(instant, boxes, self._objects_within_m(places_m)), boxes)
+        above_m = max(ABOVE_M, ABOVE_SHARE * float(np.abs(instant.static_T_vehicle[:3, 3]).max()))
+        on_objects, looks = math.ceil(self.object_points / self.places), []
+        for place_m in places_m:
+            found = strata.draw(place_m, self._rays_each, surroundings.generator, on_objects=on_objects)
+            found = self._in_range(found, place_m)
             targets_m = found.points_m + np.float32(above_m) * found.normals
             looks.append((found, sight(instant, place_m, targets_m, threads=surroundings.threads)))
-        return self._gathered(looks, redrawn=sum(redrawn for _, redrawn in drawn))
+        objects = len(surroundings.scene.world.objects)
+        return self._gathered(looks, objects, redrawn=sum(redrawn for _, redrawn in drawn))
 
     def _boxes(self) -> Bounds:
         sides = [(*area, band) for area in self.areas for band in self.bands_m]
@@ -121,6 +132,12 @@ class SurfaceReference:
         """Rays from one place to one stratum."""
         return self.rays / (self.places * len(self.areas) * len(self.bands_m))
 
+    def _objects_within_m(self, places_m: list[Float64]) -> float:
+        """How near an object must come to the vehicle's origin to get points of its own."""
+        if self.object_points == 0:
+            return -math.inf
+        return self.max_range_m + max(float(np.linalg.norm(place_m)) for place_m in places_m)
+
     def _pose(self, ego: BoundingBox, generator: np.random.Generator) -> Float64:
         return rigid(np.eye(3), position_in_shell(ego, self.shell_m, generator))
 
@@ -128,9 +145,10 @@ class SurfaceReference:
         near = np.linalg.norm(drawn.points_m - place_m, axis=1) <= self.max_range_m
         return drawn if near.all() else SurfacePoints(*(part[near] for part in drawn))
 
-    def _gathered(self, looks: list[tuple[SurfacePoints, Sight]], redrawn: int) -> ReferenceScan:
+    def _gathered(self, looks: list[tuple[SurfacePoints, Sight]], objects: int, redrawn: int) -> ReferenceScan:
         # One place stands for one of so many: every place's points are a surface of their own.
         weights = [1.0 / (self.places * found.per_m2[look.seen]) for found, look in looks]
+        of_object = np.concatenate([found.of_object for found, _ in looks])
         return ReferenceScan(
             points=np.concatenate([found.points_m[look.seen] for found, look in looks]),
             weights=np.concatenate(weights).astype(np.float32),
@@ -139,4 +157,5 @@ class SurfaceReference:
             self_hits=sum(look.self_hits for _, look in looks),
             body_casts=sum(look.body_casts for _, look in looks),
             redrawn=redrawn,
+            drawn=np.bincount(of_object[of_object >= 0], minlength=objects),
         )

@@ -37,7 +37,7 @@ class World:
         actors: The others.
         time_step_s: Time between two frames.
         duration_s: Time after which the trajectories end.
-        parked: Objects that never move and whose geometry is among `static`: where they are, and what.
+        parked: Objects that never move, of which there may be many.
     """
 
     static: tuple[Mesh, ...]
@@ -46,6 +46,11 @@ class World:
     time_step_s: float = 0.1
     duration_s: float = 0.0
     parked: tuple[Actor, ...] = ()
+
+    @property
+    def objects(self) -> tuple[Actor, ...]:
+        """What may be recognised: the actors, then the parked. An object's number is its place in this order."""
+        return self.actors + self.parked
 
     @property
     def steps(self) -> int:

@@ -164,7 +164,7 @@ class CoverageCallback(Callback):
         pl_module.log_dict(self._logged, on_step=False, on_epoch=True, sync_dist=True, reduce_fx="max")
 
     def _compute(self) -> Coverage:
-        self.metric.update([], [])  # a process that was dealt nothing but padding has not updated yet
+        self.metric.update([], [], weights=[])  # a process that was dealt nothing but padding has not updated yet
         coverage: Coverage = self.metric.compute()
         self.coverage = coverage
         if not bool((coverage.probed_steps > 0).any()):

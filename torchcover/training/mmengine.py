@@ -92,7 +92,7 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         """
         self._add([], size)
         self.metric.to(get_comm_device())  # processes on GPUs exchange nothing that lies on the CPU
-        self.metric.update([], [])  # a process that was dealt nothing but padding has not updated yet
+        self.metric.update([], [], weights=[])  # a process that was dealt nothing but padding has not updated yet
         scalars = self.compute_metrics(self.results)
         self.metric.reset()
         self._once.start_epoch()

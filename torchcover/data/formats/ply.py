@@ -5,15 +5,19 @@ binary one with triangles beside quads although its vertices are sound, and roun
 """
 
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from torchcover.data.formats.arrays import Points
-from torchcover.data.formats.text import AXES, decode, parse_rows
+from torchcover.data.formats.binary import check_rest
+from torchcover.data.formats.text import AXES, parse_rows, read_lines
+from torchcover.files import check_memory
 
 # Bounds the search for end_header in a file that is no PLY.
 MAX_HEADER_BYTES = 65536
+MAX_DIGITS = 18
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 # The names of the first specification and the ones with a size in them (CARLA writes float32).
 TYPES = {
@@ -43,6 +47,7 @@ class _Element:
 
 def read_ply(path: Path) -> Points:
     """Read x y z of the element `vertex` of a PLY file."""
+    check_memory(4 * path.stat().st_size)
     encoding, elements, body = _parse_header(path.read_bytes())
     names = [element.name for element in elements]
     if "vertex" not in names:
@@ -50,18 +55,29 @@ def read_ply(path: Path) -> Points:
     before, vertex = elements[: names.index("vertex")], elements[names.index("vertex")]
     _check_vertex(vertex)
     if encoding == "ascii":
-        rows = [row for row in decode(body).splitlines() if row.strip()]
-        _check_size(elements, sum(element.rows for element in elements), len(rows), "rows")
-        first = sum(element.rows for element in before)
-        properties = list(vertex.types)
-        return parse_rows(rows[first : first + vertex.rows], [properties.index(axis) for axis in AXES])
+        return _parse_ascii(elements, before, vertex, body)
     if any(element.has_list for element in before):
         raise ValueError("a binary element with a list stands before the vertices; store the vertices first")
     _check_size(elements, sum(element.rows * element.row_bytes for element in elements), len(body), "bytes")
+    if not any(element.has_list for element in elements):
+        check_rest(body[sum(element.rows * element.row_bytes for element in elements) :])
     dtype = np.dtype([(name, BYTE_ORDERS[encoding] + kind) for name, kind in vertex.types.items()])
     offset_bytes = sum(element.rows * element.row_bytes for element in before)
     table = np.frombuffer(body, dtype, vertex.rows, offset_bytes)
     return np.column_stack([table[axis] for axis in AXES])
+
+
+def _parse_ascii(elements: list[_Element], before: list[_Element], vertex: _Element, body: bytes) -> Points:
+    rows, claimed = sum(1 for _ in read_lines(body)), sum(element.rows for element in elements)
+    _check_size(elements, claimed, rows, "rows")
+    if rows > claimed:
+        raise ValueError(f"the header claims {claimed} rows; {rows} rows follow it")
+    if vertex.rows == 0:
+        return np.empty((0, 3))
+    first = sum(element.rows for element in before)
+    properties = list(vertex.types)
+    columns = [properties.index(axis) for axis in AXES]
+    return parse_rows(islice(read_lines(body), first, first + vertex.rows), columns, len(properties))
 
 
 def _parse_header(data: bytes) -> tuple[str, list[_Element], bytes]:
@@ -82,7 +98,7 @@ def _parse_header(data: bytes) -> tuple[str, list[_Element], bytes]:
                 pass
             case ["format", encoding, _]:
                 pass
-            case ["element", name, rows] if rows.isascii() and rows.isdigit():
+            case ["element", name, rows] if rows.isascii() and rows.isdigit() and len(rows) <= MAX_DIGITS:
                 elements.append(_Element(name, int(rows)))
             case ["property", *declaration] if elements:
                 _add_property(elements[-1], declaration)

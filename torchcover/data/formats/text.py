@@ -1,55 +1,100 @@
 """Clouds as text: `.csv`, `.xyz`, and the rows of the ascii variants of other formats."""
 
-from collections.abc import Sequence
+import io
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.files import check_memory
+
 COMMENT_MARKS = ("#", "//")
 AXES = ("x", "y", "z")
+# Of three float64, and once more while the array grows.
+ROW_BYTES = 48
 
 
 def read_text(path: Path) -> NDArray[np.float64]:
     """Read one point a line, separated by commas or white space.
 
-    A line above the points may name the columns (also as a comment); else the first three are x y z.
+    A line above the points may name the columns (also as a comment); else the first three are x y z. All rows have as
+    many columns as there are names, or as the first row.
     """
-    lines = [line for line in map(str.strip, decode(path.read_bytes()).splitlines()) if line]
-    rows = [line for line in lines if not line.startswith(COMMENT_MARKS)]
-    if not rows:
+    rows = read_lines(path.read_bytes())
+    above, first = "", next(rows, None)
+    while first is not None and first.startswith(COMMENT_MARKS):
+        above, first = first, next(rows, None)
+    if first is None:
         return np.empty((0, 3))
-    names = _split(rows[0])
+    points = (row for row in rows if not row.startswith(COMMENT_MARKS))
+    names = _split(first)
     if not _is_numeric(names):
         columns = _named_columns(names)
         if columns is None:
             raise ValueError(
-                f"the header line has to name the columns x, y and z; got {rows[0][:80]!r}. "
-                "Without a header line the first three columns are x y z"
+                f"the header line has to name the columns x, y and z; got {first[:80]!r}. "
+                "Without a header line the first three columns are x y z; numbers have a decimal point"
             )
-        return parse_rows(rows[1:], columns)
-    above = lines[: lines.index(rows[0])]
-    commented = _named_columns(_split(above[-1].lstrip("#/"))) if above else None
-    return parse_rows(rows, commented or (0, 1, 2))
+        first_row = next(points, None)
+        if first_row is None:
+            return np.empty((0, 3))
+        return parse_rows(chain([first_row], points), columns, len(names), "," if "," in first_row else None)
+    commented = _split(above.lstrip("#/"))
+    width = len(names) if _named_columns(commented) is None else len(commented)
+    columns = _named_columns(commented) or (0, 1, 2)
+    return parse_rows(chain([first], points), columns, width, "," if "," in first else None)
 
 
-def parse_rows(rows: Sequence[str], columns: Sequence[int]) -> NDArray[np.float64]:
-    """Parse `columns` of every row into (N, 3) float64, which keeps all digits of UTM-sized coordinates."""
-    if not rows:
-        return np.empty((0, 3))
-    delimiter = "," if "," in rows[0] else None
+def parse_rows(
+    rows: Iterable[str], columns: Sequence[int], width: int, delimiter: str | None = None
+) -> NDArray[np.float64]:
+    """Parse some columns of every row.
+
+    Args:
+        rows: At least one, without blank ones.
+        columns: Where x, y and z are.
+        width: How many columns every row has.
+        delimiter: None for white space.
+
+    Returns:
+        (N, 3) float64, which keeps all digits of UTM-sized coordinates.
+
+    Raises:
+        ValueError: A row of another width, or one without three numbers.
+    """
+    checked = _of_width(rows, width, delimiter)
     try:
-        return np.loadtxt(rows, np.float64, comments=None, delimiter=delimiter, usecols=columns, ndmin=2)
+        return np.loadtxt(checked, np.float64, comments=None, delimiter=delimiter, usecols=columns, ndmin=2)
     except ValueError as error:
         raise ValueError(f"not three numbers in every row ({error})") from error
 
 
-def decode(data: bytes) -> str:
-    """Decode UTF-8, with or without a byte order mark."""
+def read_lines(data: bytes) -> Iterator[str]:
+    """Lines of UTF-8, with or without a byte order mark; blank ones are left out.
+
+    Raises:
+        ValueError: Not UTF-8, or more lines than there is room for.
+    """
+    check_memory(2 * len(data) + ROW_BYTES * max(data.count(b"\n"), data.count(b"\r")))
+    return _lines(data)
+
+
+def _lines(data: bytes) -> Iterator[str]:
+    stream = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig")
     try:
-        return data.decode("utf-8-sig")
+        yield from filter(None, map(str.strip, stream))
     except UnicodeDecodeError as error:
-        raise ValueError(f"not text: byte {error.start} is 0x{data[error.start]:02x}") from error
+        raise ValueError(f"not text in UTF-8: there is a byte 0x{error.object[error.start]:02x}") from error
+
+
+def _of_width(rows: Iterable[str], width: int, delimiter: str | None) -> Iterator[str]:
+    for number, row in enumerate(rows, 1):
+        found = row.count(delimiter) + 1 if delimiter else len(row.split())
+        if found != width:
+            raise ValueError(f"row {number} has {found} columns where {width} are needed: {row[:80]!r}")
+        yield row
 
 
 def _split(line: str) -> list[str]:
@@ -66,4 +111,8 @@ def _is_numeric(words: Sequence[str]) -> bool:
 
 def _named_columns(names: Sequence[str]) -> tuple[int, ...] | None:
     bare = [name.strip(" \t\"'").lower() for name in names]
-    return tuple(bare.index(axis) for axis in AXES) if set(AXES) <= set(bare) else None
+    if not set(AXES) <= set(bare):
+        return None
+    if any(bare.count(axis) > 1 for axis in AXES):
+        raise ValueError(f"x, y and z name one column each; got {', '.join(bare)[:80]}")
+    return tuple(bare.index(axis) for axis in AXES)

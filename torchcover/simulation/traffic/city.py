@@ -20,7 +20,7 @@ Bounds = tuple[float, float]
 
 
 class City:
-    """Builds the part of a city that the ego gets to see.
+    """Builds the part of a city that the ego gets to see, and parks cars in it.
 
     Args:
         streets: The plan.
@@ -36,21 +36,21 @@ class City:
         self._generator = generator
 
     def static(self, seen_m: Bounds) -> tuple[Mesh, ...]:
-        """The ground, the blocks, buildings, furniture and parked cars.
+        """The ground, the blocks, buildings and furniture; cars are parked among them.
 
         Args:
             seen_m: Smallest and largest x that matter; the ground goes on to the ends of all lanes.
         """
         reach = self._streets.reach_m + 200.0
-        blocks, buildings, furniture, parked = [], [], [], []
+        blocks, buildings, furniture = [], [], []
         for x_m in self._blocks(seen_m):
             for side in (1, -1):
                 kerb = self._streets.kerb_m
                 blocks.append(block(x_m, _sides(side, kerb, kerb + BLOCK_DEPTH_M), (0.0, PAVEMENT_M)))
                 buildings += self._facade(x_m, side) + self._side_streets(x_m, side)
                 furniture += self._furniture(x_m, side)
-                parked += self._parked(x_m, side)
-        return (ground((-reach, -reach), (reach, reach)), *few(blocks, buildings, furniture, parked))
+                self._park(x_m, side)
+        return (ground((-reach, -reach), (reach, reach)), *few(blocks, buildings, furniture))
 
     def _blocks(self, seen_m: Bounds) -> Iterator[Bounds]:
         """The blocks between junctions, from kerb to kerb."""
@@ -110,9 +110,8 @@ class City:
         radius, height = self._uniform(1.0, 1.6), self._uniform(5.0, 8.5)
         return tree((x, y), PAVEMENT_M, self._uniform(2.8, 3.4), height, radius)
 
-    def _parked(self, x_m: Bounds, side: int) -> list[Mesh]:
+    def _park(self, x_m: Bounds, side: int) -> None:
         """Cars at the kerb, in the direction of the traffic beside them."""
-        cars = []
         x, end = x_m[0] + FREE_AT_CORNERS_M, x_m[1] - FREE_AT_CORNERS_M
         while x < end:
             kind = self._fleet.draw_kind(PARKED)
@@ -121,9 +120,8 @@ class City:
                 slack = max((PARKING_BAY_M - self._fleet.width_m(kind)) / 2 - 0.08, 0.0)
                 y = -side * (self._streets.bay_m + self._uniform(0.0, slack))
                 yaw = (0.0 if side == 1 else 180.0) + self._uniform(-0.4, 0.4)
-                cars.append(self._fleet.park(kind, (x + length / 2, y, yaw)))
+                self._fleet.park(kind, (x + length / 2, y, yaw))
             x += length
-        return cars
 
     def _uniform(self, low: float, high: float) -> float:
         return float(self._generator.uniform(low, high))

@@ -10,7 +10,6 @@ from torchcover.simulation.documents import load_document
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.flow import Agent, Lane
 from torchcover.simulation.traffic.idm import Driver
-from torchcover.simulation.traffic.scenery import placed
 from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor
 
@@ -84,12 +83,11 @@ class Fleet:
         """Somebody of a kind on a lane."""
         return Agent(kind, self.length_m(kind), lane, place_m, driver)
 
-    def park(self, kind: str, pose: tuple[float, float, float]) -> Mesh:
-        """A body at a pose x, y in metres and yaw in degrees, noted down in `parked`."""
+    def park(self, kind: str, pose: tuple[float, float, float]) -> None:
+        """Note a body down in `parked`, at a pose x, y in metres and yaw in degrees."""
         x_m, y_m, yaw_deg = pose
         place = Trajectory.resting((x_m, y_m, 0.0), (yaw_deg, 0.0, 0.0))
         self.parked.append(Actor(f"parked {kind} {len(self.parked)}", CATEGORIES[kind], self.meshes[kind], place))
-        return placed(self.meshes[kind], pose)
 
     def fill(
         self,

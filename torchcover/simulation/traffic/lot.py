@@ -56,36 +56,35 @@ class Lot:
         return [(side, _stall_x(column)) for side in (1, -1) for column in sorted(self._empty[side])]
 
     def static(self) -> tuple[Mesh, ...]:
-        """Everything, with ground for 300 m around."""
-        parked, low = [], []
+        """Everything but the cars, with ground for 300 m around; the cars are parked."""
+        low = []
         for side in (1, -1):
             for head, inwards in ((MIDDLE_WALKWAY_M / 2, 1), (OUTER_HEAD_M, -1)):
                 for column in range(STALLS):
                     low.append(self._wheel_stop(_stall_x(column), side * (head + inwards * 0.12)))
                     if column not in self._empty[side]:
                         place = (_stall_x(column), side * head, side * inwards)
-                        car, trolley = self._occupant(*place)
-                        parked += car
-                        low += trolley
+                        low += self._occupant(*place)
         islands, trees = self._islands()
         around = self._surroundings()
-        return (ground((-300.0, -300.0), (300.0, 300.0)), *few(parked, low, self._bollards(), islands, trees, around))
+        return (ground((-300.0, -300.0), (300.0, 300.0)), *few(low, self._bollards(), islands, trees, around))
 
     def _wheel_stop(self, x: float, y: float) -> Mesh:
         return box((x, y), (1.8, 0.15, 0.1))
 
-    def _occupant(self, x: float, head_y: float, inwards: int) -> tuple[list[Mesh], list[Mesh]]:
-        """A car in a stall, nose or tail first; or a trolley that somebody left there; or nothing."""
+    def _occupant(self, x: float, head_y: float, inwards: int) -> list[Mesh]:
+        """Park a car in a stall, nose or tail first; or return a trolley that somebody left there; or nothing."""
         if self._generator.random() < self._parked_share:
             kind = self._fleet.draw_kind(PARKED)
             y = head_y + inwards * (NOSE_OFF_HEAD_M + self._fleet.length_m(kind) / 2)
             yaw = self._generator.choice((90.0, -90.0)) + self._generator.uniform(-1.5, 1.5)
             x += self._generator.uniform(-0.1, 0.1)
-            return [self._fleet.park(kind, (x, y, yaw))], []
+            self._fleet.park(kind, (x, y, yaw))
+            return []
         if self._generator.random() < TROLLEY_SHARE:
             x, y = x + self._generator.uniform(-0.6, 0.6), head_y + inwards * self._generator.uniform(1.0, 4.0)
-            return [], [box((x, y), TROLLEY_M, yaw_deg=self._generator.uniform(0.0, 360.0))]
-        return [], []
+            return [box((x, y), TROLLEY_M, yaw_deg=self._generator.uniform(0.0, 360.0))]
+        return []
 
     def _islands(self) -> tuple[list[Mesh], list[Mesh]]:
         """Kerbed ends of the double row, each with trees."""

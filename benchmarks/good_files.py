@@ -1,0 +1,199 @@
+"""A good file of every format that is read."""
+
+import io
+import struct
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import lzf
+import numpy as np
+import torch
+from PIL import Image
+
+from torchcover.cameras import Camera, read_depth
+from torchcover.coverage import BevGrid, Coverage, CoverageMetric
+from torchcover.data import read_cloud
+from torchcover.data.poses import read_poses
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One format and its reader.
+
+    Args:
+        name: The file's.
+        data: A good one.
+        read: What reads it; raises for a bad one.
+        beside: Other files that belong to it.
+    """
+
+    name: str
+    data: bytes
+    read: object
+    beside: tuple[tuple[str, bytes], ...] = ()
+
+
+def stored(write):
+    """The bytes that a function writes into a file."""
+    stream = io.BytesIO()
+    write(stream)
+    return stream.getvalue()
+
+
+def archive(members, compression=zipfile.ZIP_DEFLATED):
+    """A ZIP archive of these files."""
+
+    def write(stream):
+        with zipfile.ZipFile(stream, "w", compression) as file:
+            for name, data in members.items():
+                file.writestr(name, data)
+
+    return stored(write)
+
+
+def rows(points, separator):
+    """Points as text."""
+    return "".join(separator.join(f"{value:.4f}" for value in point) + "\n" for point in points.tolist()).encode()
+
+
+def pcd(encoding, body):
+    """A PCD file of 40 points with intensities."""
+    return (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\n"
+        f"COUNT 1 1 1 1\nWIDTH 20\nHEIGHT 2\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 40\nDATA {encoding}\n"
+    ).encode() + body
+
+
+def ply(encoding, body):
+    """A PLY file of 40 points with intensities."""
+    columns = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
+    return f"ply\nformat {encoding} 1.0\nelement vertex 40\n{columns}end_header\n".encode() + body
+
+
+def png(pixels):
+    """A PNG image."""
+    return stored(lambda stream: Image.fromarray(pixels).save(stream, "png"))
+
+
+def exr(folder):
+    """An EXR image of one channel."""
+    import OpenEXR
+
+    path = Path(folder, "seed.exr")
+    OpenEXR.File(
+        {"compression": OpenEXR.ZIP_COMPRESSION}, {"Z": np.linspace(1, 9, 48, dtype="f4").reshape(6, 8)}
+    ).write(str(path))
+    return path.read_bytes()
+
+
+def coverage(folder):
+    """A saved result with blocks and sums over the surface."""
+    grid = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=0.5)
+    metric = CoverageMetric(grid, blocks=8, max_radius=9.0, square_metres=True)
+    random = torch.Generator().manual_seed(0)
+    for _ in range(8):
+        reference = torch.rand(60, 3, generator=random) * torch.tensor([4.0, 2.0, 1.0])
+        metric.update(reference[::5] + 0.1, reference, weights=torch.ones(60))
+    path = Path(folder, "seed.npz")
+    metric.compute().save(path)
+    return path.read_bytes()
+
+
+ROS = b"""image_width: 640
+image_height: 480
+camera_name: head
+camera_matrix: {rows: 3, cols: 3, data: [520., 0., 318., 0., 510., 242., 0., 0., 1.]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [-0.2, 0.1, 0.0, 0.001, 0.02]}
+"""
+OPENCV = b"""%YAML:1.0
+---
+image_width: 640
+image_height: 480
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 520., 0., 318., 0., 510., 242., 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 4
+   cols: 1
+   dt: d
+   data: [ 1e-1, 0., 0., 0. ]
+"""
+KITTI = b"""P0: 520 0 318 0 0 510 242 0 0 0 1 0
+P2: 520 0 318 44.8 0 510 242 0.2 0 0 1 0.003
+R0_rect: 1 0 0 0 1 0 0 0 1
+Tr_velo_to_cam: 0 -1 0 0.01 0 0 -1 -0.07 1 0 0 -0.27
+"""
+POSES = b"""sensor:
+  vehicle_T_sensor: [[1, 0, 0, -0.52], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]]
+rigs:
+  roof: {vehicle_T_sensor: [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 2.0], [0, 0, 0, 1]]}
+"""
+SENSORS = b'[{"token": "s1", "channel": "CAM_FRONT"}, {"token": "s2", "channel": "LIDAR_TOP"}]'
+CALIBRATED = b"""[
+ {"token": "a", "sensor_token": "s1", "translation": [1.7, 0.0, 1.5], "rotation": [0.5, -0.5, 0.5, -0.5],
+  "camera_intrinsic": [[520.0, 0.0, 318.0], [0.0, 510.0, 242.0], [0.0, 0.0, 1.0]]},
+ {"token": "l", "sensor_token": "s2", "translation": [0.9, 0, 1.8], "rotation": [1, 0, 0, 0], "camera_intrinsic": []}
+]"""
+
+
+def kinds(folder):
+    """One of each format that is read.
+
+    Args:
+        folder: Where libraries may write what they write into files only.
+    """
+    random = np.random.default_rng(0)
+    cloud = random.uniform([-40, -40, -2, 0], [40, 40, 3, 1], (40, 4)).astype("<f4")
+    xyz = cloud[:, :3].astype(np.float64)
+    rings = np.c_[cloud, np.arange(40) % 16].astype("<f4")
+    packed = lzf.compress(cloud.T.tobytes(), 2000)
+    member = stored(lambda stream: np.save(stream, xyz))
+    colour = random.integers(0, 256, (6, 8, 4), dtype=np.uint8)
+    rgb, grey = colour[..., :3].copy(), random.integers(0, 65536, (6, 8)).astype(np.uint16)
+    clouds = {
+        "c.npy": stored(lambda stream: np.save(stream, cloud)),
+        "c64.npy": member,
+        "deflated.npz": archive({"points.npy": member}),
+        "stored.npz": archive({"points.npy": member}, zipfile.ZIP_STORED),
+        "bzip2.npz": archive({"points.npy": member}, zipfile.ZIP_BZIP2),
+        "c.bin": cloud.tobytes(),
+        "c.pcd.bin": rings.tobytes(),
+        "ascii.pcd": pcd("ascii", rows(cloud, " ")),
+        "binary.pcd": pcd("binary", cloud.tobytes()),
+        "compressed.pcd": pcd("binary_compressed", struct.pack("<II", len(packed), cloud.nbytes) + packed),
+        "ascii.ply": ply("ascii", rows(cloud, " ")),
+        "binary.ply": ply("binary_little_endian", cloud.tobytes()),
+        "c.csv": b"x,y,z,intensity\n" + rows(cloud, ","),
+        "c.xyz": b"# x y z intensity\n" + rows(cloud, " "),
+    }
+
+    def depth(path):
+        return read_depth(path, metres_per_unit=0.001 if path.stem.startswith("whole") else None)
+
+    depths = {
+        "rgb.png": png(rgb),
+        "rgba.png": png(colour),
+        "whole.png": png(grey),
+        "d.npy": stored(lambda stream: np.save(stream, grey.astype(np.float32))),
+        "whole.npy": stored(lambda stream: np.save(stream, grey)),
+        "d.exr": exr(folder),
+    }
+
+    def nuscenes(path):
+        return Camera.from_nuscenes(path.parent, "CAM_FRONT")
+
+    return (
+        *(Kind(name, data, read_cloud) for name, data in clouds.items()),
+        *(Kind(name, data, depth) for name, data in depths.items()),
+        Kind("ros.yaml", ROS, Camera.from_ros),
+        Kind("opencv.yml", OPENCV, Camera.from_opencv),
+        Kind("kitti.txt", KITTI, lambda path: Camera.from_kitti(path, 2, width=640, height=480)),
+        Kind("sensor.json", SENSORS, nuscenes, (("calibrated_sensor.json", CALIBRATED),)),
+        Kind("calibrated_sensor.json", CALIBRATED, nuscenes, (("sensor.json", SENSORS),)),
+        Kind("frames.yaml", POSES, read_poses),
+        Kind("coverage.npz", coverage(folder), Coverage.load),
+    )

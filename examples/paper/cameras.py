@@ -1,0 +1,67 @@
+"""Three cameras: blind spots within 10 m and 40 m, and Figure 2, one rig seen in four ways."""
+
+import torch
+from rich.console import Console
+
+from examples.paper.measuring import Measurement
+from torchcover import BevGrid, Region
+from torchcover.evaluation import sensor_views
+from torchcover.report import (
+    CoverageTable,
+    as_markdown,
+    draw_four_views,
+    map_figures,
+    parts_of,
+    print_table,
+    write_figures,
+)
+
+RIG = "three_cameras"
+GRID = BevGrid(x=(-40.0, 40.0), y=(-40.0, 40.0), cell=0.25)
+REGIONS = (Region("10m around", (-10.0, 10.0), (-10.0, 10.0)), Region("40m around", (-40.0, 40.0), (-40.0, 40.0)))
+# Figure 2 shows the part within 20 m.
+NEARBY = BevGrid(x=(-20.0, 20.0), y=(-20.0, 20.0), cell=GRID.cell)
+BLOCKS = 16  # for standard errors
+# One band that holds every point of a rig.
+ANY_HEIGHT = {"any": (-100.0, 100.0)}
+
+
+def run(options):
+    """Measure; print and write tables, coverages and maps, and draw the figure."""
+    out = options.out / "cameras"
+    measurement = Measurement({RIG: RIG}, GRID, REGIONS, options)
+    points = PointCount()
+    coverages = measurement.run(range(options.steps), blocks=BLOCKS, also=[points])
+    views = sensor_views(measurement.frames.sensors[RIG])
+    texts = []
+    for (_, measure), coverage in coverages.items():
+        table = CoverageTable.of({RIG: coverage}, REGIONS)
+        print_table(table, Console())
+        texts.append(as_markdown(table, parts_of(table)))
+        figures = map_figures({RIG: coverage}, ego_outline_m=measurement.frames.ego_outline_m, sensors={RIG: views})
+        write_figures(figures, out / "maps" / measure)
+        coverage.save(out / f"{RIG}_{measure}.npz")
+    (out / "table.md").write_text("\n".join(texts), encoding="utf-8")
+    near = Region("nearby", NEARBY.x, NEARBY.y).mask(GRID)
+    figure = draw_four_views(
+        coverages[RIG, "known"].radius[:, near].reshape(NEARBY.shape),
+        points.counts.reshape(GRID.shape[1:])[near].reshape(NEARBY.shape[1:]),
+        NEARBY,
+        steps=options.steps,
+        title=f"{RIG}, four ways to look at it",
+        ego_outline_m=measurement.frames.ego_outline_m,
+        sensors=views,
+    )
+    figure.savefig(out / "figure_2.png", dpi=figure.dpi)
+
+
+class PointCount:
+    """How many points of the rig lie in each cell, at any height."""
+
+    def __init__(self):
+        self.grid = BevGrid(GRID.x, GRID.y, GRID.cell, ANY_HEIGHT)
+        self.counts = torch.zeros(self.grid.cells, dtype=torch.int64)
+
+    def update(self, frame):
+        cells = self.grid.cell_of(frame.cloud_of(RIG))
+        self.counts += torch.bincount(cells[cells >= 0], minlength=self.grid.cells)

@@ -1,0 +1,202 @@
+"""Points of their own for objects: they find all of an object that is seen, and move no other number."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover.data import SimulatedFrames
+from torchcover.detection import box_visibility
+from torchcover.simulation import Rig, SurfaceReference
+from torchcover.simulation.patches import Bounds, Patches
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.shapes import Box, Plane
+from torchcover.simulation.sight import sight
+from torchcover.simulation.surface_points import SurfaceStrata
+from torchcover.simulation.surroundings import Surroundings
+from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.world import Actor, World
+
+from .small_worlds import AHEAD, FLOOR, agrees, box, scenario
+
+BEHIND = (((-20.0, -10.0), (-5.0, 5.0)),)
+GROUND = Plane(type="plane", size_m=(400.0, 400.0)).mesh()
+EGO = Actor("ego", "ego", Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh(), Trajectory.resting([0.0, 0.0, 0.0]))
+
+
+def there(x_m, y_m=0.0, z_m=0.0, *, size_m=(2.0, 2.0, 1.5), moves=False, until_s=None):
+    """A box at a place; one that moves gets there at 1 s."""
+    place = [x_m, y_m, z_m]
+    track = Trajectory.from_arrays([0.0, 1.0], [[x_m + 5.0, y_m, z_m], place], np.zeros((2, 3)))
+    if until_s is not None:
+        track = Trajectory(np.array([0.0, until_s]), np.array([place, place]), np.zeros((2, 3)), transient=True)
+    return Actor("box", "car", Box(type="box", size_m=size_m).mesh(), track if moves else Trajectory.resting(place))
+
+
+def world(actors=(), parked=(), static=()):
+    return World((GROUND, *static), EGO, tuple(actors), 1.0, 3.0, tuple(parked))
+
+
+def scans(made, sensor, steps=40, step=1):
+    scene = Scene(made)
+    surroundings = (
+        Surroundings(scene, scene.at(step), np.random.default_rng([3, index]), "test") for index in range(steps)
+    )
+    return [sensor.scan(some) for some in surroundings]
+
+
+def m2(found, which=lambda x, y, z: x > 5.0):
+    """(scans,) square metres of the points of which something holds."""
+    return np.array([scan.weights.astype(np.float64)[which(*scan.points.T)].sum() for scan in found])
+
+
+def worlds_with(actor_of):
+    """The same box as an actor at rest, as one that moves, and parked."""
+    return [world([actor_of(moves=False)]), world([actor_of(moves=True)]), world(parked=[actor_of(moves=False)])]
+
+
+@pytest.mark.parametrize("made", worlds_with(lambda moves: there(10.0, moves=moves)), ids=["rests", "moves", "parked"])
+def test_all_of_an_object_that_is_seen_is_found_wherever_the_areas_are(at, made):
+    at([2.5, 3.0, 2.5])
+    found = scans(made, SurfaceReference(BEHIND, rays=100, places=1, object_points=64))
+    assert all(scan.drawn.tolist() == [64] for scan in found)
+    # One in each of 64 equal parts of the three faces, none of which is hidden: no scan is off by more than a part.
+    np.testing.assert_allclose(m2(found), 3.0 + 3.0 + 4.0, rtol=1e-5)
+    agrees(m2(found, lambda x, y, z: (x > 5.0) & (z > 1.49999)), 4.0)
+    agrees(m2(found, lambda x, y, z: (x > 5.0) & (z < 0.75)), 3.0)
+
+
+@pytest.mark.parametrize("made", worlds_with(lambda moves: there(10.0, moves=moves)), ids=["rests", "moves", "parked"])
+def test_in_the_areas_and_bands_the_square_metres_are_those_without_them(at, made):
+    at([2.5, 3.0, 2.5])
+    # The area holds a quarter of the box in x, and the upper band half of it.
+    areas, bands = (((4.0, 9.5), (-5.0, 5.0)),), ((-0.5, 0.5), (0.75, 2.0))
+    found = [
+        scans(made, SurfaceReference(areas, rays=1200, places=2, bands_m=bands, object_points=points))
+        for points in (0, 40)
+    ]
+    parts = {
+        "ground": (lambda x, y, z: (x < 9.5) & (z < 1e-3), None),
+        "front": (lambda x, y, z: (x < 9.001) & (z >= 0.75), 1.5),
+        "side": (lambda x, y, z: (x > 9.001) & (x < 9.5) & (y > 0.999) & (z >= 0.75), 0.375),
+        "top": (lambda x, y, z: (x < 9.5) & (z > 1.499), 1.0),
+    }
+    for which, exact in parts.values():
+        without, with_ = (m2(some, which) for some in found)
+        agrees(without, exact or with_.mean(), within=0.05)
+        agrees(with_, exact or without.mean(), within=0.05)
+
+
+def test_each_object_gets_at_least_the_number_of_points_that_was_asked_for(at):
+    at([2.5, 3.0, 2.5])
+    made = world([there(10.0), there(30.0, moves=True)], parked=[there(90.0)])
+    (scan,) = scans(made, SurfaceReference(BEHIND, rays=100, places=4, object_points=10), steps=1)
+    assert scan.drawn.tolist() == [12, 12, 12]
+    # In addition to the others, half of which had no surface to be on.
+    assert 36 + 40 < scan.rays < 36 + 60
+    (scan,) = scans(made, SurfaceReference((AHEAD,), rays=400, places=4), steps=1)
+    # Without points of their own, objects have their share of those of the areas.
+    assert scan.drawn[0] > 0
+    assert scan.drawn[1:].tolist() == [0, 0]
+
+
+def test_of_two_objects_that_overlap_the_inside_is_not_seen(at):
+    at([2.5, 0.0, 1.0])
+    made = world([there(10.0), there(12.0, size_m=(4.0, 1.0, 3.0))])
+    found = scans(made, SurfaceReference(BEHIND, rays=10, places=1, object_points=128))
+    agrees(m2(found, lambda x, y, z: np.abs(x - 9.0) < 1e-3), 3.0)
+    agrees(m2(found, lambda x, y, z: np.abs(x - 10.0) < 1e-3), 3.0 - (1.0 + 0.5 * 7.5 / 6.5))
+    agrees(m2(found), 6.0 - (1.0 + 0.5 * 7.5 / 6.5))
+    assert all(scan.drawn.tolist() == [128, 128] for scan in found)
+
+
+def test_what_is_below_the_ground_is_drawn_and_not_seen(at):
+    at([2.5, 0.0, 0.9])
+    made = world(parked=[there(10.0, z_m=-0.5)])
+    agrees(m2(scans(made, SurfaceReference(BEHIND, rays=10, places=1, object_points=128))), 2.0)
+
+
+def test_one_place_and_one_point_have_the_right_mean():
+    found = scans(world([there(10.0)]), SurfaceReference(BEHIND, rays=1, places=1, object_points=1), steps=150)
+    many = scans(world([there(10.0)]), SurfaceReference(BEHIND, rays=1, places=8, object_points=512), steps=30)
+    assert all(scan.drawn.tolist() == [1] for scan in found)
+    agrees(m2(found), m2(many).mean(), within=0.1)
+
+
+def test_without_an_object_nothing_changes():
+    scene = Scene(world())
+    with_, without = (
+        SurfaceReference((AHEAD,), rays=200, object_points=points).scan(
+            Surroundings(scene, scene.at(0), np.random.default_rng(0), "test")
+        )
+        for points in (64, 0)
+    )
+    assert with_.drawn.shape == (0,)
+    np.testing.assert_array_equal(with_.points, without.points)
+    np.testing.assert_array_equal(with_.weights, without.weights)
+
+
+def test_nothing_is_drawn_on_who_is_not_there_or_out_of_range(at):
+    at([-2.5, 0.0, 1.0])
+    made = world([there(10.0, moves=True, until_s=1.5), there(37.0), there(40.0)])
+    sensor = SurfaceReference(BEHIND, rays=100, places=2, object_points=20, max_range_m=39.0)
+    (while_there,) = scans(made, sensor, steps=1, step=1)
+    (afterwards,) = scans(made, sensor, steps=1, step=2)
+    assert while_there.drawn.tolist() == [20, 20, 0]
+    assert afterwards.drawn.tolist() == [0, 20, 0]
+
+
+def test_an_object_that_turns_only_its_inner_side_to_a_place_hides_itself():
+    mesh = Box(type="box", size_m=(20.0, 20.0, 20.0)).mesh()
+    place_m = np.array([1.0, 2.0, 3.0])
+    away = Bounds(np.full((1, 3), 90.0), np.full((1, 3), 99.0))
+    strata = SurfaceStrata(Patches.of(mesh).given_to(0), away)
+    drawn = strata.draw(place_m, 5.0, np.random.default_rng(0), on_objects=50)
+    assert drawn.of_object.tolist() == [0] * 50
+    instant = Scene(World((mesh,), EGO)).at(0)
+    assert not sight(instant, place_m, drawn.points_m + np.float32(1e-3) * drawn.normals).seen.any()
+    assert sight(instant, place_m, drawn.points_m - np.float32(1e-3) * drawn.normals).seen.all()
+
+
+def test_an_object_of_any_size_is_cut_whole():
+    huge = Patches.of(Plane(type="plane", size_m=(1e6, 10.0)).mesh())
+    assert len(huge.outward) < 10_000
+    assert np.linalg.norm(huge.normals_m2.astype(np.float64), axis=0).sum() / 2 == pytest.approx(1e7, rel=1e-5)
+    assert max(np.abs(huge.first_m).max(), np.abs(huge.second_m).max()) <= 1e6 / 64
+    car = Patches.of(Box(type="box", size_m=(18.0, 2.5, 4.0)).mesh())
+    assert max(np.linalg.norm(edges, axis=0).max() for edges in (car.first_m, car.second_m)) <= 4.0
+
+
+LIDAR = {
+    "type": "lidar", "name": "top", "mount": {"z_m": 1.9}, "channels": 32, "vertical_fov_deg": (-30, 5),
+    "horizontal_fov_deg": 180, "columns": 720, "max_range_m": 120,
+}  # fmt: skip
+
+
+def test_a_frame_tells_what_is_hidden_from_the_places_too_from_what_nobody_asked_about(at):
+    at([-2.5, 0.0, 1.9])
+    cars = [
+        {"name": name, "category": "car", "shape": {"type": "box", "size_m": [4, 2, 1.5]}, "pose": pose}
+        for name, pose in [
+            ("ahead", {"x_m": 15}), ("behind a wall", {"x_m": 40}), ("at the edge", {"x_m": 59.9}),
+            ("behind", {"x_m": -15})
+        ]
+    ]  # fmt: skip
+    made = scenario(FLOOR, box([0.2, 20, 6], x_m=30), actors=cars)
+    rig = Rig.model_validate({"name": "r", "sensors": [LIDAR]})
+    sensor = SurfaceReference((AHEAD,), rays=100, object_points=64, max_range_m=60.0)
+    (frame,) = SimulatedFrames(made, rig, steps=1, reference_sensor=sensor, boxes=True)
+    seen = box_visibility(frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights)
+    assert frame.boxes.ids == ("ahead", "behind a wall", "at the edge", "behind")
+    assert seen.known.tolist() == [True, False, False, True]
+    assert seen.hidden.tolist() == [False, True, False, False]
+    assert seen.drawn_points.tolist()[1:] == [64, 0, 64]
+    # Its front: the roof is too flat for the rig to hit it at all.
+    assert abs(float(seen.share[0]) - 3 / 11) < 0.05
+    assert seen.share[3] == 0.0
+    assert torch.equal(frame.boxes.select(seen.hidden).drawn_points, torch.tensor([64]))
+
+
+def test_frames_with_boxes_ask_about_every_object_unless_they_are_given_a_reference():
+    frames = [SimulatedFrames("courtyard", "front_roof_32", steps=1, boxes=boxes) for boxes in (False, True)]
+    assert [some.reference_sensor.object_points for some in frames] == [0, 64]
+    assert frames[0].reference_sensor.areas == frames[1].reference_sensor.areas

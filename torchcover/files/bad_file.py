@@ -1,0 +1,112 @@
+"""The door of the readers: what is refused unread, and the one error that leaves it."""
+
+import os
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import wraps
+from pathlib import Path
+from typing import Concatenate, ParamSpec, TypeVar
+
+import numpy as np
+
+Arguments = ParamSpec("Arguments")
+Content = TypeVar("Content")
+
+# Libraries quote what they choke on, which may be the whole file.
+MAX_REASON_CHARS = 500
+
+
+class BadFileError(ValueError):
+    """A file is not what it is meant to be; the message names it, what arrived and what is needed.
+
+    Example:
+        >>> isinstance(BadFileError("scan.pcd: an empty file (0 bytes)"), ValueError)
+        True
+    """
+
+
+def reads(
+    content: str,
+) -> Callable[
+    [Callable[Concatenate[Path, Arguments], Content]],
+    Callable[Concatenate[str | os.PathLike[str], Arguments], Content],
+]:
+    """Make a function the door through which one kind of file is read.
+
+    The function gets the path of a regular file that is not empty. It says what is wrong as a ValueError that does not
+    name the file, and may let through whatever its libraries raise.
+
+    Args:
+        content: What the file is meant to be, for messages: "a depth image".
+
+    Returns:
+        A decorator. The function then raises
+
+            FileNotFoundError: There is no such file.
+            IsADirectoryError: A folder.
+            ImportError: A package that the reader needs is missing.
+            BadFileError: Anything else: a device or a FIFO (which would never end), an empty file, a file that may not
+                be opened, one that needs more memory than `check_memory` allows, damaged content.
+
+    Example:
+        >>> import tempfile
+        >>> read = reads("a number")(lambda path: float(path.read_text()))
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     path = Path(folder, "number.txt")
+        ...     _ = path.write_text("7.5")
+        ...     read(path)
+        7.5
+    """
+
+    def decorate(
+        read: Callable[Concatenate[Path, Arguments], Content],
+    ) -> Callable[Concatenate[str | os.PathLike[str], Arguments], Content]:
+        @wraps(read)
+        def door(path: str | os.PathLike[str], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Content:
+            path = Path(path)
+            # Numbers of damaged files overflow; what they become is infinite or NaN, and judged as such.
+            with naming(path, content), np.errstate(all="ignore"):
+                _check_regular(path, content)
+                return read(path, *args, **kwargs)
+
+        return door  # type: ignore[return-value]  # which would have the path without a name
+
+    return decorate
+
+
+@contextmanager
+def naming(path: Path, content: str) -> Iterator[None]:
+    """Turn whatever goes wrong into a `BadFileError` that names the file; a missing one, a folder and a package aside.
+
+    Args:
+        path: The file, or the folder of several.
+        content: What it is meant to be.
+    """
+    try:
+        yield
+    except (BadFileError, FileNotFoundError, IsADirectoryError, ImportError):
+        raise
+    except MemoryError as error:
+        raise BadFileError(f"{path}: there is not enough memory to read {content} of this size") from error
+    except Exception as error:
+        reason = _one_line(error)
+        if not isinstance(error, ValueError) or isinstance(error, UnicodeError):
+            reason = f"not readable as {content} ({type(error).__name__}: {reason}); is it damaged, or another format?"
+        raise BadFileError(f"{path}: {reason}") from error
+
+
+def _check_regular(path: Path, content: str) -> None:
+    status = path.stat() if path.exists() else None
+    if status is None:
+        raise FileNotFoundError(f"{path}: no such file; {content} is needed")
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(f"{path}: a folder; {content} is one file")
+    if not stat.S_ISREG(status.st_mode):
+        raise ValueError(f"a pipe, a socket or a device; {content} has to be a regular file")
+    if status.st_size == 0:
+        raise ValueError(f"an empty file (0 bytes); {content} is needed")
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:MAX_REASON_CHARS] or type(error).__name__

@@ -1,0 +1,143 @@
+"""NumPy's `.npy` and `.npz`, without trust in what their headers claim."""
+
+import math
+import warnings
+import zipfile
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import IO, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.files.budget import check_memory
+
+# Deflate spends at least 2 bits on 258 bytes.
+DEFLATE_MAX_RATIO = 1032
+# How often its compressed size a member can have.
+MAX_RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: DEFLATE_MAX_RATIO}
+CHUNK_BYTES = 1 << 20
+_HEADER_READERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+class NpyHeader(NamedTuple):
+    """What a `.npy` says about its array.
+
+    Args:
+        shape: Of the array.
+        dtype: Of its elements, never Python objects.
+    """
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+
+
+def read_npy(path: Path, check: Callable[[NpyHeader], None]) -> NDArray[Any]:
+    """Read a `.npy`.
+
+    Args:
+        path: The file.
+        check: Called with the header, before memory is reserved; raises ValueError if it is not what is needed.
+
+    Returns:
+        The array.
+
+    Raises:
+        ValueError: Not such a file, Python objects, an array of another size than the file, or too large a one.
+    """
+    return _load(lambda: path.open("rb"), path.stat().st_size, check)
+
+
+def read_npz(
+    path: Path,
+    check: Callable[[NpyHeader], None],
+    choose: Callable[[Collection[str]], Collection[str]] = lambda names: names,
+) -> dict[str, NDArray[Any]]:
+    """Read arrays of a `.npz`, whatever its compression.
+
+    Args:
+        path: The file.
+        check: Called with each header, before memory is reserved; raises ValueError if it is not what is needed.
+        choose: Called with the names of all arrays, returns those that are wanted; else all are.
+
+    Returns:
+        Name -> array.
+
+    Raises:
+        ValueError: Not such an archive, a damaged one, or one that grows beyond what a file may take.
+    """
+    # zipfile raises, beside its own: RuntimeError (encrypted), NotImplementedError (a compression it lacks),
+    # zlib.error, EOFError, OSError on offsets that lead out of the file.
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
+            if len(members) < len(archive.infolist()):
+                raise ValueError("two arrays of one name")
+            wanted = {name: members[name] for name in choose(members)}
+            for member in wanted.values():
+                _check_growth(archive, member)
+            check_memory(sum(member.file_size for member in wanted.values()))
+            return {
+                name: _load(partial(archive.open, member), member.file_size, check) for name, member in wanted.items()
+            }
+    except (ValueError, MemoryError):
+        raise
+    except Exception as error:
+        raise ValueError(f"not a readable .npz archive ({error})") from error
+
+
+def _check_growth(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:
+    if member.compress_type in MAX_RATIOS:
+        largest_bytes = MAX_RATIOS[member.compress_type] * member.compress_size
+    else:  # bzip2 and LZMA have no useful bound: what comes out is counted, and thrown away
+        with archive.open(member) as stream:
+            largest_bytes = sum(map(len, iter(lambda: stream.read(CHUNK_BYTES), b"")))
+    if member.file_size > largest_bytes:
+        raise ValueError(
+            f"{member.filename} claims {member.file_size} bytes out of {member.compress_size} compressed ones; "
+            f"at most {largest_bytes} are possible"
+        )
+
+
+def _load(open_stream: Callable[[], IO[bytes]], size_bytes: int, check: Callable[[NpyHeader], None]) -> NDArray[Any]:
+    with open_stream() as stream:
+        header = _npy_header(stream)
+        data_bytes = size_bytes - stream.tell()
+    if header.dtype.hasobject:
+        raise ValueError("an array of numbers is needed; got pickled Python objects")
+    check(header)
+    # Before NumPy sees it: it reserves memory for whatever shape the header claims.
+    shape, dtype = header
+    claimed_bytes = math.prod(shape) * dtype.itemsize
+    if claimed_bytes != data_bytes:
+        raise ValueError(f"the header claims {shape} {dtype} = {claimed_bytes} bytes; {data_bytes} bytes follow it")
+    check_memory(2 * claimed_bytes)  # whoever takes some columns copies them
+    with open_stream() as stream, _quiet():
+        array: NDArray[Any] = np.lib.format.read_array(stream, allow_pickle=False)
+    return array
+
+
+def _npy_header(stream: IO[bytes]) -> NpyHeader:
+    # The header is a Python literal: NumPy, the parser and the tokenizer each fail with exceptions of their own.
+    try:
+        version = np.lib.format.read_magic(stream)
+        if version not in _HEADER_READERS:
+            raise ValueError(f"version {version[0]}.{version[1]} of the format")
+        with _quiet():
+            shape, _, dtype = _HEADER_READERS[version](stream)
+    except Exception as error:
+        raise ValueError(f"not a readable .npy header ({error})") from error
+    return NpyHeader(shape, dtype)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Silence NumPy on headers that Python 2 wrote (they read well) and Python on doubtful literals in them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
