@@ -23,6 +23,7 @@ BENCHMARKS = (
     "calibration",
     "training_overhead",
     "known_boxes",
+    "hostile_documents",
     "mutated_files",
 )
 

@@ -55,7 +55,9 @@ def main():
     with np.load(options.sums) as sums:
         cities = Cities(**sums)
     random = np.random.default_rng(0)
-    print(f"{len(cities.steps)} cities of {options.scenario}, {RIG}; of {options.runs} runs, how many intervals cover\n")
+    print(
+        f"{len(cities.steps)} cities of {options.scenario}, {RIG}; of {options.runs} runs, how many intervals cover\n"
+    )
     lengths = {f"{steps} steps": cities.covered(random, steps, options.runs) for steps in (64, 256, 1024)}
     stopped = {
         f"stopped, target as at {steps}": cities.stopped(random, steps, options.runs // 4) for steps in (96, 192)

@@ -79,7 +79,7 @@ def test_ros_message(tmp_path):
             "cols: a whole number is needed; got 'a'",
         ),
         ("- 1", "a mapping of names to values is needed; got list"),
-        ("a: [1", "not readable as YAML"),
+        ("a: [1", "not a YAML file"),
         ("", "an empty file"),
     ],
 )
@@ -95,7 +95,7 @@ def test_a_calibration_that_laughs_is_not_written_out(tmp_path):
     for key in ("distortion_model", "d", "k", "width"):
         lines = [line for line in ROS_MESSAGE.splitlines() if not line.startswith(f"{key}:")]
         (tmp_path / "info.yaml").write_text(laughs + "\n".join([*lines, f"{key}: *a11"]))
-        with pytest.raises(BadFileError, match=r"got a list|a list is unknown"):
+        with pytest.raises(BadFileError, match="more than 200,000 values, those of aliases included"):
             Camera.from_ros(tmp_path / "info.yaml")
 
 

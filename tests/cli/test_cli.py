@@ -193,8 +193,19 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["evaluate", "--frames", "no_such_folder"], "no_such_folder"),
         (["evaluate", "kitti", "--scenario", "courtyard", "--frames", "recording"], "exclude each other"),
         (["evaluate", "front_roof_128", "--cell", "0.3"], "not a multiple of the cell of 0.3 m"),
+        (
+            ["evaluate", "front_roof_128", "--cell", "20"],
+            "region '20m' holds no cell centre; use smaller cells than 20 m",
+        ),
+        (["evaluate", "front_roof_128", "--cell", "1e-310"], "x: inf cells of 1e-310 m, over 100,000,000"),
+        (["evaluate", "front_roof_128", "--cell", "0.02"], "the sums of 80,000,000 cells in 16 blocks: "),
+        (["evaluate", "front_roof_128", "--threshold", "inf"], "thresholds: finite distances"),
+        (["evaluate", "front_roof_128", "--rays", "99999999999"], "rays a step (230,400 of the rig's sensors, 99,999"),
+        (["evaluate", "front_roof_128", "--steps", "9" * 20], "steps: a number from 1 to 1,000,000,000 is needed"),
+        (["evaluate", "front_roof_128", "--workers", "1000000"], "1,000,000 workers: 3e+05 GB of memory are needed"),
+        (["evaluate", "front_roof_128", "--device", "meta"], "device meta: cannot be used here"),
         (["evaluate", "front_roof_128", "--cell", "-1"], "cell: a positive length"),
-        (["evaluate", "front_roof_128", "--threshold", "-1"], "thresholds: distances >= 0"),
+        (["evaluate", "front_roof_128", "--threshold", "-1"], "thresholds: finite distances >= 0"),
         (["evaluate", "front_roof_128", "--steps", "0"], "--steps"),
         (["evaluate", "front_roof_128", "--steps", "many"], "--steps"),
         (["evaluate", "front_roof_128", "--seed", "-1"], "--seed"),
@@ -241,10 +252,18 @@ def test_an_output_folder_that_cannot_be_made_is_a_mistake_too(torchcover, recor
 def test_an_impossible_output_folder_is_found_before_the_run(torchcover, recording, tmp_path, monkeypatch):
     monkeypatch.setattr("torchcover.evaluation.evaluating.observe", lambda *_, **__: pytest.fail("it ran all the same"))
     (tmp_path / "file").write_text("")
-    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+    (tmp_path / "link").symlink_to(tmp_path / "nothing")
+    for out in (tmp_path / "file", tmp_path / "file" / "below", tmp_path / "link", tmp_path / "link" / "below"):
         code, _, error = torchcover("evaluate", "--frames", recording, "--out", out)
         assert code == 2
         assert f"--out {out}: " in error
+
+
+def test_a_folder_may_be_called_what_rich_takes_for_markup(torchcover, recording, monkeypatch):
+    monkeypatch.chdir(recording.parent)
+    code, printed, _ = torchcover("evaluate", "--frames", recording, "--out", "[/x]")
+    assert code == 0
+    assert "maps to [/x]" in printed
 
 
 def test_an_output_without_the_signs_of_the_tables_gets_question_marks_not_an_error(torchcover, monkeypatch):

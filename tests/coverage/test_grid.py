@@ -248,5 +248,7 @@ def test_bands_that_make_no_sense_are_refused(heights, message):
 
 
 def test_a_grid_too_large_for_the_memory_is_refused_before_it_is_made():
+    with pytest.raises(ValueError, match=r"x: inf cells of 1e-310 m, over 100,000,000: use larger cells"):
+        BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1e-310)
     with pytest.raises(ValueError, match="the grid has 200,000,000 cells, over 100,000,000: use larger cells"):
         BevGrid(x=(0, 10_000), y=(0, 10_000), cell=1.0)

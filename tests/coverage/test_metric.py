@@ -282,8 +282,10 @@ def test_a_step_split_in_two_is_another_number():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"thresholds": (0.4, -0.1)}, r"thresholds: distances >= 0 in metres are needed; got \(0.4, -0.1\)"),
-        ({"thresholds": (math.nan,)}, "thresholds: distances >= 0"),
+        ({"thresholds": (0.4, -0.1)}, r"thresholds: finite distances >= 0 in metres are needed; got \(0.4, -0.1\)"),
+        ({"thresholds": (math.nan,)}, "thresholds: finite distances >= 0"),
+        # Within it lies whatever a blind rig has not seen.
+        ({"thresholds": (0.4, math.inf)}, r"thresholds: finite distances .*got \(0.4, inf\)"),
         ({"thresholds": (0.4, 0.5, 0.4)}, r"thresholds: each may be given once.*got \(0.4, 0.5, 0.4\)"),
         ({"thresholds": (0.4, 0.40000004)}, "thresholds: each may be given once, to the six digits that name it"),
         ({"thresholds": (0.4, 3.0), "max_radius": 2.0}, "thresholds: at most max_radius = 2.0 m"),
@@ -297,6 +299,40 @@ def test_a_step_split_in_two_is_another_number():
 def test_parameters_that_make_no_sense_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         CoverageMetric(ONE_CELL, **options)
+
+
+@pytest.mark.parametrize("thresholds", [0.4, "0.4", ("0.4",), {0.4: 1}])
+def test_what_is_no_sequence_of_thresholds_is_refused(thresholds):
+    with pytest.raises(TypeError, match=r"thresholds: a sequence of metres, as in \(0.4,\), is needed; got"):
+        CoverageMetric(ONE_CELL, thresholds)
+
+
+@pytest.mark.parametrize(
+    ("index", "error", "message"),
+    [
+        (
+            10**20,
+            ValueError,
+            r"index\[0\]: a number from 0 to 1,000,000,000,000,000 is needed; got 1000000000000000000",
+        ),
+        (-1, ValueError, r"index\[0\]: a number from 0"),
+        (1.5, TypeError, "index: a whole number, or a list with one for each step, is needed; got 1.5"),
+        (["1"], TypeError, "index: a whole number"),
+    ],
+)
+def test_a_number_of_a_step_that_is_none_is_refused(index, error, message):
+    metric = CoverageMetric(ONE_CELL, blocks=8)
+    with pytest.raises(error, match=message):
+        metric.update(ORIGIN, ORIGIN, index=index)
+    assert int(metric.steps) == 0
+
+
+def test_the_largest_number_of_a_step_has_its_block():
+    metric = CoverageMetric(ONE_CELL, blocks=8)
+    metric.update(ORIGIN, ORIGIN, index=np.int64(3))
+    metric.update(ORIGIN, ORIGIN, index=10**15)
+    assert metric.block_steps.sum() == 2
+    assert 8 * int(metric.block_length) > 10**15
 
 
 @pytest.mark.parametrize("aggregations", [Maximum(), (Quantiles,), ("maximum",)])
@@ -316,6 +352,8 @@ BAD = torch.tensor([[0.0, 0.0, math.nan], [0.0, 0.0, 0.0], [math.inf, 0.0, 0.0]]
         ([ORIGIN], [ORIGIN, ORIGIN], ValueError, "1 sensor clouds for 2 reference clouds; one pair a step"),
         (torch.zeros(4, 2), ORIGIN, ValueError, r"sensor\[0\]: shape \(N, 3\) is needed; got \(4, 2\)"),
         ([ORIGIN], [torch.zeros(1, 3, dtype=torch.int64)], TypeError, r"reference\[0\]: .*got torch.int64"),
+        (ORIGIN.numpy(), ORIGIN, TypeError, r"sensor: a torch tensor, or a list .* got ndarray .*torch.from_numpy"),
+        (ORIGIN, ORIGIN.numpy(), TypeError, r"reference: a torch tensor, or a list with one for each step"),
         ([[0.0, 0.0, 0.0]], [ORIGIN], TypeError, r"sensor\[0\]: a floating-point torch tensor is needed; got list"),
     ],
 )

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from torchcover import BevGrid, Region, forward_regions
+from torchcover.coverage import check_regions
 
 GRID = BevGrid(x=(-4.0, 4.0), y=(-2.0, 2.0), cell=0.5)
 
@@ -70,3 +71,9 @@ def test_a_region_needs_a_name():
 def test_a_forward_region_of_no_range_is_refused():
     with pytest.raises(ValueError, match="region '-1m': x needs finite bounds"):
         forward_regions((-1.0,))
+
+
+def test_regions_without_a_cell_are_found_before_a_run():
+    check_regions([Region("all", x=GRID.x, y=GRID.y)], GRID)
+    with pytest.raises(ValueError, match="region 'gap' holds no cell centre; use smaller cells than"):
+        check_regions([Region("gap", x=(0.3, 0.7), y=(0.0, 1.0))], GRID)

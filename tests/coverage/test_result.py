@@ -95,7 +95,7 @@ def test_the_regions_of_the_paper_are_given_where_the_grid_holds_them(x, y, name
 def test_a_region_the_grid_cannot_speak_of_is_refused():
     with pytest.raises(ValueError, match="region 'far' spans x = 0 to 30 m, beyond the grid's -1 to 20 m"):
         a_coverage().summary([Region("far", (0.0, 30.0), (-1.0, 1.0))])
-    with pytest.raises(ValueError, match=r"region 'slit' holds no cell centre; the cell is 0\.5 m"):
+    with pytest.raises(ValueError, match=r"region 'slit' holds no cell centre; use smaller cells than 0\.5 m"):
         a_coverage().summary([Region("slit", (0.3, 0.7), (-1.0, 1.0))])
 
 

@@ -171,7 +171,7 @@ MATRIX = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         ("{", r"not a YAML file"),
         ("# nothing", r"got NoneType, not a mapping; allowed are sensor, or rigs"),
         ("- 1", r"got list, not a mapping"),
-        ("sensor: {", r"not a YAML file \(.*line 1"),
+        ("sensor: {", r"not a YAML file: .*line 1"),
         ("\x00", r"not a YAML file"),
         (f"lidar: {{vehicle_T_sensor: {MATRIX}}}", r"lidar: Extra inputs are not permitted; allowed are sensor"),
         (f"sensor: {{vehicle_T_lidar: {MATRIX}}}", r"sensor\.vehicle_T_sensor: Field required; sensor\.vehicle_T_lid"),

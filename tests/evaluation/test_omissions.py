@@ -1,10 +1,13 @@
 """What a run left out."""
 
+import sys
+
 import pytest
 import torch
 
 from torchcover.coverage import AGGREGATIONS, BevGrid, CoverageMetric, Maximum
 from torchcover.evaluation import left_out
+from torchcover.simulation import CameraSensor
 
 
 def test_points_outside_the_grid_are_counted_over_all_rigs():
@@ -32,3 +35,21 @@ def test_what_was_not_left_out_is_not_listed(count):
     counts = {"moving_bodies_out_of_range": count, "moving_bodies": 9}
     listed = [row.count for row in left_out(counts, [metric.compute()]) if row.of == 9]
     assert listed == ([7] if count else [])
+
+
+@pytest.mark.parametrize(
+    ("lens", "coefficients"), [("brown_conrady", (0.1, 0, 0, 0)), ("kannala_brandt", (0.1, 0, 0, 0))]
+)
+def test_nobody_is_told_that_the_distortion_of_a_lens_was_left_out(lens, coefficients, monkeypatch):
+    """The lens may need no kornia, and who makes the frames may be another process."""
+    monkeypatch.delitem(sys.modules, "kornia", raising=False)
+    size = {"width": 8, "height": 6, "fx": 5, "fy": 5, "cx": 4, "cy": 3, "max_range_m": 50}
+    straight = CameraSensor(name="a", **size)
+    bent = CameraSensor(name="b", lens=lens, coefficients=(0.1, 0.0, 0.0, 0.0), **size)
+
+    def listed(*sensors, **options):
+        return [row.what for row in left_out({}, [], (), sensors, **options) if "lenses with distortion" in row.what]
+
+    assert listed(straight) == ["kornia, for lenses with distortion: not imported"]
+    assert listed(straight, bent) == []
+    assert listed(straight, workers=2) == []

@@ -1,10 +1,16 @@
 """YAML documents: what is wrong is said in one line that names the file and the key."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
 from torchcover import Rig, Scenario
-from torchcover.simulation import Pose, builtin_names
+from torchcover.cameras.calibration import read_opencv, read_ros
+from torchcover.data.poses import read_poses
+from torchcover.simulation import Lidar, LidarModel, Pose, builtin_names
+from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.documents import load_document
 
 RIG = """
 name: r
@@ -45,9 +51,6 @@ def test_a_scenario_is_read_and_mesh_paths_are_relative_to_it(tmp_path):
 
 @pytest.mark.parametrize("kind", ["rigs", "scenarios", "vehicles"])
 def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
-    from torchcover.simulation.bodies import Vehicle
-    from torchcover.simulation.documents import load_document
-
     model = {"rigs": Rig, "scenarios": Scenario, "vehicles": Vehicle}[kind]
     names = builtin_names(kind)
     assert names
@@ -81,6 +84,16 @@ def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
         ("columns: 8", "columns: 8\n    azimuth_offsets_deg: [1, 2]", "one for each of the 4 rows is needed; got 2"),
         ("  - type: lidar", "  - type: radar", r"sensors\.0: type: a sensor is a 'lidar' or a 'camera'; got 'radar'"),
         ("name: r\n", "", "name: Field required"),
+        ("columns: 8", "columns: true", r"columns: .*valid integer \(got True\)"),
+        ("columns: 8", "columns: 8.0", r"columns: .*valid integer \(got 8\.0\)"),
+        ("columns: 8", "columns: 0100", r"columns: .*valid integer \(got '0100'\)"),
+        ("columns: 8", "columns: 1:40", r"columns: .*valid integer \(got '1:40'\)"),
+        ("columns: 8", 'columns: "60"', r"columns: .*valid integer \(got '60'\)"),
+        ("max_range_m: 50", "max_range_m: '50'", r"max_range_m: .*valid number \(got '50'\)"),
+        ("x_m: 1.0", "x_m: true", r"mount\.x_m: .*valid number \(got True\)"),
+        ("[-10, 10]", "['-10', 10]", r"vertical_fov_deg\.0: .*valid number \(got '-10'\)"),
+        ("name: r\n", "name: 5\n", r"name: .*valid string \(got 5\)"),
+        ("columns: 8", "columns: 8\n    columns: 9", "the key 'columns' is there twice, in line 10 and in line 11"),
     ],
 )
 def test_a_wrong_rig_names_file_and_key(tmp_path, old, new, message):
@@ -90,6 +103,54 @@ def test_a_wrong_rig_names_file_and_key(tmp_path, old, new, message):
         Rig.load(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
+
+
+DOUBLED = {
+    "rig": (Rig.load, RIG + "sensors: []\n", "sensors"),
+    "scenario": (Scenario.load, SCENARIO + "bodies: []\n", "bodies"),
+    "vehicle": (partial(load_document, Vehicle, "vehicles"), "name: v\nparts: []\nparts: []\n", "parts"),
+    "lidar": (LidarModel.load, "name: l\ncolumns: 5\ncolumns: 6\n", "columns"),
+    "ros": (read_ros, "width: 5\nwidth: 6\n", "width"),
+    "opencv": (read_opencv, "%YAML:1.0\n---\nimage_width: 5\nimage_width: 6\n", "image_width"),
+    "frames": (read_poses, "sensor: {}\nsensor: {}\n", "sensor"),
+}
+
+
+@pytest.mark.parametrize("kind", DOUBLED)
+def test_a_key_that_is_there_twice_is_an_error_in_every_document(tmp_path, kind):
+    read, content, key = DOUBLED[kind]
+    path = write(tmp_path, content)
+    with pytest.raises(ValueError, match=f"the key '{key}' is there twice, in line .* and in line ") as caught:
+        read(path)
+    assert str(caught.value).startswith(f"{path}: ")
+
+
+def test_whole_numbers_lists_and_numpys_numbers_may_stand_for_what_is_kept():
+    given = {"vertical_fov_deg": [-10, np.float32(10)], "horizontal_fov_deg": np.int64(360), "max_range_m": 50}
+    lidar = Lidar(name="a", channels=np.int64(4), columns=8, **given)
+    assert lidar.vertical_fov_deg == (-10.0, 10.0)
+    assert (lidar.channels, type(lidar.channels), type(lidar.max_range_m)) == (4, int, float)
+
+
+def test_a_bad_sensor_does_not_make_the_list_of_sensors_too_short(tmp_path):
+    with pytest.raises(ValueError, match=r"sensors\.0\.colums: Extra inputs") as caught:
+        Rig.load(write(tmp_path, RIG.replace("columns: 8", "colums: 8")))
+    assert "at least 1" not in str(caught.value)
+
+
+def test_a_message_is_short_however_many_mistakes_there_are_and_however_large_they_are(tmp_path):
+    nested = "[" * 50 + "1, 2" + "]" * 50
+    keys = "".join(f"key_{k}: {nested}\n" for k in range(40))
+    with pytest.raises(ValueError, match="and 35 more mistakes") as caught:
+        Rig.load(write(tmp_path, RIG + keys))
+    assert len(str(caught.value)) < 1000
+
+
+def test_a_vehicle_that_names_itself_is_refused(tmp_path):
+    path = tmp_path / "v.yaml"
+    path.write_text(f"name: v\nparts: [{{name: p, shape: {{type: vehicle, vehicle: {path}}}}}]\n")
+    with pytest.raises(ValueError, match=r"v\.yaml: document: part 'p' is the vehicle '.*v\.yaml'; a vehicle is put"):
+        load_document(Vehicle, "vehicles", path)
 
 
 def test_sensors_need_different_names(tmp_path):

@@ -43,6 +43,7 @@ class Altimeter(Document):
     min_range_m: float = 0.0
     range_noise_m: float = 0.0
     dropout: float = 0.0
+    rays: int = 5
 
     def directions(self):
         across = np.deg2rad(np.linspace(-10.0, 10.0, 5))

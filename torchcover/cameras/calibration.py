@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike
 
 from torchcover.cameras.entries import first, has_numbers, numbers, numbers_of, told, whole
 from torchcover.cameras.models import as_vector, check_image, check_model
-from torchcover.files import check_memory, decode, naming, read_short_text, reads
+from torchcover.files import check_memory, decode, naming, parse_yaml, read_short_text, reads
 from torchcover.geometry import check_rigid, invert, rigid, rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 
@@ -239,25 +238,8 @@ def read_nuscenes(
         return _checked(Calibration(width, height, *intrinsics, vehicle_T_camera=pose, name=channel))
 
 
-class _Loader(yaml.SafeLoader):
-    """Knows OpenCV's tag for matrices."""
-
-
-def _construct_matrix(loader: yaml.SafeLoader, node: yaml.MappingNode) -> Any:  # noqa: ANN401  (YAML knows no types)
-    return loader.construct_mapping(node, deep=True)
-
-
-_Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", _construct_matrix)
-
-
 def _read_yaml(path: Path) -> dict[str, Any]:
-    text = read_short_text(path)
-    if text.startswith("%YAML:"):  # OpenCV's directive has a colon that YAML does not allow
-        text = text.partition("\n")[2]
-    try:
-        content = yaml.load(text, _Loader)  # a SafeLoader with one more tag
-    except yaml.YAMLError as error:
-        raise ValueError(f"not readable as YAML: {error}") from error
+    content = parse_yaml(read_short_text(path))
     if not isinstance(content, dict):
         raise ValueError(f"a mapping of names to values is needed; got {type(content).__name__}")
     return content

@@ -29,6 +29,9 @@ MISTAKE, INTERRUPTED, TERMINATED = 2, 130, 143
 # What is raised for any mistake in options and arguments. Typer names only descendants of it.
 USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
 
+# Of what a mistake is told in: whoever gave a name of thousands does not want it back.
+MAX_LINE_CHARS = 2000
+
 
 def main() -> None:
     """Run the command line; a user's mistake ends in one line on stderr and exit code 2, a warning is one line too."""
@@ -44,6 +47,10 @@ def main() -> None:
         _fail(error.format_message())  # type: ignore[attr-defined]  # the typed name is private
     except (ValueError, TypeError, OSError) as error:
         _fail(str(error))
+    except MemoryError as error:
+        _fail(f"there is not enough memory ({error or 'for what was asked'}); ask for less, or use a larger machine")
+    except (OverflowError, RecursionError) as error:
+        _fail(f"a number is too large, or a file nested too deeply ({error})")
     if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
         _fail(*("terminated", TERMINATED) if terminated else ("interrupted", INTERRUPTED))
     sys.exit(code if isinstance(code, int) else 0)
@@ -250,5 +257,6 @@ def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  
 
 
 def _fail(message: str, code: int = MISTAKE) -> None:
-    typer.echo(f"torchcover: {' '.join(message.split())}", err=True)
+    line = " ".join(message.split())
+    typer.echo(f"torchcover: {line if len(line) <= MAX_LINE_CHARS else line[:MAX_LINE_CHARS] + ' ...'}", err=True)
     sys.exit(code)

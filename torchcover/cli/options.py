@@ -11,9 +11,12 @@ def check_out(folder: Path) -> Path:
     """Find out before the run, not after it, whether its results can be written.
 
     Raises:
-        ValueError: The folder, or the first of its parents that exists, is a file or may not be written to.
+        ValueError: The folder, or the first of its parents that exists, is a file, a link to nothing, or may not be
+            written to.
     """
-    nearest = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    nearest = next(place for place in (folder, *folder.absolute().parents) if os.path.lexists(place))
+    if not nearest.exists():
+        raise ValueError(f"--out {folder}: {nearest} is a link to what is not there")
     if not nearest.is_dir():
         raise ValueError(f"--out {folder}: {nearest} is a file, not a folder")
     if not os.access(nearest, os.W_OK):

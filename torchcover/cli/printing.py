@@ -22,7 +22,9 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
         console.print(line, markup=False, soft_wrap=True)
     maps = sum(path.suffix == ".png" for path in files)
     coverages = f"{len(result.coverages)} coverage files" if result.is_comparison else "coverage.npz"
-    console.print(f"Wrote summary.json, summary.csv, {coverages} and {maps} maps to {out}", soft_wrap=True)
+    console.print(
+        f"Wrote summary.json, summary.csv, {coverages} and {maps} maps to {out}", markup=False, soft_wrap=True
+    )
 
 
 def print_study(study: Study, out: Path) -> None:
@@ -43,7 +45,7 @@ def print_study(study: Study, out: Path) -> None:
     )
     for wanted, point in study.recommended.items():
         console.print(advice(wanted, point, study.plan), soft_wrap=True)
-    console.print(f"Wrote study.json, long_run.npz and work_precision.png to {out}", soft_wrap=True)
+    console.print(f"Wrote study.json, long_run.npz and work_precision.png to {out}", markup=False, soft_wrap=True)
 
 
 def advice(wanted: float, point: WorkPoint | None, plan: StudyPlan) -> str:

@@ -4,12 +4,12 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import yaml
 from matplotlib.figure import Figure
 from rich.console import Console
 
 from torchcover.evaluation import cameras_of, rig_pictures, scenario_picture
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
+from torchcover.files import parse_yaml
 from torchcover.simulation import Rig, Scenario, builtin_names
 
 DEFAULT_RIG = "front_roof_128"
@@ -38,7 +38,7 @@ def run(name: str, *, scenario: str | None, rig: str | None, step: int | None, s
         path = out / f"{Path(name).stem}{suffix}.png"
         out.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=figure.dpi)
-        Console().print(f"Wrote {path}", soft_wrap=True)
+        Console().print(f"Wrote {path}", markup=False, soft_wrap=True)
 
 
 def _is_rig(name: str) -> bool:
@@ -55,8 +55,8 @@ def _has_sensors(path: Path) -> bool:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError):
+        content = parse_yaml(path.read_text(encoding="utf-8"))
+    except ValueError:
         return False  # whatever loads it says what is wrong
     return isinstance(content, dict) and "sensors" in content
 

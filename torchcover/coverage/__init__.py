@@ -17,7 +17,7 @@ from torchcover.coverage.layer import Layer
 from torchcover.coverage.metric import CoverageMetric
 from torchcover.coverage.paired import Difference, check_paired, differences
 from torchcover.coverage.quantity import Quantity
-from torchcover.coverage.regions import Region, forward_regions, regions_within
+from torchcover.coverage.regions import Region, check_regions, forward_regions, regions_within
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.summary import Number, RegionSummary
 
@@ -42,6 +42,7 @@ __all__ = [
     "State",
     "StepQuantiles",
     "check_paired",
+    "check_regions",
     "differences",
     "forward_regions",
     "regions_within",

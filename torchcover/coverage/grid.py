@@ -203,6 +203,8 @@ def _check_bounds(name: str, bounds: tuple[float, float]) -> None:
 def _check_multiple(name: str, bounds: tuple[float, float], cell: float) -> None:
     extent = bounds[1] - bounds[0]
     cells = extent / cell
+    if not cells <= MAX_CELLS:
+        raise ValueError(f"{name}: {cells:.6g} cells of {cell:.10g} m, over {MAX_CELLS:,}: use larger cells")
     if cells < 0.5 or abs(cells - round(cells)) > min(MULTIPLE_TOLERANCE * max(1.0, cells), MULTIPLE_TOLERANCE_CELLS):
         fits = extent / max(1, round(cells))
         raise ValueError(

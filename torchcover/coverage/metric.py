@@ -41,7 +41,7 @@ class CoverageMetric(MergeableMetric):
 
     Args:
         grid: Cells and height bands.
-        thresholds: Radii in metres up to which a point counts as detected, each of them >= 0 and at most
+        thresholds: Radii in metres up to which a point counts as detected, each of them finite, >= 0 and at most
             `max_radius`.
         max_radius: Saturation of r in metres. An empty sensor cloud gives r = `max_radius`: with the default,
             infinity, such a step makes the radius of its cells infinite.
@@ -56,8 +56,8 @@ class CoverageMetric(MergeableMetric):
         kwargs: For `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
 
     Raises:
-        ValueError: A threshold that is negative, NaN, over `max_radius`, or given twice; a `max_radius` that is not
-            positive; a number of blocks that is neither 1 nor even and 8 or more; two aggregations of one kind.
+        ValueError: A threshold that is negative, not finite, over `max_radius`, or given twice; a `max_radius` that is
+            not positive; a number of blocks that is neither 1 nor even and 8 or more; two aggregations of one kind.
 
     Example:
         >>> metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)}))
@@ -151,14 +151,15 @@ class CoverageMetric(MergeableMetric):
             weights: (M,) weight of each reference point in the mean over its cell in its step, or a list of the same
                 length. For reference sensors whose density within a cell is not the one that is asked for: the
                 weights are the second divided by the first. Not given: every point weighs the same.
-            index: Number of the step in time, or a list of the same length; it decides about the block, so that steps
-                of one number, as of an instant that is seen again, share one. Not given: counted on from the steps so
-                far.
+            index: Number of the step in time, 10^15 at most, or a list of them; it decides about the block, so that
+                steps of one number, as of an instant that is seen again, share one. Not given: counted on from the
+                steps so far.
 
         Raises:
             ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights
-                that are not positive and finite, none where they are square metres, a negative index.
-            TypeError: A cloud is not a floating-point tensor.
+                that are not positive and finite, none where they are square metres, an index that is negative or too
+                large.
+            TypeError: A cloud is not a floating-point tensor, an index not a whole number.
         """
         if self.square_metres and weights is None:
             raise ValueError(
@@ -178,7 +179,7 @@ class CoverageMetric(MergeableMetric):
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
         if index is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
-            index = [int(self.steps) + step for step in range(len(as_list(sensor)))]
+            index = [int(self.steps) + step for step in range(len(as_list(sensor, "sensor")))]
         coverage: Coverage = super().forward(sensor, reference, weights=weights, index=index)
         return coverage
 

@@ -52,6 +52,17 @@ class Region:
         return ((y >= self.y[0]) & (y < self.y[1]))[:, None] & ((x >= self.x[0]) & (x < self.x[1]))
 
 
+def check_regions(regions: Sequence[Region], grid: BevGrid) -> None:
+    """Refuse regions that no number of a grid can be given for.
+
+    Raises:
+        ValueError: One reaches beyond the grid, or holds no cell centre.
+    """
+    for region in regions:
+        if not region.mask(grid).any():
+            raise ValueError(f"region {region.name!r} holds no cell centre; use smaller cells than {grid.cell:g} m")
+
+
 def regions_within(grid: BevGrid) -> tuple[Region, ...]:
     """Those of the paper's regions that the grid holds.
 

@@ -19,7 +19,7 @@ from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.intervals import interval95
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import RADIUS, Quantity, by_area
-from torchcover.coverage.regions import Region, regions_within
+from torchcover.coverage.regions import Region, check_regions, regions_within
 from torchcover.coverage.summary import Number, RegionSummary
 
 
@@ -161,9 +161,8 @@ class Coverage:
         return self._estimates[key]
 
     def _estimate(self, region: Region, height: str, measure: Measure) -> RegionEstimate:
+        check_regions([region], self.grid)
         cells = region.mask(self.grid).to(self.radius.device)
-        if not cells.any():
-            raise ValueError(f"region {region.name!r} holds no cell centre; the cell is {self.grid.cell:g} m")
         if height not in self.grid.heights:
             raise ValueError(f"height {height!r}: the grid has {', '.join(self.grid.heights)}")
         band = list(self.grid.heights).index(height)

@@ -1,7 +1,10 @@
 """What the metric takes, checked once at the door."""
 
+import math
+import operator
 from collections.abc import Sequence
-from typing import NamedTuple, TypeAlias
+from numbers import Real
+from typing import Any, NamedTuple, TypeAlias
 
 from torch import Tensor
 
@@ -11,6 +14,9 @@ from torchcover.neighbors import check_cloud
 
 # The aggregations that a metric has by itself, and the names that its own states begin with.
 BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, "block", "probed"})
+
+# Steps are numbered in int64, and blocks double until one holds the last.
+MAX_NUMBER = 10**15
 
 # One step, or a list with an entry for each.
 Clouds: TypeAlias = Tensor | Sequence[Tensor]
@@ -29,12 +35,15 @@ def check_parameters(thresholds: Sequence[float], max_radius: float, aggregation
     """Refuse parameters of a metric that make no sense.
 
     Raises:
-        ValueError: A threshold that is negative, NaN, over `max_radius`, or given twice; a `max_radius` that is not
-            positive; two aggregations of one kind, or one that is built in.
-        TypeError: What is no sequence of aggregations.
+        ValueError: A threshold that is negative, NaN, infinite, over `max_radius`, or given twice; a `max_radius` that
+            is not positive; two aggregations of one kind, or one that is built in.
+        TypeError: What is no sequence of numbers, or of aggregations.
     """
-    if not all(threshold >= 0 for threshold in thresholds):
-        raise ValueError(f"thresholds: distances >= 0 in metres are needed; got {tuple(thresholds)}")
+    if not isinstance(thresholds, Sequence) or not all(isinstance(threshold, Real) for threshold in thresholds):
+        raise TypeError(f"thresholds: a sequence of metres, as in (0.4,), is needed; got {thresholds!r}")
+    # Within an infinite distance lies whatever a blind rig has not seen.
+    if not all(0 <= threshold < math.inf for threshold in thresholds):
+        raise ValueError(f"thresholds: finite distances >= 0 in metres are needed; got {tuple(thresholds)}")
     if len({detection(threshold).key for threshold in thresholds}) != len(thresholds):
         raise ValueError(f"thresholds: each may be given once, to the six digits that name it; got {tuple(thresholds)}")
     if not max_radius > 0:
@@ -71,16 +80,13 @@ def checked_steps(
 
     Raises:
         ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights that are
-            not positive and finite, a negative index.
-        TypeError: A cloud is not a floating-point tensor.
+            not positive and finite, an index that is negative or above 10^15.
+        TypeError: A cloud is not a floating-point tensor, an index not a whole number.
     """
-    sensors, references = as_list(sensor), as_list(reference)
+    sensors, references = as_list(sensor, "sensor"), as_list(reference, "reference")
     count = len(references)
-    every_weights: Sequence[Tensor | None] = [None] * count if weights is None else as_list(weights)
-    if index is None:
-        numbers = list(range(first, first + count))
-    else:
-        numbers = [int(number) for number in index] if isinstance(index, Sequence) else [int(index)]
+    every_weights: Sequence[Tensor | None] = [None] * count if weights is None else as_list(weights, "weights")
+    numbers = list(range(first, first + count)) if index is None else _numbers(index)
     if len(sensors) != count:
         raise ValueError(f"{len(sensors)} sensor clouds for {count} reference clouds; one pair a step")
     if len(every_weights) != count or len(numbers) != count:
@@ -92,14 +98,37 @@ def checked_steps(
         check_cloud(step.sensor, f"sensor[{at}]")
         check_cloud(step.reference, f"reference[{at}]")
         _check_weights(step.weights, len(step.reference), f"weights[{at}]")
-        if step.number < 0:
-            raise ValueError(f"index[{at}]: a number >= 0 is needed; got {step.number}")
+        if not 0 <= step.number <= MAX_NUMBER:
+            raise ValueError(f"index[{at}]: a number from 0 to {MAX_NUMBER:,} is needed; got {step.number}")
     return steps
 
 
-def as_list(clouds: Clouds) -> list[Tensor]:
-    """A list with an entry for each step."""
-    return [clouds] if isinstance(clouds, Tensor) else list(clouds)
+def as_list(clouds: Clouds, name: str) -> list[Tensor]:
+    """A list with an entry for each step.
+
+    Args:
+        clouds: One tensor, or several.
+        name: What messages call them.
+
+    Raises:
+        TypeError: Neither a tensor nor a sequence.
+    """
+    if isinstance(clouds, Tensor):
+        return [clouds]
+    if not isinstance(clouds, Sequence):
+        raise TypeError(
+            f"{name}: a torch tensor, or a list with one for each step, is needed; got {type(clouds).__name__} (an "
+            "array of NumPy's becomes one with torch.from_numpy)"
+        )
+    return list(clouds)
+
+
+def _numbers(index: Any) -> list[int]:  # noqa: ANN401  (whatever the caller gave)
+    each = index if isinstance(index, Sequence) else [index]
+    try:
+        return [operator.index(number) for number in each]
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"index: a whole number, or a list with one for each step, is needed; got {index!r}") from error
 
 
 def _check_weights(weights: Tensor | None, points: int, name: str) -> None:

@@ -2,23 +2,22 @@
 
 from pathlib import Path
 
-import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from torchcover.files import read_short_text, reads
+from torchcover.files import parse_yaml, read_short_text, reads
 from torchcover.geometry.rigid import Matrix, check_rigid
 
 ALLOWED = "allowed are sensor, or rigs by name, and reference, each with a 4x4 vehicle_T_sensor"
 
 
 class _Pose(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
     vehicle_T_sensor: list[list[float]]
 
 
 class _Poses(BaseModel):
-    model_config = ConfigDict(extra="forbid")
+    model_config = ConfigDict(extra="forbid", strict=True)
 
     sensor: _Pose | None = None
     rigs: dict[str, _Pose] = Field(default_factory=dict)
@@ -42,11 +41,7 @@ def read_poses(path: Path) -> dict[str, Matrix]:
 
 @reads("a file of poses")
 def _read(path: Path) -> dict[str, Matrix]:
-    text = read_short_text(path)
-    try:
-        content = yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(f"not a YAML file ({error})") from error
+    content = parse_yaml(read_short_text(path))
     if not isinstance(content, dict):
         raise ValueError(f"got {type(content).__name__}, not a mapping; {ALLOWED}")
     try:

@@ -16,6 +16,9 @@ from torchcover.data.reference import reference_called, reference_of_objects
 from torchcover.detection.boxes import Boxes, points_in_boxes
 from torchcover.simulation import Label, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
 
+# What takes years.
+MAX_STEPS = 1_000_000_000
+
 
 class SimulatedFrames(Dataset[Frame]):
     """What a rig and the random reference sensor see of a scenario, step by step. A map-style torch Dataset.
@@ -45,8 +48,8 @@ class SimulatedFrames(Dataset[Frame]):
     Raises:
         FileNotFoundError: An unknown name or file.
         ValueError: A document that is not valid, neither or both of `rig` and `rigs`, a number of steps below 1, a
-            negative seed, a time that is no multiple of the time step. From indexing: a sensor inside the ego's body,
-            an actor that overlaps the ego.
+            negative seed, a time that is no multiple of the time step. From indexing: a sensor inside a body or
+            below the ground, an actor that overlaps the ego.
 
     Example:
         >>> frames = SimulatedFrames("courtyard", "front_roof_128", steps=2, seed=0)
@@ -66,8 +69,8 @@ class SimulatedFrames(Dataset[Frame]):
         every_s: float | None = None,
         boxes: bool = False,
     ) -> None:
-        if steps < 1:
-            raise ValueError(f"steps: at least 1 is needed; got {steps}")
+        if not 1 <= steps <= MAX_STEPS:
+            raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
         if reference_sensor is None:
             reference_sensor = reference_of_objects() if boxes else reference_called()
         self.simulator = Simulator(

@@ -9,6 +9,7 @@ from torchcover.evaluation.pipeline import observe
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.rig_names import AnyRig, given_as
 from torchcover.evaluation.saved import compare_saved, saved_among
+from torchcover.evaluation.sensor_drawings import check_drawable
 from torchcover.evaluation.settings import AnyDevice, AnyThresholds, Settings
 from torchcover.evaluation.target_error import AnyTargetError, TargetWatch
 from torchcover.evaluation.task import AnyFrames, AnyScenario, Task, task_of
@@ -171,6 +172,8 @@ def _check_saved_only(
 
 def _measured(task: Task, settings: Settings, others: Observers, *, progress: bool) -> Result:
     frames, regions, target = task.frames, settings.regions, settings.target_error
+    sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
+    check_drawable(sensors)
     observers = {name: CoverageObserver(settings.metric(frames.weight_kind), name) for name in task.rigs}
     run = observe(
         frames,
@@ -198,5 +201,11 @@ def _measured(task: Task, settings: Settings, others: Observers, *, progress: bo
         sensors=task.sensors,
         ego_outline_m=frames.ego_outline_m,
         observed={name: observer.compute() for name, observer in others.items()},
-        left_out=left_out(run.counts, list(coverages.values()), settings.aggregations),
+        left_out=left_out(
+            run.counts,
+            list(coverages.values()),
+            settings.aggregations,
+            sensors,
+            workers=settings.workers,
+        ),
     )

@@ -40,11 +40,11 @@ class Bar:
         from rich.progress import Progress as RichProgress
 
         self.rich = RichProgress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(),
             MofNCompleteColumn(),
             TextColumn("{task.fields[rate]}"),
-            TextColumn("{task.fields[words]}"),
+            TextColumn("{task.fields[words]}", markup=False),
             TimeRemainingColumn(),
             TextColumn("left"),
             console=Console(stderr=True),

@@ -18,3 +18,17 @@ def sensor_views(sensors: Sequence[Sensor]) -> list[SensorView]:
         )
         for sensor in sensors
     ]
+
+
+def check_drawable(sensors: Sequence[Sensor]) -> None:
+    """Find out before a run, not after it, whether its maps can show the sensors.
+
+    Raises:
+        ValueError: A sensor none of whose rays in the middle row is one, so that nobody knows how wide it sees.
+    """
+    for sensor in sensors:
+        if not 0 < sensor.horizontal_fov_deg <= 360:
+            raise ValueError(
+                f"sensor {sensor.name!r}: its rays span {sensor.horizontal_fov_deg:g} degrees in the middle row; above "
+                "0 are needed, so check its lens and its principal point"
+            )

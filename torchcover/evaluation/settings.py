@@ -3,15 +3,18 @@
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from numbers import Real
 from typing import Any, Self, get_args
 
 import torch
+from torch import Tensor
 
-from torchcover.coverage import Aggregation, BevGrid, CoverageMetric, Measure, Region, forward_regions
+from torchcover.coverage import Aggregation, BevGrid, CoverageMetric, Measure, Region, check_regions, forward_regions
 from torchcover.data import GRID_X_M, GRID_Y_M
 from torchcover.evaluation.target_error import AnyTargetError, TargetError
 from torchcover.simulation import Scenario, WeightKind
+from torchcover.simulation.memory import check_fits
 
 DEFAULT_SCENARIO = "courtyard"
 DEFAULT_STEPS = 64
@@ -21,6 +24,10 @@ MAX_STEPS = 4096
 EVERY_S_IN_TRAFFIC = 10.0
 # For standard errors: at least half as many are in use at the end of a long run.
 BLOCKS = 16
+# Beside its sums a metric keeps what they start from, and makes a result of them.
+STATE_COPIES = 3
+# A process with torch and the geometry of a small scenario.
+BYTES_PER_WORKER = 300e6
 
 AnyThresholds = float | Iterable[float]
 AnyDevice = str | torch.device
@@ -31,7 +38,7 @@ class Settings:
     """What `evaluate` and `compare` let the user set, see there; None where the user gave nothing.
 
     Raises:
-        ValueError: A number of steps below 1, an unknown measure.
+        ValueError: A number of steps below 1, an unknown measure, more workers than the memory has room for.
     """
 
     steps: int | None = None
@@ -51,6 +58,7 @@ class Settings:
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps: at least 1 is needed; got {self.steps}")
+        check_fits(f"{self.workers:,} workers", BYTES_PER_WORKER * self.workers, "use fewer")
         if self.estimate not in (None, *get_args(Measure)):
             raise ValueError(f"estimate {self.estimate}: `area` or `known` is needed")
 
@@ -98,7 +106,7 @@ class Settings:
 
         Raises:
             ValueError: An estimate by area is wanted, and the weights are no square metres; a device that cannot be
-                used.
+                used; as `new_metric`.
         """
         if self.estimate == "area" and weight_kind != "m2":
             raise ValueError(
@@ -122,7 +130,7 @@ def usable_device(name: str) -> torch.device:
     """
     try:
         device = torch.device(name)
-        torch.empty(0, device=device)
+        torch.zeros(1, device=device).item()  # the device `meta` has no values
     except (RuntimeError, AssertionError) as error:
         raise ValueError(f"device {name}: cannot be used here ({str(error).splitlines()[0]}); try cpu") from error
     return device
@@ -140,19 +148,26 @@ def new_metric(
     """An empty metric over the grid of every evaluation, with standard errors unless there is one block only.
 
     Raises:
-        ValueError: A cell or a threshold that makes no sense, or more cells than the memory has room for.
+        ValueError: A cell or a threshold that makes no sense, a region without a cell, or more cells than there is
+            memory for.
     """
     grid = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=cell_m)
+    check_regions(forward_regions(), grid)
+    build = partial(
+        CoverageMetric,
+        grid,
+        thresholds,
+        max_radius=grid.diagonal_m,
+        blocks=blocks,
+        aggregations=aggregations,
+        square_metres=square_metres,
+    )
+    with torch.device("meta"):  # where tensors have a size and take no memory
+        state_bytes = sum(state.nbytes for state in build().metric_state.values() if isinstance(state, Tensor))
+    check_fits(f"the sums of {grid.cells:,} cells in {blocks} blocks", STATE_COPIES * state_bytes, "use larger cells")
     try:
-        return CoverageMetric(
-            grid,
-            thresholds,
-            max_radius=grid.diagonal_m,
-            blocks=blocks,
-            aggregations=aggregations,
-            square_metres=square_metres,
-        ).to(device)
-    except RuntimeError as error:  # what torch raises when there is no memory left
+        return build().to(device)
+    except RuntimeError as error:  # what torch raises when there is no memory left on the device
         raise ValueError(
             f"a cell of {cell_m:g} m: there is not enough memory for the sums of {grid.cells:,} cells in {blocks} "
             "blocks; use larger cells"

@@ -84,6 +84,7 @@ def _simulation(rigs: Sequence[AnyRig], scenario: AnyScenario, settings: Setting
         every_s=spread_s(world, settings.every_s),
         reference_sensor=reference_called(settings.reference_sensor, settings.rays),
     )
+    frames.simulator.check_run(frames.steps)
     given = {name: given_as(rig) for name, rig in zip(names, rigs, strict=True)}
     # A path says more than the name within the file.
     description = {**frames.description, "scenario": world.name if world is scenario else str(scenario)}

@@ -4,6 +4,7 @@ from torchcover.files.bad_file import BadFileError, naming, reads
 from torchcover.files.budget import TooLargeError, check_memory
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, read_npy, read_npz
 from torchcover.files.text import decode, read_short_text
+from torchcover.files.yaml_text import parse_yaml
 
 __all__ = [
     "DEFLATE_MAX_RATIO",
@@ -13,6 +14,7 @@ __all__ = [
     "check_memory",
     "decode",
     "naming",
+    "parse_yaml",
     "read_npy",
     "read_npz",
     "read_short_text",

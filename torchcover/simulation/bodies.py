@@ -1,9 +1,9 @@
 """Bodies: shapes at places, and vehicles put together from them."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import shapes
@@ -64,6 +64,16 @@ class Vehicle(Document):
     name: str
     description: str = ""
     parts: tuple[Body, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _check_parts(self) -> Self:
+        for part in self.parts:
+            if isinstance(part.shape, VehicleShape):
+                raise ValueError(
+                    f"part {part.name!r} is the vehicle {part.shape.vehicle!r}; a vehicle is put together from other "
+                    "shapes, or it would never end: copy that vehicle's parts"
+                )
+        return self
 
     def mesh(self) -> Mesh:
         """All parts in one mesh, in the vehicle frame."""

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from torch import Tensor
 
 from torchcover.cameras import Camera
 from torchcover.geometry import rigid
@@ -14,6 +15,10 @@ from torchcover.simulation.documents import Document, Pose
 # The camera frame is x right, y down, z forward; a mount looks along its x, with y left and z up.
 MOUNT_T_CAMERA = rigid(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 ROWS_AT_ONCE = 64
+# Ten times the sides of the largest images that there are.
+MAX_PIXELS = 200_000
+
+Side = Annotated[int, Field(gt=0, le=MAX_PIXELS)]
 
 
 class CameraSensor(Document):
@@ -43,8 +48,8 @@ class CameraSensor(Document):
     type: Literal["camera"] = "camera"
     name: str
     mount: Pose = Pose()
-    width: PositiveInt
-    height: PositiveInt
+    width: Side
+    height: Side
     fov_deg: Annotated[float, Field(gt=0.0, lt=180.0)] | None = None
     fx: PositiveFloat | None = None
     fy: PositiveFloat | None = None
@@ -71,11 +76,24 @@ class CameraSensor(Document):
         return self
 
     @property
+    def rays(self) -> int:
+        """How many pixels are used, those without a ray included."""
+        return -(-self.width // self.stride) * -(-self.height // self.stride)
+
+    @property
     def horizontal_fov_deg(self) -> float:
-        """Angle between the outermost rays of the middle row, seen from above."""
-        forward, left, _ = self.directions()[:, self.height // self.stride // 2]
+        """Angle between the outermost rays of the middle row, seen from above; NaN if none of them has a ray.
+
+        A single column is as wide as its pixel.
+        """
+        columns = torch.arange(0, self.width, self.stride, dtype=torch.float64)
+        if len(columns) == 1:
+            columns = torch.tensor([-0.5, 0.5], dtype=torch.float64)
+        row = self.height // self.stride // 2 * self.stride
+        forward, left, _ = self._directions(torch.stack([columns, torch.full_like(columns, row)], dim=1)[None])
         angle = np.rad2deg(np.arctan2(left, forward))
-        return float(np.nanmax(angle) - np.nanmin(angle))
+        angle = angle[~np.isnan(angle)]
+        return float(np.ptp(angle)) if len(angle) else np.nan
 
     def camera(self) -> Camera:
         """The camera with its lens, at its place on the vehicle.
@@ -108,7 +126,10 @@ class CameraSensor(Document):
     def directions(self) -> NDArray[np.float64]:
         """(3, rows, columns) unit directions in the frame of the mount; NaN where a pixel has no ray."""
         rows, columns = (torch.arange(0, size, self.stride, dtype=torch.float64) for size in (self.height, self.width))
-        pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2)
+        return self._directions(torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2))
+
+    def _directions(self, pixels: Tensor) -> NDArray[np.float64]:
+        """(3, rows, columns) of (rows, columns, 2) pixels."""
         camera = self.camera()
         # Only the pixels that are used, and not all at once: the solver needs many times their memory.
         rays = torch.cat([camera.rays(band)[0] for band in torch.split(pixels, ROWS_AT_ONCE)])

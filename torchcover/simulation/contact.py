@@ -42,16 +42,17 @@ class Faces:
             self._upper_m.max(axis=1, initial=-np.inf),
         )
 
-    def hold(self, place_m: NDArray[np.floating]) -> bool:
-        """Whether a (3,) place lies on one of them."""
+    def holding(self, place_m: NDArray[np.floating]) -> NDArray[np.int64]:
+        """Numbers of those that a (3,) place lies on."""
         if ((place_m < self._least_m) | (place_m > self._most_m)).any():
-            return False
+            return np.empty(0, dtype=np.int64)
         x, y, z = place_m
         # One axis after the other: the first, which asks all faces, leaves few to the second.
         near = np.flatnonzero((self._lower_m[2] <= z) & (z <= self._upper_m[2]))
         for axis, coordinate_m in ((0, x), (1, y)):
             near = near[(self._lower_m[axis, near] <= coordinate_m) & (coordinate_m <= self._upper_m[axis, near])]
-        return bool((self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]).any())
+        held: NDArray[np.int64] = near[self.from_plane_m(place_m, near) <= 2 * self.contact_m[near]]
+        return held
 
     def from_plane_m(self, place_m: NDArray[np.floating], faces: NDArray[np.int64]) -> NDArray[np.float64]:
         """Distance of a (3,) place from the planes of some of them."""

@@ -1,24 +1,48 @@
 """YAML documents: typed, without unknown keys, found by path or by built-in name."""
 
+from collections.abc import Sequence
 from importlib.resources import files
+from itertools import islice
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from reprlib import Repr
+from typing import Annotated, Any, Self, TypeVar
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
+from pydantic_core import ErrorDetails
 
+from torchcover.files import parse_yaml
 from torchcover.geometry import rigid, rotation_from_euler, rotation_from_quaternion
 
-# That of libyaml is ten times as fast; not every build of PyYAML has it.
-LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+# Mistakes of one document that a message tells, and characters of what arrived.
+MAX_TOLD = 5
+MAX_QUOTED = 60
+# Looks at no more of a value than it writes: a list of lists of lists may be endless.
+_QUOTE = Repr()
+_QUOTE.maxlevel, _QUOTE.maxstring, _QUOTE.maxlong, _QUOTE.maxother = 2, MAX_QUOTED, MAX_QUOTED, MAX_QUOTED
 
 
 class Document(BaseModel):
-    """Base of everything that is written in YAML: unknown keys, NaN and infinity are errors; values do not change."""
+    """Base of everything that is written in YAML: unknown keys, NaN and infinity are errors; values do not change.
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    Types are strict: true is no number, 8.0 no whole one, "60" neither. A whole number may stand for any number, a list
+    for a tuple, and a number of NumPy's for Python's.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _as_python_keeps_them(cls, content: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
+        if not isinstance(content, dict):
+            return content
+        return {key: _kept(value) for key, value in content.items()}
+
+
+# Farther away rays know no place any more.
+FARTHEST_M = 1e9
+Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 
 
 class Pose(Document):
@@ -38,9 +62,9 @@ class Pose(Document):
         array([-1. , -0. ,  0. ,  1.5])
     """
 
-    x_m: float = 0.0
-    y_m: float = 0.0
-    z_m: float = 0.0
+    x_m: Coordinate = 0.0
+    y_m: Coordinate = 0.0
+    z_m: Coordinate = 0.0
     yaw_deg: float = 0.0
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
@@ -79,13 +103,16 @@ def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -
 
     Raises:
         FileNotFoundError: No such file, or no built-in document of this name; the message lists the names.
-        ValueError: Not YAML, or a key is unknown, missing or has a wrong value; the message names the file and key.
+        ValueError: Not YAML, or a key is unknown, missing, doubled or has a wrong value; the message names the file and
+            the key.
     """
     path = _find(kind, path_or_name)
     try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=LOADER)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not a YAML file: {' '.join(str(error).split())}") from error
+        content = parse_yaml(path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: not a YAML file: {error}") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
     if not isinstance(content, dict):
         raise ValueError(f"{path}: a YAML mapping of keys is needed; got {type(content).__name__}")
     try:
@@ -101,18 +128,37 @@ def builtin_names(kind: str) -> list[str]:
 
 def explain(error: ValidationError) -> str:
     """What pydantic found, in one line: the key, what is wrong, what arrived."""
-    found = []
-    for detail in error.errors(include_url=False):
-        key = ".".join(str(part) for part in detail["loc"]) or "document"
-        arrived = "" if detail["type"] in ("missing", "value_error") else f" (got {_shorten(detail['input'])})"
-        found.append(f"{key}: {detail['msg'].removeprefix('Value error, ')}{arrived}")
-    return "; ".join(found)
+    details = [detail for detail in error.errors(include_url=False) if not _follows_from_another(detail)]
+    told = [_told(detail) for detail in islice(details, MAX_TOLD)]
+    more = len(details) - len(told)
+    return "; ".join([*told, f"and {more} more mistakes"] if more else told)
+
+
+def _told(detail: ErrorDetails) -> str:
+    key = ".".join(str(part)[:MAX_QUOTED] for part in detail["loc"]) or "document"
+    arrived = "" if detail["type"] in ("missing", "value_error") else f" (got {_shorten(detail['input'])})"
+    return f"{key}: {detail['msg'].removeprefix('Value error, ')}{arrived}"
+
+
+def _follows_from_another(detail: ErrorDetails) -> bool:
+    """Whether a list is too short only because what is in it was refused, which is told already."""
+    if detail["type"] != "too_short" or not isinstance(detail["input"], Sequence):
+        return False
+    return len(detail["input"]) >= int(detail["ctx"]["min_length"])
+
+
+def _beside(path: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+    return beside(Path(path), info) if isinstance(path, str) else path
 
 
 def beside(path: Path, info: ValidationInfo) -> Path:
-    """Validator: a relative path is meant from the folder of the document that holds it."""
+    """A relative path is meant from the folder of the document that holds it."""
     folder = (info.context or {}).get("folder")
     return folder / path if folder and not path.is_absolute() else path
+
+
+PathBeside = Annotated[Path, BeforeValidator(_beside)]
+"""A path in a document; a relative one is meant from the document's folder."""
 
 
 def _find(kind: str, path_or_name: str | Path) -> Path:
@@ -138,5 +184,11 @@ def _builtin_folder(kind: str) -> Path:
 
 
 def _shorten(value: Any) -> str:  # noqa: ANN401  (whatever stood in the file)
-    text = repr(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
+    text = _QUOTE.repr(value)
+    return text if len(text) <= MAX_QUOTED else f"{text[: MAX_QUOTED - 3]}..."
+
+
+def _kept(value: Any) -> Any:  # noqa: ANN401
+    if isinstance(value, list):
+        return tuple(map(_kept, value))
+    return value.item() if isinstance(value, np.generic) else value

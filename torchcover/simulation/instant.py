@@ -143,17 +143,24 @@ class Instant:
         return image
 
     def buried(self, position_m: Matrix) -> bool:
-        """Whether a place in the vehicle frame lies below the ground or inside a wall or another body."""
+        """Whether a place in the vehicle frame lies below the ground or inside a wall or another body than the ego."""
         casters = [(self.static, self.static_T_vehicle)]
         casters += [
             (part.caster, part.part_T_vehicle)
             for part in self.moving
-            if np.linalg.norm(part.centre_m - position_m) <= CLEAR_RADII * part.radius_m
+            if part.body != self.ego and np.linalg.norm(part.centre_m - position_m) <= CLEAR_RADII * part.radius_m
         ]
-        return any(
-            caster.back_faces(transform(part_T_vehicle, position_m[None])[0], ALL_AROUND_RAYS).mean() > BURIED_SHARE
-            for caster, part_T_vehicle in casters
-        )
+        for caster, part_T_vehicle in casters:
+            met = caster.met_from_behind(transform(part_T_vehicle, position_m[None])[0], ALL_AROUND_RAYS)
+            # What never moves may have the ego in it, under its own number; a body that moves is number 0 of its own.
+            if ((met >= 0) & ((caster is not self.static) | (met != self.ego))).mean() > BURIED_SHARE:
+                return True
+        return False
+
+    def on_a_face(self, position_m: Matrix) -> bool:
+        """Whether a place in the vehicle frame lies exactly on the ground, or on a face of what else never moves."""
+        touched = self.static.touched(transform(self.static_T_vehicle, position_m[None])[0])
+        return bool((touched != self.ego).any())
 
     def outlines(self, origin_m: Matrix) -> Outlines:
         """The bodies that move, as they look from a place."""

@@ -86,6 +86,11 @@ class PaperReference:
         side = round(math.sqrt(rays))
         return cls(rows=side, columns=side)
 
+    @property
+    def rays(self) -> int:
+        """Rows times columns."""
+        return self.rows * self.columns
+
     def scan(self, surroundings: Surroundings) -> ReferenceScan:
         """What its rays hit at one step; see `ReferenceSensor.scan`."""
         return cast_pattern(self, surroundings, ego_points=self.ego_points)

@@ -52,7 +52,7 @@ class RayCaster:
             )
         self._faces = Faces(bodies, reach_m)
         self._first_face = np.cumsum([0] + [len(body.faces) for body in bodies])
-        self._last_asked = (b"", False)
+        self._last_asked: tuple[bytes, NDArray[np.int64]] = b"", np.empty(0, dtype=np.int64)
         # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
         self._scene = EmbreeScene(robust=True)
         for body in bodies:
@@ -77,7 +77,7 @@ class RayCaster:
         )
         answer = self._scene.run(origins, directions.T, dists=limit_m.copy(), output=True)
         hits = Hits(answer["tfar"], answer["geomID"])
-        if self._starts_on_a_face(origin_m):
+        if len(self.touched(origin_m)):
             self._leave_faces(origin_m, directions, limit_m, hits, self._numbers(answer))
         return hits
 
@@ -86,15 +86,15 @@ class RayCaster:
         numbers: NDArray[np.int64] = self._first_face[np.maximum(answer["geomID"], 0)] + np.maximum(answer["primID"], 0)
         return numbers
 
-    def _starts_on_a_face(self, origin_m: NDArray[np.floating]) -> bool:
-        """Whether a place lies on a face: hardly any does, and asking the faces is cheaper than asking the rays.
+    def touched(self, place_m: NDArray[np.floating]) -> NDArray[np.int64]:
+        """Numbers of the bodies on whose faces a place lies: hardly any does, and the faces are sooner asked than rays.
 
         The last answer is kept, for all tiles of a scan start at one place.
         """
         asked, answer = self._last_asked  # read at once: other threads may ask about other places
-        if asked != origin_m.tobytes():
-            answer = self._faces.hold(origin_m)
-            self._last_asked = (origin_m.tobytes(), answer)
+        if asked != place_m.tobytes():
+            answer = np.searchsorted(self._first_face, self._faces.holding(place_m), side="right") - 1
+            self._last_asked = (place_m.tobytes(), answer)
         return answer
 
     def _leave_faces(
@@ -128,19 +128,19 @@ class RayCaster:
             again = hit & starts_on_plane(faces)
             rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
 
-    def back_faces(self, origin_m: NDArray[np.floating], directions: Float32) -> NDArray[np.bool_]:
-        """Which rays first meet a face from behind, as rays that start inside a closed body do.
+    def met_from_behind(self, origin_m: NDArray[np.floating], directions: Float32) -> NDArray[np.int32]:
+        """Which bodies rays first meet from behind, as rays that start inside a closed body do.
 
         Args:
             origin_m: (3,) common origin of the rays.
             directions: (3, N) unit directions.
 
         Returns:
-            (N,) whether the ray's first hit is the back of a face.
+            (N,) number of the body of which a ray first hits the back of a face; -1 if it hits a front, or nothing.
         """
         origins = np.ascontiguousarray(np.broadcast_to(origin_m.astype(np.float32), (directions.shape[1], 3)))
         answer = self._scene.run(origins, directions.T, output=True)
         # Embree's Ng points to where the corners of the face turn counter-clockwise.
-        behind: NDArray[np.bool_] = (answer["Ng"] * directions.T).sum(axis=1) > 0
-        behind &= answer["geomID"] >= 0
-        return behind
+        behind = (answer["Ng"] * directions.T).sum(axis=1) > 0
+        bodies: NDArray[np.int32] = np.where(behind, answer["geomID"], -1)
+        return bodies

@@ -68,6 +68,11 @@ class ReferenceSensor(Protocol):
         ...
 
     @property
+    def rays(self) -> int:
+        """About how many rays it casts at a step: asked before it is made to scan."""
+        ...
+
+    @property
     def shell_m(self) -> float:
         """How far its places lie from the ego's bounding box in metres, at most."""
         ...

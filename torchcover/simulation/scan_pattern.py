@@ -4,10 +4,13 @@ from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from torchcover.simulation.documents import Document
 from torchcover.simulation.rays import unit_directions
+
+# A hundred times what there is on the market.
+MAX_ROWS, MAX_COLUMNS = 100_000, 1_000_000
 
 Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
 
@@ -32,12 +35,12 @@ class ScanPattern(Document):
         dropout: Probability that a ray gives no point, from 0 to 1.
     """
 
-    channels: PositiveInt | None = None
+    channels: Annotated[int, Field(gt=0, le=MAX_ROWS)] | None = None
     vertical_fov_deg: tuple[Elevation, Elevation] | None = None
     elevations_deg: tuple[Elevation, ...] | None = Field(default=None, min_length=1)
     azimuth_offsets_deg: tuple[float, ...] | None = None
     horizontal_fov_deg: Annotated[float, Field(gt=0.0, le=360.0)]
-    columns: PositiveInt
+    columns: Annotated[int, Field(gt=0, le=MAX_COLUMNS)]
     min_range_m: NonNegativeFloat = 0.0
     max_range_m: PositiveFloat
     range_noise_m: NonNegativeFloat = 0.0
@@ -58,6 +61,11 @@ class ScanPattern(Document):
         if self.min_range_m >= self.max_range_m:
             raise ValueError(f"min_range_m ({self.min_range_m}) must be below max_range_m ({self.max_range_m})")
         return self
+
+    @property
+    def rays(self) -> int:
+        """How many rays there are: rows times columns."""
+        return (self.channels or len(self.elevations_deg or ())) * self.columns
 
     def rows_deg(self) -> NDArray[np.float64]:
         """(rows,) elevation of each row."""

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from torchcover.geometry import BoundingBox
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, mover_mesh
-from torchcover.simulation.documents import Document, Pose, beside, load_document
+from torchcover.simulation.documents import Document, PathBeside, Pose, load_document
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.tracks import read_boxes, read_trajectory
 from torchcover.simulation.traffic import Highway, Parking, Urban
@@ -34,9 +34,7 @@ class Mover(Document):
 
     shape: Shape
     pose: Pose | None = None
-    trajectory: Path | None = None
-
-    _path_beside = field_validator("trajectory")(beside)
+    trajectory: PathBeside | None = None
 
     @model_validator(mode="after")
     def _check_one_of(self) -> Self:
@@ -89,15 +87,15 @@ class Scenario(Document):
     ego: Mover | None = None
     bodies: tuple[Body, ...] = ()
     actors: tuple[NamedMover, ...] = ()
-    boxes: Path | None = None
+    boxes: PathBeside | None = None
     time_step_s: PositiveFloat = 0.1
     duration_s: NonNegativeFloat = 0.0
     traffic: Traffic | None = None
 
-    _path_beside = field_validator("boxes")(beside)
-
     @model_validator(mode="after")
     def _check_given_or_procedural(self) -> Self:
+        times = self.traffic or self
+        steps_of(times.duration_s, times.time_step_s)
         if self.traffic is None:
             missing = [key for key in ("ego", "bodies") if not getattr(self, key)]
             if missing:
@@ -154,7 +152,7 @@ class Scenario(Document):
             ValueError: It is not a positive multiple of the time step.
         """
         time_step_s = self.step_s
-        steps = round(time_s / time_step_s) if math.isfinite(time_s) else 0
+        steps = round(time_s / time_step_s) if math.isfinite(time_s / time_step_s) else 0
         if steps < 1 or not math.isclose(steps * time_step_s, time_s, rel_tol=1e-6):
             raise ValueError(
                 f"every_s: a positive multiple of the time step of {self.name!r}, {time_step_s:g} s, is needed; "

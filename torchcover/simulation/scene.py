@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import BoundingBox, euler_from_rotation, invert, overlap, rotation_from_euler, transform
 from torchcover.simulation.culling import SLACK_M, SLACK_SHARE
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant, Part, rotate
+from torchcover.simulation.memory import check_fits
 from torchcover.simulation.patches import Bounds
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import Tile
@@ -18,6 +19,9 @@ from torchcover.simulation.world import Actor, World
 
 Matrix = NDArray[np.float64]
 Float32 = NDArray[np.float32]
+
+# Three float64, and the copies that are made on the way to them.
+BYTES_PER_POSITION = 96
 
 
 class Solid(NamedTuple):
@@ -58,6 +62,11 @@ class Scene:
         # One solid for each mesh object, however many actors share it.
         self._solids = {id(mesh): _solid(mesh) for mesh in {id(actor.mesh): actor.mesh for actor in bodies}.values()}
         # (steps, bodies, 3): where they are, to find out at once which are near; NaN, so never near, if absent.
+        check_fits(
+            f"{world.steps:,} time steps of {len(bodies):,} bodies",
+            BYTES_PER_POSITION * world.steps * len(bodies),
+            "shorten the duration, or make the time steps longer",
+        )
         times_s = world.time_step_s * np.arange(world.steps, dtype=np.float64)
         tracks = [actor.trajectory.positions_at(times_s) for actor in self._resting + self._moving]
         self._positions_m = np.stack(tracks, axis=1)
@@ -117,7 +126,7 @@ class Scene:
         time_s = step * self.world.time_step_s
         world_T_vehicle = self.world.ego.trajectory.at(time_s)
         vehicle_T_world = invert(world_T_vehicle)
-        distance_m = np.linalg.norm(self._positions_m[step] - world_T_vehicle[:3, 3], axis=1) - self._reach_m
+        distance_m = self._distance_m(step, world_T_vehicle)
         self._check_overlap(time_s, vehicle_T_world, distance_m)
         resting, first = len(self._resting), self._first_moving
         moving = tuple(
@@ -131,6 +140,27 @@ class Scene:
             static_T_vehicle, ego = np.eye(4), 0
         out_of_range = len(self._moving) - len(moving)
         return Instant(self._static, static_T_vehicle, moving, ego, out_of_range, level_axes(world_T_vehicle))
+
+    def check_apart(self, steps: NDArray[np.int64]) -> None:
+        """Refuse time steps at which an actor overlaps the ego, as `at` does for one.
+
+        Raises:
+            ValueError: As said; the message names the actor and the first such time.
+        """
+        ego = self.world.ego
+        bodies = self._resting + self._moving
+        ego_m = self._positions_m[:, [body is ego for body in bodies]]
+        reach_m = self._reach_m + self._solids[id(ego.mesh)].reach_m
+        near = (np.linalg.norm(self._positions_m - ego_m, axis=2) < reach_m).sum(axis=1) > 1  # one is the ego itself
+        for step in steps[near[steps]].tolist():
+            time_s = step * self.world.time_step_s
+            world_T_vehicle = ego.trajectory.at(time_s)
+            self._check_overlap(time_s, invert(world_T_vehicle), self._distance_m(step, world_T_vehicle))
+
+    def _distance_m(self, step: int, world_T_vehicle: Matrix) -> Matrix:
+        """(bodies,) how far each is from the vehicle at least."""
+        distance_m: Matrix = np.linalg.norm(self._positions_m[step] - world_T_vehicle[:3, 3], axis=1) - self._reach_m
+        return distance_m
 
     @property
     def _first_moving(self) -> int:

@@ -49,6 +49,11 @@ class Sensor(Protocol):
         """Probability that a ray gives no point, from 0 to 1."""
         ...
 
+    @property
+    def rays(self) -> int:
+        """How many rays `directions` has, NaN ones included: asked before it is called."""
+        ...
+
     def directions(self) -> NDArray[np.float64]:
         """(3, rows, columns) unit directions in the sensor's frame; NaN where there is no ray."""
         ...

@@ -1,17 +1,17 @@
 """Shapes: primitives, and meshes from files."""
 
 import warnings
-from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, PositiveFloat, field_validator
+from pydantic import Field, PositiveFloat
 
 from torchcover.geometry import transform
-from torchcover.simulation.documents import Document, beside
+from torchcover.simulation.documents import Document, PathBeside
 
 CYLINDER_SIDES = 24
+MAX_SIDES = 10_000
 ELLIPSOID_SIDES = 12  # around the z axis; half as many bands from pole to pole
 # Nothing on a road is longer; no building, and no terrain within a sensor's range, is higher.
 MAX_VEHICLE_LENGTH_M = 100.0
@@ -96,7 +96,7 @@ class Cylinder(Document):
     type: Literal["cylinder"]
     radius_m: Length
     height_m: Length
-    sides: Annotated[int, Field(ge=3)] = CYLINDER_SIDES
+    sides: Annotated[int, Field(ge=3, le=MAX_SIDES)] = CYLINDER_SIDES
 
     def mesh(self) -> Mesh:
         """A closed prism."""
@@ -136,10 +136,8 @@ class MeshFile(Document):
     """
 
     type: Literal["mesh"]
-    path: Path
+    path: PathBeside
     metres_per_unit: PositiveFloat = 1.0
-
-    _path_beside = field_validator("path")(beside)
 
     def mesh(self) -> Mesh:
         """All geometry of the file in one mesh; a warning if it is not closed.

@@ -12,6 +12,7 @@ from torchcover.geometry import BoundingBox
 from torchcover.simulation.disturbance import disturb
 from torchcover.simulation.instant import Instant, Scan
 from torchcover.simulation.labels import Label, labels
+from torchcover.simulation.memory import check_fits
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.observation import Observation, counts_of
 from torchcover.simulation.reference_sensor import ReferenceSensor
@@ -20,6 +21,9 @@ from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.stage import Stage, Stages
 from torchcover.simulation.surroundings import Surroundings
+
+# What a step takes at its largest: 73 to 246 were measured, for a LiDAR, a camera and the reference sensors.
+BYTES_PER_RAY = 300
 
 
 class Simulator:
@@ -37,7 +41,7 @@ class Simulator:
         every_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
 
     Raises:
-        ValueError: A negative seed, a time that is no multiple of the time step.
+        ValueError: A negative seed, a time that is no multiple of the time step, more rays than there is memory for.
 
     Example:
         >>> from torchcover.simulation import PaperReference
@@ -65,6 +69,7 @@ class Simulator:
         self.seed = seed
         self._every_steps = 1 if every_s is None else scenario.steps_in(every_s)
         self._stages = Stages(scenario, rigs, seed)
+        self._check_size()
 
     @property
     def every_s(self) -> float:
@@ -93,6 +98,7 @@ class Simulator:
         """The same instants as another reference sensor sees them; the geometry is built once for both."""
         other = copy.copy(self)
         other.reference_sensor = reference_sensor
+        other._check_size()
         return other
 
     def step(self, index: int) -> Observation:
@@ -103,11 +109,12 @@ class Simulator:
 
         Raises:
             FileNotFoundError: A mesh, vehicle or trajectory file is missing.
-            ValueError: A negative index, a sensor inside the ego's body, an actor that overlaps the ego, an ego below
-                the ground.
+            ValueError: A negative index, a sensor inside a body or below the ground, an actor that overlaps the ego, an
+                ego below the ground.
         """
         stage, step = self._stage(index)
         instant = stage.scene.at(step, within_m=self._reach_m(stage.scene.ego_box))
+        stage.check_mounts(instant)
         scans = {name: self._scan_rig(sensors, instant, index) for name, sensors in stage.mounted.items()}
         reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
@@ -122,6 +129,22 @@ class Simulator:
                 "repeated_instants": int(self.distinct_steps is not None and index >= self.distinct_steps),
             },
         )
+
+    def check_run(self, steps: int) -> None:
+        """Refuse before its first step what a run through a given world would end with; traffic is made as it comes.
+
+        Args:
+            steps: How many steps the run has.
+
+        Raises:
+            ValueError: A sensor that is where none can be at the first step, an actor that overlaps the ego at any.
+        """
+        if self.scenario.traffic is None:
+            stage, _ = self._stage(0)
+            world_steps = stage.scene.world.steps
+            indices = np.arange(min(steps, world_steps), dtype=np.int64)  # then they repeat themselves
+            stage.scene.check_apart(np.unique(indices * self._every_steps % world_steps))
+            stage.check_mounts(stage.scene.at(0))
 
     def labels(self, index: int) -> list[Label]:
         """The objects within the reference sensor's range at one step; names are an object's own within a run."""
@@ -139,6 +162,15 @@ class Simulator:
     def run_of(self, index: int) -> int:
         """Which run through the scenario a step belongs to: in traffic, each is a world of its own."""
         return self.scenario.locate(index * self._every_steps)[0]
+
+    def _check_size(self) -> None:
+        of_rigs = sum(sensor.rays for rig in self.rigs.values() for sensor in rig.sensors)
+        rays = of_rigs + self.reference_sensor.rays
+        check_fits(
+            f"{rays:,} rays a step ({of_rigs:,} of the rig's sensors, {self.reference_sensor.rays:,} of the reference)",
+            BYTES_PER_RAY * rays,
+            "use fewer rays, rows or columns",
+        )
 
     def _stage(self, index: int) -> tuple[Stage, int]:
         if index < 0:

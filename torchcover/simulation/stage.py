@@ -1,20 +1,60 @@
 """Where a run through a scenario plays: its geometry, and the rigs' sensors in it."""
 
+import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.simulation.instant import Instant
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import Tile, into_tiles
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 
+# A sensor on the ground is asked about a place this far above it: whether it is inside of something else.
+LIFT_M = np.array([0.0, 0.0, 0.01])
 
-class Stage(NamedTuple):
+
+@dataclass(eq=False)
+class Stage:
     """One run's geometry, and the sensors of each rig at their places on its ego."""
 
     scene: Scene
     mounted: Mapping[str, Sequence[MountedSensor]]
+    _free_for_good: bool = field(default=False, init=False)
+
+    def check_mounts(self, instant: Instant) -> None:
+        """Refuse a sensor that is where none can be; where nothing moves, the first answer holds.
+
+        Raises:
+            ValueError: It lies below the ground or inside a body.
+        """
+        if self._free_for_good:
+            return
+        for rig, sensors in self.mounted.items():
+            for mounted in sensors:
+                place_m = mounted.vehicle_T_sensor[:3, 3]
+                _check_place(f"rig {rig!r}: sensor {mounted.sensor.name!r}", place_m, instant)
+        self._free_for_good = not self.scene.moves
+
+
+def _check_place(sensor: str, place_m: NDArray[np.float64], instant: Instant) -> None:
+    where = f"{sensor} at {place_m.round(3).tolist()} m"
+    on_a_face = instant.on_a_face(place_m)
+    if instant.buried(place_m + LIFT_M if on_a_face else place_m):
+        raise ValueError(
+            f"{where} lies below the ground, or inside a wall or another body, so that it sees what is none; "
+            "is the sign of z_m right, does the ego stand on the ground, and do faces point outwards?"
+        )
+    if on_a_face:
+        warnings.warn(
+            f"{where} lies exactly on the ground or on a wall, and sees nothing of it; move its mount away from it",
+            stacklevel=2,
+        )
 
 
 class Stages:

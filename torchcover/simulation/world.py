@@ -5,6 +5,9 @@ from dataclasses import dataclass
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.trajectory import Trajectory
 
+# A day at ten to a second.
+MAX_STEPS = 1_000_000
+
 
 @dataclass(frozen=True, eq=False)
 class Actor:
@@ -56,5 +59,15 @@ class World:
 
 
 def steps_of(duration_s: float, time_step_s: float) -> int:
-    """Number of instants from 0 to a duration, both included."""
-    return int(duration_s / time_step_s + 1e-9) + 1
+    """Number of instants from 0 to a duration, both included.
+
+    Raises:
+        ValueError: More than a million.
+    """
+    steps = duration_s / time_step_s
+    if not steps < MAX_STEPS:
+        raise ValueError(
+            f"a duration of {duration_s:g} s has {steps:.6g} time steps of {time_step_s:g} s, over {MAX_STEPS:,}; "
+            "shorten it, or make the steps longer"
+        )
+    return int(steps + 1e-9) + 1

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.simulation.memory import check_fits
 from torchcover.simulation.traffic.gates import Gate, Gates
 from torchcover.simulation.traffic.idm import Driver, acceleration, advance
 from torchcover.simulation.traffic.roads import Line
@@ -26,6 +27,9 @@ BRAKING_FOR_A_LIGHT_MPS2 = 2.5
 STOP_BEFORE_LINE_M = 0.5
 # A vehicle ahead that is slower than this share of one's own desired speed is a queue, not a flow.
 QUEUE_SPEED = 0.15
+
+# Place and speed, pose and yaw, and their copies.
+BYTES_PER_STATE = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +166,23 @@ class Simulation:
         to_leader = np.maximum(self._gap_to_leader() - self._driver.standstill_gap_m, 0.0)
         bearable = to_leader / self._driver.headway_s
         return np.asarray(np.minimum(0.95 * self._driver.desired_speed_mps, np.minimum(stoppable, bearable)))
+
+
+def check_crowd(agents: float, steps: int) -> None:
+    """Refuse more agents than a simulation has memory for, before any of them is made.
+
+    Args:
+        agents: How many there are, about.
+        steps: For how many times their state is kept.
+
+    Raises:
+        ValueError: There is not so much memory.
+    """
+    check_fits(
+        f"traffic of about {agents:,.0f} for {steps:,} time steps",
+        BYTES_PER_STATE * agents * steps,
+        "shorten the duration, or let there be fewer to a kilometre",
+    )
 
 
 def _leaders(lanes: Sequence[Lane], lane: NDArray[np.int64], place_m: Numbers) -> tuple[NDArray[np.int64], Numbers]:

@@ -4,14 +4,14 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat
+from pydantic import Field
 
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.assemble import actors, ego_actor, paths
 from torchcover.simulation.traffic.fleet import EGO, Fleet
-from torchcover.simulation.traffic.flow import Agent, Lane, Simulation
+from torchcover.simulation.traffic.flow import Agent, Lane, Simulation, check_crowd
 from torchcover.simulation.traffic.idm import Driver
-from torchcover.simulation.traffic.procedural import Procedural
+from torchcover.simulation.traffic.procedural import MostVehicles, Procedural
 from torchcover.simulation.traffic.roads import Line
 from torchcover.simulation.traffic.roadside import LANE_CENTRES_M, roadside
 from torchcover.simulation.traffic.signals import Signals
@@ -50,7 +50,7 @@ class Highway(Procedural):
     """
 
     type: Literal["highway"] = "highway"
-    traffic_per_km: NonNegativeFloat = 12.0
+    traffic_per_km: MostVehicles = 12.0
     ego_lane: int = Field(default=2, ge=1, le=3)
 
     def _build(
@@ -91,10 +91,11 @@ class Highway(Procedural):
             fleet.agent(EGO, own, start - LEADER_AHEAD_M / 2, Driver(EGO_MPS, headway_s=0.9)),
             fleet.agent(kind, own, start + LEADER_AHEAD_M / 2, leader),
         ]
-        for index, lane in enumerate(lanes):
+        # Nobody of one's own direction who is that far ahead is ever caught up with.
+        ends_m = [2 * start] * 3 + [lane.line.length_m for lane in lanes[3:]]
+        check_crowd(self.traffic_per_km * sum(ends_m) / 1000, self.steps)
+        for index, end in enumerate(ends_m):
             users = LANE_USERS[index % 3]
-            # Nobody of one's own direction who is that far ahead is ever caught up with.
-            end = 2 * start if index < 3 else lane.line.length_m
             agents += fleet.fill(
                 lanes, index, (0.0, end), self.traffic_per_km, users, keep_free=agents[:2], spread=SPEED_SPREAD
             )

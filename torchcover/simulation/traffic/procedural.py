@@ -2,15 +2,23 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import PositiveFloat
+from pydantic import Field
 
 from torchcover.simulation.documents import Document
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import Actor, World, steps_of
+
+# Streets are as long as the ego's way: what moves on them grows with the square of the duration.
+MAX_DURATION_S = 3600.0
+MIN_TIME_STEP_S = 0.01
+# To a kilometre of a lane; more have no room.
+MostVehicles = Annotated[float, Field(ge=0.0, le=200.0)]
+MostPeople = Annotated[float, Field(ge=0.0, le=1000.0)]
 
 
 class Procedural(Document):
@@ -21,8 +29,8 @@ class Procedural(Document):
         time_step_s: Time between two frames.
     """
 
-    duration_s: PositiveFloat = 60.0
-    time_step_s: PositiveFloat = 0.1
+    duration_s: Annotated[float, Field(gt=0.0, le=MAX_DURATION_S)] = 60.0
+    time_step_s: Annotated[float, Field(ge=MIN_TIME_STEP_S)] = 0.1
 
     def world(self, seed: int, ego: Mesh | None = None, bodies: Mapping[str, Mesh] | None = None) -> World:
         """Build the world; the same for the same arguments.
@@ -41,10 +49,15 @@ class Procedural(Document):
         """
         generator = np.random.default_rng(seed)
         fleet = Fleet(load_bodies() if bodies is None else bodies, ego, generator)
-        steps = int(np.ceil(self.duration_s / self.time_step_s - 1e-9))
+        steps = max(1, int(np.ceil(self.duration_s / self.time_step_s - 1e-9)))
         times_s = self.time_step_s * np.arange(steps + 1, dtype=np.float64)
         static, driver, others = self._build(fleet, times_s, generator)
         return World(static, driver, others, self.time_step_s, self.duration_s, tuple(fleet.parked))
+
+    @property
+    def steps(self) -> int:
+        """Number of instants."""
+        return steps_of(self.duration_s, self.time_step_s)
 
     @abstractmethod
     def _build(

@@ -4,16 +4,16 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat
+from pydantic import Field
 
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.assemble import Paths, actors, ego_actor, paths
 from torchcover.simulation.traffic.city import City
 from torchcover.simulation.traffic.crossing import Footpath, step_height, walk
 from torchcover.simulation.traffic.fleet import CYCLING, EGO, WALKING, Fleet
-from torchcover.simulation.traffic.flow import Agent, Flow, Lane, Simulation
+from torchcover.simulation.traffic.flow import Agent, Flow, Lane, Simulation, check_crowd
 from torchcover.simulation.traffic.idm import Driver
-from torchcover.simulation.traffic.procedural import Procedural
+from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles, Procedural
 from torchcover.simulation.traffic.signals import CROSS, MAIN
 from torchcover.simulation.traffic.streets import (
     FOOTPATHS_M,
@@ -62,9 +62,9 @@ class Urban(Procedural):
     type: Literal["urban"] = "urban"
     lanes: Literal[2, 4] = 4
     speed_mps: float = Field(default=13.9, ge=5.0, le=20.0)
-    traffic_per_km: NonNegativeFloat = 20.0
-    cyclists_per_km: NonNegativeFloat = 6.0
-    people_per_km: NonNegativeFloat = 25.0
+    traffic_per_km: MostVehicles = 20.0
+    cyclists_per_km: MostPeople = 6.0
+    people_per_km: MostPeople = 25.0
     parked_share: float = Field(default=0.45, ge=0.0, le=1.0)
 
     def _build(
@@ -97,16 +97,17 @@ class Urban(Procedural):
             kind: (weight, Driver(self.speed_mps * pace, headway_s=headway, acceleration_mps2=starting))
             for kind, (weight, pace, headway, starting) in DRIVING.items()
         }
-        agents = self._ego_and_leader(streets, fleet, generator)
         per_lane = [
             *[(self.traffic_per_km, driving)] * len(main),
             *[(self.cyclists_per_km, {"cyclist": (1.0, CYCLING)})] * len(bicycles),
             *[(self.people_per_km, {"adult": (5.0, WALKING), "child": (1.0, WALKING)})] * len(sidewalks),
             *[(self.traffic_per_km / 2, driving)] * len(cross),
         ]
-        for index, (per_km, drivers) in enumerate(per_lane):
-            # Who has left a cross street's junction far behind does not come back.
-            end = 2 * streets.reach_m if index < len(lanes) - len(cross) else streets.reach_m + AHEAD_M
+        # Who has left a cross street's junction far behind does not come back.
+        ends_m = [2 * streets.reach_m] * (len(lanes) - len(cross)) + [streets.reach_m + AHEAD_M] * len(cross)
+        check_crowd(sum(per_km * end / 1000 for (per_km, _), end in zip(per_lane, ends_m, strict=True)), self.steps)
+        agents = self._ego_and_leader(streets, fleet, generator)
+        for index, ((per_km, drivers), end) in enumerate(zip(per_lane, ends_m, strict=True)):
             agents += fleet.fill(lanes, index, (0.0, end), per_km, drivers, keep_free=agents[:2])
         return lanes, agents
 

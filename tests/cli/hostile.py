@@ -1,0 +1,186 @@
+"""Documents and options that nobody should write: what each must end in is an exit code and one line, at once."""
+
+from collections.abc import Callable, Iterator
+from itertools import chain
+from pathlib import Path
+from typing import NamedTuple
+
+RIG = """name: r
+sensors:
+  - name: top
+    mount: {x_m: 1.0, z_m: 2.0}
+    channels: 4
+    vertical_fov_deg: [-30, 10]
+    horizontal_fov_deg: 360
+    columns: 8
+    max_range_m: 50
+"""
+CAMERA = """name: c
+sensors:
+  - type: camera
+    name: front
+    mount: {x_m: 1.0, z_m: 2.0}
+    width: 32
+    height: 24
+    fx: 20
+    fy: 20
+    cx: 16
+    cy: 12
+    lens: kannala_brandt
+    coefficients: [0.01, 0.0, 0.0, 0.0]
+    max_range_m: 50
+"""
+YARD = """name: s
+ego: {shape: {type: box, size_m: [4, 2, 1.5]}, pose: {x_m: 0, yaw_deg: 10}}
+bodies:
+  - {name: ground, shape: {type: plane, size_m: [400, 400]}, poses: [{x_m: 0}]}
+  - {name: post, shape: {type: cylinder, radius_m: 0.2, height_m: 3, sides: 8}, poses: [{x_m: 9}]}
+actors:
+  - {name: a, category: car, shape: {type: box, size_m: [4, 2, 1]}, pose: {x_m: 20}}
+time_step_s: 0.1
+duration_s: 1.0
+"""
+TOWN = """name: t
+traffic:
+  type: urban
+  duration_s: 3.0
+  time_step_s: 0.5
+  speed_mps: 10
+  traffic_per_km: 5
+  people_per_km: 5
+"""
+BASES = {"rig": RIG, "camera": CAMERA, "yard": YARD, "town": TOWN}
+
+# Instead of a number: other types, YAML 1.1's readings, and numbers that have no room.
+VALUES = (
+    "true", "'60'", "0100", "1:40", "1_000", "~", "[]", "{}", "abc", ".nan", "-.inf", "1e400", "-1e300", "-1", "1e-320",
+    "99999999999999999999", "1000000000", "9" * 5000, "[[[[1]]]]", "2020-01-01", "!!python/object:os.system x",
+)  # fmt: skip
+
+LAUGHS = "x0: &x0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"x{k}: &x{k} [{', '.join([f'*x{k - 1}'] * 9)}]\n" for k in range(1, 15)
+)
+# Few enough values to be read, and far more once they are written out.
+CHUCKLES = "x0: &x0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
+    f"x{k}: &x{k} [{', '.join([f'*x{k - 1}'] * 9)}]\n" for k in range(1, 4)
+)
+
+
+class Case(NamedTuple):
+    """A call of the command line.
+
+    Args:
+        name: What a report calls it.
+        arguments: Of the command; paths are relative to its folder.
+        files: Name -> content of what is written into that folder before.
+        prepare: What else is done to the folder.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    files: dict[str, str] = {}  # noqa: RUF012  (a NamedTuple; nobody changes it)
+    prepare: Callable[[Path], object] = lambda folder: None
+
+
+def cases() -> Iterator[Case]:
+    """All of them: more than 150."""
+    return chain(documents(), values(), options())
+
+
+def documents() -> Iterator[Case]:
+    """Documents that are broken as a whole."""
+    broken = {
+        "empty": "", "list": "- 1\n- 2\n", "text": "abc", "tab": "\t", "open": "name: [1", "nul": "name: \x00",
+        "two documents": "name: a\n---\nname: b\n", "tag": "!!python/object:os.system x", "merge of nothing": "<<: 3\n",
+        "deep list": "name: " + "[" * 500 + "]" * 500, "deep mapping": "{a: " * 500 + "1" + "}" * 500,
+        "endless depth": "[" * 5_000, "laughs": LAUGHS, "an anchor in itself": "name: &a [*a]",
+        "long": "name: " + "x" * 2_000_000, "keys that are no names": "? [1, 2]\n: 3\n",
+        "numbers as keys": "1: 2\n3: 4\n",
+    }  # fmt: skip
+    for (what, content), base in ((item, base) for item in broken.items() for base in ("rig", "yard")):
+        yield _case(f"{base}: {what}", {base: content})
+    for base, content in BASES.items():
+        yield _case(f"{base}: a key twice", {base: content + f"name: {base}\n"})
+        yield _case(f"{base}: a wrong key", {base: content + "colour: red\n"})
+        yield _case(f"{base}: hundreds of wrong keys", {base: content + "".join(f"key_{k}: {k}\n" for k in range(200))})
+        yield _case(f"{base}: anchors of anchors", {base: content + CHUCKLES})
+    itself = "name: v\nparts: [{name: p, shape: {type: vehicle, vehicle: v.yaml}}]\n"
+    ego = YARD.replace("{type: box, size_m: [4, 2, 1.5]}", "{type: vehicle, vehicle: v.yaml}")
+    yield _case("a vehicle in itself", {"yard": ego, "v": itself})
+    yield _case("a vehicle that is not there", {"yard": ego})
+    yield _case("a model that is not there", {"rig": RIG.replace("columns: 8", "model: none.yaml")})
+    yield _case(
+        "a model with a key twice", {"rig": RIG.replace("columns: 8", "model: m.yaml"), "m": "name: m\nname: n\n"}
+    )
+    yield _case("below the ground", {"rig": RIG.replace("z_m: 2.0", "z_m: -1.73")})
+    yield _case("in the ego", {"rig": RIG.replace("z_m: 2.0", "z_m: 0.7")})
+    yield _case("in a post", {"rig": RIG.replace("x_m: 1.0, z", "x_m: 8.86, y_m: -1.56, z")})
+    yield _case("an actor in the ego", {"yard": YARD.replace("pose: {x_m: 20}", "pose: {x_m: 1}")})
+    trajectory = "\n".join(["t,x,y,z,roll,pitch,yaw", "0,20,0,0,0,0,0", "1,0,0,0,0,0,0"])
+    meets = YARD.replace("pose: {x_m: 20}", "trajectory: a.csv")
+    write = lambda folder: (folder / "a.csv").write_text(trajectory)  # noqa: E731
+    yield _case("an actor that gets into the ego", {"yard": meets}, prepare=write, steps=11)
+
+
+def values() -> Iterator[Case]:
+    """Every number of every document, replaced by what is none or by one that has no room."""
+    numbers = {
+        "rig": ("x_m: 1.0", "channels: 4", "columns: 8", "horizontal_fov_deg: 360", "max_range_m: 50"),
+        "camera": ("width: 32", "fx: 20", "cx: 16", "max_range_m: 50"),
+        "yard": ("radius_m: 0.2", "sides: 8", "time_step_s: 0.1", "duration_s: 1.0", "x_m: 20"),
+        "town": ("duration_s: 3.0", "time_step_s: 0.5", "traffic_per_km: 5", "people_per_km: 5"),
+    }
+    for base, keys in numbers.items():
+        for key in keys:
+            for value in VALUES:
+                name = key.split(":")[0]
+                yield _case(f"{base}: {name}: {value[:30]}", {base: BASES[base].replace(key, f"{name}: {value}", 1)})
+
+
+def options() -> Iterator[Case]:
+    """Options with values that make no sense or have no room."""
+    refused = {
+        "--cell": ("20", "1e-310", "0.001", "nan", "inf", "-1", "1e300", "x"),
+        "--threshold": ("inf", "nan", "-1", "1e9", "x"),
+        "--rays": ("99999999999", "9" * 30, "0", "-1", "1e9"),
+        "--steps": ("9" * 20, "0", "1.5"),
+        "--seed": ("-1", "x"),
+        "--every": ("1e308", "nan", "inf", "0", "1e-300", "-1"),
+        "--device": ("meta", "abacus", "cuda:99", ""),
+        "--workers": ("-1", "1000000", "9" * 20),
+        "--target-error": ("0%", "nan%", "infm", "1e400%", "5", ""),
+        "--reference": ("", "[/x]"),
+        "--estimate": ("[/x]",),
+        "--scenario": ("", "[/x]", ".", "/", "none.yaml", "x" * 5000),
+        "--out": ("link", "file", "file/below"),
+    }
+
+    def prepare(folder: Path) -> None:
+        (folder / "link").symlink_to(folder / "nothing")
+        (folder / "file").write_text("")
+
+    for option, given in refused.items():
+        for value in given:
+            yield Case(f"{option} {value[:30]}", _evaluate("rig.yaml", option, value), _files({}), prepare)
+    for rig in ("", "[/x]", ".", "/", "none.yaml", "../rig", "x" * 5000, "\udcff"):
+        yield Case(f"evaluate {rig[:30]!r}", _evaluate(rig), _files({}))
+
+
+def _case(
+    name: str, changed: dict[str, str], prepare: Callable[[Path], object] = lambda folder: None, steps: int = 1
+) -> Case:
+    rig = "camera.yaml" if "camera" in changed else "rig.yaml"
+    scenario = ("--scenario", "town.yaml") if "town" in changed else ()
+    return Case(name, _evaluate(rig, *scenario, "--steps", str(steps)), _files(changed), prepare)
+
+
+def _files(changed: dict[str, str]) -> dict[str, str]:
+    return {f"{name}.yaml": content for name, content in {**BASES, **changed}.items()}
+
+
+def _evaluate(rig: str, *more: str) -> tuple[str, ...]:
+    quick = ("--scenario", "yard.yaml", "--steps", "1", "--cell", "4", "--rays", "64", "--out", "out")
+    return ("evaluate", rig, *quick, *more)
+
+
+PLAIN = Case("nothing wrong", _evaluate("rig.yaml"), _files({}))

@@ -1,0 +1,33 @@
+"""Documents and options that nobody should write end at once, in one line; `benchmarks hostile_documents` has all."""
+
+import time
+from itertools import chain
+
+import pytest
+
+from . import hostile
+
+# Every second of those that are broken as a whole and of the options, and one number of one document.
+CASES = [
+    *list(chain(hostile.documents(), hostile.options()))[::2],
+    *(case for case in hostile.values() if case.name.startswith("rig: columns: ")),
+]
+
+
+def test_there_are_enough_of_them():
+    assert len(list(hostile.cases())) >= 400
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name[:40])
+def test_it_ends_at_once_in_one_line(case, torchcover, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, content in case.files.items():
+        (tmp_path / name).write_text(content)
+    case.prepare(tmp_path)
+    start = time.perf_counter()
+    code, _, said = torchcover(*case.arguments)
+    assert time.perf_counter() - start < 30
+    assert code == 2, said
+    assert said.startswith("torchcover: ")
+    assert said.count("\n") == 1
+    assert len(said) < 2100

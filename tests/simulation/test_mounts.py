@@ -1,0 +1,85 @@
+"""Sensors are where sensors can be: above the ground and outside of bodies, at every step."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from torchcover.simulation import Lidar, PaperReference, Pose, Rig, Scenario, Simulator
+from torchcover.simulation.instant import Instant
+from torchcover.simulation.scene import Scene
+
+EGO = {"shape": {"type": "box", "size_m": [4, 2, 1]}}
+GROUND = {"name": "ground", "shape": {"type": "plane", "size_m": [400, 400]}}
+# 5 m ahead of the ego's place at the start, above its roof.
+BAR = {"name": "bar", "shape": {"type": "box", "size_m": [1, 8, 1]}, "poses": [{"x_m": 5.0, "z_m": 1.5}]}
+
+
+def simulator(tmp_path, mount, *, speed_mps=0.0, bodies=(), actors=()):
+    """A sensor `top` of the rig `mine`; with a speed, the ego drives along x for five steps of a second."""
+    ego, steps = EGO, {}
+    if speed_mps:
+        rows = [f"{t},{speed_mps * t},0,0,0,0,0" for t in range(6)]
+        (tmp_path / "ego.csv").write_text("\n".join(["t,x,y,z,roll,pitch,yaw", *rows]))
+        ego, steps = {**EGO, "trajectory": str(tmp_path / "ego.csv")}, {"time_step_s": 1.0, "duration_s": 5.0}
+    scenario = Scenario.model_validate({"name": "s", "ego": ego, "bodies": [GROUND, *bodies], "actors": actors} | steps)
+    pattern = {"channels": 4, "vertical_fov_deg": (-30, 10), "horizontal_fov_deg": 360, "columns": 12}
+    lidar = Lidar(name="top", mount=Pose(**mount), max_range_m=60, **pattern)
+    return Simulator(scenario, {"mine": Rig(name="mine", sensors=(lidar,))}, PaperReference(rows=4, columns=4))
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 2.0])
+@pytest.mark.parametrize("mount", [{"z_m": -1.73}, {"x_m": 3.0, "z_m": -0.01}])
+def test_a_sensor_below_the_ground_is_refused_by_name(tmp_path, mount, speed_mps):
+    with pytest.raises(ValueError, match=r"rig 'mine': sensor 'top' at .* lies below the ground, or inside a wall"):
+        simulator(tmp_path, mount, speed_mps=speed_mps).step(0)
+
+
+def test_a_sensor_in_a_wall_or_in_another_vehicle_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"'top' at .* inside a wall"):
+        simulator(tmp_path, {"x_m": 5.0, "z_m": 2.0}, bodies=[BAR]).step(0)
+    van = {"name": "van", "category": "car", "shape": {"type": "box", "size_m": [5, 2, 3]}, "pose": {"y_m": 4.0}}
+    with pytest.raises(ValueError, match=r"'top' at .* or another body"):
+        simulator(tmp_path, {"y_m": 3.5, "z_m": 2.0}, actors=[van]).step(0)
+
+
+def test_a_sensor_that_drives_into_a_wall_is_refused_when_it_gets_there(tmp_path):
+    driving = simulator(tmp_path, {"z_m": 2.0}, speed_mps=1.0, bodies=[BAR])
+    assert len(driving.step(4).clouds["mine"]) > 0
+    with pytest.raises(ValueError, match="'top' at"):
+        driving.step(5)
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 2.0])
+def test_a_sensor_exactly_on_the_ground_is_warned_of(tmp_path, speed_mps):
+    lying = simulator(tmp_path, {"x_m": 3.0, "z_m": 0.0}, speed_mps=speed_mps)
+    with pytest.warns(UserWarning, match=r"rig 'mine': sensor 'top' at \[3.0, 0.0, 0.0\] m lies exactly on the ground"):
+        lying.step(1 if speed_mps else 0)
+
+
+@pytest.mark.parametrize("speed_mps", [0.0, 2.0])
+def test_a_sensor_on_the_skin_of_the_ego_is_where_it_may_be(tmp_path, speed_mps):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(simulator(tmp_path, {"z_m": 1.0}, speed_mps=speed_mps).step(0).clouds["mine"]) > 0
+
+
+@pytest.mark.parametrize(("speed_mps", "times"), [(0.0, 1), (2.0, 3)])
+def test_mounts_are_asked_once_where_nothing_moves(tmp_path, speed_mps, times, monkeypatch):
+    asked, buried = [], Instant.buried
+    monkeypatch.setattr(
+        Instant, "buried", lambda self, place_m: asked.append(tuple(place_m.tolist())) or buried(self, place_m)
+    )
+    watched = simulator(tmp_path, {"z_m": 1.6}, speed_mps=speed_mps)
+    for step in range(3):
+        watched.step(step)
+    assert asked.count((0.0, 0.0, 1.6)) == times
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_the_ego_buries_nobody_and_is_no_ground(tmp_path, moving):
+    scene = Scene(simulator(tmp_path, {"z_m": 1.6}, speed_mps=2.0 * moving).scenario.world())
+    instant = scene.at(0)
+    assert not instant.buried(np.array([0.0, 0.0, 0.5]))
+    assert not instant.on_a_face(np.array([0.5, 0.5, 1.0]))
+    assert instant.on_a_face(np.array([30.0, 0.5, 0.0]))

@@ -1,0 +1,136 @@
+"""What has no room is refused before it is made, with its size."""
+
+import numpy as np
+import pytest
+
+from torchcover.simulation import (
+    CameraSensor,
+    Lidar,
+    PaperReference,
+    Pose,
+    Rig,
+    Scenario,
+    Simulator,
+    SurfaceReference,
+    memory,
+)
+from torchcover.simulation.memory import check_fits, machine_bytes
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.shapes import Box
+from torchcover.simulation.traffic import Highway, Urban
+from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.world import Actor, World, steps_of
+
+SPACED = {"vertical_fov_deg": (-10, 10), "horizontal_fov_deg": 360, "max_range_m": 50}
+AREAS = (((0.0, 20.0), (-5.0, 5.0)),)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """A machine of 100 MB."""
+    monkeypatch.setattr(memory, "machine_bytes", lambda: 1e8)
+
+
+def test_a_machine_has_memory_and_what_is_more_is_refused(small):
+    assert 1e8 < machine_bytes() < 1e15
+    check_fits("a scan", 1e8, "take less")
+    with pytest.raises(ValueError, match=r"a scan: 0.2 GB of memory .*, and this machine has 0.1 GB; take less"):
+        check_fits("a scan", 2e8, "take less")
+
+
+def test_the_limit_of_a_container_counts(tmp_path, monkeypatch):
+    (tmp_path / "memory.max").write_text("5000000\n")
+    (tmp_path / "none").write_text("max\n")
+    monkeypatch.setattr(memory, "CGROUP_LIMITS", (tmp_path / "missing", tmp_path / "none", tmp_path / "memory.max"))
+    machine_bytes.cache_clear()
+    try:
+        assert machine_bytes() == 5e6
+    finally:
+        machine_bytes.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Lidar(name="a", channels=10**9, columns=9, **SPACED), "channels\n.*less than or equal to 100000"),
+        (lambda: Lidar(name="a", channels=9, columns=10**9, **SPACED), "columns\n.*less than or equal to 1000000"),
+        (lambda: CameraSensor(name="a", width=10**9, height=9, fov_deg=90, max_range_m=9), "width\n.*to 200000"),
+        (lambda: Pose(x_m=1e300), "x_m\n.*less than or equal to 1000000000"),
+        (lambda: Urban(people_per_km=1e6), "people_per_km\n.*less than or equal to 1000"),
+        (lambda: Highway(duration_s=1e9), "duration_s\n.*less than or equal to 3600"),
+        (lambda: steps_of(1e9, 0.1), r"1e\+10 time steps of 0.1 s, over 1,000,000; shorten it"),
+        (lambda: steps_of(1.0, 1e-320), "inf time steps"),
+    ],
+)
+def test_no_number_is_larger_than_there_can_be(make, message):
+    with pytest.raises(ValueError, match=message):
+        make()
+
+
+def test_sensors_know_how_many_rays_they_have():
+    sensors = [
+        Lidar(name="a", channels=4, columns=9, **SPACED),
+        Lidar(name="b", model="velodyne_vlp16", max_range_m=9),
+        CameraSensor(name="c", width=13, height=8, fov_deg=90, stride=3, max_range_m=9),
+    ]
+    for sensor in sensors:
+        assert sensor.rays == np.prod(sensor.directions().shape[1:])
+    assert PaperReference(rows=3, columns=4).rays == 12
+
+
+@pytest.mark.parametrize("stride", [16, 40])
+def test_a_camera_with_one_used_column_is_as_wide_as_a_pixel(stride):
+    camera = CameraSensor(name="c", width=16, height=8, fov_deg=90, stride=stride, max_range_m=9)
+    ahead = CameraSensor(name="c", width=16, height=8, fov_deg=90, max_range_m=9).horizontal_fov_deg
+    assert 0 < camera.horizontal_fov_deg < ahead / 10
+
+
+def test_more_rays_than_there_is_memory_for_are_refused_before_they_are_made(small):
+    lidar = Lidar(name="a", channels=1000, columns=1000, **SPACED)
+    scenario, rigs = Scenario.load("courtyard"), {"r": Rig(name="r", sensors=(lidar,))}
+    with pytest.raises(ValueError, match=r"1,000,012 rays a step \(1,000,000 of the rig's .*, 12 of the reference\)"):
+        Simulator(scenario, rigs, PaperReference(rows=3, columns=4))
+    fits = Simulator(scenario, {}, PaperReference(rows=3, columns=4))
+    with pytest.raises(ValueError, match=r"1,000,000 of the reference\): 0.3 GB"):
+        fits.with_reference_sensor(SurfaceReference(AREAS, rays=1_000_000))
+
+
+def test_more_steps_and_bodies_than_there_is_memory_for_are_refused(small):
+    mesh = Box(type="box", size_m=(4, 2, 1)).mesh()
+    ego = Actor("ego", "ego", mesh, Trajectory.resting((0, 0, 0)))
+    cars = tuple(Actor(f"car {k}", "car", mesh, Trajectory.resting((9.0 * k, 9, 0))) for k in range(3))
+    with pytest.raises(ValueError, match=r"500,001 time steps of 4 bodies: 0.192 GB of memory are needed"):
+        Scene(World((), ego, cars, time_step_s=0.1, duration_s=50_000.0))
+
+
+@pytest.mark.parametrize("traffic", [Urban(duration_s=600.0, traffic_per_km=100), Highway(duration_s=3600.0)])
+def test_more_traffic_than_there_is_memory_for_is_refused_before_anybody_is_made(small, traffic):
+    with pytest.raises(ValueError, match=r"traffic of about [\d,]+ for [\d,]+ time steps: .* shorten the duration"):
+        traffic.world(0)
+
+
+def test_an_actor_that_will_get_into_the_ego_is_known_before_the_run(tmp_path):
+    rows = [f"{t},{20 - 2 * t},0,0,0,0,0" for t in range(11)]
+    (tmp_path / "a.csv").write_text("\n".join(["t,x,y,z,roll,pitch,yaw", *rows]))
+    box = {"type": "box", "size_m": [4, 2, 1]}
+    actor = {"name": "a", "category": "car", "shape": box, "trajectory": str(tmp_path / "a.csv")}
+    ground = {"name": "ground", "shape": {"type": "plane", "size_m": [100, 100]}}
+    steps = {"time_step_s": 1.0, "duration_s": 10.0}
+    scenario = Scenario.model_validate(
+        {"name": "s", "ego": {"shape": box}, "bodies": [ground], "actors": [actor]} | steps
+    )
+    simulator = Simulator(scenario, {}, PaperReference(rows=4, columns=4))
+    simulator.check_run(9)
+    with pytest.raises(ValueError, match=r"actor 'a' overlaps the ego at t = 9 s"):
+        simulator.check_run(10)
+    with pytest.raises(ValueError, match=r"at t = 9 s"):
+        simulator.step(9)
+    # 0, 3, 6, and then 9.
+    every_third = Simulator(scenario, {}, PaperReference(rows=4, columns=4), every_s=3.0)
+    every_third.check_run(3)
+    with pytest.raises(ValueError, match=r"at t = 9 s"):
+        every_third.check_run(4)
+
+
+def test_traffic_has_two_instants_however_short_it_is():
+    assert len(Highway(duration_s=1e-320).world(0).ego.trajectory.times_s) == 2

@@ -1,0 +1,51 @@
+"""What a run would need, asked before it starts: a process that is killed for its memory says nothing."""
+
+import os
+from functools import lru_cache
+from pathlib import Path
+
+# What containers and cluster jobs are limited to, where the system tells: cgroups of version 2, and of version 1.
+CGROUP_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
+# Where no system call tells.
+USUAL_BYTES = 16e9
+
+
+@lru_cache
+def machine_bytes() -> float:
+    """The memory that this process may take at most."""
+    limits = []
+    for path in CGROUP_LIMITS:
+        try:
+            limits.append(float(path.read_text()))
+        except (OSError, ValueError):  # there is none; or "max"
+            continue
+    try:
+        limits.append(float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, OSError, ValueError):  # not on Windows
+        limits.append(USUAL_BYTES)
+    return min(limits)
+
+
+def check_fits(what: str, needed_bytes: float, advice: str) -> None:
+    """Refuse what this machine has no memory for, before any of it is reserved.
+
+    Args:
+        what: What needs it, and how many there are: "1,000,000 rays".
+        needed_bytes: About how much.
+        advice: What to do.
+
+    Raises:
+        ValueError: It is more than the machine has; the message has both sizes.
+
+    Example:
+        >>> check_fits("1,000 rays", 1e6, "take fewer")
+        >>> check_fits("a million million rays", 1e14, "take fewer")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        ValueError: a million million rays: 1e+05 GB of memory are needed, and this machine has ... GB; take fewer
+    """
+    if needed_bytes > machine_bytes():
+        raise ValueError(
+            f"{what}: {needed_bytes / 1e9:.3g} GB of memory are needed, and this machine has "
+            f"{machine_bytes() / 1e9:.3g} GB; {advice}"
+        )
