@@ -24,6 +24,7 @@ BENCHMARKS = (
     "training_overhead",
     "known_boxes",
     "hostile_documents",
+    "kills",
     "mutated_files",
 )
 

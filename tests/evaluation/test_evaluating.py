@@ -255,21 +255,40 @@ def test_a_summary_that_lists_others_deletes_nothing(tmp_path, names):
     assert (tmp_path / "mine.txt").read_text() == "mine"
 
 
-def test_results_that_could_not_be_written_do_not_look_complete(tmp_path, monkeypatch):
+def contents(folder):
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def full(path):
+    path.write_bytes(b"half")
+    raise OSError("no space left on device")
+
+
+def test_a_result_stays_whole_until_the_numbers_of_the_next_are_there(tmp_path, monkeypatch):
     result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=2)
     result.save(tmp_path)
-    before = (tmp_path / "maps" / "radius_m_ground.png").read_bytes()
-
-    def full(self, path, **_):
-        path.write_bytes(b"half")
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr(Figure, "savefig", full)
+    before = contents(tmp_path)
+    monkeypatch.setattr(Coverage, "save", lambda self, path: full(path))
     with pytest.raises(OSError, match="no space left"):
         result.save(tmp_path)
-    assert not (tmp_path / "summary.json").exists()
-    assert (tmp_path / "maps" / "radius_m_ground.png").read_bytes() == before
-    assert not [path for path in tmp_path.rglob("*") if "partial" in path.name]
+    assert contents(tmp_path) == before
+
+
+def test_numbers_are_safe_and_listed_although_a_map_could_not_be_written(tmp_path, monkeypatch):
+    torchcover.compare(frames=Source(), cell_m=8.0).save(tmp_path)
+    monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: full(path))
+    with pytest.raises(OSError, match="no space left"):
+        torchcover.evaluate(frames=Single(), cell_m=8.0, steps=2).save(tmp_path)
+    after = contents(tmp_path)
+    assert set(after) == {"coverage.npz", "summary.csv", "summary.json"}
+    assert json.loads(after["summary.json"])["files"] == ["coverage.npz", "summary.csv"]
+
+
+def test_what_a_killed_process_left_aside_is_cleared(tmp_path):
+    (tmp_path / ".partial_left").mkdir()
+    (tmp_path / ".partial_left" / "coverage.npz").write_bytes(b"half")
+    torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1).save(tmp_path)
+    assert not [name for name in contents(tmp_path) if name.startswith(".")]
 
 
 def test_a_source_that_lacks_something_is_told_what():

@@ -32,7 +32,7 @@ def other(tmp_path):
 def write(folder):
     with ResultFiles(folder) as files:
         files.add("a.txt", lambda path: path.write_text("a"))
-        files.finish({"complete": True})
+        files.publish({"complete": True})
 
 
 def test_the_second_is_refused_while_the_first_lives_and_not_when_it_was_killed(other, tmp_path):

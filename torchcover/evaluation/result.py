@@ -119,7 +119,9 @@ class Result:
         return map_figures(self.coverages, ego_outline_m=self.ego_outline_m, sensors=views, errors=errors)
 
     def save(self, folder: str | Path, *, error_maps: bool = False) -> list[Path]:
-        """Write the files of the command line; `summary.json` last, so that a folder that has it is complete.
+        """Write the files of the command line: first the numbers, then the maps.
+
+        At any time `summary.json` lists files of one run; those of an earlier one stay until the new numbers are there.
 
         Args:
             folder: Where to write: `coverage.npz`, or `coverage/RIG.npz` for several; `summary.csv`, `maps/STEM.png`,
@@ -140,9 +142,11 @@ class Result:
             for name, coverage in self._coverage_files.items():
                 files.add(name, coverage.save)
             files.add("summary.csv", lambda path: path.write_text(RENDERERS["csv"](self.table), encoding="utf-8"))
+            record = self.record
+            files.publish(record)  # the numbers are safe before the maps, which take seconds, are drawn
             for stem, figure in self.maps(errors=error_maps):
                 files.add(f"maps/{stem}.png", partial(_draw, figure))
-            files.finish(self.record)
+            files.publish(record)
         return files.paths
 
     @property

@@ -5,6 +5,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path, PurePosixPath
+from shutil import rmtree
 from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, Self
@@ -14,6 +15,8 @@ from filelock import FileLock, Timeout
 # Written last, and taken away first: without it the folder is not complete.
 SUMMARY = "summary.json"
 LOCK = ".lock"
+# What files that are not complete yet are in.
+PARTIAL = ".partial_"
 
 
 @contextmanager
@@ -47,10 +50,10 @@ def claimed(folder: Path) -> Iterator[None]:
 
 
 class ResultFiles:
-    """Writes the files of a run into a folder, each of them whole or not at all. A context manager.
+    """Writes the files of a run into a folder. A context manager.
 
-    What an earlier run has written here, as its `summary.json` lists it, and this one does not write, is deleted at the
-    end. If it is left by an error, that stays, and there is no `summary.json`. See `claimed`, too.
+    They are written aside, and `publish` puts them in their places, which takes no time: until then what an earlier run
+    has written stays as it is, and from then on it is gone, as its `summary.json` lists it. See `claimed`, too.
 
     Args:
         folder: Where to write; made if it does not exist.
@@ -59,39 +62,46 @@ class ResultFiles:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.paths: list[Path] = []
-        self._earlier = _listed(folder / SUMMARY)
+        self._written: list[str] = []
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             stack.enter_context(claimed(self.folder))
-            (self.folder / SUMMARY).unlink(missing_ok=True)
+            for left in self.folder.glob(f"{PARTIAL}*"):  # by a process that was killed
+                rmtree(left, ignore_errors=True)
             # In the folder itself, so that what is done can be renamed.
-            self._partial = Path(stack.enter_context(TemporaryDirectory(dir=self.folder, prefix=".partial_")))
+            self._aside = Path(stack.enter_context(TemporaryDirectory(dir=self.folder, prefix=PARTIAL)))
             self._until_exit = stack.pop_all()
         return self
 
     def add(self, name: str, write: Callable[[Path], object]) -> None:
-        """Write a file.
+        """Write a file aside.
 
         Args:
             name: Its path within the folder.
             write: Writes it to the path that it is given.
         """
-        path = self.folder / name
-        partial = self._partial / path.name
-        write(partial)
+        path = self._aside / name
         path.parent.mkdir(exist_ok=True)
-        os.replace(partial, path)
-        self.paths.append(path)
+        write(path)
+        self._written.append(name)
 
-    def finish(self, record: Mapping[str, Any]) -> None:
-        """Delete what is left of an earlier run, and write `summary.json`: the record, and the names of all files."""
-        names = [path.relative_to(self.folder).as_posix() for path in self.paths]
-        for path in {self.folder / name for name in self._earlier}.difference(self.paths):
+    def publish(self, record: Mapping[str, Any]) -> None:
+        """Put what was added in its place, last `summary.json`: the record, and the names of all files of this run."""
+        earlier = {self.folder / name for name in _listed(self.folder / SUMMARY)}
+        paths = [path for path in self.paths if path.name != SUMMARY] + [self.folder / name for name in self._written]
+        names = [path.relative_to(self.folder).as_posix() for path in paths]
+        text = json.dumps({**record, "files": names}, indent=2, allow_nan=False) + "\n"
+        (self._aside / SUMMARY).write_text(text, encoding="utf-8")
+        (self.folder / SUMMARY).unlink(missing_ok=True)
+        for name in self._written:
+            (self.folder / name).parent.mkdir(exist_ok=True)
+            os.replace(self._aside / name, self.folder / name)
+        for path in earlier.difference(paths):
             if path.is_file():
                 path.unlink()
-        text = json.dumps({**record, "files": names}, indent=2, allow_nan=False) + "\n"
-        self.add(SUMMARY, lambda path: path.write_text(text, encoding="utf-8"))
+        os.replace(self._aside / SUMMARY, self.folder / SUMMARY)
+        self.paths, self._written = [*paths, self.folder / SUMMARY], []
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
