@@ -31,10 +31,16 @@ def test_small_errors_give_the_plain_interval_but_for_the_blind_side():
 
 
 @pytest.mark.parametrize("unit", ["m", "share"])
-def test_what_is_not_known_has_no_interval_and_what_is_exact_has_no_width(unit):
+def test_what_is_not_known_has_no_interval_and_neither_has_what_all_blocks_agree_on(unit):
     assert all(map(math.isnan, interval95(0.5, math.nan, 3, unit)))
-    assert interval95(1.0, 0.0, 10, unit) == (1.0, 1.0)
+    assert all(map(math.isnan, interval95(1.0, 0.0, 10, unit)))
     assert interval95(math.inf, math.nan, 10, unit)[0] != math.inf
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, 1 + 2e-16, -1e-17])
+def test_a_share_at_the_rim_with_an_error_may_be_anything(value):
+    assert interval95(value, 1e-3, 10, "share") == (0.0, 1.0)
+    assert all(map(math.isnan, interval95(0.0, 1e-3, 10, "m")))
 
 
 @pytest.mark.parametrize(("value", "error"), [(1e-9, 1.0), (1 - 1e-12, 0.5), (0.5, 1e6)])

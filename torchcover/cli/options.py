@@ -75,7 +75,7 @@ Every = Annotated[
     float | None,
     typer.Option(
         help="Seconds between one step and the next; steps that follow each other are alike. Not given: 10 in traffic, "
-        "which starts anew in another city every minute, else the scenario's own time step."
+        "which starts anew in another city every minute, else what spreads the steps over the scenario."
     ),
 ]
 TargetErrors = Annotated[

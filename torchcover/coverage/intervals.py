@@ -28,7 +28,7 @@ def interval95(value: float, error: float, degrees_of_freedom: int, unit: Unit) 
         unit: Which of the two it is.
 
     Returns:
-        Its ends, NaN if the error is; `value` twice where there is no error.
+        Its ends; NaN if the error is, or 0: blocks that all say the same do not prove that others would.
 
     Example:
         >>> [round(end, 3) for end in interval95(2.0, 0.1, 10, "m")]
@@ -36,13 +36,9 @@ def interval95(value: float, error: float, degrees_of_freedom: int, unit: Unit) 
         >>> [round(end, 3) for end in interval95(0.9, 0.02, 10, "share")]
         [0.791, 0.937]
     """
-    if math.isnan(error):
+    if math.isnan(error) or error <= ROUND_OFF or (unit == "m" and value <= 0):
         return math.nan, math.nan
-    if error <= ROUND_OFF:
-        return value, value
     if unit == "m":
-        if value <= 0:
-            return math.nan, math.nan
         reach = student_t95(degrees_of_freedom) * error / value
         return value * math.exp(-reach), value * math.exp(min(BLIND_SIDE * reach, MOST))
     if not 0 < value < 1:  # rounding may have put it there; nothing is known of the other side

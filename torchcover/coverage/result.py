@@ -12,7 +12,7 @@ from torch import Tensor
 from torchcover.coverage.aggregations import MeanOfMeans
 from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
-from torchcover.coverage.errors import ratio_errors
+from torchcover.coverage.errors import ROUND_OFF, ratio_errors
 from torchcover.coverage.estimate import Measure, RegionEstimate, estimate_area, estimate_known
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.intervals import interval95
@@ -254,5 +254,6 @@ class Coverage:
         for quantity, value, error in zip(
             self.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True
         ):
-            numbers[quantity.key] = Number(value, error, *interval95(value, error, freedom, quantity.unit))
+            known = error if error > ROUND_OFF else math.nan  # blocks that all say the same prove nothing
+            numbers[quantity.key] = Number(value, known, *interval95(value, error, freedom, quantity.unit))
         return numbers

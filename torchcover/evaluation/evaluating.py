@@ -55,7 +55,7 @@ def evaluate(
         rays: Its rays at each step; as many as it does best with if not given.
         estimate: What the number of a region is a mean over: "area", its visible surface, or "known", its known cells.
             Not given: the surface, if the reference points have square metres.
-        every_s: Time between two steps in seconds; 10 in traffic if not given, else the scenario's own step.
+        every_s: Time between two steps in seconds; not given: 10 in traffic, else what spreads them over the scenario.
         target_error: End once every number is this good: a `TargetError`, "0.1%", or ["0.1%", "0.02m"].
         device: Where the search and the sums run: "cpu", "cuda", ...
         workers: Processes that make frames; 0 makes them in this one.

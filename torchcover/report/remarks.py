@@ -130,7 +130,7 @@ SENTENCES: Mapping[RemarkName, Callable[[Remark, CoverageTable, str], str]] = Ma
         ),
         "too_few_blocks": _too_few_blocks,
         "standard_errors": _standard_errors,
-        "one_block_regions": lambda *_: "No ± where one block alone has probed the region.",
+        "one_block_regions": lambda *_: "No ± where one block alone has probed the region, or all say the same.",
         "empty_sensor_steps": lambda remark, *_: (
             f"{_some(remark)} steps had no sensor point: they count as blind, not as missing."
         ),

@@ -17,7 +17,7 @@ from torchcover.simulation.surroundings import Surroundings
 
 # Height above the ground up to which half of the rays look for bodies that stand on it.
 TOP_M = 2.0
-# The best number of those tried for runs of seconds to a minute: docs/measured/error_against_time.md.
+# Enough for the known cells of the paper's regions in runs of up to a minute.
 DEFAULT_RAYS = 262_144
 
 Float64 = NDArray[np.float64]
