@@ -1,5 +1,7 @@
 """A study of error against run time."""
 
+import math
+
 import pytest
 import torch
 
@@ -11,8 +13,8 @@ from torchcover.evaluation import (
     area_sums,
     error_against_time,
     evaluate,
-    study_runs,
 )
+from torchcover.evaluation.study_runs import tried
 
 GRID = BevGrid(x=(-40.0, 160.0), y=(-40.0, 40.0), cell=8.0)
 SMALL = {"rays": (64,), "steps": 2, "runs": 2, "long_run_steps": 8, "cell_m": 4.0}
@@ -31,7 +33,7 @@ def coverage(shift_m, steps=1, **settings):
 
 @pytest.fixture(autouse=True)
 def no_command(monkeypatch):
-    monkeypatch.setattr(study_runs, "command_s", lambda plan: 100.0)
+    monkeypatch.setattr("torchcover.evaluation.study.command_s", lambda plan: 100.0)
 
 
 def test_the_long_run_itself_has_no_distance_and_a_shifted_one_its_shift():
@@ -43,6 +45,12 @@ def test_the_long_run_itself_has_no_distance_and_a_shifted_one_its_shift():
     each = torch.stack([area_sums(coverage(shift)) for shift in (0.0, 0.5)])
     far = truth.distances(each)  # root mean squares of 0 and 0.5, and of 0 and 1
     assert far == {"radius_m": pytest.approx(0.5**1.5, rel=1e-6), "detection_0.4m": pytest.approx(0.5**0.5)}
+
+
+def test_a_run_that_has_not_seen_a_region_has_no_distance():
+    sums = area_sums(coverage(0.25))
+    sums[0, :, 0] = 0.0
+    assert all(map(math.isnan, Truth(coverage(0.0)).distances(sums[None]).values()))
 
 
 def test_sums_of_parts_are_those_of_the_whole():
@@ -58,7 +66,7 @@ def test_only_square_metres_can_be_a_long_run():
 def test_a_study_says_of_the_same_steps_what_an_evaluation_says():
     plan = StudyPlan("front_roof_32", **SMALL)
     same = evaluate("front_roof_32", steps=4, cell_m=4.0, rays=64).coverage
-    (trial,) = study_runs.tried(plan, progress=False).trials
+    (trial,) = tried(plan, 100.0, progress=False).trials
     whole, again = trial.sums(4)[0], area_sums(same)
     assert torch.allclose(whole, again, rtol=1e-12, atol=0)
 

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torchcover import __version__
 from torchcover.coverage import Quantity
 from torchcover.evaluation.study_plan import StudyPlan
-from torchcover.evaluation.study_runs import tried
+from torchcover.evaluation.study_runs import command_s, tried
 from torchcover.evaluation.study_truth import Truth, long_run
 from torchcover.evaluation.work_points import WorkPoint, cheapest, study_records, work_panels
 from torchcover.report import draw_work_precision, json_record
@@ -101,7 +101,9 @@ def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
         ValueError: A plan that makes no sense.
         FileNotFoundError: An unknown name or file.
     """
-    truth, done = long_run(plan, progress=progress), tried(plan, progress=progress)
+    one_step_s = command_s(plan)  # first: it fails at once if anything is wrong
+    truth = long_run(plan, progress=progress)
+    done = tried(plan, one_step_s, progress=progress)
     points = [
         WorkPoint(
             rays=trial.rays,

@@ -92,8 +92,14 @@ class Tried:
         return self.start_s + whole * steps / self.steps
 
 
-def tried(plan: StudyPlan, *, progress: bool) -> Tried:
-    """Do all steps of all runs, one after the other."""
+def tried(plan: StudyPlan, one_step_s: float, *, progress: bool) -> Tried:
+    """Do all steps of all runs, one after the other.
+
+    Args:
+        plan: What to try.
+        one_step_s: What `command_s` said.
+        progress: Whether to show a bar.
+    """
     steps, part = plan.runs * plan.lengths[-1], plan.lengths[0]
     base = plan.frames(plan.seed, steps)
     trials = [
@@ -117,15 +123,21 @@ def tried(plan: StudyPlan, *, progress: bool) -> Tried:
             if index == 0:
                 first_step_s = worlds.seconds + first.casting.seconds + first.measuring.seconds
             bar.advance(steps)
-    return Tried(trials, steps, command_s(plan) - first_step_s, worlds.seconds)
+    return Tried(trials, steps, one_step_s - first_step_s, worlds.seconds)
 
 
 def command_s(plan: StudyPlan) -> float:
-    """How long `torchcover evaluate` takes for one step, from its start to its end."""
+    """How long `torchcover evaluate` takes for one step, from its start to its end.
+
+    Raises:
+        ValueError: It fails.
+    """
     command = [sys.executable, "-m", "torchcover", "evaluate", str(plan.rig), "--scenario", str(plan.scenario)]
     settings = {"rays": plan.rays[0], "steps": 1, "seed": plan.seed, "cell": plan.cell_m}
     clock = Clock()
     with TemporaryDirectory() as folder, clock.running():
         options = [f"--{name}={value}" for name, value in settings.items()]
-        subprocess.run([*command, *options, f"--out={folder}"], check=True, capture_output=True)
+        done = subprocess.run([*command, *options, f"--out={folder}"], check=False, capture_output=True, text=True)
+    if done.returncode:
+        raise ValueError(f"{' '.join([*command[1:], *options])} ended with {done.returncode}: {done.stderr.strip()}")
     return clock.seconds

@@ -39,12 +39,15 @@ class Truth:
     def distances(self, sums: Tensor) -> dict[str, float]:
         """Root mean squares of what runs are off by, over them, the regions and the bands, by the key of the quantity.
 
+        NaN if a run has seen nothing of a region of which the long run has.
+
         Args:
             sums: (N, R, 1 + Q, H) what `area_sums` says of each of N runs.
         """
-        off = _ratios(sums) - _ratios(area_sums(self.coverage))
-        # A region of which nothing was seen has no distance.
-        return self._by_key(off.square().nanmean(dim=(0, 1, 3)).sqrt())
+        truth = _ratios(area_sums(self.coverage))
+        known = truth.isfinite()
+        squares = (_ratios(sums) - truth).square().where(known, 0.0)
+        return self._by_key((squares.sum(dim=(0, 1, 3)) / (len(sums) * known.sum(dim=(0, 2)))).sqrt())
 
     def _by_key(self, numbers: Tensor) -> dict[str, float]:
         keys = [quantity.key for quantity in self.coverage.quantities]
