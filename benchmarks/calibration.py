@@ -17,8 +17,8 @@ from benchmarks.timing import table
 from torchcover import forward_regions, nearest
 from torchcover.coverage import BevGrid, intervals
 from torchcover.coverage.binning import mean_per_cell
-from torchcover.coverage.blocks import AreaSums, Blocks
-from torchcover.coverage.errors import cell_errors
+from torchcover.coverage.blocks import AreaSums
+from torchcover.coverage.errors import ratio_errors
 from torchcover.coverage.estimate import estimate_area
 from torchcover.data import SimulatedFrames
 from torchcover.data.reference import GRID_X_M, GRID_Y_M
@@ -42,17 +42,19 @@ def main():
     parser.add_argument("--seed", type=int, default=77)
     parser.add_argument("--steps", type=int, default=720, help="steps to simulate, six a city")
     parser.add_argument("--runs", type=int, default=1000)
-    parser.add_argument("--sums", type=Path, default=Path("out/calibration.npz"), help="simulated anew if missing")
+    parser.add_argument("--sums", type=Path, help="simulated if missing (out/calibration_SCENARIO_SEED_STEPS.npz)")
     parser.add_argument("--blind-side", type=float, default=intervals.BLIND_SIDE, help="to try another factor")
     options = parser.parse_args([] if __name__ != "__main__" else None)
     intervals.BLIND_SIDE = options.blind_side
-    if not options.sums.is_file():
-        options.sums.parent.mkdir(parents=True, exist_ok=True)
+    name = f"calibration_{options.scenario}_{options.seed}_{options.steps}.npz"
+    path = options.sums or Path("out") / name
+    if not path.is_file():
+        path.parent.mkdir(parents=True, exist_ok=True)
         halves = [range(options.steps // 2), range(options.steps // 2, options.steps)]
         with ProcessPoolExecutor(2) as pool:
             parts = list(pool.map(simulated, halves, [options.scenario] * 2, [options.seed] * 2))
-        np.savez(options.sums, **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
-    with np.load(options.sums) as sums:
+        np.savez(path, **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
+    with np.load(path) as sums:
         cities = Cities(**sums)
     random = np.random.default_rng(0)
     print(
@@ -66,9 +68,10 @@ def main():
     rows = [(name, *(f"{share[at]:.3f}" for share in columns.values())) for at, name in enumerate(NAMES)]
     rows += [(f"**{f.__name__}**", *(f"{f(share):.3f}" for share in columns.values())) for f in (np.mean, np.min)]
     table(("number", *columns), rows)
-    print("\nCells of 0.25 m, mean +- two errors:\n")
-    rows = [(steps, *cities.covered_cells(random, steps, runs=10)) for steps in (64, 256)]
-    table(("steps", "cells with an error", "radius", "detection", "errors of 0"), rows)
+    print("\nCells of 0.25 m, number +- two errors:\n")
+    kinds = [(measure, steps) for measure in ("area", "known") for steps in (64, 256)]
+    rows = [(*kind, *cities.covered_cells(random, *kind, runs=10)) for kind in kinds]
+    table(("measure", "steps", "cells with an error", "radius", "detection", "errors of 0"), rows)
 
 
 def simulated(steps, scenario, seed):
@@ -86,7 +89,8 @@ def simulated(steps, scenario, seed):
         cell = GRID.cell_of(frame.reference)
         inside = cell >= 0
         means = mean_per_cell(cell[inside], each[:, inside], GRID.cells, m2[inside])
-        cells.append(np.column_stack([np.full(len(means.cell), index), means.cell, *means.mean]))
+        seen_m2 = torch.bincount(cell[inside], m2[inside], minlength=GRID.cells)[means.cell]
+        cells.append(np.column_stack([np.full(len(means.cell), index), means.cell, seen_m2, *means.mean]))
     return {"city": np.array(city), "over_regions": np.array(over_regions), "cells": np.concatenate(cells)}
 
 
@@ -105,7 +109,7 @@ class Cities:
     Args:
         city: (n,) city of each step.
         over_regions: (n, 6, 3) square metres, and the sums of radius and detection.
-        cells: (k, 4) step, cell, mean radius and mean detection of what was probed.
+        cells: (k, 5) step, cell, square metres, mean radius and mean detection of what was probed.
     """
 
     def __init__(self, city, over_regions, cells):
@@ -122,11 +126,11 @@ class Cities:
         known, probed_by = np.unique(pairs[:, 1], return_counts=True)
         known = known[probed_by >= CITIES_OF_A_CELL]
         cells = cells[np.isin(cells[:, 1], known) & np.isin(cells[:, 0], np.concatenate(self.steps))]
-        number = np.searchsorted(known, cells[:, 1])
-        self.cell_sums = np.zeros((len(city), 3, len(known)), dtype=np.float32)  # steps, radius, detection
-        self.cell_sums[cells[:, 0].astype(int), :, number] = np.column_stack([np.ones(len(cells)), cells[:, 2:]])
-        total = self.cell_sums.sum(axis=0, dtype=np.float64)
-        self.cell_truth = torch.from_numpy(total[1:] / total[0])
+        at = cells[:, 0].astype(int), slice(None), np.searchsorted(known, cells[:, 1])
+        # By measure: what the ratio is over, radius and detection.
+        self.cell_sums = {name: np.zeros((len(city), 3, len(known)), dtype=np.float32) for name in ("area", "known")}
+        self.cell_sums["area"][at] = cells[:, 2:3] * np.column_stack([np.ones(len(cells)), cells[:, 3:]])
+        self.cell_sums["known"][at] = np.column_stack([np.ones(len(cells)), cells[:, 3:]])
 
     def drawn(self, random, steps):
         """The blocks of a run: steps of whole cities, as a metric with 16 blocks has them."""
@@ -176,21 +180,20 @@ class Cities:
             needed = steps * max(1.0, error / target) ** 2
             steps = min(most, math.ceil(min(max(needed, MIN_GROWTH * steps), MAX_GROWTH * steps)))
 
-    def covered_cells(self, random, steps, runs):
+    def covered_cells(self, random, measure, steps, runs):
         """How many cells had an error, and how many of their radii and detections two errors cover; errors of 0."""
         cells, covered, zero = 0, np.zeros(2), 0
+        of_steps = self.cell_sums[measure]
+        total = torch.from_numpy(of_steps.sum(axis=0, dtype=np.float64))
         for _ in range(runs):
             drawn = self.drawn(random, steps)
-            sums = torch.from_numpy(np.stack([self.cell_sums[block].sum(axis=0, dtype=np.float64) for block in drawn]))
-            sums = sums[:, :, None, None]  # a grid of one row
-            lengths = torch.tensor([len(block) for block in drawn])
-            blocks = Blocks(lengths, sums[:, 0].long(), sums[:, 1:])
-            for at, unit in enumerate(UNITS):
-                error = cell_errors(blocks.sums[:, at], blocks, unit).flatten()
-                mean = (sums[:, 1 + at].sum(dim=0) / sums[:, 0].sum(dim=0)).flatten()
+            sums = torch.from_numpy(np.stack([of_steps[block].sum(axis=0, dtype=np.float64) for block in drawn]))
+            for at, unit in enumerate(UNITS, 1):
+                error = ratio_errors(sums[:, 0], sums[:, at], unit)
+                ratio = sums[:, at].sum(dim=0) / sums[:, 0].sum(dim=0)
                 known = error.isfinite()
-                holds = (mean - self.cell_truth[at]).abs()[known] <= 2 * error[known]
-                covered[at] += int(holds.sum())
+                holds = (ratio - total[at] / total[0]).abs()[known] <= 2 * error[known]
+                covered[at - 1] += int(holds.sum())
                 zero += int((error == 0).sum())
             cells += int(known.sum())
         return cells, *(f"{share:.3f}" for share in covered / cells), zero

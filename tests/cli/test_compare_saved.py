@@ -34,7 +34,7 @@ def test_two_evaluations_of_the_same_frames_are_a_comparison(torchcover, worlds,
     rows = json.loads((worlds / "out" / "summary.json").read_text())["rows"]
     assert rows == together.summary
     assert {row["rig"] for row in rows} == {"low", "both"}
-    assert (worlds / "out" / "maps" / "difference_radius_m_ground_both_minus_low.png").is_file()
+    assert (worlds / "out" / "maps" / "difference_radius_area_m_ground_both_minus_low.png").is_file()
     # And what a comparison wrote can be compared again.
     assert compare([worlds / "out" / "coverage" / f"{name}.npz" for name in ("low", "both")]).summary == rows
 
@@ -70,7 +70,7 @@ def test_what_is_no_pair_of_coverage_files_is_said(torchcover, worlds, saved):
     (worlds / "rubbish.npz").write_bytes(b"PK")
     for arguments, message in (
         ([file], "at least two coverage files"),
-        ([file, worlds / "missing.npz"], "no such coverage file"),
+        ([file, worlds / "missing.npz"], "no such file; a saved coverage is needed"),
         ([file, worlds / "rubbish.npz"], "not a coverage file"),
         ([file, file, "--steps", 3], "measured already"),
         ([file, worlds / "both.yaml"], "coverage files are compared with coverage files only"),

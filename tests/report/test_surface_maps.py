@@ -11,9 +11,9 @@ from torchcover.coverage.blocks import AreaSums
 from torchcover.report.maps.surface import (
     FAINTEST,
     MIN_POINTS,
+    errors_of_ratios,
     opacity_of,
     over_squares,
-    ratio_errors,
     ratios,
     square_sides,
 )
@@ -137,7 +137,7 @@ def test_open_ground_is_opaque_in_squares_that_the_grid_cuts_off_too():
 def test_errors_are_those_of_cells_where_squares_are_cells(coverage, sides):
     alone = sides == 1
     keys = list(coverage.layers)[3:]
-    for key, found in zip(keys, ratio_errors(coverage.area, sides), strict=True):
+    for key, found in zip(keys, errors_of_ratios(coverage.area, coverage.quantities, sides), strict=True):
         expected = coverage.errors[key][alone]
         torch.testing.assert_close(found[alone], expected, rtol=1e-12, atol=0, equal_nan=True)
         assert int(expected.isfinite().sum()) > 10

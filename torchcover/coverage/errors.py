@@ -5,7 +5,7 @@ import math
 import torch
 from torch import Tensor
 
-from torchcover.coverage.blocks import MIN_BLOCKS, Blocks
+from torchcover.coverage.blocks import MIN_BLOCKS
 from torchcover.coverage.quantity import Unit
 
 # Errors below come from rounding in sums of float64: the estimate is the same whichever block is left out.
@@ -49,32 +49,38 @@ def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor) -> Tensor:
     return error.where(whole.isfinite(), math.nan)
 
 
-def cell_errors(sums: Tensor, blocks: Blocks, unit: Unit) -> Tensor:
-    """Standard error of the mean over steps in each cell.
+def ratio_errors(base: Tensor, sums: Tensor, unit: Unit) -> Tensor:
+    """Standard error of a ratio of sums in each cell: of a mean over steps, or over square metres.
 
-    The mean is a ratio, R = S / N, of sums over the blocks; to first order its variance is that of the sum of
-    s_j - R n_j over the blocks, divided by N^2 (Cochran 1977, Sampling Techniques, section 6.4).
+    For R = S / A, sums over blocks of s_j and of a_j, the variance is to first order that of the sum of s_j - R a_j,
+    divided by A^2 (Cochran 1977, Sampling Techniques, section 6.4).
 
     A few blocks that all say the same do not prove that others would. Therefore two more are imagined, each with as
-    many steps as the others have on average: in one the rig sees all of the cell, in the other next to nothing of it,
-    as Agresti & Coull (1998, The American Statistician 52, 119-126) add successes and failures. No error is 0, and the
-    mean plus and minus two errors covers the truth in at least 93 % of the cells (docs/measured/error_bars.md).
+    much of A as the others have on average: in one the rig sees all of the cell, in the other next to nothing of it,
+    as Agresti & Coull (1998, The American Statistician 52, 119-126) add successes and failures. No error is 0; how
+    often the ratio plus and minus two errors covers the truth is in docs/measured/error_bars.md.
 
     Args:
-        sums: (B, H, Y, X) sum of each block, as in `blocks`.
-        blocks: The blocks.
-        unit: "share", so that the imagined means are 1 and 0; or "m": 0 and five times the mean.
+        base: (B, ...) the a_j: steps that probed the cell in each block, or square metres that were seen in it.
+        sums: (B, ...) the s_j.
+        unit: "share", so that the imagined ratios are 1 and 0; or "m": 0 and five times R.
 
     Returns:
-        (H, Y, X) standard errors; NaN in cells that were probed in fewer than 8 blocks, or that nothing is known of but
-        a radius of 0.
+        (...) standard errors; NaN in cells that fewer than 8 blocks know, or that nothing is known of but a radius
+        of 0.
+
+    Example:
+        >>> m2 = torch.full((16,), 2.0, dtype=torch.float64)
+        >>> half = torch.tensor([2.0, 0.0] * 8, dtype=torch.float64)
+        >>> [round(float(ratio_errors(m2, sums, "share")), 3) for sums in (half, m2)]
+        [0.121, 0.057]
     """
-    probed_steps = blocks.probed_steps.double()
-    steps = probed_steps.sum(dim=0).clamp(min=1)
-    mean = sums.sum(dim=0) / steps
-    probed = (blocks.probed_steps > 0).sum(dim=0)
-    imagined = steps / probed.clamp(min=1)
-    seen_or_not = mean**2 + (1 - mean) ** 2 if unit == "share" else mean**2 + (IMAGINED_RADIUS * mean - mean) ** 2
-    squares = (sums - mean * probed_steps).square().sum(dim=0) + imagined**2 * seen_or_not
-    variance = squares * (probed + 2) / (probed + 1) / (steps + 2 * imagined) ** 2
-    return variance.sqrt().where((probed >= MIN_BLOCKS_OF_A_CELL) & (variance > 0) & variance.isfinite(), math.nan)
+    base = base.double()
+    known = (base > 0).sum(dim=0)
+    whole = base.sum(dim=0).where(known > 0, 1.0)
+    ratio = sums.sum(dim=0) / whole
+    imagined = whole / known.clamp(min=1)
+    seen_or_not = ratio**2 + (1 - ratio) ** 2 if unit == "share" else ratio**2 + (IMAGINED_RADIUS * ratio - ratio) ** 2
+    squares = (sums - ratio * base).square().sum(dim=0) + imagined**2 * seen_or_not
+    variance = squares * (known + 2) / (known + 1) / (whole + 2 * imagined) ** 2
+    return variance.sqrt().where((known >= MIN_BLOCKS_OF_A_CELL) & (variance > 0) & variance.isfinite(), math.nan)

@@ -41,8 +41,12 @@ def interval95(value: float, error: float, degrees_of_freedom: int, unit: Unit) 
     if error <= ROUND_OFF:
         return value, value
     if unit == "m":
+        if value <= 0:
+            return math.nan, math.nan
         reach = student_t95(degrees_of_freedom) * error / value
         return value * math.exp(-reach), value * math.exp(min(BLIND_SIDE * reach, MOST))
+    if not 0 < value < 1:  # rounding may have put it there; nothing is known of the other side
+        return 0.0, 1.0
     against = (1 - value) / value
     reach = student_t95(degrees_of_freedom) * error / (value * (1 - value))
     return 1 / (1 + against * math.exp(min(BLIND_SIDE * reach, MOST))), 1 / (1 + against * math.exp(-reach))

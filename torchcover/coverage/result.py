@@ -10,10 +10,9 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import MeanOfMeans
-from torchcover.coverage.area_errors import area_errors
 from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
-from torchcover.coverage.errors import cell_errors
+from torchcover.coverage.errors import ratio_errors
 from torchcover.coverage.estimate import Measure, RegionEstimate, estimate_area, estimate_known
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.intervals import interval95
@@ -99,11 +98,11 @@ class Coverage:
         """Key of a quantity -> (H, Y, X) standard errors; NaN where too few blocks probed, empty without blocks."""
         if self.blocks is None:
             return {}
-        each = zip(self.quantities, self.blocks.sums.unbind(dim=1), strict=True)
-        errors = {quantity.key: cell_errors(sums, self.blocks, quantity.unit) for quantity, sums in each}
+        probed, each = self.blocks.probed_steps, zip(self.quantities, self.blocks.sums.unbind(dim=1), strict=True)
+        errors = {one.key: ratio_errors(probed, sums, one.unit) for one, sums in each}
         if self.area is not None:
-            over_area = [area_errors(self.area.m2, sums) for sums in self.area.sums.unbind(dim=1)]
-            errors |= {by_area(one).key: error for one, error in zip(self.quantities, over_area, strict=True)}
+            m2, each = self.area.m2, zip(self.quantities, self.area.sums.unbind(dim=1), strict=True)
+            errors |= {by_area(one).key: ratio_errors(m2, sums, one.unit) for one, sums in each}
         return errors
 
     @property

@@ -162,10 +162,12 @@ def new_metric(
         aggregations=aggregations,
         square_metres=square_metres,
     )
-    with torch.device("meta"):  # where tensors have a size and take no memory
-        state_bytes = sum(state.nbytes for state in build().metric_state.values() if isinstance(state, Tensor))
-    check_fits(f"the sums of {grid.cells:,} cells in {blocks} blocks", STATE_COPIES * state_bytes, "use larger cells")
     try:
+        with torch.device("meta"):  # where tensors have a size and take no memory
+            need = STATE_COPIES * sum(
+                state.nbytes for state in build().metric_state.values() if isinstance(state, Tensor)
+            )
+        check_fits(f"the sums of {grid.cells:,} cells in {blocks} blocks", need, "use larger cells")
         return build().to(device)
     except RuntimeError as error:  # what torch raises when there is no memory left on the device
         raise ValueError(

@@ -11,13 +11,12 @@ from torchcover.coverage.blocks import AreaSums
 from torchcover.coverage.errors import MIN_BLOCKS_OF_A_CELL
 from torchcover.coverage.quantity import by_area
 from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, error_scale, scale_of
-from torchcover.report.maps.surface import opacity_of, ratio_errors, ratios, square_sides
+from torchcover.report.maps.surface import errors_of_ratios, opacity_of, ratios, square_sides
 from torchcover.report.wording import UNITS, steps_and_cell
 
 LARGER = ", larger where points are few"
 NOTHING_FOUND = "no visible surface found"
 TOO_FEW_BLOCKS = f"probed in fewer than {MIN_BLOCKS_OF_A_CELL} blocks of steps"
-TOO_FEW_OR_EQUAL_BLOCKS = f"seen in fewer than {MIN_BLOCKS_OF_A_CELL} blocks of steps, or the same in all"
 
 
 @dataclass(frozen=True)
@@ -69,16 +68,16 @@ def error_subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
         return
     if first.measure == "area":
         sides = square_sides(first.points, first.grid.cell)
-        each = {name: ratio_errors(area, sides) for name, area in _areas(coverages).items()}
+        each = {name: errors_of_ratios(area, first.quantities, sides) for name, area in _areas(coverages).items()}
         quantities = [by_area(quantity) for quantity in first.quantities]
-        unknown, conditions = TOO_FEW_OR_EQUAL_BLOCKS, _conditions(first) + LARGER
+        conditions = _conditions(first) + LARGER
     else:
         each = {name: list(coverage.errors.values()) for name, coverage in coverages.items()}
-        quantities, unknown, conditions = list(first.quantities), TOO_FEW_BLOCKS, _conditions(first)
+        quantities, conditions = list(first.quantities), _conditions(first)
     for at, of in enumerate(quantities):
         quantity = Quantity(of.error_key, f"standard error of the {of.title}", of.unit, lower_is_better=True)
         errors = {name: errors[at] for name, errors in each.items()}
-        yield _subject(quantity, errors, error_scale, unknown, conditions)
+        yield _subject(quantity, errors, error_scale, TOO_FEW_BLOCKS, conditions)
 
 
 def _of_surface(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:

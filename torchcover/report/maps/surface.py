@@ -5,13 +5,15 @@ region together have its number.
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from torchcover.coverage.area_errors import area_errors
+from torchcover.coverage import Quantity
 from torchcover.coverage.blocks import AreaSums
+from torchcover.coverage.errors import ratio_errors
 
 # A detection from 8 points is off by 18 percentage points at most: 1 / sqrt(4 * 8).
 MIN_POINTS = 8
@@ -70,10 +72,10 @@ def ratios(area: AreaSums, sides: Tensor) -> Tensor:
     return over_squares(area.sums.sum(dim=0), sides) / over_squares(area.m2.sum(dim=0), sides)
 
 
-def ratio_errors(area: AreaSums, sides: Tensor) -> list[Tensor]:
-    """(H, Y, X) standard errors of each of the `ratios`."""
-    m2 = over_squares(area.m2, sides)
-    return [area_errors(m2, over_squares(sums, sides)) for sums in area.sums.unbind(dim=1)]
+def errors_of_ratios(area: AreaSums, quantities: Sequence[Quantity], sides: Tensor) -> list[Tensor]:
+    """(H, Y, X) standard errors of each of the `ratios`, which are of these quantities."""
+    m2, each = over_squares(area.m2, sides), zip(quantities, area.sums.unbind(dim=1), strict=True)
+    return [ratio_errors(m2, over_squares(sums, sides), one.unit) for one, sums in each]
 
 
 def opacity_of(area: AreaSums, steps: int, sides: Tensor, cell_m: float) -> Tensor:
