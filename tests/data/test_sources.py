@@ -10,6 +10,7 @@ from torchcover import Scenario
 from torchcover.data import (
     FORMATS,
     ChosenRigs,
+    Frame,
     FrameSource,
     RecordedFrames,
     SimulatedFrames,
@@ -130,3 +131,16 @@ def test_a_batch_without_the_rig_that_is_asked_for_says_what_it_has(tmp_path):
     batch = collate_frames([recorded_rigs(tmp_path)[0]])
     with pytest.raises(ValueError, match="frame 'f0' has no rig 'c'; it has a, b"):
         batch.clouds_of("c")
+
+
+def test_weights_of_several_kinds_are_no_weights_of_a_batch():
+    points, weights = torch.zeros(3, 3), torch.ones(3)
+    area, other, none = (
+        Frame({"rig": points}, points, 0, name, reference_weights=given, weight_kind=kind)
+        for name, given, kind in (("a", weights, "m2"), ("b", weights, "density"), ("c", None, None))
+    )
+    assert torch.equal(collate_frames([area, area]).weights[1], weights)
+    assert collate_frames([none, none]).weights is None
+    for mixed in ([area, other], [area, none], [none, other]):
+        with pytest.raises(ValueError, match=r"weights: one weight_kind is needed in a batch; got '?\w+'? \(as of '"):
+            _ = collate_frames(mixed).weights

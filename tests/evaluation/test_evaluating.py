@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 import torchcover
 from torchcover import Coverage, Rig, Scenario
 from torchcover.coverage import Maximum
-from torchcover.data import DEFAULT_REFERENCE, Frame
+from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame
 from torchcover.evaluation import TargetError
 from torchcover.evaluation.omissions import HEAVY
 
@@ -138,6 +138,39 @@ class Single(Source):
     def __getitem__(self, index):
         frame = super().__getitem__(index)
         return Frame({"high": frame.clouds["high"]}, frame.reference, index, frame.name)
+
+
+class Ending(PointCount):
+    """Ends the run after two frames."""
+
+    def __init__(self, error):
+        super().__init__()
+        self.error, self.frames = error, 0
+
+    def update(self, frame):
+        self.frames += 1
+        if self.frames > 2:
+            raise self.error
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (BadFrameError("f2 (frame 2): rubbish"), "BadFrameError: f2 (frame 2): rubbish"),
+        (RuntimeError("no room.\nand much more"), "RuntimeError: no room"),
+        (ZeroDivisionError(), "ZeroDivisionError"),
+        (KeyboardInterrupt(), "interrupted"),
+    ],
+)
+def test_a_result_that_was_cut_short_says_so_wherever_its_numbers_stand(error, reason):
+    result = torchcover.evaluate(frames=Single(), cell_m=4.0, observers={"ending": Ending(error)})
+    # Of the frame that ended it, coverage has the step: it was fed before the other observer.
+    assert f"The run was cut short after 3 steps: {reason}." in result.table.notes
+    assert reason in " ".join(repr(result).split())
+
+
+def test_a_run_that_came_to_its_end_says_nothing_of_one():
+    assert "cut short" not in repr(torchcover.evaluate(frames=Single(), cell_m=4.0, steps=2))
 
 
 def test_the_only_rig_of_a_source_goes_by_the_name_of_the_sensors_it_is():

@@ -80,6 +80,14 @@ def test_where_nothing_moves_errors_are_about_the_reference_and_say_so():
     assert "All 9 steps show the same instant: ± is about the reference sensor's places only." in result.table.notes
 
 
+def test_nothing_is_said_of_errors_where_there_are_none(drive):
+    still = torchcover.evaluate(RIG, "courtyard", steps=7, **FEW)
+    assert "All 7 steps show the same instant." in still.table.notes
+    few = torchcover.evaluate(RIG, drive(3), steps=9, **FEW)
+    assert "3 different instants in 9 steps: the scenario was seen again." in few.table.notes
+    assert not any("±" in note for note in (*still.table.notes, *few.table.notes))
+
+
 def test_the_steps_of_a_city_are_never_in_two_blocks():
     city = {"name": "urban", "traffic": {"type": "urban", "duration_s": 2.0, "time_step_s": 0.5}}
     few = PaperReference(rows=2, columns=2)

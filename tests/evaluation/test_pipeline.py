@@ -1,16 +1,20 @@
 """The one loop: every observer has seen the same frames, however it ends."""
 
+import multiprocessing
 import os
 import signal
 import threading
+import time
+import tracemalloc
 from dataclasses import replace
+from traceback import format_exception
 
 import pytest
 import torch
 
 from torchcover import BevGrid, CoverageMetric
 from torchcover.data import BadFrameError, SimulatedFrames
-from torchcover.evaluation import CoverageObserver, observe
+from torchcover.evaluation import CoverageObserver, observe, pipeline
 from torchcover.evaluation.pipeline import MOST_TOGETHER, made_together
 
 GRID = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, heights={"all": (-1.0, 1.0)})
@@ -109,10 +113,10 @@ def test_workers_change_nothing_and_frames_come_in_order(frames, workers):
 
 def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_order():
     spread = SimulatedFrames("urban", "front_roof_32", steps=15, every_s=10.0)
-    tasks = made_together(spread, 15, workers=2)
+    tasks = list(made_together(spread, 15, workers=2))
     assert tasks == [[*range(7)], [*range(7, 13)], [13, 14]]
     assert [{spread.simulator.run_of(index) for index in task} for task in tasks] == [{0}, {1}, {2}]
-    dense = made_together(SimulatedFrames("urban", "front_roof_32", steps=1000), 700, workers=2)
+    dense = list(made_together(SimulatedFrames("urban", "front_roof_32", steps=1000), 700, workers=2))
     assert [index for task in dense for index in task] == [*range(700)]
     assert max(map(len, dense)) == MOST_TOGETHER
     for alone in (
@@ -120,7 +124,43 @@ def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_orde
         made_together(SimulatedFrames("courtyard", "front_roof_32", steps=3), 3, workers=2),
         made_together([], 3, workers=2),
     ):
-        assert alone == [[0], [1], [2]]
+        assert list(alone) == [[0], [1], [2]]
+
+
+@pytest.mark.parametrize("scenario", ["urban", "courtyard"])
+def test_no_list_is_made_of_all_the_steps_there_may_be(scenario):
+    frames = SimulatedFrames(scenario, "front_roof_32", steps=20_000)
+    tracemalloc.start()
+    tasks = made_together(frames, 20_000, workers=2)
+    assert sum(map(len, tasks)) == 20_000
+    _, most_bytes = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most_bytes < 100_000
+
+
+class Counted(Spoiled):
+    """A dataset that knows, in all processes, how many frames were made."""
+
+    def __init__(self, frames):
+        super().__init__(frames, ())
+        self.made = multiprocessing.Value("i", 0)
+
+    def __getitem__(self, index):
+        with self.made.get_lock():
+            self.made.value += 1
+        return super().__getitem__(index)
+
+
+def test_a_worker_makes_one_task_ahead(frames):
+    counted, ahead = Counted(frames), []
+
+    def wait():
+        if not ahead:
+            time.sleep(0.3)
+            ahead.append(counted.made.value)
+
+    observe(counted, [Names(then=wait)], workers=1)
+    assert ahead[0] <= 2
 
 
 def test_of_two_rigs_none_is_meant_until_it_is_named(frames):
@@ -164,6 +204,54 @@ def test_bad_frames_are_skipped_if_that_is_asked_for(frames, workers):
     assert run.skipped == ["f0 (frame 0): rubbish", "f3 (frame 3): rubbish"]
     assert run.complete
     run.raise_failure()
+
+
+def together(monkeypatch):
+    monkeypatch.setattr(pipeline, "made_together", lambda *_: [[0, 1, 2, 3], [4, 5]])
+
+
+class OddError(ValueError):
+    """What cannot be built again from its text alone."""
+
+    def __init__(self, what, where):
+        super().__init__(f"{what} at {where}", lambda: what)
+
+    def __str__(self):
+        return self.args[0]
+
+
+class Invalid(Spoiled):
+    """A dataset in which some frames are errors that name no frame."""
+
+    def __getitem__(self, index):
+        if index in self.bad:
+            raise OddError("a sensor in a wall", index)
+        return self.frames[index]
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2])
+def test_of_frames_that_are_made_together_a_bad_one_costs_itself_only(frames, workers, monkeypatch):
+    together(monkeypatch)
+    names = Names()
+    run = observe(Spoiled(frames, {1, 4}), [names], skip_bad_frames=True, workers=workers)
+    assert names.names == ["f0", "f2", "f3", "f5"]
+    assert run.skipped == ["f1 (frame 1): rubbish", "f4 (frame 4): rubbish"]
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("dataset", "error", "message"),
+    [(Spoiled, BadFrameError, "f2 (frame 2): rubbish"), (Invalid, ValueError, "a sensor in a wall at 2")],
+)
+def test_the_frames_before_a_bad_one_are_kept(frames, workers, dataset, error, message, monkeypatch):
+    together(monkeypatch)
+    names = Names()
+    run = observe(dataset(frames, {2}), [names], keep_partial=True, workers=workers)
+    assert (run.steps, names.names, run.skipped) == (2, ["f0", "f1"], [])
+    with pytest.raises(error) as raised:
+        run.raise_failure()
+    assert str(raised.value) == message
+    assert f"raise {'OddError' if dataset is Invalid else 'BadFrameError'}(" in "".join(format_exception(raised.value))
 
 
 def test_without_a_good_frame_there_is_no_result(frames):

@@ -3,6 +3,7 @@
 import math
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from mmengine.evaluator import BaseMetric, Evaluator
 from mmengine.registry import METRICS
 
 from torchcover import BevGrid, CoverageMetric, Region
+from torchcover.data import Frame
 from torchcover.training import MMEngineCoverage, frames_of_batch_dict, frames_of_data_batch
 from torchcover.training import mmengine as adapter
 
@@ -118,6 +120,17 @@ def test_by_area_too_a_process_that_was_dealt_nothing_evaluates():
     metric = MMEngineCoverage({"grid": GRID, "square_metres": True})
     assert all(math.isnan(value) for name, value in metric.evaluate(0).items() if "radius_m" in name)
     assert metric.coverage.measure == "area"
+
+
+@pytest.mark.parametrize("kind", [None, "density"])
+def test_mmengine_takes_no_other_weights_for_square_metres(kind):
+    frame = Frame({"rig": cloud(9, 0, 3)}, cloud(9, 1, 3), 0, "0", reference_weights=torch.ones(9), weight_kind=kind)
+    metric = MMEngineCoverage({"grid": GRID, "square_metres": True}, frames_of=lambda batch, _: batch)
+    with pytest.raises(ValueError, match=r"frame '0': the metric needs the square metres"):
+        metric.process([frame], [{}])
+    metric.process([replace(frame, weight_kind="m2")], [{}])
+    metric.evaluate(1)
+    assert metric.coverage.counts["steps"] == 1
 
 
 def test_mmengine_evaluates_it_as_any_of_its_metrics():

@@ -269,6 +269,23 @@ def test_the_weights_of_reference_points_count(tmp_path):
     assert not torch.equal(callback.coverage.radius, expected(frames).radius)
 
 
+def weighted(kind):
+    """Frames whose weights are of a kind, which knows what they are."""
+    weights = torch.ones(40)
+    return [replace(frame, reference_weights=weights, weight_kind=kind) for frame in RandomFrames(2)]
+
+
+@pytest.mark.parametrize("kind", [None, "density"])
+def test_weights_are_square_metres_only_where_they_say_so(tmp_path, kind):
+    callback = CoverageCallback(make_metric(square_metres=True))
+    with pytest.raises(ValueError, match=r"needs the square metres .* and the frame has weight_kind"):
+        make_trainer(tmp_path, callback).fit(Validated(), loader(2), loader(weighted(kind)))
+    for frames in (weighted("m2"), weighted(kind)):
+        without = replace(frames[1], reference_weights=None)
+        with pytest.raises(ValueError, match=r"needs the square metres"):
+            make_trainer(tmp_path, callback).fit(Validated(), loader(2), loader([frames[0], without]))
+
+
 def test_every_n_steps_logs_the_epoch_so_far(tmp_path, blank_maps):
     callback = CoverageCallback(make_metric(), regions=REGIONS, stage="train", every_n_steps=2)
     logger = TakesImages()

@@ -65,6 +65,22 @@ class Frame:
             raise ValueError(f"frame {self.name!r} has no rig {rig!r}; it has {', '.join(self.clouds)}")
         return self.clouds[rig]
 
+    def check_weights(self, *, square_metres: bool) -> None:
+        """Whether a metric can take the weights of the reference points for what it needs.
+
+        Args:
+            square_metres: Whether it takes them for square metres, as `CoverageMetric.square_metres` says.
+
+        Raises:
+            ValueError: It does, and they are something else, or there are none.
+        """
+        if square_metres and (self.weight_kind != "m2" or self.reference_weights is None):
+            found = "no weights" if self.reference_weights is None else f"weight_kind {self.weight_kind!r}"
+            raise ValueError(
+                f'frame {self.name!r}: the metric needs the square metres of each reference point (weight_kind "m2", '
+                f"as of a SurfaceReference), and the frame has {found}; leave out square_metres=True"
+            )
+
     def pin_memory(self) -> "Frame":
         """A copy in page-locked memory; DataLoader calls it when `pin_memory=True`."""
         return self._each(Tensor.pin_memory, None if self.boxes is None else self.boxes.pin_memory())
@@ -111,7 +127,15 @@ class FrameBatch:
 
     @property
     def weights(self) -> list[Tensor] | None:
-        """One (M,) tensor a frame, the weights of its reference points; None if no frame has any."""
+        """One (M,) tensor a frame, the weights of its reference points; None if no frame has any.
+
+        Raises:
+            ValueError: Weights of several kinds, which mean nothing side by side.
+        """
+        kinds = {frame.weight_kind: frame.name for frame in self.frames}
+        if len(kinds) > 1:
+            several = ", ".join(f"{kind!r} (as of {name!r})" for kind, name in kinds.items())
+            raise ValueError(f"weights: one weight_kind is needed in a batch; got {several}; batch each kind by itself")
         if all(frame.reference_weights is None for frame in self.frames):
             return None
         given = [(frame.reference_weights, frame.reference) for frame in self.frames]

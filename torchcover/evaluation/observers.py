@@ -65,12 +65,7 @@ class CoverageObserver:
             ValueError: As `CoverageMetric.update`, several rigs and none was named, or reference points without the
                 square metres that the metric wants.
         """
-        if self.metric.square_metres and frame.weight_kind != "m2":
-            raise ValueError(
-                f'frame {frame.name!r}: the metric needs the square metres of each reference point (weight_kind "m2", '
-                f"as of a SurfaceReference), and the frame has weight_kind {frame.weight_kind!r}; leave out "
-                "square_metres=True"
-            )
+        frame.check_weights(square_metres=self.metric.square_metres)
         sensor = frame.sensor if self.rig is None else frame.cloud_of(self.rig)
         self.metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.place_in_time)
 

@@ -4,14 +4,14 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
-from traceback import clear_frames
+from itertools import groupby, islice
+from traceback import clear_frames, format_exc
 from typing import Protocol
 
 import torch
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, get_worker_info
 
-from torchcover.data import BadFrameError, Frame, FrameSource, SimulatedFrames, collate_frames
+from torchcover.data import BadFrameError, Frame, FrameSource, SimulatedFrames
 from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.progress import progress_of
@@ -164,7 +164,7 @@ def _feed(frame: Frame, observers: Sequence[AnyObserver], run: Run) -> None:
     run.steps += 1
 
 
-def made_together(frames: Frames, steps: int, workers: int) -> list[list[int]]:
+def made_together(frames: Frames, steps: int, workers: int) -> Iterator[list[int]]:
     """Which frames a worker makes in a row: in traffic those of one world, so that only one worker builds it.
 
     Args:
@@ -173,31 +173,45 @@ def made_together(frames: Frames, steps: int, workers: int) -> list[list[int]]:
         workers: Processes that make them.
     """
     if workers < 2 or not isinstance(frames, SimulatedFrames) or frames.scenario.traffic is None:
-        return [[index] for index in range(steps)]
-    together = []
-    for _, indices in groupby(range(steps), frames.simulator.run_of):
-        of_world = list(indices)
-        together += [of_world[at : at + MOST_TOGETHER] for at in range(0, len(of_world), MOST_TOGETHER)]
-    return together
+        yield from ([index] for index in range(steps))
+        return
+    for _, of_world in groupby(range(steps), frames.simulator.run_of):
+        while together := list(islice(of_world, MOST_TOGETHER)):
+            yield together
+
+
+class _FramesOrErrors(Dataset[Frame | ValueError]):
+    """Frames; what is wrong with one stands in its place, so that it costs none of those that are made with it."""
+
+    def __init__(self, frames: Frames) -> None:
+        self.frames = frames
+
+    def __getitem__(self, index: int) -> Frame | ValueError:
+        try:
+            return self.frames[index]
+        except ValueError as error:
+            if get_worker_info() is None:
+                return error
+            # Of a kind that is known to survive the way to another process; where it arose stands in a note.
+            copy = (BadFrameError if isinstance(error, BadFrameError) else ValueError)(str(error))
+            copy.add_note(format_exc())
+            return copy
 
 
 def _each(frames: Frames, most: int, workers: int, run: Run, *, skip_bad_frames: bool) -> Iterator[Frame]:
     """One frame at a time; notes bad ones if they are to be skipped."""
     loader = DataLoader(
-        frames,  # type: ignore[arg-type]  # has a length and items
+        _FramesOrErrors(frames),
         batch_sampler=made_together(frames, most, workers),
-        collate_fn=collate_frames,
+        collate_fn=list,
         num_workers=workers,
+        prefetch_factor=1 if workers else None,  # what is made ahead waits in shared memory
     )
-    iterator = iter(loader)
-    while True:
-        try:
-            batch = next(iterator)
-        except StopIteration:
-            return
-        except BadFrameError as error:
-            if not skip_bad_frames:
-                raise
-            run.skipped.append(str(error))
-        else:
-            yield from batch.frames
+    for batch in loader:
+        for made in batch:
+            if isinstance(made, Frame):
+                yield made
+            elif skip_bad_frames and isinstance(made, BadFrameError):
+                run.skipped.append(str(made))
+            else:
+                raise made

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
+from torchcover.coverage.blocks import MIN_BLOCKS
 from torchcover.evaluation.omissions import Omission
 from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.result_files import ResultFiles
@@ -180,13 +181,26 @@ class Result:
 
     @property
     def _notes(self) -> list[str]:
-        """The reference sensor in words, for a caption."""
+        """What ended the run before its time, and the reference sensor in words, for a caption."""
         record = self._reference_used
         if record is None:
-            return []
+            return self._on_failure
         rays, every_s = record["rays_per_step"], record["every_s"]
         sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
-        return [sensor, *self._on_repetitions]
+        return [*self._on_failure, sensor, *self._on_repetitions]
+
+    @property
+    def _on_failure(self) -> list[str]:
+        """That the run was cut short and why; nothing where it was not."""
+        failure = None if self.run is None else self.run.failure
+        if failure is None:
+            return []
+        steps = self._first.counts["steps"]
+        after = f"The run was cut short after {steps:,} step{'s' * (steps != 1)}"
+        if isinstance(failure, KeyboardInterrupt):
+            return [f"{after}: interrupted."]
+        reason = ": ".join([type(failure).__name__, *str(failure).strip().splitlines()[:1]])
+        return [f"{after}: {reason.rstrip('.')}."]
 
     @property
     def _on_repetitions(self) -> list[str]:
@@ -195,8 +209,15 @@ class Result:
         if not again:
             return []
         if steps - again == 1:
-            return [f"All {steps:,} steps show the same instant: ± is about the reference sensor's places only."]
-        return [f"{steps - again:,} different instants in {steps:,} steps: the scenario was seen again, which ± knows."]
+            about = ": ± is about the reference sensor's places only" if self._has_errors else ""
+            return [f"All {steps:,} steps show the same instant{about}."]
+        known = ", which ± knows" if self._has_errors else ""
+        return [f"{steps - again:,} different instants in {steps:,} steps: the scenario was seen again{known}."]
+
+    @property
+    def _has_errors(self) -> bool:
+        blocks = self._first.blocks
+        return blocks is not None and int((blocks.steps > 0).sum()) >= MIN_BLOCKS
 
     def __repr__(self) -> str:
         cut_short = ", cut short" if self.run is not None and not self.run.complete else ""

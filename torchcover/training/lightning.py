@@ -53,6 +53,7 @@ class CoverageCallback(Callback):
 
     Raises:
         ValueError: An unknown stage, a number of epochs or steps below 1, steps outside training, fixed frames in it.
+            While it measures: reference points without the square metres that the metric wants.
         ImportError: On import, without Lightning.
 
     Example:
@@ -128,6 +129,8 @@ class CoverageCallback(Callback):
         new = FrameBatch(tuple(self._once.new(frames, self._shard(trainer, loader_index), loader_index)))
         if not new.frames:
             return
+        for frame in new.frames:
+            frame.check_weights(square_metres=self.metric.square_metres)
         self._added = True
         indices = [frame.index for frame in new.frames]
         self.metric.update(
