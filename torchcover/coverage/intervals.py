@@ -8,8 +8,7 @@ from torchcover.coverage.quantity import Unit
 # Of the standard normal distribution, exceeded to either side with 5 %.
 NORMAL_QUANTILE = 1.959963984540054
 # Scenes in which a rig is all but blind are rare and missing from most short runs, so that the truth lies far on that
-# side more often than on the other: with 1, only 66 % of the intervals of the worst number cover it, with 1.75 88 %
-# (64 steps; docs/measured/error_bars.md).
+# side more often than on the other (docs/measured/error_bars.md).
 BLIND_SIDE = 1.75
 # exp of more is no float64.
 MOST = 700.0
