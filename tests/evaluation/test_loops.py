@@ -68,6 +68,14 @@ def test_going_round_again_makes_no_error_smaller(drive):
     assert "seen again" not in " ".join(once.table.notes)
 
 
+def test_a_target_error_does_not_go_round_and_round(drive):
+    result = torchcover.evaluate(RIG, drive(70), target_error="0.0001%", **FEW)
+    assert (result.run.steps, result.target_lines[0]) == (
+        70,
+        "Target error not reached in 70 steps; the largest of each region:",
+    )
+
+
 def test_a_few_instants_have_no_error_however_often_they_are_seen(drive):
     result = torchcover.evaluate(RIG, drive(3), steps=24, **FEW)
     assert np.isnan(errors(result)).all()

@@ -144,7 +144,8 @@ def test_what_was_not_reached_is_told_for_each_region_with_the_steps_it_would_ta
     target = TargetError(radius_m=0.005, detection=0.5)
     record, lines = outcome(target, {"a": filled(64, scale=0.01).compute()}, REGIONS)
     assert re.fullmatch(
-        r"  near all, radius_m of a: ± 0\.03\d m \(target 0\.005 m\), about \d,\d00 steps are needed", lines[1]
+        r"  near all, radius_m of a: ± 0\.03\d m \(target 0\.005 m\), about \d,\d00 different steps are needed",
+        lines[1],
     )
     assert re.fullmatch(r"  far all, radius_m of a: ± 0\.000\d+ m \(target 0\.005 m\), reached", lines[2])
     assert record["radius_m"] == 0.005

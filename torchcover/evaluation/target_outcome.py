@@ -63,7 +63,8 @@ def _lines(found: Sequence[Standing], steps: int) -> list[str]:
         elif worst.reached:
             lines.append(f"{where}: {worst.words}, reached")
         else:
-            lines.append(f"{where}: {worst.words}, about {_two_digits(worst.steps_needed):,} steps are needed")
+            needed = f"about {_two_digits(worst.steps_needed):,} different steps are needed"
+            lines.append(f"{where}: {worst.words}, {needed}")
     return lines
 
 

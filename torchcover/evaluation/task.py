@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from torchcover.data import ChosenRigs, FrameSource, SimulatedFrames, open_recording, reference_called
 from torchcover.evaluation.rig_names import AnyRig, distinct_names, given_as, is_document, loaded
-from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings, spread_s
+from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings, spread_s
 from torchcover.simulation import Scenario, Sensor
 
 AnyScenario = Scenario | str | Path
@@ -88,7 +88,15 @@ def _simulation(rigs: Sequence[AnyRig], scenario: AnyScenario, settings: Setting
     given = {name: given_as(rig) for name, rig in zip(names, rigs, strict=True)}
     # A path says more than the name within the file.
     description = {**frames.description, "scenario": world.name if world is scenario else str(scenario)}
-    return Task(frames, given, frames.sensors, description)
+    return Task(frames, given, frames.sensors, description, _most_steps(frames, settings))
+
+
+def _most_steps(frames: SimulatedFrames, settings: Settings) -> int | None:
+    """Where a target error ends a run at the latest: a given world that moves has no more to say than its instants."""
+    distinct = frames.simulator.distinct_steps
+    if settings.steps is not None or settings.target_error is None or distinct in (None, 1):
+        return None
+    return max(DEFAULT_STEPS, distinct)
 
 
 def _recording(rigs: Sequence[AnyRig], frames: FrameSource, settings: Settings) -> Task:
