@@ -237,9 +237,9 @@ def _opened(frames: Path | None, recording_format: str | None) -> "FrameSource |
         if recording_format is not None:
             raise ValueError("--format: for a recording, which --frames gives")
         return None
-    from torchcover.data import open_recording
+    from torchcover.data import RecordedFrames, open_recording
 
-    return open_recording(frames, recording_format)
+    return RecordedFrames(open_recording(frames, recording_format))
 
 
 def _finish(result: "Result", out: Path, *, error_maps: bool, explain: bool) -> None:

@@ -142,6 +142,15 @@ class Boxes:
         """Those of the given categories."""
         return self.select(torch.tensor([category in categories for category in self.categories], dtype=torch.bool))
 
+    def with_hits(self, clouds: Mapping[str, Tensor]) -> "Boxes":
+        """The same with `hits`: how many points of each rig lie in each box.
+
+        Args:
+            clouds: Name of each rig -> (N, 3) its points in the vehicle frame.
+        """
+        inside = {rig: points_in_boxes(cloud, self).box for rig, cloud in clouds.items()}
+        return replace(self, hits={rig: torch.bincount(box, minlength=len(self)) for rig, box in inside.items()})
+
     def pin_memory(self) -> "Boxes":
         """A copy in page-locked memory."""
         return self._moved(Tensor.pin_memory)
