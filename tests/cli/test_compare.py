@@ -178,7 +178,11 @@ def test_the_rigs_of_a_recording_are_compared(torchcover, recording, tmp_path, r
     assert code == 0, complaints
     summary = json.loads((out / "summary.json").read_text())
     assert list(summary["rigs"]) == list(radii)
-    assert (summary["frames"], summary["reference"], summary["complete"]) == (str(recording), None, True)
+    assert (summary["frames"], summary["reference"]["sensor"], summary["complete"]) == (
+        str(recording),
+        "recorded",
+        True,
+    )
     found = {row["rig"]: row["radius_m"] for row in summary["rows"] if row["region"] == "20m" and row["known_cells"]}
     assert found == pytest.approx(radii)
 

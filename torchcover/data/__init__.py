@@ -6,7 +6,8 @@ from torchcover.data.bad_frame import BadFrameError
 from torchcover.data.chosen_rigs import ChosenRigs
 from torchcover.data.clouds import read_cloud
 from torchcover.data.frame import Frame, FrameBatch, collate_frames
-from torchcover.data.recorded import RecordedFrames
+from torchcover.data.recorded import RecordedFrames, reference_of_recording
+from torchcover.data.recorded_reference import RecordedReference, Reference
 from torchcover.data.recordings import FORMATS, Recording, RecordingFormat, Scan, open_recording
 from torchcover.data.reference import DEFAULT_REFERENCE, GRID_X_M, GRID_Y_M, reference_called, reference_of_objects
 from torchcover.data.simulated import SimulatedFrames
@@ -25,8 +26,10 @@ __all__ = [
     "FrameBatch",
     "FrameSource",
     "RecordedFrames",
+    "RecordedReference",
     "Recording",
     "RecordingFormat",
+    "Reference",
     "Scan",
     "SimulatedFrames",
     "collate_frames",
@@ -35,6 +38,7 @@ __all__ = [
     "read_cloud",
     "reference_called",
     "reference_of_objects",
+    "reference_of_recording",
     "rotate",
     "scale",
 ]

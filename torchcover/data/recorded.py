@@ -148,3 +148,28 @@ class RecordedFrames(Dataset[Frame]):
                     f"rig {rig!r}: sensors of the recording {self.recording.path} are needed, which has "
                     f"{', '.join(there)}; got {', '.join(unknown) or 'none'}"
                 )
+
+
+def reference_of_recording(name: str | None = None, window_s: float | None = None) -> Reference | None:
+    """The reference of a recording by its name.
+
+    Args:
+        name: "recorded" or "accumulated"; None for what the recording has.
+        window_s: Time over which one is accumulated, in seconds.
+
+    Raises:
+        ValueError: Another name, or a time for one that was recorded.
+
+    Example:
+        >>> reference_of_recording("accumulated", 1.0).window_s
+        1.0
+    """
+    if name not in (None, "recorded", "accumulated"):
+        raise ValueError(f"reference {name}: for a recording `recorded` or `accumulated` is needed")
+    if name == "accumulated" or window_s is not None:
+        if name == "recorded":
+            raise ValueError(
+                f"window: a recorded reference has none; got {window_s:g} s; leave it out, or accumulate one"
+            )
+        return AccumulatedReference() if window_s is None else AccumulatedReference(window_s)
+    return RecordedReference() if name == "recorded" else None
