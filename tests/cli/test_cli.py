@@ -177,7 +177,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
     assert "Not enough steps for errors: 4 blocks, 8 are needed." in printed
     assert "±" not in printed
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert (summary["reference"], summary["target_error"]) == (None, None)
+    assert (summary["reference"]["sensor"], summary["target_error"]) == ("recorded", None)
     assert (summary["blocks"], summary["steps_per_block"]) == (4, 1)
     assert summary["rows"][0]["radius_m_error"] is None
     assert (tmp_path / "out" / "maps" / "radius_m_error_ground.png").is_file()
