@@ -229,7 +229,14 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         ),
         (["evaluate", "front_roof_128", "--rays", "0"], "--rays"),
         (["evaluate", "--frames", "recording", "--rays", "9"], "reference, rays and every are for simulations"),
-        (["evaluate", "--frames", "recording", "--reference", "even"], "reference, rays and every are for simul"),
+        (["evaluate", "--frames", "recording", "--reference", "even"], "for a recording `recorded` or `accumulated`"),
+        (["evaluate", "--frames", "recording", "--reference", "accumulated"], "does not say when its scans were made"),
+        (["evaluate", "--frames", "recording", "--sensors", "roof"], "which has sensor, reference; got roof"),
+        (
+            ["evaluate", "--frames", "recording", "--reference", "recorded", "--window", "1"],
+            "recorded reference has none",
+        ),
+        (["evaluate", "front_roof_128", "--sensors", "roof"], "--sensors: for a recording, which --frames gives"),
         (["measure"], "No such command 'measure'"),
     ],
 )

@@ -1,6 +1,6 @@
 """A reference made of a recording itself: what all sensors saw within some time."""
 
-from collections import Counter, OrderedDict
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 
 from torchcover.data.in_vehicle import InVehicle, in_vehicle
 from torchcover.data.recordings import Recording
-from torchcover.detection.boxes import Boxes, points_in_boxes
+from torchcover.detection import Boxes, points_in_boxes
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler, transform
 from torchcover.geometry.rigid import Matrix
 
 # Voxels are numbered with so many bits an axis: 200 km at 0.1 m.
 VOXEL_BITS = 21
-# Scans that are kept beyond those of one window, for the next frame.
-SPARE_SCANS = 2
 
 
 @dataclass(frozen=True)
@@ -69,10 +67,10 @@ class AccumulatedReference:
         self.window_s = window_s
         self.voxel_m = voxel_m
         self.sensors = None if sensors is None else tuple(sensors)
-        self._kept: OrderedDict[tuple[str, int], Thinned] = OrderedDict()
+        self._kept: dict[tuple[str, int], Thinned] = {}  # of the window that was asked for last: the next is much alike
 
     def __getstate__(self) -> dict[str, object]:
-        return {**vars(self), "_kept": OrderedDict()}
+        return {**vars(self), "_kept": {}}
 
     def check(self, recording: Recording, judged: Collection[str]) -> None:
         """Whether the recording says when and where its scans were made.
@@ -111,7 +109,9 @@ class AccumulatedReference:
         boxes = _by_name(recording.boxes(index))
         still, voxels, moved, dropped = [], [], [], Counter[str]()
         of_box: dict[str, list[NDArray[np.float64]]] = {}
-        for sensor, instant in self._scans(recording, index, judged):
+        taken = list(self._scans(recording, index, judged))
+        self._kept = {key: scan for key, scan in self._kept.items() if key in taken}
+        for sensor, instant in taken:
             scan = self._thinned(recording, sensor, instant, origin_m)
             still.append(scan.still_m)
             voxels.append(scan.voxel)
@@ -175,7 +175,6 @@ class AccumulatedReference:
     def _thinned(self, recording: Recording, sensor: str, index: int, origin_m: NDArray[np.float64]) -> Thinned:
         key = (sensor, index)
         if key in self._kept:
-            self._kept.move_to_end(key)
             return self._kept[key]
         scan = in_vehicle(recording.scan(sensor, index), recording.body)
         points_m = scan.points_m.astype(np.float64)
@@ -197,16 +196,8 @@ class AccumulatedReference:
         voxel = self._voxel(still_m)
         first = _first_of_each(voxel)
         thinned = Thinned(still_m[first], voxel[first], of_box, unnamed, scan.dropped)
-        self._keep(key, thinned, recording)
-        return thinned
-
-    def _keep(self, key: tuple[str, int], thinned: Thinned, recording: Recording) -> None:
-        """For the next frame, whose window is nearly the same."""
-        times_s = recording.times_s
-        in_a_window = 1 if times_s is None else int(np.ceil(self.window_s / max(np.median(np.diff(times_s)), 1e-3))) + 1
         self._kept[key] = thinned
-        while len(self._kept) > (in_a_window + SPARE_SCANS) * len(self._taking_part(recording)):
-            self._kept.popitem(last=False)
+        return thinned
 
     def _voxel(self, points_m: NDArray[np.float64]) -> NDArray[np.int64]:
         x, y, z = (np.floor(points_m / self.voxel_m).astype(np.int64) & ((1 << VOXEL_BITS) - 1)).T

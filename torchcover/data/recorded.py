@@ -16,6 +16,7 @@ from torchcover.data.frame import Frame
 from torchcover.data.in_vehicle import InVehicle, in_vehicle, joined
 from torchcover.data.recorded_reference import RecordedReference, Reference
 from torchcover.data.recordings import Recording, open_recording
+from torchcover.detection.inside import with_hits
 from torchcover.simulation import Sensor, WeightKind
 
 
@@ -128,7 +129,7 @@ class RecordedFrames(Dataset[Frame]):
         }
         tensors = {rig: torch.from_numpy(cloud.points_m) for rig, cloud in clouds.items()}
         if boxes is not None:
-            boxes = boxes.with_hits(tensors)
+            boxes = with_hits(boxes, tensors)
         return Frame(tensors, torch.from_numpy(reference.points_m), position, name, counts=counts, boxes=boxes)
 
     @property

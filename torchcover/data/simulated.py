@@ -13,6 +13,7 @@ from torch.utils.data import Dataset
 from torchcover.data.frame import Frame
 from torchcover.data.reference import reference_called, reference_of_objects
 from torchcover.detection.boxes import Boxes
+from torchcover.detection.inside import with_hits
 from torchcover.simulation import Label, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
 
 # What takes years.
@@ -183,4 +184,4 @@ def _boxes(found: Sequence[Label], clouds: Mapping[str, torch.Tensor], drawn: ND
         categories=tuple(label.category for label in found),
         drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
     )
-    return boxes.with_hits(clouds)
+    return with_hits(boxes, clouds)

@@ -1,12 +1,12 @@
 """A recording in a folder: the sensor clouds of one or several rigs beside a reference cloud for every instant."""
 
 import os
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import ClassVar
 
-from torchcover.data.clouds import READERS, read_cloud, split_name
+from torchcover.data.clouds import read_cloud
+from torchcover.data.recordings.file_names import check_same_names, frame_files, natural
 from torchcover.data.recordings.folder_settings import read_poses
 from torchcover.data.recordings.recording import Scan
 from torchcover.geometry.rigid import Matrix
@@ -14,7 +14,6 @@ from torchcover.geometry.rigid import Matrix
 POSES_FILE = "frames.yaml"
 # What the clouds of the only rig are called.
 ONLY_RIG = "recording"
-MAX_NAMES_SHOWN = 5
 
 
 class FolderRecording:
@@ -53,11 +52,16 @@ class FolderRecording:
             raise FileNotFoundError(f"{self.path}: no such folder; a recording holds {self.layout}")
         self.rigs = _rigs(self.path)
         self.sensors = tuple(place for places in self.rigs.values() for place in places)
-        self._files = {place: _clouds_by_name(self.path / place) for place in (*self.sensors, *self.reference_sensors)}
-        _check_same_names(self.path, self._files)
-        self.names = tuple(sorted(self._files["reference"], key=_natural))
+        self._files = {place: frame_files(self.path / place) for place in (*self.sensors, *self.reference_sensors)}
+        check_same_names(self.path, self._files)
+        self.names = tuple(self._files["reference"])
         self._vehicle_T_sensor = read_poses(self.path / POSES_FILE)
         _check_places(self.path, self._vehicle_T_sensor, self._files)
+
+    @property
+    def frames(self) -> range:
+        """All of them."""
+        return range(len(self.names))
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -85,50 +89,10 @@ def _rigs(folder: Path) -> dict[str, tuple[str, ...]]:
     names = [path.name for path in (folder / "rigs").iterdir() if not path.name.startswith(".")]
     if not names:
         raise ValueError(f"{folder / 'rigs'}: no rig; each has a folder rigs/NAME/ of its own")
-    return {name: (f"rigs/{name}",) for name in sorted(names, key=_natural)}
-
-
-def _clouds_by_name(folder: Path) -> dict[str, Path]:
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder; a recording holds {FolderRecording.layout}")
-    clouds: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.name.startswith("."):  # what file managers and version control leave behind
-            continue
-        name, suffix = split_name(path.name)
-        if not suffix or path.is_dir():
-            raise ValueError(f"{path}: not a cloud; allowed are files ending in {', '.join(READERS)}")
-        if name in clouds:
-            raise ValueError(f"{folder}: two files for the frame {name}: {clouds[name].name} and {path.name}")
-        clouds[name] = path
-    return clouds
-
-
-def _check_same_names(folder: Path, files: Mapping[str, Mapping[str, Path]]) -> None:
-    places = " and ".join(f"{place}/" for place in files)
-    anywhere = set[str]().union(*files.values())
-    if not anywhere:
-        raise ValueError(f"{folder}: no frames; {places} are empty")
-    complaints = [
-        f"{len(gaps)} missing in {place}/ ({_some_of(gaps)})"
-        for place, clouds in files.items()
-        if (gaps := sorted(anywhere - clouds.keys(), key=_natural))
-    ]
-    if complaints:
-        raise ValueError(f"{folder}: every frame needs a file in {places}; {' and '.join(complaints)}")
-
-
-def _some_of(names: Sequence[str]) -> str:
-    return ", ".join([*names[:MAX_NAMES_SHOWN], *["..."] * (len(names) > MAX_NAMES_SHOWN)])
+    return {name: (f"rigs/{name}",) for name in sorted(names, key=natural)}
 
 
 def _check_places(folder: Path, poses: Mapping[str, Matrix], files: Mapping[str, object]) -> None:
     for place in poses:
         if place not in files:
             raise ValueError(f"{folder / POSES_FILE}: {place.replace('/', '.')}: there is no {place}/ beside it")
-
-
-def _natural(name: str) -> tuple[list[str | int], str]:
-    # Text and number alternate, starting with text, so that two keys always compare; the name itself breaks a tie.
-    parts = re.split(r"(\d+)", name)
-    return [int(part) if position % 2 else part for position, part in enumerate(parts)], name

@@ -4,7 +4,11 @@ import os
 from pathlib import Path
 from typing import Protocol
 
+from torchcover.data.recordings.argoverse2 import Argoverse2
 from torchcover.data.recordings.folder import FolderRecording
+from torchcover.data.recordings.kitti_object import KittiObject
+from torchcover.data.recordings.kitti_raw import KittiRaw
+from torchcover.data.recordings.nuscenes import NuScenes
 from torchcover.data.recordings.recording import Recording
 
 
@@ -26,7 +30,13 @@ class RecordingFormat(Protocol):
 
 
 # The first that recognises a path reads it.
-FORMATS: dict[str, RecordingFormat] = {"folder": FolderRecording}
+FORMATS: dict[str, RecordingFormat] = {
+    "nuscenes": NuScenes,
+    "argoverse2": Argoverse2,
+    "kitti_raw": KittiRaw,
+    "kitti_object": KittiObject,
+    "folder": FolderRecording,
+}
 
 
 def open_recording(path: str | os.PathLike[str], format_name: str | None = None) -> Recording:

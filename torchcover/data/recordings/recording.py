@@ -30,6 +30,29 @@ class Scan:
     source: str
 
 
+def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArray[np.float64]:
+    """Return the times of instants, if they can be those.
+
+    Args:
+        times_s: (F,) in seconds.
+        count: How many instants there are.
+        source: Where they were read from, for messages.
+
+    Raises:
+        ValueError: Another number of them, or two that do not follow each other.
+    """
+    if len(times_s) != count:
+        raise ValueError(f"{source}: {len(times_s):,} times for {count:,} scans; one each is needed")
+    bad = np.flatnonzero(~(np.diff(times_s) > 0))
+    if len(bad):
+        first = int(bad[0])
+        raise ValueError(
+            f"{source}: times have to ascend; {len(bad)} do not, the first after instant {first}: "
+            f"{times_s[first]:.6f} s, then {times_s[first + 1]:.6f} s"
+        )
+    return times_s
+
+
 class Recording(Protocol):
     """A drive as somebody recorded it. A reader of a layout is a class like this, made from a path; see `FORMATS`.
 
@@ -45,6 +68,11 @@ class Recording(Protocol):
     @property
     def names(self) -> Sequence[str]:
         """What a user calls the instants; so many there are."""
+        ...
+
+    @property
+    def frames(self) -> Sequence[int]:
+        """Numbers of the instants that are meant to be looked at, ascending; the others serve a reference only."""
         ...
 
     @property
