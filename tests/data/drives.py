@@ -31,6 +31,7 @@ class Drive:
 
     def __post_init__(self):
         self.names = [f"f{step}" for step in range(self.steps)]
+        self.frames = range(self.steps)
         self.times_s = 0.1 * np.arange(self.steps)
         self.rigs = {"both": self.sensors}
         x, z = np.meshgrid(np.arange(-20.0, 40.0, 0.5) + 0.01, np.arange(0.11, 3.0, 0.5))

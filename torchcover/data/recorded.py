@@ -66,7 +66,7 @@ class RecordedFrames(Dataset[Frame]):
     @property
     def names(self) -> Sequence[str]:
         """What a user calls the frames."""
-        return self.recording.names
+        return tuple(self.recording.names[instant] for instant in self.recording.frames)
 
     @property
     def rigs(self) -> tuple[str, ...]:
@@ -100,7 +100,7 @@ class RecordedFrames(Dataset[Frame]):
         return self.reference.record(self.recording, self._judged)
 
     def __len__(self) -> int:
-        return len(self.recording.names)
+        return len(self.recording.frames)
 
     def __getitem__(self, index: int) -> Frame:
         """Read one frame.
@@ -113,11 +113,12 @@ class RecordedFrames(Dataset[Frame]):
         if not -len(self) <= position < len(self):
             raise IndexError(f"frame {position} of {len(self)} in {self.recording.path}")
         position %= len(self)
-        name = self.names[position]
+        instant = self.recording.frames[position]
+        name = self.recording.names[instant]
         try:
-            scans = {sensor: self._read(sensor, position) for sensor in self._judged}
-            reference = self.reference.cloud(self.recording, position, self._judged)
-            boxes = self.recording.boxes(position)
+            scans = {sensor: self._read(sensor, instant) for sensor in self._judged}
+            reference = self.reference.cloud(self.recording, instant, self._judged)
+            boxes = self.recording.boxes(instant)
         except (OSError, ValueError) as error:
             raise BadFrameError(f"{name} (frame {position}): {error}") from error
         dropped = sum((scan.dropped for scan in scans.values()), Counter[str]())
@@ -137,8 +138,8 @@ class RecordedFrames(Dataset[Frame]):
         """The sensors of all rigs, each once."""
         return tuple(dict.fromkeys(sensor for of in self.sensors_of_rigs.values() for sensor in of))
 
-    def _read(self, sensor: str, position: int) -> InVehicle:
-        return in_vehicle(self.recording.scan(sensor, position), self.recording.body)
+    def _read(self, sensor: str, instant: int) -> InVehicle:
+        return in_vehicle(self.recording.scan(sensor, instant), self.recording.body)
 
     def _check_sensors(self) -> None:
         there = (*self.recording.sensors, *self.recording.reference_sensors)
