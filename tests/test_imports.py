@@ -49,6 +49,13 @@ def test_what_only_tells_imports_nothing_heavy(command):
     assert not set(loaded) & (HEAVY - {"numpy", "pydantic"})  # typer imports pydantic where there is one
 
 
+def test_a_run_imports_what_it_needs_only():
+    """Of distorted lenses, meshes from files, frameworks and their loggers it may need nothing."""
+    loaded = set(python("import sys; from torchcover.evaluation import evaluate; print(*sys.modules)").split())
+    assert "torchmetrics" in loaded
+    assert not loaded & {"kornia", "trimesh", "networkx", "lightning", "tensorboard", "mmengine", "pandas", "OpenEXR"}
+
+
 @pytest.mark.parametrize("name", torchcover.__all__)
 def test_every_public_name_is_there(name):
     assert getattr(torchcover, name) is not None

@@ -3,6 +3,7 @@
 import hashlib
 import math
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from typing import Any
 
 import torch
@@ -65,13 +66,19 @@ class MergeableMetric(Metric):
         meaning = repr((type(self).__name__, sorted(self.meaning.items())))
         return torch.tensor(list(hashlib.sha256(meaning.encode()).digest()))
 
+    def add_state(self, name: str, default: Tensor | list[Any], *args: Any, **kwargs: Any) -> None:  # noqa: ANN401
+        """Add a state, as torchmetrics does; what an expanded tensor starts from takes no memory."""
+        super().add_state(name, default, *args, **kwargs)
+        if isinstance(default, Tensor) and not default.is_contiguous():
+            self._defaults[name] = deepcopy(default)  # torchmetrics keeps all of its elements
+
     def add_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:
         """Add a state that starts at zero and adds up; float64 or int64, for sums grow."""
-        self.add_state(name, torch.zeros(shape, dtype=dtype), dist_reduce_fx="sum", persistent=True)
+        self.add_state(name, torch.zeros((), dtype=dtype).expand(shape), dist_reduce_fx="sum", persistent=True)
 
     def add_maximum(self, name: str, shape: tuple[int, ...]) -> None:
         """Add a float64 state that starts at minus infinity and keeps the largest."""
-        lowest = torch.full(shape, -math.inf, dtype=torch.float64)
+        lowest = torch.tensor(-math.inf, dtype=torch.float64).expand(shape)
         self.add_state(name, lowest, dist_reduce_fx="max", persistent=True)
 
     @torch.inference_mode(False)  # here and below: a tensor made under it could not be added to outside of it
