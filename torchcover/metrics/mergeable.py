@@ -67,10 +67,16 @@ class MergeableMetric(Metric):
         return torch.tensor(list(hashlib.sha256(meaning.encode()).digest()))
 
     def add_state(self, name: str, default: Tensor | list[Any], *args: Any, **kwargs: Any) -> None:  # noqa: ANN401
-        """Add a state, as torchmetrics does; what an expanded tensor starts from takes no memory."""
-        super().add_state(name, default, *args, **kwargs)
-        if isinstance(default, Tensor) and not default.is_contiguous():
-            self._defaults[name] = deepcopy(default)  # torchmetrics keeps all of its elements
+        """Add a state, as torchmetrics does; of one number that is expanded it would keep a second copy."""
+        if not isinstance(default, Tensor) or default.is_contiguous() or any(default.stride()):
+            super().add_state(name, default, *args, **kwargs)
+            return
+        number = default[(0,) * default.dim()]
+        super().add_state(name, number, *args, **kwargs)
+        state = torch.empty_like(default, memory_format=torch.contiguous_format)
+        # The device `meta` keeps no numbers, and would import half of torch to fill in none.
+        setattr(self, name, state if state.is_meta else state.fill_(number))
+        self._defaults[name] = deepcopy(default)
 
     def add_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:
         """Add a state that starts at zero and adds up; float64 or int64, for sums grow."""
