@@ -3,7 +3,6 @@
 import hashlib
 import math
 from collections.abc import Callable, Mapping
-from copy import deepcopy
 from typing import Any
 
 import torch
@@ -76,7 +75,7 @@ class MergeableMetric(Metric):
         state = torch.empty_like(default, memory_format=torch.contiguous_format)
         # The device `meta` keeps no numbers, and would import half of torch to fill in none.
         setattr(self, name, state if state.is_meta else state.fill_(number))
-        self._defaults[name] = deepcopy(default)
+        self._defaults[name] = default
 
     def add_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:
         """Add a state that starts at zero and adds up; float64 or int64, for sums grow."""
