@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.assemble import Paths, actors, ego_actor, paths
+from torchcover.simulation.traffic.assemble import Paths, actors, come_near, ego_actor, paths
 from torchcover.simulation.traffic.city import City
 from torchcover.simulation.traffic.crossing import Footpath, step_height, walk
 from torchcover.simulation.traffic.fleet import CYCLING, EGO, WALKING, Fleet
@@ -77,7 +77,9 @@ class Urban(Procedural):
             flow = Simulation(lanes, agents, streets.signals).run(times_s, WARM_UP_S)
             if _usually_follows(agents, flow):
                 break
-        moving = _on_the_pavement(paths(lanes, agents, flow), streets, fleet)
+        near = come_near(lanes, agents, flow.place_m)
+        moving = paths(lanes, [agents[number] for number in near], flow.place_m[:, near])
+        moving = _on_the_pavement(moving, streets, fleet)
         driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator)
         way = driver.trajectory.positions_m[:, 0]
         seen = (float(way[0]) - BEHIND_M, float(way[-1]) + AHEAD_M)
@@ -150,7 +152,7 @@ def _crossers(
     positions, yaws, kinds = [], [], []
     wait_m = streets.kerb_m + WAITING_BEHIND_KERB_M
     walks = 2 * wait_m / float(WALKING.desired_speed_mps)
-    green = np.stack([streets.signals.green_left_s(time)[:, CROSS] for time in times_s])
+    green = streets.signals.green_left_s(times_s)[..., CROSS]
     may_go = (green + streets.signals.amber_s > walks) & ~flow.occupied[:, :, MAIN]
     for index in np.flatnonzero((streets.junctions_m > seen_m[0]) & (streets.junctions_m < seen_m[1])):
         for side in (1, -1):
