@@ -45,8 +45,8 @@ class Trajectory:
                 "a trajectory needs K >= 1 times, (K, 3) positions and (K, 3) angles; got "
                 f"{self.times_s.shape}, {self.positions_m.shape} and {self.angles_deg.shape}"
             )
-        numbers = np.column_stack([self.times_s, self.positions_m, self.angles_deg])
-        if not np.isfinite(numbers).all():
+        if not all(np.isfinite(numbers).all() for numbers in (self.times_s, self.positions_m, self.angles_deg)):
+            numbers = np.column_stack([self.times_s, self.positions_m, self.angles_deg])
             bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
             raise ValueError(f"a trajectory has NaN or infinite numbers in {len(bad)} of {count} poses, first {bad[0]}")
         steps = np.diff(self.times_s)

@@ -86,11 +86,13 @@ def actors(times_s: Numbers, found: Sequence[Paths], ego: Actor, fleet: Fleet) -
     near: list[Actor] = []
     for group in found:
         distance = np.linalg.norm(group.positions_m - ego.trajectory.positions_m[:, None], axis=2).min(axis=0)
-        for index in np.flatnonzero(distance < HORIZON_M):
-            kind = group.kinds[index]
-            if kind == EGO:
-                continue
-            angles = np.column_stack([group.yaw_deg[:, index], np.zeros((len(times_s), 2))])
-            trajectory = Trajectory(times_s, group.positions_m[:, index].copy(), angles)
+        numbers = np.flatnonzero((distance < HORIZON_M) & (np.array(group.kinds) != EGO))
+        # One body after the other: each has its own piece of both.
+        positions_m = np.ascontiguousarray(group.positions_m[:, numbers].swapaxes(0, 1))
+        angles_deg = np.zeros_like(positions_m)
+        angles_deg[..., 0] = group.yaw_deg[:, numbers].T
+        for number, position_m, angle_deg in zip(numbers, positions_m, angles_deg, strict=True):
+            kind = group.kinds[number]
+            trajectory = Trajectory(times_s, position_m, angle_deg)
             near.append(Actor(f"{kind} {len(near)}", CATEGORIES[kind], fleet.meshes[kind], trajectory))
     return tuple(near)
