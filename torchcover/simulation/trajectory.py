@@ -76,7 +76,12 @@ class Trajectory:
     @property
     def moves(self) -> bool:
         """Whether the body ever changes its pose, enters or leaves."""
-        return self.transient or bool(np.ptp(self.positions_m, axis=0).any() or np.ptp(self.angles_deg, axis=0).any())
+        return self.transient or any((poses != poses[0]).any() for poses in (self.positions_m, self.angles_deg))
+
+    @property
+    def bytes(self) -> int:
+        """How much memory its poses take."""
+        return self.positions_m.nbytes + self.angles_deg.nbytes
 
     def at(self, time_s: float) -> Matrix:
         """The (4, 4) pose `world_T_body` at a time."""
@@ -85,6 +90,8 @@ class Trajectory:
 
     def positions_at(self, times_s: Matrix) -> Matrix:
         """(T, 3) positions at (T,) times; NaN where the body is not there."""
+        if np.array_equal(times_s, self.times_s[: len(times_s)]):
+            return self.positions_m[: len(times_s)]
         outside = np.nan if self.transient else None
         tracks = [np.interp(times_s, self.times_s, axis, outside, outside) for axis in self.positions_m.T]
         return np.stack(tracks, axis=1)
