@@ -41,8 +41,10 @@ class Scene:
         self.world = world
         self.ego_box = BoundingBox.around(world.ego.mesh.vertices_m)
         bodies = (world.ego, *world.objects)
-        self._resting = [actor for actor in bodies if not actor.trajectory.moves]
-        self._moving = [actor for actor in bodies if actor.trajectory.moves]
+        self._resting: list[Actor] = []
+        self._moving: list[Actor] = []
+        for actor in bodies:
+            (self._moving if actor.trajectory.moves else self._resting).append(actor)
         self._solids = Solids() if solids is None else solids
         # (steps, bodies, 3): where they are, to find out at once which are near; NaN, so never near, if absent.
         check_fits(
@@ -56,17 +58,18 @@ class Scene:
         self._reach_m = np.array([self._solids.of(actor.mesh).reach_m for actor in self._resting + self._moving])
         # Subtracted in float64: world coordinates may be of UTM size. Where the ego rests, this frame is its own.
         self._world_T_local = world.ego.trajectory.at(0.0)
-        resting = [actor.mesh.moved(self._local_T_resting(actor)) for actor in self._resting]
-        scenery = [mesh.moved(invert(self._world_T_local)) for mesh in world.static]
+        local_T_world = invert(self._world_T_local)
+        self._local_T_resting = [local_T_world @ actor.trajectory.at(0.0) for actor in self._resting]
+        resting = [
+            actor.mesh.moved(pose) for actor, pose in zip(self._resting, self._local_T_resting, strict=True)
+        ]
+        scenery = self._scenery()
         self._static = RayCaster(resting + scenery)
         self._faces = sum(len(mesh.faces) for mesh in resting + scenery)
         self._surfaces: dict[tuple[float, ...], Surface] = {}
 
     def _scenery(self) -> list[Mesh]:
         return [mesh.moved(invert(self._world_T_local)) for mesh in self.world.static]
-
-    def _local_T_resting(self, actor: Actor) -> Matrix:
-        return invert(self._world_T_local) @ actor.trajectory.at(0.0)
 
     def surface(self, lower_m: Matrix, upper_m: Matrix) -> Surface:
         """The surface of everything but the ego, for questions about a box that the vehicle carries along.
@@ -80,16 +83,18 @@ class Scene:
         box = (*lower_m.tolist(), *upper_m.tolist())
         if box not in self._surfaces:
             ego, step_s = self.world.ego, self.world.time_step_s
-            poses = [ego.trajectory.at(step * step_s) for step in range(self.world.steps)]
-            bounds = bounds_along(
-                np.stack([invert(self._world_T_local) @ pose for pose in poses]), Bounds(lower_m[None], upper_m[None])
-            )
+            poses = np.stack([ego.trajectory.at(step * step_s) for step in range(self.world.steps)])
+            bounds = bounds_along(invert(self._world_T_local) @ poses, Bounds(lower_m[None], upper_m[None]))
             objects = self.world.objects
             number = {id(actor): k for k, actor in enumerate(objects)}
             self._surfaces[box] = Surface(
                 self._scenery(),
                 [self._solids.of(actor.mesh).patches for actor in objects],
-                {number[id(actor)]: self._local_T_resting(actor) for actor in self._resting if actor is not ego},
+                {
+                    number[id(actor)]: pose
+                    for actor, pose in zip(self._resting, self._local_T_resting, strict=True)
+                    if actor is not ego
+                },
                 {self._first_moving + k: number[id(actor)] for k, actor in enumerate(self._moving) if actor is not ego},
                 bounds,
             )

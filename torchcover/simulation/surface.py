@@ -16,7 +16,7 @@ Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 # Side of the squares of the ground by which patches are looked up.
-CELL_M = 16.0
+CELL_M = 16  # a power of two
 # A drive is followed by boxes around stretches of it of this length.
 STRETCH_M = 100.0
 # Boxes are grown by this much for the rounding of float32 coordinates.
@@ -121,10 +121,10 @@ def _by_place(patches: Patches) -> tuple[Numbers, Numbers]:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     middle_m = (patches.corner_m + (patches.first_m + patches.second_m) / 3)[:2]
     # To a metre: a million on a side are enough for any drive.
-    place = np.clip(middle_m - middle_m.min(axis=1, keepdims=True), 0, 2**20).astype(np.int64)
-    cell = _interleaved(place // int(CELL_M))
-    order = np.lexsort((_interleaved(place), cell))
-    return order, cell[order]
+    place = _interleaved(np.clip(middle_m - middle_m.min(axis=1, keepdims=True), 0, 2**20).astype(np.int64))
+    order = np.argsort(place, kind="stable")
+    # Halving both coordinates is a shift by two.
+    return order, place[order] // CELL_M**2
 
 
 def _interleaved(place: Numbers) -> Numbers:

@@ -76,7 +76,14 @@ class Trajectory:
     @property
     def moves(self) -> bool:
         """Whether the body ever changes its pose, enters or leaves."""
-        return self.transient or any((poses != poses[0]).any() for poses in (self.positions_m, self.angles_deg))
+        if self.transient or len(self.times_s) == 1:
+            return self.transient
+        # Most of those that move end elsewhere.
+        return any((poses[at] != poses[0]).any() for at in (slice(-1, None), slice(None)) for poses in self._poses)
+
+    @property
+    def _poses(self) -> tuple[Matrix, Matrix]:
+        return self.positions_m, self.angles_deg
 
     @property
     def bytes(self) -> int:
