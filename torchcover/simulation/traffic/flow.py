@@ -99,6 +99,7 @@ class Simulation:
             rear_m = self.place_m[members] - self._half_m[members]
             self._face(members, self._gates.next_on(int(index), rear_m))
         self.speed_mps = self._first_speed()
+        self._look()
 
     def run(self, times_s: Numbers, warm_up_s: float = 0.0) -> Flow:
         """Simulate, first the warm-up before the first time, and keep the state at each time.
@@ -114,7 +115,7 @@ class Simulation:
         for number, (start_s, duration_s) in enumerate(drives):
             self._drive(start_s, duration_s)
             place_m[number], speed_mps[number] = self.place_m, self.speed_mps
-            occupied[number] = self._occupied(self._committed(self._to_line_m())).reshape(-1, 2)
+            occupied[number] = self._occupied.reshape(-1, 2)
         return Flow(place_m, speed_mps, occupied)
 
     def _drive(self, start_s: float, duration_s: float) -> None:
@@ -126,20 +127,19 @@ class Simulation:
         driver, speed_mps = self._driver, self.speed_mps
         leader_m, leader_mps = self._leader_m(), speed_mps.take(self._leader)
         gap_m = self._gap_m(leader_m)
-        line_m = self._to_line_m()
         # Lines that may be crossed are as far away as can be.
-        line_m[~self._held_up(time_s, line_m, leader_m, leader_mps)] = np.inf
-        stop_m = line_m + driver.standstill_gap_m - STOP_BEFORE_LINE_M
-        tight = np.maximum(
-            tightness(driver, speed_mps, gap_m, speed_mps - leader_mps),
-            tightness(driver, speed_mps, stop_m, speed_mps),
-        )
+        line_m = np.where(self._held_up(time_s, leader_m, leader_mps), self._to_line_m, np.inf)
+        stop_m = line_m + driver.standstill_gap_m
+        stop_m -= STOP_BEFORE_LINE_M
+        tight = tightness(driver, speed_mps, gap_m, speed_mps - leader_mps)
+        np.maximum(tight, tightness(driver, speed_mps, stop_m, speed_mps), out=tight)
         wanted = acceleration_in(driver, speed_mps, tight)
         way, self.speed_mps = advance(speed_mps, wanted, np.minimum(gap_m, line_m), step_s)
-        self.place_m = self.place_m + way
+        self.place_m += way
         passed = np.flatnonzero(self.place_m - self._half_m > self._exit_m)
         if len(passed):
             self._face(passed, self._gate[passed] + 1)
+        self._look()
 
     def _face(self, agents: NDArray[np.int64], gates: NDArray[np.int64]) -> None:
         """Let some agents have these gates before them."""
@@ -150,44 +150,45 @@ class Simulation:
 
     def _leader_m(self) -> Numbers:
         """(N,) place of the one ahead; infinite for the first on a lane."""
-        return self.place_m.take(self._leader) + self._lap
+        leader_m = self.place_m.take(self._leader)
+        leader_m += self._lap
+        return leader_m
 
     def _gap_m(self, leader_m: Numbers) -> Numbers:
         """(N,) free road to the one ahead, bumper to bumper."""
-        return leader_m - self.place_m - self._between_middles_m
+        gap_m = leader_m - self.place_m
+        gap_m -= self._between_middles_m
+        return gap_m
 
-    def _to_line_m(self) -> Numbers:
-        """(N,) way from the front to the next stop line."""
-        return self._enter_m - self.place_m - self._half_m
+    def _look(self) -> None:
+        """See where everybody is before the next stop line, and whom the junctions belong to.
 
-    def _held_up(
-        self, time_s: float, to_line_m: Numbers, leader_m: Numbers, leader_mps: Numbers
-    ) -> NDArray[np.bool_]:
+        `_to_line_m` (N,) is the way from the front to the line; `_committed` (N,), whether one is on a junction, or
+        will be because it is too late to stop; `_occupied` (2 J,), whether somebody of each phase is.
+        """
+        self._to_line_m = self._enter_m - self.place_m
+        self._to_line_m -= self._half_m
+        self._committed = self.speed_mps**2 > 2 * BRAKING_FOR_A_LIGHT_MPS2 * self._to_line_m
+        self._occupied = np.zeros(2 * len(self._signals.offset_s), dtype=bool)
+        self._occupied[self._gates.light[self._gate[self._committed]]] = True
+
+    def _held_up(self, time_s: float, leader_m: Numbers, leader_mps: Numbers) -> NDArray[np.bool_]:
         """(N,) whether one may not cross the next stop line, and need not."""
-        gates, committed = self._gates, self._committed(to_line_m)
+        gates = self._gates
         green = self._signals.green_left_s(time_s).ravel()[gates.light] > gates.green_needed_s
-        closed = ~green | self._occupied(committed)[gates.other_light]
-        held: NDArray[np.bool_] = (closed[self._gate] | self._jammed_behind(leader_m, leader_mps)) & ~committed
+        held = (~green | self._occupied[gates.other_light])[self._gate]
+        held |= self._jammed_behind(leader_m, leader_mps)
+        held &= ~self._committed
         return held
-
-    def _committed(self, to_line_m: Numbers) -> NDArray[np.bool_]:
-        """(N,) whether one is on a junction, or will be because it is too late to stop."""
-        return self.speed_mps**2 > 2 * BRAKING_FOR_A_LIGHT_MPS2 * to_line_m
 
     def _jammed_behind(self, leader_m: Numbers, leader_mps: Numbers) -> NDArray[np.bool_]:
         """(N,) whether a queue behind the junction would force one to stop on it."""
         rear_m = leader_m - self._leaders_half_m
         return (rear_m > self._enter_m) & (rear_m < self._clear_m) & (leader_mps < self._queue_mps)
 
-    def _occupied(self, committed: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(2 J,) whether somebody of each phase is on its junction or cannot be kept from it."""
-        occupied = np.zeros(2 * len(self._signals.offset_s), dtype=bool)
-        occupied[self._gates.light[self._gate[committed]]] = True
-        return occupied
-
     def _first_speed(self) -> Numbers:
         """(N,) fast, but slow enough to stop at the next line, and for the gap to the one ahead."""
-        stoppable = np.sqrt(self._driver.deceleration_mps2 * np.maximum(self._to_line_m(), 0.0))
+        stoppable = np.sqrt(self._driver.deceleration_mps2 * np.maximum(self._enter_m - self.place_m - self._half_m, 0.0))
         to_leader = np.maximum(self._gap_m(self._leader_m()) - self._driver.standstill_gap_m, 0.0)
         bearable = to_leader / self._driver.headway_s
         return np.asarray(np.minimum(0.95 * self._driver.desired_speed_mps, np.minimum(stoppable, bearable)))

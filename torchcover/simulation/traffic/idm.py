@@ -60,17 +60,24 @@ def acceleration(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps
 
 def tightness(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: Numbers) -> Numbers:
     """(N,) the gap that drivers would like to have as a multiple of the one that they have; see `acceleration`."""
-    dynamic_gap = speed_mps * driver.headway_s + speed_mps * closing_mps / driver._braking_mps2
-    desired_gap = driver.standstill_gap_m + np.maximum(dynamic_gap, 0.0)
-    tight: Numbers = desired_gap / np.maximum(gap_m, SMALLEST_GAP_M)
-    return tight
+    # In place, here and below: what is written anew has to come from farther away than what was read just now.
+    gaps = speed_mps * closing_mps
+    gaps /= driver._braking_mps2
+    gaps += speed_mps * driver.headway_s
+    np.maximum(gaps, 0.0, out=gaps)
+    gaps += driver.standstill_gap_m
+    gaps /= np.maximum(gap_m, SMALLEST_GAP_M)
+    return gaps
 
 
 def acceleration_in(driver: Driver, speed_mps: Numbers, tightness: Numbers) -> Numbers:
     """Acceleration of N drivers; of several things ahead the one with the largest tightness counts."""
-    free_road = (speed_mps / driver.desired_speed_mps) ** FREE_ROAD_EXPONENT
-    wanted: Numbers = driver.acceleration_mps2 * (1.0 - free_road - tightness**2)
-    return np.maximum(wanted, -HARDEST_BRAKING_MPS2)
+    wanted = speed_mps / driver.desired_speed_mps
+    wanted **= FREE_ROAD_EXPONENT
+    np.subtract(1.0, wanted, out=wanted)
+    wanted -= tightness**2
+    wanted *= driver.acceleration_mps2
+    return np.maximum(wanted, -HARDEST_BRAKING_MPS2, out=wanted)
 
 
 def equilibrium_gap_m(driver: Driver, speed_mps: Quantity) -> Quantity:
@@ -100,11 +107,14 @@ def advance(speed_mps: Numbers, acceleration_mps2: Numbers, room_m: Numbers, ste
     Returns:
         (N,) ways in metres and (N,) new speeds.
     """
-    end_speed = speed_mps + acceleration_mps2 * step_s
+    end_speed = acceleration_mps2 * step_s
+    end_speed += speed_mps
     stops = np.flatnonzero(end_speed < 0.0)
     end_speed[stops] = 0.0
-    way = (speed_mps + end_speed) / 2 * step_s
+    way = speed_mps + end_speed
+    way /= 2
+    way *= step_s
     way[stops] = speed_mps[stops] ** 2 / (-2 * acceleration_mps2[stops])
     room = np.maximum(room_m, 0.0)
     end_speed[way > room] = 0.0
-    return np.minimum(way, room), end_speed
+    return np.minimum(way, room, out=way), end_speed
