@@ -115,6 +115,7 @@ class Fleet:
         """
         mix = {kind: weight for kind, (weight, _) in drivers.items()}
         agents: list[Agent] = []
+        others = [other for other in keep_free if other.lane == lane]
         rear = span_m[0]
         while per_km > 0:
             kind = self.draw_kind(mix)
@@ -124,7 +125,7 @@ class Fleet:
             if rear + length > span_m[1]:
                 break
             agent = self.agent(kind, lane, rear + length / 2, driver)
-            if not _in_the_way(agent, lanes[lane], gap, keep_free):
+            if not _in_the_way(agent, lanes[lane], gap, others):
                 agents.append(agent)
             rear += length
         return agents
@@ -160,7 +161,5 @@ def _in_the_way(agent: Agent, lane: Lane, gap_m: float, others: Sequence[Agent])
     if gate < len(lane.gates) and front > lane.gates[gate].enter_m - gap_m:
         return True
     return any(
-        abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m
-        for other in others
-        if other.lane == agent.lane
+        abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m for other in others
     )

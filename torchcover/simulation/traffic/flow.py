@@ -136,7 +136,7 @@ class Simulation:
         wanted = acceleration_in(driver, speed_mps, tight)
         way, self.speed_mps = advance(speed_mps, wanted, np.minimum(gap_m, line_m), step_s)
         self.place_m += way
-        passed = np.flatnonzero(self.place_m - self._half_m > self._exit_m)
+        (passed,) = (self.place_m - self._half_m > self._exit_m).nonzero()
         if len(passed):
             self._face(passed, self._gate[passed] + 1)
         self._look()

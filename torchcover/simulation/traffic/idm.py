@@ -109,7 +109,7 @@ def advance(speed_mps: Numbers, acceleration_mps2: Numbers, room_m: Numbers, ste
     """
     end_speed = acceleration_mps2 * step_s
     end_speed += speed_mps
-    stops = np.flatnonzero(end_speed < 0.0)
+    (stops,) = (end_speed < 0.0).nonzero()
     end_speed[stops] = 0.0
     way = speed_mps + end_speed
     way /= 2
