@@ -60,9 +60,7 @@ class Scene:
         self._world_T_local = world.ego.trajectory.at(0.0)
         local_T_world = invert(self._world_T_local)
         self._local_T_resting = [local_T_world @ actor.trajectory.at(0.0) for actor in self._resting]
-        resting = [
-            actor.mesh.moved(pose) for actor, pose in zip(self._resting, self._local_T_resting, strict=True)
-        ]
+        resting = [actor.mesh.moved(pose) for actor, pose in zip(self._resting, self._local_T_resting, strict=True)]
         scenery = self._scenery()
         self._static = RayCaster(resting + scenery)
         self._faces = sum(len(mesh.faces) for mesh in resting + scenery)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch.utils.data import get_worker_info
 
 from torchcover.simulation.instant import Instant
+from torchcover.simulation.memory import machine_bytes
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.rig import Rig
@@ -21,8 +22,10 @@ from torchcover.simulation.solids import Solids
 
 # A sensor on the ground is asked about a place this far above it: whether it is inside of something else.
 LIFT_M = np.array([0.0, 0.0, 0.01])
-# Of all stages that are kept, in all workers of a DataLoader together; one stage is kept anyway, however large.
-KEPT_BYTES = 256e6
+# What all stages that are kept may take: in a process, four cities of a minute or more of anything smaller; and of the
+# machine's memory in all workers of a DataLoader together. One stage is kept anyway, however large.
+KEPT_BYTES = 160e6
+KEPT_SHARE = 1 / 16
 
 
 @dataclass(eq=False)
@@ -105,7 +108,7 @@ class Stages:
     def _make_room(self) -> None:
         """Before a stage is built, about as large as the others: there is not always memory for one more."""
         workers = get_worker_info()
-        most_bytes = KEPT_BYTES / (workers.num_workers if workers else 1)
+        most_bytes = min(KEPT_BYTES, KEPT_SHARE * machine_bytes() / (workers.num_workers if workers else 1))
         sizes = [stage.scene.bytes for stage in self._kept.values()]
         while sizes and sum(sizes) + max(sizes) > most_bytes:
             del self._kept[next(iter(self._kept))], sizes[0]

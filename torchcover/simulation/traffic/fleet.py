@@ -160,6 +160,4 @@ def _in_the_way(agent: Agent, lane: Lane, gap_m: float, others: Sequence[Agent])
     gate = bisect_right(lane.gates, rear, key=lambda gate: gate.exit_m)
     if gate < len(lane.gates) and front > lane.gates[gate].enter_m - gap_m:
         return True
-    return any(
-        abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m for other in others
-    )
+    return any(abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m for other in others)

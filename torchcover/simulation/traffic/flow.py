@@ -77,17 +77,17 @@ class Simulation:
     """
 
     def __init__(self, lanes: Sequence[Lane], agents: Sequence[Agent], signals: Signals) -> None:
-        self.place_m = np.array([agent.place_m for agent in agents])
-        length = np.array([agent.length_m for agent in agents])
+        self.place_m = np.array([agent.place_m for agent in agents], dtype=np.float64)
+        length = np.array([agent.length_m for agent in agents], dtype=np.float64)
         lane = np.array([agent.lane for agent in agents])
         self._driver = Driver(
-            *(np.array([getattr(a.driver, name) for a in agents]) for name in Driver.__dataclass_fields__)
+            *(np.array([getattr(a.driver, name) for a in agents], np.float64) for name in Driver.__dataclass_fields__)
         )
         self._leader, self._lap = _leaders(lanes, lane, self.place_m)
         self._half_m, self._leaders_half_m = length / 2, length[self._leader] / 2
         self._between_middles_m = (length + length[self._leader]) / 2
         # Whoever stops behind a junction needs so much room there.
-        self._room_m = length, self._driver.standstill_gap_m
+        self._room_m = length, np.asarray(self._driver.standstill_gap_m)
         self._queue_mps = QUEUE_SPEED * self._driver.desired_speed_mps
         self._signals = signals
         self._gates = Gates.from_lanes([lane.gates for lane in lanes])
@@ -188,7 +188,9 @@ class Simulation:
 
     def _first_speed(self) -> Numbers:
         """(N,) fast, but slow enough to stop at the next line, and for the gap to the one ahead."""
-        stoppable = np.sqrt(self._driver.deceleration_mps2 * np.maximum(self._enter_m - self.place_m - self._half_m, 0.0))
+        stoppable = np.sqrt(
+            self._driver.deceleration_mps2 * np.maximum(self._enter_m - self.place_m - self._half_m, 0.0)
+        )
         to_leader = np.maximum(self._gap_m(self._leader_m()) - self._driver.standstill_gap_m, 0.0)
         bearable = to_leader / self._driver.headway_s
         return np.asarray(np.minimum(0.95 * self._driver.desired_speed_mps, np.minimum(stoppable, bearable)))

@@ -36,7 +36,7 @@ class Signals:
         return sum(self.green_s) + 2 * (self.amber_s + self.clear_s)
 
     def green_left_s(self, time_s: ArrayLike) -> NDArray[np.float64]:
-        """(..., J, 2) seconds of green left to the main and to the cross phase at (...) times; negative without green."""
+        """(..., J, 2) seconds of green left to the main and the cross phase at (...) times; negative without green."""
         now = np.mod(np.asarray(time_s)[..., None] + self.offset_s, self.cycle_s)
         cross_start = self.green_s[MAIN] + self.amber_s + self.clear_s
         left = np.empty((*now.shape, 2))
