@@ -158,8 +158,6 @@ def twin(lanes, agents, lights, times_s):
             )
             wanted, room = np.minimum(behind, before), np.array([min(gap, line)])
             way, end = advance(np.array([speed[n]]), wanted, room, after - time)
-                np.array([speed[n]]), np.minimum(behind, before), np.array([min(gap, line)]), after - time
-            )
             moved.append((place[n] + float(way[0]), float(end[0])))
         place, speed = map(list, zip(*moved, strict=True))
         found.append(place)
