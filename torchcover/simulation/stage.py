@@ -1,6 +1,5 @@
 """Where a run through a scenario plays: its geometry, and the rigs' sensors in it."""
 
-import copy
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -142,6 +141,4 @@ class Stages:
                     )
 
     def __getstate__(self) -> dict[str, Any]:
-        bare = copy.copy(self)
-        bare._forget()
-        return bare.__dict__
+        return Stages(self._scenario, self._rigs, self._seed).__dict__
