@@ -45,8 +45,8 @@ class Trajectory:
                 "a trajectory needs K >= 1 times, (K, 3) positions and (K, 3) angles; got "
                 f"{self.times_s.shape}, {self.positions_m.shape} and {self.angles_deg.shape}"
             )
-        numbers = np.column_stack([self.times_s, self.positions_m, self.angles_deg])
-        if not np.isfinite(numbers).all():
+        if not all(np.isfinite(numbers).all() for numbers in (self.times_s, self.positions_m, self.angles_deg)):
+            numbers = np.column_stack([self.times_s, self.positions_m, self.angles_deg])
             bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
             raise ValueError(f"a trajectory has NaN or infinite numbers in {len(bad)} of {count} poses, first {bad[0]}")
         steps = np.diff(self.times_s)
@@ -76,7 +76,19 @@ class Trajectory:
     @property
     def moves(self) -> bool:
         """Whether the body ever changes its pose, enters or leaves."""
-        return self.transient or bool(np.ptp(self.positions_m, axis=0).any() or np.ptp(self.angles_deg, axis=0).any())
+        if self.transient or len(self.times_s) == 1:
+            return self.transient
+        # Most of those that move end elsewhere.
+        return any((poses[at] != poses[0]).any() for at in (slice(-1, None), slice(None)) for poses in self._poses)
+
+    @property
+    def _poses(self) -> tuple[Matrix, Matrix]:
+        return self.positions_m, self.angles_deg
+
+    @property
+    def bytes(self) -> int:
+        """How much memory its poses take."""
+        return self.positions_m.nbytes + self.angles_deg.nbytes
 
     def at(self, time_s: float) -> Matrix:
         """The (4, 4) pose `world_T_body` at a time."""
@@ -85,6 +97,8 @@ class Trajectory:
 
     def positions_at(self, times_s: Matrix) -> Matrix:
         """(T, 3) positions at (T,) times; NaN where the body is not there."""
+        if np.array_equal(times_s, self.times_s[: len(times_s)]):
+            return self.positions_m[: len(times_s)]
         outside = np.nan if self.transient else None
         tracks = [np.interp(times_s, self.times_s, axis, outside, outside) for axis in self.positions_m.T]
         return np.stack(tracks, axis=1)
