@@ -127,7 +127,7 @@ def test_indices_count_from_both_ends_and_stop_there(tmp_path):
 def test_missing_folders_and_empty_ones(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"gone: no such recording"):
         RecordedFrames(tmp_path / "gone")
-    with pytest.raises(ValueError, match=r"of no known format; known are folder: sensor/FRAME"):
+    with pytest.raises(ValueError, match=r"of no known format; known are .*folder: sensor/FRAME"):
         RecordedFrames(tmp_path)
     (tmp_path / "sensor").mkdir()
     with pytest.raises(FileNotFoundError, match=r"reference: no such folder"):
