@@ -11,7 +11,7 @@ from torchcover.simulation.instant import Instant
 from torchcover.simulation.rays import BLOCK, Tile, into_tiles
 
 # Rays in a tile: of neighbours all, so that a tile is narrow. A constant, so that nothing depends on threads.
-TILE_RAYS = 4096
+TILE_RAYS = 8192
 # A ray ends before its target by this share of its length, which float32 leaves open.
 SHORTER = 1e-6
 
