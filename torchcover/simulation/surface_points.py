@@ -74,10 +74,7 @@ class SurfaceStrata:
         self._normals = normals / np.maximum(twice_m2, np.finfo(np.float32).tiny)
         self._plane_m = (self._normals * patches.corner_m).sum(axis=0)
         lower_m, upper_m = patches.lower_m - np.float32(SLACK_M), patches.upper_m + np.float32(SLACK_M)
-        self._strata = [
-            _stratum(twice_m2 / 2, lower_m, upper_m, low.tolist(), high.tolist())
-            for low, high in zip(*boxes, strict=True)
-        ]
+        self._strata = _strata(twice_m2 / 2, lower_m, upper_m, boxes)
         self._objects = _objects(patches.of_object, twice_m2 / 2)
 
     def draw(
@@ -131,22 +128,32 @@ def _inside(points_m: Float32, low: Float64, high: Float64) -> Bools:
     return inside
 
 
-def _stratum(m2: Float32, lower_m: Float32, upper_m: Float32, low: list[float], high: list[float]) -> Stratum:
-    meets = np.ones(lower_m.shape[1], dtype=bool)
-    for axis in range(3):
-        meets &= upper_m[axis] >= low[axis]
-        meets &= lower_m[axis] <= high[axis]
-    patch = np.flatnonzero(meets)
-    inside_m2 = m2[patch]
-    for axis in range(3):
-        from_m, to_m = lower_m[axis, patch], upper_m[axis, patch]
-        inside_m2 *= (np.minimum(to_m, high[axis]) - np.maximum(from_m, low[axis])) / (to_m - from_m)
-    return Stratum(patch, m2[patch].astype(np.float64), inside_m2.astype(np.float64))
+def _strata(m2: Float32, lower_m: Float32, upper_m: Float32, boxes: Bounds) -> list[Stratum]:
+    areas: dict[bytes, Stratum] = {}  # height bands of one area: what lies above and below it is asked once
+    strata = []
+    for low, high in zip(*boxes, strict=True):
+        area = low[:2].tobytes() + high[:2].tobytes()
+        if area not in areas:
+            whole = Stratum(np.arange(len(m2)), m2, m2)
+            areas[area] = _within(_within(whole, lower_m[0], upper_m[0], low[0], high[0]), lower_m[1], upper_m[1], low[1], high[1])
+        patch, of_patch_m2, inside_m2 = _within(areas[area], lower_m[2], upper_m[2], low[2], high[2])
+        strata.append(Stratum(patch, of_patch_m2.astype(np.float64), inside_m2.astype(np.float64)))
+    return strata
+
+
+def _within(stratum: Stratum, lower_m: Float32, upper_m: Float32, low: float, high: float) -> Stratum:
+    """What of a stratum lies between two bounds on one axis, from the bounds of all patches on it."""
+    low, high = float(low), float(high)
+    from_m, to_m = lower_m.take(stratum.patch), upper_m.take(stratum.patch)
+    meets = np.flatnonzero((to_m >= low) & (from_m <= high))
+    from_m, to_m = from_m.take(meets), to_m.take(meets)
+    share = (np.minimum(to_m, high) - np.maximum(from_m, low)) / (to_m - from_m)
+    return Stratum(stratum.patch.take(meets), stratum.m2.take(meets), stratum.inside_m2.take(meets) * share)
 
 
 def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Generator) -> tuple[Numbers, float]:
     """Patches, drawn by their area so that about `each` points lie in the stratum, and points per square metre."""
-    seen = front[stratum.patch]
+    seen = front.take(stratum.patch)
     up_to_m2 = np.cumsum(stratum.m2 * seen)
     whole_m2 = float(up_to_m2[-1]) if len(up_to_m2) else 0.0
     if whole_m2 == 0:
