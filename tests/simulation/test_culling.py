@@ -28,10 +28,11 @@ def at_every_body(instant, vehicle_T_sensor, tiles, max_range_m):
         directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
         limit_m = np.full(directions.shape[1], max_range_m, dtype=np.float32)
         hits = cast_from(instant.static, instant.static_T_vehicle, origin_m, directions, limit_m)
-        for part in instant.moving:
-            nearer = cast_from(part.caster, part.part_T_vehicle, origin_m, directions, hits.range_m)
+        moving = instant.moving
+        for caster, part_T_vehicle, body in zip(moving.casters, moving.part_T_vehicle, moving.body, strict=True):
+            nearer = cast_from(caster, part_T_vehicle, origin_m, directions, hits.range_m)
             hits.range_m[:] = nearer.range_m
-            hits.body[nearer.body >= 0] = part.body
+            hits.body[nearer.body >= 0] = body
         seen = (hits.body >= 0) & (hits.body != instant.ego)
         points = (directions * hits.range_m + origin_m.astype(np.float32)[:, None])[:, seen]
         answers.append((points.T, np.count_nonzero(hits.body == instant.ego)))
@@ -105,8 +106,9 @@ def test_no_ray_that_meets_a_box_is_left_out():
         assert k in boxes_in_cone(seen, turned @ tile.axis, tile.half_angle, float(ends_m.max()))
         blocks = blocks_towards(seen.kept(np.array([k])), tile, turned, ends_m)
         assert blocks.all()
-        rays = tile.blocks[blocks[0]].ravel()
-        kept = rays_towards(seen, k, rays, directions.astype(np.float32), ends_m)
+        rays = tile.blocks[blocks[0]]
+        box, kept = rays_towards(seen, np.full(len(rays), k), rays, directions.astype(np.float32), ends_m)
+        assert (box == k).all()
         np.testing.assert_array_equal(np.unique(kept), np.arange(100))
         close += bool((seen.normals[k] == 0).all())
     assert 3 < close < 150
@@ -118,15 +120,15 @@ def test_rays_that_miss_a_box_by_far_or_end_before_it_are_left_out():
     (tile,) = into_tiles(unit_directions(np.linspace(-40, 40, 81)[:, None], np.linspace(-90, 90, 181)[None]),
                          tile_columns=181)  # fmt: skip
     forever, short = (np.full(tile.directions.shape[1], metres, np.float32) for metres in (np.inf, 9.9))
-    every = np.arange(tile.directions.shape[1])
+    every, box = np.arange(tile.directions.shape[1])[None], np.zeros(1, dtype=np.int64)
     x, y, z = tile.directions
     with np.errstate(divide="ignore"):
         meets = (np.abs(y / x) < 0.1) & (z / x < 0.15) & (z >= 0)
-    kept = rays_towards(seen, 0, every, tile.directions, forever)
+    _, kept = rays_towards(seen, box, every, tile.directions, forever)
     assert set(np.flatnonzero(meets)) <= set(kept)
     assert len(kept) <= 1.5 * meets.sum() + 20
     assert blocks_towards(seen, tile, np.eye(3), forever).mean() < 0.1
-    assert len(rays_towards(seen, 0, every, tile.directions, short)) == 0
+    assert len(rays_towards(seen, box, every, tile.directions, short)[1]) == 0
     assert not blocks_towards(seen, tile, np.eye(3), short).any()
     assert len(boxes_in_cone(seen, np.array([0.0, 1.0, 0.0]), 0.3, np.inf)) == 0
     assert len(boxes_in_cone(seen, np.array([1.0, 0.0, 0.0]), 0.3, 9.0)) == 0

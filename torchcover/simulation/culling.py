@@ -109,9 +109,11 @@ def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, ra
         range_m: (n,) where each of the tile's rays ends.
     """
     ends_m = range_m.take(tile.blocks).max(axis=1)
-    normals = outlines.normals @ vehicle_R_sensor
+    normals = (outlines.normals @ vehicle_R_sensor).reshape(-1, 3)
     # No direction between the lower and the upper bounds of a block has a smaller product with a normal.
-    least = np.maximum(normals, 0.0) @ tile.block_lower + np.minimum(normals, 0.0) @ tile.block_upper
+    bounds = np.vstack([tile.block_lower, tile.block_upper]).astype(np.float32)
+    towards = np.hstack([np.maximum(normals, 0.0), np.minimum(normals, 0.0)]).astype(np.float32)
+    least = (towards @ bounds).reshape(-1, 4, bounds.shape[1])
     reached: NDArray[np.bool_] = (least.max(axis=1) <= ROUNDING) & (outlines.nearest_m[:, None] <= ends_m)
     return reached
 

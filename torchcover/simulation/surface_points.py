@@ -129,26 +129,30 @@ def _inside(points_m: Float32, low: Float64, high: Float64) -> Bools:
 
 
 def _strata(m2: Float32, lower_m: Float32, upper_m: Float32, boxes: Bounds) -> list[Stratum]:
-    areas: dict[bytes, Stratum] = {}  # height bands of one area: what lies above and below it is asked once
+    above: dict[bytes, Stratum] = {}  # what lies in an area, whatever its height: several bands ask about it
     strata = []
     for low, high in zip(*boxes, strict=True):
-        area = low[:2].tobytes() + high[:2].tobytes()
-        if area not in areas:
-            whole = Stratum(np.arange(len(m2)), m2, m2)
-            areas[area] = _within(_within(whole, lower_m[0], upper_m[0], low[0], high[0]), lower_m[1], upper_m[1], low[1], high[1])
-        patch, of_patch_m2, inside_m2 = _within(areas[area], lower_m[2], upper_m[2], low[2], high[2])
-        strata.append(Stratum(patch, of_patch_m2.astype(np.float64), inside_m2.astype(np.float64)))
+        area = np.stack([low[:2], high[:2]]).tobytes()
+        if area not in above:
+            (x_low, y_low, _), (x_high, y_high, _) = low.tolist(), high.tolist()
+            meets = (upper_m[0] >= x_low) & (lower_m[0] <= x_high) & (upper_m[1] >= y_low) & (lower_m[1] <= y_high)
+            patch = np.flatnonzero(meets)
+            inside_m2 = m2.take(patch)
+            inside_m2 = inside_m2 * _share(lower_m[0].take(patch), upper_m[0].take(patch), x_low, x_high)
+            inside_m2 *= _share(lower_m[1].take(patch), upper_m[1].take(patch), y_low, y_high)
+            above[area] = Stratum(patch, m2.take(patch).astype(np.float64), inside_m2)
+        column, z_low, z_high = above[area], float(low[2]), float(high[2])
+        from_m, to_m = lower_m[2].take(column.patch), upper_m[2].take(column.patch)
+        meets = np.flatnonzero((to_m >= z_low) & (from_m <= z_high))
+        inside_m2 = column.inside_m2.take(meets) * _share(from_m.take(meets), to_m.take(meets), z_low, z_high)
+        strata.append(Stratum(column.patch.take(meets), column.m2.take(meets), inside_m2.astype(np.float64)))
     return strata
 
 
-def _within(stratum: Stratum, lower_m: Float32, upper_m: Float32, low: float, high: float) -> Stratum:
-    """What of a stratum lies between two bounds on one axis, from the bounds of all patches on it."""
-    low, high = float(low), float(high)
-    from_m, to_m = lower_m.take(stratum.patch), upper_m.take(stratum.patch)
-    meets = np.flatnonzero((to_m >= low) & (from_m <= high))
-    from_m, to_m = from_m.take(meets), to_m.take(meets)
-    share = (np.minimum(to_m, high) - np.maximum(from_m, low)) / (to_m - from_m)
-    return Stratum(stratum.patch.take(meets), stratum.m2.take(meets), stratum.inside_m2.take(meets) * share)
+def _share(from_m: Float32, to_m: Float32, low: float, high: float) -> Float32:
+    """Which share of each stretch lies between two bounds, of those that meet them."""
+    share: Float32 = (np.minimum(to_m, high) - np.maximum(from_m, low)) / (to_m - from_m)
+    return share
 
 
 def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Generator) -> tuple[Numbers, float]:
