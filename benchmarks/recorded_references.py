@@ -92,9 +92,9 @@ def scanned(lidar, instant, pose, generator):
     points_m = mount[:3, 3] + way_m
     on_moving = np.zeros(len(points_m), dtype=bool)
     moving = instant.moving
-    for part_T_vehicle, body, corners_m in zip(moving.part_T_vehicle, moving.body, moving.corners_m, strict=True):
+    for part_T_vehicle, body, box_m in zip(moving.part_T_vehicle, moving.body, moving.corners_m, strict=True):
         if body != instant.ego:
-            corners_m = transform(part_T_vehicle, corners_m)
+            corners_m = transform(part_T_vehicle, box_m)
             low, high = corners_m.min(axis=0) - BODY_SLACK_M, corners_m.max(axis=0) + BODY_SLACK_M
             own_m = transform(part_T_vehicle, points_m)
             on_moving |= ((own_m >= low) & (own_m <= high)).all(axis=1)

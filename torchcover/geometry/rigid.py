@@ -52,7 +52,7 @@ def rotation_from_euler(yaw_deg: ArrayLike, pitch_deg: ArrayLike, roll_deg: Arra
         >>> rotation_from_euler(90.0, 0.0, 0.0).round(6) @ [1.0, 0.0, 0.0]
         array([0., 1., 0.])
     """
-    yaw, pitch, roll = np.deg2rad([yaw_deg, pitch_deg, roll_deg])
+    yaw, pitch, roll = np.deg2rad(np.array([yaw_deg, pitch_deg, roll_deg]))
     (cy, cp, cr), (sy, sp, sr) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
     rotation = np.array(
         [

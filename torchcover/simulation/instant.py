@@ -198,7 +198,10 @@ class Instant:
         bodies: Outlines,
         ego_is_known: bool,
     ) -> int:
-        """Cast the rays of one tile at what moves, each at the bodies that it may meet before it ends."""
+        """Cast the rays of one tile at what moves, each at the bodies that it may meet before it ends; how many pairs.
+
+        The hits are brought up to date.
+        """
         farthest_m = float(hits.range_m.max(initial=0.0))
         near = boxes_in_cone(bodies, vehicle_R_sensor @ tile.axis, tile.half_angle, farthest_m)
         if ego_is_known:
@@ -272,12 +275,11 @@ def rotate(rotation: Matrix, directions: Float32) -> Float32:
     """Turn (3, n) directions. What becomes of one does not depend on the others."""
     if np.array_equal(rotation, np.eye(3)):
         return directions
-    # No matrix product: BLAS rounds a single column differently, and wakes threads of its own for many.
-    rotated: Float32 = np.einsum("ij,jn->in", rotation.astype(np.float32), directions)
-    return rotated
+    return rotate_each(rotation.astype(np.float32)[None], directions)
 
 
 def rotate_each(rotations: NDArray[AnyFloat], directions: NDArray[AnyFloat]) -> NDArray[AnyFloat]:
     """Turn each of (3, n) directions by its own of (n, 3, 3) rotations, to the bits of `rotate`."""
+    # No matrix product: BLAS rounds a single column differently, and wakes threads of its own for many.
     (x, y, z), rows = directions, rotations.swapaxes(0, 1)
     return np.stack([row[:, 0] * x + row[:, 1] * y + row[:, 2] * z for row in rows])

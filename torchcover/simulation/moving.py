@@ -52,7 +52,7 @@ class Moving:
 
     def touched_by(self, place_m: Float64, places_m: Float64) -> NDArray[np.bool_]:
         """(P,) whether a (3,) place of the vehicle frame, `places_m` (P, 3) from there, lies on a face of each body."""
-        touched = np.linalg.norm(self.centre_m - place_m, axis=1) <= self.radius_m + SLACK_M
+        touched: NDArray[np.bool_] = np.linalg.norm(self.centre_m - place_m, axis=1) <= self.radius_m + SLACK_M
         for k in np.flatnonzero(touched).tolist():
             touched[k] = len(self.casters[k].touched(places_m[k])) > 0
         return touched

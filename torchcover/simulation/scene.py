@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox, euler_from_rotation, invert, overlap, rotation_from_euler, transform
+from torchcover.geometry import BoundingBox, euler_from_rotation, invert, overlap, rotation_from_euler
 from torchcover.simulation.culling import SLACK_M, SLACK_SHARE
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant, rotate
 from torchcover.simulation.memory import check_fits

@@ -129,7 +129,8 @@ def _inside(points_m: Float32, low: Float64, high: Float64) -> Bools:
 
 
 def _strata(m2: Float32, lower_m: Float32, upper_m: Float32, boxes: Bounds) -> list[Stratum]:
-    above: dict[bytes, Stratum] = {}  # what lies in an area, whatever its height: several bands ask about it
+    # What lies in an area, whatever its height, and how much of it: several bands ask about it.
+    above: dict[bytes, tuple[Numbers, Float32, Float32]] = {}
     strata = []
     for low, high in zip(*boxes, strict=True):
         area = np.stack([low[:2], high[:2]]).tobytes()
@@ -137,15 +138,15 @@ def _strata(m2: Float32, lower_m: Float32, upper_m: Float32, boxes: Bounds) -> l
             (x_low, y_low, _), (x_high, y_high, _) = low.tolist(), high.tolist()
             meets = (upper_m[0] >= x_low) & (lower_m[0] <= x_high) & (upper_m[1] >= y_low) & (lower_m[1] <= y_high)
             patch = np.flatnonzero(meets)
-            inside_m2 = m2.take(patch)
-            inside_m2 = inside_m2 * _share(lower_m[0].take(patch), upper_m[0].take(patch), x_low, x_high)
+            inside_m2 = m2.take(patch) * _share(lower_m[0].take(patch), upper_m[0].take(patch), x_low, x_high)
             inside_m2 *= _share(lower_m[1].take(patch), upper_m[1].take(patch), y_low, y_high)
-            above[area] = Stratum(patch, m2.take(patch).astype(np.float64), inside_m2)
-        column, z_low, z_high = above[area], float(low[2]), float(high[2])
-        from_m, to_m = lower_m[2].take(column.patch), upper_m[2].take(column.patch)
-        meets = np.flatnonzero((to_m >= z_low) & (from_m <= z_high))
-        inside_m2 = column.inside_m2.take(meets) * _share(from_m.take(meets), to_m.take(meets), z_low, z_high)
-        strata.append(Stratum(column.patch.take(meets), column.m2.take(meets), inside_m2.astype(np.float64)))
+            above[area] = patch, m2.take(patch), inside_m2
+        patch, whole_m2, inside_m2 = above[area]
+        from_m, to_m, z_low, z_high = lower_m[2].take(patch), upper_m[2].take(patch), float(low[2]), float(high[2])
+        in_band = np.flatnonzero((to_m >= z_low) & (from_m <= z_high))
+        inside_m2 = inside_m2.take(in_band) * _share(from_m.take(in_band), to_m.take(in_band), z_low, z_high)
+        stratum = Stratum(patch.take(in_band), whole_m2.take(in_band).astype(np.float64), inside_m2.astype(np.float64))
+        strata.append(stratum)
     return strata
 
 

@@ -115,7 +115,7 @@ def poses_at(trajectories: Sequence[Trajectory], time_s: float) -> Matrix:
     ends, shares = [], []
     for each in trajectories:
         before, after, share = moments[id(each.times_s)]
-        ends.append((each.positions_m[before], each.positions_m[after], each.angles_deg[before], each.angles_deg[after]))
+        ends += [each.positions_m[before], each.positions_m[after], each.angles_deg[before], each.angles_deg[after]]
         shares.append(share)
     from_m, to_m, from_deg, to_deg = np.array(ends).reshape(-1, 4, 3).swapaxes(0, 1)
     return _between(from_m, to_m, from_deg, to_deg, np.array(shares)[:, None])
