@@ -5,15 +5,17 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox, euler_from_rotation, invert, overlap, rotation_from_euler, transform
-from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant, Part, rotate
+from torchcover.geometry import BoundingBox, euler_from_rotation, invert, overlap, rotation_from_euler
+from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant, rotate
 from torchcover.simulation.memory import check_fits
+from torchcover.simulation.moving import Moving
 from torchcover.simulation.patches import Bounds
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import Tile
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.solids import Solids
 from torchcover.simulation.surface import Surface, bounds_along
+from torchcover.simulation.trajectory import poses_at
 from torchcover.simulation.world import Actor, World
 
 Matrix = NDArray[np.float64]
@@ -117,10 +119,7 @@ class Scene:
         distance_m = self._distance_m(step, world_T_vehicle)
         self._check_overlap(time_s, vehicle_T_world, distance_m)
         resting, first = len(self._resting), self._first_moving
-        moving = tuple(
-            self._place(first + k, self._moving[k], vehicle_T_world, time_s)
-            for k in np.flatnonzero(distance_m[resting:] < within_m).tolist()
-        )
+        moving = self._placed(np.flatnonzero(distance_m[resting:] < within_m), vehicle_T_world, time_s)
         # Either list of bodies begins with the ego.
         if self.world.ego.trajectory.moves:
             static_T_vehicle, ego = invert(self._world_T_local) @ world_T_vehicle, first
@@ -218,13 +217,23 @@ class Scene:
                     "change one of the trajectories"
                 )
 
-    def _place(self, body: int, actor: Actor, vehicle_T_world: Matrix, time_s: float) -> Part:
+    def _placed(self, numbers: NDArray[np.intp], vehicle_T_world: Matrix, time_s: float) -> Moving:
+        """Some of the bodies that move, at a time."""
+        actors = [self._moving[k] for k in numbers.tolist()]
+        solids = [self._solids.of(actor.mesh) for actor in actors]
+        vehicle_T_part = vehicle_T_world @ poses_at([actor.trajectory for actor in actors], time_s)
         # The ego is where it is, to the last bit: what a sensor sees of it is the same at every step.
-        ego = actor is self.world.ego
-        vehicle_T_actor = np.eye(4) if ego else vehicle_T_world @ actor.trajectory.at(time_s)
-        solid = self._solids.of(actor.mesh)
-        *corners_m, centre_m = transform(vehicle_T_actor, solid.outline_m)
-        return Part(solid.caster, invert(vehicle_T_actor), body, np.array(corners_m), centre_m, solid.radius_m)
+        vehicle_T_part[[actor is self.world.ego for actor in actors]] = np.eye(4)
+        outlines_m = np.array([solid.outline_m for solid in solids]).reshape(-1, 9, 3)
+        outlines_m = outlines_m @ vehicle_T_part[:, :3, :3].swapaxes(1, 2) + vehicle_T_part[:, None, :3, 3]
+        return Moving(
+            casters=[solid.caster for solid in solids],
+            vehicle_T_part=vehicle_T_part,
+            body=self._first_moving + numbers,
+            corners_m=outlines_m[:, :8],
+            centre_m=outlines_m[:, 8],
+            radius_m=np.array([solid.radius_m for solid in solids]),
+        )
 
 
 def level_axes(world_T_vehicle: Matrix) -> Matrix:

@@ -1,6 +1,5 @@
 """The surface of a world, cut small once; what is near the vehicle is looked up at every step."""
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import invert, transform
-from torchcover.simulation.instant import Instant
+from torchcover.simulation.instant import Instant, rotate_each
 from torchcover.simulation.patches import Bounds, Patches
 from torchcover.simulation.shapes import Mesh
 
@@ -88,15 +87,30 @@ class Surface:
         objects = np.linalg.norm(np.clip(0.0, lower_m, upper_m), axis=1) <= objects_within_m
         wanted[self._resting[self._objects.members(np.flatnonzero(objects))]] = True
         near = [self._static.taken(np.flatnonzero(wanted)).moved(vehicle_T_static)]
-        bodies = [part for part in instant.moving if part.body != instant.ego]
-        centres_m = np.array([part.centre_m for part in bodies]).reshape(-1, 3)
-        radii_m = np.array([part.radius_m for part in bodies])[:, None]
-        meets = boxes.meet(centres_m - radii_m, centres_m + radii_m)
-        meets |= np.linalg.norm(centres_m, axis=1) - radii_m[:, 0] <= objects_within_m
-        for part in itertools.compress(bodies, meets):
-            patches, number = self._moving[part.body]
-            near.append(patches.moved(invert(part.part_T_vehicle)).given_to(number))
+        moving = instant.moving
+        radii_m = moving.radius_m[:, None]
+        meets = boxes.meet(moving.centre_m - radii_m, moving.centre_m + radii_m)
+        meets |= np.linalg.norm(moving.centre_m, axis=1) - moving.radius_m <= objects_within_m
+        bodies = np.flatnonzero(meets & (moving.body != instant.ego))
+        placed = [self._moving[number] for number in moving.body[bodies].tolist()]
+        near.append(placed_each(placed, moving.vehicle_T_part[bodies]))
         return Patches.joined(near)
+
+
+def placed_each(kinds: Sequence[tuple[Patches, int]], destination_T_source: Float64) -> Patches:
+    """Patches of bodies, with the number of the object that each is, moved to where they are; see `Patches.moved`."""
+    parts = [patches for patches, _ in kinds]
+    count = [len(patches.outward) for patches in parts]
+    pose = destination_T_source.repeat(count, axis=0)
+    rotation, all_parts = pose[:, :3, :3].astype(np.float32), Patches.joined(parts)
+    corner_m = rotate_each(pose[:, :3, :3], all_parts.corner_m.astype(np.float64)) + pose[:, :3, 3].T
+    return Patches(
+        corner_m=corner_m.astype(np.float32),
+        first_m=rotate_each(rotation, all_parts.first_m),
+        second_m=rotate_each(rotation, all_parts.second_m),
+        outward=all_parts.outward,
+        of_object=np.array([number for _, number in kinds], dtype=np.int32).repeat(count),
+    )
 
 
 def bounds_along(static_T_vehicle: Float64, box: Bounds) -> Bounds:

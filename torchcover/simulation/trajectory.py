@@ -1,5 +1,6 @@
 """Where a body is at a time."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -92,8 +93,9 @@ class Trajectory:
 
     def at(self, time_s: float) -> Matrix:
         """The (4, 4) pose `world_T_body` at a time."""
-        position, angles = self._interpolate(time_s)
-        return rigid(rotation_from_euler(*angles), position)
+        before, after, share = _moment(self.times_s, time_s)
+        places_m, angles_deg = self.positions_m, self.angles_deg
+        return _between(places_m[before], places_m[after], angles_deg[before], angles_deg[after], share)
 
     def positions_at(self, times_s: Matrix) -> Matrix:
         """(T, 3) positions at (T,) times; NaN where the body is not there."""
@@ -114,13 +116,35 @@ class Trajectory:
         velocity: Matrix = (way / taken[:, None]).mean(axis=0)
         return velocity
 
-    def _interpolate(self, time_s: float) -> tuple[Matrix, Matrix]:
-        after = int(np.searchsorted(self.times_s, time_s, side="right"))
-        if after == 0 or after == len(self.times_s):
-            at = max(after - 1, 0)
-            return self.positions_m[at], self.angles_deg[at]
-        before = after - 1
-        share = (time_s - self.times_s[before]) / (self.times_s[after] - self.times_s[before])
-        turn = (self.angles_deg[after] - self.angles_deg[before] + 180.0) % 360.0 - 180.0
-        way = self.positions_m[after] - self.positions_m[before]
-        return self.positions_m[before] + share * way, self.angles_deg[before] + share * turn
+
+def poses_at(trajectories: Sequence[Trajectory], time_s: float) -> Matrix:
+    """(P, 4, 4) poses `world_T_body` of P bodies at one time; see `Trajectory.at`.
+
+    Example:
+        >>> poses_at([Trajectory.resting((x, 0.0, 0.0)) for x in (1.0, 2.0)], 0.5)[:, 0, 3]
+        array([1., 2.])
+    """
+    # Bodies of one world share their times: they are looked up once.
+    moments = {id(each.times_s): _moment(each.times_s, time_s) for each in trajectories}
+    ends, shares = [], []
+    for each in trajectories:
+        before, after, share = moments[id(each.times_s)]
+        ends += [each.positions_m[before], each.positions_m[after], each.angles_deg[before], each.angles_deg[after]]
+        shares.append(share)
+    from_m, to_m, from_deg, to_deg = np.array(ends).reshape(-1, 4, 3).swapaxes(0, 1)
+    return _between(from_m, to_m, from_deg, to_deg, np.array(shares)[:, None])
+
+
+def _moment(times_s: Matrix, time_s: float) -> tuple[int, int, float]:
+    """The poses before and after a time, and how far it is from the one to the other; at rest before and after all."""
+    after = int(times_s.searchsorted(time_s, side="right"))
+    if after == 0 or after == len(times_s):
+        return max(after - 1, 0), max(after - 1, 0), 0.0
+    return after - 1, after, float((time_s - times_s[after - 1]) / (times_s[after] - times_s[after - 1]))
+
+
+def _between(from_m: Matrix, to_m: Matrix, from_deg: Matrix, to_deg: Matrix, share: float | Matrix) -> Matrix:
+    """(..., 4, 4) poses at shares of the way from one to the other, of (..., 3) places and angles."""
+    turn_deg = (to_deg - from_deg + 180.0) % 360.0 - 180.0
+    yaw_deg, pitch_deg, roll_deg = (from_deg + share * turn_deg).T
+    return rigid(rotation_from_euler(yaw_deg, pitch_deg, roll_deg), from_m + share * (to_m - from_m))
