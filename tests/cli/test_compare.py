@@ -192,7 +192,7 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
     for command, rigs, message in (
         ("compare", ["near", "middle"], "no clouds of the rig middle; the frames have far, kitti, near"),
         ("evaluate", [], f"{recording} holds the rigs far, kitti, near: say which, or compare them"),
-        ("compare", ["near", "far", "--format", "bag"], "format 'bag': no such format of recordings; there are nuscenes"),
+        ("compare", ["near", "far", "--format", "bag"], "format 'bag': no such format of recordings; there"),
         ("compare", ["near", "far", "--scenario", "urban"], "exclude each other"),
     ):
         code, _, error = torchcover(command, *rigs, *arguments)

@@ -86,7 +86,7 @@ def test_the_format_of_a_recording_is_recognised_or_named(tmp_path):
     folder = folder_of(tmp_path / "recording", ["sensor", "reference"])
     assert isinstance(open_recording(str(folder)), FolderRecording)
     assert isinstance(open_recording(folder, "folder"), FolderRecording)
-    with pytest.raises(ValueError, match="format 'rosbag': no such format of recordings; there are .*folder"):
+    with pytest.raises(ValueError, match=r"format 'rosbag': no such format of recordings; there are .*folder"):
         open_recording(folder, "rosbag")
     with pytest.raises(FileNotFoundError, match="gone: no such recording"):
         open_recording(tmp_path / "gone")
