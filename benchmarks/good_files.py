@@ -6,6 +6,7 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import laspy
 import lzf
 import numpy as np
 import torch
@@ -69,6 +70,13 @@ def ply(encoding, body):
     """A PLY file of 40 points with intensities."""
     columns = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
     return f"ply\nformat {encoding} 1.0\nelement vertex 40\n{columns}end_header\n".encode() + body
+
+
+def las(points, *, compressed):
+    """A survey in LAS or LAZ."""
+    survey = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    survey.x, survey.y, survey.z = points.T
+    return stored(lambda stream: survey.write(stream, do_compress=compressed))
 
 
 def png(pixels):
@@ -169,6 +177,8 @@ def kinds(folder):
         "binary.ply": ply("binary_little_endian", cloud.tobytes()),
         "c.csv": b"x,y,z,intensity\n" + rows(cloud, ","),
         "c.xyz": b"# x y z intensity\n" + rows(cloud, " "),
+        "c.las": las(xyz, compressed=False),
+        "c.laz": las(xyz, compressed=True),
     }
 
     def depth(path):

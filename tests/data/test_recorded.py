@@ -155,10 +155,10 @@ def test_two_files_of_one_name_and_files_that_are_no_clouds(tmp_path):
     with pytest.raises(ValueError, match=r"sensor: two files for the frame a: a\.npy and a\.xyz"):
         RecordedFrames(tmp_path)
     (tmp_path / "sensor" / "a.xyz").unlink()
-    (tmp_path / "reference" / "b.las").write_bytes(b"LASF")
-    with pytest.raises(ValueError, match=r"b\.las: not a cloud; allowed are files ending in \.npy, "):
+    (tmp_path / "reference" / "b.e57").write_bytes(b"ASTM-E57")
+    with pytest.raises(ValueError, match=r"b\.e57: not a cloud; allowed are files ending in \.npy, "):
         RecordedFrames(tmp_path)
-    (tmp_path / "reference" / "b.las").unlink()
+    (tmp_path / "reference" / "b.e57").unlink()
     (tmp_path / "reference" / "b.npy").mkdir()
     with pytest.raises(ValueError, match=r"b\.npy: not a cloud"):
         RecordedFrames(tmp_path)
