@@ -15,7 +15,8 @@ from PIL import Image
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
-from torchcover.data.recordings.folder_settings import read_poses
+from torchcover.data.recordings.folder_settings import read_folder_settings
+from torchcover.data.recordings.folder_tables import PoseTable, read_boxes
 
 
 @dataclass(frozen=True)
@@ -137,8 +138,18 @@ Tr_velo_to_cam: 0 -1 0 0.01 0 0 -1 -0.07 1 0 0 -0.27
 """
 POSES = b"""sensor:
   vehicle_T_sensor: [[1, 0, 0, -0.52], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]]
+vehicle: {lower_m: [-2.4, -0.9, 0.05], upper_m: [2.4, 0.9, 1.6]}
+reference: {weight_kind: m2}
 rigs:
-  roof: {vehicle_T_sensor: [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 2.0], [0, 0, 0, 1]]}
+  roof: {flip_y: true, min_range_m: 0.5, vehicle_T_sensor: [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 2.0], [0, 0, 0, 1]]}
+"""
+DRIVEN = b"""frame,time_s,x_m,y_m,z_m,qw,qx,qy,qz
+f1,0.0,513248.1,5403655.2,260.1,1,0,0,0
+f2,0.1,513249.1,5403655.3,260.1,0.6,0,0,0.8
+"""
+BOXES = b"""x_m,y_m,z_m,length_m,width_m,height_m,yaw_rad,id,category
+10.5,-2.0,0.75,4.5,1.8,1.5,0.1,a,car
+-7.5,3.0,0.9,0.6,0.6,1.8,-3.1,,pedestrian
 """
 SENSORS = b'[{"token": "s1", "channel": "CAM_FRONT"}, {"token": "s2", "channel": "LIDAR_TOP"}]'
 CALIBRATED = b"""[
@@ -204,6 +215,8 @@ def kinds(folder):
         Kind("kitti.txt", KITTI, lambda path: Camera.from_kitti(path, 2, width=640, height=480)),
         Kind("sensor.json", SENSORS, nuscenes, (("calibrated_sensor.json", CALIBRATED),)),
         Kind("calibrated_sensor.json", CALIBRATED, nuscenes, (("sensor.json", SENSORS),)),
-        Kind("frames.yaml", POSES, read_poses),
+        Kind("frames.yaml", POSES, read_folder_settings),
+        Kind("poses.csv", DRIVEN, lambda path: PoseTable(path, ("f1", "f2"), timed=True)),
+        Kind("boxes.csv", BOXES, read_boxes),
         Kind("coverage.npz", coverage(folder), Coverage.load),
     )
