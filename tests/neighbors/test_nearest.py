@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pykdtree.kdtree import KDTree
 
 from torchcover import blind_spot_radius, nearest
-from torchcover.neighbors import BACKENDS, check_cloud, choice
+from torchcover.neighbors import BACKENDS, cdist, check_cloud, choice
 
 DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
 # Rounding of the search decides between points that are this close to equally near; the distance is rounded once.
@@ -323,7 +323,7 @@ def test_auto_takes_packets_for_large_clouds_in_float32(counts, dtype, chosen, m
     monkeypatch.setattr(choice, "_packets_work", lambda: True)
     for name in BACKENDS.keys() - {chosen}:
         monkeypatch.setitem(BACKENDS, name, f"not.chosen.{name}")
-    monkeypatch.setitem(BACKENDS, chosen, BACKENDS["cdist"])
+    monkeypatch.setitem(BACKENDS, chosen, "torchcover.neighbors.cdist")
     choice.choose_search(random_cloud(counts[0], 21, dtype=dtype), random_cloud(counts[1], 22, dtype=dtype), "auto")
 
 
@@ -531,3 +531,16 @@ def test_two_devices_are_refused():
 def test_the_trees_are_for_the_cpu(backend):
     with pytest.raises(ValueError, match=f"backend '{backend}' runs on the CPU; the clouds are on meta"):
         nearest(on_another_device(2), on_another_device(3), backend=backend)
+
+
+def test_many_pairs_on_a_device_are_searched_on_the_cpu_and_it_says_so_once(monkeypatch):
+    """Never run on a GPU: the choice, and the way there and back."""
+    choice._say_that_the_cpu_searches.cache_clear()
+    monkeypatch.setattr(choice, "MAX_PAIRS_ON_THE_DEVICE", 5)
+    assert choice.choose_search(on_another_device(1), on_another_device(5), "auto") is cdist.search
+    with pytest.warns(UserWarning, match="clouds on meta with more than 5 pairs are searched on the CPU") as said:
+        searches = [choice.choose_search(on_another_device(2), on_another_device(3), "auto") for _ in range(2)]
+    assert len(said) == 1
+    query, points = random_cloud(20, 60), random_cloud(300, 61)
+    expected = nearest(query, points, backend="kdtree").index
+    assert all(torch.equal(search(query, points, math.inf, 1.0), expected) for search in searches)
