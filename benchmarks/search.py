@@ -23,7 +23,7 @@ RIGS = (
 )  # fmt: skip
 SIZES = (10**3, 10**4, 10**5, 10**6, 10**7)
 MOST_QUERIES = 100_000
-SLOW = 2_000_000  # queries and points together: only pykdtree is compared, and fewer times
+SLOW = 500_000  # queries and points together: only pykdtree is compared, and fewer times
 RESULT = Path("out/benchmarks/search.json")
 
 
@@ -37,18 +37,23 @@ def measure():
     """Ratios of processor time."""
     torch.set_num_threads(1)
     others = {"pykdtree": pykdtree, "scipy": scipy} | optional()
-    rows, figures = [], []
-    for name, query, points in cases():
-        few = len(query) + len(points) < SLOW
-        compared = others if few else {"pykdtree": pykdtree}
-        searches = [lambda search=search, q=query, p=points: search(q, p) for search in (packets, *compared.values())]
-        seconds, ratios = compare(*searches, rounds=5 if few else 1, clock=time.process_time)
-        times = dict(zip(("packets", *compared), seconds, strict=True))
-        figures.append({"case": name, "queries": len(query), "points": len(points), "seconds": times})
-        faster = dict(zip(compared, ratios[1:], strict=True))
-        counts = f"{len(query):,}", f"{len(points):,}"
-        rows.append((name, *counts, times["packets"], *(faster.get(other, "") for other in others)))
-    table(("clouds", "queries", "points", "packets (s)", *(f"{other} / packets" for other in others)), rows)
+    figures = []
+
+    def rows():
+        for name, query, points in cases():
+            few = len(query) + len(points) < SLOW
+            compared = others if few else {"pykdtree": pykdtree}
+            searches = [
+                lambda search=search, q=query, p=points: search(q, p) for search in (packets, *compared.values())
+            ]
+            seconds, ratios = compare(*searches, rounds=3 if few else 1, clock=time.process_time)
+            times = dict(zip(("packets", *compared), seconds, strict=True))
+            figures.append({"case": name, "queries": len(query), "points": len(points), "seconds": times})
+            faster = dict(zip(compared, ratios[1:], strict=True))
+            counts = f"{len(query):,}", f"{len(points):,}"
+            yield name, *counts, times["packets"], *(faster.get(other, "") for other in others)
+
+    table(("clouds", "queries", "points", "packets (s)", *(f"{other} / packets" for other in others)), rows())
     RESULT.parent.mkdir(parents=True, exist_ok=True)
     RESULT.write_text(json.dumps({"torch": torch.__version__, "threads": 1, "figures": figures}, indent=1))
     print(f"\nAll figures: {RESULT}")
