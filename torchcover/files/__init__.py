@@ -2,7 +2,7 @@
 
 from torchcover.files.bad_file import BadFileError, naming, reads
 from torchcover.files.budget import TooLargeError, check_memory
-from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, read_npy, read_npz
+from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, read_npy, read_npz, write_npz
 from torchcover.files.text import decode, read_short_text
 from torchcover.files.yaml_text import parse_yaml
 
@@ -19,4 +19,5 @@ __all__ = [
     "read_npz",
     "read_short_text",
     "reads",
+    "write_npz",
 ]
