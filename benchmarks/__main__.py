@@ -5,6 +5,7 @@ import sys
 
 BENCHMARKS = (
     "nearest",
+    "search",
     "crossover",
     "raycasting",
     "paper_step",
