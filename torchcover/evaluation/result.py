@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
 from torchcover.coverage.blocks import MIN_BLOCKS
+from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.omissions import Omission
 from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.result_files import ResultFiles
@@ -140,11 +141,12 @@ class Result:
             if path.resolve().parent in (Path(folder).resolve(), Path(folder).resolve() / "coverage"):
                 raise ValueError(f"{folder}: holds {path}, which is compared, and would lose it; choose another folder")
         with ResultFiles(Path(folder)) as files:
-            for name, coverage in self._coverage_files.items():
-                files.add(name, coverage.save)
-            files.add("summary.csv", lambda path: path.write_text(RENDERERS["csv"](self.table), encoding="utf-8"))
-            record = self.record
-            files.publish(record)  # the numbers are safe before the maps, which take seconds, are drawn
+            with held_back():  # the numbers are safe before anything ends this, and before the maps are drawn
+                for name, coverage in self._coverage_files.items():
+                    files.add(name, coverage.save)
+                files.add("summary.csv", lambda path: path.write_text(RENDERERS["csv"](self.table), encoding="utf-8"))
+                record = self.record
+                files.publish(record)
             for stem, figure in self.maps(errors=error_maps):
                 files.add(f"maps/{stem}.png", partial(_draw, figure))
             files.publish(record)
