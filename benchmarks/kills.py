@@ -90,6 +90,7 @@ def started(out, steps, on_touch=None):
     """
     if pid := os.fork():
         return pid
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # which is ignored where this runs in the background
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)

@@ -196,6 +196,20 @@ class Rigs:
         self.seen |= other.seen
 
 
+def test_a_run_that_was_cut_short_warns_once_and_says_why():
+    class Broken(Single):
+        def __getitem__(self, index):
+            if index == 2:
+                raise BadFrameError("f2 (frame 2): the reference cloud has no points")
+            return super().__getitem__(index)
+
+    with pytest.warns(RuntimeWarning, match=r"cut short after 2 steps, which the result is of: f2 \(frame 2\)") as told:
+        result = torchcover.evaluate(frames=Broken(), cell_m=8.0)
+    assert len(told) == 1
+    assert told[0].filename == __file__
+    assert (result.run.complete, result.coverage.counts["steps"]) == (False, 2)
+
+
 def test_observers_see_the_rigs_that_are_measured_under_their_names():
     one = torchcover.evaluate("high", frames=Source(), cell_m=4.0, observers={"rigs": Rigs()})
     assert one.observed["rigs"] == {("high",)}

@@ -1,5 +1,6 @@
 """Evaluate a rig, or compare several: what a notebook calls, and the command line too."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 
 from torchcover.coverage import Aggregation, Measure
@@ -65,7 +66,7 @@ def evaluate(
 
     Returns:
         Numbers, maps, and how the run went. Whatever ends it after the first step, a bad frame, Ctrl-C or an error, is
-        noted in `result.run.failure`, and what was measured until then is there.
+        noted in `result.run.failure`, with a RuntimeWarning, and what was measured until then is there.
 
     Raises:
         ValueError: Settings that make no sense, or not a single good frame.
@@ -189,6 +190,10 @@ def _measured(task: Task, settings: Settings, others: Observers, *, progress: bo
     coverages = {name: observer.compute() for name, observer in observers.items()}
     if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
+    if not run.complete:
+        reason = " ".join(str(run.failure).split()) or "interrupted"
+        steps = f"{run.steps:,} step{'s' * (run.steps != 1)}"
+        warnings.warn(f"the run was cut short after {steps}, which the result is of: {reason}", RuntimeWarning, 3)
     return Result(
         coverages=coverages,
         regions=regions,

@@ -90,7 +90,7 @@ class Result:
     @property
     def target_lines(self) -> list[str]:
         """What was reached of the target error, in words."""
-        return outcome(self.target_error, self.coverages, self.regions)[1]
+        return self._outcome[1]
 
     @property
     def record(self) -> dict[str, Any]:
@@ -103,7 +103,7 @@ class Result:
             "torchcover": __version__,
             "device": self.device,
             **self._run_record,
-            "target_error": outcome(self.target_error, self.coverages, self.regions)[0],
+            "target_error": self._outcome[0],
             "measure": self._first.measure,
             **table_dict(self.table),
         }
@@ -159,6 +159,11 @@ class Result:
             return {"coverage.npz": self.coverage}
         stems = file_stems(list(self.coverages))
         return {f"coverage/{stem}.npz": coverage for stem, coverage in zip(stems, self.coverages.values(), strict=True)}
+
+    @property
+    def _outcome(self) -> tuple[dict[str, Any] | None, list[str]]:
+        confirmed = self.run is not None and self.run.reached
+        return outcome(self.target_error, self.coverages, self.regions, confirmed=confirmed)
 
     @property
     def _first(self) -> Coverage:
