@@ -190,11 +190,7 @@ def _measured(task: Task, settings: Settings, others: Observers, *, progress: bo
     coverages = {name: observer.compute() for name, observer in observers.items()}
     if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
-    if not run.complete:
-        reason = " ".join(str(run.failure).split()) or "interrupted"
-        steps = f"{run.steps:,} step{'s' * (run.steps != 1)}"
-        warnings.warn(f"the run was cut short after {steps}, which the result is of: {reason}", RuntimeWarning, 3)
-    return Result(
+    result = Result(
         coverages=coverages,
         regions=regions,
         run=run,
@@ -214,3 +210,6 @@ def _measured(task: Task, settings: Settings, others: Observers, *, progress: bo
             workers=settings.workers,
         ),
     )
+    if result.cut_short:
+        warnings.warn(result.cut_short, RuntimeWarning, stacklevel=3)
+    return result

@@ -189,25 +189,25 @@ class Result:
     @property
     def _notes(self) -> list[str]:
         """What ended the run before its time, and the reference sensor in words, for a caption."""
-        record = self._reference_used
+        record, on_failure = self._reference_used, [self.cut_short] if self.cut_short else []
         if record is None:
-            return self._on_failure
+            return on_failure
         rays, every_s = record["rays_per_step"], record["every_s"]
         sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
-        return [*self._on_failure, sensor, *self._on_repetitions]
+        return [*on_failure, sensor, *self._on_repetitions]
 
     @property
-    def _on_failure(self) -> list[str]:
-        """That the run was cut short and why; nothing where it was not."""
+    def cut_short(self) -> str:
+        """That the run was cut short, after how many steps, and why; no words where it was not."""
         failure = None if self.run is None else self.run.failure
         if failure is None:
-            return []
+            return ""
         steps = self._first.counts["steps"]
         after = f"The run was cut short after {steps:,} step{'s' * (steps != 1)}"
         if isinstance(failure, KeyboardInterrupt):
-            return [f"{after}: interrupted."]
+            return f"{after}: interrupted."
         reason = ": ".join([type(failure).__name__, *str(failure).strip().splitlines()[:1]])
-        return [f"{after}: {reason.rstrip('.')}."]
+        return f"{after}: {reason.rstrip('.')}."
 
     @property
     def _on_repetitions(self) -> list[str]:
