@@ -2,6 +2,7 @@
 
 import io
 import struct
+import warnings
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,12 +10,17 @@ from pathlib import Path
 import lzf
 import numpy as np
 import torch
+import trimesh
 from PIL import Image
 
+from tests.cli.hostile import CAMERA, RIG, TOWN, YARD
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
 from torchcover.data.recordings.folder_settings import read_poses
+from torchcover.simulation import Rig, Scenario
+from torchcover.simulation.shapes import MeshFile
+from torchcover.simulation.tracks import read_boxes, read_trajectory
 
 
 @dataclass(frozen=True)
@@ -140,6 +146,35 @@ CALIBRATED = b"""[
 ]"""
 
 
+TRAJECTORY = b"t,x,y,z,roll,pitch,yaw\n" + b"".join(b"%d,%d.5,2,0,0,0,%d\n" % (k, 3 * k, k) for k in range(9))
+BOXES = b"t,id,category,x,y,z,length,width,height,yaw\n" + b"".join(
+    b"%d,a%d,car,%d,2,0,4,2,1.5,90\n" % (k, k % 2, 3 * k) for k in range(12)
+)
+
+
+def mesh(path):
+    """Read a mesh; that a damaged one is not closed is no news."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*the mesh is not closed")
+        return MeshFile(type="mesh", path=path).mesh()
+
+
+def scene_files():
+    """What scenes are made from: trajectories, boxes, meshes and documents."""
+    poses = {"times_s": np.arange(5.0), "world_T_body": np.stack([np.eye(4)] * 5)}
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    yield Kind("trajectory.csv", TRAJECTORY, read_trajectory)
+    yield Kind("trajectory.npz", stored(lambda stream: np.savez(stream, **poses)), read_trajectory)
+    yield Kind("boxes.csv", BOXES, read_boxes)
+    for suffix in ("ply", "obj", "stl", "glb", "off"):
+        data = ball.export(file_type=suffix)
+        yield Kind(f"mesh.{suffix}", data if isinstance(data, bytes) else data.encode(), mesh)
+    yield Kind("rig.yaml", RIG.encode(), Rig.load)
+    yield Kind("camera.yaml", CAMERA.encode(), Rig.load)
+    yield Kind("yard.yaml", YARD.encode(), Scenario.load)
+    yield Kind("town.yaml", TOWN.encode(), Scenario.load)
+
+
 def kinds(folder):
     """One of each format that is read.
 
@@ -196,4 +231,5 @@ def kinds(folder):
         Kind("calibrated_sensor.json", CALIBRATED, nuscenes, (("sensor.json", SENSORS),)),
         Kind("frames.yaml", POSES, read_poses),
         Kind("coverage.npz", coverage(folder), Coverage.load),
+        *scene_files(),
     )

@@ -41,6 +41,7 @@ def main() -> None:
     try:
         with warnings.catch_warnings(), terminable() as terminated:
             warnings.showwarning = _warn
+            warnings.filterwarnings("ignore", "The run was cut short", RuntimeWarning)  # the last line says it
             code = typer.main.get_command(app).main(standalone_mode=False)
         sys.stdout.flush()
     except USAGE_ERROR as error:

@@ -1,5 +1,6 @@
 """Evaluate a rig, or compare several: what a notebook calls, and the command line too."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 
 from torchcover.coverage import Aggregation, Measure
@@ -65,7 +66,7 @@ def evaluate(
 
     Returns:
         Numbers, maps, and how the run went. Whatever ends it after the first step, a bad frame, Ctrl-C or an error, is
-        noted in `result.run.failure`, and what was measured until then is there.
+        noted in `result.run.failure`, with a RuntimeWarning, and what was measured until then is there.
 
     Raises:
         ValueError: Settings that make no sense, or not a single good frame.
@@ -189,7 +190,7 @@ def _measured(task: Task, settings: Settings, others: Observers, *, progress: bo
     coverages = {name: observer.compute() for name, observer in observers.items()}
     if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
-    return Result(
+    result = Result(
         coverages=coverages,
         regions=regions,
         run=run,
@@ -209,3 +210,6 @@ def _measured(task: Task, settings: Settings, others: Observers, *, progress: bo
             workers=settings.workers,
         ),
     )
+    if result.cut_short:
+        warnings.warn(result.cut_short, RuntimeWarning, stacklevel=3)
+    return result

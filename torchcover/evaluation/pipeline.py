@@ -30,6 +30,7 @@ class Run:
         steps: Frames that all observers have seen.
         counts: Sums of the frames' counts.
         skipped: What was wrong with the frames that were skipped.
+        reached: Whether what was waited for ended it.
         failure: What ended it before its time, if anything did: a bad frame, Ctrl-C, a worker that was killed, an error
             of an observer.
         seconds: How long it took.
@@ -38,6 +39,7 @@ class Run:
     steps: int = 0
     counts: Counter[str] = field(default_factory=Counter)
     skipped: list[str] = field(default_factory=list)
+    reached: bool = False
     failure: Exception | KeyboardInterrupt | None = None
     seconds: float = 0.0
 
@@ -131,10 +133,10 @@ def observe(
             for frame in _each(frames, most, workers, run, skip_bad_frames=skip_bad_frames):
                 with held_back():
                     _feed(frame.to(device), observers, run)
-                reached = until is not None and until.is_reached(run.steps)
-                expected = most if until is None else run.steps if reached else until.expected_steps(most)
+                run.reached = until is not None and until.is_reached(run.steps)
+                expected = most if until is None else run.steps if run.reached else until.expected_steps(most)
                 bar.advance(expected, until.words if until else "")
-                if reached:
+                if run.reached:
                     break
     except (Exception, KeyboardInterrupt) as error:  # hours of work are not lost to any of them
         clear_frames(error.__traceback__)  # which would keep the workers alive
