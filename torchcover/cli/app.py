@@ -13,7 +13,7 @@ from torchcover.evaluation.interrupt import terminable
 
 if TYPE_CHECKING:
     from torchcover.data import FrameSource
-    from torchcover.evaluation import Result
+    from torchcover.evaluation import Checkpoint, Result
 
 app = typer.Typer(
     name="torchcover",
@@ -87,6 +87,7 @@ def evaluate(
     device: options.Device = "cpu",
     workers: options.Workers = 0,
     skip_bad_frames: options.SkipBadFrames = False,
+    resume: options.Resume = False,
 ) -> None:
     """Measure the coverage of a rig: a table, maps, and files to compare and to log."""
     from torchcover.evaluation import claimed, evaluate
@@ -108,6 +109,7 @@ def evaluate(
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
+            checkpoint=_checkpoint(out, resume=resume),
             progress=True,
         )
         _finish(result, out, error_maps=error_maps, explain=explain)
@@ -134,6 +136,7 @@ def compare(
     device: options.Device = "cpu",
     workers: options.Workers = 0,
     skip_bad_frames: options.SkipBadFrames = False,
+    resume: options.Resume = False,
 ) -> None:
     """Compare rigs in the same frames: a table with the better values marked, maps side by side, differences."""
     from torchcover.evaluation import claimed, compare
@@ -155,6 +158,7 @@ def compare(
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
+            checkpoint=_checkpoint(out, resume=resume),
             progress=True,
         )
         _finish(result, out, error_maps=error_maps, explain=explain)
@@ -240,6 +244,15 @@ def _opened(frames: Path | None, recording_format: str | None) -> "FrameSource |
     from torchcover.data import open_recording
 
     return open_recording(frames, recording_format)
+
+
+def _checkpoint(out: Path, *, resume: bool) -> "Checkpoint":
+    from torchcover.evaluation import Checkpoint
+
+    path = out / "checkpoint.npz"
+    if resume and not path.exists():
+        typer.echo(f"torchcover: {path} is not there: the run starts with its first step", err=True)
+    return Checkpoint(path, resume)
 
 
 def _finish(result: "Result", out: Path, *, error_maps: bool, explain: bool) -> None:

@@ -115,6 +115,12 @@ class RecordedFrames(Dataset[Frame]):
         """None: the reference was recorded."""
         return None
 
+    @property
+    def content(self) -> Mapping[str, object]:
+        """Names, sizes and times of change of all clouds, which are not read for it, and the poses of their sensors."""
+        poses = {place: pose.tolist() for place, pose in self._vehicle_T_source.items()}
+        return {"recording": [[_stamp(path) for path in clouds.values()] for clouds in self._paths], "poses": poses}
+
     def __len__(self) -> int:
         return len(self.names)
 
@@ -150,6 +156,11 @@ class RecordedFrames(Dataset[Frame]):
             raise ValueError(f"{path}: the reference cloud has no points, so there is nothing to measure against")
         finite = np.isfinite(points).all(axis=1)
         return _to_vehicle(points[finite], self._vehicle_T_source.get(place), path), int((~finite).sum())
+
+
+def _stamp(path: Path) -> tuple[str, int, int]:
+    status = path.stat()
+    return path.name, status.st_size, status.st_mtime_ns
 
 
 def _rig_places(folder: Path) -> dict[str, str]:

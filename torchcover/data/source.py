@@ -47,6 +47,15 @@ class FrameSource(Protocol):
         """Which reference sensor was simulated and how often, `sensor` and `every_s`; None: it was recorded."""
         ...
 
+    @property
+    def content(self) -> Mapping[str, object]:
+        """All that the frames depend on, under the names that a message calls it by; for JSON.
+
+        A checkpoint is of frames of this content: it changes if, and only if, a frame may be another one. What is large
+        may be a hash.
+        """
+        ...
+
     def __len__(self) -> int:
         """Number of frames."""
         ...

@@ -1,7 +1,9 @@
+from .checkpoint import Checkpoint as Checkpoint
 from .evaluating import compare as compare
 from .evaluating import evaluate as evaluate
 from .observers import CoverageObserver as CoverageObserver
 from .observers import Observer as Observer
+from .observers import Stateful as Stateful
 from .omissions import Omission as Omission
 from .omissions import left_out as left_out
 from .pipeline import Run as Run

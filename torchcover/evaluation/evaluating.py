@@ -1,13 +1,18 @@
 """Evaluate a rig, or compare several: what a notebook calls, and the command line too."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
 
 from torchcover.coverage import Aggregation, Measure
+from torchcover.evaluation.checkpoint import AnyCheckpoint, Checkpoint, Journal
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.omissions import left_out
 from torchcover.evaluation.pipeline import observe
 from torchcover.evaluation.result import Result
+from torchcover.evaluation.result_files import claimed
 from torchcover.evaluation.rig_names import AnyRig, given_as
+from torchcover.evaluation.run_identity import run_identity
 from torchcover.evaluation.saved import compare_saved, saved_among
 from torchcover.evaluation.sensor_drawings import check_drawable
 from torchcover.evaluation.settings import AnyDevice, AnyThresholds, Settings
@@ -36,6 +41,7 @@ def evaluate(
     workers: int = 0,
     skip_bad_frames: bool = False,
     observers: Observers | None = None,
+    checkpoint: AnyCheckpoint | None = None,
     progress: bool = False,
 ) -> Result:
     """Measure the coverage of a rig, as `torchcover evaluate` does.
@@ -61,6 +67,9 @@ def evaluate(
         workers: Processes that make frames; 0 makes them in this one.
         skip_bad_frames: Skip and note frames that cannot be read, instead of ending with the first.
         observers: What else looks at the same frames, by name; what they compute is in `Result.observed`.
+        checkpoint: File (`.npz`) that the run is saved to every minute and at its end. If it is there, the run goes on
+            from it, to the same bits, and with more steps if that is asked for; or `Checkpoint(path, resume=False)`.
+            Observers need `state_dict` and `load_state_dict` then.
         progress: Whether to show a bar.
 
     Returns:
@@ -68,9 +77,9 @@ def evaluate(
         noted in `result.run.failure`, and what was measured until then is there.
 
     Raises:
-        ValueError: Settings that make no sense, or not a single good frame.
+        ValueError: Settings that make no sense, not a single good frame, or a checkpoint of another run.
         FileNotFoundError: An unknown name or file.
-        TypeError: A setting of a wrong kind.
+        TypeError: A setting of a wrong kind, or an observer whose state cannot be saved.
 
     Example:
         >>> result = evaluate("front_roof_32", steps=2, cell_m=1.0, rays=1024)
@@ -84,7 +93,7 @@ def evaluate(
     task = task_of(named, scenario, frames, settings)
     if len(task.rigs) > 1:
         raise ValueError(f"{task.place} holds the rigs {', '.join(task.rigs)}: say which, or compare them")
-    return _measured(task, settings, observers or {}, progress=progress)
+    return _measured(task, settings, observers or {}, checkpoint, progress=progress)
 
 
 def compare(
@@ -106,6 +115,7 @@ def compare(
     workers: int = 0,
     skip_bad_frames: bool = False,
     observers: Observers | None = None,
+    checkpoint: AnyCheckpoint | None = None,
     progress: bool = False,
 ) -> Result:
     """Measure several rigs in the same frames, against the same reference, as `torchcover compare` does.
@@ -130,6 +140,7 @@ def compare(
         workers: Processes that make frames.
         skip_bad_frames: Whether to skip bad frames.
         observers: What else looks at the same frames.
+        checkpoint: File that the run is saved to, and goes on from.
         progress: Whether to show a bar.
 
     Returns:
@@ -149,7 +160,7 @@ def compare(
     task = task_of(rigs, scenario, frames, settings)
     if len(task.rigs) < 2:
         raise ValueError(f"compare needs at least two rigs; got {task.rigs[0]!r} only (for one: `evaluate`)")
-    return _measured(task, settings, observers or {}, progress=progress)
+    return _measured(task, settings, observers or {}, checkpoint, progress=progress)
 
 
 def _check_saved_only(
@@ -170,22 +181,32 @@ def _check_saved_only(
         )
 
 
-def _measured(task: Task, settings: Settings, others: Observers, *, progress: bool) -> Result:
+def _measured(
+    task: Task, settings: Settings, others: Observers, checkpoint: AnyCheckpoint | None, *, progress: bool
+) -> Result:
     frames, regions, target = task.frames, settings.regions, settings.target_error
     sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
     check_drawable(sensors)
     observers = {name: CoverageObserver(settings.metric(frames.weight_kind), name) for name in task.rigs}
-    run = observe(
-        frames,
-        [*observers.values(), *others.values()],
-        steps=task.steps,
-        workers=settings.workers,
-        device=settings.device,
-        skip_bad_frames=settings.skip_bad_frames,
-        until=TargetWatch(target, observers, regions) if target else None,
-        progress=progress,
-        keep_partial=True,
-    )
+    watch = TargetWatch(target, observers, regions) if target else None
+    with ExitStack() as stack:
+        journal = None
+        if checkpoint is not None:
+            checkpoint = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
+            stack.enter_context(claimed(checkpoint.path.parent))
+            journal = Journal(checkpoint, run_identity(task, settings, others), _states(observers, others, watch))
+        run = observe(
+            frames,
+            [*observers.values(), *others.values()],
+            steps=task.steps,
+            workers=settings.workers,
+            device=settings.device,
+            skip_bad_frames=settings.skip_bad_frames,
+            until=watch,
+            progress=progress,
+            keep_partial=True,
+            journal=journal,
+        )
     coverages = {name: observer.compute() for name, observer in observers.items()}
     if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
@@ -209,3 +230,9 @@ def _measured(task: Task, settings: Settings, others: Observers, *, progress: bo
             workers=settings.workers,
         ),
     )
+
+
+def _states(coverage: Observers, others: Observers, watch: TargetWatch | None) -> dict[str, object]:
+    """What a checkpoint keeps, by the names that its file and messages have."""
+    rigs = {f"coverage of {name}": one for name, one in coverage.items()}
+    return {**rigs, **{f"observer {name}": one for name, one in others.items()}, **({"watch": watch} if watch else {})}

@@ -12,6 +12,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from torchcover.data import BadFrameError, Frame, FrameSource, SimulatedFrames
+from torchcover.evaluation.checkpoint import Journal
 from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.progress import progress_of
@@ -81,6 +82,7 @@ def observe(
     progress: bool = False,
     title: str = "steps",
     keep_partial: bool = False,
+    journal: Journal | None = None,
 ) -> Run:
     """Feed observers with frames. Whatever ends the run, all of them have seen the same frames.
 
@@ -98,6 +100,7 @@ def observe(
         title: What stands before the bar.
         keep_partial: After the first step, what ends the run is noted in it and not raised: for who looks at
             `Run.complete`.
+        journal: Goes on from a checkpoint, and keeps it; of these observers and this rule.
 
     Returns:
         How it went.
@@ -125,21 +128,35 @@ def observe(
     """
     run, observers = Run(), list(observers)
     most = len(frames) if steps is None else min(steps, len(frames))  # type: ignore[arg-type]  # map-style: has one
-    start = time.perf_counter()
+    if journal:
+        journal.restore(run)
+        _check_restored(run, most, skip_bad_frames=skip_bad_frames)
+    start = time.perf_counter() - run.seconds
+    consistent = True  # all observers and the rule know of the same frames
+    reached = until is not None and run.steps > 0 and until.is_reached(run.steps)
+    todo = range(run.steps + len(run.skipped), 0 if reached else most)
     try:
-        with progress_of(most, title, shown=progress) as bar:
-            for frame in _each(frames, most, workers, run, skip_bad_frames=skip_bad_frames):
+        with progress_of(most, title, done=run.steps, shown=progress) as bar:
+            for frame in _each(frames, todo, workers, run, skip_bad_frames=skip_bad_frames):
                 with held_back():
+                    consistent = False
                     _feed(frame.to(device), observers, run)
-                reached = until is not None and until.is_reached(run.steps)
+                    reached = until is not None and until.is_reached(run.steps)
+                    consistent = True
+                run.seconds = time.perf_counter() - start
                 expected = most if until is None else run.steps if reached else until.expected_steps(most)
                 bar.advance(expected, until.words if until else "")
                 if reached:
                     break
+                if journal:
+                    journal.write_if_due(run)
     except (Exception, KeyboardInterrupt) as error:  # hours of work are not lost to any of them
         clear_frames(error.__traceback__)  # which would keep the workers alive
         run.failure = _killed_worker(error, workers) or error
     run.seconds = time.perf_counter() - start
+    if journal and run.steps and consistent:
+        with held_back():
+            journal.write(run)
     if not (keep_partial and run.steps):
         run.raise_failure()
     if not run.steps:
@@ -164,18 +181,28 @@ def _feed(frame: Frame, observers: Sequence[AnyObserver], run: Run) -> None:
     run.steps += 1
 
 
-def made_together(frames: Frames, steps: int, workers: int) -> Iterator[list[int]]:
+def _check_restored(run: Run, most: int, *, skip_bad_frames: bool) -> None:
+    if run.steps + len(run.skipped) > most:
+        raise ValueError(f"steps: {run.steps + len(run.skipped)} are done in the checkpoint; got {most}, which is less")
+    if run.skipped and not skip_bad_frames:
+        raise ValueError(
+            f"{len(run.skipped)} bad frames were skipped before the checkpoint, such as {run.skipped[0]}; go on "
+            "skipping them (--skip-bad-frames)"
+        )
+
+
+def made_together(frames: Frames, indices: Iterable[int], workers: int) -> Iterator[list[int]]:
     """Which frames a worker makes in a row: in traffic those of one world, so that only one worker builds it.
 
     Args:
         frames: Where they come from.
-        steps: How many there are.
+        indices: Which of them, in order.
         workers: Processes that make them.
     """
     if workers < 2 or not isinstance(frames, SimulatedFrames) or frames.scenario.traffic is None:
-        yield from ([index] for index in range(steps))
+        yield from ([index] for index in indices)
         return
-    for _, of_world in groupby(range(steps), frames.simulator.run_of):
+    for _, of_world in groupby(indices, frames.simulator.run_of):
         while together := list(islice(of_world, MOST_TOGETHER)):
             yield together
 
@@ -198,11 +225,11 @@ class _FramesOrErrors(Dataset[Frame | ValueError]):
             return copy
 
 
-def _each(frames: Frames, most: int, workers: int, run: Run, *, skip_bad_frames: bool) -> Iterator[Frame]:
+def _each(frames: Frames, indices: Iterable[int], workers: int, run: Run, *, skip_bad_frames: bool) -> Iterator[Frame]:
     """One frame at a time; notes bad ones if they are to be skipped."""
     loader = DataLoader(
         _FramesOrErrors(frames),
-        batch_sampler=made_together(frames, most, workers),
+        batch_sampler=made_together(frames, indices, workers),
         collate_fn=list,
         num_workers=workers,
         prefetch_factor=1 if workers else None,  # what is made ahead waits in shared memory
