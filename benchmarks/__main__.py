@@ -25,6 +25,7 @@ BENCHMARKS = (
     "known_boxes",
     "hostile_documents",
     "kills",
+    "resumes",
     "mutated_files",
 )
 

@@ -15,6 +15,7 @@ from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
 from torchcover.data.poses import read_poses
+from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
 
 
 @dataclass(frozen=True)
@@ -140,6 +141,15 @@ CALIBRATED = b"""[
 ]"""
 
 
+def checkpoint(folder):
+    """A checkpoint of one observer."""
+    path = Path(folder) / "checkpoint.npz"
+    run = {"steps": 3, "counts": {"sensor_rays": 9}, "skipped": [], "seconds": 1.5}
+    state = {"dense": torch.arange(1, 40), "sparse": torch.eye(20, dtype=torch.float64), "looks": [1, None, "two"]}
+    write_checkpoint(path, {"identity": {"seed": "0"}, "run": run}, {"one": state})
+    return path.read_bytes()
+
+
 def kinds(folder):
     """One of each format that is read.
 
@@ -196,4 +206,5 @@ def kinds(folder):
         Kind("calibrated_sensor.json", CALIBRATED, nuscenes, (("sensor.json", SENSORS),)),
         Kind("frames.yaml", POSES, read_poses),
         Kind("coverage.npz", coverage(folder), Coverage.load),
+        Kind("checkpoint.npz", checkpoint(folder), lambda path: read_state(path, read_header(path), "one")),
     )

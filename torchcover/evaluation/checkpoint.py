@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint, write_states
+from torchcover.evaluation.checkpoint_file import RUN_KEYS, read_header, read_state, write_checkpoint, write_states
 from torchcover.evaluation.observers import CoverageObserver, Stateful
 from torchcover.evaluation.run_identity import differences
 
@@ -97,7 +97,7 @@ class Journal:
     def write(self, run: Progressing) -> None:
         """Write now; where there is no room, say so once, and leave the file that is there."""
         start_s = time.monotonic()
-        done = {name: getattr(run, name) for name in ("steps", "counts", "skipped", "seconds")}
+        done = {name: getattr(run, name) for name in RUN_KEYS}
         try:
             states = {name: one.state_dict() for name, one in self._states.items()}
             write_checkpoint(self.path, {"identity": self.identity, "run": done}, states)

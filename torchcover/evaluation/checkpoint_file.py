@@ -21,6 +21,8 @@ HEADER = "header"
 MIN_ZEROS = 0.5
 # Of NumPy's types: numbers that are real, and truth.
 KINDS = "fiub"
+# What the header has of the run.
+RUN_KEYS = ("steps", "counts", "skipped", "seconds")
 WORDS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.uint64}
 
 Array = NDArray[Any]
@@ -32,7 +34,7 @@ def write_checkpoint(path: Path, header: Mapping[str, Any], states: Mapping[str,
 
     Args:
         path: The file.
-        header: What else is to be known, for JSON.
+        header: What else is to be known, for JSON: `identity`, and `run` with `RUN_KEYS`.
         states: By name; each of tensors, numbers, texts, None, and lists and dicts of them.
 
     Raises:
@@ -54,6 +56,9 @@ def read_header(path: Path) -> dict[str, Any]:
     header: dict[str, Any] = json.loads(text)
     if header.get("format") != FORMAT_VERSION:
         raise ValueError(f"checkpoint format {header.get('format')}; this torchcover reads format {FORMAT_VERSION}")
+    for name, keys in (("identity", ()), ("run", RUN_KEYS), ("states", ())):
+        if not isinstance(header.get(name), dict) or not set(keys) <= header[name].keys():
+            raise ValueError(f"not a whole checkpoint: {name} is missing, or parts of it")
     return header
 
 

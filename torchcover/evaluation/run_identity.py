@@ -54,7 +54,7 @@ def differences(here: Mapping[str, str], there: Mapping[str, str]) -> str:
 
 
 def _change(here: str, there: str) -> str:
-    return "(other content)" if here[0] == there[0] == "#" else f"({there} there, {here} here)"
+    return "(other content)" if "#" in (here[0], there[0]) else f"({there} there, {here} here)"
 
 
 def _told(value: object) -> str:
