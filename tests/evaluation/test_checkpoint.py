@@ -17,14 +17,14 @@ from torchcover.evaluation import Checkpoint, checkpoint
 from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
 from torchcover.files import BadFileError
 
-STEPS = 24
+STEPS = 16
 SETTINGS = {"cell_m": 8.0, "aggregations": (Maximum(), StepQuantiles((0.5,)))}
 
 
 class Drive:
     """A source of frames, some of which may be bad; slower than nothing, so that a kill finds it at work."""
 
-    rigs = ("a", "b")
+    rigs = ("a",)
     sensors = {}  # noqa: RUF012
     ego_outline_m = None
     description = {"scenario": None, "frames": "drive", "seed": None}  # noqa: RUF012
@@ -81,7 +81,7 @@ def _at_every_step(monkeypatch):
 
 def measured(source, path=None, *, seen=None, **settings):
     settings = {"frames": source, "observers": {"seen": seen or Seen()}, "checkpoint": path, **SETTINGS, **settings}
-    return torchcover.compare(["a", "b"], **settings)
+    return torchcover.evaluate("a", **settings)
 
 
 def bits(result):
@@ -95,6 +95,11 @@ def bits(result):
     return {**found, "skipped": tuple(result.run.skipped)}
 
 
+def stamp(path):
+    """Another one for every file that is put there."""
+    return (path.stat().st_ino, path.stat().st_mtime_ns) if path.exists() else None
+
+
 def press():
     os.kill(os.getpid(), signal.SIGINT)
 
@@ -102,29 +107,31 @@ def press():
 @pytest.mark.parametrize("workers", [0, 2])
 def test_it_goes_on_after_ctrl_c_to_the_same_bits(frame_of, path, workers):
     whole = bits(measured(Drive(frame_of, {7}), skip_bad_frames=True))
-    for at in (0, 9, STEPS - 1):
+    for at in (0, 9, STEPS - 1):  # one run: it goes on twice
         part = measured(Drive(frame_of, {7}), path, seen=Seen(at, press), skip_bad_frames=True, workers=workers)
         assert isinstance(part.run.failure, KeyboardInterrupt)
-        assert bits(measured(Drive(frame_of, {7}), path, skip_bad_frames=True)) == whole
-        path.unlink()
+        assert len(part.observed["seen"]) == part.run.steps == at + 1 - (at > 7)
+    assert bits(measured(Drive(frame_of, {7}), path, skip_bad_frames=True)) == whole
 
 
 @pytest.mark.usefixtures("_at_every_step")
 def test_it_goes_on_after_being_killed_at_any_moment(frame_of, path):
     whole, chance, kills = bits(measured(Drive(frame_of))), random.Random(0), 0
-    for _ in range(12):
+    for _ in range(5):
+        before = stamp(path)
         child = os.fork()
         if not child:
             torch.set_num_threads(1)
-            measured(Drive(frame_of, delay_s=0.005), path)
+            measured(Drive(frame_of), path)
             os._exit(0)
-        time.sleep(chance.uniform(0.0, 0.25))
+        deadline_s = time.monotonic() + 60
+        while stamp(path) == before and time.monotonic() < deadline_s:
+            time.sleep(0.001)
+        time.sleep(chance.uniform(0.0, 0.02))
         os.kill(child, signal.SIGKILL)
         kills += os.waitpid(child, 0)[1] == signal.SIGKILL
-        if path.exists():
-            assert 0 < read_header(path)["run"]["steps"] <= STEPS
+        assert 0 < read_header(path)["run"]["steps"] <= STEPS
     assert kills >= 2
-    assert read_header(path)["run"]["steps"] > 0
     assert bits(measured(Drive(frame_of), path)) == whole
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
@@ -132,12 +139,12 @@ def test_it_goes_on_after_being_killed_at_any_moment(frame_of, path):
 def test_a_complete_run_goes_on_when_more_steps_are_wanted(frame_of, path):
     measured(Drive(frame_of), path, steps=5)
     seen = Seen()
-    assert bits(measured(Drive(frame_of), path, steps=17, seen=seen)) == bits(measured(Drive(frame_of), steps=17))
-    assert len(seen.names) == 17
-    again = measured(Drive(frame_of, range(STEPS)), path, steps=17)  # not a frame is made
-    assert bits(again) == bits(measured(Drive(frame_of), steps=17))
-    with pytest.raises(ValueError, match="steps: 17 are done in the checkpoint; got 16, which is less"):
-        measured(Drive(frame_of), path, steps=16)
+    assert bits(measured(Drive(frame_of), path, steps=12, seen=seen)) == bits(measured(Drive(frame_of), steps=12))
+    assert len(seen.names) == 12
+    again = measured(Drive(frame_of, range(STEPS)), path, steps=12)  # not a frame is made
+    assert bits(again) == bits(measured(Drive(frame_of), steps=12))
+    with pytest.raises(ValueError, match="steps: 12 are done in the checkpoint; got 11, which is less"):
+        measured(Drive(frame_of), path, steps=11)
 
 
 def test_looks_at_a_target_error_go_on_as_they_would_have(frame_of, path, monkeypatch):
@@ -145,11 +152,10 @@ def test_looks_at_a_target_error_go_on_as_they_would_have(frame_of, path, monkey
     target = {"target_error": "0.2m", "thresholds": ()}
     whole = measured(Drive(frame_of), **target)
     assert 8 < whole.run.steps < STEPS
-    for at in (7, 8, whole.run.steps - 2, whole.run.steps - 1):
+    for at in (6, 7, 8, whole.run.steps - 2):
         measured(Drive(frame_of), path, seen=Seen(at, press), **target)
-        assert bits(measured(Drive(frame_of), path, **target)) == bits(whole)
-        assert bits(measured(Drive(frame_of, range(STEPS)), path, **target)) == bits(whole)
-        path.unlink()
+    assert bits(measured(Drive(frame_of), path, **target)) == bits(whole)
+    assert bits(measured(Drive(frame_of, range(STEPS)), path, **target)) == bits(whole)
 
 
 @pytest.mark.usefixtures("_at_every_step")
@@ -259,7 +265,8 @@ def test_states_come_back_bit_for_bit(tmp_path):
 def test_a_damaged_checkpoint_is_named(frame_of, path):
     measured(Drive(frame_of), path, steps=3)
     data = bytearray(path.read_bytes())
-    for damage in (data[:-100], data[: len(data) // 2] + b"\x55" + data[len(data) // 2 + 1 :], b"PK", b""):
+    third = len(data) // 3
+    for damage in (data[:-100], data[:third] + bytes(third) + data[2 * third :], b"PK", b""):
         path.write_bytes(damage)
         with pytest.raises(BadFileError, match=r"checkpoint\.npz: "):
             measured(Drive(frame_of), path, steps=3)
