@@ -291,7 +291,7 @@ def test_what_there_is_outlives_a_worker_that_is_killed(frames):
     run = observe(Deadly(frames, {5}), [names], workers=1, keep_partial=True)
     assert (run.steps, run.complete) == (len(names.names), False)
     assert names.names == ["f0", "f1", "f2", "f3", "f4"][: len(names.names)]
-    with pytest.raises(ChildProcessError, match=r"a worker was killed, .*; use fewer workers"):
+    with pytest.raises(ChildProcessError, match=rf"a worker was killed after step {run.steps}, .*; use fewer workers"):
         run.raise_failure()
 
 

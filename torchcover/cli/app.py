@@ -3,6 +3,8 @@
 import io
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +15,7 @@ from torchcover.evaluation.interrupt import terminable
 
 if TYPE_CHECKING:
     from torchcover.data import FrameSource
-    from torchcover.evaluation import Checkpoint, Result
+    from torchcover.evaluation import Checkpoint, Ranks, Result
 
 app = typer.Typer(
     name="torchcover",
@@ -90,9 +92,9 @@ def evaluate(
     resume: options.Resume = False,
 ) -> None:
     """Measure the coverage of a rig: a table, maps, and files to compare and to log."""
-    from torchcover.evaluation import claimed, evaluate
+    from torchcover.evaluation import evaluate
 
-    with claimed(out):
+    with _sharing(out) as ranks:
         result = evaluate(
             rig,
             scenario,
@@ -110,9 +112,10 @@ def evaluate(
             workers=workers,
             skip_bad_frames=skip_bad_frames,
             checkpoint=_checkpoint(out, resume=resume),
+            ranks=ranks,
             progress=True,
         )
-        _finish(result, out, error_maps=error_maps, explain=explain)
+        _finish(result, out, ranks, error_maps=error_maps, explain=explain)
 
 
 @app.command()
@@ -139,9 +142,9 @@ def compare(
     resume: options.Resume = False,
 ) -> None:
     """Compare rigs in the same frames: a table with the better values marked, maps side by side, differences."""
-    from torchcover.evaluation import claimed, compare
+    from torchcover.evaluation import compare
 
-    with claimed(out):
+    with _sharing(out) as ranks:
         result = compare(
             rigs or (),
             scenario,
@@ -159,9 +162,10 @@ def compare(
             workers=workers,
             skip_bad_frames=skip_bad_frames,
             checkpoint=_checkpoint(out, resume=resume),
+            ranks=ranks,
             progress=True,
         )
-        _finish(result, out, error_maps=error_maps, explain=explain)
+        _finish(result, out, ranks, error_maps=error_maps, explain=explain)
 
 
 @app.command()
@@ -255,12 +259,22 @@ def _checkpoint(out: Path, *, resume: bool) -> "Checkpoint":
     return Checkpoint(path, resume)
 
 
-def _finish(result: "Result", out: Path, *, error_maps: bool, explain: bool) -> None:
+@contextmanager
+def _sharing(out: Path) -> "Iterator[Ranks | None]":
+    """The folder, kept for this run; and the processes that share it, the first of which writes."""
+    from torchcover.evaluation import claimed, joined_ranks
+
+    with joined_ranks() as ranks, claimed(out) if ranks is None or ranks.rank == 0 else nullcontext():
+        yield ranks
+
+
+def _finish(result: "Result", out: Path, ranks: "Ranks | None", *, error_maps: bool, explain: bool) -> None:
     """Results are safe before anything is printed; then the command ends as the run did."""
     from torchcover.cli.printing import print_result
 
-    files = result.save(out, error_maps=error_maps)
-    print_result(result, files, out, explain=explain)
+    if ranks is None or ranks.rank == 0:
+        files = result.save(out, error_maps=error_maps)
+        print_result(result, files, out, explain=explain)
     if result.run is not None:
         result.run.raise_failure()
 

@@ -10,6 +10,8 @@ from .pipeline import Run as Run
 from .pipeline import StoppingRule as StoppingRule
 from .pipeline import observe as observe
 from .progress import Progress as Progress
+from .ranks import Ranks as Ranks
+from .ranks import joined_ranks as joined_ranks
 from .result import Result as Result
 from .result_files import claimed as claimed
 from .scene_pictures import cameras_of as cameras_of

@@ -13,17 +13,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchcover.evaluation.sparse_words import Words, spread, words_of
 from torchcover.files import NpyHeader, check_memory, read_npz, reads, write_durably
 
 FORMAT_VERSION = 1
 HEADER = "header"
-# Zeros are left out where they are this share at least: a place takes up to as much room as a value.
-MIN_ZEROS = 0.5
 # Of NumPy's types: numbers that are real, and truth.
 KINDS = "fiub"
 # What the header has of the run.
 RUN_KEYS = ("steps", "counts", "skipped", "seconds")
-WORDS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.uint64}
 
 Array = NDArray[Any]
 State = Mapping[str, Any]
@@ -52,7 +50,7 @@ def read_header(path: Path) -> dict[str, Any]:
         FileNotFoundError: No such file.
         BadFileError: Not a checkpoint, a damaged one, or one of another version.
     """
-    text = str(read_npz(path, _check_kind, lambda _: [HEADER])[HEADER])
+    text = str(_read(path, HEADER))
     header: dict[str, Any] = json.loads(text)
     if header.get("format") != FORMAT_VERSION:
         raise ValueError(f"checkpoint format {header.get('format')}; this torchcover reads format {FORMAT_VERSION}")
@@ -111,19 +109,14 @@ def _key(key: Any) -> str:  # noqa: ANN401
 
 
 def _add_tensor(tensor: Tensor, archive: zipfile.ZipFile, name: str) -> dict[str, Any]:
-    array = np.ascontiguousarray(tensor.detach().cpu().numpy())
+    array = tensor.detach().cpu().numpy()
     if array.dtype.kind not in KINDS:
         raise TypeError(f"a state of real numbers is needed; got a tensor of {tensor.dtype}")
-    words = array.view(WORDS[array.itemsize]).reshape(-1)  # by its bits: -0.0 is no zero
-    if words.size - np.count_nonzero(words) < MIN_ZEROS * words.size:
-        _add(archive, name, words)
-        places = False
-    else:
-        at = np.flatnonzero(words)
-        _add(archive, name, words[at])
-        _add(archive, f"{name}.at", at.astype(np.uint32 if words.size < 2**32 else np.uint64))
-        places = True
-    return {"name": name, "dtype": array.dtype.str, "shape": list(tensor.shape), "places": places}
+    words, at = words_of(array)
+    _add(archive, name, words)
+    if at is not None:
+        _add(archive, f"{name}.at", at)
+    return {"name": name, "dtype": array.dtype.str, "shape": list(tensor.shape), "places": at is not None}
 
 
 def _unpacked(node: Any, path: Path) -> Any:  # noqa: ANN401  (a tree)
@@ -142,14 +135,12 @@ def _array(content: Mapping[str, Any], path: Path) -> Array:
     if dtype.kind not in KINDS or min(shape, default=0) < 0:
         raise ValueError(f"an array of {dtype} and the shape {shape}")
     check_memory(math.prod(shape) * dtype.itemsize)
-    words = read_npz(path, _check_kind, lambda _: [name])[name]
-    if content["places"]:
-        at = read_npz(path, _check_kind, lambda _: [f"{name}.at"])[f"{name}.at"]
-        spread = np.zeros(math.prod(shape), words.dtype)
-        spread[at] = words
-        words = spread
-    array: Array = words.view(dtype).reshape(shape)
-    return array
+    words = _read(path, name)
+    return spread(Words(words, _read(path, f"{name}.at") if content["places"] else None), dtype, shape)
+
+
+def _read(path: Path, name: str) -> Array:
+    return read_npz(path, _check_kind, lambda _: [name])[name]
 
 
 def _check_kind(header: NpyHeader) -> None:

@@ -1,25 +1,17 @@
 """Evaluate a rig, or compare several: what a notebook calls, and the command line too."""
 
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
-from pathlib import Path
+from collections.abc import Sequence
 
 from torchcover.coverage import Aggregation, Measure
-from torchcover.evaluation.checkpoint import AnyCheckpoint, Checkpoint, Journal
-from torchcover.evaluation.observers import AnyObserver, CoverageObserver
-from torchcover.evaluation.omissions import left_out
-from torchcover.evaluation.pipeline import observe
+from torchcover.evaluation.checkpoint import AnyCheckpoint
+from torchcover.evaluation.measuring import Observers, measured
+from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
-from torchcover.evaluation.result_files import claimed
 from torchcover.evaluation.rig_names import AnyRig, given_as
-from torchcover.evaluation.run_identity import run_identity
 from torchcover.evaluation.saved import compare_saved, saved_among
-from torchcover.evaluation.sensor_drawings import check_drawable
 from torchcover.evaluation.settings import AnyDevice, AnyThresholds, Settings
-from torchcover.evaluation.target_error import AnyTargetError, TargetWatch
-from torchcover.evaluation.task import AnyFrames, AnyScenario, Task, task_of
-
-Observers = Mapping[str, AnyObserver]
+from torchcover.evaluation.target_error import AnyTargetError
+from torchcover.evaluation.task import AnyFrames, AnyScenario, task_of
 
 
 def evaluate(
@@ -42,6 +34,7 @@ def evaluate(
     skip_bad_frames: bool = False,
     observers: Observers | None = None,
     checkpoint: AnyCheckpoint | None = None,
+    ranks: Ranks | None = None,
     progress: bool = False,
 ) -> Result:
     """Measure the coverage of a rig, as `torchcover evaluate` does.
@@ -70,6 +63,7 @@ def evaluate(
         checkpoint: File (`.npz`) that the run is saved to every minute and at its end. If it is there, the run goes on
             from it, to the same bits, and with more steps if that is asked for; or `Checkpoint(path, resume=False)`.
             Observers need `state_dict` and `load_state_dict` then.
+        ranks: Processes that share the run, from `joined_ranks()`; all of them call this, and get the same result.
         progress: Whether to show a bar.
 
     Returns:
@@ -93,7 +87,7 @@ def evaluate(
     task = task_of(named, scenario, frames, settings)
     if len(task.rigs) > 1:
         raise ValueError(f"{task.place} holds the rigs {', '.join(task.rigs)}: say which, or compare them")
-    return _measured(task, settings, observers or {}, checkpoint, progress=progress)
+    return measured(task, settings, observers or {}, checkpoint, ranks, progress=progress)
 
 
 def compare(
@@ -116,6 +110,7 @@ def compare(
     skip_bad_frames: bool = False,
     observers: Observers | None = None,
     checkpoint: AnyCheckpoint | None = None,
+    ranks: Ranks | None = None,
     progress: bool = False,
 ) -> Result:
     """Measure several rigs in the same frames, against the same reference, as `torchcover compare` does.
@@ -141,6 +136,7 @@ def compare(
         skip_bad_frames: Whether to skip bad frames.
         observers: What else looks at the same frames.
         checkpoint: File that the run is saved to, and goes on from.
+        ranks: Processes that share the run.
         progress: Whether to show a bar.
 
     Returns:
@@ -160,7 +156,7 @@ def compare(
     task = task_of(rigs, scenario, frames, settings)
     if len(task.rigs) < 2:
         raise ValueError(f"compare needs at least two rigs; got {task.rigs[0]!r} only (for one: `evaluate`)")
-    return _measured(task, settings, observers or {}, checkpoint, progress=progress)
+    return measured(task, settings, observers or {}, checkpoint, ranks, progress=progress)
 
 
 def _check_saved_only(
@@ -179,60 +175,3 @@ def _check_saved_only(
         raise ValueError(
             "coverage files are measured already: leave out the scenario, the frames, their settings and observers"
         )
-
-
-def _measured(
-    task: Task, settings: Settings, others: Observers, checkpoint: AnyCheckpoint | None, *, progress: bool
-) -> Result:
-    frames, regions, target = task.frames, settings.regions, settings.target_error
-    sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
-    check_drawable(sensors)
-    observers = {name: CoverageObserver(settings.metric(frames.weight_kind), name) for name in task.rigs}
-    watch = TargetWatch(target, observers, regions) if target else None
-    with ExitStack() as stack:
-        journal = None
-        if checkpoint is not None:
-            checkpoint = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
-            stack.enter_context(claimed(checkpoint.path.parent))
-            journal = Journal(checkpoint, run_identity(task, settings, others), _states(observers, others, watch))
-        run = observe(
-            frames,
-            [*observers.values(), *others.values()],
-            steps=task.steps,
-            workers=settings.workers,
-            device=settings.device,
-            skip_bad_frames=settings.skip_bad_frames,
-            until=watch,
-            progress=progress,
-            keep_partial=True,
-            journal=journal,
-        )
-    coverages = {name: observer.compute() for name, observer in observers.items()}
-    if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
-        run.raise_failure()  # within a step: the rigs have not seen the same
-    return Result(
-        coverages=coverages,
-        regions=regions,
-        run=run,
-        rigs=task.given,
-        source=task.description,
-        reference_record=frames.reference_record,
-        device=settings.device,
-        target_error=target,
-        sensors=task.sensors,
-        ego_outline_m=frames.ego_outline_m,
-        observed={name: observer.compute() for name, observer in others.items()},
-        left_out=left_out(
-            run.counts,
-            list(coverages.values()),
-            settings.aggregations,
-            sensors,
-            workers=settings.workers,
-        ),
-    )
-
-
-def _states(coverage: Observers, others: Observers, watch: TargetWatch | None) -> dict[str, object]:
-    """What a checkpoint keeps, by the names that its file and messages have."""
-    rigs = {f"coverage of {name}": one for name, one in coverage.items()}
-    return {**rigs, **{f"observer {name}": one for name, one in others.items()}, **({"watch": watch} if watch else {})}

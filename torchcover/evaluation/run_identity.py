@@ -13,13 +13,14 @@ from torchcover.evaluation.task import Task
 MAX_TOLD = 40
 
 
-def run_identity(task: Task, settings: Settings, others: Mapping[str, AnyObserver]) -> dict[str, str]:
+def run_identity(task: Task, settings: Settings, others: Mapping[str, AnyObserver], ranks: int = 1) -> dict[str, str]:
     """All that the result of a run depends on, by name: not the steps, of which there may be more later, nor who works.
 
     Args:
         task: What is measured.
         settings: How.
         others: The user's own observers.
+        ranks: How many processes share the run; each has its own part of it.
 
     Returns:
         Name -> what it is, or a hash of it.
@@ -38,6 +39,7 @@ def run_identity(task: Task, settings: Settings, others: Mapping[str, AnyObserve
         "estimate": settings.estimate,
         "target_error": settings.target_error,
         "observers": kinds,
+        "ranks": ranks,
     }
     return {name: _told(value) for name, value in everything.items()}
 
