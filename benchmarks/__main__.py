@@ -26,6 +26,7 @@ BENCHMARKS = (
     "hostile_documents",
     "kills",
     "resumes",
+    "scaling",
     "mutated_files",
 )
 

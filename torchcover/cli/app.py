@@ -194,8 +194,12 @@ def study(
 ) -> None:
     """Measure error against run time for numbers of rays and of steps, and recommend a setting."""
     from torchcover.cli.printing import print_study
-    from torchcover.evaluation import StudyPlan, claimed, error_against_time
+    from torchcover.evaluation import StudyPlan, claimed, error_against_time, rank_count
 
+    if rank_count() > 1:
+        raise ValueError(
+            "study measures run times, which ranks beside each other would change: run it without torchrun"
+        )
     plan = StudyPlan(
         rig=rig,
         scenario=scenario,

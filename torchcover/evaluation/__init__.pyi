@@ -12,6 +12,7 @@ from .pipeline import observe as observe
 from .progress import Progress as Progress
 from .ranks import Ranks as Ranks
 from .ranks import joined_ranks as joined_ranks
+from .ranks import rank_count as rank_count
 from .result import Result as Result
 from .result_files import claimed as claimed
 from .scene_pictures import cameras_of as cameras_of

@@ -89,7 +89,8 @@ class Ranks:
     def tell(self, failure: BaseException, key: str = FAILED) -> None:
         """Tell the others that this rank has failed, if it is the first, so that they stop."""
         words = " ".join(str(failure).split())
-        self.store.compare_set(key, "", f"rank {self.rank}: {type(failure).__name__}: {words}")
+        said = ": ".join([f"rank {self.rank}", type(failure).__name__, *[words] * bool(words)])
+        self.store.compare_set(key, "", said)
 
     @contextmanager
     def aborting(self) -> Iterator[None]:
@@ -181,6 +182,15 @@ class Ranks:
         return unpacked(data)
 
 
+def rank_count() -> int:
+    """How many processes `torchrun` has started, this one among them; 1 without it.
+
+    Raises:
+        ValueError: The environment says what is no number.
+    """
+    return int(os.environ.get("WORLD_SIZE", "1"))
+
+
 @contextmanager
 def joined_ranks() -> Iterator[Ranks | None]:
     """The ranks that `torchrun` has started, this process one of them; None where it has started one or none.
@@ -188,8 +198,7 @@ def joined_ranks() -> Iterator[Ranks | None]:
     Raises:
         ValueError: The environment of a rank is not whole.
     """
-    size = int(os.environ.get("WORLD_SIZE", "1"))
-    if size < 2:
+    if rank_count() < 2:
         yield None
         return
     store, rank, size = next(iter(rendezvous("env://", timeout=timedelta(minutes=5))))
