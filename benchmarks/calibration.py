@@ -144,7 +144,7 @@ class Cities:
         """Value, error and degrees of freedom of the radius and detection of each place."""
         sums = torch.stack([self.over_regions[block].sum(dim=0) for block in blocks])
         lengths = torch.tensor([len(block) for block in blocks])
-        area = AreaSums(lengths, sums[:, None, None, :, 0], sums[..., 1:].movedim(2, 1)[:, :, None, None])
+        area = AreaSums.of(lengths, sums[:, None, None, :, 0], sums[..., 1:].movedim(2, 1)[:, :, None, None])
         found = []
         for at in places:
             estimate = estimate_area(area, 0, torch.arange(len(PLACES))[None] == at)

@@ -359,15 +359,18 @@ def draw(results, path):
     row = SCORES.index(OPERATING_SCORE)
     for ax, axis in ((left, "visibility"), (middle, "distance")):
         curves = [module.counts.over(axis) for module, _ in results.values()]
+        cars = torch.stack([curve.recall.trials[row] for curve in curves], dim=1)
+        seen = [k for k in range(len(cars)) if cars[k].any()]
+        on_the_axis = sum(curves[0].bins[k][0].isdigit() for k in seen)  # hidden cars have a point, but no place on it
         for shift, rig, curve in zip((-0.05, 0.05), results, curves, strict=True):
-            value, low, high = (t[row].cpu().numpy() for t in (curve.recall.value, curve.recall.low, curve.recall.high))
-            error = np.abs(np.stack([value - low, high - value]))
-            ax.errorbar(np.arange(len(value)) + shift, value, error, fmt="o-", capsize=3, label=rig)
-        cars = torch.stack([curve.recall.trials[row] for curve in curves], dim=1).tolist()
-        names = [name.replace(" ", "\n", axis == "visibility") for name in curves[0].bins]
-        labels = ["\n".join(map(str, [name, *counts])) for name, counts in zip(names, cars, strict=True)]
-        ax.set_xticks(range(len(labels)), labels)
-        ax.set(xlabel=f"{axis} of the car; below, cars for each rig, in order", ylabel="recall", ylim=(0, 1))
+            value, low, high = (
+                t[row, seen].cpu().numpy() for t in (curve.recall.value, curve.recall.low, curve.recall.high)
+            )
+            x, error = np.arange(len(seen)) + shift, np.abs(np.stack([value - low, high - value]))
+            marks = ax.errorbar(x, value, error, fmt="o", capsize=3, label=rig)
+            ax.plot(x[:on_the_axis], value[:on_the_axis], color=marks[0].get_color())
+        ax.set_xticks(range(len(seen)), ["\n".join(map(str, [curves[0].bins[k], *cars[k].tolist()])) for k in seen])
+        ax.set(xlabel=f"{axis} of the car; below, cars for each rig, in order", ylabel="recall", ylim=(0, 1.03))
     for shift, (rig, (module, coverage)) in zip((-0.2, 0.2), results.items(), strict=True):
         seen = [line.numbers["detection_0.4m"] for line in coverage.summary(REGIONS)]
         bars = [average_precision(module.counts), *(number.value for number in seen)]

@@ -9,6 +9,7 @@ import pytest
 import torchcover
 
 ROOT = Path(__file__).parents[1]
+HEAVY = {"torch", "torchmetrics", "numpy", "matplotlib", "kornia", "embreex", "trimesh", "pykdtree", "pydantic"}
 
 
 def python(code):
@@ -27,15 +28,32 @@ def test_arrows_in_the_house_go_one_way():
 
 def test_importing_torchcover_imports_nothing_heavy():
     loaded = set(python("import sys, torchcover; print(*sys.modules)").split())
-    heavy = {"torch", "torchmetrics", "numpy", "matplotlib", "kornia", "embreex", "trimesh", "pykdtree", "pydantic"}
     assert "torchcover" in loaded
-    assert not loaded & heavy
+    assert not loaded & HEAVY
 
 
 def test_searching_imports_neither_the_metric_nor_the_tree_before_they_are_needed():
     search = "torchcover.nearest(*torch.zeros(2, 1, 3), backend='cdist')"
     code = f"import sys, torch, torchcover; {search}; print(*sys.modules)"
     assert not set(python(code).split()) & {"torchmetrics", "pykdtree", "matplotlib", "embreex", "trimesh"}
+
+
+@pytest.mark.parametrize("command", ["--help", "list", "evaluate --help", "show --help"])
+def test_what_only_tells_imports_nothing_heavy(command):
+    """Seconds, for an answer that needs none of it."""
+    code = f"import sys; sys.argv = 'torchcover {command}'.split()\nfrom torchcover.cli.app import main\n"
+    code += "try: main()\nexcept SystemExit as end: print(*sys.modules, 'code', end.code)"
+    *loaded, _, status = python(code).splitlines()[-1].split()
+    assert status == "0"
+    assert "typer" in loaded
+    assert not set(loaded) & (HEAVY - {"numpy", "pydantic"})  # typer imports pydantic where there is one
+
+
+def test_a_run_imports_what_it_needs_only():
+    """Of distorted lenses, meshes from files, frameworks and their loggers it may need nothing."""
+    loaded = set(python("import sys; from torchcover.evaluation import evaluate; print(*sys.modules)").split())
+    assert "torchmetrics" in loaded
+    assert not loaded & {"kornia", "trimesh", "networkx", "lightning", "tensorboard", "mmengine", "pandas", "OpenEXR"}
 
 
 @pytest.mark.parametrize("name", torchcover.__all__)

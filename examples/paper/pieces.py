@@ -70,10 +70,10 @@ def merged(pieces):
         points=torch.stack([piece.points for piece in pieces]).sum(dim=0),
         layers=map(Layer, first.quantities, whole),
         counts={name: sum(piece.counts[name] for piece in pieces) for name in Coverage.COUNTS},
-        blocks=Blocks(steps, probed_steps, sums),
+        blocks=Blocks.of(steps, probed_steps, sums),
         area=_merged_area([piece.area for piece in pieces], steps) if first.area is not None else None,
     )
 
 
 def _merged_area(areas, steps):
-    return AreaSums(steps, torch.cat([area.m2 for area in areas]), torch.cat([area.sums for area in areas]))
+    return AreaSums.of(steps, torch.cat([area.m2 for area in areas]), torch.cat([area.sums for area in areas]))

@@ -6,8 +6,7 @@ from matplotlib.image import imread
 
 from torchcover.cli import show
 from torchcover.evaluation import scene_pictures, sensor_views
-from torchcover.simulation import Rig, Scenario
-from torchcover.simulation.documents import builtin_names
+from torchcover.simulation import Rig, Scenario, builtin_names
 
 
 @pytest.fixture

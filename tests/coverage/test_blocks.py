@@ -415,7 +415,7 @@ def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
         points=frames.sum(dim=0),
         layers=map(Layer, MeanOfMeans((THRESHOLD,)).quantities, means),
         counts=counts,
-        blocks=Blocks(steps=steps, probed_steps=frames, sums=sums.movedim(0, 1)),
+        blocks=Blocks.of(steps, frames, sums.movedim(0, 1)),
     )
 
 

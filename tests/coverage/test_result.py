@@ -281,6 +281,8 @@ def saved_in_blocks(tmp_path):
         ({"area_cell": lambda old: old + 8 * 16}, "cells do not fit into"),
         ({"area_cell": lambda old: old[1:]}, "cells do not fit into"),
         ({"block_sums": lambda old: old[:, :1]}, "cells do not fit into"),
+        ({"block_cell": lambda old: old[::-1]}, "cells do not fit into"),
+        ({"area_cell": lambda old: np.repeat(old[::2], 2)[: len(old)]}, "cells do not fit into"),
     ],
 )
 def test_blocks_that_do_not_fit_are_refused(saved_in_blocks, change, message):

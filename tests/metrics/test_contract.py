@@ -148,6 +148,16 @@ def test_steps_are_added_under_inference_mode_and_after_it(case, before):
 
 
 @EVERY
+def test_what_the_sums_start_from_takes_no_memory(case):
+    """It is one number; torchmetrics would keep as many as there are sums."""
+    metric = case.over(case.steps[:2])
+    for name in metric._defaults.keys() - {"fingerprint"}:
+        start = metric._defaults[name]
+        assert start.untyped_storage().nbytes() == start.element_size(), name
+        assert getattr(metric, name).is_contiguous(), name
+
+
+@EVERY
 def test_the_state_has_a_fixed_size(case):
     metric = case.make()
 

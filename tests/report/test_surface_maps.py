@@ -115,7 +115,7 @@ def test_a_place_without_a_square_metre_is_unknown_and_has_no_opacity(coverage, 
 
 
 def sums_of(m2: torch.Tensor) -> AreaSums:
-    return AreaSums(torch.tensor([10]), m2[None], torch.zeros(1, 1, *m2.shape))
+    return AreaSums.of(torch.tensor([10]), m2[None], torch.zeros(1, 1, *m2.shape))
 
 
 def test_opacity_grows_with_the_surface_up_to_that_of_open_ground():
@@ -146,6 +146,6 @@ def test_errors_are_those_of_cells_where_squares_are_cells(coverage, sides):
 def test_infinity_stays_in_its_square():
     sums = torch.zeros(1, 1, 1, 4, 4).double()
     sums[..., 0, 0] = math.inf
-    area = AreaSums(torch.tensor([1]), torch.ones(1, 1, 4, 4).double(), sums)
+    area = AreaSums.of(torch.tensor([1]), torch.ones(1, 1, 4, 4).double(), sums)
     (found,) = ratios(area, torch.full((1, 4, 4), 2))
     assert torch.equal(found.isinf()[0], torch.tensor([[True, True, False, False]] * 2 + [[False] * 4] * 2))

@@ -5,21 +5,16 @@ import re
 from rich.console import Console
 from rich.table import Table
 
-from torchcover.simulation import LidarModel, Rig, Scenario, builtin_names
+from torchcover.simulation import builtin_descriptions
 
 
 def run() -> None:
     """Print the built-in rigs, scenarios and LiDAR models, with the first sentence of their descriptions."""
     console = Console()
-    models: tuple[tuple[str, type[Rig | Scenario | LidarModel]], ...] = (
-        ("rigs", Rig),
-        ("scenarios", Scenario),
-        ("lidars", LidarModel),
-    )
-    for kind, model in models:
+    for kind in ("rigs", "scenarios", "lidars"):
         table = Table("name", "description", title=kind, title_justify="left", box=None, padding=(0, 2, 0, 0))
-        for name in builtin_names(kind):
-            table.add_row(name, _first_sentence(model.load(name).description))
+        for name, description in builtin_descriptions(kind).items():
+            table.add_row(name, _first_sentence(description))
         console.print(table)
         console.print()
 

@@ -9,22 +9,25 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, TypedDict, TypeVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.coverage.blocks import AreaSums, Blocks
+from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import Quantity
-from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads
+from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
 
 FORMAT_VERSION = 3
 Arrays = dict[str, NDArray[Any]]
-SPREAD = ("block_probed_steps", "block_sums", "area_m2", "area_sums")
+# Steps, cells, what is divided by, sums.
+IN_BLOCKS = ("block_steps", "block_cell", "block_probed_steps", "block_sums")
+OVER_AREA = ("area_steps", "area_cell", "area_m2", "area_sums")
+BlockSumsT = TypeVar("BlockSumsT", bound=BlockSums)
 
 
 class CoverageParts(TypedDict):
@@ -64,10 +67,9 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
     tensors |= {layer.quantity.key: layer.values for layer in parts["layers"]}
     tensors |= {f"{key}_error": error for key, error in errors.items()}
     arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
-    arrays |= {} if blocks is None else _listed(blocks)
-    arrays |= {} if area is None else _listed_area(area)
-    with path.open("wb") as file:
-        np.savez_compressed(file, header=np.array(json.dumps(header)), **arrays)
+    arrays |= {} if blocks is None else _listed(blocks, IN_BLOCKS)
+    arrays |= {} if area is None else _listed(area, OVER_AREA)
+    write_npz(path, {"header": np.array(json.dumps(header)), **arrays})
 
 
 @reads("a saved coverage")
@@ -118,71 +120,35 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
         "points": torch.from_numpy(arrays["points"]),
         "layers": [Layer(quantity, torch.from_numpy(arrays[quantity.key])) for quantity in quantities],
         "counts": header["counts"],
-        "blocks": None if header["blocks"] == 1 else _blocks(header, grid, arrays),
-        "area": _area(header, grid, arrays) if header["square_metres"] else None,
+        "blocks": None if header["blocks"] == 1 else _read_listed(Blocks, IN_BLOCKS, header, grid, arrays),
+        "area": _read_listed(AreaSums, OVER_AREA, header, grid, arrays) if header["square_metres"] else None,
     }
 
 
-def _listed(blocks: Blocks) -> Arrays:
-    """The entries of the blocks that are not empty, and where they are."""
-    where = blocks.probed_steps.flatten().nonzero().squeeze(1)
-    sums = blocks.sums.movedim(1, 0).flatten(1)  # (Q, B * H * Y * X)
-    return {
-        "block_steps": blocks.steps.cpu().numpy(),
-        "block_cell": where.cpu().numpy().astype(np.uint32 if blocks.probed_steps.numel() < 2**32 else np.int64),
-        "block_probed_steps": blocks.probed_steps.flatten()[where].cpu().numpy(),
-        "block_sums": sums[:, where].cpu().numpy(),
-    }
+def _listed(blocks: BlockSums, names: Sequence[str]) -> Arrays:
+    kind = np.uint32 if math.prod(blocks.shape) < 2**32 else np.int64
+    arrays = [each.cpu().numpy() for each in (blocks.steps, blocks.at, blocks.base, blocks.listed)]
+    arrays[1] = arrays[1].astype(kind)
+    return dict(zip(names, arrays, strict=True))
 
 
-def _blocks(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> Blocks:
-    steps, cells = _block_steps(header, arrays["block_steps"]), arrays["block_cell"]
-    shape = (len(steps), *grid.shape)
-    sums = _spread(cells, arrays["block_sums"], shape)
-    return Blocks(steps, _spread(cells, arrays["block_probed_steps"], shape), sums.movedim(0, 1))
-
-
-def _listed_area(area: AreaSums) -> Arrays:
-    """The entries of the sums over the surface that are not empty, and where they are."""
-    where = area.m2.flatten().nonzero().squeeze(1)
-    return {
-        "area_steps": area.steps.cpu().numpy(),
-        "area_cell": where.cpu().numpy(),
-        "area_m2": area.m2.flatten()[where].cpu().numpy(),
-        "area_sums": area.sums.movedim(1, 0).flatten(1)[:, where].cpu().numpy(),
-    }
-
-
-def _area(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> AreaSums:
-    steps, cells = _block_steps(header, arrays["area_steps"]), arrays["area_cell"]
-    shape = (len(steps), *grid.shape)
-    sums = _spread(cells, arrays["area_sums"], shape)
-    return AreaSums(steps, _spread(cells, arrays["area_m2"], shape), sums.movedim(0, 1))
-
-
-def _block_steps(header: dict[str, Any], steps: NDArray[Any]) -> Tensor:
+def _read_listed(
+    of: type[BlockSumsT], names: Sequence[str], header: dict[str, Any], grid: BevGrid, arrays: Arrays
+) -> BlockSumsT:
+    steps, at, base, sums = (arrays[name] for name in names)
     if steps.shape != (header["blocks"],):
         raise ValueError(f"the steps of {header['blocks']} blocks have shape {steps.shape}")
-    return torch.from_numpy(steps)
+    shape = (len(steps), *grid.shape)
+    at = at.astype(np.int64)
+    fits = at.ndim == 1 and base.shape == at.shape and sums.shape[1:] == at.shape and (np.diff(at) > 0).all()
+    if not (fits and 0 <= at.min(initial=0) <= at.max(initial=0) < math.prod(shape)):
+        raise ValueError(f"sums of shape {sums.shape} at {at.shape} cells do not fit into {shape}")
+    return of(torch.from_numpy(steps), shape, *map(torch.from_numpy, (at, base, sums)))
 
 
 def _check_spread(grid: BevGrid, arrays: Arrays) -> None:
-    """The lists of the blocks become arrays over all cells of all blocks."""
-    blocks = max((len(arrays[name]) for name in ("block_steps", "area_steps") if name in arrays), default=0)
-    listed = [arrays[name] for name in SPREAD if name in arrays]
+    """Maps of errors spread the lists of the blocks over all cells of all blocks."""
+    blocks = max((len(arrays[names[0]]) for names in (IN_BLOCKS, OVER_AREA) if names[0] in arrays), default=0)
+    listed = [arrays[name] for names in (IN_BLOCKS, OVER_AREA) for name in names[2:] if name in arrays]
     spread_bytes = blocks * grid.cells * sum(math.prod(one.shape[:-1]) * one.itemsize for one in listed)
     check_memory(spread_bytes + sum(array.nbytes for array in arrays.values()))
-
-
-def _spread(cells: NDArray[Any], listed: NDArray[Any], shape: tuple[int, ...]) -> Tensor:
-    """(..., *shape): `listed` (..., N) at the N cells of blocks that it belongs to, and zeros elsewhere."""
-    leading = listed.shape[:-1]
-    if (
-        cells.ndim != 1
-        or listed.shape[-1] != len(cells)
-        or not 0 <= cells.min(initial=0) <= cells.max(initial=0) < math.prod(shape)
-    ):
-        raise ValueError(f"sums of shape {listed.shape} at {cells.shape} cells do not fit into {shape}")
-    spread = np.zeros((*leading, math.prod(shape)), listed.dtype)
-    spread[..., cells] = listed
-    return torch.from_numpy(spread.reshape(*leading, *shape))

@@ -5,7 +5,7 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from torchcover.coverage.blocks import AreaSums, Blocks
+from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
 from torchcover.coverage.errors import jackknife_error
 
 # What the number of a region is a mean over: its visible surface, or its known cells.
@@ -39,7 +39,7 @@ def estimate_known(probed: Tensor, sums: Tensor, blocks: Blocks | None, band: in
     """The unweighted means over the known cells of a region, and what they become without each block.
 
     Args:
-        probed: (K,) steps that had a reference point in each cell of the region.
+        probed: (K,) steps that had a reference point in each cell of the region; cells without may be left out.
         sums: (Q, K) sums over these steps of the radius and of the detection at each threshold.
         blocks: The same in blocks, over the whole grid, if there are any.
         band: Number of the height band.
@@ -51,11 +51,9 @@ def estimate_known(probed: Tensor, sums: Tensor, blocks: Blocks | None, band: in
     whole = known_mean(probed, sums)
     if blocks is None:
         return RegionEstimate(whole, whole.new_empty((0, len(whole))), whole.new_empty(0))
-    left_out = []
     used = blocks.steps.nonzero().flatten().tolist()
-    for block in used:
-        own = blocks.sums[block, :, band][:, cells]
-        left_out.append(known_mean(probed - blocks.probed_steps[block, band][cells], sums - own))
+    own_probed, own_sums = blocks.spread_over(_in_band(blocks, band, cells))
+    left_out = [known_mean(probed - own_probed[block], sums - own_sums[:, block]) for block in used]
     return RegionEstimate(whole, torch.stack(left_out) if left_out else whole[None][:0], blocks.steps[used])
 
 
@@ -73,11 +71,24 @@ def estimate_area(area: AreaSums, band: int, cells: Tensor) -> RegionEstimate:
     Returns:
         NaN where no square metre was seen.
     """
-    m2, sums = area.m2[:, band][:, cells].sum(dim=1), area.sums[:, :, band][:, :, cells].sum(dim=2)
+    each = area_in_blocks(area, band, cells)
+    m2, sums = each[:, 0], each[:, 1:]
     whole = sums.sum(dim=0) / m2.sum()
     used = area.steps.nonzero().flatten().tolist() if len(area.steps) > 1 else []
     left_out = [_without(sums, block).sum(dim=0) / _without(m2, block).sum() for block in used]
     return RegionEstimate(whole, torch.stack(left_out) if left_out else whole[None][:0], area.steps[used])
+
+
+def area_in_blocks(area: AreaSums, band: int, cells: Tensor) -> Tensor:
+    """(B, 1 + Q) the square metres of a region in each block, then those times each quantity; as `estimate_area`."""
+    return area.over(_in_band(area, band, cells))
+
+
+def _in_band(blocks: BlockSums, band: int, cells: Tensor) -> Tensor:
+    """(H, Y, X) bool: these cells in this band."""
+    chosen = torch.zeros(blocks.shape[1:], dtype=torch.bool, device=cells.device)
+    chosen[band] = cells
+    return chosen
 
 
 def _without(sums: Tensor, block: int) -> Tensor:

@@ -247,16 +247,15 @@ class CoverageMetric(MergeableMetric):
 
     def _blocks(self) -> Blocks:
         shape = self.grid.shape
-        return Blocks(
-            steps=self.block_steps.clone(),
-            probed_steps=self.probed_steps.view(-1, *shape).clone(),
-            sums=self.mean_sums.view(self.blocks, -1, *shape).clone(),
+        return Blocks.of(
+            self.block_steps, self.probed_steps.view(-1, *shape), self.mean_sums.view(self.blocks, -1, *shape)
         )
 
     def _area(self) -> AreaSums:
         shape = self.grid.shape
-        m2, sums = self.area_m2.view(-1, *shape), self.area_sums.view(self.blocks, -1, *shape)
-        return AreaSums(self.block_steps.clone(), m2.clone(), sums.clone())
+        return AreaSums.of(
+            self.block_steps, self.area_m2.view(-1, *shape), self.area_sums.view(self.blocks, -1, *shape)
+        )
 
     def _align_with(self, incoming: dict[str, Any]) -> None:
         # Blocks of the same length only can be added up.

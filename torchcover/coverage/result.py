@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import MeanOfMeans
-from torchcover.coverage.blocks import AreaSums, Blocks
+from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
-from torchcover.coverage.errors import ROUND_OFF, ratio_errors
-from torchcover.coverage.estimate import Measure, RegionEstimate, estimate_area, estimate_known
+from torchcover.coverage.errors import MIN_BLOCKS_OF_A_CELL, ROUND_OFF, ratio_errors
+from torchcover.coverage.estimate import Measure, RegionEstimate, area_in_blocks, estimate_area, estimate_known
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.intervals import interval95
 from torchcover.coverage.layer import Layer
@@ -98,11 +98,19 @@ class Coverage:
         """Key of a quantity -> (H, Y, X) standard errors; NaN where too few blocks probed, empty without blocks."""
         if self.blocks is None:
             return {}
-        probed, each = self.blocks.probed_steps, zip(self.quantities, self.blocks.sums.unbind(dim=1), strict=True)
-        errors = {one.key: ratio_errors(probed, sums, one.unit) for one, sums in each}
+        errors = self._errors_of(self.blocks, self.quantities)
         if self.area is not None:
-            m2, each = self.area.m2, zip(self.quantities, self.area.sums.unbind(dim=1), strict=True)
-            errors |= {by_area(one).key: ratio_errors(m2, sums, one.unit) for one, sums in each}
+            each = self._errors_of(self.area, self.quantities)
+            errors |= {by_area(one).key: each[one.key] for one in self.quantities}
+        return errors
+
+    def _errors_of(self, blocks: BlockSums, quantities: Sequence[Quantity]) -> dict[str, Tensor]:
+        where = blocks.known_in() >= MIN_BLOCKS_OF_A_CELL
+        base, sums = blocks.spread_over(where)
+        errors = {}
+        for one, own in zip(quantities, sums, strict=True):
+            errors[one.key] = sums.new_full(self.grid.shape, math.nan)
+            errors[one.key][where] = ratio_errors(base, own, one.unit)
         return errors
 
     @property
@@ -167,10 +175,10 @@ class Coverage:
         band = list(self.grid.heights).index(height)
         if measure == "area":
             return estimate_area(self._square_metres(), band, cells)
-        probed = self.probed_steps[band][cells]
-        means = torch.stack([self.layers[quantity.key].values[band][cells] for quantity in self.quantities])
-        sums = (means * probed).where(probed > 0, 0.0)
-        return estimate_known(probed, sums, self.blocks, band, cells)
+        known = cells & (self.probed_steps[band] > 0)
+        probed = self.probed_steps[band][known]
+        sums = probed * torch.stack([self.layers[quantity.key].values[band][known] for quantity in self.quantities])
+        return estimate_known(probed, sums, self.blocks, band, known)
 
     def _square_metres(self) -> AreaSums:
         if self.area is None:
@@ -246,7 +254,7 @@ class Coverage:
         )
 
     def _visible_m2(self, area: AreaSums, band: int, cells: Tensor) -> float:
-        total = float(area.m2[:, band].cpu()[:, cells].sum())
+        total = float(area_in_blocks(area, band, cells.to(area.at.device))[:, 0].sum())
         return total / self.counts["steps"] if self.counts["steps"] else math.nan
 
     def _numbers(self, estimate: RegionEstimate) -> dict[str, Number]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +75,7 @@ class Result:
         """Whether it is about several rigs."""
         return len(self.coverages) > 1
 
-    @property
+    @cached_property
     def table(self) -> CoverageTable:
         """The numbers, with errors, differences and marks; `RENDERERS` write it down."""
         return CoverageTable.of(self.coverages, self.regions, self._notes)

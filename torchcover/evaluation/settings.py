@@ -24,8 +24,8 @@ MAX_STEPS = 4096
 EVERY_S_IN_TRAFFIC = 10.0
 # For standard errors: at least half as many are in use at the end of a long run.
 BLOCKS = 16
-# Beside its sums a metric keeps what they start from, and makes a result of them.
-STATE_COPIES = 3
+# Beside its sums a metric makes a result of them, at most as large.
+STATE_COPIES = 2
 # A process with torch and the geometry of a small scenario.
 BYTES_PER_WORKER = 300e6
 

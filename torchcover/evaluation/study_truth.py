@@ -60,7 +60,7 @@ def area_sums(coverage: Coverage) -> Tensor:
     The square metres, then those times each of Q quantities.
     """
     assert coverage.area is not None  # no other is studied
-    sums = torch.cat([coverage.area.m2.sum(dim=0)[None], coverage.area.sums.sum(dim=0)])
+    sums = coverage.area.totals()
     return torch.stack([sums[:, :, region.mask(coverage.grid)].sum(dim=2) for region in forward_regions()])
 
 

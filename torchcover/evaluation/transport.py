@@ -25,7 +25,12 @@ def unpacked(data: Tensor) -> Any:  # noqa: ANN401  (whatever was packed)
 
 class _Pickler(pickle.Pickler):
     def reducer_override(self, value: Any) -> Any:  # noqa: ANN401  (as pickle has it)
-        if type(value) is Tensor and value.layout is torch.strided and not value.requires_grad:
+        if (
+            type(value) is Tensor
+            and value.layout is torch.strided
+            and value.is_contiguous()
+            and not value.requires_grad
+        ):
             try:
                 array = value.cpu().numpy()
             except TypeError:  # a type that NumPy has not

@@ -3,7 +3,7 @@
 import math
 import warnings
 import zipfile
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -89,6 +89,23 @@ def read_npz(
         raise
     except Exception as error:
         raise ValueError(f"not a readable .npz archive ({error})") from error
+
+
+def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays to a compressed `.npz`, as NumPy reads it.
+
+    Args:
+        path: The file.
+        arrays: By their names; no Python objects.
+
+    Raises:
+        ValueError: An array of Python objects.
+    """
+    # `numpy.savez_compressed` knows the slow default only, which takes twice as long for an eighth less.
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
+        for name, array in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
+                np.lib.format.write_array(stream, np.asanyarray(array), allow_pickle=False)
 
 
 def _check_growth(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> None:

@@ -65,13 +65,25 @@ class MergeableMetric(Metric):
         meaning = repr((type(self).__name__, sorted(self.meaning.items())))
         return torch.tensor(list(hashlib.sha256(meaning.encode()).digest()))
 
+    def add_state(self, name: str, default: Tensor | list[Any], *args: Any, **kwargs: Any) -> None:  # noqa: ANN401
+        """Add a state, as torchmetrics does; of one number that is expanded it would keep a second copy."""
+        if not isinstance(default, Tensor) or default.is_contiguous() or any(default.stride()):
+            super().add_state(name, default, *args, **kwargs)
+            return
+        number = default[(0,) * default.dim()]
+        super().add_state(name, number, *args, **kwargs)
+        state = torch.empty_like(default, memory_format=torch.contiguous_format)
+        # The device `meta` keeps no numbers, and would import half of torch to fill in none.
+        setattr(self, name, state if state.is_meta else state.fill_(number))
+        self._defaults[name] = default
+
     def add_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:
         """Add a state that starts at zero and adds up; float64 or int64, for sums grow."""
-        self.add_state(name, torch.zeros(shape, dtype=dtype), dist_reduce_fx="sum", persistent=True)
+        self.add_state(name, torch.zeros((), dtype=dtype).expand(shape), dist_reduce_fx="sum", persistent=True)
 
     def add_maximum(self, name: str, shape: tuple[int, ...]) -> None:
         """Add a float64 state that starts at minus infinity and keeps the largest."""
-        lowest = torch.full(shape, -math.inf, dtype=torch.float64)
+        lowest = torch.tensor(-math.inf, dtype=torch.float64).expand(shape)
         self.add_state(name, lowest, dist_reduce_fx="max", persistent=True)
 
     @torch.inference_mode(False)  # here and below: a tensor made under it could not be added to outside of it

@@ -2,7 +2,6 @@
 
 import hashlib
 from collections.abc import Sequence
-from importlib.resources import files
 from itertools import islice
 from pathlib import Path
 from reprlib import Repr
@@ -15,6 +14,7 @@ from pydantic_core import ErrorDetails
 
 from torchcover.files import parse_yaml
 from torchcover.geometry import rigid, rotation_from_euler, rotation_from_quaternion
+from torchcover.simulation.builtin import builtin_folder, builtin_names
 
 # Mistakes of one document that a message tells, and characters of what arrived.
 MAX_TOLD = 5
@@ -134,11 +134,6 @@ def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -
         raise ValueError(f"{path}: {explain(error)}") from error
 
 
-def builtin_names(kind: str) -> list[str]:
-    """Names of the built-in documents of a kind, in alphabetical order."""
-    return sorted(path.stem for path in _builtin_folder(kind).glob("*.yaml"))
-
-
 def explain(error: ValidationError) -> str:
     """What pydantic found, in one line: the key, what is wrong, what arrived."""
     details = [detail for detail in error.errors(include_url=False) if not _follows_from_another(detail)]
@@ -180,7 +175,7 @@ def _find(kind: str, path_or_name: str | Path) -> Path:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such file")
         return path
-    builtin = _builtin_folder(kind) / f"{path_or_name}.yaml"
+    builtin = builtin_folder(kind) / f"{path_or_name}.yaml"
     if path.name != str(path_or_name) or not builtin.is_file():
         raise FileNotFoundError(
             f"{str(path_or_name)!r} is neither a .yaml file nor one of the built-in {kind}: "
@@ -189,16 +184,9 @@ def _find(kind: str, path_or_name: str | Path) -> Path:
     return builtin
 
 
-def _builtin_folder(kind: str) -> Path:
-    package = Path(str(files("torchcover")))
-    # In a wheel the folder lies inside the package; in a checkout beside it.
-    installed = package / "_datasets"
-    return (installed if installed.is_dir() else package.parent / "datasets") / kind
-
-
 def builtin_hashes(kind: str) -> dict[str, str]:
     """The hash of every built-in document of a kind, by its name."""
-    return {path.stem: file_hash(path) for path in sorted(_builtin_folder(kind).glob("*.yaml"))}
+    return {path.stem: file_hash(path) for path in sorted(builtin_folder(kind).glob("*.yaml"))}
 
 
 def file_hash(path: Path) -> str:

@@ -14,7 +14,7 @@ class State(NamedTuple):
     """A sum of an aggregation.
 
     Args:
-        initial: What it is before the first step; float64 or int64.
+        initial: What it is before the first step; float64 or int64. One number that is expanded takes no memory.
         reduction: How two of them become one: added up, or the larger of each entry.
         in_blocks: Whether its first dimension is the blocks of contiguous steps.
     """

@@ -41,7 +41,7 @@ class MeanOfMeans(Aggregation):
     def states(self, cells: int) -> dict[str, State]:
         """`sums` (B, Q, C): sums over the steps of a block of the cell's mean of each quantity."""
         shape = (self.blocks, len(self.quantities), cells)
-        return {"sums": State(torch.zeros(shape, dtype=torch.float64), in_blocks=True)}
+        return {"sums": State(torch.zeros((), dtype=torch.float64).expand(shape), in_blocks=True)}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the means of a step."""

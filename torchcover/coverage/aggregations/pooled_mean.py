@@ -27,7 +27,7 @@ class PooledMean(Aggregation):
 
     def states(self, cells: int) -> dict[str, State]:
         """`sum` (C,) of weighted radii and `weight` (C,) of the points."""
-        return {name: State(torch.zeros(cells, dtype=torch.float64)) for name in ("sum", "weight")}
+        return {name: State(torch.zeros((), dtype=torch.float64).expand(cells)) for name in ("sum", "weight")}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the points of a step."""

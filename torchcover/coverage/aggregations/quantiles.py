@@ -46,7 +46,7 @@ class Quantiles(Aggregation):
 
     def states(self, cells: int) -> dict[str, State]:
         """`histogram` (bins, C): for each step that has probed the cell, shares that add up to 1."""
-        return {"histogram": State(torch.zeros(len(RADIUS_EDGES_M) - 1, cells, dtype=torch.float64))}
+        return {"histogram": State(torch.zeros((), dtype=torch.float64).expand(len(RADIUS_EDGES_M) - 1, cells))}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the points of a step, each with its share of its cell."""

@@ -37,7 +37,7 @@ class StepQuantiles(Aggregation):
 
     def states(self, cells: int) -> dict[str, State]:
         """`histogram` (bins, C): in how many steps the mean radius of the cell fell into each bin."""
-        return {"histogram": State(torch.zeros(len(RADIUS_EDGES_M) - 1, cells, dtype=torch.int64))}
+        return {"histogram": State(torch.zeros((), dtype=torch.int64).expand(len(RADIUS_EDGES_M) - 1, cells))}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Count the step in every cell that it has probed; a cell comes once."""

@@ -42,8 +42,8 @@ class VisibleArea(Aggregation):
         """`m2` (B, C): square metres in the steps of a block; `sums` (B, Q, C): each quantity times them."""
         shape = (self.blocks, len(self.thresholds) + 1, cells)
         return {
-            "m2": State(torch.zeros((self.blocks, cells), dtype=torch.float64), in_blocks=True),
-            "sums": State(torch.zeros(shape, dtype=torch.float64), in_blocks=True),
+            "m2": State(torch.zeros((), dtype=torch.float64).expand(self.blocks, cells), in_blocks=True),
+            "sums": State(torch.zeros((), dtype=torch.float64).expand(shape), in_blocks=True),
         }
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:

@@ -69,7 +69,8 @@ def over_squares(values: Tensor, sides: Tensor) -> Tensor:
 
 def ratios(area: AreaSums, sides: Tensor) -> Tensor:
     """(Q, H, Y, X) the radius in metres, then the detection at each threshold; NaN where nothing was seen."""
-    return over_squares(area.sums.sum(dim=0), sides) / over_squares(area.m2.sum(dim=0), sides)
+    m2, *sums = area.totals()
+    return over_squares(torch.stack(sums), sides) / over_squares(m2, sides)
 
 
 def errors_of_ratios(area: AreaSums, quantities: Sequence[Quantity], sides: Tensor) -> list[Tensor]:
@@ -91,7 +92,7 @@ def opacity_of(area: AreaSums, steps: int, sides: Tensor, cell_m: float) -> Tens
         (H, Y, X) in [0, 1]: 0 where nothing was seen, 1 where as much as open ground has, which is the footprint of the
         square, or more; between them the root of the share, from 0.3 on.
     """
-    m2 = over_squares(area.m2.sum(dim=0), sides)
+    m2 = over_squares(area.totals()[0], sides)
     footprint_m2 = over_squares(torch.full_like(m2, cell_m**2), sides)
     share = (m2 / (max(steps, 1) * footprint_m2)).clamp(max=1)
     return (FAINTEST + (1 - FAINTEST) * share.sqrt()).where(m2 > 0, 0.0)

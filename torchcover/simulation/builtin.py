@@ -1,0 +1,37 @@
+"""The built-in documents: rigs, scenarios, vehicles and LiDAR models by name."""
+
+from importlib.resources import files
+from pathlib import Path
+
+from torchcover.files import parse_yaml
+
+
+def builtin_names(kind: str) -> list[str]:
+    """Names of the built-in documents of a kind, in alphabetical order."""
+    return sorted(path.stem for path in builtin_folder(kind).glob("*.yaml"))
+
+
+def builtin_descriptions(kind: str) -> dict[str, str]:
+    """What the built-in documents of a kind say of themselves, by name; nothing else of them is read.
+
+    Example:
+        >>> builtin_descriptions("scenarios")["courtyard"].split(",")[0]
+        'A static yard'
+    """
+    folder = builtin_folder(kind)
+    return {
+        name: parse_yaml((folder / f"{name}.yaml").read_text(encoding="utf-8"))["description"]
+        for name in builtin_names(kind)
+    }
+
+
+def builtin_folder(kind: str) -> Path:
+    """Where the built-in documents of a kind lie.
+
+    Args:
+        kind: "rigs", "scenarios", "vehicles" or "lidars".
+    """
+    package = Path(str(files("torchcover")))
+    # In a wheel the folder lies inside the package; in a checkout beside it.
+    installed = package / "_datasets"
+    return (installed if installed.is_dir() else package.parent / "datasets") / kind
