@@ -14,7 +14,7 @@ from PIL import Image
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
-from torchcover.data.poses import read_poses
+from torchcover.data.recordings.folder_settings import read_poses
 from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
 
 

@@ -69,10 +69,11 @@ def at_every_body(instant, pose, tiles):
         directions = rotate(pose[:3, :3], tile.directions)
         limit_m = np.full(directions.shape[1], RANGE_M, dtype=np.float32)
         hits = cast_from(instant.static, instant.static_T_vehicle, pose[:3, 3], directions, limit_m)
-        for part in instant.moving:
-            nearer = cast_from(part.caster, part.part_T_vehicle, pose[:3, 3], directions, hits.range_m)
+        moving = instant.moving
+        for caster, part_T_vehicle, body in zip(moving.casters, moving.part_T_vehicle, moving.body, strict=True):
+            nearer = cast_from(caster, part_T_vehicle, pose[:3, 3], directions, hits.range_m)
             hits.range_m[:] = nearer.range_m
-            hits.body[nearer.body >= 0] = part.body
+            hits.body[nearer.body >= 0] = body
         seen = (hits.body >= 0) & (hits.body != instant.ego)
         found.append((directions * hits.range_m + pose[:3, 3].astype(np.float32)[:, None])[:, seen].T)
         self_hits += int((hits.body == instant.ego).sum())

@@ -32,6 +32,11 @@ def bare_rays(sensor, pose):
     return [(o.astype(np.float32), d.astype(np.float32)) for o, d in parts]
 
 
+def endless(tile):
+    """Where the rays of a tile end: nowhere."""
+    return np.full(tile.directions.shape[1], np.finfo(np.float32).max, dtype=np.float32)
+
+
 def main():
     """Print the ratio for the paper's reference sensor at four poses in the courtyard."""
     world = Scenario.load("courtyard").world()
@@ -49,8 +54,8 @@ def main():
                 list(pool.map(lambda part: bare.run(*part, output=True), rays))
 
             def generate_and_cast(pose=pose):
-                bodies = instant._outlines(pose[:3, 3])
-                list(pool.map(lambda tile: instant._cast_tile(pose, tile, np.inf, bodies), tiles))
+                bodies = instant.outlines(pose[:3, 3])
+                list(pool.map(lambda tile: instant.cast(pose, tile, endless(tile), bodies), tiles))
 
             def scan(pose=pose):
                 instant.scan(pose, tiles, threads=THREADS)

@@ -91,11 +91,12 @@ def scanned(lidar, instant, pose, generator):
     way_m *= 1 + generator.normal(0.0, NOISE_M, (len(way_m), 1)) / np.linalg.norm(way_m, axis=1, keepdims=True)
     points_m = mount[:3, 3] + way_m
     on_moving = np.zeros(len(points_m), dtype=bool)
-    for part in instant.moving:
-        if part.body != instant.ego:
-            corners_m = transform(part.part_T_vehicle, part.corners_m)
+    moving = instant.moving
+    for part_T_vehicle, body, box_m in zip(moving.part_T_vehicle, moving.body, moving.corners_m, strict=True):
+        if body != instant.ego:
+            corners_m = transform(part_T_vehicle, box_m)
             low, high = corners_m.min(axis=0) - BODY_SLACK_M, corners_m.max(axis=0) + BODY_SLACK_M
-            own_m = transform(part.part_T_vehicle, points_m)
+            own_m = transform(part_T_vehicle, points_m)
             on_moving |= ((own_m >= low) & (own_m <= high)).all(axis=1)
     points_m = transform(invert(pose), points_m)
     cloud = Cloud(points_m, np.ones(len(points_m)), on_moving, *np.divmod(ray, rays.shape[1]))

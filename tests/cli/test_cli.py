@@ -177,7 +177,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
     assert "Not enough steps for errors: 4 blocks, 8 are needed." in printed
     assert "±" not in printed
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert (summary["reference"], summary["target_error"]) == (None, None)
+    assert (summary["reference"]["sensor"], summary["target_error"]) == ("recorded", None)
     assert (summary["blocks"], summary["steps_per_block"]) == (4, 1)
     assert summary["rows"][0]["radius_m_error"] is None
     assert (tmp_path / "out" / "maps" / "radius_m_error_ground.png").is_file()
@@ -229,7 +229,14 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         ),
         (["evaluate", "front_roof_128", "--rays", "0"], "--rays"),
         (["evaluate", "--frames", "recording", "--rays", "9"], "reference, rays and every are for simulations"),
-        (["evaluate", "--frames", "recording", "--reference", "even"], "reference, rays and every are for simul"),
+        (["evaluate", "--frames", "recording", "--reference", "even"], "for a recording `recorded` or `accumulated`"),
+        (["evaluate", "--frames", "recording", "--reference", "accumulated"], "does not say when its scans were made"),
+        (["evaluate", "--frames", "recording", "--sensors", "roof"], "which has sensor, reference; got roof"),
+        (
+            ["evaluate", "--frames", "recording", "--reference", "recorded", "--window", "1"],
+            "recorded reference has none",
+        ),
+        (["evaluate", "front_roof_128", "--sensors", "roof"], "--sensors: for a recording, which --frames gives"),
         (["measure"], "No such command 'measure'"),
     ],
 )
@@ -250,7 +257,7 @@ def test_an_output_folder_that_cannot_be_made_is_a_mistake_too(torchcover, recor
 
 
 def test_an_impossible_output_folder_is_found_before_the_run(torchcover, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchcover.evaluation.evaluating.observe", lambda *_, **__: pytest.fail("it ran all the same"))
+    monkeypatch.setattr("torchcover.evaluation.measuring.observe", lambda *_, **__: pytest.fail("it ran all the same"))
     (tmp_path / "file").write_text("")
     (tmp_path / "link").symlink_to(tmp_path / "nothing")
     for out in (tmp_path / "file", tmp_path / "file" / "below", tmp_path / "link", tmp_path / "link" / "below"):

@@ -178,7 +178,11 @@ def test_the_rigs_of_a_recording_are_compared(torchcover, recording, tmp_path, r
     assert code == 0, complaints
     summary = json.loads((out / "summary.json").read_text())
     assert list(summary["rigs"]) == list(radii)
-    assert (summary["frames"], summary["reference"], summary["complete"]) == (str(recording), None, True)
+    assert (summary["frames"], summary["reference"]["sensor"], summary["complete"]) == (
+        str(recording),
+        "recorded",
+        True,
+    )
     found = {row["rig"]: row["radius_m"] for row in summary["rows"] if row["region"] == "20m" and row["known_cells"]}
     assert found == pytest.approx(radii)
 
@@ -188,7 +192,7 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
     for command, rigs, message in (
         ("compare", ["near", "middle"], "no clouds of the rig middle; the frames have far, kitti, near"),
         ("evaluate", [], f"{recording} holds the rigs far, kitti, near: say which, or compare them"),
-        ("compare", ["near", "far", "--format", "bag"], "format 'bag': no such format of recordings; there are folder"),
+        ("compare", ["near", "far", "--format", "bag"], "format 'bag': no such format of recordings; there"),
         ("compare", ["near", "far", "--scenario", "urban"], "exclude each other"),
     ):
         code, _, error = torchcover(command, *rigs, *arguments)

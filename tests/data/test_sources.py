@@ -17,6 +17,7 @@ from torchcover.data import (
     collate_frames,
     open_recording,
 )
+from torchcover.data.recordings.folder import FolderRecording
 from torchcover.simulation import PaperReference, SurfaceReference
 
 
@@ -34,11 +35,11 @@ def simulated(_):
 
 
 def recorded(path):
-    return open_recording(folder_of(path, ["sensor", "reference"]))
+    return RecordedFrames(folder_of(path, ["sensor", "reference"]))
 
 
 def recorded_rigs(path):
-    return open_recording(folder_of(path, ["rigs/b", "rigs/a", "reference"]))
+    return RecordedFrames(folder_of(path, ["rigs/b", "rigs/a", "reference"]))
 
 
 def chosen(path):
@@ -65,9 +66,8 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
         source[2]
     assert set(source.sensors) <= set(source.rigs)
     assert set(source.description) == {"scenario", "frames", "seed"}
-    assert (source.reference_record is None) == (source.description["scenario"] is None)
-    if source.reference_record is not None:
-        assert set(source.reference_record) == {"sensor", "every_s"}
+    simulated = source.description["scenario"] is not None
+    assert {"sensor", "every_s" if simulated else "notes"} == set(source.reference_record)
     if source.ego_outline_m is not None:
         assert source.ego_outline_m.shape[1] == 2
     torch.testing.assert_close(pickle.loads(pickle.dumps(source))[1].reference, source[1].reference)
@@ -84,19 +84,19 @@ def test_the_outline_of_a_simulation_is_that_of_its_ego_and_needs_no_world(monke
 
 def test_the_format_of_a_recording_is_recognised_or_named(tmp_path):
     folder = folder_of(tmp_path / "recording", ["sensor", "reference"])
-    assert isinstance(open_recording(str(folder)), RecordedFrames)
-    assert isinstance(open_recording(folder, "folder"), RecordedFrames)
-    with pytest.raises(ValueError, match="format 'rosbag': no such format of recordings; there are folder"):
+    assert isinstance(open_recording(str(folder)), FolderRecording)
+    assert isinstance(open_recording(folder, "folder"), FolderRecording)
+    with pytest.raises(ValueError, match=r"format 'rosbag': no such format of recordings; there are .*folder"):
         open_recording(folder, "rosbag")
     with pytest.raises(FileNotFoundError, match="gone: no such recording"):
         open_recording(tmp_path / "gone")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match=r"empty: a recording of no known format; known are folder: sensor/FRAME\.\*"):
+    with pytest.raises(ValueError, match=r"empty: a recording of no known format; known are nuscenes: v1"):
         open_recording(tmp_path / "empty")
 
 
 def test_another_format_is_a_class_and_a_line(tmp_path, monkeypatch):
-    class Single(RecordedFrames):
+    class Single(FolderRecording):
         layout = "a file that ends in .one"
 
         def __init__(self, path):

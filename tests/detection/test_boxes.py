@@ -12,7 +12,7 @@ from torch.utils.data import DataLoader
 from torchcover import Scenario
 from torchcover.data import Frame, SimulatedFrames, collate_frames
 from torchcover.detection import Boxes, points_in_boxes
-from torchcover.detection.boxes import SKIN_M
+from torchcover.detection.inside import SKIN_M
 from torchcover.simulation import PaperReference, Rig
 
 SMALL = PaperReference(rows=96, columns=128)

@@ -6,10 +6,13 @@ import pytest
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.simulation import EvenReference, Lidar, PaperReference, Pose, Scenario
 from torchcover.simulation.culling import blocks_towards, boxes_in_cone, outlines, rays_towards
-from torchcover.simulation.instant import cast_from, rotate
+from torchcover.simulation.instant import cast_from, rotate, rotate_each
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles, unit_directions
 from torchcover.simulation.scene import Scene
+from torchcover.simulation.shapes import Box, Plane
+from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.world import Actor, World
 
 EGO = BoundingBox((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
 SPHERE = into_tiles(unit_directions(np.linspace(-89, 89, 60)[:, None], np.linspace(-180, 179, 120)[None]))
@@ -28,10 +31,11 @@ def at_every_body(instant, vehicle_T_sensor, tiles, max_range_m):
         directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
         limit_m = np.full(directions.shape[1], max_range_m, dtype=np.float32)
         hits = cast_from(instant.static, instant.static_T_vehicle, origin_m, directions, limit_m)
-        for part in instant.moving:
-            nearer = cast_from(part.caster, part.part_T_vehicle, origin_m, directions, hits.range_m)
+        moving = instant.moving
+        for caster, part_T_vehicle, body in zip(moving.casters, moving.part_T_vehicle, moving.body, strict=True):
+            nearer = cast_from(caster, part_T_vehicle, origin_m, directions, hits.range_m)
             hits.range_m[:] = nearer.range_m
-            hits.body[nearer.body >= 0] = part.body
+            hits.body[nearer.body >= 0] = body
         seen = (hits.body >= 0) & (hits.body != instant.ego)
         points = (directions * hits.range_m + origin_m.astype(np.float32)[:, None])[:, seen]
         answers.append((points.T, np.count_nonzero(hits.body == instant.ego)))
@@ -74,6 +78,28 @@ def test_a_mounted_sensor_sees_the_same_without_casting_at_the_ego_again(scene, 
     assert mounted.body_casts < afresh.body_casts
 
 
+def test_bodies_of_one_kind_are_cast_at_together_from_a_place_on_one_of_them_too():
+    """Two coincide: what a ray hits then is the last of them, as it is when they are cast at in turn."""
+    car, away = Box(type="box", size_m=(4, 2, 1.5)).mesh(), np.array([0.0, 3.0])
+    places = [(0, 0, 0), (8, 1, 0), (8, 1, 0), (9, -4, 0), (-7, 2, 0)]
+    ways = [
+        Trajectory.from_arrays(away, [at, np.add(at, (9, 0, 0))], [[15.0 * k, 0, 0]] * 2) for k, at in enumerate(places)
+    ]
+    ways[2] = ways[1]
+    actors = [Actor(f"car {k}", "car", car, way) for k, way in enumerate(ways)]
+    ground = Plane(type="plane", size_m=(60, 60)).mesh().moved(rigid(np.eye(3), [0, 0, -2]))
+    instant = Scene(World((ground,), actors[0], tuple(actors[1:]), duration_s=3.0)).at(0)
+    roof_m = np.array([9.0, -4.0, car.vertices_m[:, 2].max()])
+    touched = instant.moving.touched_by(roof_m, instant.moving.from_there_m(roof_m))
+    assert touched.tolist() == [False, False, False, True, False]
+    for place_m in (roof_m, np.array([4.0, 0.0, 1.0])):
+        pose = rigid(np.eye(3), place_m)
+        assert_same_bits(instant.scan(pose, SPHERE, max_range_m=90.0), at_every_body(instant, pose, SPHERE, 90.0))
+    (tile,) = into_tiles(unit_directions(np.zeros((1, 1)), np.array([[14.0]])))
+    _, hits, _ = instant.cast(rigid(np.eye(3), place_m), tile, np.full(1, 90, np.float32), instant.outlines(place_m))
+    assert hits.body == instant.moving.body[2]
+
+
 def boxes_around(generator, count):
     """(count, 8, 3) corners of boxes of all forms and orientations, some around the origin, and their poses."""
     corners = BoundingBox((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).corners_m
@@ -105,8 +131,9 @@ def test_no_ray_that_meets_a_box_is_left_out():
         assert k in boxes_in_cone(seen, turned @ tile.axis, tile.half_angle, float(ends_m.max()))
         blocks = blocks_towards(seen.kept(np.array([k])), tile, turned, ends_m)
         assert blocks.all()
-        rays = tile.blocks[blocks[0]].ravel()
-        kept = rays_towards(seen, k, rays, directions.astype(np.float32), ends_m)
+        rays = tile.blocks[blocks[0]]
+        box, kept = rays_towards(seen, np.full(len(rays), k), rays, directions.astype(np.float32), ends_m)
+        assert (box == k).all()
         np.testing.assert_array_equal(np.unique(kept), np.arange(100))
         close += bool((seen.normals[k] == 0).all())
     assert 3 < close < 150
@@ -118,15 +145,15 @@ def test_rays_that_miss_a_box_by_far_or_end_before_it_are_left_out():
     (tile,) = into_tiles(unit_directions(np.linspace(-40, 40, 81)[:, None], np.linspace(-90, 90, 181)[None]),
                          tile_columns=181)  # fmt: skip
     forever, short = (np.full(tile.directions.shape[1], metres, np.float32) for metres in (np.inf, 9.9))
-    every = np.arange(tile.directions.shape[1])
+    every, box = np.arange(tile.directions.shape[1])[None], np.zeros(1, dtype=np.int64)
     x, y, z = tile.directions
     with np.errstate(divide="ignore"):
         meets = (np.abs(y / x) < 0.1) & (z / x < 0.15) & (z >= 0)
-    kept = rays_towards(seen, 0, every, tile.directions, forever)
+    _, kept = rays_towards(seen, box, every, tile.directions, forever)
     assert set(np.flatnonzero(meets)) <= set(kept)
     assert len(kept) <= 1.5 * meets.sum() + 20
     assert blocks_towards(seen, tile, np.eye(3), forever).mean() < 0.1
-    assert len(rays_towards(seen, 0, every, tile.directions, short)) == 0
+    assert len(rays_towards(seen, box, every, tile.directions, short)[1]) == 0
     assert not blocks_towards(seen, tile, np.eye(3), short).any()
     assert len(boxes_in_cone(seen, np.array([0.0, 1.0, 0.0]), 0.3, np.inf)) == 0
     assert len(boxes_in_cone(seen, np.array([1.0, 0.0, 0.0]), 0.3, 9.0)) == 0
@@ -140,3 +167,6 @@ def test_a_ray_does_not_depend_on_its_company():
         for count in (1, 2, 3, 5, 8):
             some = slice(first, first + count)
             np.testing.assert_array_equal(rotate(turn, rays[:, some]), together[:, some])
+    turns = np.array([rotation_from_euler(*angles) for angles in np.random.default_rng(1).uniform(-90, 90, (50, 3))])
+    alone = [rotate(turn, ray[:, None])[:, 0] for turn, ray in zip(turns, rays.T[:50], strict=True)]
+    np.testing.assert_array_equal(rotate_each(turns.astype(np.float32), rays[:, :50]).T, alone)

@@ -9,7 +9,7 @@ from torchcover.simulation import Pose
 from torchcover.simulation.rays import into_tiles, unit_directions
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.tracks import read_boxes, read_trajectory
-from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.trajectory import Trajectory, poses_at
 
 HEADER = "t,x,y,z,roll,pitch,yaw\n"
 BOXES = "t,id,category,x,y,z,length,width,height,yaw\n"
@@ -48,6 +48,18 @@ def test_positions_at_many_times_are_those_of_the_poses():
     )
     times = generator.uniform(-1, 10, 50)
     np.testing.assert_allclose(track.positions_at(times), [track.at(time)[:3, 3] for time in times], atol=1e-12)
+
+
+def test_poses_of_many_bodies_are_those_of_each():
+    generator, common = np.random.default_rng(2), np.array([0.0, 1.0, 2.5])
+    tracks = [
+        Trajectory.from_arrays(common[:k] + late, generator.normal(size=(k, 3)), generator.uniform(-400, 400, (k, 3)))
+        for k in (1, 2, 3)
+        for late in (0.0, 0.0, 0.7)
+    ]
+    for time_s in (-1.0, 0.0, 0.3, 1.0, 2.4, 9.0):
+        np.testing.assert_array_equal(poses_at(tracks, time_s), [track.at(time_s) for track in tracks])
+    assert poses_at([], 0.0).shape == (0, 4, 4)
 
 
 @pytest.mark.parametrize("pitch", [-90.0, -89.999, 0.0, 45.0, 90.0])

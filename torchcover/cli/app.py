@@ -74,6 +74,8 @@ def evaluate(
     scenario: options.ScenarioOrNone = None,
     frames: options.Frames = None,
     recording_format: options.Format = None,
+    sensors: options.Sensors = None,
+    window: options.Window = None,
     steps: options.Steps = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
@@ -98,12 +100,12 @@ def evaluate(
         result = evaluate(
             rig,
             scenario,
-            frames=_opened(frames, recording_format),
+            frames=_opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
             cell_m=cell,
             thresholds=threshold or (0.4,),
-            reference_sensor=reference,
+            reference_sensor=None if frames else reference,
             rays=rays,
             estimate=estimate,
             every_s=every,
@@ -124,6 +126,8 @@ def compare(
     scenario: options.ScenarioOrNone = None,
     frames: options.Frames = None,
     recording_format: options.Format = None,
+    sensors: options.Sensors = None,
+    window: options.Window = None,
     steps: options.Steps = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
@@ -148,12 +152,12 @@ def compare(
         result = compare(
             rigs or (),
             scenario,
-            frames=_opened(frames, recording_format),
+            frames=_opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
             cell_m=cell,
             thresholds=threshold or (0.4,),
-            reference_sensor=reference,
+            reference_sensor=None if frames else reference,
             rays=rays,
             estimate=estimate,
             every_s=every,
@@ -244,14 +248,25 @@ def list_builtin() -> None:
     run()
 
 
-def _opened(frames: Path | None, recording_format: str | None) -> "FrameSource | None":
+def _opened(
+    frames: Path | None,
+    recording_format: str | None,
+    sensors: list[str] | None,
+    reference: str | None,
+    window_s: float | None,
+) -> "FrameSource | None":
     if frames is None:
-        if recording_format is not None:
-            raise ValueError("--format: for a recording, which --frames gives")
+        for option, given in (("format", recording_format), ("sensors", sensors), ("window", window_s)):
+            if given is not None:
+                raise ValueError(f"--{option}: for a recording, which --frames gives")
         return None
-    from torchcover.data import open_recording
+    from torchcover.data import RecordedFrames, open_recording, reference_of_recording
 
-    return open_recording(frames, recording_format)
+    return RecordedFrames(
+        open_recording(frames, recording_format),
+        rigs={names: names.split(",") for names in sensors} if sensors else None,
+        reference=reference_of_recording(reference, window_s),
+    )
 
 
 def _checkpoint(out: Path, *, resume: bool) -> "Checkpoint":

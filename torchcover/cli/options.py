@@ -38,9 +38,19 @@ Rigs = Annotated[
 ScenarioOrNone = Annotated[str | None, typer.Option(help="Scenario: a built-in name or a YAML file (courtyard).")]
 Frames = Annotated[
     Path | None,
-    typer.Option(help="A recording instead: a folder with sensor/NAME.*, or rigs/RIG/NAME.*, beside reference/NAME.*"),
+    typer.Option(help="A recording instead of a simulation, of any layout in docs/formats.md."),
 ]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
+Sensors = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="With --frames: sensors of a rig, as in `roof,left`; once for each rig. Not given: those of the recording."
+    ),
+]
+Window = Annotated[
+    float | None,
+    typer.Option(help="Seconds over which `--reference accumulated` adds up what all sensors saw (2)."),
+]
 Steps = Annotated[
     int | None, typer.Option(min=1, help="Steps to simulate (64), or most frames of a recording to use (all).")
 ]
@@ -54,7 +64,7 @@ Reference = Annotated[
     str | None,
     typer.Option(
         help="Reference sensor: `surface`, points drawn evenly on what can be seen (default); `even`, rays spread over "
-        "the regions and the grid; or `paper`."
+        "the regions and the grid; or `paper`. With --frames: `recorded`, or `accumulated` from the recording itself."
     ),
 ]
 Rays = Annotated[

@@ -1,12 +1,14 @@
 """Datasets of frames: simulated worlds, recordings, and the readers of cloud files."""
 
+from torchcover.data.accumulated_reference import AccumulatedReference
 from torchcover.data.augmentation import Augmentation, flip, rotate, scale
 from torchcover.data.bad_frame import BadFrameError
 from torchcover.data.chosen_rigs import ChosenRigs
 from torchcover.data.clouds import read_cloud
 from torchcover.data.frame import Frame, FrameBatch, collate_frames
-from torchcover.data.recorded import RecordedFrames
-from torchcover.data.recordings import FORMATS, RecordingFormat, open_recording
+from torchcover.data.recorded import RecordedFrames, reference_of_recording
+from torchcover.data.recorded_reference import RecordedReference, Reference
+from torchcover.data.recordings import FORMATS, Recording, RecordingFormat, Scan, open_recording
 from torchcover.data.reference import DEFAULT_REFERENCE, GRID_X_M, GRID_Y_M, reference_called, reference_of_objects
 from torchcover.data.simulated import SimulatedFrames
 from torchcover.data.source import FrameSource
@@ -16,6 +18,7 @@ __all__ = [
     "FORMATS",
     "GRID_X_M",
     "GRID_Y_M",
+    "AccumulatedReference",
     "Augmentation",
     "BadFrameError",
     "ChosenRigs",
@@ -23,7 +26,11 @@ __all__ = [
     "FrameBatch",
     "FrameSource",
     "RecordedFrames",
+    "RecordedReference",
+    "Recording",
     "RecordingFormat",
+    "Reference",
+    "Scan",
     "SimulatedFrames",
     "collate_frames",
     "flip",
@@ -31,6 +38,7 @@ __all__ = [
     "read_cloud",
     "reference_called",
     "reference_of_objects",
+    "reference_of_recording",
     "rotate",
     "scale",
 ]

@@ -1,62 +1,49 @@
-"""A recording in a folder: the sensor clouds of one or several rigs beside a reference cloud for every instant."""
+"""Frames of a recording."""
 
 import operator
 import os
-import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
+from torchcover.data.accumulated_reference import AccumulatedReference
 from torchcover.data.bad_frame import BadFrameError
-from torchcover.data.clouds import READERS, read_cloud, split_name
-from torchcover.data.formats.arrays import Points
 from torchcover.data.frame import Frame
-from torchcover.data.poses import read_poses
-from torchcover.geometry.rigid import Matrix, transform
+from torchcover.data.in_vehicle import InVehicle, in_vehicle, joined
+from torchcover.data.recorded_reference import RecordedReference, Reference
+from torchcover.data.recordings import Recording, open_recording
+from torchcover.detection.inside import with_hits
 from torchcover.simulation import Sensor, WeightKind
 
-POSES_FILE = "frames.yaml"
-# What the clouds of the only rig are called.
-ONLY_RIG = "recording"
-# float32 resolves 8 mm here; clouds in world coordinates lie far beyond and would lose decimetres without a word.
-MAX_COORDINATE_M = 1e5
-MAX_NAMES_SHOWN = 5
+# What a folder of results holds, during the run or after it.
+RESULTS = frozenset({".lock", "summary.json", "checkpoint.npz"})
 
 
 class RecordedFrames(Dataset[Frame]):
-    """Frames of a folder with `sensor/FRAME.*` beside `reference/FRAME.*`, in natural order (frame2 before frame10).
+    """What the sensors of a recording saw beside a reference, instant by instant. A map-style torch Dataset.
 
-    Several rigs have `rigs/NAME/FRAME.*` each, instead of `sensor/`, against one reference. Any format of `read_cloud`
-    will do, and the sides may differ. Clouds are in the vehicle frame, unless `frames.yaml` in the folder says where
-    their sensor is:
-
-        sensor:                      # all are optional
-          vehicle_T_sensor:          # 4x4, metres
-            - [1, 0, 0, 1.2]
-            - [0, 1, 0, 0.0]
-            - [0, 0, 1, 1.73]
-            - [0, 0, 0, 1]
-
-    for the rig and likewise for `reference`; for several rigs `rigs: {NAME: {vehicle_T_sensor: ...}}`.
-
-    Non-finite points are dropped and counted in `Frame.counts` (`sensor_nonfinite`, `reference_nonfinite`). An empty
-    sensor cloud is a blind step; an empty reference cloud is an error, for nothing was measured.
+    Points that are not finite, never came back (they lie in the sensor) or lie on the vehicle itself are in neither
+    cloud; `Frame.counts` says how many (`sensor_nonfinite`, `reference_no_return`, ...). An empty sensor cloud is a
+    blind step; an empty reference cloud is an error, for nothing was measured.
 
     Args:
-        folder: The recording.
+        recording: A recording, or the path of one; see `open_recording`.
+        rigs: Names of rigs -> names of their sensors; those of the recording if not given.
+        reference: Where the reference clouds come from. Not given: the sensors that were recorded for it, or
+            else an `AccumulatedReference`.
 
     Raises:
-        FileNotFoundError: The folder, or `sensor` or `reference` in it, is missing.
-        ValueError: No frames, a file that is no cloud, two files of one name, names on one side only, both `sensor` and
-            `rigs`, or a bad `frames.yaml`. From indexing: `BadFrameError`.
+        FileNotFoundError: There is no such recording, or a part of it is missing.
+        ValueError: What is no recording, sensors that it does not have, no reference. From indexing: `BadFrameError`.
 
     Example:
         >>> import tempfile
+        >>> from pathlib import Path
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     for source in ("sensor", "reference"):
         ...         Path(folder, source).mkdir()
@@ -65,45 +52,46 @@ class RecordedFrames(Dataset[Frame]):
         [('frame7', [[1.0, 2.0, 3.0]])]
     """
 
-    layout: ClassVar[str] = "sensor/FRAME.*, or rigs/NAME/FRAME.* for several, beside reference/FRAME.*"
+    def __init__(
+        self,
+        recording: Recording | str | os.PathLike[str],
+        *,
+        rigs: Mapping[str, Sequence[str]] | None = None,
+        reference: Reference | None = None,
+    ) -> None:
+        self.recording = open_recording(recording) if isinstance(recording, str | os.PathLike) else recording
+        self.sensors_of_rigs = {name: tuple(of) for name, of in (rigs or self.recording.rigs).items()}
+        self._check_sensors()
+        if reference is None:
+            reference = RecordedReference() if self.recording.reference_sensors else AccumulatedReference()
+        self.reference = reference
+        self.reference.check(self.recording, self._judged)
 
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self.folder = Path(folder)
-        if not self.folder.is_dir():
-            raise FileNotFoundError(f"{self.folder}: no such folder; a recording holds {self.layout}")
-        # Name of the rig -> its folder; a pose is under the same path in frames.yaml.
-        self._places = _rig_places(self.folder)
-        files = {place: _clouds_by_name(self.folder / place) for place in (*self._places.values(), "reference")}
-        _check_same_names(self.folder, files)
-        self.names = tuple(sorted(files["reference"], key=_natural))
-        self._paths = [{place: clouds[name] for place, clouds in files.items()} for name in self.names]
-        self._vehicle_T_source = read_poses(self.folder / POSES_FILE)
-        _check_places(self.folder, self._vehicle_T_source, files)
-
-    @classmethod
-    def recognises(cls, path: Path) -> bool:
-        """Whether it is a folder with clouds of a sensor, of rigs or of a reference in it."""
-        return any((path / place).is_dir() for place in ("sensor", "rigs", "reference"))
+    @property
+    def names(self) -> Sequence[str]:
+        """What a user calls the frames."""
+        return tuple(self.recording.names[instant] for instant in self.recording.frames)
 
     @property
     def rigs(self) -> tuple[str, ...]:
-        """Names of the rigs, in natural order; `recording` if there is one only, without a name."""
-        return tuple(self._places)
+        """Names of the rigs."""
+        return tuple(self.sensors_of_rigs)
 
     @property
     def sensors(self) -> Mapping[str, Sequence[Sensor]]:
-        """Nothing: a recording does not say what its sensors are."""
+        """Nothing: a recording does not say how its sensors scan."""
         return {}
 
     @property
     def ego_outline_m(self) -> NDArray[np.float64] | None:
-        """Nothing: nor does it say how large the vehicle is."""
-        return None
+        """The outline of the vehicle, if the recording says how large it is."""
+        body = self.recording.body
+        return None if body is None else body.outline_m
 
     @property
     def description(self) -> Mapping[str, object]:
-        """The folder."""
-        return {"scenario": None, "frames": str(self.folder), "seed": None}
+        """Where the recording is."""
+        return {"scenario": None, "frames": str(self.recording.path), "seed": None}
 
     @property
     def weight_kind(self) -> WeightKind | None:
@@ -111,18 +99,27 @@ class RecordedFrames(Dataset[Frame]):
         return None
 
     @property
-    def reference_record(self) -> Mapping[str, object] | None:
-        """None: the reference was recorded."""
-        return None
+    def reference_record(self) -> Mapping[str, object]:
+        """Where the reference comes from."""
+        return self.reference.record(self.recording, self._judged)
 
     @property
     def content(self) -> Mapping[str, object]:
-        """Names, sizes and times of change of all clouds, which are not read for it, and the poses of their sensors."""
-        poses = {place: pose.tolist() for place, pose in self._vehicle_T_source.items()}
-        return {"recording": [[_stamp(path) for path in clouds.values()] for clouds in self._paths], "poses": poses}
+        """Names, sizes and times of change of its files, which are not read for it, and what is made of them.
+
+        Raises:
+            OSError: A file is gone.
+        """
+        reference = {name: value for name, value in vars(self.reference).items() if not name.startswith("_")}
+        return {
+            "recording": list(_stamps(self.recording.path)),
+            "instants": [list(self.recording.names), list(self.recording.frames)],
+            "sensors": self.sensors_of_rigs,
+            "reference": [type(self.reference).__name__, reference],
+        }
 
     def __len__(self) -> int:
-        return len(self.names)
+        return len(self.recording.frames)
 
     def __getitem__(self, index: int) -> Frame:
         """Read one frame.
@@ -133,100 +130,81 @@ class RecordedFrames(Dataset[Frame]):
         """
         position = operator.index(index)
         if not -len(self) <= position < len(self):
-            raise IndexError(f"frame {position} of {len(self)} in {self.folder}")
+            raise IndexError(f"frame {position} of {len(self)} in {self.recording.path}")
         position %= len(self)
-        name = self.names[position]
+        instant = self.recording.frames[position]
+        name = self.recording.names[instant]
         try:
-            sensors = {rig: self._read(position, place) for rig, place in self._places.items()}
-            reference, reference_dropped = self._read(position, "reference")
+            scans = {sensor: self._read(sensor, instant) for sensor in self._judged}
+            reference = self.reference.cloud(self.recording, instant, self._judged)
+            boxes = self.recording.boxes(instant)
         except (OSError, ValueError) as error:
             raise BadFrameError(f"{name} (frame {position}): {error}") from error
+        dropped = sum((scan.dropped for scan in scans.values()), Counter[str]())
+        clouds = {rig: joined([scans[sensor] for sensor in of]) for rig, of in self.sensors_of_rigs.items()}
         counts = {
-            "sensor_nonfinite": sum(dropped for _, dropped in sensors.values()),
-            "reference_nonfinite": reference_dropped,
+            f"{side}_{why}": number[why]
+            for side, number in (("sensor", dropped), ("reference", reference.dropped))
+            for why in sorted({"nonfinite", "no_return", "own_vehicle", *number})
         }
-        clouds = {rig: cloud for rig, (cloud, _) in sensors.items()}
-        return Frame(clouds, reference, index=position, name=name, counts=counts)
+        tensors = {rig: torch.from_numpy(cloud.points_m) for rig, cloud in clouds.items()}
+        if boxes is not None:
+            boxes = with_hits(boxes, tensors)
+        return Frame(tensors, torch.from_numpy(reference.points_m), position, name, counts=counts, boxes=boxes)
 
-    def _read(self, position: int, place: str) -> tuple[torch.Tensor, int]:
-        """One cloud in the vehicle frame, and how many of its points were not finite."""
-        path = self._paths[position][place]
-        points = read_cloud(path)
-        if place == "reference" and len(points) == 0:
-            raise ValueError(f"{path}: the reference cloud has no points, so there is nothing to measure against")
-        finite = np.isfinite(points).all(axis=1)
-        return _to_vehicle(points[finite], self._vehicle_T_source.get(place), path), int((~finite).sum())
+    @property
+    def _judged(self) -> tuple[str, ...]:
+        """The sensors of all rigs, each once."""
+        return tuple(dict.fromkeys(sensor for of in self.sensors_of_rigs.values() for sensor in of))
 
+    def _read(self, sensor: str, instant: int) -> InVehicle:
+        return in_vehicle(self.recording.scan(sensor, instant), self.recording.body)
 
-def _stamp(path: Path) -> tuple[str, int, int]:
-    status = path.stat()
-    return path.name, status.st_size, status.st_mtime_ns
-
-
-def _rig_places(folder: Path) -> dict[str, str]:
-    """Name of each rig -> its folder within the recording."""
-    if not (folder / "rigs").is_dir():
-        return {ONLY_RIG: "sensor"}
-    if (folder / "sensor").exists():
-        raise ValueError(f"{folder}: both sensor/ and rigs/; sensor/ is for one rig, rigs/NAME/ for several")
-    names = [path.name for path in (folder / "rigs").iterdir() if not path.name.startswith(".")]
-    if not names:
-        raise ValueError(f"{folder / 'rigs'}: no rig; each has a folder rigs/NAME/ of its own")
-    return {name: f"rigs/{name}" for name in sorted(names, key=_natural)}
+    def _check_sensors(self) -> None:
+        there = (*self.recording.sensors, *self.recording.reference_sensors)
+        for rig, sensors in self.sensors_of_rigs.items():
+            unknown = [sensor for sensor in sensors if sensor not in there]
+            if unknown or not sensors:
+                raise ValueError(
+                    f"rig {rig!r}: sensors of the recording {self.recording.path} are needed, which has "
+                    f"{', '.join(there)}; got {', '.join(unknown) or 'none'}"
+                )
 
 
-def _to_vehicle(points_m: Points, vehicle_T_source: Matrix | None, path: Path) -> torch.Tensor:
-    points = points_m if vehicle_T_source is None else transform(vehicle_T_source, points_m)
-    farthest_m = float(np.abs(points).max(initial=0.0))
-    if farthest_m > MAX_COORDINATE_M:
-        raise ValueError(
-            f"{path}: a coordinate of {farthest_m:.6g} m in the vehicle frame, at most {MAX_COORDINATE_M:g} m is "
-            f"allowed; for world coordinates give vehicle_T_sensor in {POSES_FILE}"
-        )
-    return torch.from_numpy(points.astype(np.float32))
-
-
-def _clouds_by_name(folder: Path) -> dict[str, Path]:
-    if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder; a recording holds {RecordedFrames.layout}")
-    clouds: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.name.startswith("."):  # what file managers and version control leave behind
+def _stamps(place: Path) -> Iterator[tuple[str, int, int]]:
+    """Path, size and time of change of every file; those of results that somebody keeps beside it are no part of it."""
+    if place.is_file():
+        yield place.name, place.stat().st_size, place.stat().st_mtime_ns
+    for folder, folders, names in os.walk(place):
+        if not RESULTS.isdisjoint(names):
+            folders.clear()
             continue
-        name, suffix = split_name(path.name)
-        if not suffix or path.is_dir():
-            raise ValueError(f"{path}: not a cloud; allowed are files ending in {', '.join(READERS)}")
-        if name in clouds:
-            raise ValueError(f"{folder}: two files for the frame {name}: {clouds[name].name} and {path.name}")
-        clouds[name] = path
-    return clouds
+        folders.sort()
+        for name in sorted(names):
+            status = Path(folder, name).stat()
+            yield Path(folder, name).relative_to(place).as_posix(), status.st_size, status.st_mtime_ns
 
 
-def _check_same_names(folder: Path, files: Mapping[str, Mapping[str, Path]]) -> None:
-    places = " and ".join(f"{place}/" for place in files)
-    anywhere = set[str]().union(*files.values())
-    if not anywhere:
-        raise ValueError(f"{folder}: no frames; {places} are empty")
-    complaints = [
-        f"{len(gaps)} missing in {place}/ ({_some_of(gaps)})"
-        for place, clouds in files.items()
-        if (gaps := sorted(anywhere - clouds.keys(), key=_natural))
-    ]
-    if complaints:
-        raise ValueError(f"{folder}: every frame needs a file in {places}; {' and '.join(complaints)}")
+def reference_of_recording(name: str | None = None, window_s: float | None = None) -> Reference | None:
+    """The reference of a recording by its name.
 
+    Args:
+        name: "recorded" or "accumulated"; None for what the recording has.
+        window_s: Time over which one is accumulated, in seconds.
 
-def _some_of(names: Sequence[str]) -> str:
-    return ", ".join([*names[:MAX_NAMES_SHOWN], *["..."] * (len(names) > MAX_NAMES_SHOWN)])
+    Raises:
+        ValueError: Another name, or a time for one that was recorded.
 
-
-def _check_places(folder: Path, poses: Mapping[str, Matrix], files: Mapping[str, object]) -> None:
-    for place in poses:
-        if place not in files:
-            raise ValueError(f"{folder / POSES_FILE}: {place.replace('/', '.')}: there is no {place}/ beside it")
-
-
-def _natural(name: str) -> tuple[list[str | int], str]:
-    # Text and number alternate, starting with text, so that two keys always compare; the name itself breaks a tie.
-    parts = re.split(r"(\d+)", name)
-    return [int(part) if position % 2 else part for position, part in enumerate(parts)], name
+    Example:
+        >>> reference_of_recording("accumulated", 1.0).window_s
+        1.0
+    """
+    if name not in (None, "recorded", "accumulated"):
+        raise ValueError(f"reference {name}: for a recording `recorded` or `accumulated` is needed")
+    if name == "accumulated" or window_s is not None:
+        if name == "recorded":
+            raise ValueError(
+                f"window: a recorded reference has none; got {window_s:g} s; leave it out, or accumulate one"
+            )
+        return AccumulatedReference() if window_s is None else AccumulatedReference(window_s)
+    return RecordedReference() if name == "recorded" else None

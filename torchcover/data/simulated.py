@@ -4,7 +4,7 @@ import copy
 import hashlib
 import pickle
 from collections.abc import Mapping, Sequence
-from dataclasses import is_dataclass, replace
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Self
 
@@ -15,7 +15,8 @@ from torch.utils.data import Dataset
 
 from torchcover.data.frame import Frame
 from torchcover.data.reference import reference_called, reference_of_objects
-from torchcover.detection.boxes import Boxes, points_in_boxes
+from torchcover.detection.boxes import Boxes
+from torchcover.detection.inside import with_hits
 from torchcover.simulation import Label, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
 
 # What takes years.
@@ -204,5 +205,4 @@ def _boxes(found: Sequence[Label], clouds: Mapping[str, torch.Tensor], drawn: ND
         categories=tuple(label.category for label in found),
         drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
     )
-    inside = {name: points_in_boxes(cloud, boxes).box for name, cloud in clouds.items()}
-    return replace(boxes, hits={name: torch.bincount(box, minlength=len(boxes)) for name, box in inside.items()})
+    return with_hits(boxes, clouds)

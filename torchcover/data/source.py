@@ -44,7 +44,10 @@ class FrameSource(Protocol):
 
     @property
     def reference_record(self) -> Mapping[str, object] | None:
-        """Which reference sensor was simulated and how often, `sensor` and `every_s`; None: it was recorded."""
+        """Where the reference comes from, for `summary.json`: `sensor` and its settings; None if nobody knows.
+
+        One that was simulated says `every_s`, any other `notes`: sentences that a reader of the numbers has to know.
+        """
         ...
 
     @property

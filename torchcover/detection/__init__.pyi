@@ -1,5 +1,5 @@
 from .boxes import Boxes as Boxes
-from .boxes import points_in_boxes as points_in_boxes
+from .inside import points_in_boxes as points_in_boxes
 from .matching import bev_iou as bev_iou
 from .matching import match as match
 from .recall import RecallByVisibility as RecallByVisibility

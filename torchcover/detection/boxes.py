@@ -1,16 +1,16 @@
-"""Boxes around objects, and the points in them."""
+"""Boxes around objects."""
 
 import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
-# A body's points lie on its box as often as in it; rounding of coordinates may put them on either side.
-SKIN_M = 0.01
+from torchcover.detection.box_layouts import headings, upright_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +110,97 @@ class Boxes:
             raise ValueError(f"rows: shape (K, 7) is needed, x y z length width height yaw; got {tuple(rows.shape)}")
         return cls(rows[:, :3], rows[:, 3:6], rows[:, 6], **others)  # type: ignore[arg-type]
 
+    @classmethod
+    def from_openpcdet(cls, rows: Tensor, **others: object) -> "Boxes":
+        """From OpenPCDet's rows, which are those of `from_rows`: the centre is half-way up."""
+        return cls.from_rows(rows, **others)
+
+    @classmethod
+    def from_mmdet3d(cls, rows: Tensor, **others: object) -> "Boxes":
+        """From MMDetection3D's `LiDARInstance3DBoxes.tensor`: z is that of the bottom; columns 7 and 8 are velocities.
+
+        Example:
+            >>> Boxes.from_mmdet3d(torch.tensor([[5.0, 0.0, -1.6, 0.8, 0.6, 1.8, 0.0]])).centre_m[0, 2].item()
+            -0.7...
+        """
+        if rows.ndim != 2 or rows.shape[1] not in (7, 9):
+            raise ValueError(f"rows: shape (K, 7) or (K, 9) is needed; got {tuple(rows.shape)}")
+        centred = rows[:, :7].clone()
+        centred[:, 2] += rows[:, 5] / 2
+        if rows.shape[1] == 9:
+            others = {"velocity_mps": rows[:, 7:], **others}
+        return cls.from_rows(centred, **others)
+
+    @classmethod
+    def from_kitti_label(
+        cls, numbers: ArrayLike, vehicle_T_camera: NDArray[np.float64] | None = None, **others: object
+    ) -> "Boxes":
+        """From the numbers of KITTI's `label_2`: places in the rectified camera frame, at the bottom of the box.
+
+        Args:
+            numbers: (K, 14) what follows the type: truncated, occluded, alpha, four of the image, height, width,
+                length, x, y, z, rotation about the camera's y.
+            vehicle_T_camera: (4, 4) where the rectified camera is: of the LiDAR frame it is
+                inv(R0_rect Tr_velo_to_cam).
+            others: As `from_rows`.
+
+        Raises:
+            ValueError: Another shape, or as the constructor.
+        """
+        given = np.asarray(numbers, dtype=np.float64).reshape(-1, 14)
+        height, width, length, x, y, z, turn = given[:, 7:].T
+        centre = np.column_stack([x, y - height / 2, z])  # the camera's y points down
+        ahead = np.column_stack([np.cos(turn), np.zeros_like(turn), -np.sin(turn)])
+        rows = upright_rows(centre, np.column_stack([length, width, height]), ahead, vehicle_T_camera)
+        return cls.from_rows(rows, **others)
+
+    @classmethod
+    def from_nuscenes(
+        cls,
+        translation: ArrayLike,
+        size: ArrayLike,
+        rotation: ArrayLike,
+        vehicle_T_global: NDArray[np.float64] | None = None,
+        **others: object,
+    ) -> "Boxes":
+        """From nuScenes' `sample_annotation`.
+
+        Args:
+            translation: (K, 3) centres in the global frame.
+            size: (K, 3) width, length, height.
+            rotation: (K, 4) quaternions w, x, y, z.
+            vehicle_T_global: (4, 4) the inverse of the vehicle's pose.
+            others: As `from_rows`.
+
+        Raises:
+            ValueError: Shapes that do not fit, or as the constructor.
+        """
+        lengthwise = np.asarray(size, dtype=np.float64).reshape(-1, 3)[:, [1, 0, 2]]
+        return cls.from_rows(upright_rows(translation, lengthwise, headings(rotation), vehicle_T_global), **others)
+
+    @classmethod
+    def from_av2(
+        cls,
+        translation: ArrayLike,
+        size: ArrayLike,
+        rotation: ArrayLike,
+        vehicle_T_ego: NDArray[np.float64] | None = None,
+        **others: object,
+    ) -> "Boxes":
+        """From the columns of Argoverse 2's `annotations.feather`.
+
+        Args:
+            translation: (K, 3) `tx_m`, `ty_m`, `tz_m`: centres in the frame of the ego, at its rear axle.
+            size: (K, 3) `length_m`, `width_m`, `height_m`.
+            rotation: (K, 4) `qw`, `qx`, `qy`, `qz`.
+            vehicle_T_ego: (4, 4) where that frame is in the vehicle frame.
+            others: As `from_rows`.
+
+        Raises:
+            ValueError: Shapes that do not fit, or as the constructor.
+        """
+        return cls.from_rows(upright_rows(translation, size, headings(rotation), vehicle_T_ego), **others)
+
     @property
     def rows(self) -> Tensor:
         """(K, 7) x, y, z of the centre, length, width, height, yaw: the layout of OpenPCDet."""
@@ -160,63 +251,6 @@ class Boxes:
             hits={rig: move(count) for rig, count in self.hits.items()},
             drawn_points=move(self.drawn_points),
         )
-
-
-class Inside(NamedTuple):
-    """Pairs of a box and a point in it: `box` (P,) and `point` (P,) int64, by ascending box."""
-
-    box: Tensor
-    point: Tensor
-
-
-def points_in_boxes(points: Tensor, boxes: Boxes) -> Inside:
-    """Which points lie in which boxes; a point may lie in several.
-
-    A body touches its box: the wall of a box-shaped truck lies on the box's side. Sides and top are therefore closed,
-    and `SKIN_M` = 1 cm thicker than given. The bottom is raised by as much: what the body stands on is not the body.
-
-    Args:
-        points: (N, 3) points in the vehicle frame in metres.
-        boxes: K boxes in the same frame, on the same device.
-
-    Returns:
-        `Inside(box, point)`.
-
-    Example:
-        >>> boxes = Boxes.from_rows(torch.tensor([[10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]]))
-        >>> points_in_boxes(torch.tensor([[11.9, 0.9, 1.9], [12.1, 0.0, 1.0], [10.0, 0.0, 0.0]]), boxes)
-        Inside(box=tensor([0]), point=tensor([0]))
-    """
-    if len(boxes) == 0 or len(points) == 0:
-        none = torch.empty(0, dtype=torch.int64, device=points.device)
-        return Inside(none, none)
-    points = points.detach().to(torch.promote_types(points.dtype, torch.float32))
-    # Sorted by x, the points that a box can hold are next to each other.
-    x_m, order = points[:, 0].contiguous().sort()
-    y_m = points[order, 1]
-    reach_m = torch.linalg.vector_norm(boxes.size_m[:, :2].double(), dim=1) / 2 + 2 * SKIN_M
-    first = torch.searchsorted(x_m, (boxes.centre_m[:, 0].double() - reach_m).to(x_m.dtype)).tolist()
-    end = torch.searchsorted(x_m, (boxes.centre_m[:, 0].double() + reach_m).to(x_m.dtype)).tolist()
-    near = []
-    for start, stop, centre_y_m, reach in zip(first, end, boxes.centre_m[:, 1].tolist(), reach_m.tolist(), strict=True):
-        near.append(order[start:stop][(y_m[start:stop] - centre_y_m).abs() < reach])
-    point = torch.cat(near)
-    counts = torch.tensor([len(some) for some in near], device=point.device)
-    box = torch.arange(len(boxes), device=point.device).repeat_interleave(counts)
-    inside = _is_inside(points[point], boxes.rows[box])
-    return Inside(box[inside], point[inside])
-
-
-def _is_inside(points: Tensor, rows: Tensor) -> Tensor:
-    """(N,) whether each of (N, 3) points lies in the box of its (N, 7) row."""
-    x, y, z = (points.double() - rows[:, :3].double()).T
-    half_length, half_width, half_height = rows[:, 3:6].double().T / 2
-    cosine, sine = rows[:, 6].double().cos(), rows[:, 6].double().sin()
-    beside = ((x * cosine + y * sine).abs() <= half_length + SKIN_M) & (
-        (y * cosine - x * sine).abs() <= half_width + SKIN_M
-    )
-    inside: Tensor = beside & (z > SKIN_M - half_height) & (z <= half_height + SKIN_M)
-    return inside
 
 
 def check_boxes(boxes: object) -> None:

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchcover.detection.boxes import Boxes, check_boxes, points_in_boxes
+from torchcover.detection.boxes import Boxes, check_boxes
+from torchcover.detection.inside import points_in_boxes
 from torchcover.neighbors import blind_spot_radius, check_cloud
 
 

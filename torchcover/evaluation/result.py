@@ -35,7 +35,7 @@ class Result:
         run: How the run went; None if nobody knows, for they were saved.
         rigs: What the user called each rig, by its name; None for the rig of a recording that nobody named.
         source: Where the frames came from: `scenario`, `frames`, `seed`.
-        reference_record: The reference sensor: `sensor` and `every_s`; None if it was recorded.
+        reference_record: Where the reference comes from, as `FrameSource.reference_record` says; None if nobody knows.
         device: Where it ran; None if nobody knows.
         target_error: What was aimed at.
         sensors: The sensors of the rigs that they are known of, for the maps.
@@ -50,7 +50,7 @@ class Result:
     run: Run | None
     rigs: Mapping[str, str | None]
     source: Mapping[str, object]
-    reference_record: Mapping[str, object] | None
+    reference_record: Mapping[str, Any] | None
     device: str | None
     target_error: TargetError | None = None
     sensors: Mapping[str, Sequence[Sensor]] = field(default_factory=dict)
@@ -171,13 +171,13 @@ class Result:
         return dict(zip(RUN_KEYS, known, strict=True))
 
     @property
-    def _reference_used(self) -> dict[str, object] | None:
-        """The reference sensor with the rays that it cast."""
+    def _reference_used(self) -> Mapping[str, Any] | None:
+        """Where the reference comes from, with the rays that it cast where it was simulated."""
         record = self.reference_record
         if self.run is None or record is None:
             return None
         rays = self.run.counts["reference_rays"] // self.run.steps
-        return {"sensor": record["sensor"], "rays_per_step": rays, "every_s": record["every_s"]}
+        return {**record, "rays_per_step": rays} if "every_s" in record else record
 
     @property
     def _notes(self) -> list[str]:
@@ -185,6 +185,8 @@ class Result:
         record = self._reference_used
         if record is None:
             return self._on_failure
+        if "every_s" not in record:
+            return [*self._on_failure, *record["notes"]]
         rays, every_s = record["rays_per_step"], record["every_s"]
         sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
         return [*self._on_failure, sensor, *self._on_repetitions]

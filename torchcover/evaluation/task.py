@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from torchcover.data import ChosenRigs, FrameSource, SimulatedFrames, open_recording, reference_called
+from torchcover.data import ChosenRigs, FrameSource, RecordedFrames, SimulatedFrames, reference_called
 from torchcover.evaluation.rig_names import AnyRig, distinct_names, given_as, is_document, loaded
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings, spread_s
 from torchcover.simulation import Scenario, Sensor
@@ -60,7 +60,7 @@ def task_of(rigs: Sequence[AnyRig], scenario: AnyScenario | None, frames: AnyFra
     if scenario is not None:
         raise ValueError("scenario and frames exclude each other: simulate a scenario or read a recording")
     settings.check_recording()
-    source = open_recording(frames) if isinstance(frames, str | Path) else frames
+    source = RecordedFrames(frames) if isinstance(frames, str | Path) else frames
     if not isinstance(source, FrameSource):
         missing = [name for name in vars(FrameSource) if not name.startswith("_") and not hasattr(source, name)]
         raise TypeError(

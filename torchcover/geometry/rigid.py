@@ -10,56 +10,58 @@ RIGID_TOLERANCE = 1e-3
 
 
 def rigid(rotation: ArrayLike, translation_m: ArrayLike) -> Matrix:
-    """Assemble a transform from a rotation and a translation.
+    """Assemble a transform from a rotation and a translation, or many of them.
 
     Args:
-        rotation: (3, 3) rotation matrix.
-        translation_m: (3,) position of the source frame's origin in the destination frame, in metres.
+        rotation: (..., 3, 3) rotation matrix.
+        translation_m: (..., 3) position of the source frame's origin in the destination frame, in metres.
 
     Returns:
-        (4, 4) float64 matrix.
+        (..., 4, 4) float64 matrix.
 
     Example:
         >>> rigid(np.eye(3), [1.0, 2.0, 3.0])[:3, 3]
         array([1., 2., 3.])
     """
-    matrix = np.eye(4)
-    matrix[:3, :3] = rotation
-    matrix[:3, 3] = translation_m
+    matrix = np.zeros((*np.shape(translation_m)[:-1], 4, 4))
+    matrix[..., :3, :3] = rotation
+    matrix[..., :3, 3] = translation_m
+    matrix[..., 3, 3] = 1.0
     return matrix
 
 
 def invert(destination_T_source: Matrix) -> Matrix:
-    """Invert a rigid transform: `source_T_destination`, by transposing the rotation.
+    """Invert a rigid transform, or each of (..., 4, 4): `source_T_destination`, by transposing the rotation.
 
     Example:
         >>> world_T_vehicle = rigid(rotation_from_euler(90.0, 0.0, 0.0), [5.0, 0.0, 0.0])
         >>> bool(np.allclose(invert(world_T_vehicle) @ world_T_vehicle, np.eye(4)))
         True
     """
-    rotation = destination_T_source[:3, :3]
-    return rigid(rotation.T, -rotation.T @ destination_T_source[:3, 3])
+    transposed = destination_T_source[..., :3, :3].swapaxes(-1, -2)
+    return rigid(transposed, (-transposed @ destination_T_source[..., :3, 3:])[..., 0])
 
 
-def rotation_from_euler(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix:
+def rotation_from_euler(yaw_deg: ArrayLike, pitch_deg: ArrayLike, roll_deg: ArrayLike) -> Matrix:
     """Rotation by roll about x, then pitch about y, then yaw about z (all axes fixed): R = Rz(yaw) Ry(pitch) Rx(roll).
 
     In a frame with x forward, y left, z up a positive yaw turns left, a positive pitch turns the nose DOWN
-    (right-handed about y) and a positive roll lowers the right side.
+    (right-handed about y) and a positive roll lowers the right side. Of (...) angles the rotations are (..., 3, 3).
 
     Example:
         >>> rotation_from_euler(90.0, 0.0, 0.0).round(6) @ [1.0, 0.0, 0.0]
         array([0., 1., 0.])
     """
-    yaw, pitch, roll = np.deg2rad([yaw_deg, pitch_deg, roll_deg])
+    yaw, pitch, roll = np.deg2rad(np.array([yaw_deg, pitch_deg, roll_deg]))
     (cy, cp, cr), (sy, sp, sr) = np.cos([yaw, pitch, roll]), np.sin([yaw, pitch, roll])
-    return np.array(
+    rotation = np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
             [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
             [-sp, cp * sr, cp * cr],
         ]
     )
+    return rotation.transpose(*range(2, rotation.ndim), 0, 1)
 
 
 def euler_from_rotation(rotation: Matrix) -> Matrix:

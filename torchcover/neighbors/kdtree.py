@@ -11,6 +11,8 @@ from torch import Tensor
 
 # About how many points are looked at for equal ones.
 SAMPLE = 1024
+# Points in a leaf of the tree. Against pykdtree's 16, building it takes less than half the time; asking takes no more.
+LEAF = 64
 
 
 def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float) -> Tensor:
@@ -30,7 +32,7 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
     least = 2 * math.sqrt(torch.finfo(query.dtype).tiny)
     bound = None if math.isinf(max_distance) else max(max_distance * (1 + 1e-5), least)
     coordinates, number = _distinct(np.ascontiguousarray(points.numpy()))
-    _, index = KDTree(coordinates).query(np.ascontiguousarray(query.numpy()), distance_upper_bound=bound)
+    _, index = KDTree(coordinates, leafsize=LEAF).query(np.ascontiguousarray(query.numpy()), distance_upper_bound=bound)
     found = torch.from_numpy(index.astype(np.int64))
     # pykdtree answers "none" with the number of points.
     none = found >= len(coordinates)

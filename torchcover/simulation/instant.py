@@ -3,13 +3,15 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from itertools import pairwise
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import transform
 from torchcover.simulation.culling import Outlines, blocks_towards, boxes_in_cone, outlines, rays_towards
+from torchcover.simulation.moving import Moving
 from torchcover.simulation.raycaster import Hits, RayCaster
 from torchcover.simulation.rays import TILE_ROWS, Tile, into_tiles, unit_directions
 
@@ -23,6 +25,8 @@ CLEAR_RADII = 2.0
 
 Matrix = NDArray[np.float64]
 Float32 = NDArray[np.float32]
+Numbers = NDArray[np.int64]
+AnyFloat = TypeVar("AnyFloat", np.float32, np.float64)
 
 
 class Scan(NamedTuple):
@@ -37,20 +41,6 @@ class Scan(NamedTuple):
     rays: int
     self_hits: int
     body_casts: int = 0
-
-
-class Part(NamedTuple):
-    """A body that moves, placed at one instant; `body` is its number.
-
-    `corners_m` (8, 3) of the box around it, and a ball around it, both in the vehicle frame.
-    """
-
-    caster: RayCaster
-    part_T_vehicle: Matrix
-    body: int
-    corners_m: Matrix
-    centre_m: Matrix
-    radius_m: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +58,7 @@ class Instant:
 
     static: RayCaster
     static_T_vehicle: Matrix
-    moving: tuple[Part, ...]
+    moving: Moving
     ego: int
     out_of_range: int = 0
     vehicle_R_level: Matrix = field(default_factory=lambda: np.eye(3))
@@ -144,18 +134,20 @@ class Instant:
 
     def buried(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies below the ground or inside a wall or another body than the ego."""
-        casters = [(self.static, self.static_T_vehicle)]
-        casters += [
-            (part.caster, part.part_T_vehicle)
-            for part in self.moving
-            if part.body != self.ego and np.linalg.norm(part.centre_m - position_m) <= CLEAR_RADII * part.radius_m
-        ]
-        for caster, part_T_vehicle in casters:
-            met = caster.met_from_behind(transform(part_T_vehicle, position_m[None])[0], ALL_AROUND_RAYS)
-            # What never moves may have the ego in it, under its own number; a body that moves is number 0 of its own.
-            if ((met >= 0) & ((caster is not self.static) | (met != self.ego))).mean() > BURIED_SHARE:
-                return True
-        return False
+        if self._inside(self.static, transform(self.static_T_vehicle, position_m[None])[0], self.ego):
+            return True
+        moving, others = self.moving, self.moving.body != self.ego
+        near = np.linalg.norm(moving.centre_m - position_m, axis=1) <= CLEAR_RADII * moving.radius_m
+        if not (near & others).any():
+            return False
+        places_m = moving.from_there_m(position_m)
+        return any(self._inside(moving.casters[k], places_m[k]) for k in np.flatnonzero(near & others).tolist())
+
+    @staticmethod
+    def _inside(caster: RayCaster, place_m: Matrix, but: int = -1) -> bool:
+        """Whether a place lies inside another body of a caster than one."""
+        met = caster.met_from_behind(place_m, ALL_AROUND_RAYS)
+        return bool(((met >= 0) & (met != but)).mean() > BURIED_SHARE)
 
     def on_a_face(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies exactly on the ground, or on a face of what else never moves."""
@@ -164,8 +156,7 @@ class Instant:
 
     def outlines(self, origin_m: Matrix) -> Outlines:
         """The bodies that move, as they look from a place."""
-        corners_m = [part.corners_m for part in self.moving]
-        return outlines(np.array(corners_m).reshape(-1, 8, 3), origin_m)
+        return outlines(self.moving.corners_m, origin_m)
 
     def cast(
         self,
@@ -194,26 +185,68 @@ class Instant:
         hits = cast_from(self.static, self.static_T_vehicle, origin_m, directions, limit_m)
         if own_m is not None:
             hits.body[(hits.body < 0) & (own_m <= limit_m)] = self.ego
-        if not self.moving:
-            return directions, hits, 0
+        casts = self._cast_at_moving(origin_m, vehicle_R_sensor, tile, directions, hits, bodies, own_m is not None)
+        return directions, hits, casts
+
+    def _cast_at_moving(
+        self,
+        origin_m: Matrix,
+        vehicle_R_sensor: Matrix,
+        tile: Tile,
+        directions: Float32,
+        hits: Hits,
+        bodies: Outlines,
+        ego_is_known: bool,
+    ) -> int:
+        """Cast the rays of one tile at what moves, each at the bodies that it may meet before it ends; how many pairs.
+
+        The hits are brought up to date.
+        """
         farthest_m = float(hits.range_m.max(initial=0.0))
         near = boxes_in_cone(bodies, vehicle_R_sensor @ tile.axis, tile.half_angle, farthest_m)
+        if ego_is_known:
+            near = near[self.moving.body[near] != self.ego]
         if len(near) == 0:
-            return directions, hits, 0
-        reached = blocks_towards(bodies.kept(near), tile, vehicle_R_sensor, hits.range_m)
-        casts = 0
-        # In the order of the bodies: which of two coincident ones a ray hits depends on it.
-        for k, blocks in zip(near[reached.any(axis=1)].tolist(), reached[reached.any(axis=1)], strict=True):
-            part = self.moving[k]
-            if own_m is not None and part.body == self.ego:
-                continue
-            rays = rays_towards(bodies, k, tile.blocks[blocks].ravel(), directions, hits.range_m)
-            casts += len(rays)
-            if len(rays):
-                nearer = cast_from(part.caster, part.part_T_vehicle, origin_m, directions[:, rays], hits.range_m[rays])
-                hits.range_m[rays] = nearer.range_m
-                hits.body[rays[nearer.body >= 0]] = part.body
-        return directions, hits, casts
+            return 0
+        of_near, block = np.nonzero(blocks_towards(bodies.kept(near), tile, vehicle_R_sensor, hits.range_m))
+        part, ray = rays_towards(bodies, near[of_near], tile.blocks[block], directions, hits.range_m)
+        if len(ray) == 0:
+            return 0
+        range_m, met = self._cast_pairs(origin_m, directions, part, ray, hits.range_m)
+        # The nearest counts; of two that coincide, the last in the order of the bodies.
+        part, ray, range_m = part[met], ray[met], range_m[met]
+        nearest_m = np.full(len(hits.range_m), np.inf, dtype=np.float32)
+        np.minimum.at(nearest_m, ray, range_m)
+        first = range_m == nearest_m[ray]
+        hits.range_m[ray[first]] = range_m[first]
+        hits.body[ray[first]] = self.moving.body[part[first]]
+        return len(met)
+
+    def _cast_pairs(
+        self, origin_m: Matrix, directions: Float32, part: Numbers, ray: Numbers, limit_m: Float32
+    ) -> tuple[Float32, NDArray[np.bool_]]:
+        """Cast K pairs of a ray and a body that moves: (K,) where the ray ends, and whether it met the body."""
+        moving, places_m = self.moving, self.moving.from_there_m(origin_m)
+        casters, kind = moving.kinds
+        touched = moving.touched_by(origin_m, places_m)
+        # Bodies of one kind are cast at together. A ray that starts on a face is cast as one that leaves it.
+        group = np.where(touched, len(casters) + np.arange(len(moving)), kind)[part]
+        order = np.argsort(group, kind="stable")
+        part, ray, group = part[order], ray[order], group[order]
+        towards = rotate_each(moving.part_T_vehicle[:, :3, :3].astype(np.float32)[part], directions.take(ray, axis=1))
+        starts_m, limit_m = places_m.astype(np.float32)[part], limit_m[ray]
+        first, answers = np.flatnonzero(np.diff(group, prepend=-1)).tolist(), []
+        for start, end in pairwise([*first, len(group)]):
+            some, body = slice(start, end), part[start]
+            if touched[body]:
+                answers.append(moving.casters[body].cast(places_m[body], towards[:, some], limit_m[some]))
+            else:
+                caster = casters[group[start]]
+                answers.append(caster.cast_from_each(starts_m[some], towards[:, some], limit_m[some]))
+        range_m, met = np.empty_like(limit_m), np.empty(len(order), dtype=bool)
+        range_m[order] = np.concatenate([answer.range_m for answer in answers])
+        met[order] = np.concatenate([answer.body for answer in answers]) >= 0
+        return range_m, met
 
 
 def _limit(tile: Tile, max_range_m: float) -> Float32:
@@ -242,6 +275,11 @@ def rotate(rotation: Matrix, directions: Float32) -> Float32:
     """Turn (3, n) directions. What becomes of one does not depend on the others."""
     if np.array_equal(rotation, np.eye(3)):
         return directions
+    return rotate_each(rotation.astype(np.float32)[None], directions)
+
+
+def rotate_each(rotations: NDArray[AnyFloat], directions: NDArray[AnyFloat]) -> NDArray[AnyFloat]:
+    """Turn each of (3, n) directions by its own of (n, 3, 3) rotations, to the bits of `rotate`."""
     # No matrix product: BLAS rounds a single column differently, and wakes threads of its own for many.
-    rotated: Float32 = np.einsum("ij,jn->in", rotation.astype(np.float32), directions)
-    return rotated
+    (x, y, z), rows = directions, rotations.swapaxes(0, 1)
+    return np.stack([row[:, 0] * x + row[:, 1] * y + row[:, 2] * z for row in rows])

@@ -31,8 +31,7 @@ def outward_faces(mesh: Mesh) -> NDArray[np.bool_]:
         >>> outward_faces(Plane(type="plane", size_m=(1, 1)).mesh()).tolist()
         [False, False]
     """
-    _, welded = np.unique(mesh.vertices_m, axis=0, return_inverse=True)
-    corners = welded.reshape(-1)[mesh.faces]
+    corners = _welded(mesh.vertices_m)[mesh.faces]
     start, end = corners.ravel(), corners[:, [1, 2, 0]].ravel()
     lower, upper = np.minimum(start, end), np.maximum(start, end)
     _, edge = np.unique(lower * len(mesh.vertices_m) + upper, return_inverse=True)
@@ -48,6 +47,15 @@ def outward_faces(mesh: Mesh) -> NDArray[np.bool_]:
     rounding = VOLUME_ROUNDING * np.bincount(surface, weights=np.abs(volumes), minlength=len(mesh.faces))
     outward: NDArray[np.bool_] = ((open_edges == 0) & (volume >= -rounding))[surface]
     return outward
+
+
+def _welded(vertices_m: NDArray[np.float64]) -> Numbers:
+    """(V,) number of the place of each vertex; `np.unique` along an axis takes five times as long."""
+    order = np.lexsort(vertices_m.T)
+    differs = (np.diff(vertices_m[order], axis=0) != 0).any(axis=1)
+    number = np.empty(len(order), dtype=np.int64)
+    number[order] = np.concatenate([[0], np.cumsum(differs)])
+    return number
 
 
 def _connected(edge: Numbers, face: Numbers, faces: int) -> Numbers:

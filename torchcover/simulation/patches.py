@@ -20,6 +20,8 @@ LONGEST_M = 4.0
 LONGEST_SHARE = 1 / 64
 # A triangle with less area is a line: no point will ever be drawn from it.
 SMALLEST_M2 = 1e-10
+# The area of a half is half the area, to far less than this, which is far from the smallest.
+SURE_M2 = 1e-4
 
 
 class Bounds(NamedTuple):
@@ -32,7 +34,10 @@ class Bounds(NamedTuple):
         """(N,) whether each of N boxes, (N, 3) and (N, 3), meets any of these."""
         met = np.zeros(len(lower_m), dtype=bool)
         for low, high in zip(self.lower_m, self.upper_m, strict=True):
-            met |= ((lower_m <= high) & (upper_m >= low)).all(axis=1)
+            here = (lower_m[:, 0] <= high[0]) & (upper_m[:, 0] >= low[0])
+            for axis in (1, 2):
+                here &= (lower_m[:, axis] <= high[axis]) & (upper_m[:, axis] >= low[axis])
+            met |= here
         return met
 
 
@@ -59,8 +64,8 @@ class Patches(NamedTuple):
             bounds: What lies outside of these boxes is left out; all is wanted if not given.
         """
         extent_m = 0.0 if bounds is not None else float(np.ptp(mesh.vertices_m, axis=0).max())
-        triangles, face = _cut(mesh.vertices_m[mesh.faces], bounds, max(LONGEST_M, LONGEST_SHARE * extent_m))
-        corner, second, third = triangles.transpose(1, 2, 0)
+        corners_m = np.ascontiguousarray(mesh.vertices_m[mesh.faces].transpose(1, 2, 0))
+        (corner, second, third), face = _cut(corners_m, bounds, max(LONGEST_M, LONGEST_SHARE * extent_m))
         first_m, second_m = (second - corner).astype(np.float32), (third - corner).astype(np.float32)
         nobodys = np.full(len(face), -1, dtype=np.int32)
         return cls(corner.astype(np.float32), first_m, second_m, outward_faces(mesh)[face], nobodys)
@@ -109,30 +114,40 @@ class Patches(NamedTuple):
 
 
 def _cut(triangles: Float64, bounds: Bounds | None, longest_m: float) -> tuple[Float64, NDArray[np.int64]]:
-    """(N, 3, 3) triangles with short edges, and (N,) of which one of those given each is a part."""
-    face, done, done_face = np.arange(len(triangles)), [np.empty((0, 3, 3))], [np.empty(0, dtype=np.int64)]
-    while len(triangles):
-        kept = _areas(triangles) >= SMALLEST_M2
+    """(3, 3, N) triangles with short edges, and (N,) of which one of those given, (3, 3, M), each is a part.
+
+    Axes are the corner, the coordinate, the triangle: NumPy is quick along the last one.
+    """
+    face, area_m2 = np.arange(triangles.shape[2]), _areas(triangles)
+    done, done_face = [np.empty((3, 3, 0))], [np.empty(0, dtype=np.int64)]
+    while len(face):
+        kept = area_m2 >= SMALLEST_M2
         if bounds is not None:
-            kept &= bounds.meet(triangles.min(axis=1), triangles.max(axis=1))
-        triangles, face = triangles[kept], face[kept]
-        edges_m = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
-        small = (edges_m <= longest_m).all(axis=1)
-        done.append(triangles[small])
-        done_face.append(face[small])
-        triangles, face = _halved(triangles[~small], edges_m[~small].argmax(axis=1)), np.tile(face[~small], 2)
-    return np.concatenate(done), np.concatenate(done_face)
+            kept &= bounds.meet(triangles.min(axis=0).T, triangles.max(axis=0).T)
+        edges_m = np.linalg.norm(triangles[[1, 2, 0]] - triangles, axis=1)
+        small = edges_m.max(axis=0) <= longest_m
+        ready, large = np.flatnonzero(kept & small), np.flatnonzero(kept & ~small)
+        done.append(triangles.take(ready, axis=2))
+        done_face.append(face[ready])
+        triangles = _halved(triangles.take(large, axis=2), edges_m.take(large, axis=1).argmax(axis=0))
+        face, area_m2 = np.tile(face[large], 2), np.tile(area_m2[large] / 2, 2)
+        unsure = np.flatnonzero(area_m2 < SURE_M2)
+        area_m2[unsure] = _areas(triangles[..., unsure])
+    return np.concatenate(done, axis=2), np.concatenate(done_face)
 
 
 def _halved(triangles: Float64, longest: NDArray[np.int64]) -> Float64:
-    """(2 N, 3, 3) halves of N triangles on either side of the middle of one edge, first one of each, then the other."""
-    number = np.arange(len(triangles))
-    start, end, across = (triangles[number, (longest + k) % 3] for k in range(3))
+    """(3, 3, 2 N) halves of N triangles on either side of the middle of one edge, first one of each, then the other."""
+    first, second = longest == 0, longest == 1
+    a, b, c = triangles
+    start = np.where(first, a, np.where(second, b, c))
+    end = np.where(first, b, np.where(second, c, a))
+    across = np.where(first, c, np.where(second, a, b))
     middle = (start + end) / 2
-    return np.concatenate([np.stack([start, middle, across], axis=1), np.stack([middle, end, across], axis=1)])
+    return np.stack([np.hstack([start, middle]), np.hstack([middle, end]), np.hstack([across, across])])
 
 
 def _areas(triangles: Float64) -> Float64:
-    first, second = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    areas: Float64 = np.linalg.norm(np.cross(first, second), axis=1) / 2
+    a, b, c = triangles
+    areas: Float64 = np.linalg.norm(np.cross(b - a, c - a, axis=0), axis=0) / 2
     return areas

@@ -81,6 +81,20 @@ class RayCaster:
             self._leave_faces(origin_m, directions, limit_m, hits, self._numbers(answer))
         return hits
 
+    def cast_from_each(self, origins_m: Float32, directions: Float32, limit_m: Float32) -> Hits:
+        """Cast rays with an origin each, none of which lies on a face; see `touched`.
+
+        Args:
+            origins_m: (N, 3) where they start.
+            directions: (3, N) unit directions.
+            limit_m: (N,) distance at which each ray ends; may be infinite.
+
+        Returns:
+            As `cast`.
+        """
+        answer = self._scene.run(origins_m, directions.T, dists=limit_m.copy(), output=True)
+        return Hits(answer["tfar"], answer["geomID"])
+
     def _numbers(self, answer: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
         """(N,) which of all faces each ray hit; any number where it hit none."""
         numbers: NDArray[np.int64] = self._first_face[np.maximum(answer["geomID"], 0)] + np.maximum(answer["primID"], 0)

@@ -178,12 +178,13 @@ class Scenario(Document):
         """
         return BoundingBox.around(self.ego_mesh().vertices_m)
 
-    def world(self, seed: int = 0, episode: int = 0) -> World:
+    def world(self, seed: int = 0, episode: int = 0, ego: Mesh | None = None) -> World:
         """Build it.
 
         Args:
             seed: Seed of procedural traffic.
             episode: Which run; see `locate`.
+            ego: What `ego_mesh` gave, which the worlds of several runs share; made again if not given.
 
         Raises:
             FileNotFoundError: A mesh, vehicle or trajectory file is missing.
@@ -191,7 +192,7 @@ class Scenario(Document):
         """
         if self.traffic is not None:
             own_seed = int(np.random.SeedSequence([seed, episode]).generate_state(1, np.uint64)[0])
-            return self.traffic.world(own_seed, self.ego_mesh())
+            return self.traffic.world(own_seed, self.ego_mesh() if ego is None else ego)
         assert self.ego is not None  # checked in _check_given_or_procedural
         actors = tuple(actor.actor(actor.name, actor.category) for actor in self.actors)
         return World(

@@ -1,20 +1,21 @@
 """A world as geometry that rays can be cast at."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox, euler_from_rotation, invert, overlap, rotation_from_euler, transform
-from torchcover.simulation.culling import SLACK_M, SLACK_SHARE
-from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant, Part, rotate
+from torchcover.geometry import BoundingBox, euler_from_rotation, invert, overlap, rotation_from_euler
+from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant, rotate
 from torchcover.simulation.memory import check_fits
+from torchcover.simulation.moving import Moving
 from torchcover.simulation.patches import Bounds
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import Tile
 from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.solids import Solids
 from torchcover.simulation.surface import Surface, bounds_along
+from torchcover.simulation.trajectory import poses_at
 from torchcover.simulation.world import Actor, World
 
 Matrix = NDArray[np.float64]
@@ -22,24 +23,8 @@ Float32 = NDArray[np.float32]
 
 # Three float64, and the copies that are made on the way to them.
 BYTES_PER_POSITION = 96
-
-
-class Solid(NamedTuple):
-    """The geometry of one kind of body in its own frame.
-
-    `outline_m` (9, 3) has the corners of its box, grown a little, and the centre; no vertex is farther from that than
-    `radius_m`.
-    """
-
-    caster: RayCaster
-    box: BoundingBox
-    outline_m: Matrix
-    radius_m: float
-
-    @property
-    def reach_m(self) -> float:
-        """Distance from the origin of the frame that no vertex exceeds."""
-        return float(np.linalg.norm(self.outline_m[-1])) + self.radius_m
+# Of what never moves, as rays are cast at it.
+BYTES_PER_FACE = 300
 
 
 class Scene:
@@ -51,16 +36,18 @@ class Scene:
 
     Args:
         world: Meshes, actors and the ego.
+        solids: Those of other worlds whose bodies may be of the same kinds; its own if not given.
     """
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: World, solids: Solids | None = None) -> None:
         self.world = world
         self.ego_box = BoundingBox.around(world.ego.mesh.vertices_m)
         bodies = (world.ego, *world.objects)
-        self._resting = [actor for actor in bodies if not actor.trajectory.moves]
-        self._moving = [actor for actor in bodies if actor.trajectory.moves]
-        # One solid for each mesh object, however many actors share it.
-        self._solids = {id(mesh): _solid(mesh) for mesh in {id(actor.mesh): actor.mesh for actor in bodies}.values()}
+        self._resting: list[Actor] = []
+        self._moving: list[Actor] = []
+        for actor in bodies:
+            (self._moving if actor.trajectory.moves else self._resting).append(actor)
+        self._solids = Solids() if solids is None else solids
         # (steps, bodies, 3): where they are, to find out at once which are near; NaN, so never near, if absent.
         check_fits(
             f"{world.steps:,} time steps of {len(bodies):,} bodies",
@@ -70,18 +57,19 @@ class Scene:
         times_s = world.time_step_s * np.arange(world.steps, dtype=np.float64)
         tracks = [actor.trajectory.positions_at(times_s) for actor in self._resting + self._moving]
         self._positions_m = np.stack(tracks, axis=1)
-        self._reach_m = np.array([self._solids[id(actor.mesh)].reach_m for actor in self._resting + self._moving])
+        self._reach_m = np.array([self._solids.of(actor.mesh).reach_m for actor in self._resting + self._moving])
         # Subtracted in float64: world coordinates may be of UTM size. Where the ego rests, this frame is its own.
         self._world_T_local = world.ego.trajectory.at(0.0)
-        resting = [actor.mesh.moved(self._local_T_resting(actor)) for actor in self._resting]
-        self._static = RayCaster(resting + self._scenery())
+        local_T_world = invert(self._world_T_local)
+        self._local_T_resting = [local_T_world @ actor.trajectory.at(0.0) for actor in self._resting]
+        resting = [actor.mesh.moved(pose) for actor, pose in zip(self._resting, self._local_T_resting, strict=True)]
+        scenery = self._scenery()
+        self._static = RayCaster(resting + scenery)
+        self._faces = sum(len(mesh.faces) for mesh in resting + scenery)
         self._surfaces: dict[tuple[float, ...], Surface] = {}
 
     def _scenery(self) -> list[Mesh]:
         return [mesh.moved(invert(self._world_T_local)) for mesh in self.world.static]
-
-    def _local_T_resting(self, actor: Actor) -> Matrix:
-        return invert(self._world_T_local) @ actor.trajectory.at(0.0)
 
     def surface(self, lower_m: Matrix, upper_m: Matrix) -> Surface:
         """The surface of everything but the ego, for questions about a box that the vehicle carries along.
@@ -95,16 +83,18 @@ class Scene:
         box = (*lower_m.tolist(), *upper_m.tolist())
         if box not in self._surfaces:
             ego, step_s = self.world.ego, self.world.time_step_s
-            poses = [ego.trajectory.at(step * step_s) for step in range(self.world.steps)]
-            bounds = bounds_along(
-                np.stack([invert(self._world_T_local) @ pose for pose in poses]), Bounds(lower_m[None], upper_m[None])
-            )
+            poses = np.stack([ego.trajectory.at(step * step_s) for step in range(self.world.steps)])
+            bounds = bounds_along(invert(self._world_T_local) @ poses, Bounds(lower_m[None], upper_m[None]))
             objects = self.world.objects
             number = {id(actor): k for k, actor in enumerate(objects)}
             self._surfaces[box] = Surface(
                 self._scenery(),
-                [actor.mesh for actor in objects],
-                {number[id(actor)]: self._local_T_resting(actor) for actor in self._resting if actor is not ego},
+                [self._solids.of(actor.mesh).patches for actor in objects],
+                {
+                    number[id(actor)]: pose
+                    for actor, pose in zip(self._resting, self._local_T_resting, strict=True)
+                    if actor is not ego
+                },
                 {self._first_moving + k: number[id(actor)] for k, actor in enumerate(self._moving) if actor is not ego},
                 bounds,
             )
@@ -129,10 +119,7 @@ class Scene:
         distance_m = self._distance_m(step, world_T_vehicle)
         self._check_overlap(time_s, vehicle_T_world, distance_m)
         resting, first = len(self._resting), self._first_moving
-        moving = tuple(
-            self._place(first + k, self._moving[k], vehicle_T_world, time_s)
-            for k in np.flatnonzero(distance_m[resting:] < within_m).tolist()
-        )
+        moving = self._placed(np.flatnonzero(distance_m[resting:] < within_m), vehicle_T_world, time_s)
         # Either list of bodies begins with the ego.
         if self.world.ego.trajectory.moves:
             static_T_vehicle, ego = invert(self._world_T_local) @ world_T_vehicle, first
@@ -150,7 +137,7 @@ class Scene:
         ego = self.world.ego
         bodies = self._resting + self._moving
         ego_m = self._positions_m[:, [body is ego for body in bodies]]
-        reach_m = self._reach_m + self._solids[id(ego.mesh)].reach_m
+        reach_m = self._reach_m + self._solids.of(ego.mesh).reach_m
         near = (np.linalg.norm(self._positions_m - ego_m, axis=2) < reach_m).sum(axis=1) > 1  # one is the ego itself
         for step in steps[near[steps]].tolist():
             time_s = step * self.world.time_step_s
@@ -166,6 +153,16 @@ class Scene:
     def _first_moving(self) -> int:
         """Number of the first body that moves."""
         return len(self._resting) + len(self.world.static)
+
+    @property
+    def bytes(self) -> int:
+        """How much memory it takes, about, beside the solids that it shares with others."""
+        return (
+            self._positions_m.nbytes
+            + sum(actor.trajectory.bytes for actor in self._moving)
+            + BYTES_PER_FACE * self._faces
+            + sum(surface.bytes for surface in self._surfaces.values())
+        )
 
     @property
     def moves(self) -> bool:
@@ -193,7 +190,7 @@ class Scene:
         """
         if not self.world.ego.trajectory.moves:
             return ()
-        ego, own_m = self._solids[id(self.world.ego.mesh)].caster, []
+        ego, own_m = self._solids.of(self.world.ego.mesh).caster, []
         for tile in tiles:
             directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
             limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
@@ -203,30 +200,40 @@ class Scene:
 
     def encloses(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies inside the ego's body, so that no ray gets out."""
-        ego = self._solids[id(self.world.ego.mesh)].caster
+        ego = self._solids.of(self.world.ego.mesh).caster
         hits = ego.cast(position_m, ALL_AROUND_RAYS, np.full(ALL_AROUND_RAYS.shape[1], np.inf, dtype=np.float32))
         return bool((hits.body >= 0).all())
 
     def _check_overlap(self, time_s: float, vehicle_T_world: Matrix, distance_m: Matrix) -> None:
         bodies = self._resting + self._moving
-        ego_reach_m = self._solids[id(self.world.ego.mesh)].reach_m
+        ego_reach_m = self._solids.of(self.world.ego.mesh).reach_m
         for k in np.flatnonzero(distance_m < ego_reach_m).tolist():
             if bodies[k] is self.world.ego:
                 continue
             vehicle_T_actor = vehicle_T_world @ bodies[k].trajectory.at(time_s)
-            if overlap(self.ego_box, vehicle_T_actor, self._solids[id(bodies[k].mesh)].box):
+            if overlap(self.ego_box, vehicle_T_actor, self._solids.of(bodies[k].mesh).box):
                 raise ValueError(
                     f"actor {bodies[k].name!r} overlaps the ego at t = {time_s:g} s (their bounding boxes do); "
                     "change one of the trajectories"
                 )
 
-    def _place(self, body: int, actor: Actor, vehicle_T_world: Matrix, time_s: float) -> Part:
+    def _placed(self, numbers: NDArray[np.intp], vehicle_T_world: Matrix, time_s: float) -> Moving:
+        """Some of the bodies that move, at a time."""
+        actors = [self._moving[k] for k in numbers.tolist()]
+        solids = [self._solids.of(actor.mesh) for actor in actors]
+        vehicle_T_part = vehicle_T_world @ poses_at([actor.trajectory for actor in actors], time_s)
         # The ego is where it is, to the last bit: what a sensor sees of it is the same at every step.
-        ego = actor is self.world.ego
-        vehicle_T_actor = np.eye(4) if ego else vehicle_T_world @ actor.trajectory.at(time_s)
-        solid = self._solids[id(actor.mesh)]
-        *corners_m, centre_m = transform(vehicle_T_actor, solid.outline_m)
-        return Part(solid.caster, invert(vehicle_T_actor), body, np.array(corners_m), centre_m, solid.radius_m)
+        vehicle_T_part[[actor is self.world.ego for actor in actors]] = np.eye(4)
+        outlines_m = np.array([solid.outline_m for solid in solids]).reshape(-1, 9, 3)
+        outlines_m = outlines_m @ vehicle_T_part[:, :3, :3].swapaxes(1, 2) + vehicle_T_part[:, None, :3, 3]
+        return Moving(
+            casters=[solid.caster for solid in solids],
+            vehicle_T_part=vehicle_T_part,
+            body=self._first_moving + numbers,
+            corners_m=outlines_m[:, :8],
+            centre_m=outlines_m[:, 8],
+            radius_m=np.array([solid.radius_m for solid in solids]),
+        )
 
 
 def level_axes(world_T_vehicle: Matrix) -> Matrix:
@@ -236,13 +243,3 @@ def level_axes(world_T_vehicle: Matrix) -> Matrix:
         return np.eye(3)
     vehicle_R_level: Matrix = world_T_vehicle[:3, :3].T @ rotation_from_euler(yaw_deg, 0.0, 0.0)
     return vehicle_R_level
-
-
-def _solid(mesh: Mesh) -> Solid:
-    box = BoundingBox.around(mesh.vertices_m)
-    centre_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
-    radius_m = float(np.linalg.norm(mesh.vertices_m - centre_m, axis=1).max())
-    # Of the corners as they are cast: in float32.
-    slack_m = SLACK_M + SLACK_SHARE * float(np.abs(box.corners_m).max())
-    grown_m = box.corners_m + slack_m * np.sign(box.corners_m - centre_m)
-    return Solid(RayCaster([mesh]), box, np.vstack([grown_m, centre_m]), radius_m)

@@ -8,10 +8,10 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import rigid
 from torchcover.simulation.instant import Instant
-from torchcover.simulation.rays import BLOCK, Tile, into_tiles
+from torchcover.simulation.rays import BLOCK, Tile
 
 # Rays in a tile: of neighbours all, so that a tile is narrow. A constant, so that nothing depends on threads.
-TILE_RAYS = 4096
+TILE_RAYS = 8192
 # A ray ends before its target by this share of its length, which float32 leaves open.
 SHORTER = 1e-6
 
@@ -43,7 +43,8 @@ def sight(instant: Instant, place_m: NDArray[np.float64], targets_m: NDArray[np.
     order = _neighbours(directions)
 
     def cast(first: int) -> tuple[NDArray[np.int64], NDArray[np.int32], int]:
-        rays, tile = _tile(order[first : first + TILE_RAYS], directions)
+        rays = order[first : first + TILE_RAYS]
+        tile = _tile(directions[:, rays])
         _, hits, casts = instant.cast(vehicle_T_place, tile, limit_m[rays], bodies)
         return rays, hits.body, casts
 
@@ -62,17 +63,19 @@ def sight(instant: Instant, place_m: NDArray[np.float64], targets_m: NDArray[np.
 
 def _neighbours(directions: NDArray[np.float64]) -> NDArray[np.int64]:
     """An order in which as many directions as a block of a tile has are close to each other."""
-    azimuth = np.arctan2(directions[1], directions[0])
-    sectors = max(1, round(np.sqrt(len(azimuth)) / BLOCK))
-    rank = np.empty(len(azimuth), dtype=np.int64)
-    rank[np.argsort(azimuth, kind="stable")] = np.arange(len(azimuth))
-    return np.lexsort((directions[2], rank * sectors // max(len(azimuth), 1)))
+    by_azimuth = np.argsort(np.arctan2(directions[1], directions[0]))
+    sectors = max(1, round(np.sqrt(len(by_azimuth)) / BLOCK))
+    sector = np.arange(len(by_azimuth)) * sectors // max(len(by_azimuth), 1)
+    # The sine of an elevation is never as much as 4 from another.
+    return by_azimuth[np.argsort(4.0 * sector + directions[2, by_azimuth])]
 
 
-def _tile(rays: NDArray[np.int64], directions: NDArray[np.float64]) -> tuple[NDArray[np.int64], Tile]:
-    """The tile of some rays, and their numbers in its order; the last may be there more than once."""
-    rays = np.pad(rays, (0, -len(rays) % BLOCK**2), mode="edge")
-    # What follows each other becomes a square of rows and columns, as blocks are.
-    rays = rays.reshape(-1, BLOCK, BLOCK).transpose(1, 0, 2).reshape(BLOCK, -1)
-    (tile,) = into_tiles(directions[:, rays], tile_rows=BLOCK, tile_columns=rays.shape[1])
-    return rays.ravel(), tile
+def _tile(directions: NDArray[np.float64]) -> Tile:
+    """The tile of (3, n) directions; those that follow each other are a block, the last one repeats its last ray."""
+    rays = directions.shape[1]
+    blocks = np.minimum(np.arange(-(-rays // BLOCK**2) * BLOCK**2), rays - 1).reshape(-1, BLOCK**2)
+    rounded = directions.astype(np.float32)
+    in_blocks = rounded.take(blocks, axis=1)
+    lower, upper = in_blocks.min(axis=2).astype(np.float64), in_blocks.max(axis=2).astype(np.float64)
+    # They go all around: what they may meet is looked for by the block.
+    return Tile(rounded, np.array([1.0, 0.0, 0.0]), np.pi, blocks, lower, upper)

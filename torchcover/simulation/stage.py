@@ -7,16 +7,24 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch.utils.data import get_worker_info
 
 from torchcover.simulation.instant import Instant
+from torchcover.simulation.memory import machine_bytes
 from torchcover.simulation.mounted import MountedSensor
-from torchcover.simulation.rays import Tile, into_tiles
+from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
+from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.solids import Solids
 
 # A sensor on the ground is asked about a place this far above it: whether it is inside of something else.
 LIFT_M = np.array([0.0, 0.0, 0.01])
+# What all stages that are kept may take: in a process, four cities of a minute or more of anything smaller; and of the
+# machine's memory in all workers of a DataLoader together. One stage is kept anyway, however large.
+KEPT_BYTES = 160e6
+KEPT_SHARE = 1 / 16
 
 
 @dataclass(eq=False)
@@ -58,9 +66,10 @@ def _check_place(sensor: str, place_m: NDArray[np.float64], instant: Instant) ->
 
 
 class Stages:
-    """The stages of a scenario's runs: each is built when first needed, and the last one is kept.
+    """The stages of a scenario's runs: each is built when first needed, and a few are kept, in case they are again.
 
-    In each process, that is: Embree's scenes cannot be pickled, so that a DataLoader worker builds its own.
+    In each process, that is: Embree's scenes cannot be pickled, so that a DataLoader worker builds its own. What runs
+    have in common is made once: the bodies of each kind, and in traffic the sensors on the ego.
 
     Args:
         scenario: What plays.
@@ -72,8 +81,13 @@ class Stages:
         self._scenario = scenario
         self._rigs = rigs
         self._seed = seed
-        self._tiles: dict[str, list[tuple[Tile, ...]]] = {}
-        self._last: tuple[int, Stage] | None = None
+        self._forget()
+
+    def _forget(self) -> None:
+        self._kept: dict[int, Stage] = {}
+        self._solids = Solids()
+        self._ego: Mesh | None = None
+        self._mounted: Mapping[str, Sequence[MountedSensor]] | None = None
 
     def of_run(self, run: int) -> Stage:
         """The stage of one run; see `Scenario.locate`.
@@ -82,23 +96,39 @@ class Stages:
             FileNotFoundError: A mesh, vehicle or trajectory file is missing.
             ValueError: A mesh or a trajectory cannot be used, or a sensor is mounted inside the ego's body.
         """
-        if self._last is None or self._last[0] != run:
-            self._last = None  # there is not always memory for two
-            self._last = run, self._built(run)
-        return self._last[1]
+        if run in self._kept:
+            stage = self._kept.pop(run)
+        else:
+            self._make_room()
+            stage = self._built(run)
+        self._kept[run] = stage  # at the end: the first is the one that was asked for longest ago
+        return stage
+
+    def _make_room(self) -> None:
+        """Before a stage is built, about as large as the others: there is not always memory for one more."""
+        workers = get_worker_info()
+        most_bytes = min(KEPT_BYTES, KEPT_SHARE * machine_bytes() / (workers.num_workers if workers else 1))
+        sizes = [stage.scene.bytes for stage in self._kept.values()]
+        while sizes and sum(sizes) + max(sizes) > most_bytes:
+            del self._kept[next(iter(self._kept))], sizes[0]
 
     def _built(self, run: int) -> Stage:
-        scene = Scene(self._scenario.world(self._seed, run))
-        self._check_mounts(scene)
-        if not self._tiles:
-            self._tiles = {
-                name: [into_tiles(sensor.directions()) for sensor in rig.sensors] for name, rig in self._rigs.items()
-            }
-        return Stage(scene, {name: self._mount(name, scene) for name in self._rigs})
+        if self._ego is None and self._scenario.traffic is not None:
+            self._ego = self._scenario.ego_mesh()
+        scene = Scene(self._scenario.world(self._seed, run, self._ego), self._solids)
+        if self._ego is None or not scene.world.ego.trajectory.moves:
+            return Stage(scene, self._on(scene))
+        # What a sensor on an ego that moves sees of it is the same in all runs.
+        self._mounted = self._mounted or self._on(scene)
+        return Stage(scene, self._mounted)
 
-    def _mount(self, name: str, scene: Scene) -> list[MountedSensor]:
-        sensors = zip(self._rigs[name].sensors, self._tiles[name], strict=True)
-        return [MountedSensor(sensor, tiles, scene) for sensor, tiles in sensors]
+    def _on(self, scene: Scene) -> Mapping[str, Sequence[MountedSensor]]:
+        """The rigs' sensors on the ego of a scene."""
+        self._check_mounts(scene)
+        return {
+            name: [MountedSensor(sensor, into_tiles(sensor.directions()), scene) for sensor in rig.sensors]
+            for name, rig in self._rigs.items()
+        }
 
     def _check_mounts(self, scene: Scene) -> None:
         for name, rig in self._rigs.items():
@@ -111,4 +141,4 @@ class Stages:
                     )
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_last": None, "_tiles": {}}
+        return Stages(self._scenario, self._rigs, self._seed).__dict__

@@ -1,6 +1,5 @@
 """The surface of a world, cut small once; what is near the vehicle is looked up at every step."""
 
-import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import invert, transform
-from torchcover.simulation.instant import Instant
+from torchcover.simulation.instant import Instant, rotate_each
 from torchcover.simulation.patches import Bounds, Patches
 from torchcover.simulation.shapes import Mesh
 
@@ -16,7 +15,7 @@ Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 # Side of the squares of the ground by which patches are looked up.
-CELL_M = 16.0
+CELL_M = 16  # a power of two
 # A drive is followed by boxes around stretches of it of this length.
 STRETCH_M = 100.0
 # Boxes are grown by this much for the rounding of float32 coordinates.
@@ -43,7 +42,7 @@ class Surface:
 
     Args:
         scenery: What never moves and is no object, in the frame of the ray caster of what never moves.
-        objects: The objects by number, in their own frames; those of one kind share one mesh.
+        objects: Of the objects, by number, the patches of all of their surface, in their own frames.
         resting: By number, `static_T_object` of those that never move.
         moving: Of the others the number of the object, by that of the body in an instant.
         bounds: Boxes in the frame of what never moves, outside of which no scenery is ever asked for.
@@ -52,14 +51,13 @@ class Surface:
     def __init__(
         self,
         scenery: Sequence[Mesh],
-        objects: Sequence[Mesh],
+        objects: Sequence[Patches],
         resting: Mapping[int, Float64],
         moving: Mapping[int, int],
         bounds: Bounds,
     ) -> None:
-        kinds = {id(mesh): Patches.of(mesh) for mesh in {id(mesh): mesh for mesh in objects}.values()}
-        self._moving = {body: (kinds[id(objects[number])], number) for body, number in moving.items()}
-        placed = [kinds[id(objects[number])].moved(pose).given_to(number) for number, pose in resting.items()]
+        self._moving = {body: (objects[number], number) for body, number in moving.items()}
+        placed = [objects[number].moved(pose).given_to(number) for number, pose in resting.items()]
         patches = Patches.joined([Patches.of(mesh, bounds) for mesh in scenery] + placed)
         order, cell = _by_place(patches)
         self._static = patches.taken(order)
@@ -67,6 +65,11 @@ class Surface:
         of_objects = np.flatnonzero(self._static.of_object >= 0)
         self._resting = of_objects[np.argsort(self._static.of_object[of_objects], kind="stable")]
         self._objects = _groups(self._static.taken(self._resting), self._static.of_object[self._resting])
+
+    @property
+    def bytes(self) -> int:
+        """How much memory it takes, beside the objects' patches, which others share."""
+        return sum(column.nbytes for column in self._static)
 
     def near(self, instant: Instant, boxes: Bounds, objects_within_m: float = -np.inf) -> Patches:
         """The patches that may meet boxes of the vehicle frame, in that frame, and some that do not.
@@ -84,15 +87,30 @@ class Surface:
         objects = np.linalg.norm(np.clip(0.0, lower_m, upper_m), axis=1) <= objects_within_m
         wanted[self._resting[self._objects.members(np.flatnonzero(objects))]] = True
         near = [self._static.taken(np.flatnonzero(wanted)).moved(vehicle_T_static)]
-        bodies = [part for part in instant.moving if part.body != instant.ego]
-        centres_m = np.array([part.centre_m for part in bodies]).reshape(-1, 3)
-        radii_m = np.array([part.radius_m for part in bodies])[:, None]
-        meets = boxes.meet(centres_m - radii_m, centres_m + radii_m)
-        meets |= np.linalg.norm(centres_m, axis=1) - radii_m[:, 0] <= objects_within_m
-        for part in itertools.compress(bodies, meets):
-            patches, number = self._moving[part.body]
-            near.append(patches.moved(invert(part.part_T_vehicle)).given_to(number))
+        moving = instant.moving
+        radii_m = moving.radius_m[:, None]
+        meets = boxes.meet(moving.centre_m - radii_m, moving.centre_m + radii_m)
+        meets |= np.linalg.norm(moving.centre_m, axis=1) - moving.radius_m <= objects_within_m
+        bodies = np.flatnonzero(meets & (moving.body != instant.ego))
+        placed = [self._moving[number] for number in moving.body[bodies].tolist()]
+        near.append(placed_each(placed, moving.vehicle_T_part[bodies]))
         return Patches.joined(near)
+
+
+def placed_each(kinds: Sequence[tuple[Patches, int]], destination_T_source: Float64) -> Patches:
+    """Patches of bodies, with the number of the object that each is, moved to where they are; see `Patches.moved`."""
+    parts = [patches for patches, _ in kinds]
+    count = [len(patches.outward) for patches in parts]
+    pose = destination_T_source.repeat(count, axis=0)
+    rotation, all_parts = pose[:, :3, :3].astype(np.float32), Patches.joined(parts)
+    corner_m = rotate_each(pose[:, :3, :3], all_parts.corner_m.astype(np.float64)) + pose[:, :3, 3].T
+    return Patches(
+        corner_m=corner_m.astype(np.float32),
+        first_m=rotate_each(rotation, all_parts.first_m),
+        second_m=rotate_each(rotation, all_parts.second_m),
+        outward=all_parts.outward,
+        of_object=np.array([number for _, number in kinds], dtype=np.int32).repeat(count),
+    )
 
 
 def bounds_along(static_T_vehicle: Float64, box: Bounds) -> Bounds:
@@ -117,10 +135,10 @@ def _by_place(patches: Patches) -> tuple[Numbers, Numbers]:
         return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
     middle_m = (patches.corner_m + (patches.first_m + patches.second_m) / 3)[:2]
     # To a metre: a million on a side are enough for any drive.
-    place = np.clip(middle_m - middle_m.min(axis=1, keepdims=True), 0, 2**20).astype(np.int64)
-    cell = _interleaved(place // int(CELL_M))
-    order = np.lexsort((_interleaved(place), cell))
-    return order, cell[order]
+    place = _interleaved(np.clip(middle_m - middle_m.min(axis=1, keepdims=True), 0, 2**20).astype(np.int64))
+    order = np.argsort(place, kind="stable")
+    # Halving both coordinates is a shift by two.
+    return order, place[order] // CELL_M**2
 
 
 def _interleaved(place: Numbers) -> Numbers:

@@ -74,10 +74,7 @@ class SurfaceStrata:
         self._normals = normals / np.maximum(twice_m2, np.finfo(np.float32).tiny)
         self._plane_m = (self._normals * patches.corner_m).sum(axis=0)
         lower_m, upper_m = patches.lower_m - np.float32(SLACK_M), patches.upper_m + np.float32(SLACK_M)
-        self._strata = [
-            _stratum(twice_m2 / 2, lower_m, upper_m, low.tolist(), high.tolist())
-            for low, high in zip(*boxes, strict=True)
-        ]
+        self._strata = _strata(twice_m2 / 2, lower_m, upper_m, boxes)
         self._objects = _objects(patches.of_object, twice_m2 / 2)
 
     def draw(
@@ -131,22 +128,37 @@ def _inside(points_m: Float32, low: Float64, high: Float64) -> Bools:
     return inside
 
 
-def _stratum(m2: Float32, lower_m: Float32, upper_m: Float32, low: list[float], high: list[float]) -> Stratum:
-    meets = np.ones(lower_m.shape[1], dtype=bool)
-    for axis in range(3):
-        meets &= upper_m[axis] >= low[axis]
-        meets &= lower_m[axis] <= high[axis]
-    patch = np.flatnonzero(meets)
-    inside_m2 = m2[patch]
-    for axis in range(3):
-        from_m, to_m = lower_m[axis, patch], upper_m[axis, patch]
-        inside_m2 *= (np.minimum(to_m, high[axis]) - np.maximum(from_m, low[axis])) / (to_m - from_m)
-    return Stratum(patch, m2[patch].astype(np.float64), inside_m2.astype(np.float64))
+def _strata(m2: Float32, lower_m: Float32, upper_m: Float32, boxes: Bounds) -> list[Stratum]:
+    # What lies in an area, whatever its height, and how much of it: several bands ask about it.
+    above: dict[bytes, tuple[Numbers, Float32, Float32]] = {}
+    strata = []
+    for low, high in zip(*boxes, strict=True):
+        area = np.stack([low[:2], high[:2]]).tobytes()
+        if area not in above:
+            (x_low, y_low, _), (x_high, y_high, _) = low.tolist(), high.tolist()
+            meets = (upper_m[0] >= x_low) & (lower_m[0] <= x_high) & (upper_m[1] >= y_low) & (lower_m[1] <= y_high)
+            patch = np.flatnonzero(meets)
+            inside_m2 = m2.take(patch) * _share(lower_m[0].take(patch), upper_m[0].take(patch), x_low, x_high)
+            inside_m2 *= _share(lower_m[1].take(patch), upper_m[1].take(patch), y_low, y_high)
+            above[area] = patch, m2.take(patch), inside_m2
+        patch, whole_m2, inside_m2 = above[area]
+        from_m, to_m, z_low, z_high = lower_m[2].take(patch), upper_m[2].take(patch), float(low[2]), float(high[2])
+        in_band = np.flatnonzero((to_m >= z_low) & (from_m <= z_high))
+        inside_m2 = inside_m2.take(in_band) * _share(from_m.take(in_band), to_m.take(in_band), z_low, z_high)
+        stratum = Stratum(patch.take(in_band), whole_m2.take(in_band).astype(np.float64), inside_m2.astype(np.float64))
+        strata.append(stratum)
+    return strata
+
+
+def _share(from_m: Float32, to_m: Float32, low: float, high: float) -> Float32:
+    """Which share of each stretch lies between two bounds, of those that meet them."""
+    share: Float32 = (np.minimum(to_m, high) - np.maximum(from_m, low)) / (to_m - from_m)
+    return share
 
 
 def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Generator) -> tuple[Numbers, float]:
     """Patches, drawn by their area so that about `each` points lie in the stratum, and points per square metre."""
-    seen = front[stratum.patch]
+    seen = front.take(stratum.patch)
     up_to_m2 = np.cumsum(stratum.m2 * seen)
     whole_m2 = float(up_to_m2[-1]) if len(up_to_m2) else 0.0
     if whole_m2 == 0:

@@ -1,5 +1,6 @@
 """Where a body is at a time."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,8 +46,8 @@ class Trajectory:
                 "a trajectory needs K >= 1 times, (K, 3) positions and (K, 3) angles; got "
                 f"{self.times_s.shape}, {self.positions_m.shape} and {self.angles_deg.shape}"
             )
-        numbers = np.column_stack([self.times_s, self.positions_m, self.angles_deg])
-        if not np.isfinite(numbers).all():
+        if not all(np.isfinite(numbers).all() for numbers in (self.times_s, self.positions_m, self.angles_deg)):
+            numbers = np.column_stack([self.times_s, self.positions_m, self.angles_deg])
             bad = np.flatnonzero(~np.isfinite(numbers).all(axis=1))
             raise ValueError(f"a trajectory has NaN or infinite numbers in {len(bad)} of {count} poses, first {bad[0]}")
         steps = np.diff(self.times_s)
@@ -76,15 +77,30 @@ class Trajectory:
     @property
     def moves(self) -> bool:
         """Whether the body ever changes its pose, enters or leaves."""
-        return self.transient or bool(np.ptp(self.positions_m, axis=0).any() or np.ptp(self.angles_deg, axis=0).any())
+        if self.transient or len(self.times_s) == 1:
+            return self.transient
+        # Most of those that move end elsewhere.
+        return any((poses[at] != poses[0]).any() for at in (slice(-1, None), slice(None)) for poses in self._poses)
+
+    @property
+    def _poses(self) -> tuple[Matrix, Matrix]:
+        return self.positions_m, self.angles_deg
+
+    @property
+    def bytes(self) -> int:
+        """How much memory its poses take."""
+        return self.positions_m.nbytes + self.angles_deg.nbytes
 
     def at(self, time_s: float) -> Matrix:
         """The (4, 4) pose `world_T_body` at a time."""
-        position, angles = self._interpolate(time_s)
-        return rigid(rotation_from_euler(*angles), position)
+        before, after, share = _moment(self.times_s, time_s)
+        places_m, angles_deg = self.positions_m, self.angles_deg
+        return _between(places_m[before], places_m[after], angles_deg[before], angles_deg[after], share)
 
     def positions_at(self, times_s: Matrix) -> Matrix:
         """(T, 3) positions at (T,) times; NaN where the body is not there."""
+        if np.array_equal(times_s, self.times_s[: len(times_s)]):
+            return self.positions_m[: len(times_s)]
         outside = np.nan if self.transient else None
         tracks = [np.interp(times_s, self.times_s, axis, outside, outside) for axis in self.positions_m.T]
         return np.stack(tracks, axis=1)
@@ -100,13 +116,35 @@ class Trajectory:
         velocity: Matrix = (way / taken[:, None]).mean(axis=0)
         return velocity
 
-    def _interpolate(self, time_s: float) -> tuple[Matrix, Matrix]:
-        after = int(np.searchsorted(self.times_s, time_s, side="right"))
-        if after == 0 or after == len(self.times_s):
-            at = max(after - 1, 0)
-            return self.positions_m[at], self.angles_deg[at]
-        before = after - 1
-        share = (time_s - self.times_s[before]) / (self.times_s[after] - self.times_s[before])
-        turn = (self.angles_deg[after] - self.angles_deg[before] + 180.0) % 360.0 - 180.0
-        way = self.positions_m[after] - self.positions_m[before]
-        return self.positions_m[before] + share * way, self.angles_deg[before] + share * turn
+
+def poses_at(trajectories: Sequence[Trajectory], time_s: float) -> Matrix:
+    """(P, 4, 4) poses `world_T_body` of P bodies at one time; see `Trajectory.at`.
+
+    Example:
+        >>> poses_at([Trajectory.resting((x, 0.0, 0.0)) for x in (1.0, 2.0)], 0.5)[:, 0, 3]
+        array([1., 2.])
+    """
+    # Bodies of one world share their times: they are looked up once.
+    moments = {id(each.times_s): _moment(each.times_s, time_s) for each in trajectories}
+    ends, shares = [], []
+    for each in trajectories:
+        before, after, share = moments[id(each.times_s)]
+        ends += [each.positions_m[before], each.positions_m[after], each.angles_deg[before], each.angles_deg[after]]
+        shares.append(share)
+    from_m, to_m, from_deg, to_deg = np.array(ends).reshape(-1, 4, 3).swapaxes(0, 1)
+    return _between(from_m, to_m, from_deg, to_deg, np.array(shares)[:, None])
+
+
+def _moment(times_s: Matrix, time_s: float) -> tuple[int, int, float]:
+    """The poses before and after a time, and how far it is from the one to the other; at rest before and after all."""
+    after = int(times_s.searchsorted(time_s, side="right"))
+    if after == 0 or after == len(times_s):
+        return max(after - 1, 0), max(after - 1, 0), 0.0
+    return after - 1, after, float((time_s - times_s[after - 1]) / (times_s[after] - times_s[after - 1]))
+
+
+def _between(from_m: Matrix, to_m: Matrix, from_deg: Matrix, to_deg: Matrix, share: float | Matrix) -> Matrix:
+    """(..., 4, 4) poses at shares of the way from one to the other, of (..., 3) places and angles."""
+    turn_deg = (to_deg - from_deg + 180.0) % 360.0 - 180.0
+    yaw_deg, pitch_deg, roll_deg = (from_deg + share * turn_deg).T
+    return rigid(rotation_from_euler(yaw_deg, pitch_deg, roll_deg), from_m + share * (to_m - from_m))

@@ -1,11 +1,20 @@
 """Agents on lanes: queues, lights, junctions."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
-from torchcover.simulation.traffic.flow import Agent, Lane, Simulation
+from torchcover.simulation.traffic.flow import (
+    BRAKING_FOR_A_LIGHT_MPS2,
+    QUEUE_SPEED,
+    STOP_BEFORE_LINE_M,
+    Agent,
+    Lane,
+    Simulation,
+)
 from torchcover.simulation.traffic.gates import Gate
-from torchcover.simulation.traffic.idm import Driver
+from torchcover.simulation.traffic.idm import Driver, acceleration, advance
 from torchcover.simulation.traffic.roads import Line, loop
 from torchcover.simulation.traffic.signals import CROSS, MAIN, Signals
 
@@ -108,3 +117,70 @@ def test_a_coarse_time_step_gives_the_same_run():
     fine = run(lanes, agents, times_s=np.arange(0.0, 40.5, 0.1), green_s=(9.05, 18.0))
     coarse = run(lanes, agents, times_s=np.arange(0.0, 40.5, 2.0), green_s=(9.05, 18.0))
     np.testing.assert_allclose(fine.place_m[::20][: len(coarse.place_m)], coarse.place_m, atol=1e-6)
+
+
+def twin(lanes, agents, lights, times_s):
+    """(T, N) places, worked out for one agent after the other in the words of the rules."""
+    place, speed = [agent.place_m for agent in agents], Simulation(lanes, agents, lights).speed_mps.tolist()
+    found = [list(place)]
+    for time, after in pairwise(times_s):
+        left, gates, ahead = lights.green_left_s(time), [], []
+        for n, agent in enumerate(agents):
+            rear = place[n] - agent.length_m / 2
+            gates.append(next((gate for gate in lanes[agent.lane].gates if gate.exit_m >= rear), None))
+            lap = lanes[agent.lane].line.length_m if lanes[agent.lane].line.closed else np.inf
+            others = [(m, place[m] + (lap if place[m] < place[n] else 0.0)) for m in range(len(agents)) if m != n]
+            others = [(m, at) for m, at in others if agents[m].lane == agent.lane]
+            ahead.append(min(others, key=lambda other: other[1], default=(n, np.inf)))
+
+        to_line = [
+            np.inf if gate is None else gate.enter_m - at - agent.length_m / 2
+            for gate, at, agent in zip(gates, place, agents, strict=True)
+        ]
+        committed = [v**2 > 2 * BRAKING_FOR_A_LIGHT_MPS2 * way for v, way in zip(speed, to_line, strict=True)]
+        inside = {(gates[n].junction, gates[n].phase) for n in range(len(agents)) if committed[n]}
+        moved = []
+        for n, agent in enumerate(agents):
+            (m, at), gate, driver = ahead[n], gates[n], agent.driver
+            gap, line = at - place[n] - (agent.length_m + agents[m].length_m) / 2, np.inf
+            if gate is not None and not committed[n]:
+                back = at - agents[m].length_m / 2
+                jam = gate.enter_m < back < gate.exit_m + agent.length_m + driver.standstill_gap_m
+                jam = jam and speed[m] < QUEUE_SPEED * driver.desired_speed_mps
+                free = left[gate.junction, gate.phase] > gate.green_needed_s
+                if jam or not free or (gate.junction, 1 - gate.phase) in inside:
+                    line = to_line[n]
+            stop = line + driver.standstill_gap_m - STOP_BEFORE_LINE_M
+            closing = speed[n] - speed[m] if np.isfinite(at) else 0.0
+            behind, before = (
+                acceleration(driver, np.array([speed[n]]), np.array([room]), np.array([approach]))
+                for room, approach in ((gap, closing), (stop, speed[n]))
+            )
+            wanted, room = np.minimum(behind, before), np.array([min(gap, line)])
+            way, end = advance(np.array([speed[n]]), wanted, room, after - time)
+            moved.append((place[n] + float(way[0]), float(end[0])))
+        place, speed = map(list, zip(*moved, strict=True))
+        found.append(place)
+    return np.array(found)
+
+
+def test_all_together_are_that_many_single_ones():
+    generator = np.random.default_rng(0)
+    gates = [Gate(200.0, 225.0, 0, MAIN), Gate(260.0, 285.0, 1, MAIN, green_needed_s=4.0)]
+    crossing = Line.straight((0, 0), 90.0, 2000.0)
+    lanes = [
+        Lane(LONG, tuple(gates)),
+        Lane(crossing, (Gate(200.0, 225.0, 0, CROSS),)),
+        Lane(crossing, (Gate(120.0, 145.0, 1, CROSS),)),
+        Lane(loop(84.0, 18.0, 6.0)),
+    ]
+    agents = [
+        Agent("car", 5.0, lane, start + 16.0 * number, Driver(generator.uniform(3.0, 16.0)))
+        for lane, start, count in ((0, 100.0, 5), (1, 110.0, 4), (2, 70.0, 3), (3, 0.0, 3))
+        for number in range(count)
+    ]
+    lights, times_s = Signals(np.array([3.0, 11.0]), green_s=(7.0, 5.0), amber_s=2.0, clear_s=1.0), TIMES_S[:250]
+    together = Simulation(lanes, agents, lights).run(times_s)
+    np.testing.assert_allclose(together.place_m, twin(lanes, agents, lights, times_s), atol=1e-6)
+    held_up = (together.speed_mps == 0.0).any(axis=0)
+    assert 2 < held_up.sum() < len(agents)

@@ -6,7 +6,7 @@ from pydantic import ValidationError
 
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic import Highway, Parking, Urban
+from torchcover.simulation.traffic import Highway, Parking, Urban, urban
 
 WORLDS = ["urban", "narrow", "highway", "parking"]
 
@@ -214,3 +214,14 @@ def test_a_missing_body_is_an_error_that_names_it(bodies):
 def test_the_ego_may_have_a_body_of_its_own(bodies):
     w = Urban(duration_s=2.0).world(0, ego=bodies["bus"], bodies=bodies)
     assert w.ego.mesh is bodies["bus"]
+
+
+def test_who_is_left_out_changes_nothing(monkeypatch, bodies):
+    few = Urban(duration_s=8.0).world(3, bodies=bodies)
+    monkeypatch.setattr(urban, "_who_matter", lambda lanes, agents, duration_s: agents)
+    monkeypatch.setattr(urban, "come_near", lambda lanes, agents, place_m: np.arange(len(agents)))
+    everybody = Urban(duration_s=8.0).world(3, bodies=bodies)
+    assert [actor.name for actor in few.actors] == [actor.name for actor in everybody.actors]
+    for one, other in zip((few.ego, *few.actors), (everybody.ego, *everybody.actors), strict=True):
+        np.testing.assert_array_equal(one.trajectory.positions_m, other.trajectory.positions_m)
+        np.testing.assert_array_equal(one.trajectory.angles_deg, other.trajectory.angles_deg)

@@ -17,6 +17,9 @@ Numbers = NDArray[np.float64]
 
 # Beyond the farthest range of a sensor: who never comes this close to the ego is left out of the world.
 HORIZON_M = 250.0
+# Feet on a pavement, and rounding, where it is found out at first who may come so close.
+SLACK_M = 1.0
+LOOKS_EVERY = 20
 
 
 class Paths(NamedTuple):
@@ -27,15 +30,39 @@ class Paths(NamedTuple):
     kinds: tuple[str, ...]
 
 
-def paths(lanes: Sequence[Lane], agents: Sequence[Agent], flow: Flow) -> Paths:
-    """Follow the lanes, on the ground."""
-    poses = np.empty((*flow.place_m.shape, 3))
+def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> Paths:
+    """Follow the lanes, on the ground.
+
+    Args:
+        lanes: The lanes.
+        agents: Who follows them.
+        place_m: (T, N) where they are on them.
+    """
+    positions_m, yaw_deg = np.zeros((*place_m.shape, 3)), np.empty(place_m.shape)
     lane_of = np.array([agent.lane for agent in agents])
     for lane in np.unique(lane_of):
-        poses[:, lane_of == lane] = lanes[lane].line.poses(flow.place_m[:, lane_of == lane])
-    yaw_deg = poses[..., 2].copy()
-    poses[..., 2] = 0.0
-    return Paths(poses, yaw_deg, tuple(agent.kind for agent in agents))
+        on_lane = np.flatnonzero(lane_of == lane)
+        poses = lanes[lane].line.poses(place_m[:, on_lane])
+        positions_m[:, on_lane, :2], yaw_deg[:, on_lane] = poses[..., :2], poses[..., 2]
+    return Paths(positions_m, yaw_deg, tuple(agent.kind for agent in agents))
+
+
+def come_near(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> NDArray[np.int64]:
+    """Numbers of those who may come near the first one, who is among them; they are looked at now and then only.
+
+    Args:
+        lanes: The lanes.
+        agents: Who follows them.
+        place_m: (T, N) where they are on them.
+    """
+    looks = np.unique(np.append(np.arange(0, len(place_m), LOOKS_EVERY), len(place_m) - 1))
+    seen_m = place_m[looks]
+    positions_m = paths(lanes, agents, seen_m).positions_m
+    distance_m = np.linalg.norm(positions_m - positions_m[:, :1], axis=2)
+    # Nobody drives back: between two looks, the two come closer by the ways of both at most.
+    ways_m = np.diff(seen_m, axis=0, append=seen_m[-1:])
+    nearest_m = (distance_m - ways_m - ways_m[:, :1]).min(axis=0)
+    return np.flatnonzero(nearest_m < HORIZON_M + SLACK_M)
 
 
 def ego_actor(
@@ -59,11 +86,13 @@ def actors(times_s: Numbers, found: Sequence[Paths], ego: Actor, fleet: Fleet) -
     near: list[Actor] = []
     for group in found:
         distance = np.linalg.norm(group.positions_m - ego.trajectory.positions_m[:, None], axis=2).min(axis=0)
-        for index in np.flatnonzero(distance < HORIZON_M):
-            kind = group.kinds[index]
-            if kind == EGO:
-                continue
-            angles = np.column_stack([group.yaw_deg[:, index], np.zeros((len(times_s), 2))])
-            trajectory = Trajectory(times_s, group.positions_m[:, index].copy(), angles)
+        numbers = np.flatnonzero((distance < HORIZON_M) & (np.array(group.kinds) != EGO))
+        # One body after the other: each has its own piece of both.
+        positions_m = np.ascontiguousarray(group.positions_m[:, numbers].swapaxes(0, 1))
+        angles_deg = np.zeros_like(positions_m)
+        angles_deg[..., 0] = group.yaw_deg[:, numbers].T
+        for number, position_m, angle_deg in zip(numbers, positions_m, angles_deg, strict=True):
+            kind = group.kinds[number]
+            trajectory = Trajectory(times_s, position_m, angle_deg)
             near.append(Actor(f"{kind} {len(near)}", CATEGORIES[kind], fleet.meshes[kind], trajectory))
     return tuple(near)

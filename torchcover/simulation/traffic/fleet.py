@@ -1,7 +1,8 @@
 """Who is on the road: bodies by kind, how each kind drives, and lanes filled with them."""
 
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from functools import cache
+from functools import cache, lru_cache
 
 import numpy as np
 
@@ -74,8 +75,7 @@ class Fleet:
 
     def draw_kind(self, mix: Mapping[str, float]) -> str:
         """One kind, each with a probability in proportion to its weight."""
-        weights = np.array(list(mix.values()))
-        return str(self._generator.choice(list(mix), p=weights / weights.sum()))
+        return list(mix)[bisect_right(_shares_up_to(tuple(mix.values())), self._generator.random())]
 
     def draw_driver(self, typical: Driver, spread: float) -> Driver:
         """A driver whose desired speed differs from the typical one by up to `spread`, a share of it."""
@@ -115,6 +115,7 @@ class Fleet:
         """
         mix = {kind: weight for kind, (weight, _) in drivers.items()}
         agents: list[Agent] = []
+        others = [other for other in keep_free if other.lane == lane]
         rear = span_m[0]
         while per_km > 0:
             kind = self.draw_kind(mix)
@@ -124,10 +125,18 @@ class Fleet:
             if rear + length > span_m[1]:
                 break
             agent = self.agent(kind, lane, rear + length / 2, driver)
-            if not _in_the_way(agent, lanes[lane], gap, keep_free):
+            if not _in_the_way(agent, lanes[lane], gap, others):
                 agents.append(agent)
             rear += length
         return agents
+
+
+@lru_cache(maxsize=64)
+def _shares_up_to(weights: tuple[float, ...]) -> list[float]:
+    """For each of some weights, the share that it and those before it have of the sum."""
+    up_to = (np.array(weights) / np.sum(weights)).cumsum()
+    shares: list[float] = (up_to / up_to[-1]).tolist()
+    return shares
 
 
 def _with_speed(driver: Driver, desired_speed_mps: float) -> Driver:
@@ -147,10 +156,8 @@ def _smallest_gap_m(driver: Driver) -> float:
 
 def _in_the_way(agent: Agent, lane: Lane, gap_m: float, others: Sequence[Agent]) -> bool:
     rear, front = agent.place_m - agent.length_m / 2, agent.place_m + agent.length_m / 2
-    on_junction = any(front > gate.enter_m - gap_m and rear < gate.exit_m for gate in lane.gates)
-    near_others = any(
-        abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m
-        for other in others
-        if other.lane == agent.lane
-    )
-    return on_junction or near_others
+    # Gates follow each other: of those that are not behind, the first is the nearest.
+    gate = bisect_right(lane.gates, rear, key=lambda gate: gate.exit_m)
+    if gate < len(lane.gates) and front > lane.gates[gate].enter_m - gap_m:
+        return True
+    return any(abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m for other in others)

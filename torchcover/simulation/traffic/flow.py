@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.traffic.gates import Gate, Gates
-from torchcover.simulation.traffic.idm import Driver, acceleration, advance
+from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, tightness
 from torchcover.simulation.traffic.roads import Line
 from torchcover.simulation.traffic.signals import Signals
 
@@ -77,19 +77,29 @@ class Simulation:
     """
 
     def __init__(self, lanes: Sequence[Lane], agents: Sequence[Agent], signals: Signals) -> None:
-        self.place_m = np.array([agent.place_m for agent in agents])
-        self._length = np.array([agent.length_m for agent in agents])
-        self._lane = np.array([agent.lane for agent in agents])
+        self.place_m = np.array([agent.place_m for agent in agents], dtype=np.float64)
+        length = np.array([agent.length_m for agent in agents], dtype=np.float64)
+        lane = np.array([agent.lane for agent in agents])
         self._driver = Driver(
-            *(np.array([getattr(a.driver, name) for a in agents]) for name in Driver.__dataclass_fields__)
+            *(np.array([getattr(a.driver, name) for a in agents], np.float64) for name in Driver.__dataclass_fields__)
         )
-        self._leader, self._lap = _leaders(lanes, self._lane, self.place_m)
+        self._leader, self._lap = _leaders(lanes, lane, self.place_m)
+        self._half_m, self._leaders_half_m = length / 2, length[self._leader] / 2
+        self._between_middles_m = (length + length[self._leader]) / 2
+        # Whoever stops behind a junction needs so much room there.
+        self._room_m = length, np.asarray(self._driver.standstill_gap_m)
+        self._queue_mps = QUEUE_SPEED * self._driver.desired_speed_mps
         self._signals = signals
         self._gates = Gates.from_lanes([lane.gates for lane in lanes])
-        self._next = (self._gates.exit_m[self._lane] < (self.place_m - self._length / 2)[:, None]).sum(axis=1)
-        # The gate that each agent is in, or else the next one ahead.
-        self._gate = self._gates.take(self._lane, self._next)
+        # The number of the gate that each agent is in, or else of the next one ahead, and where that is.
+        self._gate = np.empty(len(agents), dtype=np.int64)
+        self._enter_m, self._exit_m, self._clear_m = np.empty((3, len(agents)))
+        for index in np.unique(lane):
+            members = np.flatnonzero(lane == index)
+            rear_m = self.place_m[members] - self._half_m[members]
+            self._face(members, self._gates.next_on(int(index), rear_m))
         self.speed_mps = self._first_speed()
+        self._look()
 
     def run(self, times_s: Numbers, warm_up_s: float = 0.0) -> Flow:
         """Simulate, first the warm-up before the first time, and keep the state at each time.
@@ -98,72 +108,90 @@ class Simulation:
             times_s: (T,) evenly spaced times.
             warm_up_s: How long before the first time the simulation begins.
         """
-        states = [self._drive(float(times_s[0]) - warm_up_s, warm_up_s)]
-        for before, after in pairwise(times_s):
-            states.append(self._drive(float(before), float(after - before)))
-        place, speed, occupied = zip(*states, strict=True)
-        return Flow(np.stack(place), np.stack(speed), np.stack(occupied))
+        place_m, speed_mps = np.empty((2, len(times_s), len(self.place_m)))
+        occupied = np.empty((len(times_s), len(self._signals.offset_s), 2), dtype=bool)
+        drives = [(float(times_s[0]) - warm_up_s, warm_up_s)]
+        drives += [(float(before), float(after - before)) for before, after in pairwise(times_s)]
+        for number, (start_s, duration_s) in enumerate(drives):
+            self._drive(start_s, duration_s)
+            place_m[number], speed_mps[number] = self.place_m, self.speed_mps
+            occupied[number] = self._occupied.reshape(-1, 2)
+        return Flow(place_m, speed_mps, occupied)
 
-    def _drive(self, start_s: float, duration_s: float) -> tuple[Numbers, Numbers, NDArray[np.bool_]]:
+    def _drive(self, start_s: float, duration_s: float) -> None:
         steps = int(np.ceil(duration_s / MAX_STEP_S - 1e-9))
         for step in range(steps):
             self._step(start_s + step * duration_s / steps, duration_s / steps)
-        return self.place_m, self.speed_mps, self._occupied(self._gate)
 
     def _step(self, time_s: float, step_s: float) -> None:
-        gap = self._gap_to_leader()
-        closing = np.where(self._leader < 0, 0.0, self.speed_mps - self.speed_mps[self._leader])
-        line = self._gap_to_closed_gate(time_s)
-        stop = line + self._driver.standstill_gap_m - STOP_BEFORE_LINE_M
-        wanted = np.minimum(
-            acceleration(self._driver, self.speed_mps, gap, closing),
-            acceleration(self._driver, self.speed_mps, stop, self.speed_mps),
-        )
-        way, self.speed_mps = advance(self.speed_mps, wanted, np.minimum(gap, line), step_s)
-        self.place_m = self.place_m + way
-        passed = self.place_m - self._length / 2 > self._gate.exit_m
-        if passed.any():
-            self._next = self._next + passed
-            self._gate = self._gates.take(self._lane, self._next)
+        driver, speed_mps = self._driver, self.speed_mps
+        leader_m, leader_mps = self._leader_m(), speed_mps.take(self._leader)
+        gap_m = self._gap_m(leader_m)
+        # Lines that may be crossed are as far away as can be.
+        line_m = np.where(self._held_up(time_s, leader_m, leader_mps), self._to_line_m, np.inf)
+        stop_m = line_m + driver.standstill_gap_m
+        stop_m -= STOP_BEFORE_LINE_M
+        tight = tightness(driver, speed_mps, gap_m, speed_mps - leader_mps)
+        np.maximum(tight, tightness(driver, speed_mps, stop_m, speed_mps), out=tight)
+        wanted = acceleration_in(driver, speed_mps, tight)
+        way, self.speed_mps = advance(speed_mps, wanted, np.minimum(gap_m, line_m), step_s)
+        self.place_m += way
+        (passed,) = (self.place_m - self._half_m > self._exit_m).nonzero()
+        if len(passed):
+            self._face(passed, self._gate[passed] + 1)
+        self._look()
 
-    def _gap_to_leader(self) -> Numbers:
+    def _face(self, agents: NDArray[np.int64], gates: NDArray[np.int64]) -> None:
+        """Let some agents have these gates before them."""
+        self._gate[agents] = gates
+        self._enter_m[agents], self._exit_m[agents] = self._gates.enter_m[gates], self._gates.exit_m[gates]
+        length_m, standstill_m = self._room_m
+        self._clear_m[agents] = self._exit_m[agents] + length_m[agents] + standstill_m[agents]
+
+    def _leader_m(self) -> Numbers:
+        """(N,) place of the one ahead; infinite for the first on a lane."""
+        leader_m = self.place_m.take(self._leader)
+        leader_m += self._lap
+        return leader_m
+
+    def _gap_m(self, leader_m: Numbers) -> Numbers:
         """(N,) free road to the one ahead, bumper to bumper."""
-        distance = self.place_m[self._leader] + self._lap - self.place_m
-        return np.where(self._leader < 0, np.inf, distance - (self._length + self._length[self._leader]) / 2)
+        gap_m = leader_m - self.place_m
+        gap_m -= self._between_middles_m
+        return gap_m
 
-    def _gap_to_closed_gate(self, time_s: float) -> Numbers:
-        """(N,) way from the front to the next stop line that one may not and need not cross; else infinite."""
-        gate = self._gate
-        green = self._signals.green_left_s(time_s)[gate.junction, gate.phase] > gate.green_needed_s
-        free = ~self._occupied(gate)[gate.junction, 1 - gate.phase]
-        closed = (~(green & free) | self._jammed_behind(gate)) & ~self._committed(gate)
-        return np.where(closed, self._gap_to(gate), np.inf)
+    def _look(self) -> None:
+        """See where everybody is before the next stop line, and whom the junctions belong to.
 
-    def _gap_to(self, gate: Gates) -> Numbers:
-        return np.asarray(gate.enter_m - self.place_m - self._length / 2)
+        `_to_line_m` (N,) is the way from the front to the line; `_committed` (N,), whether one is on a junction, or
+        will be because it is too late to stop; `_occupied` (2 J,), whether somebody of each phase is.
+        """
+        self._to_line_m = self._enter_m - self.place_m
+        self._to_line_m -= self._half_m
+        self._committed = self.speed_mps**2 > 2 * BRAKING_FOR_A_LIGHT_MPS2 * self._to_line_m
+        self._occupied = np.zeros(2 * len(self._signals.offset_s), dtype=bool)
+        self._occupied[self._gates.light[self._gate[self._committed]]] = True
 
-    def _committed(self, gate: Gates) -> NDArray[np.bool_]:
-        """(N,) whether one is on a junction, or will be because it is too late to stop."""
-        return np.asarray(self.speed_mps**2 > 2 * BRAKING_FOR_A_LIGHT_MPS2 * self._gap_to(gate))
+    def _held_up(self, time_s: float, leader_m: Numbers, leader_mps: Numbers) -> NDArray[np.bool_]:
+        """(N,) whether one may not cross the next stop line, and need not."""
+        gates = self._gates
+        green = self._signals.green_left_s(time_s).ravel()[gates.light] > gates.green_needed_s
+        held = (~green | self._occupied[gates.other_light])[self._gate]
+        held |= self._jammed_behind(leader_m, leader_mps)
+        held &= ~self._committed
+        return held
 
-    def _jammed_behind(self, gate: Gates) -> NDArray[np.bool_]:
+    def _jammed_behind(self, leader_m: Numbers, leader_mps: Numbers) -> NDArray[np.bool_]:
         """(N,) whether a queue behind the junction would force one to stop on it."""
-        rear = self.place_m[self._leader] + self._lap - self._length[self._leader] / 2
-        too_short = (rear > gate.enter_m) & (rear < gate.exit_m + self._length + self._driver.standstill_gap_m)
-        slow = self.speed_mps[self._leader] < QUEUE_SPEED * self._driver.desired_speed_mps
-        return np.asarray((self._leader >= 0) & too_short & slow)
-
-    def _occupied(self, gate: Gates) -> NDArray[np.bool_]:
-        """(J, 2) whether somebody of a phase is on a junction or cannot be kept from it."""
-        committed = self._committed(gate)
-        occupied = np.zeros((len(self._signals.offset_s), 2), dtype=bool)
-        occupied[gate.junction[committed], gate.phase[committed]] = True
-        return occupied
+        rear_m = leader_m - self._leaders_half_m
+        return (rear_m > self._enter_m) & (rear_m < self._clear_m) & (leader_mps < self._queue_mps)
 
     def _first_speed(self) -> Numbers:
         """(N,) fast, but slow enough to stop at the next line, and for the gap to the one ahead."""
-        stoppable = np.sqrt(self._driver.deceleration_mps2 * np.maximum(self._gap_to(self._gate), 0.0))
-        to_leader = np.maximum(self._gap_to_leader() - self._driver.standstill_gap_m, 0.0)
+        stoppable = np.sqrt(
+            self._driver.deceleration_mps2 * np.maximum(self._enter_m - self.place_m - self._half_m, 0.0)
+        )
+        to_leader = np.maximum(self._gap_m(self._leader_m()) - self._driver.standstill_gap_m, 0.0)
         bearable = to_leader / self._driver.headway_s
         return np.asarray(np.minimum(0.95 * self._driver.desired_speed_mps, np.minimum(stoppable, bearable)))
 
@@ -186,8 +214,11 @@ def check_crowd(agents: float, steps: int) -> None:
 
 
 def _leaders(lanes: Sequence[Lane], lane: NDArray[np.int64], place_m: Numbers) -> tuple[NDArray[np.int64], Numbers]:
-    """(N,) who is ahead, or -1; and (N,) the length of a lap where the one ahead is the last one of a loop."""
-    leader, lap = np.full(len(lane), -1), np.zeros(len(lane))
+    """(N,) who is ahead, anybody for the first on a lane; and (N,) how much farther than their place that is.
+
+    0; the length of a lap where the one ahead is the last one of a loop; infinite where there is nobody.
+    """
+    leader, lap = np.zeros(len(lane), dtype=np.int64), np.zeros(len(lane))
     for index in np.unique(lane):
         members = np.flatnonzero(lane == index)
         members = members[np.argsort(-place_m[members], kind="stable")]
@@ -195,4 +226,6 @@ def _leaders(lanes: Sequence[Lane], lane: NDArray[np.int64], place_m: Numbers) -
         if lanes[index].line.closed and len(members) > 1:
             leader[members[0]] = members[-1]
             lap[members[0]] = lanes[index].line.length_m
+        else:
+            lap[members[0]] = np.inf
     return leader, lap

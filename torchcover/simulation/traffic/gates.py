@@ -31,29 +31,36 @@ class Gate:
 
 
 class Gates(NamedTuple):
-    """Gates of many: tables (L, G + 1) for lanes, or (N,) for agents. What a `Gate` says, one array for each word."""
+    """The gates of all lanes, one lane after the other; behind the last gate of each lane is one that is never reached.
+
+    What a `Gate` says, one array (K,) for each word. `light` counts the phases of all junctions, two to a junction, and
+    `other_light` is the other one there. `first` (L,) is the number of the first gate of each lane.
+    """
 
     enter_m: Numbers
     exit_m: Numbers
-    junction: Indices
-    phase: Indices
+    light: Indices
+    other_light: Indices
     green_needed_s: Numbers
+    first: Indices
 
     @classmethod
     def from_lanes(cls, lanes: Sequence[tuple[Gate, ...]]) -> "Gates":
-        """The tables of lanes, each with its gates in order; behind its last gate a lane has one never reached."""
+        """Those of lanes, each with its gates in order."""
         never = Gate(np.inf, np.inf, 0, 0)
-        columns = max(len(gates) for gates in lanes) + 1
-        rows = [[*gates, *[never] * (columns - len(gates))] for gates in lanes]
+        gates = [gate for of_lane in lanes for gate in (*of_lane, never)]
         return cls(
-            np.array([[gate.enter_m for gate in row] for row in rows]),
-            np.array([[gate.exit_m for gate in row] for row in rows]),
-            np.array([[gate.junction for gate in row] for row in rows]),
-            np.array([[gate.phase for gate in row] for row in rows]),
-            np.array([[gate.green_needed_s for gate in row] for row in rows]),
+            np.array([gate.enter_m for gate in gates]),
+            np.array([gate.exit_m for gate in gates]),
+            np.array([2 * gate.junction + gate.phase for gate in gates]),
+            np.array([2 * gate.junction + 1 - gate.phase for gate in gates]),
+            np.array([gate.green_needed_s for gate in gates]),
+            np.cumsum([0, *(len(of_lane) + 1 for of_lane in lanes[:-1])]),
         )
 
-    def take(self, lane: Indices, index: Indices) -> "Gates":
-        """One gate for each of N agents: the one of that index on their lane."""
-        at = (lane, index)
-        return Gates(self.enter_m[at], self.exit_m[at], self.junction[at], self.phase[at], self.green_needed_s[at])
+    def next_on(self, lane: int, rear_m: Numbers) -> Indices:
+        """(N,) numbers of the first gate of a lane that each of N rear ends has not left."""
+        first = self.first[lane]
+        last = first + int(np.argmax(np.isinf(self.exit_m[first:])))
+        numbers: Indices = first + np.searchsorted(self.exit_m[first:last], rear_m)
+        return numbers

@@ -60,7 +60,7 @@ class Highway(Procedural):
         lanes = _lanes(middle)
         agents = self._traffic(lanes, fleet)
         flow = Simulation(lanes, agents, Signals.none()).run(times_s, WARM_UP_S)
-        moving = paths(lanes, agents, flow)
+        moving = paths(lanes, agents, flow.place_m)
         driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator)
         first, last = (_nearest(middle, position) for position in driver.trajectory.positions_m[[0, -1], :2])
         static = roadside(middle, (first - BEHIND_M, last + AHEAD_M), moving.positions_m, generator)

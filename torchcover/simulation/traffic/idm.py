@@ -5,6 +5,7 @@ Physical Review E 62 (2000). People on foot queue by the same law with other num
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,10 @@ class Driver:
     acceleration_mps2: Quantity = 1.5
     deceleration_mps2: Quantity = 2.0
 
+    @cached_property
+    def _braking_mps2(self) -> Quantity:
+        return 2 * np.sqrt(self.acceleration_mps2 * self.deceleration_mps2)
+
 
 def acceleration(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: Numbers) -> Numbers:
     """Acceleration of N drivers.
@@ -50,13 +55,29 @@ def acceleration(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps
     Returns:
         (N,) m/s², at least -9.
     """
-    braking = 2 * np.sqrt(driver.acceleration_mps2 * driver.deceleration_mps2)
-    dynamic_gap = speed_mps * driver.headway_s + speed_mps * closing_mps / braking
-    desired_gap = driver.standstill_gap_m + np.maximum(dynamic_gap, 0.0)
-    free_road = (speed_mps / driver.desired_speed_mps) ** FREE_ROAD_EXPONENT
-    interaction = (desired_gap / np.maximum(gap_m, SMALLEST_GAP_M)) ** 2
-    wanted: Numbers = driver.acceleration_mps2 * (1.0 - free_road - interaction)
-    return np.maximum(wanted, -HARDEST_BRAKING_MPS2)
+    return acceleration_in(driver, speed_mps, tightness(driver, speed_mps, gap_m, closing_mps))
+
+
+def tightness(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: Numbers) -> Numbers:
+    """(N,) the gap that drivers would like to have as a multiple of the one that they have; see `acceleration`."""
+    # In place, here and below: what is written anew has to come from farther away than what was read just now.
+    gaps = speed_mps * closing_mps
+    gaps /= driver._braking_mps2
+    gaps += speed_mps * driver.headway_s
+    np.maximum(gaps, 0.0, out=gaps)
+    gaps += driver.standstill_gap_m
+    gaps /= np.maximum(gap_m, SMALLEST_GAP_M)
+    return gaps
+
+
+def acceleration_in(driver: Driver, speed_mps: Numbers, tightness: Numbers) -> Numbers:
+    """Acceleration of N drivers; of several things ahead the one with the largest tightness counts."""
+    wanted = speed_mps / driver.desired_speed_mps
+    wanted **= FREE_ROAD_EXPONENT
+    np.subtract(1.0, wanted, out=wanted)
+    wanted -= tightness**2
+    wanted *= driver.acceleration_mps2
+    return np.maximum(wanted, -HARDEST_BRAKING_MPS2, out=wanted)
 
 
 def equilibrium_gap_m(driver: Driver, speed_mps: Quantity) -> Quantity:
@@ -86,10 +107,14 @@ def advance(speed_mps: Numbers, acceleration_mps2: Numbers, room_m: Numbers, ste
     Returns:
         (N,) ways in metres and (N,) new speeds.
     """
-    end_speed = np.maximum(speed_mps + acceleration_mps2 * step_s, 0.0)
-    stops = speed_mps + acceleration_mps2 * step_s < 0.0
-    stopping_way = speed_mps**2 / np.where(stops, -2 * acceleration_mps2, 1.0)
-    way = np.where(stops, stopping_way, (speed_mps + end_speed) / 2 * step_s)
+    end_speed = acceleration_mps2 * step_s
+    end_speed += speed_mps
+    (stops,) = (end_speed < 0.0).nonzero()
+    end_speed[stops] = 0.0
+    way = speed_mps + end_speed
+    way /= 2
+    way *= step_s
+    way[stops] = speed_mps[stops] ** 2 / (-2 * acceleration_mps2[stops])
     room = np.maximum(room_m, 0.0)
-    blocked = way > room
-    return np.minimum(way, room), np.where(blocked, 0.0, end_speed)
+    end_speed[way > room] = 0.0
+    return np.minimum(way, room, out=way), end_speed

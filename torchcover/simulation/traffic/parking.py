@@ -52,7 +52,7 @@ class Parking(Procedural):
         lanes = [Lane(loop(ROUND_M, 2 * AISLE_MIDDLE_M, CORNER_RADIUS_M))]
         agents = self._traffic(lanes[0].line.length_m, fleet, generator)
         flow = Simulation(lanes, agents, Signals.none()).run(times_s, WARM_UP_S)
-        driving = paths(lanes, agents, flow)
+        driving = paths(lanes, agents, flow.place_m)
         lot = Lot(fleet, self.parked_share, self.crossings, generator)
         driver = ego_actor(times_s, driving, flow, 0, fleet.meshes[EGO], generator)
         walking = _people(lot, driving, times_s, fleet, generator)

@@ -53,6 +53,11 @@ class Line:
         """
         place = np.asarray(place_m, dtype=np.float64)
         place = np.mod(place, self.length_m) if self.closed else place
+        if len(self.points_m) == 2:
+            poses = np.empty((*place.shape, 3))
+            poses[..., :2] = self.points_m[0] + place[..., None] * self._directions[0]
+            poses[..., 2] = np.rad2deg(self._headings[0])
+            return poses
         segment = np.clip(np.searchsorted(self.arc_m, place, side="right") - 1, 0, len(self.arc_m) - 2)
         along = (place - self.arc_m[segment])[..., None]
         position = self.points_m[segment] + along * self._directions[segment]

@@ -1,6 +1,7 @@
 """What stands beside a road, as closed convex pieces that are merged into few meshes."""
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -31,11 +32,17 @@ def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
         outlines_m: One (K, 2) outline for each height, counter-clockwise from above.
         heights_m: Their z.
     """
-    rings = [
-        np.column_stack([outline, np.full(len(np.asarray(outline)), z)])
-        for outline, z in zip(outlines_m, heights_m, strict=True)
-    ]
-    corners = len(rings[0])
+    outlines = np.array(outlines_m, dtype=np.float64)
+    levels, corners, _ = outlines.shape
+    rings = np.empty((levels, corners, 3))
+    rings[..., :2] = outlines
+    rings[..., 2] = np.reshape(heights_m, (-1, 1))
+    return Mesh(rings.reshape(-1, 3), _prism_faces(levels, corners))
+
+
+@cache
+def _prism_faces(levels: int, corners: int) -> NDArray[np.int64]:
+    """Sides, bottom and top of a prism through so many outlines, which share them: nobody may write into them."""
     here = np.arange(corners)
     following = (here + 1) % corners
     side = np.concatenate(
@@ -45,8 +52,10 @@ def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
         ]
     )
     fan = np.stack([np.zeros(corners - 2, dtype=np.int64), here[1:-1], here[2:]], axis=1)
-    sides = [side + level * corners for level in range(len(rings) - 1)]
-    return Mesh(np.concatenate(rings), np.concatenate([*sides, fan[:, ::-1], fan + (len(rings) - 1) * corners]))
+    sides = [side + level * corners for level in range(levels - 1)]
+    faces = np.concatenate([*sides, fan[:, ::-1], fan + (levels - 1) * corners])
+    faces.flags.writeable = False
+    return faces
 
 
 def rectangle(x_m: tuple[float, float], y_m: tuple[float, float]) -> Numbers:
@@ -126,6 +135,7 @@ def few(*kinds: Sequence[Mesh]) -> tuple[Mesh, ...]:
     return tuple(merge(list(pieces)) for pieces in kinds if pieces)
 
 
+@cache
 def _circle(sides: int) -> Numbers:
     angle = 2 * np.pi * np.arange(sides) / sides
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)

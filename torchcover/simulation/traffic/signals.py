@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 # Whoever follows the main street, on wheels or on foot, goes in one phase; whoever crosses it goes in the other.
 MAIN, CROSS = 0, 1
@@ -35,9 +35,11 @@ class Signals:
         """Time after which the lights repeat."""
         return sum(self.green_s) + 2 * (self.amber_s + self.clear_s)
 
-    def green_left_s(self, time_s: float) -> NDArray[np.float64]:
-        """(J, 2) seconds of green left to the main and to the cross phase; negative where there is no green."""
-        now = np.mod(time_s + self.offset_s, self.cycle_s)
+    def green_left_s(self, time_s: ArrayLike) -> NDArray[np.float64]:
+        """(..., J, 2) seconds of green left to the main and the cross phase at (...) times; negative without green."""
+        now = np.mod(np.asarray(time_s)[..., None] + self.offset_s, self.cycle_s)
         cross_start = self.green_s[MAIN] + self.amber_s + self.clear_s
-        cross_left = np.where(now < cross_start, -np.inf, cross_start + self.green_s[CROSS] - now)
-        return np.stack([self.green_s[MAIN] - now, cross_left], axis=1)
+        left = np.empty((*now.shape, 2))
+        left[..., MAIN] = self.green_s[MAIN] - now
+        left[..., CROSS] = np.where(now < cross_start, -np.inf, cross_start + self.green_s[CROSS] - now)
+        return left

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.assemble import Paths, actors, ego_actor, paths
+from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, come_near, ego_actor, paths
 from torchcover.simulation.traffic.city import City
 from torchcover.simulation.traffic.crossing import Footpath, step_height, walk
 from torchcover.simulation.traffic.fleet import CYCLING, EGO, WALKING, Fleet
@@ -77,7 +77,9 @@ class Urban(Procedural):
             flow = Simulation(lanes, agents, streets.signals).run(times_s, WARM_UP_S)
             if _usually_follows(agents, flow):
                 break
-        moving = _on_the_pavement(paths(lanes, agents, flow), streets, fleet)
+        near = come_near(lanes, agents, flow.place_m)
+        moving = paths(lanes, [agents[number] for number in near], flow.place_m[:, near])
+        moving = _on_the_pavement(moving, streets, fleet)
         driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator)
         way = driver.trajectory.positions_m[:, 0]
         seen = (float(way[0]) - BEHIND_M, float(way[-1]) + AHEAD_M)
@@ -109,7 +111,7 @@ class Urban(Procedural):
         agents = self._ego_and_leader(streets, fleet, generator)
         for index, ((per_km, drivers), end) in enumerate(zip(per_lane, ends_m, strict=True)):
             agents += fleet.fill(lanes, index, (0.0, end), per_km, drivers, keep_free=agents[:2])
-        return lanes, agents
+        return lanes, _who_matter(lanes, agents, self.duration_s + self.time_step_s + WARM_UP_S)
 
     def _ego_and_leader(self, streets: Streets, fleet: Fleet, generator: np.random.Generator) -> list[Agent]:
         lane, middle = int(generator.integers(streets.lanes_each_way)), streets.reach_m
@@ -118,6 +120,20 @@ class Urban(Procedural):
             fleet.agent(EGO, lane, middle - LEADER_AHEAD_M / 2, Driver(self.speed_mps, headway_s=1.1)),
             fleet.agent(kind, lane, middle + LEADER_AHEAD_M / 2, Driver(LEADER_SPEED * self.speed_mps)),
         ]
+
+
+def _who_matter(lanes: list[Lane], agents: list[Agent], duration_s: float) -> list[Agent]:
+    """Leave out those who stay so far before the first junction of their lane that nobody sees them or waits for them.
+
+    What somebody does depends on those ahead and on junctions; nobody overtakes, nor is faster than they want to be.
+    """
+    last_m, left_out = [np.inf] * len(lanes), set()
+    for agent in sorted(agents, key=lambda agent: agent.place_m, reverse=True):
+        gets_to_m = agent.place_m + float(agent.driver.desired_speed_mps) * duration_s
+        last_m[agent.lane] = min(last_m[agent.lane], gets_to_m)
+        if last_m[agent.lane] < lanes[agent.lane].gates[0].enter_m - HORIZON_M:
+            left_out.add(agent)
+    return [agent for agent in agents if agent not in left_out]
 
 
 def _usually_follows(agents: list[Agent], flow: Flow) -> bool:
@@ -150,7 +166,7 @@ def _crossers(
     positions, yaws, kinds = [], [], []
     wait_m = streets.kerb_m + WAITING_BEHIND_KERB_M
     walks = 2 * wait_m / float(WALKING.desired_speed_mps)
-    green = np.stack([streets.signals.green_left_s(time)[:, CROSS] for time in times_s])
+    green = streets.signals.green_left_s(times_s)[..., CROSS]
     may_go = (green + streets.signals.amber_s > walks) & ~flow.occupied[:, :, MAIN]
     for index in np.flatnonzero((streets.junctions_m > seen_m[0]) & (streets.junctions_m < seen_m[1])):
         for side in (1, -1):

@@ -1,11 +1,15 @@
-"""The formats of recordings, by name: a new one is a class and a line here."""
+"""The layouts of recordings, by name: a new one is a class and a line here."""
 
 import os
 from pathlib import Path
 from typing import Protocol
 
-from torchcover.data.recorded import RecordedFrames
-from torchcover.data.source import FrameSource
+from torchcover.data.recordings.argoverse2 import Argoverse2
+from torchcover.data.recordings.folder import FolderRecording
+from torchcover.data.recordings.kitti_object import KittiObject
+from torchcover.data.recordings.kitti_raw import KittiRaw
+from torchcover.data.recordings.nuscenes import NuScenes
+from torchcover.data.recordings.recording import Recording
 
 
 class RecordingFormat(Protocol):
@@ -20,16 +24,23 @@ class RecordingFormat(Protocol):
         """Whether what is at a path that exists is meant to be such a recording."""
         ...
 
-    def __call__(self, path: Path, /) -> FrameSource:
+    def __call__(self, path: Path, /) -> Recording:
         """Open it."""
         ...
 
 
-FORMATS: dict[str, RecordingFormat] = {"folder": RecordedFrames}
+# The first that recognises a path reads it.
+FORMATS: dict[str, RecordingFormat] = {
+    "nuscenes": NuScenes,
+    "argoverse2": Argoverse2,
+    "kitti_raw": KittiRaw,
+    "kitti_object": KittiObject,
+    "folder": FolderRecording,
+}
 
 
-def open_recording(path: str | os.PathLike[str], format_name: str | None = None) -> FrameSource:
-    """Open a recording.
+def open_recording(path: str | os.PathLike[str], format_name: str | None = None) -> Recording:
+    """Open a recording; `RecordedFrames` makes frames of it.
 
     Args:
         path: Where it is.

@@ -1,0 +1,69 @@
+"""Stages: which worlds are built, which are kept, and what they share."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, stage
+
+# Six instants a run.
+SHORT = Scenario.model_validate(
+    {
+        "name": "lot",
+        "ego": {"shape": {"type": "box", "size_m": [4, 2, 1.5]}},
+        "traffic": {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings": 0, "parked_share": 0.1},
+    }
+)
+ORDER = np.random.default_rng(0).permutation(24).tolist()
+
+
+@pytest.fixture
+def built(monkeypatch):
+    """The numbers of the runs whose worlds were built, in order."""
+    episodes, world = [], Scenario.world
+
+    def counted(self, seed=0, episode=0, ego=None):
+        episodes.append(episode)
+        return world(self, seed, episode, ego)
+
+    monkeypatch.setattr(Scenario, "world", counted)
+    return episodes
+
+
+def simulator():
+    return Simulator(SHORT, {"roof": Rig.load("front_roof_128")}, PaperReference(8, 8))
+
+
+def places(made):
+    """Of each step in a shuffled order, where the ego is in its world."""
+    scenes = {index: made.scene_of(index) for index in ORDER}
+    return {index: scene.world.ego.trajectory.positions_m[step] for index, (scene, step) in scenes.items()}
+
+
+def test_shuffled_steps_build_each_world_once(built):
+    found = places(simulator())
+    assert sorted(built) == [0, 1, 2, 3]
+    alone = SHORT.world(episode=1).ego.trajectory.positions_m
+    np.testing.assert_array_equal([found[index] for index in range(6, 12)], alone)
+
+
+@pytest.mark.parametrize(("room_for", "workers"), [(0.5, 1), (2.5, 1), (2.5, 4)])
+def test_no_more_worlds_are_kept_than_the_budget_has_room_for(monkeypatch, built, room_for, workers):
+    size = simulator().scene_of(0)[0].bytes
+    monkeypatch.setattr(stage, "machine_bytes", lambda: room_for * size / stage.KEPT_SHARE)
+    monkeypatch.setattr(stage, "get_worker_info", lambda: SimpleNamespace(num_workers=workers))
+    built.clear()
+    made = simulator()
+    for run in (0, 1, 0, 2, 0, 1):
+        made.scene_of(6 * run)
+    # Two worlds at most: 2 takes the place of 1, which was asked for longest ago.
+    assert built == ([0, 1, 2, 1] if room_for / workers > 2 else [0, 1, 0, 2, 0, 1])
+
+
+def test_worlds_share_what_is_the_same_in_all():
+    stages = stage.Stages(SHORT, {"roof": Rig.load("front_roof_128")}, seed=0)
+    one, other = stages.of_run(0), stages.of_run(1)
+    casters = [{part.caster for part in stage.scene.at(0).moving} for stage in (one, other)]
+    assert casters[0] & casters[1]
+    assert one.mounted is other.mounted

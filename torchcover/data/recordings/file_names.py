@@ -1,0 +1,67 @@
+"""Files of frames in a folder: one a frame, in natural order."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from torchcover.data.clouds import READERS, split_name
+
+MAX_NAMES_SHOWN = 5
+
+
+def frame_files(folder: Path, like: Sequence[str] | None = None) -> dict[str, Path]:
+    """The clouds in a folder by the names of their frames, in natural order (frame2 before frame10).
+
+    Args:
+        folder: Where they are.
+        like: Names that there have to be, and no others.
+
+    Raises:
+        FileNotFoundError: No such folder.
+        ValueError: A file that is no cloud, two files of one name, no files, or other names than `like`.
+    """
+    if not folder.is_dir():
+        raise FileNotFoundError(f"{folder}: no such folder; clouds are needed in it, one a frame")
+    clouds: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith("."):  # what file managers and version control leave behind
+            continue
+        name, suffix = split_name(path.name)
+        if not suffix or path.is_dir():
+            raise ValueError(f"{path}: not a cloud; allowed are files ending in {', '.join(READERS)}")
+        if name in clouds:
+            raise ValueError(f"{folder}: two files for the frame {name}: {clouds[name].name} and {path.name}")
+        clouds[name] = path
+    if like is not None:
+        check_same_names(folder.parent, {folder.name: clouds, "the others": dict.fromkeys(like)})
+    return {name: clouds[name] for name in sorted(clouds, key=natural)}
+
+
+def check_same_names(folder: Path, files: Mapping[str, Mapping[str, object]]) -> None:
+    """Whether all places have the same frames.
+
+    Raises:
+        ValueError: No frames at all, or some that are not everywhere.
+    """
+    places = " and ".join(f"{place}/" for place in files)
+    anywhere = set[str]().union(*files.values())
+    if not anywhere:
+        raise ValueError(f"{folder}: no frames; {places} are empty")
+    complaints = [
+        f"{len(gaps)} missing in {place}/ ({_some_of(gaps)})"
+        for place, clouds in files.items()
+        if (gaps := sorted(anywhere - clouds.keys(), key=natural))
+    ]
+    if complaints:
+        raise ValueError(f"{folder}: every frame needs a file in {places}; {' and '.join(complaints)}")
+
+
+def natural(name: str) -> tuple[list[str | int], str]:
+    """A key to sort names by, numbers in them by their values."""
+    # Text and number alternate, starting with text, so that two keys always compare; the name itself breaks a tie.
+    parts = re.split(r"(\d+)", name)
+    return [int(part) if position % 2 else part for position, part in enumerate(parts)], name
+
+
+def _some_of(names: Sequence[str]) -> str:
+    return ", ".join([*names[:MAX_NAMES_SHOWN], *["..."] * (len(names) > MAX_NAMES_SHOWN)])

@@ -1,0 +1,64 @@
+"""Tables of a data set that is written as JSON: lists of rows with tokens."""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from torchcover.files import check_memory, decode, reads
+
+# Python's objects take about so many times the bytes of their text.
+OBJECTS_PER_BYTE = 8
+
+
+class Table(NamedTuple):
+    """A table.
+
+    Args:
+        path: Its file.
+        rows: As they were written.
+        by_token: The same by their `token`.
+    """
+
+    path: Path
+    rows: list[dict[str, Any]]
+    by_token: dict[str, dict[str, Any]]
+
+    def row(self, token: str) -> dict[str, Any]:
+        """The row of a token.
+
+        Raises:
+            ValueError: It leads nowhere.
+        """
+        if token not in self.by_token:
+            raise ValueError(f"{self.path}: no row has the token {str(token)[:40]!r}, which another table names")
+        return self.by_token[token]
+
+
+@reads("a table of rows")
+def read_table(path: Path) -> Table:
+    """Read a JSON list of objects.
+
+    Raises:
+        BadFileError: Another content.
+    """
+    check_memory(OBJECTS_PER_BYTE * path.stat().st_size)
+    rows = json.loads(decode(path.read_bytes()))
+    if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+        raise ValueError(f"a list of objects is needed; got {type(rows).__name__}")
+    return Table(path, rows, {row["token"]: row for row in rows if "token" in row})
+
+
+def beneath(folder: Path, name: str) -> Path:
+    """A path that a table names, within a folder.
+
+    Raises:
+        ValueError: It leads out of it.
+
+    Example:
+        >>> beneath(Path("drive"), "samples/a.bin").as_posix()
+        'drive/samples/a.bin'
+    """
+    parts = Path(name).parts
+    if Path(name).is_absolute() or ".." in parts or not parts:
+        raise ValueError(f"{folder}: a table names the file {name!r}, which is not within it")
+    return folder / name

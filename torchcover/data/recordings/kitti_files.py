@@ -1,0 +1,134 @@
+"""The text files of KITTI: calibrations, labels, poses of the GPS and IMU (Geiger et al., IJRR 2013)."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.files import read_short_text, reads
+from torchcover.geometry import BoundingBox, check_rigid, rigid, rotation_from_euler
+from torchcover.geometry.rigid import Matrix
+
+# Of the WGS84 ellipsoid, as in the development kit.
+EARTH_RADIUS_M = 6_378_137.0
+# lat, lon, alt, roll, pitch, yaw, velocities, accelerations, rates, accuracies, status.
+OXTS_COLUMNS = 30
+# The LiDAR is 0.76 m before the rear axle and 1.73 m above the ground, the centre of the car's box 1.337 m before the
+# axle: as in the rig `kitti`, where the sources are. The car is a Volkswagen Passat B6 estate of 4.77 x 1.82 m; nothing
+# but the car and what is mounted on it can be in that outline, up to a little above the LiDAR.
+vehicle_T_velodyne = rigid(np.eye(3), [-0.577, 0.0, 1.73])
+BODY = BoundingBox((-2.387, -0.91, 0.05), (2.387, 0.91, 1.93))
+
+
+@reads("a KITTI calibration")
+def read_calibration(path: Path) -> dict[str, NDArray[np.float64]]:
+    """Read `KEY: numbers` lines; a line of other things than numbers, such as `calib_time`, is left out.
+
+    Args:
+        path: `calib/000007.txt`, `calib_velo_to_cam.txt`, ...
+
+    Raises:
+        BadFileError: A key that is there twice, or no line with numbers.
+    """
+    found: dict[str, NDArray[np.float64]] = {}
+    for number, line in enumerate(read_short_text(path).splitlines(), start=1):
+        key, colon, rest = line.partition(":")
+        if not colon or not rest.strip():
+            continue
+        try:
+            values = np.array([float(word) for word in rest.split()])
+        except ValueError:
+            continue
+        if key.strip() in found:
+            raise ValueError(f"{key.strip()} is there twice, again in line {number}")
+        if not np.isfinite(values).all():
+            raise ValueError(f"line {number}: {key.strip()} has NaN or infinite numbers")
+        found[key.strip()] = values
+    if not found:
+        raise ValueError("lines of a key, a colon and numbers are needed; there are none")
+    return found
+
+
+def transform_of(calibration: dict[str, NDArray[np.float64]], key: str, path: Path) -> Matrix:
+    """(4, 4) the rigid transform of twelve (or nine) numbers under a key.
+
+    Raises:
+        ValueError: There is none, or it is not rigid.
+    """
+    numbers = calibration.get(key)
+    if numbers is None or numbers.size not in (9, 12):
+        arrived = "none" if numbers is None else f"{numbers.size} numbers"
+        raise ValueError(f"{path}: {key} with 12 numbers, or 9 of a rotation, is needed; got {arrived}")
+    matrix = np.eye(4)
+    matrix[:3, : numbers.size // 3] = numbers.reshape(3, -1)
+    return check_rigid(matrix, f"{path}: {key}")
+
+
+@reads("KITTI labels")
+def read_labels(path: Path) -> list[tuple[str, NDArray[np.float64]]]:
+    """Read the objects of a `label_2` file: category and 14 numbers, without what is marked `DontCare`.
+
+    Raises:
+        BadFileError: A line with another number of columns than 15, or 16 with a score.
+    """
+    found = []
+    for number, line in enumerate(read_short_text(path).splitlines(), start=1):
+        words = line.split()
+        if not words:
+            continue
+        if len(words) not in (15, 16):
+            raise ValueError(f"line {number}: 15 columns are needed, or 16 with a score; got {len(words)}")
+        if words[0] != "DontCare":
+            found.append((words[0].lower(), np.array([float(word) for word in words[1:15]])))
+    return found
+
+
+@reads("a record of the GPS and IMU")
+def read_oxts(path: Path) -> NDArray[np.float64]:
+    """Read latitude, longitude, altitude, roll, pitch and yaw (degrees, metres, radians) of one instant.
+
+    Raises:
+        BadFileError: Another number of columns, or no place on earth.
+    """
+    numbers = np.array([float(word) for word in read_short_text(path).split()])
+    if len(numbers) != OXTS_COLUMNS:
+        raise ValueError(f"{OXTS_COLUMNS} numbers are needed; got {len(numbers)}")
+    if not np.isfinite(numbers[:6]).all() or abs(numbers[0]) >= 90:
+        raise ValueError(f"a latitude below 90 degrees and finite numbers are needed; got {numbers[:6].tolist()}")
+    return numbers[:6]
+
+
+def world_T_imu(oxts: NDArray[np.float64], latitude_deg: float) -> Matrix:
+    """(4, 4) the pose of the IMU in a Mercator projection, scaled at a latitude as in the development kit.
+
+    Args:
+        oxts: (6,) as `read_oxts` gives it.
+        latitude_deg: That of the drive's first record.
+
+    Example:
+        >>> world_T_imu(np.array([49.0, 8.0, 110.0, 0.0, 0.0, np.pi / 2]), 49.0)[:3, 1].round(6)
+        array([-1.,  0.,  0.])
+    """
+    latitude, longitude, altitude_m, roll, pitch, yaw = oxts
+    scale = math.cos(math.radians(latitude_deg))
+    east_m = scale * EARTH_RADIUS_M * math.radians(longitude)
+    north_m = scale * EARTH_RADIUS_M * math.log(math.tan(math.pi / 4 + math.radians(latitude) / 2))
+    rotation = rotation_from_euler(*np.rad2deg([yaw, pitch, roll]))
+    return rigid(rotation, [east_m, north_m, altitude_m])
+
+
+@reads("time stamps")
+def read_timestamps(path: Path) -> NDArray[np.float64]:
+    """Read lines such as `2011-09-26 13:02:25.964389445`: seconds since the first.
+
+    Raises:
+        BadFileError: A line that is no time.
+    """
+    lines = read_short_text(path).split("\n")
+    try:
+        times = np.array([np.datetime64(line.strip().replace(" ", "T"), "ns") for line in lines if line.strip()])
+    except ValueError as error:
+        raise ValueError(f"lines of date and time are needed: {error}") from error
+    seconds: NDArray[np.float64] = (times - times[0]) / np.timedelta64(1, "s")
+    return seconds

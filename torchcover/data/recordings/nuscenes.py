@@ -1,0 +1,138 @@
+"""nuScenes (Caesar et al., CVPR 2020): the LiDAR on the roof, its sweeps and key frames, and the annotations."""
+
+import os
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from torchcover.data.clouds import read_cloud
+from torchcover.data.recordings.json_tables import beneath, read_table
+from torchcover.data.recordings.recording import Scan, check_times
+from torchcover.data.recordings.tracks import Seen, Tracks
+from torchcover.detection.boxes import Boxes
+from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
+from torchcover.geometry.rigid import Matrix
+
+CHANNEL = "LIDAR_TOP"
+# The ego frame lies under the rear axle, on the ground; the centre of a Renault Zoe's box is 1.385 m before it, as in
+# the rig `nuscenes`, where the source is. Nothing but the car and what is mounted on it can be in its outline of
+# 4.08 x 1.73 m up to a little above the LiDAR.
+vehicle_T_ego = rigid(np.eye(3), [-1.385, 0.0, 0.0])
+BODY = BoundingBox((-2.042, -0.865, 0.05), (2.042, 0.865, 2.04))
+
+
+class NuScenes:
+    """A folder with `v1.0-*/` tables, `samples/` and `sweeps/`. Key frames are looked at, sweeps serve the reference.
+
+    Args:
+        path: The data set, or its folder of tables.
+        scenes: Names of scenes, such as `scene-0061`; all if not given.
+
+    Raises:
+        FileNotFoundError: A table is missing.
+        ValueError: A table that is none, a token that leads nowhere, a path out of the data set, an unknown scene, no
+            key frame.
+    """
+
+    layout: ClassVar[str] = "v1.0-*/*.json, samples/LIDAR_TOP, sweeps/LIDAR_TOP"
+    sensors = (CHANNEL,)
+    reference_sensors = ()
+    body = BODY
+
+    def __init__(self, path: str | os.PathLike[str], scenes: Sequence[str] | None = None) -> None:
+        tables = _tables(Path(path))
+        self.path = tables.parent
+        self.rigs = {"nuscenes": self.sensors}
+        samples = self._samples(tables, scenes)
+        poses, calibrations = read_table(tables / "ego_pose.json"), read_table(tables / "calibrated_sensor.json")
+        data = [
+            row
+            for row in read_table(tables / "sample_data.json").rows
+            if _is_lidar(row) and row["sample_token"] in samples
+        ]
+        data.sort(key=lambda row: row["timestamp"])
+        self.names = tuple(Path(row["filename"]).name.removesuffix(".pcd.bin") for row in data)
+        self.frames = [number for number, row in enumerate(data) if row["is_key_frame"]]
+        if not self.frames:
+            raise ValueError(f"{tables}: no key frame of {CHANNEL}")
+        self.times_s = check_times(np.array([row["timestamp"] for row in data]) * 1e-6, len(data), str(tables))
+        self._files = [beneath(self.path, row["filename"]) for row in data]
+        self._poses = [pose_of(poses.row(row["ego_pose_token"])) for row in data]
+        self._mounts = [pose_of(calibrations.row(row["calibrated_sensor_token"])) for row in data]
+        self._tables, self._sample_times = tables, samples
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether there are tables of samples."""
+        return path.is_dir() and ((path / "sample_data.json").exists() or any(path.glob("v1.0-*/sample_data.json")))
+
+    def scan(self, sensor: str, index: int) -> Scan:
+        """Read a sweep."""
+        path = self._files[index]
+        return Scan(read_cloud(path), vehicle_T_ego @ self._mounts[index], str(path))
+
+    def world_T_vehicle(self, index: int) -> Matrix:
+        """The pose of the ego when the sweep was made."""
+        return self._poses[index] @ invert(vehicle_T_ego)
+
+    def boxes(self, index: int) -> Boxes:
+        """The annotations; between two key frames, what lies between theirs."""
+        return self._tracks.at(float(self.times_s[index]), invert(self.world_T_vehicle(index)))
+
+    @cached_property
+    def _tracks(self) -> Tracks:
+        categories = {row["token"]: str(row["name"]) for row in read_table(self._tables / "category.json").rows}
+        instances = read_table(self._tables / "instance.json")
+        tracks: dict[str, list[Seen]] = {}
+        for row in read_table(self._tables / "sample_annotation.json").rows:
+            if row["sample_token"] not in self._sample_times:
+                continue
+            width, length, height = row["size"]
+            token = row["instance_token"]
+            seen = Seen(
+                self._sample_times[row["sample_token"]],
+                rigid(rotation_from_quaternion(row["rotation"]), row["translation"]),
+                (length, width, height),
+                categories[instances.row(token)["category_token"]],
+            )
+            tracks.setdefault(token, []).append(seen)
+        return Tracks(tracks)
+
+    def _samples(self, tables: Path, scenes: Sequence[str] | None) -> dict[str, float]:
+        """Token -> time in seconds of the key frames of the wanted scenes."""
+        by_name = {row["name"]: row["token"] for row in read_table(tables / "scene.json").rows}
+        unknown = set(scenes or ()) - by_name.keys()
+        if unknown:
+            raise ValueError(f"{tables}: no scene {', '.join(sorted(unknown))}; there are {', '.join(sorted(by_name))}")
+        wanted = {token for name, token in by_name.items() if scenes is None or name in scenes}
+        rows = read_table(tables / "sample.json").rows
+        return {row["token"]: row["timestamp"] * 1e-6 for row in rows if row["scene_token"] in wanted}
+
+
+def pose_of(row: dict[str, Any]) -> Matrix:
+    """(4, 4) the pose of a row with `rotation` (w, x, y, z) and `translation`.
+
+    Raises:
+        ValueError: Not seven finite numbers.
+    """
+    matrix = rigid(rotation_from_quaternion(row["rotation"]), row["translation"])
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"translation: three finite numbers are needed; got {row['translation']}")
+    return matrix
+
+
+def _is_lidar(row: dict[str, Any]) -> bool:
+    return f"/{CHANNEL}/" in str(row["filename"])
+
+
+def _tables(path: Path) -> Path:
+    if (path / "sample_data.json").exists():
+        return path
+    versions = sorted(found.parent for found in path.glob("v1.0-*/sample_data.json"))
+    if len(versions) != 1:
+        names = ", ".join(version.name for version in versions) or "none"
+        raise ValueError(f"{path}: one folder of tables v1.0-*/ is needed; got {names}; name it in the path")
+    return versions[0]

@@ -1,0 +1,118 @@
+"""What every reader of recordings gives: scans of named sensors at instants, and where the vehicle was."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.data.formats.arrays import Points
+from torchcover.detection.boxes import Boxes
+from torchcover.geometry import BoundingBox
+from torchcover.geometry.rigid import Matrix
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What a sensor recorded at one instant, as it was stored.
+
+    Args:
+        points_m: (N, 3) points in the frame of the sensor; those that are not finite or lie in the sensor itself are
+            returns that never came.
+        vehicle_T_sensor: (4, 4) where the sensor was; None: the points are in the vehicle frame already.
+        source: Where it was read from, for messages.
+    """
+
+    points_m: Points
+    vehicle_T_sensor: Matrix | None
+    source: str
+
+
+def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArray[np.float64]:
+    """Return the times of instants, if they can be those.
+
+    Args:
+        times_s: (F,) in seconds.
+        count: How many instants there are.
+        source: Where they were read from, for messages.
+
+    Raises:
+        ValueError: Another number of them, or two that do not follow each other.
+    """
+    if len(times_s) != count:
+        raise ValueError(f"{source}: {len(times_s):,} times for {count:,} scans; one each is needed")
+    bad = np.flatnonzero(~(np.diff(times_s) > 0))
+    if len(bad):
+        first = int(bad[0])
+        raise ValueError(
+            f"{source}: times have to ascend; {len(bad)} do not, the first after instant {first}: "
+            f"{times_s[first]:.6f} s, then {times_s[first + 1]:.6f} s"
+        )
+    return times_s
+
+
+class Recording(Protocol):
+    """A drive as somebody recorded it. A reader of a layout is a class like this, made from a path; see `FORMATS`.
+
+    Instants are numbered in time. What a reader opens at once is small: names, times, calibrations. Scans are read one
+    by one.
+    """
+
+    @property
+    def path(self) -> Path:
+        """Where it is."""
+        ...
+
+    @property
+    def names(self) -> Sequence[str]:
+        """What a user calls the instants; so many there are."""
+        ...
+
+    @property
+    def frames(self) -> Sequence[int]:
+        """Numbers of the instants that are meant to be looked at, ascending; the others serve a reference only."""
+        ...
+
+    @property
+    def times_s(self) -> NDArray[np.float64] | None:
+        """(F,) when they were, ascending; None if nobody knows."""
+        ...
+
+    @property
+    def sensors(self) -> Sequence[str]:
+        """Names of the sensors that belong to the vehicle."""
+        ...
+
+    @property
+    def rigs(self) -> Mapping[str, Sequence[str]]:
+        """Name of each rig -> its sensors, where nobody wishes anything else."""
+        ...
+
+    @property
+    def reference_sensors(self) -> Sequence[str]:
+        """Sensors that were recorded to be the reference; empty where there was none."""
+        ...
+
+    @property
+    def body(self) -> BoundingBox | None:
+        """The vehicle itself, in its own frame; None if nobody knows."""
+        ...
+
+    def scan(self, sensor: str, index: int, /) -> Scan:
+        """Read what a sensor recorded at an instant.
+
+        Raises:
+            OSError: It is not there.
+            ValueError: It is not what it is meant to be.
+        """
+        ...
+
+    def world_T_vehicle(self, index: int, /) -> Matrix | None:
+        """(4, 4) where the vehicle was, in a world that does not move; None if nobody knows."""
+        ...
+
+    def boxes(self, index: int, /) -> Boxes | None:
+        """The labelled objects of an instant in the vehicle frame; None where nobody has labelled it."""
+        ...
