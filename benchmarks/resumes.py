@@ -44,7 +44,7 @@ def main():
             while code != 0:
                 process = started(out)
                 if kills < options.kills:
-                    kill_after(process, chance.uniform(0.3, 1.0) * unbroken_s)
+                    kill_after(process, chance.uniform(0.5, 1.0) * unbroken_s)
                 code = process.wait()
                 if code == -signal.SIGKILL:
                     kills, of_run = kills + 1, of_run + 1
