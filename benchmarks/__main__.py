@@ -26,6 +26,8 @@ BENCHMARKS = (
     "known_boxes",
     "hostile_documents",
     "kills",
+    "resumes",
+    "scaling",
     "mutated_files",
 )
 

@@ -18,6 +18,7 @@ from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
 from torchcover.data.recordings.folder_settings import read_poses
+from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.shapes import MeshFile
 from torchcover.simulation.tracks import read_boxes, read_trajectory
@@ -175,6 +176,15 @@ def scene_files():
     yield Kind("town.yaml", TOWN.encode(), Scenario.load)
 
 
+def checkpoint(folder):
+    """A checkpoint of one observer."""
+    path = Path(folder) / "checkpoint.npz"
+    run = {"steps": 3, "counts": {"sensor_rays": 9}, "skipped": [], "seconds": 1.5}
+    state = {"dense": torch.arange(1, 40), "sparse": torch.eye(20, dtype=torch.float64), "looks": [1, None, "two"]}
+    write_checkpoint(path, {"identity": {"seed": "0"}, "run": run}, {"one": state})
+    return path.read_bytes()
+
+
 def kinds(folder):
     """One of each format that is read.
 
@@ -232,4 +242,5 @@ def kinds(folder):
         Kind("frames.yaml", POSES, read_poses),
         Kind("coverage.npz", coverage(folder), Coverage.load),
         *scene_files(),
+        Kind("checkpoint.npz", checkpoint(folder), lambda path: read_state(path, read_header(path), "one")),
     )

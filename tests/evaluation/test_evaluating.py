@@ -43,6 +43,7 @@ class Source:
     description = {"scenario": None, "frames": "made up", "seed": None}  # noqa: RUF012
     weight_kind = None
     reference_record = None
+    content = {"frames": "made up"}  # noqa: RUF012
 
     def __len__(self):
         return 3

@@ -1,5 +1,6 @@
 """YAML documents: typed, without unknown keys, found by path or by built-in name."""
 
+import hashlib
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
@@ -38,6 +39,18 @@ class Document(BaseModel):
         if not isinstance(content, dict):
             return content
         return {key: _kept(value) for key, value in content.items()}
+
+    def content(self) -> dict[str, Any]:
+        """All that it means to a simulation, for JSON: its keys, and hashes of the files that they name.
+
+        Raises:
+            FileNotFoundError: A file is missing.
+
+        Example:
+            >>> Pose(x_m=1.5).content()["x_m"]
+            1.5
+        """
+        return {name: _content(getattr(self, name)) for name in type(self).model_fields if name != "description"}
 
 
 # Farther away rays know no place any more.
@@ -175,6 +188,25 @@ def _find(kind: str, path_or_name: str | Path) -> Path:
             f"{', '.join(builtin_names(kind))}"
         )
     return builtin
+
+
+def builtin_hashes(kind: str) -> dict[str, str]:
+    """The hash of every built-in document of a kind, by its name."""
+    return {path.stem: file_hash(path) for path in sorted(builtin_folder(kind).glob("*.yaml"))}
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of what is in a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _content(value: Any) -> Any:  # noqa: ANN401  (whatever a document holds)
+    if isinstance(value, Document):
+        return value.content()
+    if isinstance(value, Path):
+        return file_hash(value)
+    return list(map(_content, value)) if isinstance(value, tuple | list) else value
 
 
 def _shorten(value: Any) -> str:  # noqa: ANN401  (whatever stood in the file)
