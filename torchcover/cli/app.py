@@ -179,9 +179,9 @@ def study(
     scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "courtyard",
     rays: Annotated[
         list[int] | None,
-        typer.Option(min=1, help="Rays of the reference at each step; may be repeated (1024 to 65536)."),
+        typer.Option(min=1, help="Rays of the reference at each step; may be repeated (1024, 4096 and 16384)."),
     ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Most steps of a run.")] = 256,
+    steps: Annotated[int, typer.Option(min=1, help="Most steps of a run.")] = 128,
     runs: Annotated[int, typer.Option(min=1, help="Runs of so many steps that errors are averaged over.")] = 2,
     long_run: Annotated[
         Path | None,
@@ -190,7 +190,7 @@ def study(
             "earlier study. Not given: a run is made for it."
         ),
     ] = None,
-    long_run_steps: Annotated[int, typer.Option(min=8, help="Steps of that run.")] = 1024,
+    long_run_steps: Annotated[int, typer.Option(min=8, help="Steps of that run.")] = 512,
     every: options.Every = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
