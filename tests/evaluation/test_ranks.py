@@ -128,7 +128,12 @@ def test_a_run_over_ranks_goes_on_from_its_checkpoints(frame_of, tmp_path):
 
 def test_an_error_of_one_ends_all_and_what_there_is_is_kept(frame_of, tmp_path):
     source = Drive(frame_of, 400, bad={5}, delay_s=0.01)
-    (first, first_s), (second, second_s) = in_ranks(tmp_path, lambda ranks: measured(source, ranks))
+
+    def cut_short(ranks):
+        with pytest.warns(RuntimeWarning, match="The run was cut short after"):
+            return measured(source, ranks)
+
+    (first, first_s), (second, second_s) = in_ranks(tmp_path, cut_short)
     steps, _, _, failure = first["counts"][1]
     assert 3 <= steps < 300
     assert len(first["counts"][2]["names"]) == steps

@@ -107,9 +107,9 @@ def test_a_tree_is_built_of_distinct_points_where_many_are_equal(monkeypatch, dt
     """It cannot split equal points, and queries near them would look through all of them."""
     built = []
 
-    def noted(points):
+    def noted(points, **settings):
         built.append(len(points))
-        return KDTree(points)
+        return KDTree(points, **settings)
 
     monkeypatch.setattr("torchcover.neighbors.kdtree.KDTree", noted)
     random = torch.Generator().manual_seed(4)
