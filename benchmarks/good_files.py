@@ -2,6 +2,7 @@
 
 import io
 import struct
+import warnings
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,13 +11,20 @@ import laspy
 import lzf
 import numpy as np
 import torch
+import trimesh
 from PIL import Image
 
+from tests.cli.hostile import CAMERA, RIG, TOWN, YARD
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
 from torchcover.data.recordings.folder_settings import read_folder_settings
-from torchcover.data.recordings.folder_tables import PoseTable, read_boxes
+from torchcover.data.recordings.folder_tables import PoseTable
+from torchcover.data.recordings.folder_tables import read_boxes as read_labels
+from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
+from torchcover.simulation import Rig, Scenario
+from torchcover.simulation.shapes import MeshFile
+from torchcover.simulation.tracks import read_boxes, read_trajectory
 
 
 @dataclass(frozen=True)
@@ -147,7 +155,7 @@ DRIVEN = b"""frame,time_s,x_m,y_m,z_m,qw,qx,qy,qz
 f1,0.0,513248.1,5403655.2,260.1,1,0,0,0
 f2,0.1,513249.1,5403655.3,260.1,0.6,0,0,0.8
 """
-BOXES = b"""x_m,y_m,z_m,length_m,width_m,height_m,yaw_rad,id,category
+LABELS = b"""x_m,y_m,z_m,length_m,width_m,height_m,yaw_rad,id,category
 10.5,-2.0,0.75,4.5,1.8,1.5,0.1,a,car
 -7.5,3.0,0.9,0.6,0.6,1.8,-3.1,,pedestrian
 """
@@ -157,6 +165,44 @@ CALIBRATED = b"""[
   "camera_intrinsic": [[520.0, 0.0, 318.0], [0.0, 510.0, 242.0], [0.0, 0.0, 1.0]]},
  {"token": "l", "sensor_token": "s2", "translation": [0.9, 0, 1.8], "rotation": [1, 0, 0, 0], "camera_intrinsic": []}
 ]"""
+
+
+TRAJECTORY = b"t,x,y,z,roll,pitch,yaw\n" + b"".join(b"%d,%d.5,2,0,0,0,%d\n" % (k, 3 * k, k) for k in range(9))
+BOXES = b"t,id,category,x,y,z,length,width,height,yaw\n" + b"".join(
+    b"%d,a%d,car,%d,2,0,4,2,1.5,90\n" % (k, k % 2, 3 * k) for k in range(12)
+)
+
+
+def mesh(path):
+    """Read a mesh; that a damaged one is not closed is no news."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*the mesh is not closed")
+        return MeshFile(type="mesh", path=path).mesh()
+
+
+def scene_files():
+    """What scenes are made from: trajectories, boxes, meshes and documents."""
+    poses = {"times_s": np.arange(5.0), "world_T_body": np.stack([np.eye(4)] * 5)}
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    yield Kind("trajectory.csv", TRAJECTORY, read_trajectory)
+    yield Kind("trajectory.npz", stored(lambda stream: np.savez(stream, **poses)), read_trajectory)
+    yield Kind("boxes.csv", BOXES, read_boxes)
+    for suffix in ("ply", "obj", "stl", "glb", "off"):
+        data = ball.export(file_type=suffix)
+        yield Kind(f"mesh.{suffix}", data if isinstance(data, bytes) else data.encode(), mesh)
+    yield Kind("rig.yaml", RIG.encode(), Rig.load)
+    yield Kind("camera.yaml", CAMERA.encode(), Rig.load)
+    yield Kind("yard.yaml", YARD.encode(), Scenario.load)
+    yield Kind("town.yaml", TOWN.encode(), Scenario.load)
+
+
+def checkpoint(folder):
+    """A checkpoint of one observer."""
+    path = Path(folder) / "checkpoint.npz"
+    run = {"steps": 3, "counts": {"sensor_rays": 9}, "skipped": [], "seconds": 1.5}
+    state = {"dense": torch.arange(1, 40), "sparse": torch.eye(20, dtype=torch.float64), "looks": [1, None, "two"]}
+    write_checkpoint(path, {"identity": {"seed": "0"}, "run": run}, {"one": state})
+    return path.read_bytes()
 
 
 def kinds(folder):
@@ -217,6 +263,8 @@ def kinds(folder):
         Kind("calibrated_sensor.json", CALIBRATED, nuscenes, (("sensor.json", SENSORS),)),
         Kind("frames.yaml", POSES, read_folder_settings),
         Kind("poses.csv", DRIVEN, lambda path: PoseTable(path, ("f1", "f2"), timed=True)),
-        Kind("boxes.csv", BOXES, read_boxes),
+        Kind("labels.csv", LABELS, read_labels),
         Kind("coverage.npz", coverage(folder), Coverage.load),
+        *scene_files(),
+        Kind("checkpoint.npz", checkpoint(folder), lambda path: read_state(path, read_header(path), "one")),
     )

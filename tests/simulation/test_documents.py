@@ -166,7 +166,12 @@ def test_a_rig_needs_a_sensor(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("- a\n- b", "mapping of keys is needed; got list"), ("", "got NoneType"), ("a: [1", "not a YAML file")],
+    [
+        ("- a\n- b", "mapping of keys is needed; got list"),
+        ("# nothing", "got NoneType"),
+        ("", "an empty file"),
+        ("a: [1", "not a YAML file"),
+    ],
 )
 def test_what_is_not_a_document_is_refused(tmp_path, content, message):
     with pytest.raises(ValueError, match=rf"doc\.yaml: .*{message}"):
@@ -176,7 +181,7 @@ def test_what_is_not_a_document_is_refused(tmp_path, content, message):
 def test_a_binary_file_is_refused(tmp_path):
     path = tmp_path / "doc.yaml"
     path.write_bytes(bytes(range(256)))
-    with pytest.raises(ValueError, match="not a YAML file"):
+    with pytest.raises(ValueError, match=r"doc\.yaml: not text in UTF-8"):
         Scenario.load(path)
 
 

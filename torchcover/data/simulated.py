@@ -1,7 +1,10 @@
 """Frames of a simulated world."""
 
 import copy
+import hashlib
+import pickle
 from collections.abc import Mapping, Sequence
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Self
 
@@ -132,6 +135,24 @@ class SimulatedFrames(Dataset[Frame]):
     def reference_record(self) -> Mapping[str, object]:
         """The name of the reference sensor and the time between two frames."""
         return {"sensor": self.reference_sensor.name, "every_s": self.every_s}
+
+    @property
+    def content(self) -> Mapping[str, object]:
+        """What stands in the documents and in the files that they name, and the settings.
+
+        Raises:
+            FileNotFoundError: A file is missing.
+        """
+        sensor = self.reference_sensor
+        pattern = repr(sensor) if is_dataclass(sensor) else hashlib.sha256(pickle.dumps(sensor)).hexdigest()
+        return {
+            "scenario": self.scenario.content(),
+            **{f"rig {name}": rig.content() for name, rig in self.rigs.items()},
+            "reference sensor": pattern,
+            "seed": self.seed,
+            "every_s": self.every_s,
+            "boxes": self.boxes,
+        }
 
     def with_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
         """The same instants as another reference sensor sees them; the geometry is built once for both."""

@@ -161,6 +161,7 @@ def new_metric(
         blocks=blocks,
         aggregations=aggregations,
         square_metres=square_metres,
+        sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
     )
     try:
         with torch.device("meta"):  # where tensors have a size and take no memory
