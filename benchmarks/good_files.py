@@ -7,6 +7,7 @@ import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import laspy
 import lzf
 import numpy as np
 import torch
@@ -17,7 +18,9 @@ from tests.cli.hostile import CAMERA, RIG, TOWN, YARD
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
-from torchcover.data.recordings.folder_settings import read_poses
+from torchcover.data.recordings.folder_settings import read_folder_settings
+from torchcover.data.recordings.folder_tables import PoseTable
+from torchcover.data.recordings.folder_tables import read_boxes as read_labels
 from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.shapes import MeshFile
@@ -78,6 +81,13 @@ def ply(encoding, body):
     return f"ply\nformat {encoding} 1.0\nelement vertex 40\n{columns}end_header\n".encode() + body
 
 
+def las(points, *, compressed):
+    """A survey in LAS or LAZ."""
+    survey = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    survey.x, survey.y, survey.z = points.T
+    return stored(lambda stream: survey.write(stream, do_compress=compressed))
+
+
 def png(pixels):
     """A PNG image."""
     return stored(lambda stream: Image.fromarray(pixels).save(stream, "png"))
@@ -136,8 +146,18 @@ Tr_velo_to_cam: 0 -1 0 0.01 0 0 -1 -0.07 1 0 0 -0.27
 """
 POSES = b"""sensor:
   vehicle_T_sensor: [[1, 0, 0, -0.52], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]]
+vehicle: {lower_m: [-2.4, -0.9, 0.05], upper_m: [2.4, 0.9, 1.6]}
+reference: {weight_kind: m2}
 rigs:
-  roof: {vehicle_T_sensor: [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 2.0], [0, 0, 0, 1]]}
+  roof: {flip_y: true, min_range_m: 0.5, vehicle_T_sensor: [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 2.0], [0, 0, 0, 1]]}
+"""
+DRIVEN = b"""frame,time_s,x_m,y_m,z_m,qw,qx,qy,qz
+f1,0.0,513248.1,5403655.2,260.1,1,0,0,0
+f2,0.1,513249.1,5403655.3,260.1,0.6,0,0,0.8
+"""
+LABELS = b"""x_m,y_m,z_m,length_m,width_m,height_m,yaw_rad,id,category
+10.5,-2.0,0.75,4.5,1.8,1.5,0.1,a,car
+-7.5,3.0,0.9,0.6,0.6,1.8,-3.1,,pedestrian
 """
 SENSORS = b'[{"token": "s1", "channel": "CAM_FRONT"}, {"token": "s2", "channel": "LIDAR_TOP"}]'
 CALIBRATED = b"""[
@@ -214,6 +234,8 @@ def kinds(folder):
         "binary.ply": ply("binary_little_endian", cloud.tobytes()),
         "c.csv": b"x,y,z,intensity\n" + rows(cloud, ","),
         "c.xyz": b"# x y z intensity\n" + rows(cloud, " "),
+        "c.las": las(xyz, compressed=False),
+        "c.laz": las(xyz, compressed=True),
     }
 
     def depth(path):
@@ -239,7 +261,9 @@ def kinds(folder):
         Kind("kitti.txt", KITTI, lambda path: Camera.from_kitti(path, 2, width=640, height=480)),
         Kind("sensor.json", SENSORS, nuscenes, (("calibrated_sensor.json", CALIBRATED),)),
         Kind("calibrated_sensor.json", CALIBRATED, nuscenes, (("sensor.json", SENSORS),)),
-        Kind("frames.yaml", POSES, read_poses),
+        Kind("frames.yaml", POSES, read_folder_settings),
+        Kind("poses.csv", DRIVEN, lambda path: PoseTable(path, ("f1", "f2"), timed=True)),
+        Kind("labels.csv", LABELS, read_labels),
         Kind("coverage.npz", coverage(folder), Coverage.load),
         *scene_files(),
         Kind("checkpoint.npz", checkpoint(folder), lambda path: read_state(path, read_header(path), "one")),

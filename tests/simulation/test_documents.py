@@ -7,7 +7,7 @@ import pytest
 
 from torchcover import Rig, Scenario
 from torchcover.cameras.calibration import read_opencv, read_ros
-from torchcover.data.recordings.folder_settings import read_poses
+from torchcover.data.recordings.folder_settings import read_folder_settings
 from torchcover.simulation import Lidar, LidarModel, Pose, builtin_names
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.documents import load_document
@@ -112,7 +112,7 @@ DOUBLED = {
     "lidar": (LidarModel.load, "name: l\ncolumns: 5\ncolumns: 6\n", "columns"),
     "ros": (read_ros, "width: 5\nwidth: 6\n", "width"),
     "opencv": (read_opencv, "%YAML:1.0\n---\nimage_width: 5\nimage_width: 6\n", "image_width"),
-    "frames": (read_poses, "sensor: {}\nsensor: {}\n", "sensor"),
+    "frames": (read_folder_settings, "sensor: {}\nsensor: {}\n", "sensor"),
 }
 
 

@@ -225,6 +225,24 @@ def study(
 
 
 @app.command()
+def record(
+    rig: options.Rig,
+    out: options.RecordingOut,
+    scenario: options.ScenarioOrNone = None,
+    steps: options.Steps = None,
+    seed: options.Seed = 0,
+    every: options.Every = None,
+    reference: options.Reference = None,
+    rays: options.Rays = None,
+    layout: options.Layout = "folder",
+) -> None:
+    """Write what a simulated rig sees as a recording, for other tools and for `evaluate --frames`."""
+    from torchcover.cli.record import run
+
+    run(rig, out, layout, scenario=scenario, steps=steps, seed=seed, every_s=every, reference=reference, rays=rays)
+
+
+@app.command()
 def show(
     name: Annotated[str, typer.Argument(help="Rig or scenario: a built-in name (see `list`) or a YAML file.")],
     scenario: Annotated[

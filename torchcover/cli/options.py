@@ -56,6 +56,12 @@ Steps = Annotated[
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the simulation.")]
 Out = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
+RecordingOut = Annotated[
+    Path, typer.Option("--out", help="Folder for the recording, new or empty.", callback=check_out)
+]
+Layout = Annotated[
+    str, typer.Option("--format", help="`folder`, or `kitti`: KITTI's object layout, of a rig of one LiDAR.")
+]
 Cell = Annotated[float, typer.Option(help="Side of a grid cell in metres.")]
 Thresholds = Annotated[
     list[float] | None, typer.Option("--threshold", help="Detection threshold in metres (0.4); may be repeated.")

@@ -95,8 +95,8 @@ class RecordedFrames(Dataset[Frame]):
 
     @property
     def weight_kind(self) -> WeightKind | None:
-        """None: all points of the reference count the same."""
-        return None
+        """What the weights of the reference points are; None: all of them count the same."""
+        return self.reference.weight_kind(self.recording)
 
     @property
     def reference_record(self) -> Mapping[str, object]:
@@ -150,7 +150,17 @@ class RecordedFrames(Dataset[Frame]):
         tensors = {rig: torch.from_numpy(cloud.points_m) for rig, cloud in clouds.items()}
         if boxes is not None:
             boxes = with_hits(boxes, tensors)
-        return Frame(tensors, torch.from_numpy(reference.points_m), position, name, counts=counts, boxes=boxes)
+        return Frame(
+            tensors,
+            torch.from_numpy(reference.points_m),
+            position,
+            name,
+            counts=counts,
+            reference_weights=None if reference.weights is None else torch.from_numpy(reference.weights),
+            weight_kind=self.weight_kind,
+            boxes=boxes,
+            instant=None if self.recording.instants is None else self.recording.instants[instant],
+        )
 
     @property
     def _judged(self) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ from torchcover.data.frame import Frame
 from torchcover.data.reference import reference_called, reference_of_objects
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import with_hits
-from torchcover.simulation import Label, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
+from torchcover.simulation import Label, Observation, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
 
 # What takes years.
 MAX_STEPS = 1_000_000_000
@@ -166,7 +166,10 @@ class SimulatedFrames(Dataset[Frame]):
     def __getitem__(self, index: int) -> Frame:
         if not 0 <= index < self.steps:
             raise IndexError(f"frame {index} of {self.steps}")
-        seen = self.simulator.step(index)
+        return self.frame_of(self.simulator.step(index), index)
+
+    def frame_of(self, seen: Observation, index: int) -> Frame:
+        """The frame of what the simulator saw at a step."""
         clouds = {name: torch.from_numpy(points) for name, points in seen.clouds.items()}
         weights = seen.reference_weights
         return Frame(

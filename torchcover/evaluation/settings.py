@@ -110,7 +110,7 @@ class Settings:
         """
         if self.estimate == "area" and weight_kind != "m2":
             raise ValueError(
-                "estimate area: it needs the square metres of reference points, which only the surface reference of a "
+                "estimate area: it needs the square metres of reference points, which the surface reference of a "
                 "simulation gives; leave it out for means over the known cells"
             )
         return new_metric(
