@@ -67,10 +67,12 @@ class AccumulatedReference:
         self.window_s = window_s
         self.voxel_m = voxel_m
         self.sensors = None if sensors is None else tuple(sensors)
-        self._kept: dict[tuple[str, int], Thinned] = {}  # of the window that was asked for last: the next is much alike
+        # Of the recording and the window that were asked for last: the next window is much alike.
+        self._kept: dict[tuple[str, int], Thinned] = {}
+        self._kept_of: Recording | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        return {**vars(self), "_kept": {}}
+        return {**vars(self), "_kept": {}, "_kept_of": None}
 
     def check(self, recording: Recording, judged: Collection[str]) -> None:
         """Whether the recording says when and where its scans were made.
@@ -110,7 +112,8 @@ class AccumulatedReference:
         still, voxels, moved, dropped = [], [], [], Counter[str]()
         of_box: dict[str, list[NDArray[np.float64]]] = {}
         taken = list(self._scans(recording, index, judged))
-        self._kept = {key: scan for key, scan in self._kept.items() if key in taken}
+        of_recording = self._kept if recording is self._kept_of else {}
+        self._kept_of, self._kept = recording, {key: scan for key, scan in of_recording.items() if key in taken}
         for sensor, instant in taken:
             scan = self._thinned(recording, sensor, instant, origin_m)
             still.append(scan.still_m)
