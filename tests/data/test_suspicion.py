@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import torchcover
 from tests.data.drives import Drive
 from torchcover.data import AccumulatedReference, RecordedFrames, Scan
 from torchcover.data.suspicion import ground_height_m, suspicions
@@ -28,6 +29,7 @@ class Street:
     mount: np.ndarray = None
     flipped: bool = False
     same: bool = False
+    halved: bool = False
     turned_deg: float = 0.0
     slope: tuple = (0.03, -0.02)
     step_s: float = 0.1
@@ -57,6 +59,8 @@ class Street:
             for row in self.boxes(index).rows
         ]
         points_m = np.concatenate([ground_m, wall_m, beneath_m, *sides_m])
+        if self.halved and sensor == "lidar":
+            points_m = points_m[::2]  # every second laser
         if self.flipped:
             points_m = points_m * [1.0, -1.0, 1.0]
         return Scan(transform(invert(MOUNT), points_m), MOUNT if self.mount is None else self.mount, sensor)
@@ -84,6 +88,7 @@ def test_nothing_is_wrong_with_what_is_right():
     assert doubts(Street(), reference=AccumulatedReference(1.0)) == []
     assert doubts(Street(slope=(0.12, 0.0))) == []  # a hill
     assert doubts(Street(steps=1)) == []
+    assert doubts(Street(same=True, halved=True)) == []  # half of the lasers against all
     assert doubts(Street(turned_deg=180.0)) == []  # it reverses
     for drive in (
         Drive(),
@@ -143,3 +148,10 @@ def test_a_frame_that_cannot_be_read_is_not_looked_at():
     assert len(doubts(street)) == 1
     street.scan = lambda sensor, index: Path("gone").read_bytes()
     assert doubts(street) == []
+
+
+def test_a_run_warns_before_it_begins():
+    frames = RecordedFrames(Street(mount=np.eye(4), steps=1))
+    with pytest.warns(UserWarning, match=r"^street: the ground lies at z = -1.[78] m \(lidar\)") as caught:
+        torchcover.evaluate(frames=frames, cell_m=8.0)
+    assert [warning.filename for warning in caught] == [__file__]
