@@ -21,6 +21,7 @@ BENCHMARKS = (
     "even_reference",
     "ray_budget",
     "recorded_measure",
+    "accumulated_reference",
     "calibration",
     "training_overhead",
     "known_boxes",

@@ -80,6 +80,14 @@ def test_a_frame_does_not_depend_on_those_read_before():
     assert len(one.reference._kept) <= 2 * 5
 
 
+def test_one_reference_serves_several_recordings():
+    reference = AccumulatedReference(10.0, voxel_m=0.05)
+    drives = Drive(), Drive(labelled=False), Drive(origin_m=FAR_M)
+    shared = [RecordedFrames(drive, reference=reference)[2].reference for drive in drives]
+    alone = [RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2].reference for drive in drives]
+    assert all(torch.equal(*pair) for pair in zip(shared, alone, strict=True))
+
+
 def test_where_the_vehicle_stands_is_no_reference():
     body = BoundingBox((-30.0, -30.0, 0.0), (30.0, 30.0, 1.0))
     frame = RecordedFrames(Drive(body=body), reference=AccumulatedReference(10.0))[2]

@@ -15,6 +15,9 @@ from torchcover.files import BadFileError
 
 CLOUD = np.random.default_rng(0).uniform([-60, -60, -2, 0], [60, 60, 5, 0.99], (100, 4)).astype("<f4")
 RINGS = np.c_[CLOUD[:, :3], 255 * CLOUD[:, 3], np.arange(100) % 32].astype("<f4")
+# With a time and what else drivers add, for which there is no suffix.
+SIX, SEVEN = np.c_[RINGS, CLOUD[:, 3]], np.c_[RINGS, CLOUD[:, 3], CLOUD[:, 3]]
+EIGHT = np.c_[SEVEN, np.zeros(100, "<f4")]
 
 
 def refused(tmp_path, name, data):
@@ -162,6 +165,19 @@ def test_text_takes_no_more_than_is_granted(tmp_path, monkeypatch):
     [
         ("a.bin", RINGS.tobytes(), "every fifth is a ring, so it holds no .bin .*; likelier is a .pcd.bin"),
         ("a.pcd.bin", CLOUD.tobytes(), "every fourth is an intensity, so it holds no .pcd.bin .*; likelier is a .bin"),
+        (
+            "a.bin",
+            SIX.tobytes(),
+            "not an intensity but has coordinates in it.*; likelier is 6 columns, for which there is .npy",
+        ),
+        ("a.pcd.bin", SIX[:-10].tobytes(), "not a ring but has coordinates.*likelier is 6 columns"),
+        ("a.bin", SEVEN.tobytes(), "not an intensity but has coordinates in it.*; likelier is 7 columns"),
+        ("a.bin", EIGHT.tobytes(), "every second point has no negative y or z, .*; likelier is 8 columns"),
+        (
+            "a.bin",
+            np.tile(CLOUD[:, :3], (2, 1)).tobytes(),
+            "not an intensity but has coordinates in it, so it holds no .bin",
+        ),
         ("a.bin", CLOUD.astype("<f8").tobytes(), "of 200 points lie beyond 100000 m.* likelier is float64, where"),
         ("a.bin", CLOUD.astype(">f4").tobytes(), "likelier is big-endian float32, where little-endian"),
         ("a.bin", (1000 * CLOUD).astype("<i4").tobytes(), "denormal|finite in one coordinate"),

@@ -24,7 +24,7 @@ class Thinned:
 
     Args:
         still_m: (N, 3) float64 points that belong to no box, in the world, from the recording's first place.
-        voxel: (N,) int64 number of the voxel of each.
+        voxel: (N,) int64 number of the voxel of each, ascending.
         of_box: Name of each object -> (M, 3) float64 points in the frame of its box: x along its heading, its centre in
             the middle.
         unnamed: Points in boxes without a name, which nobody can find again.
@@ -67,10 +67,12 @@ class AccumulatedReference:
         self.window_s = window_s
         self.voxel_m = voxel_m
         self.sensors = None if sensors is None else tuple(sensors)
-        self._kept: dict[tuple[str, int], Thinned] = {}  # of the window that was asked for last: the next is much alike
+        # Of the recording and the window that were asked for last: the next window is much alike.
+        self._kept: dict[tuple[str, int], Thinned] = {}
+        self._kept_of: Recording | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        return {**vars(self), "_kept": {}}
+        return {**vars(self), "_kept": {}, "_kept_of": None}
 
     def check(self, recording: Recording, judged: Collection[str]) -> None:
         """Whether the recording says when and where its scans were made.
@@ -110,7 +112,8 @@ class AccumulatedReference:
         still, voxels, moved, dropped = [], [], [], Counter[str]()
         of_box: dict[str, list[NDArray[np.float64]]] = {}
         taken = list(self._scans(recording, index, judged))
-        self._kept = {key: scan for key, scan in self._kept.items() if key in taken}
+        of_recording = self._kept if recording is self._kept_of else {}
+        self._kept_of, self._kept = recording, {key: scan for key, scan in of_recording.items() if key in taken}
         for sensor, instant in taken:
             scan = self._thinned(recording, sensor, instant, origin_m)
             still.append(scan.still_m)
@@ -125,8 +128,11 @@ class AccumulatedReference:
                 dropped["gone"] += len(points_m)
                 continue
             moved.append(transform(boxes[name], points_m[_first_of_each(self._voxel(points_m))]))
-        first = _first_of_each(np.concatenate([np.empty(0, np.int64), *voxels]))
-        standing_m = transform(vehicle_T_local, np.concatenate([np.empty((0, 3)), *still])[first])
+        first = np.sort(_first_of_each(np.concatenate([np.empty(0, np.int64), *voxels])))
+        ends = np.cumsum([0, *map(len, still)])
+        kept = np.split(first, np.searchsorted(first, ends[1:-1]))
+        still = [points_m[own - start] for points_m, own, start in zip(still, kept, ends[:-1], strict=False)]
+        standing_m = transform(vehicle_T_local, np.concatenate([np.empty((0, 3)), *still]))
         points_m = np.concatenate([standing_m, *moved])
         own = _beneath_or_in(points_m, recording.body)
         dropped["own_vehicle"] += int(own.sum())
@@ -209,11 +215,10 @@ class AccumulatedReference:
 
 
 def _first_of_each(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where each number is seen first, in the order in which they are seen."""
-    ordered, order = torch.sort(torch.from_numpy(numbers), stable=True)
-    new = torch.ones(len(ordered), dtype=torch.bool)
-    new[1:] = ordered[1:] != ordered[:-1]
-    first: NDArray[np.int64] = order[new].sort().values.numpy()
+    """Where each number is seen first, by ascending number; fast where ascending runs follow each other."""
+    order = np.argsort(numbers, kind="stable")
+    ordered = numbers[order]
+    first: NDArray[np.int64] = order[np.append(True, ordered[1:] != ordered[:-1])[: len(order)]]
     return first
 
 

@@ -1,10 +1,12 @@
 """What there is to measure: which rigs, in which frames."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from torchcover.data import ChosenRigs, FrameSource, RecordedFrames, SimulatedFrames, reference_called
+from torchcover.data.suspicion import suspicions
 from torchcover.evaluation.rig_names import AnyRig, distinct_names, given_as, is_document, loaded
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings, spread_s
 from torchcover.simulation import Scenario, Sensor
@@ -54,6 +56,9 @@ def task_of(rigs: Sequence[AnyRig], scenario: AnyScenario | None, frames: AnyFra
         ValueError: No rig, a scenario beside a recording, settings for the other of the two, a rig that is not there.
         FileNotFoundError: An unknown name or file.
         TypeError: Frames that do not say whose they are.
+
+    Warns:
+        UserWarning: A recording that looks wrong; see `torchcover.data.suspicion`.
     """
     if frames is None:
         return _simulation(rigs, DEFAULT_SCENARIO if scenario is None else scenario, settings)
@@ -61,6 +66,9 @@ def task_of(rigs: Sequence[AnyRig], scenario: AnyScenario | None, frames: AnyFra
         raise ValueError("scenario and frames exclude each other: simulate a scenario or read a recording")
     settings.check_recording()
     source = RecordedFrames(frames) if isinstance(frames, str | Path) else frames
+    if isinstance(source, RecordedFrames):
+        for doubt in suspicions(source, settings.steps):
+            warnings.warn(doubt, stacklevel=3)  # where `evaluate` or `compare` is called from
     if not isinstance(source, FrameSource):
         missing = [name for name in vars(FrameSource) if not name.startswith("_") and not hasattr(source, name)]
         raise TypeError(

@@ -13,7 +13,12 @@ MAX_PARTLY_FINITE = 0.05
 MAX_DIAGONAL = 0.1
 # Fewer points are no statistics.
 MIN_POINTS = 16
+MIN_STATISTICS = 100
 MAX_INTENSITY, MAX_RING = 255, 255
+# A column of which so large a share lies so far off on both sides of 0 holds coordinates.
+MIN_FAR, FAR_M = 0.05, 2.0
+# A column in which more than a share lies this far on either side of 0 holds coordinates.
+FAR_M, MIN_FAR = 2.0, 0.05
 PRINTABLE = string.printable.encode()
 SIGNATURES = {
     b"\x93NUMPY": "a .npy",
@@ -26,6 +31,8 @@ SIGNATURES = {
     b"\x89PNG": "a PNG image",
     b"\x1f\x8b": "a gzip file",
 }
+# Other numbers of columns that there are.
+UNKNOWN_WIDTHS = (6, 7, 8)
 # Layouts with a suffix of their own, by their number of columns.
 SUFFIXES = {4: ".bin (x y z intensity)", 5: ".pcd.bin (x y z intensity ring)"}
 
@@ -98,16 +105,32 @@ def _complaint(points: NDArray[np.float32]) -> str | None:
 
 
 def _of_other_columns(records: NDArray[np.float32]) -> str | None:
-    """Why the rows have another number of columns; only where they lack what theirs would have, and show the other."""
+    """Why the rows have another number of columns; only where they lack what theirs would have."""
     columns = records.shape[1]
     numbers = records.ravel()
-    if len(records) < MIN_POINTS or numbers.size % (9 - columns):
+    if len(records) < MIN_POINTS:
         return None
+    if numbers.size % (9 - columns):
+        return _of_unknown_columns(records)
     as_four, as_five = (numbers[: numbers.size // width * width].reshape(-1, width) for width in (4, 5))
     if columns == 4 and not _is_intensity(as_four[:, 3]) and _is_ring(as_five[:, 4]):
         return "every fourth number is no intensity, and every fifth is a ring"
     if columns == 5 and not _is_ring(as_five[:, 4]) and _is_intensity(as_four[:, 3]):
         return "every fifth number is no ring, and every fourth is an intensity"
+    return _of_unknown_columns(records)
+
+
+def _of_unknown_columns(records: NDArray[np.float32]) -> str | None:
+    """Why the rows are of columns that no suffix stands for."""
+    last, name = records[:, -1], {4: "an intensity", 5: "a ring"}[records.shape[1]]
+    if len(records) < MIN_STATISTICS:
+        return None
+    if (last < -FAR_M).mean() > MIN_FAR and (last > FAR_M).mean() > MIN_FAR:
+        return f"its last column is not {name} but has coordinates in it"
+    if records.shape[1] == 4:  # rows of eight, cut in halves
+        signs = [(records[side::2, 1:3] < 0).mean(axis=0).min() for side in (0, 1)]
+        if min(signs) == 0 and max(signs) > MIN_FAR:
+            return "every second point has no negative y or z, and the others have"
     return None
 
 
@@ -126,6 +149,12 @@ def _likelier(data: bytes, columns: int) -> str:
         last = _is_ring(records[:, 4]) if other == 5 else _is_intensity(records[:, 3])
         if last and _complaint(records[:, :3]) is None:
             return f"a {SUFFIXES[other]}"
+    numbers = np.frombuffer(data[: len(data) // 4 * 4], "<f4")
+    for width in UNKNOWN_WIDTHS:
+        if numbers.size % width == 0 and numbers.size >= MIN_POINTS * width:
+            rows = numbers.reshape(-1, width)
+            if _is_intensity(rows[:, 3:]) and _complaint(rows[:, :3]) is None:
+                return f"{width} columns, for which there is .npy (N, {width})"
     for name, kind, width in (("float64", "<f8", 8), ("big-endian float32", ">f4", 4)):
         if len(data) % width == 0:
             size = np.abs(np.frombuffer(data, kind))
