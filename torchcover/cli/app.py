@@ -3,19 +3,14 @@
 import io
 import sys
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from torchcover.cli import options
+from torchcover.cli.running import checkpoint_in, finish, opened, sharing
 from torchcover.evaluation.interrupt import terminable
-
-if TYPE_CHECKING:
-    from torchcover.data import FrameSource
-    from torchcover.evaluation import Checkpoint, Ranks, Result
 
 app = typer.Typer(
     name="torchcover",
@@ -97,11 +92,11 @@ def evaluate(
     """Measure the coverage of a rig: a table, maps, and files to compare and to log."""
     from torchcover.evaluation import evaluate
 
-    with _sharing(out) as ranks:
+    with sharing(out) as ranks:
         result = evaluate(
             rig,
             scenario,
-            frames=_opened(frames, recording_format, sensors, reference, window),
+            frames=opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
             cell_m=cell,
@@ -114,11 +109,11 @@ def evaluate(
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
-            checkpoint=_checkpoint(out, resume=resume),
+            checkpoint=checkpoint_in(out, resume=resume),
             ranks=ranks,
             progress=True,
         )
-        _finish(result, out, ranks, error_maps=error_maps, explain=explain)
+        finish(result, out, ranks, error_maps=error_maps, explain=explain)
 
 
 @app.command()
@@ -149,11 +144,11 @@ def compare(
     """Compare rigs in the same frames: a table with the better values marked, maps side by side, differences."""
     from torchcover.evaluation import compare
 
-    with _sharing(out) as ranks:
+    with sharing(out) as ranks:
         result = compare(
             rigs or (),
             scenario,
-            frames=_opened(frames, recording_format, sensors, reference, window),
+            frames=opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
             cell_m=cell,
@@ -166,11 +161,11 @@ def compare(
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
-            checkpoint=_checkpoint(out, resume=resume),
+            checkpoint=checkpoint_in(out, resume=resume),
             ranks=ranks,
             progress=True,
         )
-        _finish(result, out, ranks, error_maps=error_maps, explain=explain)
+        finish(result, out, ranks, error_maps=error_maps, explain=explain)
 
 
 @app.command()
@@ -265,56 +260,6 @@ def list_builtin() -> None:
     from torchcover.cli.listing import run
 
     run()
-
-
-def _opened(
-    frames: Path | None,
-    recording_format: str | None,
-    sensors: list[str] | None,
-    reference: str | None,
-    window_s: float | None,
-) -> "FrameSource | None":
-    if frames is None:
-        for option, given in (("format", recording_format), ("sensors", sensors), ("window", window_s)):
-            if given is not None:
-                raise ValueError(f"--{option}: for a recording, which --frames gives")
-        return None
-    from torchcover.data import RecordedFrames, open_recording, reference_of_recording
-
-    return RecordedFrames(
-        open_recording(frames, recording_format),
-        rigs={names: names.split(",") for names in sensors} if sensors else None,
-        reference=reference_of_recording(reference, window_s),
-    )
-
-
-def _checkpoint(out: Path, *, resume: bool) -> "Checkpoint":
-    from torchcover.evaluation import Checkpoint
-
-    path = out / "checkpoint.npz"
-    if resume and not path.exists():
-        typer.echo(f"torchcover: {path} is not there: the run starts with its first step", err=True)
-    return Checkpoint(path, resume)
-
-
-@contextmanager
-def _sharing(out: Path) -> "Iterator[Ranks | None]":
-    """The folder, kept for this run; and the processes that share it, the first of which writes."""
-    from torchcover.evaluation import claimed, joined_ranks
-
-    with joined_ranks() as ranks, claimed(out) if ranks is None or ranks.rank == 0 else nullcontext():
-        yield ranks
-
-
-def _finish(result: "Result", out: Path, ranks: "Ranks | None", *, error_maps: bool, explain: bool) -> None:
-    """Results are safe before anything is printed; then the command ends as the run did."""
-    from torchcover.cli.printing import print_result
-
-    if ranks is None or ranks.rank == 0:
-        files = result.save(out, error_maps=error_maps)
-        print_result(result, files, out, explain=explain)
-    if result.run is not None:
-        result.run.raise_failure()
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)
