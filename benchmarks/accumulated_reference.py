@@ -57,6 +57,8 @@ class SimulatedDrive:
     """A `Recording` of sweeps around one instant, which is its only frame; scans are kept."""
 
     reference_sensors = ()
+    weight_kind = None
+    instants = None
     body = None
     path = Path("simulated")
 

@@ -18,6 +18,7 @@ from tests.cli.hostile import CAMERA, RIG, TOWN, YARD
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
+from torchcover.data.recordings.carla import read_carla_sensors
 from torchcover.data.recordings.folder_settings import read_folder_settings
 from torchcover.data.recordings.folder_tables import PoseTable
 from torchcover.data.recordings.folder_tables import read_boxes as read_labels
@@ -155,6 +156,10 @@ DRIVEN = b"""frame,time_s,x_m,y_m,z_m,qw,qx,qy,qz
 f1,0.0,513248.1,5403655.2,260.1,1,0,0,0
 f2,0.1,513249.1,5403655.3,260.1,0.6,0,0,0.8
 """
+CARLA = b"""[
+ {"id": "roof", "type": "sensor.lidar.ray_cast", "x": 0.7, "y": 0.4, "z": 1.6, "yaw": 30.0, "channels": "64"},
+ {"id": "reference", "type": "sensor.lidar.ray_cast", "roll": 2.5, "rotation_frequency": 20}
+]"""
 LABELS = b"""x_m,y_m,z_m,length_m,width_m,height_m,yaw_rad,id,category
 10.5,-2.0,0.75,4.5,1.8,1.5,0.1,a,car
 -7.5,3.0,0.9,0.6,0.6,1.8,-3.1,,pedestrian
@@ -263,6 +268,7 @@ def kinds(folder):
         Kind("calibrated_sensor.json", CALIBRATED, nuscenes, (("sensor.json", SENSORS),)),
         Kind("frames.yaml", POSES, read_folder_settings),
         Kind("poses.csv", DRIVEN, lambda path: PoseTable(path, ("f1", "f2"), timed=True)),
+        Kind("sensors.json", CARLA, read_carla_sensors),
         Kind("labels.csv", LABELS, read_labels),
         Kind("coverage.npz", coverage(folder), Coverage.load),
         *scene_files(),

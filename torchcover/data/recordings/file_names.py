@@ -1,6 +1,7 @@
 """Files of frames in a folder: one a frame, in natural order."""
 
 import re
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
@@ -55,6 +56,26 @@ def check_same_names(folder: Path, files: Mapping[str, Mapping[str, object]]) ->
     ]
     if complaints:
         raise ValueError(f"{folder}: every frame needs a file in {places}; {' and '.join(complaints)}")
+
+
+def check_frames(frames: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Which row of a table belongs to each frame.
+
+    Args:
+        frames: The frame of each row.
+        names: The frames, in order.
+
+    Raises:
+        ValueError: A frame that is missing, doubled or unknown.
+    """
+    there, wanted = set(frames), set(names)
+    doubled = [frame for frame, count in Counter(frames).items() if count > 1]
+    missing, unknown = [name for name in names if name not in there], sorted(there - wanted)
+    for what, which in (("missing", missing), ("doubled", doubled), ("unknown", unknown)):
+        if which:
+            raise ValueError(f"one row for every frame is needed; {len(which)} {what} ({some_of(which)})")
+    row_of = {frame: row for row, frame in enumerate(frames)}
+    return [row_of[name] for name in names]
 
 
 def natural(name: str) -> tuple[list[str | int], str]:

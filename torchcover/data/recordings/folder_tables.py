@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.data.recordings.csv_tables import read_csv
-from torchcover.data.recordings.file_names import some_of
+from torchcover.data.recordings.file_names import check_frames, some_of
 from torchcover.detection.boxes import Boxes
 from torchcover.files import naming
 from torchcover.geometry import rigid, rotation_from_quaternion
@@ -36,11 +36,8 @@ class PoseTable:
     def __init__(self, path: Path, names: Sequence[str], *, timed: bool) -> None:
         optional = ("instant",) if timed else ()
         table = read_csv(path, (*("time_s",) * timed, *PLACE, *ROTATION), ("frame",), optional)
-        frames = table.words["frame"]
         with naming(path, "a table of poses"):
-            _check_frames(frames, names)
-            row_of = {frame: row for row, frame in enumerate(frames)}
-            order = [row_of[name] for name in names]
+            order = check_frames(table.words["frame"], names)
             columns = {name: values[order] for name, values in table.numbers.items()}
             self._place_m = np.column_stack([columns[name] for name in PLACE])
             self._wxyz = np.column_stack([columns[name] for name in ROTATION])
@@ -81,15 +78,6 @@ def read_boxes(path: Path) -> Boxes:
             raise ValueError(f"id: every object has its own; {some_of(doubled)}: there twice")
         rows = torch.from_numpy(np.column_stack([table.numbers[name] for name in BOX])).float()
         return Boxes.from_rows(rows, ids=tuple(ids), categories=tuple(table.words["category"]))
-
-
-def _check_frames(frames: Sequence[str], names: Sequence[str]) -> None:
-    there, wanted = set(frames), set(names)
-    doubled = [frame for frame, count in Counter(frames).items() if count > 1]
-    missing, unknown = [name for name in names if name not in there], sorted(there - wanted)
-    for what, which in (("missing", missing), ("doubled", doubled), ("unknown", unknown)):
-        if which:
-            raise ValueError(f"one row for every frame is needed; {len(which)} {what} ({some_of(which)})")
 
 
 def _whole_numbers(values: NDArray[np.float64]) -> list[int]:

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Protocol
 
 from torchcover.data.recordings.argoverse2 import Argoverse2
+from torchcover.data.recordings.carla import Carla
 from torchcover.data.recordings.folder import FolderRecording
 from torchcover.data.recordings.kitti_object import KittiObject
 from torchcover.data.recordings.kitti_raw import KittiRaw
@@ -35,6 +36,7 @@ FORMATS: dict[str, RecordingFormat] = {
     "argoverse2": Argoverse2,
     "kitti_raw": KittiRaw,
     "kitti_object": KittiObject,
+    "carla": Carla,
     "folder": FolderRecording,
 }
 
