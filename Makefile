@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint types doctest smoke bench paper clean
+.PHONY: demo test lowest lint types doctest smoke bench paper clean
 
 demo: STEPS ?= 24
 demo: $(VENV)/.ready  ## evaluate a built-in rig in the built-in courtyard; writes to out/demo
@@ -12,6 +12,17 @@ demo: $(VENV)/.ready  ## evaluate a built-in rig in the built-in courtyard; writ
 # One thread in each process: the tests are dealt out to as many processes as there are cores.
 test: $(VENV)/.ready  ## every test
 	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(BIN)/python -m pytest --numprocesses auto --dist worksteal
+
+# Of torch the version of constraints.txt: older ones come with gigabytes for CUDA. What old packages say of their own use
+# of newer ones is nobody's concern here.
+lowest: LOWEST := .venv-lowest
+lowest: $(VENV)/.ready  ## every test with the lowest versions that pyproject.toml promises, but for torch
+	$(PYTHON) .ci/make_venv.py $(LOWEST)
+	$(BIN)/python .ci/lowest.py torch > $(LOWEST)/constraints.txt
+	grep '^torch==' constraints.txt >> $(LOWEST)/constraints.txt
+	$(LOWEST)/bin/python -m pip install --quiet --constraint $(LOWEST)/constraints.txt --editable '.[dev]'
+	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(LOWEST)/bin/python -m pytest --numprocesses auto --dist worksteal \
+	  -W ignore::DeprecationWarning
 
 lint: $(VENV)/.ready
 	$(BIN)/ruff check .

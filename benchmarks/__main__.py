@@ -5,6 +5,7 @@ import sys
 
 BENCHMARKS = (
     "nearest",
+    "search",
     "crossover",
     "raycasting",
     "paper_step",
@@ -26,6 +27,8 @@ BENCHMARKS = (
     "known_boxes",
     "hostile_documents",
     "kills",
+    "resumes",
+    "scaling",
     "mutated_files",
 )
 

@@ -2,19 +2,29 @@
 
 import io
 import struct
+import warnings
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 
+import laspy
 import lzf
 import numpy as np
 import torch
+import trimesh
 from PIL import Image
 
+from tests.cli.hostile import CAMERA, RIG, TOWN, YARD
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
-from torchcover.data.recordings.folder_settings import read_poses
+from torchcover.data.recordings.folder_settings import read_folder_settings
+from torchcover.data.recordings.folder_tables import PoseTable
+from torchcover.data.recordings.folder_tables import read_boxes as read_labels
+from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
+from torchcover.simulation import Rig, Scenario
+from torchcover.simulation.shapes import MeshFile
+from torchcover.simulation.tracks import read_boxes, read_trajectory
 
 
 @dataclass(frozen=True)
@@ -69,6 +79,13 @@ def ply(encoding, body):
     """A PLY file of 40 points with intensities."""
     columns = "".join(f"property float {name}\n" for name in ("x", "y", "z", "intensity"))
     return f"ply\nformat {encoding} 1.0\nelement vertex 40\n{columns}end_header\n".encode() + body
+
+
+def las(points, *, compressed):
+    """A survey in LAS or LAZ."""
+    survey = laspy.LasData(laspy.LasHeader(point_format=3, version="1.2"))
+    survey.x, survey.y, survey.z = points.T
+    return stored(lambda stream: survey.write(stream, do_compress=compressed))
 
 
 def png(pixels):
@@ -129,8 +146,18 @@ Tr_velo_to_cam: 0 -1 0 0.01 0 0 -1 -0.07 1 0 0 -0.27
 """
 POSES = b"""sensor:
   vehicle_T_sensor: [[1, 0, 0, -0.52], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]]
+vehicle: {lower_m: [-2.4, -0.9, 0.05], upper_m: [2.4, 0.9, 1.6]}
+reference: {weight_kind: m2}
 rigs:
-  roof: {vehicle_T_sensor: [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 2.0], [0, 0, 0, 1]]}
+  roof: {flip_y: true, min_range_m: 0.5, vehicle_T_sensor: [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 2.0], [0, 0, 0, 1]]}
+"""
+DRIVEN = b"""frame,time_s,x_m,y_m,z_m,qw,qx,qy,qz
+f1,0.0,513248.1,5403655.2,260.1,1,0,0,0
+f2,0.1,513249.1,5403655.3,260.1,0.6,0,0,0.8
+"""
+LABELS = b"""x_m,y_m,z_m,length_m,width_m,height_m,yaw_rad,id,category
+10.5,-2.0,0.75,4.5,1.8,1.5,0.1,a,car
+-7.5,3.0,0.9,0.6,0.6,1.8,-3.1,,pedestrian
 """
 SENSORS = b'[{"token": "s1", "channel": "CAM_FRONT"}, {"token": "s2", "channel": "LIDAR_TOP"}]'
 CALIBRATED = b"""[
@@ -138,6 +165,44 @@ CALIBRATED = b"""[
   "camera_intrinsic": [[520.0, 0.0, 318.0], [0.0, 510.0, 242.0], [0.0, 0.0, 1.0]]},
  {"token": "l", "sensor_token": "s2", "translation": [0.9, 0, 1.8], "rotation": [1, 0, 0, 0], "camera_intrinsic": []}
 ]"""
+
+
+TRAJECTORY = b"t,x,y,z,roll,pitch,yaw\n" + b"".join(b"%d,%d.5,2,0,0,0,%d\n" % (k, 3 * k, k) for k in range(9))
+BOXES = b"t,id,category,x,y,z,length,width,height,yaw\n" + b"".join(
+    b"%d,a%d,car,%d,2,0,4,2,1.5,90\n" % (k, k % 2, 3 * k) for k in range(12)
+)
+
+
+def mesh(path):
+    """Read a mesh; that a damaged one is not closed is no news."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*the mesh is not closed")
+        return MeshFile(type="mesh", path=path).mesh()
+
+
+def scene_files():
+    """What scenes are made from: trajectories, boxes, meshes and documents."""
+    poses = {"times_s": np.arange(5.0), "world_T_body": np.stack([np.eye(4)] * 5)}
+    ball = trimesh.creation.icosphere(subdivisions=1)
+    yield Kind("trajectory.csv", TRAJECTORY, read_trajectory)
+    yield Kind("trajectory.npz", stored(lambda stream: np.savez(stream, **poses)), read_trajectory)
+    yield Kind("boxes.csv", BOXES, read_boxes)
+    for suffix in ("ply", "obj", "stl", "glb", "off"):
+        data = ball.export(file_type=suffix)
+        yield Kind(f"mesh.{suffix}", data if isinstance(data, bytes) else data.encode(), mesh)
+    yield Kind("rig.yaml", RIG.encode(), Rig.load)
+    yield Kind("camera.yaml", CAMERA.encode(), Rig.load)
+    yield Kind("yard.yaml", YARD.encode(), Scenario.load)
+    yield Kind("town.yaml", TOWN.encode(), Scenario.load)
+
+
+def checkpoint(folder):
+    """A checkpoint of one observer."""
+    path = Path(folder) / "checkpoint.npz"
+    run = {"steps": 3, "counts": {"sensor_rays": 9}, "skipped": [], "seconds": 1.5}
+    state = {"dense": torch.arange(1, 40), "sparse": torch.eye(20, dtype=torch.float64), "looks": [1, None, "two"]}
+    write_checkpoint(path, {"identity": {"seed": "0"}, "run": run}, {"one": state})
+    return path.read_bytes()
 
 
 def kinds(folder):
@@ -169,6 +234,8 @@ def kinds(folder):
         "binary.ply": ply("binary_little_endian", cloud.tobytes()),
         "c.csv": b"x,y,z,intensity\n" + rows(cloud, ","),
         "c.xyz": b"# x y z intensity\n" + rows(cloud, " "),
+        "c.las": las(xyz, compressed=False),
+        "c.laz": las(xyz, compressed=True),
     }
 
     def depth(path):
@@ -194,6 +261,10 @@ def kinds(folder):
         Kind("kitti.txt", KITTI, lambda path: Camera.from_kitti(path, 2, width=640, height=480)),
         Kind("sensor.json", SENSORS, nuscenes, (("calibrated_sensor.json", CALIBRATED),)),
         Kind("calibrated_sensor.json", CALIBRATED, nuscenes, (("sensor.json", SENSORS),)),
-        Kind("frames.yaml", POSES, read_poses),
+        Kind("frames.yaml", POSES, read_folder_settings),
+        Kind("poses.csv", DRIVEN, lambda path: PoseTable(path, ("f1", "f2"), timed=True)),
+        Kind("labels.csv", LABELS, read_labels),
         Kind("coverage.npz", coverage(folder), Coverage.load),
+        *scene_files(),
+        Kind("checkpoint.npz", checkpoint(folder), lambda path: read_state(path, read_header(path), "one")),
     )

@@ -210,7 +210,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["evaluate", "front_roof_128", "--steps", "many"], "--steps"),
         (["evaluate", "front_roof_128", "--seed", "-1"], "--seed"),
         (["evaluate", "front_roof_128", "--device", "abacus"], "device abacus: cannot be used here"),
-        (["evaluate", "front_roof_128", "--colour"], "No such option: --colour"),
+        (["evaluate", "front_roof_128", "--colour"], "No such option"),
         (["evaluate", "front_roof_128", "--target-error", "5"], "target error 5: a positive number with its unit"),
         (["evaluate", "front_roof_128", "--target-error", "-1m"], "target error -1m: a positive number"),
         (["evaluate", "front_roof_128", "--target-error", "1m", "--target-error", "2m"], "another number in m"),
@@ -257,7 +257,7 @@ def test_an_output_folder_that_cannot_be_made_is_a_mistake_too(torchcover, recor
 
 
 def test_an_impossible_output_folder_is_found_before_the_run(torchcover, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchcover.evaluation.evaluating.observe", lambda *_, **__: pytest.fail("it ran all the same"))
+    monkeypatch.setattr("torchcover.evaluation.measuring.observe", lambda *_, **__: pytest.fail("it ran all the same"))
     (tmp_path / "file").write_text("")
     (tmp_path / "link").symlink_to(tmp_path / "nothing")
     for out in (tmp_path / "file", tmp_path / "file" / "below", tmp_path / "link", tmp_path / "link" / "below"):

@@ -51,3 +51,9 @@ def test_the_advice_has_every_option_that_decides_about_the_error():
     expected = "For 2 percentage points of detection: --rays 1024 --steps 4 --every 2 (7 s)."
     assert advice(0.02, point, plan) == expected
     assert advice(0.02, None, plan).endswith("not reached within 8 steps.")
+
+
+def test_run_times_are_not_measured_beside_other_ranks(torchcover, monkeypatch, tmp_path):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    code, _, said = torchcover("study", "front_roof_32", "--out", tmp_path / "out")
+    assert (code, "run it without torchrun" in said) == (2, True)

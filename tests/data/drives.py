@@ -27,6 +27,8 @@ class Drive:
     body: BoundingBox | None = None
     sensors = ("left", "right")
     reference_sensors = ()
+    weight_kind = None
+    instants = None
     path = Path("drive")
 
     def __post_init__(self):

@@ -1,5 +1,6 @@
 """Drives written down as the data sets do it."""
 
+import csv
 import json
 import math
 
@@ -153,4 +154,47 @@ def posed(matrix):
     return {**rotation, **dict(zip(("tx_m", "ty_m", "tz_m"), map(float, matrix[:3, 3]), strict=True))}
 
 
-LAYOUTS = {"kitti_raw": kitti_raw, "nuscenes": nuscenes_tables, "argoverse2": argoverse2_log}
+HALF_TURN = rigid(rotation_from_euler(180.0, 0.0, 0.0), [0.0, 0.0, 2.0])
+POSE = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
+BOX = ("x_m", "y_m", "z_m", "length_m", "width_m", "height_m", "yaw_rad")
+
+
+def pose_row(matrix):
+    return [*map(float, matrix[:3, 3]), *quaternion(matrix)]
+
+
+def table(path, columns, rows):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([columns, *rows])
+
+
+def plain_folder(drive, root):
+    """A drive as a plain folder; one mount is in frames.yaml, the other in a table of its own."""
+    for sensor in drive.sensors:
+        (root / "sensors" / sensor).mkdir(parents=True)
+    poses, mounts = [], []
+    for index, name in enumerate(drive.names):
+        poses.append([name, drive.times_s[index], *pose_row(drive.world_T_vehicle(index))])
+        for sensor in drive.sensors:
+            scan = drive.scan(sensor, index)
+            turned = rigid(rotation_from_euler(40.0 * index, 0.0, 0.0), [index, 0.0, 1.0])
+            points_m = transform(scan.vehicle_T_sensor, scan.points_m)
+            if sensor == "left":
+                mounts.append([name, *pose_row(turned)])
+                points_m = transform(invert(turned), points_m)
+            else:
+                points_m = transform(HALF_TURN, points_m - [0.0, 0.0, 4.0]) * [1, -1, 1]  # its own inverse but for z
+            np.save(root / "sensors" / sensor / f"{name}.npy", points_m)
+        row = drive.boxes(index).rows[0].tolist()
+        table(root / "boxes" / f"{name}.csv", (*BOX, "id", "category"), [[*row, "car", "car, red"]])
+    table(root / "poses.csv", ("frame", "time_s", *POSE), poses[::-1])
+    table(root / "sensors" / "left" / "poses.csv", ("frame", *POSE), mounts)
+    (root / "frames.yaml").write_text(
+        f"sensors: {{right: {{vehicle_T_sensor: {HALF_TURN.tolist()}, flip_y: true}}}}\n"
+        "vehicle: {lower_m: [-2, -1, 0], upper_m: [2, 1, 1.5]}\n"
+    )
+    return root
+
+
+LAYOUTS = {"kitti_raw": kitti_raw, "nuscenes": nuscenes_tables, "argoverse2": argoverse2_log, "folder": plain_folder}

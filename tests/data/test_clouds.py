@@ -1,9 +1,11 @@
 import io
 import random
 import struct
+import sys
 import tracemalloc
 import zipfile
 
+import laspy
 import lzf
 import numpy as np
 import pytest
@@ -50,6 +52,17 @@ def pcd_block(columns):
     return struct.pack("<II", len(packed), len(plain)) + packed
 
 
+def las_bytes(array, *, compressed=False):
+    """A survey to the 1/256 of a metre, which `CLOUD` has exactly."""
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.scales, header.offsets = [2**-8] * 3, [0.0, 1.0, 0.0]
+    survey = laspy.LasData(header)
+    survey.x, survey.y, survey.z = array.T.astype(np.float64)
+    stream = io.BytesIO()
+    survey.write(stream, do_compress=compressed)
+    return stream.getvalue()
+
+
 def ply_header(encoding, *lines):
     return "\n".join(["ply", f"format {encoding} 1.0", *lines, "end_header", ""]).encode()
 
@@ -67,6 +80,8 @@ FORMATS = {
     "npy_python2": (".npy", npy_bytes(CLOUD).replace(b"(3, 3), }  ", b"(3L, 3L), }")),
     "npz_points": (".npz", npz_bytes(points=CLOUD, pose=np.eye(4))),
     "npz_single": (".npz", npz_bytes(cloud=CLOUD)),
+    "npz_only_one_of_three_columns": (".npz", npz_bytes(cloud=CLOUD, pose=np.eye(4), ring=np.arange(3))),
+    "npy_float16": (".npy", npy_bytes(CLOUD.astype(np.float16))),
     "kitti": (".bin", with_columns(CLOUD, 4)),
     "nuscenes": (".pcd.bin", with_columns(CLOUD, 5)),
     "pcd_ascii": (".pcd", pcd_header(3, "ascii") + rows(CLOUD)),
@@ -78,8 +93,10 @@ FORMATS = {
     "ply_carla": (".ply", ply_header("ascii", *xyz_lines(3, "float32")) + rows(CLOUD)),
     "csv": (".csv", b"x,y,z\n" + rows(CLOUD, ",")),
     "xyz": (".xyz", rows(CLOUD)),
+    "las": (".las", las_bytes(CLOUD)),
+    "laz": (".laz", las_bytes(CLOUD, compressed=True)),
 }
-TEXT = {"pcd_ascii", "ply_ascii", "ply_carla", "csv", "xyz"}
+OF_FLOAT64 = {"npy_float64", "pcd_ascii", "ply_ascii", "ply_carla", "csv", "xyz", "las", "laz"}
 
 
 def store(folder, suffix, data):
@@ -92,7 +109,7 @@ def store(folder, suffix, data):
 def test_every_format_gives_the_same_cloud(tmp_path, name):
     cloud = read_cloud(store(tmp_path, *FORMATS[name]))
     np.testing.assert_array_equal(cloud, CLOUD)
-    assert cloud.dtype == (np.float64 if name in TEXT | {"npy_float64"} else np.float32)
+    assert cloud.dtype == (np.float64 if name in OF_FLOAT64 else np.float32)
     assert cloud.dtype.isnative
     assert cloud.flags.c_contiguous
     assert cloud.flags.writeable
@@ -131,6 +148,8 @@ def test_utm_coordinates_keep_every_digit(tmp_path, suffix, data):
         (".ply", ply_header("binary_little_endian", *xyz_lines(0))),
         (".csv", b"x,y,z\n"),
         (".xyz", b"# x y z\n"),
+        (".las", las_bytes(CLOUD[:0])),
+        (".laz", las_bytes(CLOUD[:0], compressed=True)),
     ],
 )
 def test_a_header_without_points_is_an_empty_cloud(tmp_path, suffix, data):
@@ -251,6 +270,13 @@ def test_ply_finds_the_vertices_among_other_elements(tmp_path, data):
     np.testing.assert_array_equal(read_cloud(store(tmp_path, ".ply", data)), CLOUD)
 
 
+def test_a_compressed_survey_without_its_package_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "laspy", None)
+    with pytest.raises(ImportError, match=r"cloud\.laz: LAZ needs laspy: pip install 'torchcover\[las\]'"):
+        read_cloud(store(tmp_path, *FORMATS["laz"]))
+    np.testing.assert_array_equal(read_cloud(store(tmp_path, *FORMATS["las"])), CLOUD)
+
+
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(range(1, 100))
 BINARY_PLY = ply_header("binary_little_endian", *xyz_lines(3)) + CLOUD.tobytes()
 
@@ -272,7 +298,6 @@ def mislabelled_member():
         (".npy", npy_bytes(CLOUD) + b"\0", r"= 36 bytes; 37 bytes follow it"),
         (".npy", npy_bytes(np.array([[{}, 1, 2]], dtype=object)), r"is needed; got pickled Python objects"),
         (".npy", npy_bytes(CLOUD.astype(np.int32)), r"float32 or float64 is needed; got int32"),
-        (".npy", npy_bytes(CLOUD.astype(np.float16)), r"float32 or float64 is needed; got float16"),
         (".npy", npy_bytes(CLOUD[:, :2]), r"shape \(N, 3\).* is needed; got \(3, 2\)"),
         (".npy", npy_bytes(CLOUD[0]), r"is needed; got \(3,\)"),
         (".npy", npy_bytes(CLOUD[None]), r"is needed; got \(1, 3, 3\)"),
@@ -280,7 +305,17 @@ def mislabelled_member():
         (".npz", PNG, r"not a readable \.npz archive \(File is not a zip file\)"),
         (".npz", npz_bytes(points=CLOUD)[:-30], r"not a readable \.npz archive"),
         (".npz", mislabelled_member(), r"not a readable \.npy header"),
-        (".npz", npz_bytes(a=CLOUD, b=CLOUD), r"points, or a single array, is needed; got 2 arrays: a, b$"),
+        (".npz", npz_bytes(a=CLOUD, b=CLOUD), r"of shape \(N, 3\) is needed; got 2 arrays: a, b$"),
+        (".npz", npz_bytes(a=np.eye(4), b=np.ones(3)), r"of shape \(N, 3\) is needed; got 2 arrays: a, b$"),
+        (".las", b"LAS!" + las_bytes(CLOUD)[4:], r"not a LAS file: it starts with b'LAS!'"),
+        (".las", las_bytes(CLOUD)[:100], r"a header of 227 bytes is needed; the file has 100"),
+        (".las", las_bytes(CLOUD)[:-1], r"the header claims 3 points of 34 bytes from byte 227 on; the file has 328"),
+        (
+            ".laz",
+            las_bytes(CLOUD, compressed=True)[:-20],
+            r"of chunks is said to be at byte 395; the file has 38",
+        ),
+        (".laz", las_bytes(CLOUD, compressed=True)[:399] + b"\xff" * 9, r"3 points, the table of chunks 4294967295 "),
         (".npz", npz_bytes(), r"got 0 arrays: none$"),
         (".npz", npz_bytes(points=np.array([None])), r"got pickled Python objects"),
         # records

@@ -130,7 +130,7 @@ def test_missing_folders_and_empty_ones(tmp_path):
     with pytest.raises(ValueError, match=r"of no known format; known are .*folder: sensor/FRAME"):
         RecordedFrames(tmp_path)
     (tmp_path / "sensor").mkdir()
-    with pytest.raises(FileNotFoundError, match=r"reference: no such folder"):
+    with pytest.raises(ValueError, match=r"no frames; sensor/ are empty"):
         RecordedFrames(tmp_path)
     (tmp_path / "reference").mkdir()
     with pytest.raises(ValueError, match=r"no frames; sensor/ and reference/ are empty"):
@@ -155,10 +155,10 @@ def test_two_files_of_one_name_and_files_that_are_no_clouds(tmp_path):
     with pytest.raises(ValueError, match=r"sensor: two files for the frame a: a\.npy and a\.xyz"):
         RecordedFrames(tmp_path)
     (tmp_path / "sensor" / "a.xyz").unlink()
-    (tmp_path / "reference" / "b.las").write_bytes(b"LASF")
-    with pytest.raises(ValueError, match=r"b\.las: not a cloud; allowed are files ending in \.npy, "):
+    (tmp_path / "reference" / "b.e57").write_bytes(b"ASTM-E57")
+    with pytest.raises(ValueError, match=r"b\.e57: not a cloud; allowed are files ending in \.npy, "):
         RecordedFrames(tmp_path)
-    (tmp_path / "reference" / "b.las").unlink()
+    (tmp_path / "reference" / "b.e57").unlink()
     (tmp_path / "reference" / "b.npy").mkdir()
     with pytest.raises(ValueError, match=r"b\.npy: not a cloud"):
         RecordedFrames(tmp_path)
@@ -172,16 +172,26 @@ MATRIX = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
     [
         ("", r"an empty file \(0 bytes\); a file of poses is needed"),
         ("{", r"not a YAML file"),
-        ("# nothing", r"got NoneType, not a mapping; allowed are sensor, or rigs"),
+        ("# nothing", r"got NoneType, not a mapping; allowed are sensor, "),
         ("- 1", r"got list, not a mapping"),
         ("sensor: {", r"not a YAML file: .*line 1"),
         ("\x00", r"not a YAML file"),
         (f"lidar: {{vehicle_T_sensor: {MATRIX}}}", r"lidar: Extra inputs are not permitted; allowed are sensor"),
-        (f"sensor: {{vehicle_T_lidar: {MATRIX}}}", r"sensor\.vehicle_T_sensor: Field required; sensor\.vehicle_T_lid"),
+        (f"sensor: {{vehicle_T_lidar: {MATRIX}}}", r"sensor\.vehicle_T_lidar: Extra inputs are not permitted"),
         ("reference: {vehicle_T_sensor: 5}", r"reference\.vehicle_T_sensor: Input should be a valid list"),
         ("sensor: {vehicle_T_sensor: [[1, a]]}", r"sensor\.vehicle_T_sensor\.0\.1: Input should be a valid number"),
         ("sensor: {vehicle_T_sensor: [[1, 0], [0]]}", r"sensor\.vehicle_T_sensor: a 4x4 matrix of numbers"),
         (f"sensor: {{vehicle_T_sensor: {MATRIX[:3]}}}", r"sensor\.vehicle_T_sensor: a 4x4 matrix is needed"),
+        ("sensor: {min_range_m: -1}", r"sensor\.min_range_m: Input should be greater than or equal to 0"),
+        ("sensor: {min_range_m: 1}", r"sensor\.min_range_m: it needs vehicle_T_sensor"),
+        ("sensor: {flip_y: 1}", r"sensor\.flip_y: Input should be a valid boolean"),
+        ("sensors: {roof: {}}", r"sensors\.roof: there is no sensors/roof/ beside it"),
+        ("reference: {weight_kind: m3}", r"reference\.weight_kind: Input should be 'density' or 'm2'"),
+        ("sensor: {weight_kind: m2}", r"sensor\.weight_kind: Extra inputs are not permitted"),
+        ("vehicle: {lower_m: [0, 0, 0]}", r"vehicle\.upper_m: Field required"),
+        ("vehicle: {lower_m: [0, 0], upper_m: [1, 1, 1]}", r"vehicle\.lower_m: List should have at least 3"),
+        ("vehicle: {lower_m: [0, 0, .nan], upper_m: [1, 1, 1]}", r"vehicle\.lower_m\.2: Input should be a finite"),
+        ("vehicle: {lower_m: [0, 0, 1], upper_m: [1, 1, 1]}", r"vehicle: a box needs lower < upper on every axis"),
         (f"reference: {{vehicle_T_sensor: {[[2, 0, 0, 0], *MATRIX[1:]]}}}", r"reference\.vehicle_T_sensor: not a rig"),
     ],
 )
@@ -285,7 +295,7 @@ def test_what_is_wrong_with_several_rigs_is_named(tmp_path):
     with pytest.raises(ValueError, match=r"file in rigs/a/ and rigs/b/ and reference/; 1 missing in rigs/b/ \(f2\)$"):
         RecordedFrames(folder)
     (folder / "sensor").mkdir()
-    with pytest.raises(ValueError, match=r"both sensor/ and rigs/; sensor/ is for one rig, rigs/NAME/ for several"):
+    with pytest.raises(ValueError, match=r"both sensor/ and rigs/; sensor/ is for one sensor, sensors/NAME/ for"):
         RecordedFrames(folder)
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import sys
 
 import numpy as np
@@ -42,6 +43,7 @@ class Source:
     description = {"scenario": None, "frames": "made up", "seed": None}  # noqa: RUF012
     weight_kind = None
     reference_record = None
+    content = {"frames": "made up"}  # noqa: RUF012
 
     def __len__(self):
         return 3
@@ -163,7 +165,9 @@ class Ending(PointCount):
     ],
 )
 def test_a_result_that_was_cut_short_says_so_wherever_its_numbers_stand(error, reason):
-    result = torchcover.evaluate(frames=Single(), cell_m=4.0, observers={"ending": Ending(error)})
+    with pytest.warns(RuntimeWarning, match=f"The run was cut short after 3 steps: {re.escape(reason)}.") as told:
+        result = torchcover.evaluate(frames=Single(), cell_m=4.0, observers={"ending": Ending(error)})
+    assert [warning.filename for warning in told] == [__file__]
     # Of the frame that ended it, coverage has the step: it was fed before the other observer.
     assert f"The run was cut short after 3 steps: {reason}." in result.table.notes
     assert reason in " ".join(repr(result).split())

@@ -113,16 +113,16 @@ def test_workers_change_nothing_and_frames_come_in_order(frames, workers):
 
 def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_order():
     spread = SimulatedFrames("urban", "front_roof_32", steps=15, every_s=10.0)
-    tasks = list(made_together(spread, 15, workers=2))
+    tasks = list(made_together(spread, range(15), workers=2))
     assert tasks == [[*range(7)], [*range(7, 13)], [13, 14]]
     assert [{spread.simulator.run_of(index) for index in task} for task in tasks] == [{0}, {1}, {2}]
-    dense = list(made_together(SimulatedFrames("urban", "front_roof_32", steps=1000), 700, workers=2))
+    dense = list(made_together(SimulatedFrames("urban", "front_roof_32", steps=1000), range(700), workers=2))
     assert [index for task in dense for index in task] == [*range(700)]
     assert max(map(len, dense)) == MOST_TOGETHER
     for alone in (
-        made_together(spread, 3, workers=1),
-        made_together(SimulatedFrames("courtyard", "front_roof_32", steps=3), 3, workers=2),
-        made_together([], 3, workers=2),
+        made_together(spread, range(3), workers=1),
+        made_together(SimulatedFrames("courtyard", "front_roof_32", steps=3), range(3), workers=2),
+        made_together([], range(3), workers=2),
     ):
         assert list(alone) == [[0], [1], [2]]
 
@@ -131,7 +131,7 @@ def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_orde
 def test_no_list_is_made_of_all_the_steps_there_may_be(scenario):
     frames = SimulatedFrames(scenario, "front_roof_32", steps=20_000)
     tracemalloc.start()
-    tasks = made_together(frames, 20_000, workers=2)
+    tasks = made_together(frames, range(20_000), workers=2)
     assert sum(map(len, tasks)) == 20_000
     _, most_bytes = tracemalloc.get_traced_memory()
     tracemalloc.stop()
@@ -291,7 +291,7 @@ def test_what_there_is_outlives_a_worker_that_is_killed(frames):
     run = observe(Deadly(frames, {5}), [names], workers=1, keep_partial=True)
     assert (run.steps, run.complete) == (len(names.names), False)
     assert names.names == ["f0", "f1", "f2", "f3", "f4"][: len(names.names)]
-    with pytest.raises(ChildProcessError, match=r"a worker was killed, .*; use fewer workers"):
+    with pytest.raises(ChildProcessError, match=rf"a worker was killed after step {run.steps}, .*; use fewer workers"):
         run.raise_failure()
 
 

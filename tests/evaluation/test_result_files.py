@@ -1,7 +1,10 @@
 """A folder of results is of one run only."""
 
+import os
+import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -62,3 +65,42 @@ def test_what_was_made_for_nothing_is_taken_away(tmp_path):
     with claimed(tmp_path / "old"):
         pass
     assert (tmp_path / "old").exists()
+
+
+def test_a_signal_waits_until_the_files_are_in_their_places(tmp_path, monkeypatch):
+    write(tmp_path)
+    replace = os.replace
+    monkeypatch.setattr(os, "replace", lambda *paths: (signal.raise_signal(signal.SIGINT), replace(*paths)))
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.txt", "summary.json"]
+
+
+def test_what_is_listed_stays_so_while_more_is_added(tmp_path, monkeypatch):
+    replace, seen = os.replace, []
+    monkeypatch.setattr(
+        os, "replace", lambda *paths: (seen.append((tmp_path / "summary.json").exists()), replace(*paths))
+    )
+    with ResultFiles(tmp_path) as files:
+        for name in "ab", "b":
+            for letter in name:
+                files.add(f"{letter}.txt", lambda path: path.write_text("new"))
+            files.publish({"complete": True})
+        files.add("c.txt", lambda path: path.write_text("more"))
+        files.publish({"complete": True})
+    # Not there while a file that it lists is replaced.
+    assert seen == [False, False, False, False, False, True, True]
+
+
+def test_kills_leave_a_result_or_none():
+    """In full: `python -m benchmarks kills`."""
+    done = subprocess.run(
+        [sys.executable, "-m", "benchmarks.kills", "--kills", "4"],
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    rows = [line.split(" | ") for line in done.stdout.splitlines() if "| SIG" in line]
+    assert len(rows) == 4
+    assert [row for row in rows if "BROKEN" in row[2] or (row[2] == "incomplete" and row[1] != "SIGKILL")] == []

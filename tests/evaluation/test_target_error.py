@@ -109,7 +109,7 @@ def test_a_run_stops_once_every_error_is_small_enough_at_two_looks_in_a_row():
     assert not any(first and second for first, second in itertools.pairwise(small))
     assert (np.diff([*looks, steps]) >= 3).all()
     assert len(looks) < 15
-    record, lines = outcome(target, {"a": metric.compute()}, REGIONS)
+    record, lines = outcome(target, {"a": metric.compute()}, REGIONS, confirmed=True)
     assert record["reached"] is True
     assert record["steps_needed"] == steps
     assert record["unknown"] == ["near above", "far above"]
@@ -119,11 +119,19 @@ def test_a_run_stops_once_every_error_is_small_enough_at_two_looks_in_a_row():
     ]
 
 
+def test_small_enough_once_is_not_reached():
+    coverages = {"a": filled(64, scale=0.01).compute()}
+    record, lines = outcome(TargetError(radius_m=1.0), coverages, REGIONS, confirmed=False)
+    assert all(number["reached"] for number in record["numbers"])
+    assert record["reached"] is False
+    assert lines[0].startswith("Target error not reached in 64 steps: every error is small enough now, but was not at")
+
+
 @pytest.mark.parametrize("steps", [5, 63])
 def test_however_good_it_looks_no_run_ends_before_64_steps(steps):
     watch = TargetWatch(TargetError(radius_m=1e6), {"a": CoverageObserver(filled(steps))}, REGIONS)
     assert not watch.is_reached(steps)
-    record, (first, *_) = outcome(watch.target, {"a": filled(steps).compute()}, REGIONS)
+    record, (first, *_) = outcome(watch.target, {"a": filled(steps).compute()}, REGIONS, confirmed=False)
     assert record["reached"] is False
     assert first.startswith(f"Target error not reached in {steps} steps")
 
@@ -135,14 +143,14 @@ def test_nothing_known_is_not_good_enough():
     watch = TargetWatch(TargetError(radius_m=1.0), {"a": CoverageObserver(metric)}, REGIONS)
     assert not watch.is_reached(64)
     assert watch.expected_steps(100) == 100
-    record, lines = outcome(watch.target, {"a": metric.compute()}, REGIONS)
+    record, lines = outcome(watch.target, {"a": metric.compute()}, REGIONS, confirmed=False)
     assert (record["reached"], record["steps_needed"], record["numbers"]) == (False, None, [])
     assert lines[0] == "Target error not reached: no region has a known cell."
 
 
 def test_what_was_not_reached_is_told_for_each_region_with_the_steps_it_would_take():
     target = TargetError(radius_m=0.005, detection=0.5)
-    record, lines = outcome(target, {"a": filled(64, scale=0.01).compute()}, REGIONS)
+    record, lines = outcome(target, {"a": filled(64, scale=0.01).compute()}, REGIONS, confirmed=False)
     assert re.fullmatch(
         r"  near all, radius_m of a: ± 0\.03\d m \(target 0\.005 m\), about \d,\d00 different steps are needed",
         lines[1],
@@ -155,7 +163,7 @@ def test_what_was_not_reached_is_told_for_each_region_with_the_steps_it_would_ta
 
 
 def test_without_an_error_no_number_of_steps_is_made_up():
-    record, lines = outcome(TargetError(radius_m=0.01), {"a": filled(5).compute()}, REGIONS)
+    record, lines = outcome(TargetError(radius_m=0.01), {"a": filled(5).compute()}, REGIONS, confirmed=False)
     assert record["steps_needed"] is None
     assert {number["error"] for number in record["numbers"]} == {None}
     assert lines[1] == "  near all, radius_m of a: not enough steps for an error"
@@ -163,7 +171,7 @@ def test_without_an_error_no_number_of_steps_is_made_up():
 
 
 def test_without_a_target_nothing_is_said():
-    assert outcome(None, {"a": filled(5).compute()}, REGIONS) == (None, [])
+    assert outcome(None, {"a": filled(5).compute()}, REGIONS, confirmed=False) == (None, [])
 
 
 @pytest.mark.parametrize(

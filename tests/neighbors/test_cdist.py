@@ -77,7 +77,7 @@ def test_screening_compares_few_pairs_where_blocks_are_far_apart(monkeypatch):
     assert 0 < sum(pairs) < 0.05 * len(query) * len(points) / cdist.BLOCK
 
 
-@pytest.mark.parametrize("count", [1, 255, 256, 257, 1000])
+@pytest.mark.parametrize("count", [256, 257, 511, 1000])
 def test_the_filling_of_the_last_block_is_never_named(count):
     query, points = random_cloud(50, 8), random_cloud(count, 9) + 30
     found = nearest(query, points, backend="cdist", memory_mb=64)
@@ -89,7 +89,15 @@ def test_the_filling_of_the_last_block_is_never_named(count):
 def test_a_tie_with_the_filling_names_the_last_point(monkeypatch):
     """Which index of a tie torch.min gives is not promised."""
     monkeypatch.setattr(cdist, "_search_rows", lambda query, *_: torch.full((len(query),), cdist.BLOCK - 1))
-    assert nearest(random_cloud(3, 8), random_cloud(10, 9), backend="cdist").index.tolist() == [9, 9, 9]
+    found = cdist._search_by_screening(random_cloud(3, 8), random_cloud(10, 9), budget=8_000_000)
+    assert found.tolist() == [9, 9, 9]
+
+
+def test_fewer_points_than_a_block_are_not_screened(monkeypatch):
+    monkeypatch.setattr(cdist, "_search_by_screening", fail)
+    query, points = random_cloud(50, 8), random_cloud(255, 9)
+    found = nearest(query, points, backend="cdist")
+    np.testing.assert_allclose(found.distance.double().numpy(), brute_force(query, points), rtol=1e-6)
 
 
 def fail(*_):

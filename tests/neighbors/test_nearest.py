@@ -1,6 +1,7 @@
 """The contract of `nearest` and `blind_spot_radius`, for every backend."""
 
 import math
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -10,13 +11,14 @@ from hypothesis import strategies as st
 from pykdtree.kdtree import KDTree
 
 from torchcover import blind_spot_radius, nearest
-from torchcover.neighbors import BACKENDS, check_cloud
+from torchcover.neighbors import BACKENDS, cdist, check_cloud, choice
 
 DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
 # Rounding of the search decides between points that are this close to equally near; the distance is rounded once.
 ULPS = {torch.float32: 4 * 2.0**-23, torch.float64: 4 * 2.0**-52}
 
-backends = pytest.mark.parametrize("backend", sorted(BACKENDS))
+INSTALLED = sorted(BACKENDS if find_spec("numba") else BACKENDS.keys() - {"packets"})
+backends = pytest.mark.parametrize("backend", INSTALLED)
 
 
 def cloud(*rows, dtype=torch.float32):
@@ -72,7 +74,7 @@ def test_any_number_of_points(backend, counts, dtype):
 def test_every_backend_agrees_with_brute_force(seed, counts, offset, scale, dtype):
     query = (random_cloud(counts[0], seed, scale, torch.float64) + offset).to(dtype)
     points = (random_cloud(counts[1], seed + 1, scale, torch.float64) + offset).to(dtype)
-    for backend in BACKENDS:
+    for backend in INSTALLED:
         assert_exact(query, points, backend)
 
 
@@ -105,9 +107,9 @@ def test_a_tree_is_built_of_distinct_points_where_many_are_equal(monkeypatch, dt
     """It cannot split equal points, and queries near them would look through all of them."""
     built = []
 
-    def noted(points):
+    def noted(points, **settings):
         built.append(len(points))
-        return KDTree(points)
+        return KDTree(points, **settings)
 
     monkeypatch.setattr("torchcover.neighbors.kdtree.KDTree", noted)
     random = torch.Generator().manual_seed(4)
@@ -266,7 +268,7 @@ def rotation(seed):
 
 
 @settings(max_examples=25, deadline=None)
-@given(seed=st.integers(0, 2**32), backend=st.sampled_from(sorted(BACKENDS)))
+@given(seed=st.integers(0, 2**32), backend=st.sampled_from(INSTALLED))
 def test_distances_do_not_depend_on_the_frame_or_the_order(seed, backend):
     query, points = random_cloud(30, seed, dtype=torch.float64), random_cloud(300, seed + 1, dtype=torch.float64)
     turn, shift = rotation(seed + 2), random_cloud(1, seed + 3, dtype=torch.float64)
@@ -293,7 +295,7 @@ def test_backends_agree_under_autocast():
     """A matrix product in bfloat16 would pick wrong neighbours."""
     query, points = random_cloud(300, 19), random_cloud(3000, 20)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        for backend in BACKENDS:
+        for backend in INSTALLED:
             assert_exact(query, points, backend)
 
 
@@ -305,6 +307,56 @@ def test_auto_chooses_by_size_and_is_as_exact(counts, chosen, monkeypatch):
     for name in BACKENDS.keys() - {chosen}:
         monkeypatch.setitem(BACKENDS, name, f"not.chosen.{name}")
     assert_exact(random_cloud(counts[0], 21), random_cloud(counts[1], 22), "auto")
+
+
+@pytest.mark.parametrize(
+    ("counts", "dtype", "chosen"),
+    [
+        ((100, 19_900), torch.float32, "packets"),
+        ((100, 19_900), torch.float64, "kdtree"),
+        ((100, 19_899), torch.float32, "kdtree"),
+        ((16, 30_000), torch.float32, "cdist"),
+    ],
+)
+def test_auto_takes_packets_for_large_clouds_in_float32(counts, dtype, chosen, monkeypatch):
+    """Stood in for by what any machine has: which is chosen, not what it finds."""
+    monkeypatch.setattr(choice, "_packets_work", lambda: True)
+    for name in BACKENDS.keys() - {chosen}:
+        monkeypatch.setitem(BACKENDS, name, f"not.chosen.{name}")
+    monkeypatch.setitem(BACKENDS, chosen, "torchcover.neighbors.cdist")
+    choice.choose_search(random_cloud(counts[0], 21, dtype=dtype), random_cloud(counts[1], 22, dtype=dtype), "auto")
+
+
+@pytest.fixture
+def untried():
+    """Whether numba works is asked anew, and afterwards again."""
+    choice._packets_work.cache_clear()
+    yield
+    choice._packets_work.cache_clear()
+
+
+LARGE = (random_cloud(200, 50), random_cloud(20_000, 51))
+
+
+def test_without_numba_the_tree_searches_and_the_log_says_how_to_get_it(monkeypatch, caplog, untried):
+    monkeypatch.setitem(BACKENDS, "packets", "no.such.module")
+    with caplog.at_level("INFO", logger="torchcover"):
+        found = [nearest(*LARGE) for _ in range(2)]
+    expected = nearest(*LARGE, backend="kdtree")
+    assert all(torch.equal(each.index, expected.index) for each in found)
+    (line,) = caplog.messages
+    assert "the KD-tree searches" in line
+    assert "pip install 'torchcover[fast]'" in line
+
+
+def test_with_a_broken_numba_the_tree_searches_and_says_so_once(monkeypatch, tmp_path, untried):
+    (tmp_path / "broken_backend.py").write_text("raise OSError('libllvm: no such file\\nand a trace')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(BACKENDS, "packets", "broken_backend")
+    with pytest.warns(UserWarning, match="the KD-tree searches instead of packets.*libllvm: no such file$") as said:
+        found = [nearest(*LARGE) for _ in range(2)]
+    assert len(said) == 1
+    assert torch.equal(found[0].index, nearest(*LARGE, backend="kdtree").index)
 
 
 # Gradients
@@ -321,12 +373,13 @@ def test_gradients_agree_with_finite_differences(backend):
 @pytest.mark.parametrize("dtype", DTYPES)
 def test_gradients_are_the_same_for_every_backend(dtype):
     gradients = []
-    for backend in BACKENDS:
+    for backend in INSTALLED:
         query = random_cloud(50, 25).to(dtype).requires_grad_()
         points = random_cloud(700, 26).to(dtype).requires_grad_()
         nearest(query, points, backend=backend).distance.sum().backward()
         gradients.append((query.grad, points.grad))
-    assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
+    for others in gradients[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(gradients[0], others, strict=True))
     torch.testing.assert_close(gradients[0][0].double().norm(dim=1), torch.ones(50).double(), rtol=1e-2, atol=0)
 
 
@@ -397,7 +450,7 @@ def test_small_distances_survive_where_a_matrix_product_loses_them(offset):
     truth = brute_force(query, line)
     by_product = torch.cdist(query, line, compute_mode="use_mm_for_euclid_dist").min(dim=1).values
     assert np.abs(by_product.double().numpy() - truth).max() > 0.3 * truth.max()
-    for backend in BACKENDS:
+    for backend in INSTALLED:
         np.testing.assert_allclose(nearest(query, line, backend=backend).distance.numpy(), truth, rtol=1e-6)
 
 
@@ -456,7 +509,7 @@ def test_a_memory_budget_that_is_none_is_refused(budget):
 
 
 def test_an_unknown_backend_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match="backend: one of auto, cdist, kdtree is needed; got 'faiss'"):
+    with pytest.raises(ValueError, match="backend: one of auto, cdist, kdtree, packets is needed; got 'faiss'"):
         nearest(random_cloud(2, 38), random_cloud(2, 39), backend="faiss")
 
 
@@ -474,6 +527,20 @@ def test_two_devices_are_refused():
         nearest(random_cloud(2, 40), on_another_device(2))
 
 
-def test_the_tree_is_for_the_cpu():
-    with pytest.raises(ValueError, match="backend 'kdtree' runs on the CPU; the clouds are on meta"):
-        nearest(on_another_device(2), on_another_device(3), backend="kdtree")
+@pytest.mark.parametrize("backend", ["kdtree", "packets"])
+def test_the_trees_are_for_the_cpu(backend):
+    with pytest.raises(ValueError, match=f"backend '{backend}' runs on the CPU; the clouds are on meta"):
+        nearest(on_another_device(2), on_another_device(3), backend=backend)
+
+
+def test_many_pairs_on_a_device_are_searched_on_the_cpu_and_it_says_so_once(monkeypatch):
+    """Never run on a GPU: the choice, and the way there and back."""
+    choice._say_that_the_cpu_searches.cache_clear()
+    monkeypatch.setattr(choice, "MAX_PAIRS_ON_THE_DEVICE", 5)
+    assert choice.choose_search(on_another_device(1), on_another_device(5), "auto") is cdist.search
+    with pytest.warns(UserWarning, match="clouds on meta with more than 5 pairs are searched on the CPU") as said:
+        searches = [choice.choose_search(on_another_device(2), on_another_device(3), "auto") for _ in range(2)]
+    assert len(said) == 1
+    query, points = random_cloud(20, 60), random_cloud(300, 61)
+    expected = nearest(query, points, backend="kdtree").index
+    assert all(torch.equal(search(query, points, math.inf, 1.0), expected) for search in searches)

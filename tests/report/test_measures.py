@@ -78,6 +78,15 @@ def test_known_cells_have_no_square_metres(trio, regions):
     assert {part.headings[-1] for part in parts_of(table)} == {"known cells\n(%)"}
 
 
+def test_only_means_over_the_surface_have_intervals(table, trio, regions):
+    def ends(table):
+        return {row[f"{key}{end}"] for row in records(table) for key in KEYS for end in ("_low", "_high")}
+
+    assert ends(CoverageTable.of(trio, regions)) == {None}
+    assert ends(table) - {None}
+    assert any(row["radius_m_error"] for row in records(CoverageTable.of(trio, regions)))
+
+
 @pytest.mark.parametrize("name", ["text", "markdown"])
 def test_readers_are_told_which_measure_it_is(name, table, trio, regions):
     surface, known = RENDERERS[name](table), RENDERERS[name](CoverageTable.of(trio, regions))

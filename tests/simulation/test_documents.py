@@ -7,7 +7,7 @@ import pytest
 
 from torchcover import Rig, Scenario
 from torchcover.cameras.calibration import read_opencv, read_ros
-from torchcover.data.recordings.folder_settings import read_poses
+from torchcover.data.recordings.folder_settings import read_folder_settings
 from torchcover.simulation import Lidar, LidarModel, Pose, builtin_names
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.documents import load_document
@@ -112,7 +112,7 @@ DOUBLED = {
     "lidar": (LidarModel.load, "name: l\ncolumns: 5\ncolumns: 6\n", "columns"),
     "ros": (read_ros, "width: 5\nwidth: 6\n", "width"),
     "opencv": (read_opencv, "%YAML:1.0\n---\nimage_width: 5\nimage_width: 6\n", "image_width"),
-    "frames": (read_poses, "sensor: {}\nsensor: {}\n", "sensor"),
+    "frames": (read_folder_settings, "sensor: {}\nsensor: {}\n", "sensor"),
 }
 
 
@@ -166,7 +166,12 @@ def test_a_rig_needs_a_sensor(tmp_path):
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [("- a\n- b", "mapping of keys is needed; got list"), ("", "got NoneType"), ("a: [1", "not a YAML file")],
+    [
+        ("- a\n- b", "mapping of keys is needed; got list"),
+        ("# nothing", "got NoneType"),
+        ("", "an empty file"),
+        ("a: [1", "not a YAML file"),
+    ],
 )
 def test_what_is_not_a_document_is_refused(tmp_path, content, message):
     with pytest.raises(ValueError, match=rf"doc\.yaml: .*{message}"):
@@ -176,7 +181,7 @@ def test_what_is_not_a_document_is_refused(tmp_path, content, message):
 def test_a_binary_file_is_refused(tmp_path):
     path = tmp_path / "doc.yaml"
     path.write_bytes(bytes(range(256)))
-    with pytest.raises(ValueError, match="not a YAML file"):
+    with pytest.raises(ValueError, match=r"doc\.yaml: not text in UTF-8"):
         Scenario.load(path)
 
 

@@ -105,7 +105,7 @@ def test_mesh_files_are_scaled_to_metres(tmp_path):
         (TETRAHEDRON.replace("1000 0 0", "nan 0 0"), r"1 of 4 vertices are NaN"),
         (TETRAHEDRON.split("3 0 2 1")[0].replace("face 4", "face 0"), "no face"),
         ("not a mesh at all", "cannot read it"),
-        ("", "cannot read it"),
+        ("", "an empty file"),
     ],
 )
 def test_unusable_mesh_files_are_named(tmp_path, content, message):
@@ -116,7 +116,7 @@ def test_unusable_mesh_files_are_named(tmp_path, content, message):
 
 
 def test_a_missing_mesh_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none\.stl: no such mesh file"):
+    with pytest.raises(FileNotFoundError, match=r"none\.stl: no such file; a mesh is needed"):
         MeshFile(type="mesh", path=tmp_path / "none.stl").mesh()
 
 

@@ -88,10 +88,11 @@ def test_poses_are_read(tmp_path):
     ("content", "message"),
     [
         (HEADER, "holds no row"),
-        ("", "needs the columns t, x, y, z, roll, pitch, yaw; t, x, y, z, roll, pitch, yaw missing"),
+        ("", "an empty file"),
+        ("a\n1\n", "needs the columns t, x, y, z, roll, pitch, yaw; t, x, y, z, roll, pitch, yaw missing"),
         ("t,x,y,z,yaw\n0,0,0,0,0\n", "roll, pitch missing"),
         (HEADER + "0,0,0,0,0,0,0\n1,0,zero,0,0,0,0\n", "line 3: y is 'zero', not a number"),
-        (HEADER + "0,0,0,0,0,0,0\n1,0,0\n", "line 3: z is None, not a number"),
+        (HEADER + "0,0,0,0,0,0,0\n1,0,0\n", "line 3: not 7 values, as the header has"),
         (HEADER + "0,0,0,0,0,0,0\n1,nan,0,0,0,0,0\n", r"NaN or infinite numbers in 1 of 2 poses, first 1"),
         (HEADER + "0,0,0,0,0,0,0\n0,1,0,0,0,0,0\n", r"must ascend; pose 1 is at 0 s, after 0 s"),
         (HEADER + "0,0,0,0,0,0,0\n2,1,0,0,0,0,0\n1,1,0,0,0,0,0\n", r"must ascend; pose 2 is at 1 s, after 2 s"),
@@ -115,11 +116,11 @@ def test_poses_that_are_not_rigid_are_refused(tmp_path):
 
 
 def test_missing_files_and_other_formats_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"none\.csv: no such trajectory"):
+    with pytest.raises(FileNotFoundError, match=r"none\.csv: no such file; a trajectory is needed"):
         read_trajectory(tmp_path / "none.csv")
     with pytest.raises(ValueError, match=r"a trajectory is a \.csv or \.npz file; got \.txt"):
-        read_trajectory(tmp_path / "t.txt")
-    with pytest.raises(FileNotFoundError, match="no such file of boxes"):
+        read_trajectory(write(tmp_path, HEADER).rename(tmp_path / "t.txt"))
+    with pytest.raises(FileNotFoundError, match="no such file; a file of boxes is needed"):
         read_boxes(tmp_path / "none.csv")
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 import torch
@@ -62,7 +63,8 @@ class Search:
         return torch.as_tensor(np.asarray(rows)).to(device=self.device, dtype=dtype).reshape(-1, 3)
 
 
-CPU_SEARCHES = (*(Search(backend) for backend in sorted(BACKENDS)), Search("cdist", memory_mb=8.0))
+INSTALLED = sorted(BACKENDS if find_spec("numba") else BACKENDS.keys() - {"packets"})
+CPU_SEARCHES = (*(Search(backend) for backend in INSTALLED), Search("cdist", memory_mb=8.0))
 CUDA_SEARCHES = (Search("auto", "cuda"), Search("cdist", "cuda"))
 
 

@@ -135,7 +135,9 @@ class SensorTilt:
         from kornia.geometry.calibration import tilt_projection
 
         tau_x, tau_y = as_vector([self.tau_x, self.tau_y], u)
-        rows = tilt_projection(tau_x, tau_y, inverse)
+        # Of kornia's two maps this one is right in all versions; the other turns the wrong way before 0.9.
+        undo = tilt_projection(tau_x, tau_y, True)
+        rows = undo if inverse else torch.linalg.inv(undo)
         x, y, w = (row[0] * u + row[1] * v + row[2] for row in rows)
         front = w > 0
         w = torch.where(front, w, 1.0)

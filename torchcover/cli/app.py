@@ -3,6 +3,8 @@
 import io
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,7 +15,7 @@ from torchcover.evaluation.interrupt import terminable
 
 if TYPE_CHECKING:
     from torchcover.data import FrameSource
-    from torchcover.evaluation import Result
+    from torchcover.evaluation import Checkpoint, Ranks, Result
 
 app = typer.Typer(
     name="torchcover",
@@ -41,6 +43,7 @@ def main() -> None:
     try:
         with warnings.catch_warnings(), terminable() as terminated:
             warnings.showwarning = _warn
+            warnings.filterwarnings("ignore", "The run was cut short", RuntimeWarning)  # the last line says it
             code = typer.main.get_command(app).main(standalone_mode=False)
         sys.stdout.flush()
     except USAGE_ERROR as error:
@@ -89,11 +92,12 @@ def evaluate(
     device: options.Device = "cpu",
     workers: options.Workers = 0,
     skip_bad_frames: options.SkipBadFrames = False,
+    resume: options.Resume = False,
 ) -> None:
     """Measure the coverage of a rig: a table, maps, and files to compare and to log."""
-    from torchcover.evaluation import claimed, evaluate
+    from torchcover.evaluation import evaluate
 
-    with claimed(out):
+    with _sharing(out) as ranks:
         result = evaluate(
             rig,
             scenario,
@@ -110,9 +114,11 @@ def evaluate(
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
+            checkpoint=_checkpoint(out, resume=resume),
+            ranks=ranks,
             progress=True,
         )
-        _finish(result, out, error_maps=error_maps, explain=explain)
+        _finish(result, out, ranks, error_maps=error_maps, explain=explain)
 
 
 @app.command()
@@ -138,11 +144,12 @@ def compare(
     device: options.Device = "cpu",
     workers: options.Workers = 0,
     skip_bad_frames: options.SkipBadFrames = False,
+    resume: options.Resume = False,
 ) -> None:
     """Compare rigs in the same frames: a table with the better values marked, maps side by side, differences."""
-    from torchcover.evaluation import claimed, compare
+    from torchcover.evaluation import compare
 
-    with claimed(out):
+    with _sharing(out) as ranks:
         result = compare(
             rigs or (),
             scenario,
@@ -159,9 +166,11 @@ def compare(
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
+            checkpoint=_checkpoint(out, resume=resume),
+            ranks=ranks,
             progress=True,
         )
-        _finish(result, out, error_maps=error_maps, explain=explain)
+        _finish(result, out, ranks, error_maps=error_maps, explain=explain)
 
 
 @app.command()
@@ -170,9 +179,9 @@ def study(
     scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "courtyard",
     rays: Annotated[
         list[int] | None,
-        typer.Option(min=1, help="Rays of the reference at each step; may be repeated (1024 to 65536)."),
+        typer.Option(min=1, help="Rays of the reference at each step; may be repeated (1024, 4096 and 16384)."),
     ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Most steps of a run.")] = 256,
+    steps: Annotated[int, typer.Option(min=1, help="Most steps of a run.")] = 128,
     runs: Annotated[int, typer.Option(min=1, help="Runs of so many steps that errors are averaged over.")] = 2,
     long_run: Annotated[
         Path | None,
@@ -181,7 +190,7 @@ def study(
             "earlier study. Not given: a run is made for it."
         ),
     ] = None,
-    long_run_steps: Annotated[int, typer.Option(min=8, help="Steps of that run.")] = 1024,
+    long_run_steps: Annotated[int, typer.Option(min=8, help="Steps of that run.")] = 512,
     every: options.Every = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
@@ -190,8 +199,12 @@ def study(
 ) -> None:
     """Measure error against run time for numbers of rays and of steps, and recommend a setting."""
     from torchcover.cli.printing import print_study
-    from torchcover.evaluation import StudyPlan, claimed, error_against_time
+    from torchcover.evaluation import StudyPlan, claimed, error_against_time, rank_count
 
+    if rank_count() > 1:
+        raise ValueError(
+            "study measures run times, which ranks beside each other would change: run it without torchrun"
+        )
     plan = StudyPlan(
         rig=rig,
         scenario=scenario,
@@ -209,6 +222,24 @@ def study(
         found = error_against_time(plan, progress=True)
         found.save(out)
         print_study(found, out)
+
+
+@app.command()
+def record(
+    rig: options.Rig,
+    out: options.RecordingOut,
+    scenario: options.ScenarioOrNone = None,
+    steps: options.Steps = None,
+    seed: options.Seed = 0,
+    every: options.Every = None,
+    reference: options.Reference = None,
+    rays: options.Rays = None,
+    layout: options.Layout = "folder",
+) -> None:
+    """Write what a simulated rig sees as a recording, for other tools and for `evaluate --frames`."""
+    from torchcover.cli.record import run
+
+    run(rig, out, layout, scenario=scenario, steps=steps, seed=seed, every_s=every, reference=reference, rays=rays)
 
 
 @app.command()
@@ -257,12 +288,31 @@ def _opened(
     )
 
 
-def _finish(result: "Result", out: Path, *, error_maps: bool, explain: bool) -> None:
+def _checkpoint(out: Path, *, resume: bool) -> "Checkpoint":
+    from torchcover.evaluation import Checkpoint
+
+    path = out / "checkpoint.npz"
+    if resume and not path.exists():
+        typer.echo(f"torchcover: {path} is not there: the run starts with its first step", err=True)
+    return Checkpoint(path, resume)
+
+
+@contextmanager
+def _sharing(out: Path) -> "Iterator[Ranks | None]":
+    """The folder, kept for this run; and the processes that share it, the first of which writes."""
+    from torchcover.evaluation import claimed, joined_ranks
+
+    with joined_ranks() as ranks, claimed(out) if ranks is None or ranks.rank == 0 else nullcontext():
+        yield ranks
+
+
+def _finish(result: "Result", out: Path, ranks: "Ranks | None", *, error_maps: bool, explain: bool) -> None:
     """Results are safe before anything is printed; then the command ends as the run did."""
     from torchcover.cli.printing import print_result
 
-    files = result.save(out, error_maps=error_maps)
-    print_result(result, files, out, explain=explain)
+    if ranks is None or ranks.rank == 0:
+        files = result.save(out, error_maps=error_maps)
+        print_result(result, files, out, explain=explain)
     if result.run is not None:
         result.run.raise_failure()
 

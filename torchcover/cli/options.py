@@ -56,6 +56,12 @@ Steps = Annotated[
 ]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the simulation.")]
 Out = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
+RecordingOut = Annotated[
+    Path, typer.Option("--out", help="Folder for the recording, new or empty.", callback=check_out)
+]
+Layout = Annotated[
+    str, typer.Option("--format", help="`folder`, or `kitti`: KITTI's object layout, of a rig of one LiDAR.")
+]
 Cell = Annotated[float, typer.Option(help="Side of a grid cell in metres.")]
 Thresholds = Annotated[
     list[float] | None, typer.Option("--threshold", help="Detection threshold in metres (0.4); may be repeated.")
@@ -100,6 +106,13 @@ ErrorMaps = Annotated[bool, typer.Option("--error-maps", help="Draw maps of the 
 Explain = Annotated[bool, typer.Option("--explain", help="Say what was left out because the scene did not need it.")]
 Device = Annotated[str, typer.Option(help="Where the search and the sums run: cpu, cuda, cuda:1, ...")]
 Workers = Annotated[int, typer.Option(min=0, help="Processes that make frames; 0 makes them in this one.")]
+Resume = Annotated[
+    bool,
+    typer.Option(
+        "--resume",
+        help="Go on from the checkpoint in --out, whatever ended that run; from a complete one with more --steps.",
+    ),
+]
 SkipBadFrames = Annotated[
     bool, typer.Option("--skip-bad-frames", help="Skip and count frames that cannot be read, instead of stopping.")
 ]

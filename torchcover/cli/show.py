@@ -9,8 +9,9 @@ from rich.console import Console
 
 from torchcover.evaluation import cameras_of, rig_pictures, scenario_picture
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
-from torchcover.files import parse_yaml
+from torchcover.files import BadFileError
 from torchcover.simulation import Rig, Scenario, builtin_names
+from torchcover.simulation.documents import read_mapping
 
 DEFAULT_RIG = "front_roof_128"
 
@@ -52,13 +53,10 @@ def _is_rig(name: str) -> bool:
 
 
 def _has_sensors(path: Path) -> bool:
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
     try:
-        content = parse_yaml(path.read_text(encoding="utf-8"))
-    except ValueError:
+        return "sensors" in read_mapping(path)
+    except BadFileError:
         return False  # whatever loads it says what is wrong
-    return isinstance(content, dict) and "sensors" in content
 
 
 def _refuse(kind: str, options: dict[str, Any], reason: str) -> None:

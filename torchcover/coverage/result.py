@@ -248,8 +248,8 @@ class Coverage:
             cells=len(probed),
             known_cells=int((probed > 0).sum()),
             measure=self.measure,
-            numbers=self._numbers(self.estimate(region, height)),
-            known=self._numbers(self.estimate(region, height, "known")),
+            numbers=self._numbers(self.estimate(region, height), self.measure),
+            known=self._numbers(self.estimate(region, height, "known"), "known"),
             visible_m2=math.nan if self.area is None else self._visible_m2(self.area, band, cells),
         )
 
@@ -257,11 +257,13 @@ class Coverage:
         total = float(area_in_blocks(area, band, cells.to(area.at.device))[:, 0].sum())
         return total / self.counts["steps"] if self.counts["steps"] else math.nan
 
-    def _numbers(self, estimate: RegionEstimate) -> dict[str, Number]:
+    def _numbers(self, estimate: RegionEstimate, measure: Measure) -> dict[str, Number]:
         numbers, freedom = {}, len(estimate.steps) - 1
         for quantity, value, error in zip(
             self.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True
         ):
             known = error if error > ROUND_OFF else math.nan  # blocks that all say the same prove nothing
-            numbers[quantity.key] = Number(value, known, *interval95(value, error, freedom, quantity.unit))
+            # Of the mean over known cells nobody has measured how often an interval holds the truth.
+            ends = interval95(value, error, freedom, quantity.unit) if measure == "area" else ()
+            numbers[quantity.key] = Number(value, known, *ends)
         return numbers

@@ -14,7 +14,7 @@ class Number(NamedTuple):
     Args:
         value: The number.
         error: Its standard error.
-        low: Lower end of the interval, from `torchcover.coverage.intervals.interval95`.
+        low: Lower end of the interval, from `torchcover.coverage.intervals.interval95`; NaN for means over known cells.
         high: Upper end.
     """
 

@@ -140,6 +140,9 @@ class AccumulatedReference:
             raise ValueError(f"no reference point is left of the scans within {self.window_s / 2:g} s of this instant")
         return InVehicle(points_m[~own].astype(np.float32), dropped)
 
+    def weight_kind(self, recording: Recording) -> None:
+        """None: one point a voxel, which all count the same."""
+
     def record(self, recording: Recording, judged: Collection[str]) -> Mapping[str, object]:
         """Settings, and what such a reference cannot know."""
         taking_part = self._taking_part(recording)

@@ -63,6 +63,11 @@ class ChosenRigs(Dataset[Frame]):
         """As there."""
         return self.frames.reference_record
 
+    @property
+    def content(self) -> Mapping[str, object]:
+        """As there, and which rigs."""
+        return {**self.frames.content, "rigs of the recording": self.names}
+
     def __len__(self) -> int:
         return len(self.frames)
 

@@ -5,8 +5,10 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from torchcover.data.formats.arrays import Points, read_archive, read_array, read_records
+from torchcover.data.formats.arrays import Points, read_archive, read_array, read_records, read_weighted_archive
+from torchcover.data.formats.las import read_las
 from torchcover.data.formats.pcd import read_pcd
 from torchcover.data.formats.ply import read_ply
 from torchcover.data.formats.text import read_text
@@ -22,6 +24,8 @@ READERS: dict[str, Callable[[Path], Points]] = {
     ".ply": read_ply,
     ".csv": read_text,
     ".xyz": read_text,
+    ".las": read_las,
+    ".laz": read_las,
 }
 
 
@@ -40,10 +44,11 @@ def split_name(name: str) -> tuple[str, str]:
 def read_cloud(path: Path) -> Points:
     """Read a point cloud; the suffix says how.
 
-    `.npy`; `.npz` (the array `points`, or the only one); `.bin` (KITTI: x y z intensity, float32); `.pcd.bin`
-    (nuScenes: x y z intensity ring, float32); `.pcd` (ascii, binary, binary_compressed); `.ply` (ascii, binary);
-    `.csv` and `.xyz` (commas or white space; a line above the points may name the columns). In a file without names
-    the first three columns are x y z.
+    `.npy`; `.npz` (the array `points`, or the only one, or the only one of shape (N, 3)); `.bin` (KITTI: x y z
+    intensity, float32); `.pcd.bin` (nuScenes: x y z intensity ring, float32); `.pcd` (ascii, binary,
+    binary_compressed); `.ply` (ascii, binary); `.csv` and `.xyz` (commas or white space; a line above the points may
+    name the columns); `.las` and `.laz` (the latter with `torchcover[las]`). In a file without names the first three
+    columns are x y z.
 
     Args:
         path: The file.
@@ -55,6 +60,7 @@ def read_cloud(path: Path) -> Points:
     Raises:
         FileNotFoundError: There is no such file.
         IsADirectoryError: A folder.
+        ImportError: A `.laz`, and laspy is not installed.
         BadFileError: Not a cloud: an unknown suffix, an empty or truncated file, other content than the suffix says,
             rows of different width, a header that claims more or less than the file holds, another shape or type, more
             memory than `TORCHCOVER_MAX_FILE_GB` allows, or points of which none is finite. `.bin` and `.pcd.bin` have
@@ -76,3 +82,22 @@ def read_cloud(path: Path) -> Points:
         raise ValueError(f"none of the {len(points)} points is finite; at least one has to be")
     # Native byte order, contiguous and the caller's own: readers hand out views of buffers.
     return np.array(points, dtype=points.dtype.newbyteorder("="), order="C")
+
+
+@reads("a point cloud with weights")
+def read_weighted_cloud(path: Path) -> tuple[Points, NDArray[np.float64]]:
+    """Read a cloud and what each of its points counts for: the arrays `points` and `weights` of a `.npz`.
+
+    Args:
+        path: The file.
+
+    Returns:
+        (N, 3) points as `read_cloud` gives them, and (N,) float64 weights.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        BadFileError: Not such a file; a weight that is not positive and finite, or another number of them.
+    """
+    if path.suffix.lower() != ".npz":
+        raise ValueError("weights are read from a .npz with the arrays points and weights only")
+    return read_weighted_archive(path)

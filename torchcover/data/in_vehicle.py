@@ -24,10 +24,12 @@ class InVehicle(NamedTuple):
         points_m: (N, 3) float32.
         dropped: How many points were left out: `nonfinite`, `no_return`, `own_vehicle`; of an accumulated reference
             also `gone`, those of objects that nobody has labelled at the instant.
+        weights: (N,) float32 what each point counts for; None if all count the same.
     """
 
     points_m: NDArray[np.float32]
     dropped: Counter[str]
+    weights: NDArray[np.float32] | None = None
 
 
 def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
@@ -43,23 +45,26 @@ def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
     Example:
         >>> scan = Scan(np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]), None, "a.npy")
         >>> in_vehicle(scan)
-        InVehicle(points_m=array([[5., 0., 0.]], dtype=float32), dropped=Counter({'nonfinite': 1, 'no_return': 1}))
+        InVehicle(points_m=array([[5., 0., 0.]], dtype=float32), dropped=Counter({...}), weights=None)
     """
-    points_m = scan.points_m
+    points_m, weights = scan.points_m, scan.weights
     finite = np.isfinite(points_m).all(axis=1)
     returned = (np.abs(points_m) > NO_RETURN_M).any(axis=1)  # NaN is not larger; it is counted as what it is
-    kept = finite & returned
+    if scan.min_range_m:
+        returned &= ~(np.linalg.norm(points_m, axis=1) < scan.min_range_m)
+    kept = np.flatnonzero(finite & returned)
     dropped = Counter({"nonfinite": int((~finite).sum()), "no_return": int((finite & ~returned).sum())})
-    if not kept.all():
-        points_m = points_m[kept]
+    if len(kept) < len(points_m):
+        points_m, weights = points_m[kept], _chosen(weights, kept)
     if scan.vehicle_T_sensor is not None:
         points_m = transform(scan.vehicle_T_sensor, points_m)
     _check_range(points_m, scan.source)
     if body is not None:
         own = ((points_m > body.lower_m) & (points_m < body.upper_m)).all(axis=1)
         dropped["own_vehicle"] = int(own.sum())
-        points_m = points_m[~own]
-    return InVehicle(points_m.astype(np.float32), dropped)
+        others = np.flatnonzero(~own)
+        points_m, weights = points_m[others], _chosen(weights, others)
+    return InVehicle(points_m.astype(np.float32), dropped, None if weights is None else weights.astype(np.float32))
 
 
 def joined(clouds: Sequence[InVehicle]) -> InVehicle:
@@ -67,7 +72,16 @@ def joined(clouds: Sequence[InVehicle]) -> InVehicle:
     if len(clouds) == 1:
         return clouds[0]
     dropped = sum((cloud.dropped for cloud in clouds), Counter[str]())
-    return InVehicle(np.concatenate([np.empty((0, 3), np.float32), *(cloud.points_m for cloud in clouds)]), dropped)
+    weights = [cloud.weights for cloud in clouds if cloud.weights is not None]
+    return InVehicle(
+        np.concatenate([np.empty((0, 3), np.float32), *(cloud.points_m for cloud in clouds)]),
+        dropped,
+        np.concatenate(weights) if weights else None,
+    )
+
+
+def _chosen(weights: NDArray[np.float64] | None, which: NDArray[np.intp]) -> NDArray[np.float64] | None:
+    return None if weights is None else weights[which]
 
 
 def _check_range(points_m: Points, source: str) -> None:

@@ -3,7 +3,8 @@
 import operator
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,6 +19,9 @@ from torchcover.data.recorded_reference import RecordedReference, Reference
 from torchcover.data.recordings import Recording, open_recording
 from torchcover.detection.inside import with_hits
 from torchcover.simulation import Sensor, WeightKind
+
+# What a folder of results holds, during the run or after it.
+RESULTS = frozenset({".lock", "summary.json", "checkpoint.npz"})
 
 
 class RecordedFrames(Dataset[Frame]):
@@ -91,13 +95,28 @@ class RecordedFrames(Dataset[Frame]):
 
     @property
     def weight_kind(self) -> WeightKind | None:
-        """None: all points of the reference count the same."""
-        return None
+        """What the weights of the reference points are; None: all of them count the same."""
+        return self.reference.weight_kind(self.recording)
 
     @property
     def reference_record(self) -> Mapping[str, object]:
         """Where the reference comes from."""
         return self.reference.record(self.recording, self._judged)
+
+    @property
+    def content(self) -> Mapping[str, object]:
+        """Names, sizes and times of change of its files, which are not read for it, and what is made of them.
+
+        Raises:
+            OSError: A file is gone.
+        """
+        reference = {name: value for name, value in vars(self.reference).items() if not name.startswith("_")}
+        return {
+            "recording": list(_stamps(self.recording.path)),
+            "instants": [list(self.recording.names), list(self.recording.frames)],
+            "sensors": self.sensors_of_rigs,
+            "reference": [type(self.reference).__name__, reference],
+        }
 
     def __len__(self) -> int:
         return len(self.recording.frames)
@@ -131,7 +150,17 @@ class RecordedFrames(Dataset[Frame]):
         tensors = {rig: torch.from_numpy(cloud.points_m) for rig, cloud in clouds.items()}
         if boxes is not None:
             boxes = with_hits(boxes, tensors)
-        return Frame(tensors, torch.from_numpy(reference.points_m), position, name, counts=counts, boxes=boxes)
+        return Frame(
+            tensors,
+            torch.from_numpy(reference.points_m),
+            position,
+            name,
+            counts=counts,
+            reference_weights=None if reference.weights is None else torch.from_numpy(reference.weights),
+            weight_kind=self.weight_kind,
+            boxes=boxes,
+            instant=None if self.recording.instants is None else self.recording.instants[instant],
+        )
 
     @property
     def _judged(self) -> tuple[str, ...]:
@@ -150,6 +179,20 @@ class RecordedFrames(Dataset[Frame]):
                     f"rig {rig!r}: sensors of the recording {self.recording.path} are needed, which has "
                     f"{', '.join(there)}; got {', '.join(unknown) or 'none'}"
                 )
+
+
+def _stamps(place: Path) -> Iterator[tuple[str, int, int]]:
+    """Path, size and time of change of every file; those of results that somebody keeps beside it are no part of it."""
+    if place.is_file():
+        yield place.name, place.stat().st_size, place.stat().st_mtime_ns
+    for folder, folders, names in os.walk(place):
+        if not RESULTS.isdisjoint(names):
+            folders.clear()
+            continue
+        folders.sort()
+        for name in sorted(names):
+            status = Path(folder, name).stat()
+            yield Path(folder, name).relative_to(place).as_posix(), status.st_size, status.st_mtime_ns
 
 
 def reference_of_recording(name: str | None = None, window_s: float | None = None) -> Reference | None:

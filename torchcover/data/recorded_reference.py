@@ -5,6 +5,7 @@ from typing import Protocol
 
 from torchcover.data.in_vehicle import InVehicle, in_vehicle, joined
 from torchcover.data.recordings import Recording
+from torchcover.simulation import WeightKind
 
 
 class Reference(Protocol):
@@ -28,6 +29,10 @@ class Reference(Protocol):
         Raises:
             OSError, ValueError: It cannot be read, or has no points.
         """
+        ...
+
+    def weight_kind(self, recording: Recording, /) -> WeightKind | None:
+        """What the weights of its points are, as in `Frame`."""
         ...
 
     def record(self, recording: Recording, judged: Collection[str], /) -> Mapping[str, object]:
@@ -54,6 +59,10 @@ class RecordedReference:
             where = ", ".join(scan.source for scan in scans)
             raise ValueError(f"{where}: the reference cloud has no points, so there is nothing to measure against")
         return found
+
+    def weight_kind(self, recording: Recording) -> WeightKind | None:
+        """As they were recorded."""
+        return recording.weight_kind
 
     def record(self, recording: Recording, judged: Collection[str]) -> Mapping[str, object]:
         """That it was recorded."""

@@ -1,7 +1,10 @@
 """Frames of a simulated world."""
 
 import copy
+import hashlib
+import pickle
 from collections.abc import Mapping, Sequence
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Self
 
@@ -14,7 +17,7 @@ from torchcover.data.frame import Frame
 from torchcover.data.reference import reference_called, reference_of_objects
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import with_hits
-from torchcover.simulation import Label, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
+from torchcover.simulation import Label, Observation, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
 
 # What takes years.
 MAX_STEPS = 1_000_000_000
@@ -133,6 +136,24 @@ class SimulatedFrames(Dataset[Frame]):
         """The name of the reference sensor and the time between two frames."""
         return {"sensor": self.reference_sensor.name, "every_s": self.every_s}
 
+    @property
+    def content(self) -> Mapping[str, object]:
+        """What stands in the documents and in the files that they name, and the settings.
+
+        Raises:
+            FileNotFoundError: A file is missing.
+        """
+        sensor = self.reference_sensor
+        pattern = repr(sensor) if is_dataclass(sensor) else hashlib.sha256(pickle.dumps(sensor)).hexdigest()
+        return {
+            "scenario": self.scenario.content(),
+            **{f"rig {name}": rig.content() for name, rig in self.rigs.items()},
+            "reference sensor": pattern,
+            "seed": self.seed,
+            "every_s": self.every_s,
+            "boxes": self.boxes,
+        }
+
     def with_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
         """The same instants as another reference sensor sees them; the geometry is built once for both."""
         other = copy.copy(self)
@@ -145,7 +166,10 @@ class SimulatedFrames(Dataset[Frame]):
     def __getitem__(self, index: int) -> Frame:
         if not 0 <= index < self.steps:
             raise IndexError(f"frame {index} of {self.steps}")
-        seen = self.simulator.step(index)
+        return self.frame_of(self.simulator.step(index), index)
+
+    def frame_of(self, seen: Observation, index: int) -> Frame:
+        """The frame of what the simulator saw at a step."""
         clouds = {name: torch.from_numpy(points) for name, points in seen.clouds.items()}
         weights = seen.reference_weights
         return Frame(

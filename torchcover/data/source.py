@@ -50,6 +50,15 @@ class FrameSource(Protocol):
         """
         ...
 
+    @property
+    def content(self) -> Mapping[str, object]:
+        """All that the frames depend on, under the names that a message calls it by; for JSON.
+
+        A checkpoint is of frames of this content: it changes if, and only if, a frame may be another one. What is large
+        may be a hash.
+        """
+        ...
+
     def __len__(self) -> int:
         """Number of frames."""
         ...

@@ -1,20 +1,17 @@
 """Evaluate a rig, or compare several: what a notebook calls, and the command line too."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from torchcover.coverage import Aggregation, Measure
-from torchcover.evaluation.observers import AnyObserver, CoverageObserver
-from torchcover.evaluation.omissions import left_out
-from torchcover.evaluation.pipeline import observe
+from torchcover.evaluation.checkpoint import AnyCheckpoint
+from torchcover.evaluation.measuring import Observers, measured
+from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.rig_names import AnyRig, given_as
 from torchcover.evaluation.saved import compare_saved, saved_among
-from torchcover.evaluation.sensor_drawings import check_drawable
 from torchcover.evaluation.settings import AnyDevice, AnyThresholds, Settings
-from torchcover.evaluation.target_error import AnyTargetError, TargetWatch
-from torchcover.evaluation.task import AnyFrames, AnyScenario, Task, task_of
-
-Observers = Mapping[str, AnyObserver]
+from torchcover.evaluation.target_error import AnyTargetError
+from torchcover.evaluation.task import AnyFrames, AnyScenario, task_of
 
 
 def evaluate(
@@ -36,6 +33,8 @@ def evaluate(
     workers: int = 0,
     skip_bad_frames: bool = False,
     observers: Observers | None = None,
+    checkpoint: AnyCheckpoint | None = None,
+    ranks: Ranks | None = None,
     progress: bool = False,
 ) -> Result:
     """Measure the coverage of a rig, as `torchcover evaluate` does.
@@ -61,16 +60,20 @@ def evaluate(
         workers: Processes that make frames; 0 makes them in this one.
         skip_bad_frames: Skip and note frames that cannot be read, instead of ending with the first.
         observers: What else looks at the same frames, by name; what they compute is in `Result.observed`.
+        checkpoint: File (`.npz`) that the run is saved to every minute and at its end. If it is there, the run goes on
+            from it, to the same bits, and with more steps if that is asked for; or `Checkpoint(path, resume=False)`.
+            Observers need `state_dict` and `load_state_dict` then.
+        ranks: Processes that share the run, from `joined_ranks()`; all of them call this, and get the same result.
         progress: Whether to show a bar.
 
     Returns:
         Numbers, maps, and how the run went. Whatever ends it after the first step, a bad frame, Ctrl-C or an error, is
-        noted in `result.run.failure`, and what was measured until then is there.
+        noted in `result.run.failure`, with a RuntimeWarning, and what was measured until then is there.
 
     Raises:
-        ValueError: Settings that make no sense, or not a single good frame.
+        ValueError: Settings that make no sense, not a single good frame, or a checkpoint of another run.
         FileNotFoundError: An unknown name or file.
-        TypeError: A setting of a wrong kind.
+        TypeError: A setting of a wrong kind, or an observer whose state cannot be saved.
 
     Example:
         >>> result = evaluate("front_roof_32", steps=2, cell_m=1.0, rays=1024)
@@ -84,7 +87,7 @@ def evaluate(
     task = task_of(named, scenario, frames, settings)
     if len(task.rigs) > 1:
         raise ValueError(f"{task.place} holds the rigs {', '.join(task.rigs)}: say which, or compare them")
-    return _measured(task, settings, observers or {}, progress=progress)
+    return measured(task, settings, observers or {}, checkpoint, ranks, progress=progress)
 
 
 def compare(
@@ -106,6 +109,8 @@ def compare(
     workers: int = 0,
     skip_bad_frames: bool = False,
     observers: Observers | None = None,
+    checkpoint: AnyCheckpoint | None = None,
+    ranks: Ranks | None = None,
     progress: bool = False,
 ) -> Result:
     """Measure several rigs in the same frames, against the same reference, as `torchcover compare` does.
@@ -130,6 +135,8 @@ def compare(
         workers: Processes that make frames.
         skip_bad_frames: Whether to skip bad frames.
         observers: What else looks at the same frames.
+        checkpoint: File that the run is saved to, and goes on from.
+        ranks: Processes that share the run.
         progress: Whether to show a bar.
 
     Returns:
@@ -149,7 +156,7 @@ def compare(
     task = task_of(rigs, scenario, frames, settings)
     if len(task.rigs) < 2:
         raise ValueError(f"compare needs at least two rigs; got {task.rigs[0]!r} only (for one: `evaluate`)")
-    return _measured(task, settings, observers or {}, progress=progress)
+    return measured(task, settings, observers or {}, checkpoint, ranks, progress=progress)
 
 
 def _check_saved_only(
@@ -168,44 +175,3 @@ def _check_saved_only(
         raise ValueError(
             "coverage files are measured already: leave out the scenario, the frames, their settings and observers"
         )
-
-
-def _measured(task: Task, settings: Settings, others: Observers, *, progress: bool) -> Result:
-    frames, regions, target = task.frames, settings.regions, settings.target_error
-    sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
-    check_drawable(sensors)
-    observers = {name: CoverageObserver(settings.metric(frames.weight_kind), name) for name in task.rigs}
-    run = observe(
-        frames,
-        [*observers.values(), *others.values()],
-        steps=task.steps,
-        workers=settings.workers,
-        device=settings.device,
-        skip_bad_frames=settings.skip_bad_frames,
-        until=TargetWatch(target, observers, regions) if target else None,
-        progress=progress,
-        keep_partial=True,
-    )
-    coverages = {name: observer.compute() for name, observer in observers.items()}
-    if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
-        run.raise_failure()  # within a step: the rigs have not seen the same
-    return Result(
-        coverages=coverages,
-        regions=regions,
-        run=run,
-        rigs=task.given,
-        source=task.description,
-        reference_record=frames.reference_record,
-        device=settings.device,
-        target_error=target,
-        sensors=task.sensors,
-        ego_outline_m=frames.ego_outline_m,
-        observed={name: observer.compute() for name, observer in others.items()},
-        left_out=left_out(
-            run.counts,
-            list(coverages.values()),
-            settings.aggregations,
-            sensors,
-            workers=settings.workers,
-        ),
-    )

@@ -1,6 +1,7 @@
 """What is fed with frames: coverage, and whatever else a user wants to know of them."""
 
-from typing import Any, Protocol, Self, TypeVar
+from collections.abc import Mapping
+from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 from torchcover.coverage import Coverage, CoverageMetric
 from torchcover.data import Frame
@@ -8,10 +9,28 @@ from torchcover.data import Frame
 ResultT = TypeVar("ResultT", covariant=True)
 
 
+@runtime_checkable
+class Stateful(Protocol):
+    """What a checkpoint can keep: an observer, or a stopping rule, that hands out all that it knows and takes it back.
+
+    A state consists of tensors, numbers, texts and None, in lists and in dicts with names as keys. An object to which
+    one is given goes on as the other would have, bit for bit.
+    """
+
+    def state_dict(self) -> Mapping[str, Any]:
+        """All that the frames so far have left; it is written at once, so that it need not be a copy."""
+        ...
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], /) -> object:
+        """Be what the other was; the tensors are on the CPU, and nobody else's."""
+        ...
+
+
 class Observer(Protocol[ResultT]):
     """Something that looks at frames, one after the other, and says something in the end.
 
-    Over several processes or ranks each has an observer of its own over other frames; one merges the others.
+    Over several processes or ranks each has an observer of its own over other frames; one merges the others. A run with
+    a checkpoint needs those that are `Stateful`, too.
 
     Example:
         >>> class PointCount:
@@ -73,6 +92,18 @@ class CoverageObserver:
         """The coverage so far."""
         coverage: Coverage = self.metric.compute()
         return coverage
+
+    def state_dict(self) -> dict[str, Any]:
+        """The sums of the metric."""
+        return self.metric.metric_state
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Take the sums of another one.
+
+        Raises:
+            ValueError: Of a metric with other parameters.
+        """
+        self.metric.load_state_dict(state_dict)
 
     def merge_state(self, other: "CoverageObserver") -> None:
         """Add the frames of another one of the same rig.

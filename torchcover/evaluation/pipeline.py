@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby, islice
 from traceback import clear_frames, format_exc
@@ -12,9 +12,11 @@ import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from torchcover.data import BadFrameError, Frame, FrameSource, SimulatedFrames
+from torchcover.evaluation.checkpoint import Journal
 from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.progress import progress_of
+from torchcover.evaluation.ranks import Ranks
 
 Frames = FrameSource | Dataset[Frame] | Sequence[Frame]
 
@@ -30,6 +32,7 @@ class Run:
         steps: Frames that all observers have seen.
         counts: Sums of the frames' counts.
         skipped: What was wrong with the frames that were skipped.
+        reached: Whether what was waited for ended it.
         failure: What ended it before its time, if anything did: a bad frame, Ctrl-C, a worker that was killed, an error
             of an observer.
         seconds: How long it took.
@@ -38,6 +41,7 @@ class Run:
     steps: int = 0
     counts: Counter[str] = field(default_factory=Counter)
     skipped: list[str] = field(default_factory=list)
+    reached: bool = False
     failure: Exception | KeyboardInterrupt | None = None
     seconds: float = 0.0
 
@@ -81,6 +85,8 @@ def observe(
     progress: bool = False,
     title: str = "steps",
     keep_partial: bool = False,
+    journal: Journal | None = None,
+    ranks: Ranks | None = None,
 ) -> Run:
     """Feed observers with frames. Whatever ends the run, all of them have seen the same frames.
 
@@ -98,6 +104,8 @@ def observe(
         title: What stands before the bar.
         keep_partial: After the first step, what ends the run is noted in it and not raised: for who looks at
             `Run.complete`.
+        journal: Goes on from a checkpoint, and keeps it; of these observers and this rule.
+        ranks: The processes that share the frames, each of which calls this; the caller adds up what they have seen.
 
     Returns:
         How it went.
@@ -125,36 +133,54 @@ def observe(
     """
     run, observers = Run(), list(observers)
     most = len(frames) if steps is None else min(steps, len(frames))  # type: ignore[arg-type]  # map-style: has one
-    start = time.perf_counter()
+    if journal:
+        journal.restore(run)
+    todo = _left(_share(frames, range(most), ranks), run, skip_bad_frames=skip_bad_frames)
+    start = time.perf_counter() - run.seconds
+    consistent = True  # all observers and the rule know of the same frames
+    run.reached = until is not None and run.steps > 0 and until.is_reached(run.steps)
+    share = most if ranks is None else -(-most // ranks.size)
     try:
-        with progress_of(most, title, shown=progress) as bar:
-            for frame in _each(frames, most, workers, run, skip_bad_frames=skip_bad_frames):
+        with progress_of(share, title, done=run.steps, shown=progress) as bar:
+            for frame in _each(frames, () if run.reached else todo, workers, run, skip_bad_frames=skip_bad_frames):
+                if ranks:
+                    ranks.check_others()
                 with held_back():
+                    consistent = False
                     _feed(frame.to(device), observers, run)
-                reached = until is not None and until.is_reached(run.steps)
-                expected = most if until is None else run.steps if reached else until.expected_steps(most)
+                    run.reached = until is not None and until.is_reached(run.steps)
+                    consistent = True
+                run.seconds = time.perf_counter() - start
+                expected = share if until is None else run.steps if run.reached else until.expected_steps(share)
                 bar.advance(expected, until.words if until else "")
-                if reached:
+                if run.reached:
                     break
+                if journal:
+                    journal.write_if_due(run)
     except (Exception, KeyboardInterrupt) as error:  # hours of work are not lost to any of them
         clear_frames(error.__traceback__)  # which would keep the workers alive
-        run.failure = _killed_worker(error, workers) or error
+        run.failure = _killed_worker(error, workers, run.steps) or error
     run.seconds = time.perf_counter() - start
-    if not (keep_partial and run.steps):
+    if journal and run.steps and consistent:
+        with held_back():
+            journal.write(run)
+    if not (keep_partial and (run.steps or ranks)):
         run.raise_failure()
-    if not run.steps:
+    if not (run.steps or ranks):
         raise ValueError("no frame could be used, so there is no result")
     return run
 
 
-def _killed_worker(error: BaseException, workers: int) -> ChildProcessError | None:
+def _killed_worker(error: BaseException, workers: int, steps: int) -> ChildProcessError | None:
     """What torch says, wherever this process is, when a worker dies; as an error that a user can do something about."""
     told = isinstance(error, RuntimeError) and str(error).startswith("DataLoader worker (pid")
     # Or its last frame could not be fetched; what a worker itself raises is "Caught ... in DataLoader worker process".
     cut_off = workers > 0 and isinstance(error, EOFError | ConnectionError) and not str(error).startswith("Caught ")
     if not (told or cut_off):
         return None
-    return ChildProcessError(f"a worker was killed, perhaps for want of memory; use fewer workers ({error!r})")
+    return ChildProcessError(
+        f"a worker was killed after step {steps:,}, perhaps for want of memory; use fewer workers ({error!r})"
+    )
 
 
 def _feed(frame: Frame, observers: Sequence[AnyObserver], run: Run) -> None:
@@ -164,18 +190,45 @@ def _feed(frame: Frame, observers: Sequence[AnyObserver], run: Run) -> None:
     run.steps += 1
 
 
-def made_together(frames: Frames, steps: int, workers: int) -> Iterator[list[int]]:
+def _share(frames: Frames, indices: range, ranks: Ranks | None) -> Iterator[int]:
+    if ranks is None:
+        return iter(indices)
+    return ranks.share(indices, _worlds(frames) or int)
+
+
+def _left(indices: Iterator[int], run: Run, *, skip_bad_frames: bool) -> Iterator[int]:
+    """What a checkpoint has left to do."""
+    done = run.steps + len(run.skipped)
+    if (most := sum(1 for _ in islice(indices, done))) < done:
+        raise ValueError(f"steps: {done} are done in the checkpoint; got {most}, which is less")
+    if run.skipped and not skip_bad_frames:
+        raise ValueError(
+            f"{len(run.skipped)} bad frames were skipped before the checkpoint, such as {run.skipped[0]}; go on "
+            "skipping them (--skip-bad-frames)"
+        )
+    return indices
+
+
+def _worlds(frames: Frames) -> Callable[[int], int] | None:
+    """Which world a frame is of, where there are several: each is built for its own frames."""
+    if not isinstance(frames, SimulatedFrames) or frames.scenario.traffic is None:
+        return None
+    return frames.simulator.run_of
+
+
+def made_together(frames: Frames, indices: Iterable[int], workers: int) -> Iterator[list[int]]:
     """Which frames a worker makes in a row: in traffic those of one world, so that only one worker builds it.
 
     Args:
         frames: Where they come from.
-        steps: How many there are.
+        indices: Which of them, in order.
         workers: Processes that make them.
     """
-    if workers < 2 or not isinstance(frames, SimulatedFrames) or frames.scenario.traffic is None:
-        yield from ([index] for index in range(steps))
+    world_of = _worlds(frames)
+    if workers < 2 or world_of is None:
+        yield from ([index] for index in indices)
         return
-    for _, of_world in groupby(range(steps), frames.simulator.run_of):
+    for _, of_world in groupby(indices, world_of):
         while together := list(islice(of_world, MOST_TOGETHER)):
             yield together
 
@@ -198,11 +251,11 @@ class _FramesOrErrors(Dataset[Frame | ValueError]):
             return copy
 
 
-def _each(frames: Frames, most: int, workers: int, run: Run, *, skip_bad_frames: bool) -> Iterator[Frame]:
+def _each(frames: Frames, indices: Iterable[int], workers: int, run: Run, *, skip_bad_frames: bool) -> Iterator[Frame]:
     """One frame at a time; notes bad ones if they are to be skipped."""
     loader = DataLoader(
         _FramesOrErrors(frames),
-        batch_sampler=made_together(frames, most, workers),
+        batch_sampler=made_together(frames, indices, workers),
         collate_fn=list,
         num_workers=workers,
         prefetch_factor=1 if workers else None,  # what is made ahead waits in shared memory

@@ -31,9 +31,10 @@ class Bar:
     Args:
         steps: Steps that the run is thought to have.
         title: What stands before it.
+        done: Steps that are done before.
     """
 
-    def __init__(self, steps: int, title: str) -> None:
+    def __init__(self, steps: int, title: str, done: int) -> None:
         # rich takes 0.1 s to import, which nobody should wait for who wants no bar.
         from rich.console import Console
         from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
@@ -49,7 +50,7 @@ class Bar:
             TextColumn("left"),
             console=Console(stderr=True),
         )
-        self._task = self.rich.add_task(title, total=steps, rate="", words="")
+        self._task = self.rich.add_task(title, total=steps, completed=done, rate="", words="")
 
     def advance(self, expected_steps: int, words: str = "") -> None:
         """Move on by a step."""
@@ -59,9 +60,9 @@ class Bar:
         self.rich.update(self._task, total=expected_steps, rate=rate, words=words)
 
 
-def progress_of(steps: int, title: str, *, shown: bool) -> AbstractContextManager[Progress]:
+def progress_of(steps: int, title: str, *, done: int = 0, shown: bool) -> AbstractContextManager[Progress]:
     """A bar on stderr (in a notebook: below the cell), or nothing."""
-    return _bar(steps, title) if shown else _silence()
+    return _bar(steps, title, done) if shown else _silence()
 
 
 @contextmanager
@@ -70,7 +71,7 @@ def _silence() -> Iterator[Progress]:
 
 
 @contextmanager
-def _bar(steps: int, title: str) -> Iterator[Progress]:
-    bar = Bar(steps, title)
+def _bar(steps: int, title: str, done: int) -> Iterator[Progress]:
+    bar = Bar(steps, title, done)
     with bar.rich:
         yield bar

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
 from torchcover.coverage.blocks import MIN_BLOCKS
+from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.omissions import Omission
 from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.result_files import ResultFiles
@@ -89,7 +90,7 @@ class Result:
     @property
     def target_lines(self) -> list[str]:
         """What was reached of the target error, in words."""
-        return outcome(self.target_error, self.coverages, self.regions)[1]
+        return self._outcome[1]
 
     @property
     def record(self) -> dict[str, Any]:
@@ -102,7 +103,7 @@ class Result:
             "torchcover": __version__,
             "device": self.device,
             **self._run_record,
-            "target_error": outcome(self.target_error, self.coverages, self.regions)[0],
+            "target_error": self._outcome[0],
             "measure": self._first.measure,
             **table_dict(self.table),
         }
@@ -140,11 +141,12 @@ class Result:
             if path.resolve().parent in (Path(folder).resolve(), Path(folder).resolve() / "coverage"):
                 raise ValueError(f"{folder}: holds {path}, which is compared, and would lose it; choose another folder")
         with ResultFiles(Path(folder)) as files:
-            for name, coverage in self._coverage_files.items():
-                files.add(name, coverage.save)
-            files.add("summary.csv", lambda path: path.write_text(RENDERERS["csv"](self.table), encoding="utf-8"))
-            record = self.record
-            files.publish(record)  # the numbers are safe before the maps, which take seconds, are drawn
+            with held_back():  # the numbers are safe before anything ends this, and before the maps are drawn
+                for name, coverage in self._coverage_files.items():
+                    files.add(name, coverage.save)
+                files.add("summary.csv", lambda path: path.write_text(RENDERERS["csv"](self.table), encoding="utf-8"))
+                record = self.record
+                files.publish(record)
             for stem, figure in self.maps(errors=error_maps):
                 files.add(f"maps/{stem}.png", partial(_draw, figure))
             files.publish(record)
@@ -157,6 +159,11 @@ class Result:
             return {"coverage.npz": self.coverage}
         stems = file_stems(list(self.coverages))
         return {f"coverage/{stem}.npz": coverage for stem, coverage in zip(stems, self.coverages.values(), strict=True)}
+
+    @property
+    def _outcome(self) -> tuple[dict[str, Any] | None, list[str]]:
+        confirmed = self.run is not None and self.run.reached
+        return outcome(self.target_error, self.coverages, self.regions, confirmed=confirmed)
 
     @property
     def _first(self) -> Coverage:
@@ -182,27 +189,27 @@ class Result:
     @property
     def _notes(self) -> list[str]:
         """What ended the run before its time, and the reference sensor in words, for a caption."""
-        record = self._reference_used
+        record, on_failure = self._reference_used, [self.cut_short] if self.cut_short else []
         if record is None:
-            return self._on_failure
+            return on_failure
         if "every_s" not in record:
-            return [*self._on_failure, *record["notes"]]
+            return [*on_failure, *record["notes"]]
         rays, every_s = record["rays_per_step"], record["every_s"]
         sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
-        return [*self._on_failure, sensor, *self._on_repetitions]
+        return [*on_failure, sensor, *self._on_repetitions]
 
     @property
-    def _on_failure(self) -> list[str]:
-        """That the run was cut short and why; nothing where it was not."""
+    def cut_short(self) -> str:
+        """That the run was cut short, after how many steps, and why; no words where it was not."""
         failure = None if self.run is None else self.run.failure
         if failure is None:
-            return []
+            return ""
         steps = self._first.counts["steps"]
         after = f"The run was cut short after {steps:,} step{'s' * (steps != 1)}"
         if isinstance(failure, KeyboardInterrupt):
-            return [f"{after}: interrupted."]
+            return f"{after}: interrupted."
         reason = ": ".join([type(failure).__name__, *str(failure).strip().splitlines()[:1]])
-        return [f"{after}: {reason.rstrip('.')}."]
+        return f"{after}: {reason.rstrip('.')}."
 
     @property
     def _on_repetitions(self) -> list[str]:

@@ -12,6 +12,8 @@ from typing import Any, Self
 
 from filelock import FileLock, Timeout
 
+from torchcover.evaluation.interrupt import held_back
+
 # Written last, and taken away first: without it the folder is not complete.
 SUMMARY = "summary.json"
 LOCK = ".lock"
@@ -89,18 +91,22 @@ class ResultFiles:
     def publish(self, record: Mapping[str, Any]) -> None:
         """Put what was added in its place, last `summary.json`: the record, and the names of all files of this run."""
         earlier = {self.folder / name for name in _listed(self.folder / SUMMARY)}
-        paths = [path for path in self.paths if path.name != SUMMARY] + [self.folder / name for name in self._written]
+        new = [self.folder / name for name in self._written]
+        paths = [path for path in self.paths if path.name != SUMMARY] + new
         names = [path.relative_to(self.folder).as_posix() for path in paths]
         text = json.dumps({**record, "files": names}, indent=2, allow_nan=False) + "\n"
         (self._aside / SUMMARY).write_text(text, encoding="utf-8")
-        (self.folder / SUMMARY).unlink(missing_ok=True)
-        for name in self._written:
-            (self.folder / name).parent.mkdir(exist_ok=True)
-            os.replace(self._aside / name, self.folder / name)
-        for path in earlier.difference(paths):
-            if path.is_file():
-                path.unlink()
-        os.replace(self._aside / SUMMARY, self.folder / SUMMARY)
+        only_adds = bool(self.paths) and set(self.paths).isdisjoint(new)  # what is listed already stays as it is
+        with held_back():
+            if not only_adds:
+                (self.folder / SUMMARY).unlink(missing_ok=True)
+            for name, path in zip(self._written, new, strict=True):
+                path.parent.mkdir(exist_ok=True)
+                os.replace(self._aside / name, path)
+            for path in earlier.difference(paths):
+                if path.is_file():
+                    path.unlink()
+            os.replace(self._aside / SUMMARY, self.folder / SUMMARY)
         self.paths, self._written = [*paths, self.folder / SUMMARY], []
 
     def __exit__(

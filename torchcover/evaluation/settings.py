@@ -110,7 +110,7 @@ class Settings:
         """
         if self.estimate == "area" and weight_kind != "m2":
             raise ValueError(
-                "estimate area: it needs the square metres of reference points, which only the surface reference of a "
+                "estimate area: it needs the square metres of reference points, which the surface reference of a "
                 "simulation gives; leave it out for means over the known cells"
             )
         return new_metric(
@@ -161,6 +161,7 @@ def new_metric(
         blocks=blocks,
         aggregations=aggregations,
         square_metres=square_metres,
+        sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
     )
     try:
         with torch.device("meta"):  # where tensors have a size and take no memory

@@ -13,7 +13,7 @@ from torchcover.simulation import Scenario
 # The long run's seed is far away from any other.
 LONG_RUN_SEED = 1_000_003
 # What runs have reached is looked at after these steps at the least, then after twice as many, ...
-DOUBLINGS = 5
+DOUBLINGS = 4
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,11 @@ class StudyPlan:
 
     rig: str | Path
     scenario: str | Path = DEFAULT_SCENARIO
-    rays: tuple[int, ...] = (1024, 4096, 16_384, 65_536)
-    steps: int = 256
+    rays: tuple[int, ...] = (1024, 4096, 16_384)
+    steps: int = 128
     runs: int = 2
     long_run: Path | None = None
-    long_run_steps: int = 1024
+    long_run_steps: int = 512
     every_s: float | None = None
     seed: int = 0
     cell_m: float = 0.25

@@ -3,7 +3,8 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from torchcover.coverage import Coverage, Region
 from torchcover.evaluation.observers import Observer
@@ -184,6 +185,19 @@ class TargetWatch:
         needed = math.inf if self.worst is None else self.worst.steps_needed or math.inf
         self.next_look = math.ceil(min(max(needed, MIN_GROWTH * steps), MAX_GROWTH * steps))
         return False
+
+    def state_dict(self) -> dict[str, Any]:
+        """When it looks again, and what the last looks said."""
+        return {
+            "next_look": self.next_look,
+            "good_looks": self._good_looks,
+            "worst": None if self.worst is None else asdict(self.worst),
+        }
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on as another one would have."""
+        self.next_look, self._good_looks = state_dict["next_look"], state_dict["good_looks"]
+        self.worst = None if state_dict["worst"] is None else Standing(**state_dict["worst"])
 
     def expected_steps(self, most: int) -> int:
         """Steps that the run is thought to take, of so many at most."""

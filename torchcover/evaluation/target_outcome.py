@@ -11,7 +11,7 @@ from torchcover.report import json_record
 
 
 def outcome(
-    target: TargetError | None, coverages: Mapping[str, Coverage], regions: Sequence[Region]
+    target: TargetError | None, coverages: Mapping[str, Coverage], regions: Sequence[Region], *, confirmed: bool
 ) -> tuple[dict[str, Any] | None, list[str]]:
     """What was aimed at and what was reached at the end of a run.
 
@@ -19,6 +19,7 @@ def outcome(
         target: What is good enough; None if nothing was aimed at.
         coverages: As in `standings`.
         regions: Regions within the grid.
+        confirmed: Whether the run has ended because every number was good enough at two looks in a row.
 
     Returns:
         A record for `summary.json`, with errors in metres or as shares, and lines for the terminal.
@@ -27,10 +28,10 @@ def outcome(
         return None, []
     found, first = standings(target, coverages, regions), next(iter(coverages.values()))
     blank = [f"{row.region} {row.height}" for row in first.summary(regions) if not row.known_cells]
-    lines = _lines(found, first.counts["steps"])
+    lines = _lines(found, first.counts["steps"], confirmed=confirmed)
     if blank:
         lines.append(f"Not waited for, as no cell of it is known: {', '.join(blank)}.")
-    return _record(target, found) | {"unknown": blank}, lines
+    return {**_record(target, found), "reached": confirmed, "unknown": blank}, lines
 
 
 def _record(target: TargetError, found: Sequence[Standing]) -> dict[str, Any]:
@@ -42,19 +43,21 @@ def _record(target: TargetError, found: Sequence[Standing]) -> dict[str, Any]:
         numbers.append(json_record({**record, "reached": standing.reached, "steps_needed": steps}))
     return {
         **asdict(target),
-        "reached": bool(found) and all(standing.reached for standing in found),
         "steps_needed": max(known) if known and len(known) == len(needed) else None,
         "numbers": numbers,
     }
 
 
-def _lines(found: Sequence[Standing], steps: int) -> list[str]:
+def _lines(found: Sequence[Standing], steps: int, *, confirmed: bool) -> list[str]:
     """That it was reached, or the worst number of each region and band and what it would take."""
     if not found:
         return ["Target error not reached: no region has a known cell."]
-    if all(standing.reached for standing in found):
+    if confirmed:
         return [f"Target error reached after {steps:,} steps."]
-    lines = [f"Target error not reached in {steps:,} step{'s' * (steps != 1)}; the largest of each region:"]
+    after = f"Target error not reached in {steps:,} step{'s' * (steps != 1)}"
+    if all(standing.reached for standing in found):
+        return [f"{after}: every error is small enough now, but was not at two looks in a row; take more steps."]
+    lines = [f"{after}; the largest of each region:"]
     for (region, height), group in groupby(found, key=lambda standing: (standing.region, standing.height)):
         worst = max(group, key=lambda standing: standing.excess)
         where = f"  {region} {height}, {worst.quantity} of {worst.rig}"

@@ -2,7 +2,8 @@
 
 from torchcover.files.bad_file import BadFileError, naming, reads
 from torchcover.files.budget import TooLargeError, check_memory
-from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, read_npy, read_npz, write_npz
+from torchcover.files.durable import write_durably
+from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, npz_headers, read_npy, read_npz, write_npz
 from torchcover.files.text import decode, read_short_text
 from torchcover.files.yaml_text import parse_yaml
 
@@ -14,10 +15,12 @@ __all__ = [
     "check_memory",
     "decode",
     "naming",
+    "npz_headers",
     "parse_yaml",
     "read_npy",
     "read_npz",
     "read_short_text",
     "reads",
+    "write_durably",
     "write_npz",
 ]

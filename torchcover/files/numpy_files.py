@@ -4,7 +4,7 @@ import math
 import warnings
 import zipfile
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -89,6 +89,20 @@ def read_npz(
         raise
     except Exception as error:
         raise ValueError(f"not a readable .npz archive ({error})") from error
+
+
+def npz_headers(path: Path) -> dict[str, NpyHeader]:
+    """What the arrays of a `.npz` are, unread; members that are no arrays are left out.
+
+    Raises:
+        ValueError: Not such an archive, or a damaged one.
+    """
+    found = {}
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.infolist():
+            with archive.open(member) as stream, suppress(ValueError):
+                found[member.filename.removesuffix(".npy")] = _npy_header(stream)
+    return found
 
 
 def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:

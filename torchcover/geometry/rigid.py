@@ -118,6 +118,30 @@ def rotation_from_quaternion(wxyz: ArrayLike) -> Matrix:
     )
 
 
+def quaternion_from_rotation(rotation: Matrix) -> Matrix:
+    """(w, x, y, z) of a rotation matrix, w not negative; the inverse of `rotation_from_quaternion`.
+
+    Of the symmetric matrix that a rotation makes of its quaternion it is the eigenvector with the largest eigenvalue
+    (Bar-Itzhack 2000), which no rotation makes inexact.
+
+    Example:
+        >>> quaternion_from_rotation(rotation_from_euler(90.0, 0.0, 0.0)).round(6)
+        array([0.707107, 0.      , 0.      , 0.707107])
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = rotation
+    matrix = np.array(
+        [
+            [xx + yy + zz, zy - yz, xz - zx, yx - xy],
+            [zy - yz, xx - yy - zz, xy + yx, xz + zx],
+            [xz - zx, xy + yx, yy - xx - zz, yz + zy],
+            [yx - xy, xz + zx, yz + zy, zz - xx - yy],
+        ]
+    )
+    wxyz = np.linalg.eigh(matrix)[1][:, -1]
+    found: Matrix = np.copysign(1.0, wxyz[0]) * wxyz + 0.0  # no -0
+    return found
+
+
 def check_rigid(matrix: ArrayLike, name: str) -> Matrix:
     """Return `matrix` as float64 if it is a rigid transform, else say by how much it is not.
 

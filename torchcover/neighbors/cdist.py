@@ -28,7 +28,8 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
         (N,) int64 indices into `points`.
     """
     budget = int(memory_mb * 1e6) // query.element_size()
-    if _matrix_product_is_exact_enough(query) and budget >= 4 * TILE:
+    # Fewer points than a block are compared faster than screened: a block is filled up.
+    if len(points) >= BLOCK and _matrix_product_is_exact_enough(query) and budget >= 4 * TILE:
         return _search_by_screening(query, points, budget)
     return _search_by_differences(query, points, budget)
 

@@ -1,27 +1,15 @@
 """The blind spot radius, and the exact nearest-neighbour search beneath it."""
 
 import math
-from collections.abc import Callable
-from importlib import import_module
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-# backend -> its module; imported when first used, so that an unused library costs nothing.
-BACKENDS = {
-    "cdist": "torchcover.neighbors.cdist",
-    "kdtree": "torchcover.neighbors.kdtree",
-}
+from torchcover.neighbors.choice import choose_search
 
-# On the CPU brute force beats the tree only for few queries against many points, where building it does not pay
-# (docs/measured/performance.md, crossover).
-MAX_QUERIES_COMPARED = 16
-MANY_POINTS = 10_000
 # Queries that are measured together on a CPU.
 PART = 32_768
-
-Search = Callable[[Tensor, Tensor, float, float], Tensor]
 
 
 class Nearest(NamedTuple):
@@ -84,6 +72,7 @@ def nearest(
     once. So backends agree to the last bits, and gradients flow to both inputs whichever backend was used.
 
     * Ties: any one of the points at the same distance; which one depends on the backend, the distance does not.
+      "packets" names the smallest index among those at the same distance in float32.
     * `max_distance` is inclusive, and compared after rounding it to the type of the distance.
     * float16 and bfloat16 coordinates are widened to float32 (exactly), mixed types to the wider one.
     * At distance 0 the gradient is taken as 0.
@@ -94,7 +83,8 @@ def nearest(
         query: (N, 3) floating-point coordinates, any strides, any device.
         points: (M, 3) floating-point coordinates on the same device. M = 0 is allowed.
         max_distance: Only points within this distance count. A finite value makes the search faster.
-        backend: "cdist" (any device), "kdtree" (CPU) or "auto" (by device and size).
+        backend: "cdist" (any device), "kdtree" (CPU), "packets" (CPU, float32; needs `torchcover[fast]`; wider types
+            are left to the KD-tree) or "auto" (by device, type and size; packets only where numba is installed).
         memory_mb: Most memory in megabytes that "cdist" may use for the pairs under comparison, beside a few arrays as
             long as the clouds.
 
@@ -104,8 +94,9 @@ def nearest(
 
     Raises:
         ValueError: A shape other than (N, 3); NaN or infinite coordinates; two devices; a negative or NaN
-            `max_distance`; an unknown backend, or "kdtree" for tensors that are not on the CPU.
+            `max_distance`; an unknown backend, or one for the CPU with tensors that are not there.
         TypeError: An input is not a tensor of a floating-point type.
+        ImportError: "packets" without numba.
 
     Example:
         >>> points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
@@ -119,7 +110,7 @@ def nearest(
 
 def _nearest(query: Tensor, points: Tensor, max_distance: float, backend: str, memory_mb: float) -> Nearest:
     query, points = _check_together(query, points, max_distance, memory_mb)
-    search = _choose_search(query, points, backend)
+    search = choose_search(query, points, backend)
     if len(query) == 0 or len(points) == 0:
         index = torch.full((len(query),), -1, dtype=torch.int64, device=query.device)
     else:
@@ -160,19 +151,6 @@ def _check_together(query: Tensor, points: Tensor, max_distance: float, memory_m
         raise ValueError(f"memory_mb: a positive number of megabytes is needed; got {memory_mb}")
     common = torch.promote_types(torch.promote_types(query.dtype, points.dtype), torch.float32)
     return query.to(common), points.to(common)
-
-
-def _choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
-    on_cpu = query.device.type == "cpu"
-    if backend == "auto":
-        tree_pays = len(query) > MAX_QUERIES_COMPARED or len(points) < MANY_POINTS
-        backend = "kdtree" if on_cpu and tree_pays else "cdist"
-    if backend not in BACKENDS:
-        raise ValueError(f"backend: one of {', '.join(['auto', *BACKENDS])} is needed; got {backend!r}")
-    if backend == "kdtree" and not on_cpu:
-        raise ValueError(f"backend 'kdtree' runs on the CPU; the clouds are on {query.device}: use 'cdist' or 'auto'")
-    search: Search = import_module(BACKENDS[backend]).search
-    return search
 
 
 def _rescale(query: Tensor, points: Tensor, max_distance: float) -> tuple[Tensor, Tensor, float]:

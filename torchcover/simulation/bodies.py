@@ -1,6 +1,6 @@
 """Bodies: shapes at places, and vehicles put together from them."""
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -24,6 +24,10 @@ class VehicleShape(Document):
     def mesh(self) -> Mesh:
         """All parts in one mesh, in the vehicle frame."""
         return load_document(Vehicle, "vehicles", self.vehicle).mesh()
+
+    def content(self) -> dict[str, Any]:
+        """Its parts, wherever they stand."""
+        return load_document(Vehicle, "vehicles", self.vehicle).content()
 
 
 Shape = Annotated[

@@ -1,5 +1,6 @@
 """YAML documents: typed, without unknown keys, found by path or by built-in name."""
 
+import hashlib
 from collections.abc import Sequence
 from itertools import islice
 from pathlib import Path
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
 from pydantic_core import ErrorDetails
 
-from torchcover.files import parse_yaml
+from torchcover.files import BadFileError, parse_yaml, read_short_text, reads
 from torchcover.geometry import rigid, rotation_from_euler, rotation_from_quaternion
 from torchcover.simulation.builtin import builtin_folder, builtin_names
 
@@ -38,6 +39,18 @@ class Document(BaseModel):
         if not isinstance(content, dict):
             return content
         return {key: _kept(value) for key, value in content.items()}
+
+    def content(self) -> dict[str, Any]:
+        """All that it means to a simulation, for JSON: its keys, and hashes of the files that they name.
+
+        Raises:
+            FileNotFoundError: A file is missing.
+
+        Example:
+            >>> Pose(x_m=1.5).content()["x_m"]
+            1.5
+        """
+        return {name: _content(getattr(self, name)) for name in type(self).model_fields if name != "description"}
 
 
 # Farther away rays know no place any more.
@@ -103,22 +116,30 @@ def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -
 
     Raises:
         FileNotFoundError: No such file, or no built-in document of this name; the message lists the names.
-        ValueError: Not YAML, or a key is unknown, missing, doubled or has a wrong value; the message names the file and
-            the key.
+        BadFileError: Not YAML, or a key is unknown, missing, doubled or has a wrong value; the message names the file
+            and the key.
     """
     path = _find(kind, path_or_name)
-    try:
-        content = parse_yaml(path.read_text(encoding="utf-8"))
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: not a YAML file: {error}") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"{path}: a YAML mapping of keys is needed; got {type(content).__name__}")
+    content = read_mapping(path)
     try:
         return model.model_validate(content, context={"folder": path.parent})
     except ValidationError as error:
-        raise ValueError(f"{path}: {explain(error)}") from error
+        raise BadFileError(f"{path}: {explain(error)}") from error
+
+
+@reads("a YAML document")
+def read_mapping(path: Path) -> dict[str, Any]:
+    """The keys of a YAML file and what they hold.
+
+    Raises:
+        FileNotFoundError: No such file.
+        IsADirectoryError: A folder.
+        BadFileError: Not YAML, or no mapping.
+    """
+    content = parse_yaml(read_short_text(path))
+    if not isinstance(content, dict):
+        raise ValueError(f"a YAML mapping of keys is needed; got {type(content).__name__}")
+    return content
 
 
 def explain(error: ValidationError) -> str:
@@ -159,8 +180,6 @@ PathBeside = Annotated[Path, BeforeValidator(_beside)]
 def _find(kind: str, path_or_name: str | Path) -> Path:
     path = Path(path_or_name)
     if path.suffix in (".yaml", ".yml"):
-        if not path.is_file():
-            raise FileNotFoundError(f"{path}: no such file")
         return path
     builtin = builtin_folder(kind) / f"{path_or_name}.yaml"
     if path.name != str(path_or_name) or not builtin.is_file():
@@ -169,6 +188,25 @@ def _find(kind: str, path_or_name: str | Path) -> Path:
             f"{', '.join(builtin_names(kind))}"
         )
     return builtin
+
+
+def builtin_hashes(kind: str) -> dict[str, str]:
+    """The hash of every built-in document of a kind, by its name."""
+    return {path.stem: file_hash(path) for path in sorted(builtin_folder(kind).glob("*.yaml"))}
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 of what is in a file."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _content(value: Any) -> Any:  # noqa: ANN401  (whatever a document holds)
+    if isinstance(value, Document):
+        return value.content()
+    if isinstance(value, Path):
+        return file_hash(value)
+    return list(map(_content, value)) if isinstance(value, tuple | list) else value
 
 
 def _shorten(value: Any) -> str:  # noqa: ANN401  (whatever stood in the file)

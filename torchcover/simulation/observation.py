@@ -19,6 +19,7 @@ class Observation:
 
     Args:
         clouds: Name of each rig -> (N, 3) float32 points of all its sensors, in their order.
+        sensor_points: Name of each rig -> how many of its points are of each of its sensors.
         reference: (M, 3) float32 points of the reference sensor.
         reference_weights: (M,) float32 weight of each of them; None if they weigh the same.
         weight_kind: What the weights are, from `ReferenceScan`.
@@ -27,6 +28,7 @@ class Observation:
     """
 
     clouds: Mapping[str, Float32]
+    sensor_points: Mapping[str, Sequence[int]]
     reference: Float32
     reference_weights: Float32 | None
     weight_kind: WeightKind | None

@@ -1,12 +1,14 @@
 """Shapes: primitives, and meshes from files."""
 
 import warnings
+from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat
 
+from torchcover.files import check_memory, reads
 from torchcover.geometry import transform
 from torchcover.simulation.documents import Document, PathBeside
 
@@ -16,6 +18,9 @@ ELLIPSOID_SIDES = 12  # around the z axis; half as many bands from pole to pole
 # Nothing on a road is longer; no building, and no terrain within a sensor's range, is higher.
 MAX_VEHICLE_LENGTH_M = 100.0
 TALLEST_SCENERY_M = 1000.0
+
+# What trimesh takes for each byte of a mesh's file at most: text becomes lists of words.
+_BYTES_PER_FILE_BYTE = 16
 
 Length = PositiveFloat
 
@@ -144,23 +149,10 @@ class MeshFile(Document):
 
         Raises:
             FileNotFoundError: No such file.
-            ValueError: trimesh cannot read it, it has no faces, or a vertex is NaN or infinite.
+            IsADirectoryError: A folder.
+            BadFileError: trimesh cannot read it, it has no faces, a vertex is NaN or infinite, or it is too large.
         """
-        import trimesh
-
-        if not self.path.is_file():
-            raise FileNotFoundError(f"{self.path}: no such mesh file")
-        try:
-            loaded = trimesh.load_mesh(self.path, process=False)
-        except Exception as error:  # trimesh raises whatever the reader of the format raises
-            raise ValueError(f"{self.path}: trimesh cannot read it as a mesh ({error})") from error
-        vertices = np.asarray(getattr(loaded, "vertices", ()), dtype=np.float64)
-        faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64)
-        if len(faces) == 0:
-            raise ValueError(f"{self.path}: a mesh with faces is needed; it has {len(vertices)} vertices and no face")
-        if not np.isfinite(vertices).all():
-            bad = int((~np.isfinite(vertices)).any(axis=1).sum())
-            raise ValueError(f"{self.path}: {bad} of {len(vertices)} vertices are NaN or infinite")
+        vertices, faces = _read_mesh(self.path)
         if openings := _open_edges(vertices, faces):
             warnings.warn(
                 f"{self.path}: the mesh is not closed ({openings} edges have a face on one side only): rays pass "
@@ -169,6 +161,28 @@ class MeshFile(Document):
                 stacklevel=2,
             )
         return Mesh(vertices * self.metres_per_unit, faces)
+
+
+@reads("a mesh")
+def _read_mesh(path: Path) -> Mesh:
+    """All geometry of a file, in its own unit."""
+    import trimesh
+
+    check_memory(_BYTES_PER_FILE_BYTE * path.stat().st_size)
+    try:
+        loaded = trimesh.load_mesh(path, process=False)
+    except Exception as error:  # trimesh raises whatever the reader of the format raises
+        raise ValueError(f"trimesh cannot read it as a mesh ({error})") from error
+    vertices = np.asarray(getattr(loaded, "vertices", ()), dtype=np.float64)
+    faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64)
+    if len(faces) == 0:
+        raise ValueError(f"a mesh with faces is needed; it has {len(vertices)} vertices and no face")
+    if not np.isfinite(vertices).all():
+        bad = int((~np.isfinite(vertices)).any(axis=1).sum())
+        raise ValueError(f"{bad} of {len(vertices)} vertices are NaN or infinite")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ValueError(f"faces have vertices {faces.min()} to {faces.max()}; there are {len(vertices)}")
+    return Mesh(vertices, faces)
 
 
 def warn_of_units(owner: str, mesh: Mesh, *, moves: bool) -> None:

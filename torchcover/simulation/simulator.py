@@ -120,6 +120,7 @@ class Simulator:
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
         return Observation(
             clouds={name: np.concatenate([scan.points for scan in of_rig]) for name, of_rig in scans.items()},
+            sensor_points={name: [len(scan.points) for scan in of_rig] for name, of_rig in scans.items()},
             reference=reference.points,
             reference_weights=reference.weights,
             weight_kind=reference.weight_kind,

@@ -1,12 +1,14 @@
 """Trajectories and actors from files."""
 
 import csv
-from collections.abc import Sequence
+import io
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.files import NpyHeader, check_memory, decode, read_npz, reads
 from torchcover.geometry import check_rigid
 from torchcover.simulation.shapes import Box, Mesh
 from torchcover.simulation.trajectory import Trajectory
@@ -14,10 +16,13 @@ from torchcover.simulation.world import Actor
 
 TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")
 BOX_COLUMNS = ("t", "id", "category", "x", "y", "z", "length", "width", "height", "yaw")
+# Text as Python keeps it: a dict of strings for each row.
+_BYTES_PER_CHARACTER = 64
 # A step this many times longer than the usual one means that poses are missing.
 MAX_STEP = 5.0
 
 
+@reads("a trajectory")
 def read_trajectory(path: Path) -> Trajectory:
     """Read a trajectory.
 
@@ -30,22 +35,19 @@ def read_trajectory(path: Path) -> Trajectory:
 
     Raises:
         FileNotFoundError: No such file.
-        ValueError: Another suffix, missing columns, what is no number, NaN, times that do not ascend, a gap in time,
-            or a pose that is not a rigid transform; the message names the file.
+        IsADirectoryError: A folder.
+        BadFileError: Another suffix, missing columns, what is no number, NaN, times that do not ascend, a gap in time,
+            a pose that is not a rigid transform, or damage; the message names the file.
     """
     readers = {".csv": _read_csv, ".npz": _read_npz}
     if path.suffix not in readers:
-        raise ValueError(f"{path}: a trajectory is a .csv or .npz file; got {path.suffix or 'no suffix'}")
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such trajectory file")
-    try:
-        trajectory = readers[path.suffix](path)
-        _check_gaps(trajectory.times_s)
-    except (ValueError, KeyError, OSError) as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"a trajectory is a .csv or .npz file; got {path.suffix or 'no suffix'}")
+    trajectory = readers[path.suffix](path)
+    _check_gaps(trajectory.times_s)
     return trajectory
 
 
+@reads("a file of boxes")
 def read_boxes(path: Path) -> tuple[Actor, ...]:
     """Read recorded boxes as actors, one for each id: the box of its first size, there between its first and last time.
 
@@ -58,17 +60,13 @@ def read_boxes(path: Path) -> tuple[Actor, ...]:
 
     Raises:
         FileNotFoundError: No such file.
-        ValueError: As `read_trajectory`, or a box without volume; the message names the file and the id.
+        IsADirectoryError: A folder.
+        BadFileError: As `read_trajectory`, or a box without volume; the message names the file and the id.
     """
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file of boxes")
     rows: dict[str, list[dict[str, str]]] = {}
-    try:
-        for row in _rows(path, BOX_COLUMNS):
-            rows.setdefault(row["id"], []).append(row)
-        return tuple(_box_actor(name, track) for name, track in rows.items())
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+    for row in _rows(path, BOX_COLUMNS):
+        rows.setdefault(row["id"], []).append(row)
+    return tuple(_box_actor(name, track) for name, track in rows.items())
 
 
 def _read_csv(path: Path) -> Trajectory:
@@ -78,23 +76,36 @@ def _read_csv(path: Path) -> Trajectory:
 
 
 def _read_npz(path: Path) -> Trajectory:
-    with np.load(path, allow_pickle=False) as file:
-        missing = {"times_s", "world_T_body"} - set(file.files)
-        if missing:
-            raise ValueError(f"needs the arrays times_s and world_T_body; got {', '.join(file.files) or 'none'}")
-        times_s, poses = file["times_s"], file["world_T_body"]
+    wanted = ("times_s", "world_T_body")
+
+    def check(header: NpyHeader) -> None:
+        if header.dtype.kind not in "fiu":
+            raise ValueError(f"times and poses are integers or floats; got {header.dtype}")
+
+    def choose(names: Collection[str]) -> Collection[str]:
+        if not set(wanted).issubset(names):
+            raise ValueError(f"needs the arrays {' and '.join(wanted)}; got {', '.join(names) or 'none'}")
+        return wanted
+
+    times_s, poses = read_npz(path, check, choose).values()
+    if times_s.ndim != 1 or poses.shape != (len(times_s), 4, 4):
+        raise ValueError(f"times_s (K,) and world_T_body (K, 4, 4) are needed; got {times_s.shape} and {poses.shape}")
     return Trajectory.from_poses(times_s, np.stack([check_rigid(pose, f"pose {k}") for k, pose in enumerate(poses)]))
 
 
 def _rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file, skipinitialspace=True)
-        names = [name.strip() for name in reader.fieldnames or ()]
-        missing = [column for column in columns if column not in names]
-        if missing:
-            raise ValueError(f"needs the columns {', '.join(columns)}; {', '.join(missing)} missing")
-        reader.fieldnames = names
-        rows = list(reader)
+    check_memory(_BYTES_PER_CHARACTER * path.stat().st_size)
+    reader = csv.DictReader(io.StringIO(decode(path.read_bytes()), newline=""), skipinitialspace=True)
+    names = [name.strip() for name in reader.fieldnames or ()]
+    missing = [column for column in columns if column not in names]
+    if missing:
+        raise ValueError(f"needs the columns {', '.join(columns)}; {', '.join(missing)} missing")
+    reader.fieldnames = names
+    rows: list[dict[str, str]] = []
+    for row in reader:
+        if None in row or None in row.values():
+            raise ValueError(f"line {reader.line_num}: not {len(names)} values, as the header has")
+        rows.append(row)
     if not rows:
         raise ValueError("holds no row")
     return rows

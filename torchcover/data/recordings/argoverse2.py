@@ -44,6 +44,8 @@ class Argoverse2:
     layout: ClassVar[str] = "sensors/lidar/TIME.feather, city_SE3_egovehicle.feather"
     sensors = tuple(LASERS)
     reference_sensors = ()
+    weight_kind = None
+    instants = None
     body = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:

@@ -1,7 +1,7 @@
 """Files of frames in a folder: one a frame, in natural order."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 
 from torchcover.data.clouds import READERS, split_name
@@ -9,12 +9,13 @@ from torchcover.data.clouds import READERS, split_name
 MAX_NAMES_SHOWN = 5
 
 
-def frame_files(folder: Path, like: Sequence[str] | None = None) -> dict[str, Path]:
+def frame_files(folder: Path, like: Sequence[str] | None = None, beside: Collection[str] = ()) -> dict[str, Path]:
     """The clouds in a folder by the names of their frames, in natural order (frame2 before frame10).
 
     Args:
         folder: Where they are.
         like: Names that there have to be, and no others.
+        beside: Names of files that may be there and are no clouds.
 
     Raises:
         FileNotFoundError: No such folder.
@@ -24,7 +25,7 @@ def frame_files(folder: Path, like: Sequence[str] | None = None) -> dict[str, Pa
         raise FileNotFoundError(f"{folder}: no such folder; clouds are needed in it, one a frame")
     clouds: dict[str, Path] = {}
     for path in sorted(folder.iterdir()):
-        if path.name.startswith("."):  # what file managers and version control leave behind
+        if path.name in beside or path.name.startswith("."):  # what file managers and version control leave behind
             continue
         name, suffix = split_name(path.name)
         if not suffix or path.is_dir():
@@ -48,7 +49,7 @@ def check_same_names(folder: Path, files: Mapping[str, Mapping[str, object]]) ->
     if not anywhere:
         raise ValueError(f"{folder}: no frames; {places} are empty")
     complaints = [
-        f"{len(gaps)} missing in {place}/ ({_some_of(gaps)})"
+        f"{len(gaps)} missing in {place}/ ({some_of(gaps)})"
         for place, clouds in files.items()
         if (gaps := sorted(anywhere - clouds.keys(), key=natural))
     ]
@@ -63,5 +64,6 @@ def natural(name: str) -> tuple[list[str | int], str]:
     return [int(part) if position % 2 else part for position, part in enumerate(parts)], name
 
 
-def _some_of(names: Sequence[str]) -> str:
+def some_of(names: Sequence[str]) -> str:
+    """The first of many names, for a message."""
     return ", ".join([*names[:MAX_NAMES_SHOWN], *["..."] * (len(names) > MAX_NAMES_SHOWN)])

@@ -37,6 +37,8 @@ class KittiObject:
     layout: ClassVar[str] = "velodyne/FRAME.bin, calib/FRAME.txt, label_2/FRAME.txt"
     sensors = ("velodyne",)
     times_s = None
+    weight_kind = None
+    instants = None
     body = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:

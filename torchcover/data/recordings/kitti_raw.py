@@ -42,6 +42,8 @@ class KittiRaw:
     layout: ClassVar[str] = "DATE/DRIVE/velodyne_points/data/FRAME.bin, oxts/data/FRAME.txt"
     sensors = ("velodyne",)
     reference_sensors = ()
+    weight_kind = None
+    instants = None
     body = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:

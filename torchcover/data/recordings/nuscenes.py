@@ -40,6 +40,8 @@ class NuScenes:
     layout: ClassVar[str] = "v1.0-*/*.json, samples/LIDAR_TOP, sweeps/LIDAR_TOP"
     sensors = (CHANNEL,)
     reference_sensors = ()
+    weight_kind = None
+    instants = None
     body = BODY
 
     def __init__(self, path: str | os.PathLike[str], scenes: Sequence[str] | None = None) -> None:

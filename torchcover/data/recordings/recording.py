@@ -12,6 +12,7 @@ from torchcover.data.formats.arrays import Points
 from torchcover.detection.boxes import Boxes
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix
+from torchcover.simulation import WeightKind
 
 
 @dataclass(frozen=True)
@@ -23,11 +24,15 @@ class Scan:
             returns that never came.
         vehicle_T_sensor: (4, 4) where the sensor was; None: the points are in the vehicle frame already.
         source: Where it was read from, for messages.
+        min_range_m: What is nearer to the sensor is a return that never came.
+        weights: (N,) what each point of a reference counts for, positive; None if all count the same.
     """
 
     points_m: Points
     vehicle_T_sensor: Matrix | None
     source: str
+    min_range_m: float = 0.0
+    weights: NDArray[np.float64] | None = None
 
 
 def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArray[np.float64]:
@@ -98,6 +103,16 @@ class Recording(Protocol):
     @property
     def body(self) -> BoundingBox | None:
         """The vehicle itself, in its own frame; None if nobody knows."""
+        ...
+
+    @property
+    def weight_kind(self) -> WeightKind | None:
+        """What the weights of the reference sensors' points are; None if they have none."""
+        ...
+
+    @property
+    def instants(self) -> Sequence[int] | None:
+        """`Frame.instant` of each instant, for standard errors; None: no two of them are known to be alike."""
         ...
 
     def scan(self, sensor: str, index: int, /) -> Scan:

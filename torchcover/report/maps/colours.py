@@ -199,6 +199,6 @@ def _draw_image(axes: Axes, array: NDArray[Any], **colours: Any) -> AxesImage:  
         extent=(*axes.get_xlim(), *axes.get_ylim()),
         origin="lower",
         aspect="equal",
-        interpolation="nearest" if larger_than_pixel else "auto",
+        interpolation="nearest" if larger_than_pixel else "antialiased",
         **colours,
     )

@@ -2,13 +2,13 @@
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from torchcover.simulation.documents import Document
+from torchcover.simulation.documents import Document, builtin_hashes
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
 from torchcover.simulation.world import Actor, World, steps_of
@@ -53,6 +53,10 @@ class Procedural(Document):
         times_s = self.time_step_s * np.arange(steps + 1, dtype=np.float64)
         static, driver, others = self._build(fleet, times_s, generator)
         return World(static, driver, others, self.time_step_s, self.duration_s, tuple(fleet.parked))
+
+    def content(self) -> dict[str, Any]:
+        """Its keys, and the vehicles that may be in it."""
+        return {**super().content(), "vehicles": builtin_hashes("vehicles")}
 
     @property
     def steps(self) -> int:

@@ -1,0 +1,204 @@
+"""How the cost of a run grows with rays, traffic, cells, steps, rigs and ranks, and what a thousand rigs would take.
+
+Processor seconds of one thread. A run takes
+
+    start + worlds * world + steps * (base + rays * ray + rigs * rig) + rigs * files
+
+each of which is measured, and the whole beside a run that none of them was measured in.
+"""
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.timing import table
+from torchcover.data import SimulatedFrames, reference_called
+from torchcover.evaluation import CoverageObserver
+from torchcover.evaluation.checkpoint_file import write_checkpoint
+from torchcover.evaluation.settings import new_metric
+from torchcover.evaluation.transport import packed
+from torchcover.simulation import Scenario
+
+RIG, SCENARIO, EVERY_S, STEPS_A_WORLD = "front_roof_128", "urban", 10.0, 6
+RAYS = (4096, 16_384, 65_536, 262_144)
+CELLS_M = (1.0, 0.5, 0.25)
+TRAFFIC = (5.0, 20.0, 80.0)  # vehicles to a kilometre of lane
+RIGS = (1, 2, 4, 8)
+# The run that is extrapolated to: as in the documentation.
+MANY_RIGS, MANY_SCENARIOS, STEPS = 1000, 100, 64
+RIGS_TOGETHER = 8
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--worlds", type=int, default=2, help="worlds of six steps each, for every row")
+    parser.add_argument("--ranks", action="store_true", help="wall times of ranks and workers too: on a quiet machine")
+    options = parser.parse_args([] if __name__ != "__main__" else None)
+    torch.set_num_threads(1)
+    steps = STEPS_A_WORLD * options.worlds
+    table(("traffic", "bodies that move", "triangles", "a world (s)", "a step (s)"), list(by_traffic(steps)))
+    of_rays = {rays: step_s(steps, rays=rays) for rays in RAYS}
+    print()
+    table(("rays of the reference", "a step (s)"), list(of_rays.items()))
+    of_rigs = {rigs: step_s(steps, rigs=rigs) for rigs in RIGS}
+    print()
+    table(("rigs in the same frames", "a step (s)", "a step and rig (s)"), [(n, s, s / n) for n, s in of_rigs.items()])
+    print()
+    table(("cell (m)", "cells", "a step (s)", "sums (MB)", "checkpoint (s)", "checkpoint (MB)", "to another rank (MB)"),
+          list(by_cells(steps)))  # fmt: skip
+    print()
+    table(("steps", "a step (s)"), [(n, step_s(n, rays=4096)) for n in (steps, 2 * steps, 4 * steps)])
+    cost = fitted(steps, of_rays, of_rigs)
+    print()
+    table(("part", "processor seconds"), list(cost.items()))
+    print()
+    table(("run", "steps", "formula (s)", "measured (s)"), [checked(cost, 24)])
+    print()
+    table(("run", "core hours"), extrapolated(cost))
+    if options.ranks:
+        print()
+        table(("processes", "wall (s)", "processor (s)"), list(by_processes()))
+
+
+def frames_of(steps, *, rays=16_384, rigs=1, scenario=SCENARIO):
+    rigs = {f"rig {number}": RIG for number in range(rigs)}
+    reference = reference_called(rays=rays)
+    return SimulatedFrames(scenario, rigs=rigs, steps=steps, every_s=EVERY_S, reference_sensor=reference)
+
+
+def observers_of(frames, cell_m=0.25):
+    return [
+        CoverageObserver(new_metric(cell_m, (0.4,), torch.device("cpu"), square_metres=True), name)
+        for name in frames.rigs
+    ]
+
+
+def times(steps, *, cell_m=0.25, **settings):
+    """Processor seconds of all worlds and of all steps."""
+    frames = frames_of(steps, **settings)
+    observers = observers_of(frames, cell_m)
+    worlds_s = steps_s = 0.0
+    for index in range(steps):
+        begin_s = time.process_time()
+        frames.simulator.scene_of(index)
+        built_s = time.process_time()
+        frame = frames[index]
+        for observer in observers:
+            observer.update(frame)
+        worlds_s, steps_s = worlds_s + built_s - begin_s, steps_s + time.process_time() - built_s
+    return worlds_s, steps_s, frames, observers
+
+
+def step_s(steps, **settings):
+    return times(steps, **settings)[1] / steps
+
+
+def by_traffic(steps):
+    scenario = Scenario.load(SCENARIO)
+    for vehicles in TRAFFIC:
+        traffic = scenario.traffic.model_copy(update={"traffic_per_km": vehicles})
+        worlds_s, steps_s, frames, _ = times(steps, scenario=scenario.model_copy(update={"traffic": traffic}))
+        world = frames.simulator.scene_of(0)[0].world
+        meshes = [*world.static, world.ego.mesh, *(actor.mesh for actor in world.actors)]
+        triangles = sum(len(mesh.faces) for mesh in meshes)
+        worlds = steps / STEPS_A_WORLD
+        yield f"{vehicles:g} vehicles/km", len(world.actors), triangles, worlds_s / worlds, steps_s / steps
+
+
+def by_cells(steps):
+    for cell_m in CELLS_M:
+        _, steps_s, _, (observer,) = times(steps, cell_m=cell_m)
+        state = observer.state_dict()
+        sums_mb = sum(tensor.nbytes for tensor in state.values() if isinstance(tensor, torch.Tensor)) / 1e6
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "checkpoint.npz"
+            begin_s = time.process_time()
+            write_checkpoint(path, {}, {"coverage": state})
+            taken_s = time.process_time() - begin_s
+            size_mb = path.stat().st_size / 1e6
+        grid = observer.metric.grid
+        yield cell_m, grid.cells, steps_s / steps, sums_mb, taken_s, size_mb, len(packed(observer)) / 1e6
+
+
+def fitted(steps, of_rays, of_rigs):
+    """The parts of the formula; slopes are least squares."""
+    worlds_s, *_ = times(steps)
+    ray_s, _ = np.polyfit(list(of_rays), list(of_rays.values()), 1)
+    rig_s, _ = np.polyfit(list(of_rigs), list(of_rigs.values()), 1)
+    base_s = of_rigs[1] - rig_s - 16_384 * ray_s
+    start_s, files_s = command_s(1), command_s(4)
+    one_s = worlds_s * STEPS_A_WORLD / steps + of_rigs[1]
+    files_each_s = max(0.0, (files_s - start_s) / 3 - rig_s)
+    return {
+        "start": start_s - one_s - files_each_s,
+        "world": worlds_s * STEPS_A_WORLD / steps,
+        "base": base_s,
+        "ray": ray_s,
+        "rig": rig_s,
+        "files": files_each_s,
+    }
+
+
+def command_s(rigs, steps=1):
+    """Processor seconds of a command from its start to its end."""
+    verb = ("evaluate", RIG) if rigs == 1 else ("compare", *([RIG] * rigs))
+    with tempfile.TemporaryDirectory() as out:
+        command = [sys.executable, "-m", "torchcover", *verb, "--scenario", SCENARIO, "--steps", str(steps)]
+        return ended([*command, "--out", out])[1]
+
+
+def ended(command):
+    """Wall and processor seconds of a command and its children, one thread each."""
+    before, begin_s = os.times(), time.perf_counter()
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment)
+    after = os.times()
+    used_s = after.children_user + after.children_system - before.children_user - before.children_system
+    return time.perf_counter() - begin_s, used_s
+
+
+def run_s(cost, rigs, steps, rays=16_384):
+    """The formula."""
+    worlds = -(-steps // STEPS_A_WORLD)
+    of_steps = steps * (cost["base"] + rays * cost["ray"] + rigs * cost["rig"])
+    return cost["start"] + worlds * cost["world"] + of_steps + rigs * cost["files"]
+
+
+def checked(cost, steps):
+    return f"evaluate {RIG} in {SCENARIO}", steps, run_s(cost, 1, steps), command_s(1, steps)
+
+
+def extrapolated(cost):
+    """Core hours of many rigs in many scenarios of this kind."""
+    alone = MANY_RIGS * MANY_SCENARIOS * run_s(cost, 1, STEPS)
+    together = MANY_RIGS / RIGS_TOGETHER * MANY_SCENARIOS * run_s(cost, RIGS_TOGETHER, STEPS)
+    what = f"{MANY_RIGS:,} rigs x {MANY_SCENARIOS} scenarios x {STEPS} steps"
+    return [
+        (f"{what}, `evaluate` of each", alone / 3600),
+        (f"{what}, `compare` of {RIGS_TOGETHER} at a time", together / 3600),
+    ]
+
+
+def by_processes(steps=48):
+    """Wall and processor time by the number of workers and of ranks."""
+    arguments = ["torchcover", "evaluate", RIG, "--scenario", SCENARIO, "--steps", str(steps)]
+    launch = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node"]
+    runs = {
+        "one": [sys.executable, "-m", *arguments],
+        "2 workers": [sys.executable, "-m", *arguments, "--workers", "2"],
+        "2 ranks": [*launch, "2", "-m", *arguments],
+    }
+    for name, command in runs.items():
+        with tempfile.TemporaryDirectory() as out:
+            yield name, *ended([*command, "--out", out])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""Packets beside pykdtree, and scipy, Open3D and nanoflann where installed: one thread each, trees built every time."""
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from pykdtree.kdtree import KDTree
+from scipy.spatial import cKDTree
+
+from benchmarks.timing import compare, table
+from torchcover import nearest
+from torchcover.data import SimulatedFrames
+from torchcover.simulation import PaperReference
+
+RIGS = (
+    "front_roof_128", "front_roof_32", "front_grille_128", "kitti", "nuscenes", "argoverse2", "edgar", "hu2022_center",
+    "place3d_line", "kitti_cameras",
+)  # fmt: skip
+SIZES = (10**3, 10**4, 10**5, 10**6, 10**7)
+MOST_QUERIES = 100_000
+SLOW = 500_000  # queries and points together: only pykdtree is compared, and fewer times
+RESULT = Path("out/benchmarks/search.json")
+
+
+def main():
+    """Print the table from a process in which every library has one thread; the figures go to `RESULT`, too."""
+    command = [sys.executable, "-m", "benchmarks.search"]
+    subprocess.run(command, env=os.environ | {"OMP_NUM_THREADS": "1"}, check=True)
+
+
+def measure():
+    """Ratios of processor time."""
+    torch.set_num_threads(1)
+    others = {"pykdtree": pykdtree, "scipy": scipy} | optional()
+    figures = []
+
+    def rows():
+        for name, query, points in cases():
+            few = len(query) + len(points) < SLOW
+            compared = others if few else {"pykdtree": pykdtree}
+            searches = [
+                lambda search=search, q=query, p=points: search(q, p) for search in (packets, *compared.values())
+            ]
+            seconds, ratios = compare(*searches, rounds=3 if few else 1, clock=time.process_time)
+            times = dict(zip(("packets", *compared), seconds, strict=True))
+            figures.append({"case": name, "queries": len(query), "points": len(points), "seconds": times})
+            faster = dict(zip(compared, ratios[1:], strict=True))
+            counts = f"{len(query):,}", f"{len(points):,}"
+            yield name, *counts, times["packets"], *(faster.get(other, "") for other in others)
+
+    table(("clouds", "queries", "points", "packets (s)", *(f"{other} / packets" for other in others)), rows())
+    RESULT.parent.mkdir(parents=True, exist_ok=True)
+    RESULT.write_text(json.dumps({"torch": torch.__version__, "threads": 1, "figures": figures}, indent=1))
+    print(f"\nAll figures: {RESULT}")
+
+
+def cases():
+    """Name, queries and points: rigs in `urban` under three references, random clouds, degenerate ones."""
+    references = {
+        "default": None,
+        "paper's, 256 x 256": PaperReference(rows=256, columns=256),
+        "paper's, 1024 x 1024": PaperReference(),
+    }
+    for name, sensor in references.items():
+        frame = SimulatedFrames("urban", rigs={rig: rig for rig in RIGS}, steps=1, reference_sensor=sensor)[0]
+        for rig in RIGS:
+            yield f"{rig}, {name}", frame.reference.numpy(), frame.cloud_of(rig).numpy()
+    random = np.random.default_rng(0)
+    for size in SIZES:
+        query, points = (random.uniform(-50, 50, (n, 3)).astype(np.float32) for n in (min(size, MOST_QUERIES), size))
+        yield "random", query, points
+    for count in (10**4, 10**5):
+        query, points = random.uniform(-80, 80, (2, count, 1)).astype(np.float32) * np.float32([0.8, 0.599, 0.03])
+        yield "on a line", query, points
+        yield "in a plane", *(random.uniform(-50, 50, (2, count, 3)).astype(np.float32) * np.float32([1, 1, 0]))
+        query = random.uniform(-50, 50, (count, 3)).astype(np.float32)
+        yield "far apart", query, random.permutation(query) + np.float32([1e4, 0, 0])
+
+
+def packets(query, points):
+    return nearest(torch.from_numpy(query), torch.from_numpy(points), backend="packets")
+
+
+def pykdtree(query, points):
+    return KDTree(points).query(query)
+
+
+def scipy(query, points):
+    return cKDTree(points).query(query)
+
+
+def optional():
+    """What is compared with where it is installed."""
+    found = {}
+    try:
+        import open3d
+
+        def open3d_search(query, points):
+            index = open3d.core.nns.NearestNeighborSearch(open3d.core.Tensor(np.ascontiguousarray(points)))
+            index.knn_index()
+            return index.knn_search(open3d.core.Tensor(query), 1)
+
+        found["Open3D"] = open3d_search
+    except ImportError:
+        pass
+    try:
+        import pynanoflann
+
+        def nanoflann_search(query, points):
+            index = pynanoflann.KDTree(n_neighbors=1, metric="L2", leaf_size=16)
+            index.fit(np.ascontiguousarray(points))
+            return index.kneighbors(query)
+
+        found["nanoflann"] = nanoflann_search
+    except ImportError:
+        pass
+    return found
+
+
+if __name__ == "__main__":
+    measure()

@@ -1,0 +1,37 @@
+"""`torchcover record`: what it writes measures as the simulation does."""
+
+import json
+
+import numpy as np
+
+from torchcover import Coverage
+
+
+def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_path):
+    options = ("--scenario", worlds / "yard.yaml", "--steps", 3, "--seed", 2, "--rays", 1024)
+    measured, read, recording = (tmp_path / name for name in ("simulated", "read", "recording"))
+    code, printed, _ = torchcover("record", worlds / "both.yaml", *options, "--out", recording)
+    assert (code, len(printed.splitlines())) == (0, 1)
+    assert printed.startswith(f"Wrote 3 frames to {recording}; ")
+    cell = ("--cell", 1, "--threshold", 0.4, "--threshold", 1)
+    assert torchcover("evaluate", worlds / "both.yaml", *options, *cell, "--out", measured)[0] == 0
+    assert torchcover("evaluate", "--frames", recording, *cell, "--out", read)[0] == 0
+    first, second = (Coverage.load(folder / "coverage.npz") for folder in (measured, read))
+    assert first.measure == second.measure == "area"
+    for name in ("radius", "detection", "radius_error", "probed_steps", "points"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
+    rows = [json.loads((folder / "summary.json").read_text())["rows"] for folder in (measured, read)]
+    assert [{**row, "rig": None} for row in rows[0]] == [{**row, "rig": None} for row in rows[1]]
+    assert any(row["radius_m"] for row in rows[0])
+
+
+def test_what_record_refuses(torchcover, worlds, tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "a").write_text("")
+    low, both, yard = worlds / "low.yaml", worlds / "both.yaml", ("--scenario", worlds / "yard.yaml", "--steps", 1)
+    code, _, error = torchcover("record", low, *yard, "--out", tmp_path / "out")
+    assert (code, len(error.splitlines())) == (2, 1)
+    assert "not empty; a new or empty folder is needed" in error
+    code, _, error = torchcover("record", both, *yard, "--out", tmp_path / "new", "--format", "kitti")
+    assert code == 2
+    assert "format kitti: a rig of one LiDAR is needed; both has front, rear; use the format folder" in error

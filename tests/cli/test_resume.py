@@ -1,0 +1,33 @@
+"""`--resume`: a run goes on in the folder of its results."""
+
+import json
+
+import pytest
+
+SMALL = ("--cell", 8, "--rays", 256)
+
+
+def files_of(folder):
+    """What was measured, by file; the time that it took aside."""
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary.pop("seconds") >= 0
+    arrays = {path.name: path.read_bytes() for path in folder.rglob("coverage/*.npz")}
+    arrays |= {path.name: path.read_bytes() for path in folder.glob("coverage.npz")}
+    return summary, arrays
+
+
+@pytest.mark.parametrize("command", [("evaluate", "low.yaml"), ("compare", "low.yaml", "both.yaml")])
+def test_a_run_goes_on_to_the_same_files(torchcover, worlds, monkeypatch, command):
+    monkeypatch.chdir(worlds)
+    arguments = [*command, "--scenario", "yard.yaml", *SMALL]
+    assert torchcover(*arguments, "--steps", 5, "--out", "whole")[0] == 0
+    code, _, said = torchcover(*arguments, "--steps", 2, "--out", "parts", "--resume")
+    assert (code, "parts/checkpoint.npz is not there: the run starts with its first step" in said) == (0, True)
+    code, _, said = torchcover(*arguments, "--steps", 5, "--out", "parts", "--resume")
+    assert (code, "is not there" in said) == (0, False)
+    assert files_of(worlds / "parts") == files_of(worlds / "whole")
+    code, _, said = torchcover(*arguments, "--steps", 5, "--out", "parts", "--resume", "--seed", 1)
+    assert code == 2
+    assert "parts/checkpoint.npz: a checkpoint of another run: seed (0 there, 1 here); resume with the" in said
+    assert torchcover(*arguments, "--steps", 1, "--out", "parts")[0] == 0  # anew
+    assert files_of(worlds / "parts") != files_of(worlds / "whole")

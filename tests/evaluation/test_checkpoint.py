@@ -1,0 +1,281 @@
+"""No run is lost: whatever ends it, it goes on from its checkpoint to the same bits."""
+
+import errno
+import os
+import random
+import signal
+import time
+
+import numpy as np
+import pytest
+import torch
+
+import torchcover
+from torchcover.coverage import Maximum, StepQuantiles
+from torchcover.data import BadFrameError
+from torchcover.evaluation import Checkpoint, checkpoint
+from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
+from torchcover.files import BadFileError
+
+STEPS = 16
+SETTINGS = {"cell_m": 8.0, "aggregations": (Maximum(), StepQuantiles((0.5,)))}
+
+
+class Drive:
+    """A source of frames, some of which may be bad; slower than nothing, so that a kill finds it at work."""
+
+    rigs = ("a",)
+    sensors = {}  # noqa: RUF012
+    ego_outline_m = None
+    description = {"scenario": None, "frames": "drive", "seed": None}  # noqa: RUF012
+    weight_kind = None
+    reference_record = None
+
+    def __init__(self, frame_of, bad=(), content="drive", delay_s=0.0):
+        self.frame_of, self.bad, self.content, self.delay_s = frame_of, bad, {"frames": content}, delay_s
+
+    def __len__(self):
+        return STEPS
+
+    def __getitem__(self, index):
+        time.sleep(self.delay_s)
+        if index in self.bad:
+            raise BadFrameError(f"f{index} (frame {index}): rubbish")
+        return self.frame_of(index)
+
+
+class Seen:
+    """An observer whose state is no tensor; it may do something at a frame."""
+
+    def __init__(self, at=None, then=lambda: None):
+        self.names, self.at, self.then = [], at, then
+
+    def update(self, frame):
+        self.names.append(frame.name)
+        if frame.index == self.at:
+            self.then()
+
+    def compute(self):
+        return tuple(self.names)
+
+    def merge_state(self, other):
+        self.names += other.names
+
+    def state_dict(self):
+        return {"names": self.names}
+
+    def load_state_dict(self, state):
+        self.names = list(state["names"])
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "out" / "checkpoint.npz"
+
+
+@pytest.fixture
+def _at_every_step(monkeypatch):
+    monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
+    monkeypatch.setattr(checkpoint, "MOST_TIME", 1e9)
+
+
+def measured(source, path=None, *, seen=None, **settings):
+    settings = {"frames": source, "observers": {"seen": seen or Seen()}, "checkpoint": path, **SETTINGS, **settings}
+    return torchcover.evaluate("a", **settings)
+
+
+def cut_short(*args, **settings):
+    """The same, of a run that is ended before its time."""
+    with pytest.warns(RuntimeWarning, match="The run was cut short after"):
+        return measured(*args, **settings)
+
+
+def bits(result):
+    """All that was measured."""
+    found = {"observed": result.observed, "steps": result.run.steps, "counts": dict(result.run.counts)}
+    for name, coverage in result.coverages.items():
+        blocks = {"block sums": coverage.blocks.sums, "block steps": coverage.blocks.steps}
+        layers = {key: layer.values for key, layer in coverage.layers.items()}
+        for key, tensor in {**blocks, **layers, "points": coverage.points, "probed": coverage.probed_steps}.items():
+            found[f"{name} {key}"] = tensor.numpy().tobytes()
+    return {**found, "skipped": tuple(result.run.skipped)}
+
+
+def stamp(path):
+    """Another one for every file that is put there."""
+    return (path.stat().st_ino, path.stat().st_mtime_ns) if path.exists() else None
+
+
+def press():
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_it_goes_on_after_ctrl_c_to_the_same_bits(frame_of, path, workers):
+    whole = bits(measured(Drive(frame_of, {7}), skip_bad_frames=True))
+    for at in (0, 9, STEPS - 1):  # one run: it goes on twice
+        part = cut_short(Drive(frame_of, {7}), path, seen=Seen(at, press), skip_bad_frames=True, workers=workers)
+        assert isinstance(part.run.failure, KeyboardInterrupt)
+        assert len(part.observed["seen"]) == part.run.steps == at + 1 - (at > 7)
+    assert bits(measured(Drive(frame_of, {7}), path, skip_bad_frames=True)) == whole
+
+
+@pytest.mark.usefixtures("_at_every_step")
+def test_it_goes_on_after_being_killed_at_any_moment(frame_of, path):
+    whole, chance, kills = bits(measured(Drive(frame_of))), random.Random(0), 0
+    for _ in range(5):
+        before = stamp(path)
+        child = os.fork()
+        if not child:
+            torch.set_num_threads(1)
+            measured(Drive(frame_of), path)
+            os._exit(0)
+        deadline_s = time.monotonic() + 60
+        while stamp(path) == before and time.monotonic() < deadline_s:
+            time.sleep(0.001)
+        time.sleep(chance.uniform(0.0, 0.02))
+        os.kill(child, signal.SIGKILL)
+        kills += os.waitpid(child, 0)[1] == signal.SIGKILL
+        assert 0 < read_header(path)["run"]["steps"] <= STEPS
+    assert kills >= 2
+    assert bits(measured(Drive(frame_of), path)) == whole
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+def test_a_complete_run_goes_on_when_more_steps_are_wanted(frame_of, path):
+    measured(Drive(frame_of), path, steps=5)
+    seen = Seen()
+    assert bits(measured(Drive(frame_of), path, steps=12, seen=seen)) == bits(measured(Drive(frame_of), steps=12))
+    assert len(seen.names) == 12
+    again = measured(Drive(frame_of, range(STEPS)), path, steps=12)  # not a frame is made
+    assert bits(again) == bits(measured(Drive(frame_of), steps=12))
+    with pytest.raises(ValueError, match="steps: 12 are done in the checkpoint; got 11, which is less"):
+        measured(Drive(frame_of), path, steps=11)
+
+
+def test_looks_at_a_target_error_go_on_as_they_would_have(frame_of, path, monkeypatch):
+    monkeypatch.setattr("torchcover.evaluation.target_error.MIN_STEPS", 8)
+    target = {"target_error": "0.2m", "thresholds": ()}
+    whole = measured(Drive(frame_of), **target)
+    assert 8 < whole.run.steps < STEPS
+    for at in range(6, whole.run.steps - 1):
+        cut_short(Drive(frame_of), path, seen=Seen(at, press), **target)
+    assert bits(measured(Drive(frame_of), path, **target)) == bits(whole)
+    assert bits(measured(Drive(frame_of, range(STEPS)), path, **target)) == bits(whole)
+
+
+@pytest.mark.usefixtures("_at_every_step")
+def test_what_one_observer_has_seen_and_another_has_not_is_not_kept(frame_of, path):
+    with pytest.raises(ZeroDivisionError):
+        cut_short(Drive(frame_of), path, seen=Seen(6, lambda: 1 / 0)).run.raise_failure()
+    assert read_header(path)["run"]["steps"] == 6
+    assert bits(measured(Drive(frame_of), path)) == bits(measured(Drive(frame_of)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"cell_m": 4.0}, r"cell_m \(8.0 there, 4.0 here\)"),
+        ({"thresholds": (0.4, 1.0)}, r"thresholds \(\[0.4\] there, \[0.4, 1.0\] here\)"),
+        ({"aggregations": ()}, r"aggregations \(other content\)"),
+        ({"estimate": "known"}, r"estimate \(null there, \"known\" here\)"),
+        ({"target_error": "1%"}, r"target_error \(other content\)"),
+        ({"observers": {}}, r"observers \(other content\)"),
+    ],
+)
+def test_a_checkpoint_of_another_run_is_refused_by_what_differs(frame_of, path, changes, named):
+    measured(Drive(frame_of), path, steps=3)
+    with pytest.raises(ValueError, match=rf"checkpoint.npz: a checkpoint of another run: {named}; resume with the"):
+        measured(Drive(frame_of), path, steps=3, **changes)
+    with pytest.raises(ValueError, match=r"another run: frames \(\"drive\" there, \"other\" here\)"):
+        measured(Drive(frame_of, content="other"), path, steps=3)
+
+
+def test_without_resume_it_starts_anew(frame_of, path):
+    measured(Drive(frame_of), path, steps=3)
+    result = measured(Drive(frame_of, content="other"), Checkpoint(path, resume=False), steps=2)
+    assert (result.run.steps, read_header(path)["run"]["steps"]) == (2, 2)
+
+
+def test_skipped_frames_are_not_forgotten(frame_of, path):
+    measured(Drive(frame_of, {1}), path, steps=3, skip_bad_frames=True)
+    with pytest.raises(ValueError, match=r"1 bad frames were skipped before the checkpoint, such as f1"):
+        measured(Drive(frame_of, {1}), path)
+
+
+@pytest.mark.usefixtures("_at_every_step")
+def test_a_full_disk_is_told_of_once_and_the_run_goes_on(frame_of, path, monkeypatch):
+    def full(_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    measured(Drive(frame_of), path, steps=3)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full)
+        with pytest.warns(UserWarning, match="no checkpoint was written .*No space left.*; the run goes on") as told:
+            result = measured(Drive(frame_of), path, steps=9)
+    assert len(told) == 1
+    assert (result.run.complete, bits(result)) == (True, bits(measured(Drive(frame_of), steps=9)))
+    assert read_header(path)["run"]["steps"] == 3
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+    assert bits(measured(Drive(frame_of), path)) == bits(measured(Drive(frame_of)))
+
+
+class Mute:
+    update = compute = merge_state = None
+
+
+class Odd(Seen):
+    def state_dict(self):
+        return {"names": {1, 2}}
+
+
+@pytest.mark.parametrize(
+    ("observer", "message"),
+    [
+        (Mute, "observer seen: a Mute without state_dict and load_state_dict, which a checkpoint needs"),
+        (Odd, "observer seen: its state_dict cannot be kept in a checkpoint: .* got set in it"),
+    ],
+)
+def test_an_observer_that_cannot_be_kept_is_refused_before_the_run(frame_of, path, observer, message):
+    with pytest.raises(TypeError, match=message):
+        measured(Drive(frame_of, range(STEPS)), path, seen=observer())
+    assert not path.parent.exists()
+
+
+def test_states_come_back_bit_for_bit(tmp_path):
+    path = tmp_path / "a.npz"
+    nan = torch.tensor([0x7FF8_0000_0000_1234], dtype=torch.int64).view(torch.float64)
+    sparse = torch.zeros(50, 40, dtype=torch.float64)
+    sparse[7, 3], sparse[49, 39] = -0.0, 5e-324
+    state = {
+        "dense": torch.cat([torch.rand(9, dtype=torch.float64), nan, torch.tensor([-0.0, torch.inf, -torch.inf])]),
+        "sparse": sparse,
+        "transposed": torch.arange(6).view(2, 3).T,
+        "scalar": torch.tensor(7),
+        "empty": torch.zeros(0, 3),
+        "truth": torch.tensor([True, False]),
+        "tree": {"list": [1, 0.1, None, "text", True, [torch.tensor([1.5])]], "": {}},
+    }
+    header = {"identity": {}, "run": {"steps": 1, "counts": {}, "skipped": [], "seconds": 0.0}}
+    write_checkpoint(path, header, {"one": state})
+    back = read_state(path, read_header(path), "one")
+    tree, tree_back = state.pop("tree"), back.pop("tree")
+    assert tree_back.pop("list")[5][0].equal(tree.pop("list")[5][0])
+    assert tree_back == tree
+    assert back.keys() == state.keys()
+    for name, tensor in state.items():
+        assert (back[name].shape, back[name].dtype) == (tensor.shape, tensor.dtype)
+        assert back[name].numpy().tobytes() == tensor.numpy().tobytes()
+
+
+def test_a_damaged_checkpoint_is_named(frame_of, path):
+    measured(Drive(frame_of), path, steps=3)
+    data = bytearray(path.read_bytes())
+    third = len(data) // 3
+    for damage in (data[:-100], data[:third] + bytes(third) + data[2 * third :], b"PK", b""):
+        path.write_bytes(damage)
+        with pytest.raises(BadFileError, match=r"checkpoint\.npz: "):
+            measured(Drive(frame_of), path, steps=3)
+    np.savez(path, header=np.array("{}"))
+    with pytest.raises(BadFileError, match="checkpoint format None; this torchcover reads format 1"):
+        measured(Drive(frame_of), path, steps=3)

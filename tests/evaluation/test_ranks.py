@@ -1,0 +1,214 @@
+"""Several processes share a run: one result, that of a single one; and whatever happens to one happens to all."""
+
+import os
+import pickle
+import signal
+import threading
+import time
+import warnings
+
+import pytest
+import torch
+from torch.distributed import FileStore
+
+import torchcover
+from torchcover.data import BadFrameError, SimulatedFrames
+from torchcover.evaluation import Ranks, joined_ranks
+from torchcover.evaluation.transport import packed, unpacked
+
+LONGEST_S = 60.0
+
+
+class Drive:
+    """A source of frames, some of which may be bad."""
+
+    rigs = ("a", "b")
+    sensors = {}  # noqa: RUF012
+    ego_outline_m = None
+    description = {"scenario": None, "frames": "drive", "seed": None}  # noqa: RUF012
+    weight_kind = None
+    reference_record = None
+
+    def __init__(self, frame_of, length=7, bad=(), content="drive", delay_s=0.0):
+        self.frame_of, self.length, self.bad, self.content = frame_of, length, bad, {"frames": content}
+        self.delay_s = delay_s
+
+    def __len__(self):
+        return self.length
+
+    def __getitem__(self, index):
+        time.sleep(self.delay_s)
+        if index in self.bad:
+            raise BadFrameError(f"f{index} (frame {index}): rubbish")
+        return self.frame_of(index)
+
+
+class Names:
+    def __init__(self):
+        self.names = []
+
+    def update(self, frame):
+        self.names.append(frame.name)
+
+    def compute(self):
+        return sorted(self.names)
+
+    def merge_state(self, other):
+        self.names += other.names
+
+    def state_dict(self):
+        return {"names": self.names}
+
+    def load_state_dict(self, state):
+        self.names = list(state["names"])
+
+
+def in_ranks(folder, work, size=2):
+    """What `work(ranks)` gives in each of these processes, or raises, and after how many seconds."""
+    store, children = folder / f"store{time.monotonic_ns()}", []
+    for rank in range(size):
+        if not (child := os.fork()):
+            torch.set_num_threads(1)
+            begin_s = time.monotonic()
+            try:
+                answer = work(Ranks(FileStore(str(store), size), rank, size))
+            except BaseException as error:
+                answer = error
+            folder.joinpath(f"{rank}.pickle").write_bytes(pickle.dumps((answer, time.monotonic() - begin_s)))
+            os._exit(0)
+        children.append(child)
+    deadline_s = time.monotonic() + LONGEST_S
+    while children and time.monotonic() < deadline_s:
+        children = [child for child in children if os.waitpid(child, os.WNOHANG) == (0, 0)]
+        time.sleep(0.01)
+    for child in children:  # it hangs
+        os.kill(child, signal.SIGKILL)
+    assert not children
+    return [pickle.loads(folder.joinpath(f"{rank}.pickle").read_bytes()) for rank in range(size)]
+
+
+def measured(source, ranks=None, **settings):
+    result = torchcover.compare(
+        ["a", "b"], frames=source, cell_m=8.0, observers={"names": Names()}, ranks=ranks, **settings
+    )
+    counts, sums = {}, {}
+    for name, coverage in result.coverages.items():
+        counts[name] = (coverage.counts, coverage.points, coverage.probed_steps, coverage.blocks.steps)
+        sums[name] = (coverage.blocks.sums, coverage.radius)
+    run = (result.run.steps, dict(result.run.counts), result.run.skipped, str(result.run.failure))
+    return {"counts": (counts, run, result.observed), "sums": sums}
+
+
+def check_equal(found, single):
+    assert str(found["counts"]) == str(single["counts"])
+    torch.testing.assert_close(found["counts"][0], single["counts"][0], rtol=0, atol=0)
+    torch.testing.assert_close(found["sums"], single["sums"], rtol=1e-12, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize(("length", "workers", "size"), [(7, 0, 3), (1, 0, 2), (5, 2, 2)])
+def test_all_get_the_result_of_a_single_process(frame_of, tmp_path, length, workers, size):
+    source = Drive(frame_of, length, bad={4})
+    single = measured(source, skip_bad_frames=True)
+    for found, _ in in_ranks(
+        tmp_path, lambda ranks: measured(source, ranks, skip_bad_frames=True, workers=workers), size
+    ):
+        check_equal(found, single)
+
+
+def test_a_run_over_ranks_goes_on_from_its_checkpoints(frame_of, tmp_path):
+    path = tmp_path / "out" / "checkpoint.npz"
+    in_ranks(tmp_path, lambda ranks: measured(Drive(frame_of), ranks, steps=3, checkpoint=path))
+    assert sorted(file.name for file in path.parent.iterdir()) == ["checkpoint.npz", "checkpoint_rank1.npz"]
+    done = {0, 1, 2}
+    for found, _ in in_ranks(tmp_path, lambda ranks: measured(Drive(frame_of, bad=done), ranks, checkpoint=path)):
+        check_equal(found, measured(Drive(frame_of)))
+    with pytest.raises(ValueError, match=r"a checkpoint of another run: ranks \(2 there, 1 here\)"):
+        measured(Drive(frame_of), checkpoint=path)
+
+
+def test_an_error_of_one_ends_all_and_what_there_is_is_kept(frame_of, tmp_path):
+    source = Drive(frame_of, 400, bad={5}, delay_s=0.01)
+
+    def cut_short(ranks):
+        with pytest.warns(RuntimeWarning, match="The run was cut short after"):
+            return measured(source, ranks)
+
+    (first, first_s), (second, second_s) = in_ranks(tmp_path, cut_short)
+    steps, _, _, failure = first["counts"][1]
+    assert 3 <= steps < 300
+    assert len(first["counts"][2]["names"]) == steps
+    assert failure == "rank 1: BadFrameError: f5 (frame 5): rubbish"
+    assert second["counts"][1][3] == "f5 (frame 5): rubbish"
+    assert max(first_s, second_s) < 10.0
+
+
+def test_an_error_before_the_first_step_ends_all(frame_of, tmp_path):
+    def work(ranks):
+        return measured(Drive(frame_of, 400, content=f"that of {ranks.rank}", delay_s=0.01), ranks)
+
+    (first, first_s), (second, second_s) = in_ranks(tmp_path, work)
+    assert isinstance(second, ValueError)
+    assert str(second) == (
+        'rank 1 is about another run than rank 0: frames ("that of 0" there, "that of 1" here); start all with the same'
+    )
+    assert isinstance(first, ChildProcessError)
+    assert str(first) == f"rank 1: ValueError: {second}"
+    assert max(first_s, second_s) < 10.0
+    for error, _ in in_ranks(tmp_path, lambda ranks: measured(Drive(frame_of), ranks, target_error="1%")):
+        assert "target error: every rank sees its share only" in str(error)
+
+
+def test_who_waits_for_a_rank_that_is_gone_can_be_ended(frame_of, tmp_path):
+    def work(ranks):
+        if ranks.rank == 1:
+            ranks.check_same = lambda _: os._exit(0)
+        else:
+            threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+        try:
+            return measured(Drive(frame_of), ranks)
+        finally:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    tmp_path.joinpath("1.pickle").write_bytes(pickle.dumps((None, 0.0)))
+    (first, first_s), _ = in_ranks(tmp_path, work)
+    assert isinstance(first, KeyboardInterrupt)
+    assert first_s < 10.0
+
+
+@pytest.mark.parametrize("every_s", [0.1, 10.0, 120.0])
+def test_shares_are_whole_worlds_and_more_steps_only_add_to_them(every_s):
+    frames = SimulatedFrames("urban", "front_roof_32", steps=5000, every_s=every_s)
+    world_of, everybody = frames.simulator.run_of, [Ranks(None, rank, 3) for rank in range(3)]
+    shares = [list(ranks.share(range(5000), world_of)) for ranks in everybody]
+    assert sorted(index for share in shares for index in share) == list(range(5000))
+    worlds = [{world_of(index) for index in share} for share in shares]
+    assert not (worlds[0] & worlds[1] | worlds[0] & worlds[2] | worlds[1] & worlds[2])
+    assert max(map(len, worlds)) - min(map(len, worlds)) <= 1
+    for ranks, share in zip(everybody, shares, strict=True):
+        fewer = list(ranks.share(range(1234), world_of))
+        assert share[: len(fewer)] == fewer
+
+
+def test_without_torchrun_there_are_no_ranks(monkeypatch):
+    for size in (None, "1"):
+        monkeypatch.delenv("WORLD_SIZE", raising=False)
+        if size:
+            monkeypatch.setenv("WORLD_SIZE", size)
+        with joined_ranks() as ranks:
+            assert ranks is None
+
+
+def test_what_travels_arrives_to_the_last_bit_and_without_its_zeros():
+    sparse = torch.zeros(1000, 100, dtype=torch.float64)
+    sparse[3, 7], sparse[999, 99] = -0.0, torch.nan
+    half = torch.tensor([1.5], dtype=torch.bfloat16)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data = packed(
+            {"sparse": sparse, "dense": torch.arange(9), "half": half, "scalar": torch.tensor(3), "text": "a"}
+        )
+        back = unpacked(data)
+    assert len(data) < 10_000
+    assert back["sparse"].numpy().tobytes() == sparse.numpy().tobytes()
+    assert back["dense"].equal(torch.arange(9))
+    assert (back["half"].equal(half), back["scalar"].shape, back["text"]) == (True, (), "a")

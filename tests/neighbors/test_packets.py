@@ -1,0 +1,172 @@
+"""The laws of the search in packets: exact in float32, smallest index of a tie, whatever the order and the threads."""
+
+import os
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover import nearest
+
+ROOT = Path(__file__).parents[2]
+INSTALLED = find_spec("numba") is not None
+if INSTALLED:
+    from torchcover.neighbors import packets
+    from torchcover.neighbors.morton import along_the_curve
+
+
+def generator(seed):
+    return np.random.default_rng(seed)
+
+
+def uniform(count, seed, low=-50.0, high=50.0):
+    return generator(seed).uniform(low, high, (count, 3)).astype(np.float32)
+
+
+def line(count, seed):
+    return (generator(seed).uniform(-80, 80, (count, 1)) * [0.8, 0.599, 0.03]).astype(np.float32)
+
+
+def scan(rows, columns):
+    """Where the rays of a LiDAR at 2 m height meet the ground or a wall: rings, denser near the sensor."""
+    elevation, azimuth = np.meshgrid(np.linspace(-0.5, -0.02, rows), np.linspace(-3.1, 3.1, columns), indexing="ij")
+    reach = np.minimum(2.0 / np.sin(-elevation), 30.0)
+    over_ground = reach * np.cos(elevation)
+    xyz = over_ground * np.cos(azimuth), over_ground * np.sin(azimuth), 2.0 + reach * np.sin(elevation)
+    return np.stack(xyz, axis=-1).reshape(-1, 3).astype(np.float32)
+
+
+def grid(side):
+    """Whole metres: almost every query between them has ties."""
+    axis = np.arange(side, dtype=np.float32)
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+CLOUDS = {
+    "random": (uniform(700, 1), uniform(3000, 2)),
+    "scan": (uniform(700, 3, [-30, -30, 0], [30, 30, 3]), scan(40, 120)),
+    "ties": (grid(9) + np.float32(0.5), generator(4).permutation(grid(10))),
+    "every point 8 times": (uniform(300, 5), generator(6).permutation(np.repeat(uniform(300, 7), 8, axis=0))),
+    "all equal": (uniform(200, 8), np.ones((3000, 3), np.float32)),
+    "queries all equal": (np.ones((200, 3), np.float32), uniform(3000, 9)),
+    "on a line": (line(500, 10), line(3000, 11)),
+    "in a plane": (uniform(500, 12) * np.float32([1, 1, 0]), uniform(3000, 13) * np.float32([1, 1, 0])),
+    "far apart": (uniform(300, 14), uniform(3000, 15) + np.float32([1e6, 0, 0])),
+    "one far away": (uniform(300, 16), np.concatenate([uniform(3000, 17), np.float32([[1e9, -1e9, 0]])])),
+    "huge": (uniform(300, 18) * np.float32(2e7), uniform(3000, 19) * np.float32(2e7)),
+    "tiny": (uniform(300, 20) * np.float32(1e-11), uniform(3000, 21) * np.float32(1e-11)),
+    "one point": (uniform(300, 22), uniform(1, 23)),
+    "one query": (uniform(1, 24), uniform(3000, 25)),
+    "17 points": (uniform(65, 26), uniform(17, 27)),
+}
+clouds = pytest.mark.parametrize("name", CLOUDS if INSTALLED else [])
+if_installed = pytest.mark.parametrize("installed", [True] if INSTALLED else [])
+
+
+def slow_twin(query, points):
+    """The same sums in float32, one after the other: the first of the least."""
+    x, y, z = (query[:, None, axis] - points[None, :, axis] for axis in range(3))
+    return (x * x + y * y + z * z).argmin(axis=1)
+
+
+def search(query, points, max_distance=np.inf):
+    return packets.search(torch.from_numpy(query), torch.from_numpy(points), max_distance, 1.0).numpy()
+
+
+@pytest.fixture
+def threads():
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@clouds
+def test_the_index_is_the_slow_twins(name):
+    query, points = CLOUDS[name]
+    np.testing.assert_array_equal(search(query, points), slow_twin(query, points))
+
+
+@clouds
+def test_the_order_of_the_queries_and_the_threads_change_nothing(name, threads, monkeypatch):
+    query, points = CLOUDS[name]
+    threads(1)
+    expected = search(query, points)
+    order = generator(30).permutation(len(query))
+    threads(3)
+    monkeypatch.setattr(packets, "SHARE", 70)
+    np.testing.assert_array_equal(search(query[order], points), expected[order])
+
+
+@clouds
+@pytest.mark.parametrize("quantile", [0.0, 0.5, 1.0])
+def test_a_bound_only_leaves_out_what_is_beyond(name, quantile):
+    query, points = (torch.from_numpy(cloud) for cloud in CLOUDS[name])
+    everything = nearest(query, points, backend="packets")
+    limit = float(everything.distance.quantile(quantile, interpolation="nearest"))
+    bounded = nearest(query, points, max_distance=limit, backend="packets")
+    within = everything.distance <= limit
+    assert torch.equal(bounded.index, everything.index.where(within, -1))
+    assert torch.equal(bounded.distance, everything.distance.where(within, torch.inf))
+
+
+def leaf_sizes(cloud):
+    """The diagonals of the boxes around every 16 points in order."""
+    leaves = cloud[along_the_curve(cloud)][: len(cloud) // 16 * 16].reshape(-1, 16, 3)
+    return np.linalg.norm(np.ptp(leaves.astype(np.float64), axis=1), axis=1)
+
+
+@if_installed
+def test_a_point_far_away_does_not_coarsen_the_order(installed):
+    cloud = uniform(20_000, 31)
+    far = np.float32([[1e9, 1e9, 1e9]])
+    alone = np.median(leaf_sizes(cloud))
+    assert np.median(leaf_sizes(np.concatenate([cloud, far]))) < 1.2 * alone
+    assert alone < 0.2 * np.median(np.linalg.norm(np.ptp(cloud.reshape(-1, 16, 3), axis=1), axis=1))
+
+
+@if_installed
+@pytest.mark.parametrize("count", [1, 2, 5000])
+@pytest.mark.parametrize("extent", [0.0, 1e-45, 1e-38, 1e-3, 1e9])
+def test_the_order_is_a_permutation(installed, count, extent):
+    for cloud in (uniform(count, 32, 0, 1) * np.float32(extent), np.full((count, 3), np.float32(extent))):
+        assert sorted(along_the_curve(cloud)) == list(range(count))
+
+
+@if_installed
+def test_equal_points_keep_their_order(installed):
+    assert along_the_curve(np.ones((5000, 3), np.float32)).tolist() == list(range(5000))
+
+
+def run(code, **environment):
+    command = [sys.executable, "-W", "error", "-c", code]
+    return subprocess.run(
+        command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+def test_without_numba_the_backend_says_what_to_install():
+    code = "import sys; sys.modules['numba'] = None; import torch, torchcover; "
+    done = run(code + "torchcover.nearest(*torch.zeros(2, 1, 3), backend='packets')")
+    assert done.stderr.splitlines()[-1].endswith("needs numba: pip install 'torchcover[fast]'")
+
+
+@if_installed
+def test_a_forked_process_searches(installed):
+    """As the workers of a DataLoader do, after the main process has searched on several threads."""
+    code = """
+import os, torch, torchcover
+torch.set_num_threads(2)
+clouds = torch.rand(2, 20_000, 3)
+index = torchcover.nearest(*clouds, backend="packets").index
+child = os.fork()
+if not child:
+    torch.set_num_threads(1)
+    os._exit(0 if torch.equal(torchcover.nearest(*clouds, backend="packets").index, index) else 1)
+print(os.waitpid(child, 0)[1])
+"""
+    done = run(code)
+    assert done.stdout == "0\n", done.stderr

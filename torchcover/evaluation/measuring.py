@@ -1,0 +1,166 @@
+"""One measurement: a task and its settings in, a result out; from a checkpoint, and over ranks."""
+
+import warnings
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, nullcontext
+from dataclasses import replace
+from pathlib import Path
+
+from torchcover.data import BadFrameError
+from torchcover.evaluation.checkpoint import AnyCheckpoint, Checkpoint, Journal
+from torchcover.evaluation.observers import AnyObserver, CoverageObserver
+from torchcover.evaluation.omissions import left_out
+from torchcover.evaluation.pipeline import Run, observe
+from torchcover.evaluation.ranks import Ranks
+from torchcover.evaluation.result import Result
+from torchcover.evaluation.result_files import claimed
+from torchcover.evaluation.run_identity import run_identity
+from torchcover.evaluation.sensor_drawings import check_drawable
+from torchcover.evaluation.settings import Settings
+from torchcover.evaluation.target_error import TargetWatch
+from torchcover.evaluation.task import Task
+
+Observers = Mapping[str, AnyObserver]
+
+
+def measured(
+    task: Task,
+    settings: Settings,
+    others: Observers,
+    checkpoint: AnyCheckpoint | None = None,
+    ranks: Ranks | None = None,
+    *,
+    progress: bool = False,
+) -> Result:
+    """Measure it.
+
+    Args:
+        task: Which rigs in which frames.
+        settings: How.
+        others: The user's own observers.
+        checkpoint: Where the run is saved, and goes on from.
+        ranks: The processes that share it.
+        progress: Whether to show a bar.
+
+    Raises:
+        ValueError: As `evaluate`.
+    """
+    frames = task.frames
+    sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
+    check_drawable(sensors)
+    with ranks.aborting() if ranks else nullcontext():
+        coverage, others, run = _observed(task, settings, others, checkpoint, ranks, progress=progress)
+    coverages = {name: observer.compute() for name, observer in coverage.items()}
+    if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
+        run.raise_failure()  # within a step: the rigs have not seen the same
+    result = Result(
+        coverages=coverages,
+        regions=settings.regions,
+        run=run,
+        rigs=task.given,
+        source=task.description,
+        reference_record=frames.reference_record,
+        device=settings.device,
+        target_error=settings.target_error,
+        sensors=task.sensors,
+        ego_outline_m=frames.ego_outline_m,
+        observed={name: observer.compute() for name, observer in others.items()},
+        left_out=left_out(
+            run.counts,
+            list(coverages.values()),
+            settings.aggregations,
+            sensors,
+            workers=settings.workers,
+        ),
+    )
+    if result.cut_short:
+        warnings.warn(result.cut_short, RuntimeWarning, stacklevel=3)
+    return result
+
+
+def _observed(
+    task: Task,
+    settings: Settings,
+    others: Observers,
+    checkpoint: AnyCheckpoint | None,
+    ranks: Ranks | None,
+    *,
+    progress: bool,
+) -> tuple[Observers, Observers, Run]:
+    """All that was seen, by all ranks."""
+    if ranks:
+        settings = replace(settings, device=ranks.device(settings.device))
+    coverage = {name: CoverageObserver(settings.metric(task.frames.weight_kind), name) for name in task.rigs}
+    target = settings.target_error
+    watch = TargetWatch(target, coverage, settings.regions) if target else None
+    observers: Sequence[AnyObserver] = [*coverage.values(), *others.values()]
+    identity = run_identity(task, settings, others, ranks.size if ranks else 1) if ranks or checkpoint else {}
+    if ranks:
+        if target:
+            raise ValueError("target error: every rank sees its share only; leave it out, or run without torchrun")
+        ranks.check_same({**identity, "steps": str(task.steps or len(task.frames))})
+    with ExitStack() as stack:
+        journal = None
+        if checkpoint is not None:
+            place = _place(checkpoint, ranks)
+            if ranks is None or ranks.rank == 0:
+                stack.enter_context(claimed(place.path.parent))
+            journal = Journal(place, identity, _states(coverage, others, watch))
+        run = observe(
+            task.frames,
+            observers,
+            steps=task.steps,
+            workers=settings.workers,
+            device=settings.device,
+            skip_bad_frames=settings.skip_bad_frames,
+            until=watch,
+            progress=progress and (ranks is None or ranks.rank == 0),
+            keep_partial=True,
+            journal=journal,
+            ranks=ranks,
+        )
+        if ranks:
+            run, observers = _whole(run, observers, ranks)
+    rigs = len(coverage)
+    return dict(zip(coverage, observers[:rigs], strict=True)), dict(zip(others, observers[rigs:], strict=True)), run
+
+
+def _whole(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Run, Sequence[AnyObserver]]:
+    """What all ranks have seen, as if one had."""
+    if isinstance(run.failure, KeyboardInterrupt):
+        raise run.failure  # whoever ends one rank ends all, and does not wait for them
+    if run.failure:
+        ranks.tell(run.failure)
+    with ranks.connected():
+        parts = ranks.gather((run.steps, run.counts, run.skipped, run.seconds))
+        observers = ranks.merge(observers)
+    words, counts = ranks.failure, Counter[str]()
+    for part in parts:
+        counts.update(part[1])  # + would forget what was never counted
+    whole = Run(
+        steps=sum(steps for steps, *_ in parts),
+        counts=counts,
+        skipped=sorted((line for part in parts for line in part[2]), key=lambda line: BadFrameError(line).index),
+        failure=run.failure or (ChildProcessError(words) if words else None),
+        seconds=max(seconds for *_, seconds in parts),
+    )
+    if not whole.steps:
+        whole.raise_failure()
+        raise ValueError("no frame could be used, so there is no result")
+    return whole, observers
+
+
+def _place(checkpoint: AnyCheckpoint, ranks: Ranks | None) -> Checkpoint:
+    """Where this process keeps it: every rank has a file of its own."""
+    place = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
+    if ranks is None or ranks.rank == 0:
+        return place
+    place.path.parent.mkdir(parents=True, exist_ok=True)
+    return replace(place, path=place.path.with_stem(f"{place.path.stem}_rank{ranks.rank}"))
+
+
+def _states(coverage: Observers, others: Observers, watch: TargetWatch | None) -> dict[str, object]:
+    """What a checkpoint keeps, by the names that its file and messages have."""
+    rigs = {f"coverage of {name}": one for name, one in coverage.items()}
+    return {**rigs, **{f"observer {name}": one for name, one in others.items()}, **({"watch": watch} if watch else {})}

@@ -1,0 +1,209 @@
+"""Several processes, on one machine or many, share a run: each makes the frames of its share, and all are added up."""
+
+import json
+import os
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from datetime import timedelta
+from itertools import groupby
+from typing import Any, TypeVar
+
+import torch
+from torch import distributed
+from torch.distributed.distributed_c10d import PrefixStore, Store
+from torch.distributed.rendezvous import rendezvous
+
+from torchcover.evaluation.observers import AnyObserver
+from torchcover.evaluation.run_identity import differences
+from torchcover.evaluation.transport import packed, unpacked
+
+Payload = TypeVar("Payload")
+
+# A rank may wait for another as long as a run takes; that one of them is gone shows at once.
+LONGEST_WAIT = timedelta(days=30)
+LOOK_EVERY_S = 0.05
+# How long rank 0 lets the others read its last word.
+PARTING_S = 5.0
+# What ranks tell each other, beside what they have measured.
+FAILED, ABORTED, IDENTITY, PARTED = "failed", "aborted", "identity", "parted"
+
+
+class Ranks:
+    """The processes that share a run, as `torchrun` starts them: every one of them calls the same.
+
+    Args:
+        store: Where they tell each other short words.
+        rank: Which one this is.
+        size: How many there are.
+    """
+
+    def __init__(self, store: Store, rank: int, size: int) -> None:
+        self.store = store
+        self.rank = rank
+        self.size = size
+
+    def share(self, indices: Sequence[int], world_of: Callable[[int], int]) -> Iterator[int]:
+        """The frames that are this rank's: those of whole worlds, dealt in turns, so that more steps change no share.
+
+        Args:
+            indices: All frames, in order.
+            world_of: Which world a frame is of.
+        """
+        for number, (_, of_world) in enumerate(groupby(indices, world_of)):
+            if number % self.size == self.rank:
+                yield from of_world
+
+    def device(self, name: str) -> str:
+        """Where this rank computes: of several GPUs, one each."""
+        return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if name == "cuda" else name
+
+    def check_same(self, identity: Mapping[str, str]) -> None:
+        """Find out whether all ranks are about the same run.
+
+        Raises:
+            ValueError: This one is not; the message says what differs from rank 0.
+        """
+        if self.rank == 0:
+            self.store.set(IDENTITY, json.dumps(dict(identity)))
+            return
+        self._wait_for([IDENTITY])
+        if other := differences(identity, json.loads(self.store.get(IDENTITY))):
+            raise ValueError(f"rank {self.rank} is about another run than rank 0: {other}; start all with the same")
+
+    def check_others(self) -> None:
+        """Between two frames: whether this rank is to go on.
+
+        Raises:
+            ChildProcessError: Another one has failed; the message says which, and how.
+        """
+        for key in (ABORTED, FAILED):
+            if self.store.check([key]):
+                raise ChildProcessError(self.store.get(key).decode())
+
+    @property
+    def failure(self) -> str | None:
+        """Which rank has failed first, and how, in words."""
+        return self.store.get(FAILED).decode() if self.store.check([FAILED]) else None
+
+    def tell(self, failure: BaseException, key: str = FAILED) -> None:
+        """Tell the others that this rank has failed, if it is the first, so that they stop."""
+        words = " ".join(str(failure).split())
+        said = ": ".join([f"rank {self.rank}", type(failure).__name__, *[words] * bool(words)])
+        self.store.compare_set(key, "", said)
+
+    @contextmanager
+    def aborting(self) -> Iterator[None]:
+        """Whatever leaves the block as an error ends all ranks, and nothing is added up."""
+        try:
+            yield
+        except BaseException as error:
+            self.tell(error, ABORTED)
+            raise
+
+    @contextmanager
+    def connected(self) -> Iterator[None]:
+        """Where ranks `gather` and `merge`; elsewhere nobody knows of them, such as a metric that would add them up.
+
+        Raises:
+            ChildProcessError: Another rank cannot go on.
+        """
+        self.store.set(f"here {self.rank}", "")
+        # In a way that a signal can end, unlike what waits for data.
+        self._wait_for([f"here {rank}" for rank in range(self.size)])
+        sums = PrefixStore("sums", self.store)
+        distributed.init_process_group("gloo", store=sums, rank=self.rank, world_size=self.size, timeout=LONGEST_WAIT)
+        try:
+            yield
+        finally:
+            distributed.destroy_process_group()
+
+    def merge(self, observers: Sequence[AnyObserver]) -> list[AnyObserver]:
+        """Add up what all ranks have seen, in their order; every rank gets all of it.
+
+        Args:
+            observers: Those of this rank, which other ranks have likewise.
+
+        Raises:
+            ValueError: Observers that do not measure the same.
+        """
+        return [self._from_first(self._merged(number, one)) for number, one in enumerate(observers)]
+
+    def gather(self, value: Payload) -> list[Payload]:
+        """What each rank has, in their order; every rank gets all of it."""
+        values = [value, *(self._receive(rank) for rank in range(1, self.size))] if self.rank == 0 else []
+        if self.rank:
+            self._send(value, 0)
+        return self._from_first(values)
+
+    def part(self) -> None:
+        """Wait for rank 0, which writes the results: who ends with an error is the end of all of them."""
+        with suppress(RuntimeError):  # the store ends with the process that keeps it
+            if self.rank == 0:
+                self.store.set(PARTED, "")
+                self._wait_for([f"{PARTED} {rank}" for rank in range(1, self.size)], at_most_s=PARTING_S)
+            else:
+                self._wait_for([PARTED])
+                self.store.set(f"{PARTED} {self.rank}", "")
+
+    def _merged(self, number: int, observer: AnyObserver) -> AnyObserver:
+        if self.rank:
+            self._send(observer, 0)
+            return observer
+        for rank in range(1, self.size):
+            observer.merge_state(self._receive(rank))
+        return observer
+
+    def _wait_for(self, keys: list[str], at_most_s: float = LONGEST_WAIT.total_seconds()) -> None:
+        end_s = time.monotonic() + at_most_s
+        while not self.store.check(keys) and time.monotonic() < end_s:
+            if self.store.check([ABORTED]) and PARTED not in keys:
+                raise ChildProcessError(self.store.get(ABORTED).decode())
+            time.sleep(LOOK_EVERY_S)
+
+    def _from_first(self, value: Payload) -> Payload:
+        if self.rank == 0:
+            for rank in range(1, self.size):
+                self._send(value, rank)
+            return value
+        received: Payload = self._receive(0)
+        return received
+
+    def _send(self, value: object, rank: int) -> None:
+        data = packed(value)
+        distributed.send(torch.tensor([len(data)]), rank)
+        distributed.send(data, rank)
+
+    def _receive(self, rank: int) -> Any:  # noqa: ANN401  (what another rank has sent)
+        length = torch.zeros(1, dtype=torch.int64)
+        distributed.recv(length, rank)
+        data = torch.empty(int(length), dtype=torch.uint8)
+        distributed.recv(data, rank)
+        return unpacked(data)
+
+
+def rank_count() -> int:
+    """How many processes `torchrun` has started, this one among them; 1 without it.
+
+    Raises:
+        ValueError: The environment says what is no number.
+    """
+    return int(os.environ.get("WORLD_SIZE", "1"))
+
+
+@contextmanager
+def joined_ranks() -> Iterator[Ranks | None]:
+    """The ranks that `torchrun` has started, this process one of them; None where it has started one or none.
+
+    Raises:
+        ValueError: The environment of a rank is not whole.
+    """
+    if rank_count() < 2:
+        yield None
+        return
+    store, rank, size = next(iter(rendezvous("env://", timeout=timedelta(minutes=5))))
+    ranks = Ranks(store, rank, size)
+    try:
+        yield ranks
+    finally:
+        ranks.part()
