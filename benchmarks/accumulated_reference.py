@@ -58,6 +58,8 @@ class SimulatedDrive:
 
     reference_sensors = ()
     body = None
+    weight_kind = None
+    instants = None
     path = Path("simulated")
 
     def __init__(self, sweeps, instant, window_s, *, labelled=True):

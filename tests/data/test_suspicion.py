@@ -40,6 +40,8 @@ class Street:
     path = Path("street")
     sensors = ("lidar",)
     reference_sensors = ("reference",)
+    weight_kind = None
+    instants = None
 
     def __post_init__(self):
         self.names = [f"f{step}" for step in range(self.steps)]
