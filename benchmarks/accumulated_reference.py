@@ -60,6 +60,8 @@ class SimulatedDrive:
     weight_kind = None
     instants = None
     body = None
+    weight_kind = None
+    instants = None
     path = Path("simulated")
 
     def __init__(self, sweeps, instant, window_s, *, labelled=True):

@@ -30,6 +30,7 @@ class Street:
     flipped: bool = False
     same: bool = False
     halved: bool = False
+    both_sides: bool = False
     turned_deg: float = 0.0
     slope: tuple = (0.03, -0.02)
     step_s: float = 0.1
@@ -76,9 +77,11 @@ class Street:
 
     def boxes(self, index):
         x, y = torch.tensor([-15.0, -5.0, 8.0, 16.0]), torch.full((4,), -5.0)
+        if self.both_sides:  # cars on both sides
+            x, y = x.repeat(2), torch.cat([y, -y])
         z = self.slope[0] * x + self.slope[1] * y + SIZE_M[2] / 2
-        size_m = torch.tensor(SIZE_M).expand(4, 3)
-        return Boxes.from_rows(torch.column_stack([x, y, z, size_m, torch.zeros(4)]))
+        size_m = torch.tensor(SIZE_M).expand(len(x), 3)
+        return Boxes.from_rows(torch.column_stack([x, y, z, size_m, torch.zeros(len(x))]))
 
 
 def doubts(street, **options):
@@ -90,6 +93,7 @@ def test_nothing_is_wrong_with_what_is_right():
     assert doubts(Street(), reference=AccumulatedReference(1.0)) == []
     assert doubts(Street(slope=(0.12, 0.0))) == []  # a hill
     assert doubts(Street(steps=1)) == []
+    assert doubts(Street(both_sides=True)) == doubts(Street(both_sides=True, flipped=True)) == []  # none can tell
     assert doubts(Street(same=True, halved=True)) == []  # half of the lasers against all
     assert doubts(Street(turned_deg=180.0)) == []  # it reverses
     for drive in (

@@ -85,7 +85,16 @@ def test_trouble_is_told_in_words_with_its_count():
     assert "1 of 3 steps had no sensor point" in text
     assert "1 of 3 steps had no reference point" in text
     assert "3 of 4 reference points count as 0.5 m far, the limit" in text
-    assert "2 of 6 reference points lie outside the grid" in text
+    assert "2 of 6 reference points lie outside the grid: left out." in text
+    assert "z = 0" not in text
+
+
+def test_a_reference_that_lies_elsewhere_is_doubted():
+    coverage = metric()
+    coverage.update(ORIGIN, torch.tensor([[0.2, 0.0, 0.0], *[[0.5, 0.5, -1.7]] * 9]))
+    assert "9 of 10 reference points lie outside the grid: left out. Is the ground at z = 0" in text_of(
+        coverage.compute(), NEAR
+    )
 
 
 def test_without_trouble_none_is_told():

@@ -157,7 +157,7 @@ def mirrored(sensor: str, looks: Iterable[tuple[NDArray[np.float32], Boxes | Non
         return None
     return (
         f"{fuller_mirrored} of {sightings} labelled boxes have points of {sensor} only if its left and right are "
-        f"exchanged, and {fuller} the way it is: turn its y axis round, as for a left-handed simulator"
+        f"exchanged, and {fuller} the way it is: turn its y axis round (flip_y), as for a left-handed simulator"
     )
 
 

@@ -23,6 +23,9 @@ RemarkName = Literal[
     "outside_points",
 ]
 
+# Buildings and trees are above every band; where more than such a share is outside, the clouds may be elsewhere.
+MOSTLY = 0.8
+
 
 @dataclass(frozen=True)
 class Remark:
@@ -117,6 +120,11 @@ def _saturated(remark: Remark, table: CoverageTable, _: str) -> str:
     return f"{_some(remark)} reference points count as {far}: no sensor point was nearer."
 
 
+def _outside(remark: Remark, *_: object) -> str:
+    doubt = " Is the ground at z = 0, and x ahead?" if remark.count > MOSTLY * remark.of else ""
+    return f"{_some(remark)} reference points lie outside the grid: left out.{doubt}"
+
+
 def _some(remark: Remark) -> str:
     return f"{remark.count:,} of {remark.of:,}"
 
@@ -136,6 +144,6 @@ SENTENCES: Mapping[RemarkName, Callable[[Remark, CoverageTable, str], str]] = Ma
         ),
         "empty_reference_steps": lambda remark, *_: f"{_some(remark)} steps had no reference point: they say nothing.",
         "saturated_points": _saturated,
-        "outside_points": lambda remark, *_: f"{_some(remark)} reference points lie outside the grid: left out.",
+        "outside_points": _outside,
     }
 )
