@@ -463,6 +463,6 @@ def test_a_missing_file_a_folder_and_an_unknown_suffix(tmp_path):
     (tmp_path / "folder.npy").mkdir()
     with pytest.raises(IsADirectoryError, match=r"folder\.npy: a folder; a point cloud is one file$"):
         read_cloud(tmp_path / "folder.npy")
-    (tmp_path / "cloud.las").write_bytes(b"LASF")
-    with pytest.raises(ValueError, match=r"cloud\.las: no reader for this suffix; allowed are \.npy, .*\.xyz$"):
-        read_cloud(str(tmp_path / "cloud.las"))
+    (tmp_path / "cloud.e57").write_bytes(b"ASTM-E57")
+    with pytest.raises(ValueError, match=r"cloud\.e57: no reader for this suffix; allowed are \.npy, .*\.xyz"):
+        read_cloud(str(tmp_path / "cloud.e57"))

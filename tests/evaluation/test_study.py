@@ -85,7 +85,7 @@ def test_more_steps_cost_more_time_and_the_start_is_in_it():
 
 
 def test_runs_are_looked_at_whenever_their_steps_have_doubled():
-    assert StudyPlan("rig", steps=100).lengths == [3, 6, 12, 24, 48, 96]
+    assert StudyPlan("rig", steps=100).lengths == [6, 12, 24, 48, 96]
     assert StudyPlan("rig", steps=5).lengths == [1, 2, 4]
 
 
