@@ -339,3 +339,16 @@ def test_a_rule_ends_the_run_and_a_bar_tells_of_it(frames, progress, capsys):
     told = capsys.readouterr().err
     assert ("3/3" in told and "nearly there" in told) == progress
     assert bool(told) == progress
+
+
+@pytest.mark.parametrize(("workers", "threads"), [(0, 2), (1, 1), (2, 1)])
+def test_each_worker_is_left_a_core(frame_of, monkeypatch, workers, threads):
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    before, seen = torch.get_num_threads(), []
+    torch.set_num_threads(2)
+    try:
+        names = Names(lambda: seen.append(torch.get_num_threads()))
+        observe([frame_of(index) for index in range(3)], [names], workers=workers)
+        assert (seen, torch.get_num_threads()) == ([threads] * 3, 2)
+    finally:
+        torch.set_num_threads(before)

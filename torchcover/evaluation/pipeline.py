@@ -1,8 +1,10 @@
 """The one loop: frames in order, and every observer is fed with each of them."""
 
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import groupby, islice
 from traceback import clear_frames, format_exc
@@ -141,7 +143,7 @@ def observe(
     run.reached = until is not None and run.steps > 0 and until.is_reached(run.steps)
     share = most if ranks is None else -(-most // ranks.size)
     try:
-        with progress_of(share, title, done=run.steps, shown=progress) as bar:
+        with _threads_beside(workers), progress_of(share, title, done=run.steps, shown=progress) as bar:
             for frame in _each(frames, () if run.reached else todo, workers, run, skip_bad_frames=skip_bad_frames):
                 if ranks:
                     ranks.check_others()
@@ -169,6 +171,18 @@ def observe(
     if not (run.steps or ranks):
         raise ValueError("no frame could be used, so there is no result")
     return run
+
+
+@contextmanager
+def _threads_beside(workers: int) -> Iterator[None]:
+    """Leave each worker a core: threads that wait here would spin on it."""
+    before = torch.get_num_threads()
+    if workers:
+        torch.set_num_threads(max(1, min(before, (os.cpu_count() or 1) - workers)))
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _killed_worker(error: BaseException, workers: int, steps: int) -> ChildProcessError | None:
