@@ -15,13 +15,19 @@ import trimesh
 from PIL import Image
 
 from tests.cli.hostile import CAMERA, RIG, TOWN, YARD
+from tests.data.drives import Drive
+from tests.data.layouts import LAYOUTS
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
+from torchcover.data.recordings import kitti_files
+from torchcover.data.recordings.argoverse2 import read_feather
 from torchcover.data.recordings.carla import read_carla_sensors
 from torchcover.data.recordings.folder_settings import read_folder_settings
 from torchcover.data.recordings.folder_tables import PoseTable
 from torchcover.data.recordings.folder_tables import read_boxes as read_labels
+from torchcover.data.recordings.json_tables import read_table
+from torchcover.data.recordings.tracklets import read_tracklets
 from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.shapes import MeshFile
@@ -201,6 +207,35 @@ def scene_files():
     yield Kind("town.yaml", TOWN.encode(), Scenario.load)
 
 
+def recording_files(folder):
+    """What recordings are made of beside clouds, as a drive leaves it."""
+    drive, places = Drive(steps=3), {}
+    for layout, write in LAYOUTS.items():
+        (Path(folder) / layout).mkdir()
+        places[layout] = write(drive, Path(folder) / layout)
+    kitti, nuscenes, argoverse2 = (places[layout] for layout in ("kitti_raw", "nuscenes", "argoverse2"))
+
+    def boxes(path):
+        return read_tracklets(path, kitti_files.vehicle_T_velodyne)
+
+    def cuboids(path):
+        return read_feather(path, ("timestamp_ns", "track_uuid", "qw", "tx_m"))
+
+    for path, read in (
+        (kitti.parent / "calib_imu_to_velo.txt", kitti_files.read_calibration),
+        (kitti / "oxts" / "data" / "0000000000.txt", kitti_files.read_oxts),
+        (kitti / "velodyne_points" / "timestamps.txt", kitti_files.read_timestamps),
+        (kitti / "tracklet_labels.xml", boxes),
+        (nuscenes / "v1.0-mini" / "sample_data.json", read_table),
+        (argoverse2 / "annotations.feather", cuboids),
+    ):
+        yield Kind(path.name, path.read_bytes(), read)
+    yield Kind("label_2.txt", KITTI_LABEL, kitti_files.read_labels)
+
+
+KITTI_LABEL = b"Car 0.00 0 1.5 100 100 200 200 1.5 1.6 3.9 1.0 1.6 20.0 1.5\n" * 3
+
+
 def checkpoint(folder):
     """A checkpoint of one observer."""
     path = Path(folder) / "checkpoint.npz"
@@ -272,5 +307,6 @@ def kinds(folder):
         Kind("labels.csv", LABELS, read_labels),
         Kind("coverage.npz", coverage(folder), Coverage.load),
         *scene_files(),
+        *recording_files(folder),
         Kind("checkpoint.npz", checkpoint(folder), lambda path: read_state(path, read_header(path), "one")),
     )

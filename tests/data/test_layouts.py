@@ -1,5 +1,6 @@
 """Every reader finds in its layout the world that was written down in it."""
 
+import json
 import pickle
 
 import numpy as np
@@ -10,6 +11,8 @@ from tests.data.drives import Drive
 from tests.data.layouts import LAYOUTS
 from tests.data.test_accumulated_reference import distances_m, moving, standing
 from torchcover.data import FORMATS, AccumulatedReference, RecordedFrames, open_recording
+from torchcover.data.recordings.kitti_files import read_timestamps
+from torchcover.files import BadFileError
 from torchcover.geometry import invert
 
 
@@ -67,3 +70,30 @@ def test_a_reader_reads_nothing_but_what_is_asked_for(written, monkeypatch):
     _, recording = written
     monkeypatch.setattr("torchcover.data.clouds.read_cloud", lambda path: pytest.fail("a scan was read"))
     assert recording.world_T_vehicle(1).shape == (4, 4)
+
+
+@pytest.mark.parametrize(
+    ("table", "change", "named"),
+    [
+        ("sample_data", lambda row: row.pop("timestamp"), "KeyError: 'timestamp'"),
+        ("sample_data", lambda row: row.update(ego_pose_token="gone"), "no row has the token 'gone'"),
+        ("sample_data", lambda row: row.update(filename="x/LIDAR_TOP/../../a.bin"), "which is not within it"),
+        ("ego_pose", lambda row: row.update(rotation=[0, 0, 0, 0]), "norm 0"),
+        ("sample_annotation", lambda row: row.pop("size"), "KeyError: 'size'"),
+    ],
+)
+def test_tables_that_do_not_hold_together_are_bad_files(tmp_path, table, change, named):
+    root = LAYOUTS["nuscenes"](Drive(steps=3), tmp_path)
+    path = root / "v1.0-mini" / f"{table}.json"
+    rows = json.loads(path.read_text())
+    change(rows[0])
+    path.write_text(json.dumps(rows))
+    with pytest.raises(BadFileError, match=named) as told:
+        open_recording(root).boxes(0)
+    assert str(root) in str(told.value)
+
+
+def test_a_time_zone_is_no_time_of_kitti(tmp_path):
+    (tmp_path / "timestamps.txt").write_text("2011-09-26 13:02:25+02\n")
+    with pytest.raises(BadFileError, match="lines of date and time are needed"):
+        read_timestamps(tmp_path / "timestamps.txt")

@@ -1,6 +1,7 @@
 """The text files of KITTI: calibrations, labels, poses of the GPS and IMU (Geiger et al., IJRR 2013)."""
 
 import math
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -127,8 +128,10 @@ def read_timestamps(path: Path) -> NDArray[np.float64]:
     """
     lines = read_short_text(path).split("\n")
     try:
-        times = np.array([np.datetime64(line.strip().replace(" ", "T"), "ns") for line in lines if line.strip()])
-    except ValueError as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # of time zones, which NumPy would leave out with a warning
+            times = np.array([np.datetime64(line.strip().replace(" ", "T"), "ns") for line in lines if line.strip()])
+    except (ValueError, UserWarning) as error:
         raise ValueError(f"lines of date and time are needed: {error}") from error
     seconds: NDArray[np.float64] = (times - times[0]) / np.timedelta64(1, "s")
     return seconds

@@ -13,6 +13,7 @@ from torchcover.data.recordings.json_tables import beneath, read_table
 from torchcover.data.recordings.recording import Scan, check_times
 from torchcover.data.recordings.tracks import Seen, Tracks
 from torchcover.detection.boxes import Boxes
+from torchcover.files import naming
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 
@@ -48,23 +49,8 @@ class NuScenes:
         tables = _tables(Path(path))
         self.path = tables.parent
         self.rigs = {"nuscenes": self.sensors}
-        samples = self._samples(tables, scenes)
-        poses, calibrations = read_table(tables / "ego_pose.json"), read_table(tables / "calibrated_sensor.json")
-        data = [
-            row
-            for row in read_table(tables / "sample_data.json").rows
-            if _is_lidar(row) and row["sample_token"] in samples
-        ]
-        data.sort(key=lambda row: row["timestamp"])
-        self.names = tuple(Path(row["filename"]).name.removesuffix(".pcd.bin") for row in data)
-        self.frames = [number for number, row in enumerate(data) if row["is_key_frame"]]
-        if not self.frames:
-            raise ValueError(f"{tables}: no key frame of {CHANNEL}")
-        self.times_s = check_times(np.array([row["timestamp"] for row in data]) * 1e-6, len(data), str(tables))
-        self._files = [beneath(self.path, row["filename"]) for row in data]
-        self._poses = [pose_of(poses.row(row["ego_pose_token"])) for row in data]
-        self._mounts = [pose_of(calibrations.row(row["calibrated_sensor_token"])) for row in data]
-        self._tables, self._sample_times = tables, samples
+        with naming(tables, "tables of nuScenes"):  # rows without a column, numbers that are none
+            self._read(tables, scenes)
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
@@ -84,8 +70,31 @@ class NuScenes:
         """The annotations; between two key frames, what lies between theirs."""
         return self._tracks.at(float(self.times_s[index]), invert(self.world_T_vehicle(index)))
 
+    def _read(self, tables: Path, scenes: Sequence[str] | None) -> None:
+        samples = self._samples(tables, scenes)
+        poses, calibrations = read_table(tables / "ego_pose.json"), read_table(tables / "calibrated_sensor.json")
+        data = [
+            row
+            for row in read_table(tables / "sample_data.json").rows
+            if _is_lidar(row) and row["sample_token"] in samples
+        ]
+        data.sort(key=lambda row: row["timestamp"])
+        self.names = tuple(Path(row["filename"]).name.removesuffix(".pcd.bin") for row in data)
+        self.frames = [number for number, row in enumerate(data) if row["is_key_frame"]]
+        if not self.frames:
+            raise ValueError(f"no key frame of {CHANNEL}")
+        self.times_s = check_times(np.array([row["timestamp"] for row in data]) * 1e-6, len(data), CHANNEL)
+        self._files = [beneath(self.path, row["filename"]) for row in data]
+        self._poses = [pose_of(poses.row(row["ego_pose_token"])) for row in data]
+        self._mounts = [pose_of(calibrations.row(row["calibrated_sensor_token"])) for row in data]
+        self._tables, self._sample_times = tables, samples
+
     @cached_property
     def _tracks(self) -> Tracks:
+        with naming(self._tables, "annotations of nuScenes"):
+            return self._read_tracks()
+
+    def _read_tracks(self) -> Tracks:
         categories = {row["token"]: str(row["name"]) for row in read_table(self._tables / "category.json").rows}
         instances = read_table(self._tables / "instance.json")
         tracks: dict[str, list[Seen]] = {}
@@ -108,7 +117,7 @@ class NuScenes:
         by_name = {row["name"]: row["token"] for row in read_table(tables / "scene.json").rows}
         unknown = set(scenes or ()) - by_name.keys()
         if unknown:
-            raise ValueError(f"{tables}: no scene {', '.join(sorted(unknown))}; there are {', '.join(sorted(by_name))}")
+            raise ValueError(f"no scene {', '.join(sorted(unknown))}; there are {', '.join(sorted(by_name))}")
         wanted = {token for name, token in by_name.items() if scenes is None or name in scenes}
         rows = read_table(tables / "sample.json").rows
         return {row["token"]: row["timestamp"] * 1e-6 for row in rows if row["scene_token"] in wanted}
