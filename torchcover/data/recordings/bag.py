@@ -39,6 +39,8 @@ class Bag:
         self.path = path
         if path.is_dir():
             check_metadata(path / METADATA)
+        else:
+            check_suffix(path)
         self._opened: tuple[int, Any, Any] | None = None
         with naming(path, "a ROS 2 bag"):
             connections, _ = self._reader()
@@ -92,6 +94,17 @@ class Bag:
             weakref.finalize(self, reader.close)
             self._opened = os.getpid(), reader, get_typestore(Stores.ROS2_HUMBLE)
         return self._opened[1:]
+
+
+@reads("a ROS 2 bag")
+def check_suffix(path: Path) -> None:
+    """Whether a file is called as bags are.
+
+    Raises:
+        BadFileError: It is not.
+    """
+    if path.suffix not in SUFFIXES.values():
+        raise ValueError(f"a folder with {METADATA}, or a file of {' or '.join(SUFFIXES.values())} is needed")
 
 
 @reads("the metadata of a ROS 2 bag")
