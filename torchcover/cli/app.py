@@ -238,6 +238,22 @@ def record(
 
 
 @app.command()
+def rig(
+    frames: options.RecordingFrames,
+    recording_format: options.Format = None,
+    sensors: options.Sensors = None,
+    lidar: Annotated[
+        list[str] | None,
+        typer.Option(help="SENSOR=MODEL: a LiDAR scans as this model (see `list`), and is not estimated."),
+    ] = None,
+) -> None:
+    """Print the sensors of a recording as a rig: mounts, LiDARs and cameras for `show` and `evaluate`."""
+    from torchcover.cli.rig import run
+
+    run(frames, recording_format, sensors or (), lidar or ())
+
+
+@app.command()
 def show(
     name: Annotated[str, typer.Argument(help="Rig or scenario: a built-in name (see `list`) or a YAML file.")],
     scenario: Annotated[

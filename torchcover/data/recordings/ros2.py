@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.data.recordings.bag import METADATA, SUFFIXES, Bag
+from torchcover.data.recordings.calibrated import SensorCalibrations
 from torchcover.data.recordings.frame_tree import FrameTree, frame_name
 from torchcover.data.recordings.point_cloud2 import CloudMessage, cloud_of
 from torchcover.data.recordings.recording import NO_RETURN_M, Scan, check_times
@@ -121,6 +122,10 @@ class Ros2:
             BadFileError: The messages are damaged, or there is no pose near that time.
         """
         return None if self._poses is None else self._world_T_vehicle(self._poses, index)
+
+    def calibrations(self) -> SensorCalibrations:
+        """The mounts."""
+        return SensorCalibrations(f"static transforms to {self.vehicle_frame}", self._mounts)
 
     def boxes(self, index: int) -> None:
         """Nobody has labelled anything."""
