@@ -105,6 +105,8 @@ def read_rectified(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, 
         matrix = matrix.reshape(3, 4)
         with naming(path, "a KITTI calibration"):
             intrinsics = split_matrix(matrix[:, :3], f"P_rect_{name}")
+            if 0.0 in intrinsics[:2]:
+                raise ValueError(f"P_rect_{name} has no focal length")
             # P = K [I | t]: the rectified cameras differ from each other by a translation only.
             rectified_T_camera = invert(rigid(np.eye(3), np.linalg.solve(matrix[:, :3], matrix[:, 3])))
         pose = vehicle_T_rectified @ rectified_T_camera
