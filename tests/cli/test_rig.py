@@ -8,7 +8,8 @@ from torchcover import Rig
 
 def test_a_recorded_rig_is_found_again(torchcover, worlds, tmp_path):
     recording, found = tmp_path / "recording", tmp_path / "found.yaml"
-    torchcover("record", worlds / "both.yaml", "--scenario", worlds / "yard.yaml", "--steps", 2, "--out", recording)
+    few = ("--scenario", worlds / "yard.yaml", "--steps", 2, "--rays", 64)
+    torchcover("record", worlds / "both.yaml", *few, "--out", recording)
     code, printed, error = torchcover("rig", "--frames", recording)
     assert (code, error) == (0, "")
     found.write_text(printed)
@@ -22,8 +23,7 @@ def test_a_recorded_rig_is_found_again(torchcover, worlds, tmp_path):
         assert (lidar.name, lidar.columns, lidar.horizontal_fov_deg) == (of.name, 30, 90.0)
         np.testing.assert_allclose(lidar.mount.matrix(), of.mount.matrix(), atol=1e-6)
         assert lidar.max_range_m <= 60.1
-    few = ("--steps", 1, "--rays", 256, "--cell", 1)
-    assert torchcover("evaluate", found, "--scenario", worlds / "yard.yaml", *few, "--out", tmp_path / "out")[0] == 0
+    assert torchcover("evaluate", found, *few, "--cell", 1, "--out", tmp_path / "out")[0] == 0
     code, printed, _ = torchcover("rig", "--frames", recording, "--sensors", "rear", "--lidar", "rear=velodyne_vlp16")
     (sensor,) = yaml.safe_load(printed)["sensors"]
     assert (code, sensor["name"], sensor["model"]) == (0, "rear", "velodyne_vlp16")

@@ -13,8 +13,8 @@ BIN_DEG, FINEST_DEG, COARSEST_DEG, GROWTH = 0.005, 0.01, 1.0, 1.15
 SAME_THROUGH = 5
 # A peak is at least of so many points. There are no more rows in a LiDAR than MAX_ROWS.
 PEAK_POINTS, MAX_ROWS = 1.5, 1000
-# What is seen nowhere over a wider angle is beyond the field of view.
-BLIND_DEG = 5.0
+# What is seen nowhere over a wider angle is beyond the field of view; over a smaller one, something is in the way.
+BLIND_DEG = 30.0
 # So many neighbours that returned nothing may lie between two points that tell the step of the columns.
 FARTHEST_COLUMNS = 3
 
