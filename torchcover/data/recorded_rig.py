@@ -94,8 +94,8 @@ def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: st
         )
     mount = mount @ rigid(rotation_from_euler(found.centre_deg, 0.0, 0.0), np.zeros(3))
     return {"type": "lidar", "name": name, "mount": _pose(mount), **_pattern(found)}, (
-        f"{mounted}; estimated from {count} scan{'s' * (count > 1)}: {len(found.elevations_deg)} rows (those that returned anything), "
-        f"{found.columns:,} columns, ranges of the nearest and the farthest return"
+        f"{mounted}; estimated from {count} scan{'s' * (count > 1)}: {len(found.elevations_deg)} rows (those that "
+        f"returned anything), {found.columns:,} columns, ranges of the nearest and the farthest return"
     )
 
 

@@ -25,6 +25,8 @@ VEHICLE_FRAMES = ("base_link", "base_footprint")
 RAREST = 0.25
 # Scans of one instant: none is farther from the first sensor's than this share of the time from one to the next.
 FARTHEST_SCAN = 0.75
+# Points of so short a time are moved together: 0.4 mm at 40 m/s.
+TICK_S = 1e-5
 
 
 class Ros2:
@@ -109,8 +111,9 @@ class Ros2:
             return Scan(cloud.points_m, vehicle_T_world @ world_T_then @ mount, source)
         # Only what came back: zeros stay zeros, which say that nothing did.
         came = np.flatnonzero((np.abs(cloud.points_m) > NO_RETURN_M).any(axis=1))
-        times_ns = stamp_ns + np.rint(cloud.offsets_s[came] * 1e9).astype(np.int64)
-        sensor_T_then = invert(mount) @ vehicle_T_world @ self._poses.at(times_ns, logged_ns) @ mount
+        tick, of_point = np.unique(np.rint(cloud.offsets_s[came] / TICK_S).astype(np.int64), return_inverse=True)
+        times_ns = stamp_ns + np.rint(tick * TICK_S * 1e9).astype(np.int64)
+        sensor_T_then = (invert(mount) @ vehicle_T_world @ self._poses.at(times_ns, logged_ns) @ mount)[of_point]
         points_m = cloud.points_m.astype(np.float64)
         points_m[came] = np.einsum("nij,nj->ni", sensor_T_then[:, :3, :3], points_m[came]) + sensor_T_then[:, :3, 3]
         return Scan(points_m, mount, source)
