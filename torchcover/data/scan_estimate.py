@@ -15,8 +15,6 @@ SAME_THROUGH = 5
 PEAK_POINTS, MAX_ROWS = 1.5, 1000
 # What is seen nowhere over a wider angle is beyond the field of view; over a smaller one, something is in the way.
 BLIND_DEG = 30.0
-# So many neighbours that returned nothing may lie between two points that tell the step of the columns.
-FARTHEST_COLUMNS = 3
 
 
 class ScanEstimate(NamedTuple):
@@ -117,9 +115,7 @@ def _column_step_deg(azimuth_deg: NDArray[np.float64], of_row: NDArray[np.int64]
         return None
     step_deg = float(np.median(gaps_deg))
     for _ in range(3):
-        steps = np.rint(gaps_deg / step_deg)
-        near = (steps >= 1) & (steps <= FARTHEST_COLUMNS)
-        step_deg = float(gaps_deg[near].sum() / steps[near].sum())
+        step_deg = float(gaps_deg[np.rint(gaps_deg / step_deg) == 1].mean())
     return step_deg
 
 
@@ -128,7 +124,7 @@ def _field_of_view(azimuth_deg: NDArray[np.float64], step_deg: float) -> tuple[f
     ordered = np.sort(azimuth_deg)
     gaps_deg = np.diff(ordered, append=ordered[0] + 360.0)
     widest = int(gaps_deg.argmax())
-    if gaps_deg[widest] < max(BLIND_DEG, FARTHEST_COLUMNS * step_deg):
+    if gaps_deg[widest] < BLIND_DEG:
         return 360.0, 0.0
     centre_deg = float(ordered[widest] + gaps_deg[widest] / 2 + 180.0)
     return min(360.0, 360.0 - float(gaps_deg[widest]) + step_deg), (centre_deg + 180.0) % 360.0 - 180.0
