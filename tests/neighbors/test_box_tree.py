@@ -48,8 +48,8 @@ def test_points_far_away_do_not_coarsen_the_order(far_m):
 
 
 def test_many_equal_points_do_not_coarsen_the_order_of_the_others():
-    cloud = random_cloud(300, 3)
-    assert leaf_sizes(torch.cat([cloud, torch.zeros(50_000, 3)])).mean() < 1.0
+    sizes = leaf_sizes(torch.cat([random_cloud(3000, 3), torch.zeros(250_000, 3)]))
+    assert sizes[sizes > 0].mean() < 50
 
 
 @pytest.mark.parametrize("count", [1, 2, 5000])

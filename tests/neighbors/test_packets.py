@@ -49,6 +49,12 @@ def grid(side):
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
+def sphere(count, seed):
+    """All at about the same distance from the origin: which one is nearest to it, rounding decides."""
+    directions = generator(seed).normal(size=(count, 3))
+    return (10 * directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+
+
 CLOUDS = {
     "random": (uniform(700, 1), uniform(3000, 2)),
     "scan": (uniform(700, 3, [-30, -30, 0], [30, 30, 3]), scan(40, 120)),
@@ -58,6 +64,7 @@ CLOUDS = {
     "queries all equal": (np.ones((200, 3), np.float32), uniform(3000, 9)),
     "on a line": (line(500, 10), line(3000, 11)),
     "in a plane": (uniform(500, 12) * np.float32([1, 1, 0]), uniform(3000, 13) * np.float32([1, 1, 0])),
+    "on a sphere": (uniform(300, 28) * np.float32(1e-7), sphere(3000, 29)),
     "far apart": (uniform(300, 14), uniform(3000, 15) + np.float32([1e6, 0, 0])),
     "one far away": (uniform(300, 16), np.concatenate([uniform(3000, 17), np.float32([[1e9, -1e9, 0]])])),
     "huge": (uniform(300, 18) * np.float32(2e7), uniform(3000, 19) * np.float32(2e7)),
