@@ -17,7 +17,7 @@ DEFAULT_RIG = "front_roof_128"
 
 
 def run(name: str, *, scenario: str | None, rig: str | None, step: int | None, seed: int | None, out: Path) -> None:
-    """Print what it says of itself; draw it to `out/NAME.png`, and what a rig's cameras measure to `out/NAME_depth.png`.
+    """Print what it says of itself; draw it to `out/NAME.png`, what a rig's cameras measure to `out/NAME_depth.png`.
 
     Raises:
         ValueError: The name of neither or of both, an option for the other kind, or a document that is not valid.
