@@ -31,8 +31,8 @@ lint: $(VENV)/.ready
 types: $(VENV)/.ready
 	$(BIN)/mypy
 
-doctest: $(VENV)/.ready  ## the examples in the docstrings and in the documentation
-	$(BIN)/python -m pytest --doctest-modules torchcover --doctest-glob='*.md' README.md docs
+doctest: $(VENV)/.ready  ## the examples in the docstrings; tests/test_documentation.py runs those of the documentation
+	$(BIN)/python -m pytest --doctest-modules torchcover
 
 docs: $(VENV)/.ready  ## the pages, with those made from the code, in out/site
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
