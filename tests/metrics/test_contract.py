@@ -89,6 +89,20 @@ def test_the_inputs_are_as_they_were(case):
 
 
 @EVERY
+@pytest.mark.parametrize("in_a_list", [False, True])
+def test_an_array_of_numpy_is_refused_by_its_name_and_nothing_is_added(case, in_a_list):
+    metric = case.over(case.steps[:1])
+    before, step = states(metric), case.steps[1]
+    tensors = [name for name, value in step.items() if isinstance(value, torch.Tensor)]
+    assert tensors
+    for name in tensors:
+        given = {**step, name: step[name].numpy()}
+        with pytest.raises(TypeError, match=rf"^{name}.* got a NumPy array of float.*; torch.from_numpy\(array\)"):
+            metric.update(**(in_lists([given]) if in_a_list else given))
+    assert_states(metric, before)
+
+
+@EVERY
 def test_forward_gives_the_step_and_adds_it(case):
     metric = case.make()
     for step in case.steps:
