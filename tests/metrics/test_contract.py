@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
 import torch
 from torchmetrics import Metric, MetricCollection
@@ -132,6 +133,24 @@ def test_reset_forgets_every_step(case):
     metric.update(**case.steps[5])
     assert_same(metric.compute(), case.over(case.steps[5:6]).compute())
     assert_states(case.make(), states(case.over([])))
+
+
+@EVERY
+def test_plot_gives_figure_and_axes_and_changes_nothing(case):
+    metric = case.over(case.steps[:3])
+    before, other = states(metric), case.over(case.steps[3:6]).compute()
+    try:
+        figure, axes = metric.plot()
+        assert (axes.figure, axes) == metric.plot(metric.compute(), axes) == (figure, axes)
+        wide, (left, right) = plt.subplots(1, 2)
+        assert metric.plot(other, right) == (wide, right)
+        assert (left.has_data(), right.has_data()) == (False, True)
+        assert MetricCollection({"one": metric}).plot(ax=[left]) == [(wide, left)]
+        with pytest.raises(TypeError, match=r"^val: "):
+            metric.plot([other])
+    finally:
+        plt.close("all")
+    assert_states(metric, before)
 
 
 # What the state is.

@@ -389,11 +389,9 @@ def test_mlflow_gets_a_file_for_every_figure_and_step(tmp_path, blank_maps):
     make_trainer(tmp_path, CoverageCallback(make_metric()), logger=logger, max_epochs=2).fit(
         Validated(), loader(2), loader(3)
     )
-    names = [
-        f"coverage/val/{name}/step_0000000{step}.png" for step in (0, 1) for name in ("radius_m", "detection_0.4m")
-    ]
+    names = [f"coverage/val/{name}/step_0000000{step}.png" for step in (0, 1) for name in ("radius", "blank")]
     assert taken == dict.fromkeys(names, "a1b2")
-    assert (tmp_path / "drawn.png").stat().st_size > 1000
+    assert (tmp_path / "drawn.png").stat().st_size > 100
 
 
 def test_comet_gets_figures_by_name_and_step(tmp_path, blank_maps):
