@@ -155,7 +155,7 @@ class CoverageMetric(MergeableMetric):
                 the step says nothing.
             weights: (M,) weight of each reference point in the mean over its cell in its step, or a list of the same
                 length. For reference sensors whose density within a cell is not the one that is asked for: the
-                weights are the second divided by the first. Not given: every point weighs the same.
+                weights are the second divided by the first (`frame.reference_weights`). Not given: all weigh the same.
             index: Number of the step in time, 10^15 at most, or a list of them; it decides about the block, so that
                 steps of one number, as of an instant that is seen again, share one. Not given: counted on from the
                 steps so far.
