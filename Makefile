@@ -30,6 +30,7 @@ lint: $(VENV)/.ready
 
 types: $(VENV)/.ready
 	$(BIN)/mypy
+	$(BIN)/mypy tests/typing
 
 doctest: $(VENV)/.ready  ## the examples in the docstrings; tests/test_documentation.py runs those of the documentation
 	$(BIN)/python -m pytest --doctest-modules torchcover
