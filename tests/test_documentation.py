@@ -3,6 +3,7 @@
 import doctest
 import re
 import shlex
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -41,7 +42,7 @@ def commands():
     for parameter in blocks("console"):
         for line in re.sub(r"\\\n", " ", parameter.values[0]).splitlines():
             if line.startswith("$ "):
-                words = shlex.split(line[2:], comments=True)
+                words = list(takewhile(lambda word: word not in (">", "|"), shlex.split(line[2:], comments=True)))
                 yield pytest.param(words, id=f"{parameter.id} {' '.join(words)}"[:80])
 
 
