@@ -8,15 +8,19 @@ from pathlib import Path
 from torchcover.data.clouds import READERS, split_name
 
 MAX_NAMES_SHOWN = 5
+CLOUDS = f"a cloud; allowed are files ending in {', '.join(READERS)}"
 
 
-def frame_files(folder: Path, like: Sequence[str] | None = None, beside: Collection[str] = ()) -> dict[str, Path]:
-    """The clouds in a folder by the names of their frames, in natural order (frame2 before frame10).
+def frame_files(
+    folder: Path, like: Sequence[str] | None = None, beside: Collection[str] = (), *, images: bool = False
+) -> dict[str, Path]:
+    """The clouds, or depth images, in a folder by the names of their frames, in natural order (frame2 before frame10).
 
     Args:
         folder: Where they are.
         like: Names that there have to be, and no others.
         beside: Names of files that may be there and are no clouds.
+        images: Whether depth images in PNG are wanted, and no clouds.
 
     Raises:
         FileNotFoundError: No such folder.
@@ -28,9 +32,10 @@ def frame_files(folder: Path, like: Sequence[str] | None = None, beside: Collect
     for path in sorted(folder.iterdir()):
         if path.name in beside or path.name.startswith("."):  # what file managers and version control leave behind
             continue
-        name, suffix = split_name(path.name)
+        name, suffix = (path.stem, path.suffix == ".png") if images else split_name(path.name)
         if not suffix or path.is_dir():
-            raise ValueError(f"{path}: not a cloud; allowed are files ending in {', '.join(READERS)}")
+            wanted = "a depth image; allowed are files ending in .png" if images else CLOUDS
+            raise ValueError(f"{path}: not {wanted}")
         if name in clouds:
             raise ValueError(f"{folder}: two files for the frame {name}: {clouds[name].name} and {path.name}")
         clouds[name] = path
