@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchcover.data.in_vehicle import InVehicle, in_vehicle
+from torchcover.data.in_vehicle import InVehicle, in_vehicle, within
 from torchcover.data.recordings import Recording
 from torchcover.detection import Boxes, points_in_boxes
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler, transform
@@ -134,14 +134,19 @@ class AccumulatedReference:
         first = np.sort(_first_of_each(np.concatenate([np.empty(0, np.int64), *voxels])))
         ends = np.cumsum([0, *map(len, still)])
         kept = np.split(first, np.searchsorted(first, ends[1:-1]))
-        still = [points_m[own - start] for points_m, own, start in zip(still, kept, ends[:-1], strict=False)]
-        standing_m = transform(vehicle_T_local, np.concatenate([np.empty((0, 3)), *still]))
-        points_m = np.concatenate([standing_m, *moved])
-        own = _beneath_or_in(points_m, recording.body)
-        dropped["own_vehicle"] += int(own.sum())
-        if own.all():
+        placed = [
+            transform(vehicle_T_local, points_m.take(own - start, axis=0))
+            for points_m, own, start in zip(still, kept, ends[:-1], strict=False)
+        ]
+        parts = [np.empty((0, 3), np.float32)]
+        for points_m in (*placed, *moved):
+            own = _beneath_or_in(points_m, recording.body)
+            dropped["own_vehicle"] += len(own)
+            parts.append((np.delete(points_m, own, axis=0) if len(own) else points_m).astype(np.float32))
+        reference_m: NDArray[np.float32] = np.concatenate(parts)
+        if not len(reference_m):
             raise ValueError(f"no reference point is left of the scans within {self.window_s / 2:g} s of this instant")
-        return InVehicle(points_m[~own].astype(np.float32), dropped)
+        return InVehicle(reference_m, dropped)
 
     def weight_kind(self, recording: Recording) -> None:
         """None: one point a voxel, which all count the same."""
@@ -250,9 +255,8 @@ def _by_name(boxes: Boxes | None) -> dict[str, Matrix]:
     return {} if boxes is None else {name: _pose_of(boxes, number) for number, name in enumerate(boxes.ids)}
 
 
-def _beneath_or_in(points_m: NDArray[np.float64], body: BoundingBox | None) -> NDArray[np.bool_]:
-    """What is where the vehicle stands; no other sensor could see it at that instant."""
+def _beneath_or_in(points_m: NDArray[np.float64], body: BoundingBox | None) -> NDArray[np.intp]:
+    """Numbers of the points where the vehicle stands; no other sensor could see them at that instant."""
     if body is None:
-        return np.zeros(len(points_m), dtype=bool)
-    lower_m, upper_m = (*body.lower_m[:2], -np.inf), body.upper_m
-    return np.logical_and.reduce([points_m > lower_m, points_m < upper_m]).all(axis=1)  # type: ignore[no-any-return]
+        return np.empty(0, np.intp)
+    return within(points_m, BoundingBox((*body.lower_m[:2], -np.inf), body.upper_m))
