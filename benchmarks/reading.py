@@ -34,7 +34,7 @@ def main():
             start, used = time.perf_counter(), time.process_time()
             frames = RecordedFrames(path)
             opened = time.process_time() - used
-            frames[LONG // 4]
+            frames[len(frames) // 4]
             rows.append((layout, opened, time.process_time() - used, time.perf_counter() - start))
     print(f"\n{LONG:,} frames")
     table(("layout", "opened, s", "first frame, s", "by the clock, s"), rows)

@@ -67,7 +67,8 @@ def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
             inside = within(part_m, body)
             part_m = np.delete(part_m, inside, axis=0) if len(inside) else part_m
             own.append(rows.start + inside)
-        moved_m[count : count + len(part_m)] = part_m
+        with np.errstate(over="ignore"):  # see _check_range
+            moved_m[count : count + len(part_m)] = part_m
         count += len(part_m)
     _check_range(farthest_m, scan.source)
     if body is not None:
