@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from torchcover import Coverage, CoverageMetric
-from torchcover.simulation import REFERENCE_SENSORS
+from torchcover.simulation import REFERENCE_SENSORS, builtin_documents, builtin_names
 
 
 @pytest.fixture
@@ -276,16 +276,32 @@ def test_a_folder_may_be_called_what_rich_takes_for_markup(torchcover, recording
 def test_an_output_without_the_signs_of_the_tables_gets_question_marks_not_an_error(torchcover, monkeypatch):
     buffer = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(buffer, encoding="ascii"))
-    monkeypatch.setattr("torchcover.cli.listing.run", lambda: Console().print("0.3 ± 0.1"))
+    monkeypatch.setattr("torchcover.cli.listing.run", lambda word: Console().print("0.3 ± 0.1"))
     assert torchcover("list")[0] == 0
     assert buffer.getvalue() == b"0.3 ? 0.1\n"
 
 
-def test_list_names_everything_built_in(torchcover):
+def test_list_names_everything_built_in_and_what_it_is_made_of(torchcover):
     code, printed, _ = torchcover("list")
+    lines = [line.split(maxsplit=1) for line in printed.splitlines()]
+    said = {name: rest[0] for name, *rest in filter(None, lines) if rest}
     assert code == 0
-    for name in ("front_roof_128", "front_grille_128", "courtyard"):
-        assert name in printed
+    for kind in ("rigs", "scenarios", "lidars", "vehicles"):
+        assert set(builtin_names(kind)) <= set(said)
+    assert said["nuscenes_cameras"].startswith("6 cameras  The six cameras of the nuScenes cars (Renault Zoe)")
+    assert said["velodyne_vlp16"].startswith("16 rows, 100 m   Velodyne VLP-16.")
+    assert said["courtyard"].startswith("static")
+
+
+def test_list_with_a_word_prints_what_has_it_and_all_that_is_said_of_it(torchcover):
+    code, printed, _ = torchcover("list", "PANDAR64")
+    assert (code, "hesai_pandar64" in printed, "velodyne_vlp16" in printed) == (0, True, False)
+    assert " ".join(builtin_documents("lidars")["hesai_pandar64"]["description"].split()) in printed
+    code, _, said = torchcover("list", "no such thing")
+    assert (code, said) == (
+        2,
+        "torchcover: nothing built in with 'no such thing'; torchcover list prints all there is\n",
+    )
 
 
 def test_version_and_help(torchcover):

@@ -484,7 +484,7 @@ def test_other_shapes_are_refused(backend, shape):
     [
         (torch.zeros(2, 3, dtype=torch.int32), "torch.int32"),
         (torch.zeros(2, 3, dtype=torch.complex64), "torch.complex64"),
-        (np.zeros((2, 3)), "ndarray"),
+        (np.zeros((2, 3)), "a NumPy array of float64"),
         ([[0.0, 0.0, 0.0]], "list"),
     ],
 )

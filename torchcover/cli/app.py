@@ -255,11 +255,15 @@ def show(
 
 
 @app.command("list")
-def list_builtin() -> None:
-    """List the built-in rigs and scenarios."""
+def list_builtin(
+    word: Annotated[
+        str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
+    ] = None,
+) -> None:
+    """List the built-in rigs, scenarios, LiDAR models and vehicles."""
     from torchcover.cli.listing import run
 
-    run()
+    run(word)
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)

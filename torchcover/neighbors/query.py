@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchcover.neighbors.checks import check_cloud
 from torchcover.neighbors.choice import choose_search
 
 # Queries that are measured together on a CPU.
@@ -118,28 +119,6 @@ def _nearest(query: Tensor, points: Tensor, max_distance: float, backend: str, m
         with torch.no_grad(), torch.autocast(query.device.type, enabled=False):
             index = search(*_rescale(query, points, max_distance), memory_mb)
     return _distance_to(query, points, index, max_distance)
-
-
-def check_cloud(cloud: Tensor, name: str) -> None:
-    """Raise unless `cloud` is a floating-point tensor of shape (N, 3) with finite coordinates.
-
-    Args:
-        cloud: What arrived.
-        name: What the caller calls it, for the message.
-
-    Raises:
-        TypeError: Not a tensor of a floating-point type.
-        ValueError: Another shape, or NaN or infinite coordinates (the message says how many points have them).
-    """
-    if not isinstance(cloud, Tensor) or not cloud.is_floating_point():
-        arrived = cloud.dtype if isinstance(cloud, Tensor) else type(cloud).__name__
-        raise TypeError(f"{name}: a floating-point torch tensor is needed; got {arrived}")
-    if cloud.ndim != 2 or cloud.shape[1] != 3:
-        raise ValueError(f"{name}: shape (N, 3) is needed; got {tuple(cloud.shape)}")
-    # A sum is finite only if all its terms are; one that overflows is looked at term by term.
-    if not cloud.detach().sum().isfinite() and not cloud.isfinite().all():
-        bad = int((~cloud.detach().isfinite()).any(dim=1).sum())
-        raise ValueError(f"{name}: {bad} of {len(cloud)} points have NaN or infinite coordinates; drop them first")
 
 
 def _check_together(query: Tensor, points: Tensor, max_distance: float, memory_mb: float) -> tuple[Tensor, Tensor]:
