@@ -1,6 +1,6 @@
 """Read one point cloud from one file, whatever its format."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 
@@ -29,15 +29,19 @@ READERS: dict[str, Callable[[Path], Points]] = {
 }
 
 
-def split_name(name: str) -> tuple[str, str]:
-    """Split a file name into stem and registered suffix; the suffix is empty where no reader is registered.
+def split_name(name: str, suffixes: Collection[str] | None = None) -> tuple[str, str]:
+    """Split a file name into stem and suffix, one that is registered or one of others; empty where it is none of them.
 
     Example:
         >>> split_name("LIDAR_TOP__15.pcd.bin"), split_name("000007.BIN"), split_name("notes.txt")
         (('LIDAR_TOP__15', '.pcd.bin'), ('000007', '.bin'), ('notes.txt', ''))
     """
-    suffix = max((known for known in READERS if name.lower().endswith(known)), key=len, default="")
-    return name[: len(name) - len(suffix)], suffix
+    lower, known = name.lower(), READERS if suffixes is None else suffixes
+    last = lower.rfind(".")
+    for start in (lower.rfind(".", 0, max(last, 0)), last):  # the longer one first
+        if start >= 0 and lower[start:] in known:
+            return name[:start], lower[start:]
+    return name, ""
 
 
 @reads("a point cloud")

@@ -1,5 +1,6 @@
 """Files of frames in a folder: one a frame, in natural order."""
 
+import os
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -29,19 +30,22 @@ def frame_files(
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; clouds are needed in it, one a frame")
     clouds: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.name in beside or path.name.startswith("."):  # what file managers and version control leave behind
+    with os.scandir(folder) as entries:
+        found = sorted((entry.name, entry.is_dir()) for entry in entries)
+    for file, is_folder in found:
+        if file in beside or file.startswith("."):  # what file managers and version control leave behind
             continue
-        name, suffix = (path.stem, path.suffix == ".png") if images else split_name(path.name)
-        if not suffix or path.is_dir():
+        name, suffix = split_name(file, (".png",)) if images else split_name(file)
+        if not suffix or is_folder:
             wanted = "a depth image; allowed are files ending in .png" if images else CLOUDS
-            raise ValueError(f"{path}: not {wanted}")
+            raise ValueError(f"{folder / file}: not {wanted}")
         if name in clouds:
-            raise ValueError(f"{folder}: two files for the frame {name}: {clouds[name].name} and {path.name}")
-        clouds[name] = path
+            raise ValueError(f"{folder}: two files for the frame {name}: {clouds[name].name} and {file}")
+        clouds[name] = folder / file
     if like is not None:
         check_same_names(folder.parent, {folder.name: clouds, "the others": dict.fromkeys(like)})
-    return {name: clouds[name] for name in sorted(clouds, key=natural)}
+    numbers = all(map(str.isdecimal, clouds))  # which need not be taken apart
+    return {name: clouds[name] for name in sorted(clouds, key=_number if numbers else natural)}
 
 
 def check_same_names(folder: Path, files: Mapping[str, Mapping[str, object]]) -> None:
@@ -88,6 +92,10 @@ def natural(name: str) -> tuple[list[str | int], str]:
     # Text and number alternate, starting with text, so that two keys always compare; the name itself breaks a tie.
     parts = re.split(r"(\d+)", name)
     return [int(part) if position % 2 else part for position, part in enumerate(parts)], name
+
+
+def _number(name: str) -> tuple[int, str]:
+    return int(name), name
 
 
 def some_of(names: Sequence[str]) -> str:
