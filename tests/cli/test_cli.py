@@ -5,12 +5,14 @@ import io
 import json
 import subprocess
 import sys
+from itertools import count
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
 
-from torchcover import Coverage, CoverageMetric
+from torchcover import Coverage, CoverageMetric, nearest
 from torchcover.simulation import REFERENCE_SENSORS, builtin_documents, builtin_names
 
 
@@ -210,6 +212,8 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["evaluate", "front_roof_128", "--steps", "many"], "--steps"),
         (["evaluate", "front_roof_128", "--seed", "-1"], "--seed"),
         (["evaluate", "front_roof_128", "--device", "abacus"], "device abacus: cannot be used here"),
+        (["evaluate", "front_roof_128", "--device", "cuda:99"], "device cuda:99: cannot be used here"),
+        (["evaluate", "front_roof_128", "--device", "hpu"], "device hpu: cannot be used here"),
         (["evaluate", "front_roof_128", "--colour"], "No such option"),
         (["evaluate", "front_roof_128", "--target-error", "5"], "target error 5: a positive number with its unit"),
         (["evaluate", "front_roof_128", "--target-error", "-1m"], "target error -1m: a positive number"),
@@ -341,3 +345,27 @@ def test_a_grid_that_does_not_fit_into_memory_ends_in_one_line(torchcover, tmp_p
         "torchcover: a cell of 0.05 m: there is not enough memory for the sums of 12,800,000 cells in 16 blocks; "
         "use larger cells"
     )
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (MemoryError("cuda:0: the search among 7 points"), "(cuda:0: the search among 7 points); ask for less"),
+        (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 7.00 GiB.\nGPU 0 ..."), "7.00 GiB.); ask"),
+    ],
+)
+def test_out_of_memory_on_a_gpu_ends_in_one_line_and_keeps_what_was_measured(
+    torchcover, recording, tmp_path, monkeypatch, error, told
+):
+    def search(*arguments, **options):
+        if next(calls) == 2:
+            raise error
+        return nearest(*arguments, **options)
+
+    calls = count()
+    monkeypatch.setattr("torchcover.coverage.metric.nearest", search)
+    code, _, complaints = torchcover("evaluate", "--frames", recording, "--cell", 4, "--out", tmp_path / "out")
+    assert code == 2
+    assert complaints.splitlines()[-1].startswith("torchcover: there is not enough memory (")
+    assert told in complaints.splitlines()[-1]
+    assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["steps"] == 2

@@ -47,6 +47,10 @@ def main() -> None:
         _fail(str(error))
     except MemoryError as error:
         _fail(f"there is not enough memory ({error or 'for what was asked'}); ask for less, or use a larger machine")
+    except RuntimeError as error:
+        if type(error).__name__ != "OutOfMemoryError":  # of torch, which most mistakes are told without
+            raise
+        _fail(f"there is not enough memory ({str(error).splitlines()[0]}); ask for less, or use --device cpu")
     except (OverflowError, RecursionError) as error:
         _fail(f"a number is too large, or a file nested too deeply ({error})")
     if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
