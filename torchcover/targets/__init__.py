@@ -1,0 +1,1 @@
+"""What a rig sees of a body, for every place around the vehicle."""
