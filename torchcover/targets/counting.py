@@ -156,7 +156,8 @@ def _in_target(mounted: MountedSensor, met: _Met, vehicle_T_target: Float64, noi
     range_m = met.range_m.astype(np.float64) + (0.0 if noise_m is None else noise_m[met.ray])
     from_origin_m = mounted.vehicle_T_sensor[:3, 3] + met.direction * range_m[:, None]
     from_origin_m -= vehicle_T_target[met.position, :3, 3]
-    return np.einsum("nji,nj->ni", vehicle_T_target[met.position, :3, :3], from_origin_m)
+    hits_m: Float64 = np.einsum("nji,nj->ni", vehicle_T_target[met.position, :3, :3], from_origin_m)
+    return hits_m
 
 
 def _any_of_each(position: Numbers, bits: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:

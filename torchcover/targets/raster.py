@@ -81,18 +81,24 @@ class Raster:
     @property
     def x_m(self) -> NDArray[np.float64]:
         """(X,) middles of the columns."""
-        return self.x[0] + self.step_m * (np.arange(self.shape[1]) + 0.5)
+        return _middles_m(self.x[0], self.step_m, self.shape[1])
 
     @property
     def y_m(self) -> NDArray[np.float64]:
         """(Y,) middles of the rows."""
-        return self.y[0] + self.step_m * (np.arange(self.shape[0]) + 0.5)
+        return _middles_m(self.y[0], self.step_m, self.shape[0])
 
     @property
     def positions_m(self) -> NDArray[np.float64]:
         """(Y * X, 2) middles of the cells, row by row."""
         x, y = np.meshgrid(self.x_m, self.y_m)
         return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def _middles_m(low_m: float, step_m: float, count: int) -> NDArray[np.float64]:
+    middles_m: NDArray[np.float64] = low_m + step_m * (np.arange(count, dtype=np.float64) + 0.5)
+    # A cell that was meant to be at 0.1 is not at 0.09999999999999998.
+    return middles_m.round(9)
 
 
 def from_outline_m(box: BoundingBox, positions_m: NDArray[np.float64]) -> NDArray[np.float64]:

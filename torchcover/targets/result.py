@@ -57,6 +57,7 @@ class TargetMap:
         vehicle: Box of the vehicle.
         vehicle_outline_m: (K, 2) what is drawn of it.
         sensor_names: Of the rig.
+        sensors_m: (S, 2) where they are, seen from above.
         hits: How many points are enough.
         threshold_m: How near a point of its surface must be to a measured one.
         seed: Of the simulation.
@@ -79,6 +80,7 @@ class TargetMap:
     vehicle: BoundingBox
     vehicle_outline_m: Float64
     sensor_names: tuple[str, ...]
+    sensors_m: Float64
     hits: int
     threshold_m: float
     seed: int
@@ -122,7 +124,7 @@ class TargetMap:
     @property
     def distance_m(self) -> Float64:
         """(Y, X) from the middle of each cell to the vehicle's box, seen from above; 0 within it."""
-        away_m = np.linalg.norm(from_outline_m(self.vehicle, self.raster.positions_m), axis=1)
+        away_m: Float64 = np.linalg.norm(from_outline_m(self.vehicle, self.raster.positions_m), axis=1)
         return away_m.reshape(self.raster.shape)
 
     @property
@@ -144,12 +146,25 @@ class TargetMap:
                 rows.append(SideShare(name, limit_m, cells, float(self.enough[there].mean()) if cells else math.nan))
         return rows
 
-    def worst(self, count: int = 10) -> list[Place]:
-        """The places with the fewest points, and of those the nearest first."""
+    def unseen_to_m(self) -> dict[str, float]:
+        """For each side, how far from the vehicle the farthest free cell is that has not enough points; 0 if all have."""
+        unseen, side = self.free & ~self.enough, self.side
+        return {
+            name: float(self.distance_m[unseen & (side == number)].max(initial=0.0))
+            for number, name in enumerate(SIDES)
+        }
+
+    def worst(self, count: int = 10, apart_m: float = 1.0) -> list[Place]:
+        """The places with the fewest points, and of those the nearest first; no two within a distance of each other."""
         row, column = np.nonzero(self.free)
-        points, distance_m = self.points[row, column], self.distance_m[row, column]
-        order = np.lexsort((distance_m, points))[:count]
-        return [self.place(int(row[at]), int(column[at])) for at in order]
+        order = np.lexsort((self.distance_m[row, column], self.points[row, column]))
+        row, column = row[order], column[order]
+        worst = []
+        while len(row) and len(worst) < count:
+            worst.append(self.place(int(row[0]), int(column[0])))
+            away_m = np.hypot(self.x_m[column] - worst[-1].x_m, self.y_m[row] - worst[-1].y_m)
+            row, column = row[away_m >= apart_m], column[away_m >= apart_m]
+        return worst
 
     def place(self, row: int, column: int) -> Place:
         """What is seen at one cell."""

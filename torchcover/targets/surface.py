@@ -108,5 +108,5 @@ def _enclosed(target: Target, points_m: Float64) -> Bools:
     origins_m = points_m.astype(np.float32).repeat(rays, axis=0)
     directions = np.tile(ALL_AROUND_RAYS, len(points_m))
     hits = target.solid.caster.cast_from_each(origins_m, directions, np.full(len(origins_m), np.inf, dtype=np.float32))
-    enclosed: Bools = (hits.body >= 0).reshape(-1, rays).all(axis=1)
+    enclosed: Bools = np.all((hits.body >= 0).reshape(-1, rays), axis=1)
     return enclosed

@@ -95,6 +95,7 @@ def survey(
         vehicle=vehicle,
         vehicle_outline_m=_outline_m(scenario),
         sensor_names=tuple(sensor.name for sensor in rig.sensors),
+        sensors_m=np.array([sensor.mount.matrix()[:2, 3] for sensor in rig.sensors]),
         hits=hits,
         threshold_m=threshold_m,
         seed=seed,
