@@ -148,7 +148,7 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
         np.testing.assert_array_equal(arrays["first_seen_m"], seen.first_seen_m())
         assert json.loads(str(arrays["settings"]))["raster"] == {"x": [-3, 3], "y": [-2, 2], "step_m": 1}
         assert arrays["x_m"].tolist() == [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
-    rows = list(csv.DictReader((tmp_path / "targets.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "targets.csv").read_text().splitlines()))
     assert len(rows) == 24
     assert (rows[0]["x_m"], rows[0]["points"], rows[0]["points_a"], rows[0]["state"]) == ("-2.5", "3", "1.5", "free")
     assert (rows[8]["state"], rows[8]["points"], rows[8]["side"]) == ("occupied", "", "")
@@ -172,7 +172,7 @@ def test_the_picture_shows_cells_where_they_are():
     assert at(-5.3, 4.3) == at(5.3, 1.3) == UNSEEN
     assert at(5.3, -4.3) not in (UNSEEN, "#ffffff")
     assert at(1.9, 0.9) == at(-1.9, -0.9) == "#ffffff"  # the vehicle, true to scale
-    assert at(5.25, 0.0) == "#000000"  # the line between seen and not
+    assert at(5.25, 0.0) < "#202020"  # the line between seen and not
     assert figure.axes[0].get_legend() is not None
 
 
@@ -193,7 +193,7 @@ def test_names_become_bodies(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"raster": Raster((3.0, 4.0), (0.0, 0.2), 0.2)}, "larger than the raster of 1 x 0.2 m"),
+        ({"raster": Raster((3.0, 3.2), (0.0, 0.2), 0.2)}, "larger than the raster of 0.2 x 0.2 m"),
         ({"steps": 0}, "steps"),
         ({"hits": 0}, "hits"),
         ({"threshold_m": -1.0}, "threshold"),
