@@ -48,6 +48,10 @@ def main() -> None:
         _fail(str(error))
     except MemoryError as error:
         _fail(f"there is not enough memory ({error or 'for what was asked'}); ask for less, or use a larger machine")
+    except RuntimeError as error:
+        if type(error).__name__ != "OutOfMemoryError":  # of torch, which most mistakes are told without
+            raise
+        _fail(f"there is not enough memory ({str(error).splitlines()[0]}); ask for less, or use --device cpu")
     except (OverflowError, RecursionError) as error:
         _fail(f"a number is too large, or a file nested too deeply ({error})")
     if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
@@ -259,11 +263,15 @@ app.command()(targets)
 
 
 @app.command("list")
-def list_builtin() -> None:
-    """List the built-in rigs and scenarios."""
+def list_builtin(
+    word: Annotated[
+        str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
+    ] = None,
+) -> None:
+    """List the built-in rigs, scenarios, LiDAR models and vehicles."""
     from torchcover.cli.listing import run
 
-    run()
+    run(word)
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
 from torchcover.coverage.quantity import detection
-from torchcover.neighbors import check_cloud
+from torchcover.neighbors import check_cloud, check_tensor
 
 # The aggregations that a metric has by itself, and the names that its own states begin with.
 BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, "block", "probed"})
@@ -116,10 +116,7 @@ def as_list(clouds: Clouds, name: str) -> list[Tensor]:
     if isinstance(clouds, Tensor):
         return [clouds]
     if not isinstance(clouds, Sequence):
-        raise TypeError(
-            f"{name}: a torch tensor, or a list with one for each step, is needed; got {type(clouds).__name__} (an "
-            "array of NumPy's becomes one with torch.from_numpy)"
-        )
+        check_tensor(clouds, f"{name} (one, or a list with one for each step)")
     return list(clouds)
 
 
@@ -134,6 +131,7 @@ def _numbers(index: Any) -> list[int]:  # noqa: ANN401  (whatever the caller gav
 def _check_weights(weights: Tensor | None, points: int, name: str) -> None:
     if weights is None:
         return
+    check_tensor(weights, name)
     if weights.shape != (points,):
         raise ValueError(
             f"{name}: shape ({points},), one for each reference point, is needed; got {tuple(weights.shape)}"
