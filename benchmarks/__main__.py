@@ -31,6 +31,7 @@ BENCHMARKS = (
     "resumes",
     "scaling",
     "mutated_files",
+    "targets",
 )
 
 

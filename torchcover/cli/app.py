@@ -10,6 +10,7 @@ import typer
 
 from torchcover.cli import options
 from torchcover.cli.running import checkpoint_in, finish, opened, sharing
+from torchcover.cli.targets import targets
 from torchcover.evaluation.interrupt import terminable
 
 app = typer.Typer(
@@ -272,6 +273,9 @@ def show(
     from torchcover.cli.show import run
 
     run(name, scenario=scenario, rig=rig, step=step, seed=seed, out=out)
+
+
+app.command()(targets)
 
 
 @app.command("list")
