@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from torchcover.cli import options
+from torchcover.cli.asking import asked
 from torchcover.cli.running import checkpoint_in, finish, opened, sharing
 from torchcover.evaluation.interrupt import terminable
 
@@ -75,7 +76,11 @@ def evaluate(
     steps: options.Steps = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    region: options.Regions = None,
+    height: options.Heights = None,
+    grid: options.Grid = None,
+    ask: options.Ask = None,
+    cell: options.Cell = None,
     threshold: options.Thresholds = None,
     reference: options.Reference = None,
     rays: options.Rays = None,
@@ -99,6 +104,7 @@ def evaluate(
             frames=opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
+            ask=asked(ask, region, height, grid),
             cell_m=cell,
             thresholds=threshold or (0.4,),
             reference_sensor=None if frames else reference,
@@ -127,7 +133,11 @@ def compare(
     steps: options.Steps = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    region: options.Regions = None,
+    height: options.Heights = None,
+    grid: options.Grid = None,
+    ask: options.Ask = None,
+    cell: options.Cell = None,
     threshold: options.Thresholds = None,
     reference: options.Reference = None,
     rays: options.Rays = None,
@@ -151,6 +161,7 @@ def compare(
             frames=opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
+            ask=asked(ask, region, height, grid),
             cell_m=cell,
             thresholds=threshold or (0.4,),
             reference_sensor=None if frames else reference,
@@ -189,7 +200,7 @@ def study(
     every: options.Every = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    cell: Annotated[float, typer.Option(help="Side of a grid cell in metres.")] = 0.25,
     threshold: Annotated[float, typer.Option(help="Detection threshold in metres.")] = 0.4,
 ) -> None:
     """Measure error against run time for numbers of rays and of steps, and recommend a setting."""

@@ -18,6 +18,7 @@ from .quantity import Quantity as Quantity
 from .regions import Region as Region
 from .regions import check_regions as check_regions
 from .regions import forward_regions as forward_regions
+from .regions import near_field_regions as near_field_regions
 from .regions import regions_within as regions_within
 from .result import Coverage as Coverage
 from .summary import Number as Number

@@ -20,9 +20,10 @@ from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import Quantity
+from torchcover.coverage.regions import Region
 from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 Arrays = dict[str, NDArray[Any]]
 # Steps, cells, what is divided by, sums.
 IN_BLOCKS = ("block_steps", "block_cell", "block_probed_steps", "block_sums")
@@ -42,6 +43,7 @@ class CoverageParts(TypedDict):
     counts: Mapping[str, int]
     blocks: Blocks | None
     area: AreaSums | None
+    regions: Sequence[Region]
 
 
 def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Path) -> None:
@@ -62,6 +64,7 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         "counts": parts["counts"],
         "blocks": 1 if blocks is None else len(blocks.steps),
         "square_metres": area is not None,
+        "regions": [asdict(region) for region in parts["regions"]],
     }
     tensors = {"probed_steps": parts["probed_steps"], "points": parts["points"]}
     tensors |= {layer.quantity.key: layer.values for layer in parts["layers"]}
@@ -122,7 +125,13 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
         "counts": header["counts"],
         "blocks": None if header["blocks"] == 1 else _read_listed(Blocks, IN_BLOCKS, header, grid, arrays),
         "area": _read_listed(AreaSums, OVER_AREA, header, grid, arrays) if header["square_metres"] else None,
+        "regions": [_region(stored) for stored in header["regions"]],
     }
+
+
+def _region(stored: Mapping[str, Any]) -> Region:
+    corners = tuple((x, y) for x, y in stored["corners_m"])
+    return Region(stored["name"], tuple(stored["x"]), tuple(stored["y"]), corners)
 
 
 def _listed(blocks: BlockSums, names: Sequence[str]) -> Arrays:

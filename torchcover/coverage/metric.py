@@ -13,6 +13,7 @@ from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.blocks import AreaSums, Blocks, check_blocks, pair_up
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
+from torchcover.coverage.regions import Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.steps import Clouds, Step, as_list, check_parameters, checked_steps
 from torchcover.metrics import MergeableMetric
@@ -49,6 +50,8 @@ class CoverageMetric(MergeableMetric):
             long run. The state grows with it: 24 bytes a cell and block.
         aggregations: Maps beside the mean of means, from `torchcover.coverage`: `Maximum()`, `PooledMean()`,
             `Quantiles(levels)`, `StepQuantiles(levels)`, or a class of one's own; at most one of each.
+        regions: What the result gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
+            the grid if not given. The sums do not depend on it.
         square_metres: Whether the weights of reference points are square metres of surface, as `SurfaceReference` gives
             them: then there is an estimate by area too. The state grows by 8 (2 + thresholds) bytes a cell and block.
         backend: Nearest-neighbour search, as in `torchcover.nearest`.
@@ -57,7 +60,8 @@ class CoverageMetric(MergeableMetric):
 
     Raises:
         ValueError: A threshold that is negative, not finite, over `max_radius`, or given twice; a `max_radius` that is
-            not positive; a number of blocks that is neither 1 nor even and 8 or more; two aggregations of one kind.
+            not positive; a number of blocks that is neither 1 nor even and 8 or more; two aggregations of one kind; a
+            region beyond the grid, or without a cell centre.
 
     Example:
         >>> metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)}))
@@ -76,6 +80,7 @@ class CoverageMetric(MergeableMetric):
     empty_sensor_steps: Tensor
     empty_reference_steps: Tensor
     saturated_points: Tensor
+    inside_points: Tensor
     outside_points: Tensor
 
     def __init__(
@@ -86,6 +91,7 @@ class CoverageMetric(MergeableMetric):
         max_radius: float = math.inf,
         blocks: int = 1,
         aggregations: Sequence[Aggregation] = (),
+        regions: Sequence[Region] | None = None,
         square_metres: bool = False,
         backend: str = "auto",
         memory_mb: float = 256.0,
@@ -93,6 +99,8 @@ class CoverageMetric(MergeableMetric):
     ) -> None:
         check_parameters(thresholds, max_radius, aggregations)
         check_blocks(blocks)
+        regions = regions_within(grid) if regions is None else tuple(regions)
+        check_regions(regions, grid)
         meaning = {
             "grid": grid,
             "thresholds": tuple(float(threshold) for threshold in thresholds),
@@ -103,6 +111,7 @@ class CoverageMetric(MergeableMetric):
         }
         super().__init__(meaning, **kwargs)
         self.grid = grid
+        self.regions = regions
         self.thresholds: tuple[float, ...] = tuple(float(threshold) for threshold in thresholds)
         self.max_radius = float(max_radius)
         self.blocks = blocks
@@ -186,8 +195,7 @@ class CoverageMetric(MergeableMetric):
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
     def _add_step(self, step: Step) -> None:
         sensor, reference, weights, index = step
-        cell = self.grid.cell_of(reference)
-        inside = cell >= 0
+        inside, of, cell = self.grid.bins(reference)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
         distance = nearest(
             reference[inside],
@@ -197,13 +205,14 @@ class CoverageMetric(MergeableMetric):
             memory_mb=self.memory_mb,
         ).distance
         device = self.points.device
-        weights = None if weights is None else weights.to(reference.device)[inside].to(device)
+        weights = None if weights is None else weights.to(reference.device)[inside[of]].to(device)
         block = self._block_of(index)
-        self._accumulate(block, cell[inside].to(device), distance.to(device), weights)
+        self._accumulate(block, cell.to(device), distance[of].to(device), weights)
         self.block_steps[block] += 1
         self.steps += 1
         self.empty_sensor_steps += len(sensor) == 0
         self.empty_reference_steps += len(reference) == 0
+        self.inside_points += len(distance)
         self.outside_points += len(reference) - len(distance)
         self.saturated_points += (distance >= self.max_radius).sum().to(device)
 
@@ -243,6 +252,7 @@ class CoverageMetric(MergeableMetric):
             blocks=self._blocks() if self.blocks > 1 else None,
             area=self._area() if self.square_metres else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
+            regions=self.regions,
         )
 
     def _blocks(self) -> Blocks:

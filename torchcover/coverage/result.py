@@ -37,6 +37,8 @@ class Coverage:
         counts: What happened on the way, one number for each name in `COUNTS`.
         blocks: The sums in blocks of contiguous steps, if errors were asked for.
         area: The sums over the visible surface, if the reference points had square metres.
+        regions: What `summary` gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
+            the grid if not given.
 
     Attributes:
         layers: By the key of their quantity: `coverage.layers["radius_m"].values`.
@@ -47,6 +49,7 @@ class Coverage:
         "empty_sensor_steps",
         "empty_reference_steps",
         "saturated_points",
+        "inside_points",
         "outside_points",
     )
 
@@ -62,6 +65,7 @@ class Coverage:
         counts: Mapping[str, int],
         blocks: Blocks | None = None,
         area: AreaSums | None = None,
+        regions: Sequence[Region] | None = None,
     ) -> None:
         self.grid = grid
         self.thresholds = tuple(thresholds)
@@ -72,6 +76,7 @@ class Coverage:
         self.counts = dict(counts)
         self.blocks = blocks
         self.area = area
+        self.regions = regions_within(grid) if regions is None else tuple(regions)
         self._estimates: dict[tuple[Region, str, Measure], RegionEstimate] = {}
 
     def __repr__(self) -> str:
@@ -132,7 +137,7 @@ class Coverage:
         """One row for each region and height band.
 
         Args:
-            regions: Regions within the grid; the paper's `forward_regions()` that fit the grid if not given.
+            regions: Regions within the grid; `self.regions` if not given.
 
         Returns:
             Rows in the order of the regions, then of the bands.
@@ -140,7 +145,7 @@ class Coverage:
         Raises:
             ValueError: A region reaches beyond the grid, or holds no cell centre.
         """
-        wanted = regions_within(self.grid) if regions is None else regions
+        wanted = self.regions if regions is None else regions
         return [self._summarise(region, height) for region in wanted for height in self.grid.heights]
 
     @property
@@ -225,6 +230,7 @@ class Coverage:
             "counts": self.counts,
             "blocks": self.blocks,
             "area": self.area,
+            "regions": self.regions,
         }
         write_coverage(parts, self.errors, Path(path))
 

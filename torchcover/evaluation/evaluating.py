@@ -9,7 +9,7 @@ from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.rig_names import AnyRig, given_as
 from torchcover.evaluation.saved import compare_saved, saved_among
-from torchcover.evaluation.settings import AnyDevice, AnyThresholds, Settings
+from torchcover.evaluation.settings import AnyAsk, AnyDevice, AnyThresholds, Settings
 from torchcover.evaluation.target_error import AnyTargetError
 from torchcover.evaluation.task import AnyFrames, AnyScenario, task_of
 
@@ -21,7 +21,8 @@ def evaluate(
     frames: AnyFrames | None = None,
     steps: int | None = None,
     seed: int = 0,
-    cell_m: float = 0.25,
+    ask: AnyAsk | None = None,
+    cell_m: float | None = None,
     thresholds: AnyThresholds = (0.4,),
     aggregations: Sequence[Aggregation] = (),
     reference_sensor: str | None = None,
@@ -46,7 +47,9 @@ def evaluate(
         frames: A recording, or any source of frames, instead.
         steps: Steps to simulate (64; with a target error at most, 4096), or frames to use at most (all).
         seed: Seed of the simulation.
-        cell_m: Side of a grid cell in metres.
+        ask: Regions, height bands and grid: `RegionsOfInterest`, or the path of a YAML file; not given: the paper's
+            regions in front, and the near field on the four sides of the vehicle.
+        cell_m: Side of a grid cell in metres, whatever `ask` says; 0.25 if neither does.
         thresholds: Detection thresholds in metres, or a single one.
         aggregations: Maps beside the mean of means, as in `CoverageMetric`.
         reference_sensor: Name of the reference sensor, as in `torchcover.simulation.REFERENCE_SENSORS`; "surface" if
@@ -78,7 +81,7 @@ def evaluate(
     Example:
         >>> result = evaluate("front_roof_32", steps=2, cell_m=1.0, rays=1024)
         >>> result.coverage.counts["steps"], [row["region"] for row in result.summary][::2]
-        (2, ['20m', '80m', '160m'])
+        (2, ['20m', '80m', '160m', 'front_3m', 'rear_3m', 'left_3m', 'right_3m'])
     """
     settings = Settings.among(locals())
     named = [] if rig is None else [rig]
@@ -97,7 +100,8 @@ def compare(
     frames: AnyFrames | None = None,
     steps: int | None = None,
     seed: int = 0,
-    cell_m: float = 0.25,
+    ask: AnyAsk | None = None,
+    cell_m: float | None = None,
     thresholds: AnyThresholds = (0.4,),
     aggregations: Sequence[Aggregation] = (),
     reference_sensor: str | None = None,
@@ -123,6 +127,7 @@ def compare(
         frames: Frames of several rigs.
         steps: Steps.
         seed: Seed.
+        ask: Regions, height bands and grid.
         cell_m: Side of a grid cell in metres.
         thresholds: Detection thresholds in metres.
         aggregations: Maps beside the mean of means.
