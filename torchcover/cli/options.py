@@ -120,6 +120,10 @@ TargetErrors = Annotated[
         "0.02m (of each radius); both may be given. --steps is then the most steps (4096).",
     ),
 ]
+Redundancy = Annotated[
+    bool,
+    typer.Option("--redundancy", help="Say by how many sensors places are seen, and what is lost when each one fails."),
+]
 ErrorMaps = Annotated[bool, typer.Option("--error-maps", help="Draw maps of the standard errors too.")]
 Explain = Annotated[bool, typer.Option("--explain", help="Say what was left out because the scene did not need it.")]
 Device = Annotated[str, typer.Option(help="Where the search and the sums run: cpu, cuda, cuda:1, ...")]

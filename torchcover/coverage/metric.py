@@ -13,9 +13,10 @@ from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.blocks import AreaSums, Blocks, check_blocks, pair_up
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
+from torchcover.coverage.redundancy import PlaceSums, Redundancy, SensorFailures
 from torchcover.coverage.regions import Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.steps import Clouds, Step, as_list, check_parameters, checked_steps
+from torchcover.coverage.steps import Clouds, SensorClouds, Step, as_list, check_parameters, checked_steps
 from torchcover.metrics import MergeableMetric
 from torchcover.neighbors import nearest
 
@@ -52,6 +53,8 @@ class CoverageMetric(MergeableMetric):
             `Quantiles(levels)`, `StepQuantiles(levels)`, or a class of one's own; at most one of each.
         regions: What the result gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
             the grid if not given. The sums do not depend on it.
+        sensors: Names of the rig's sensors, for `Coverage.redundancy`: then `update` takes a cloud for each by its
+            name, and what the rig is without each of them is known as well.
         square_metres: Whether the weights of reference points are square metres of surface, as `SurfaceReference` gives
             them: then there is an estimate by area too. The state grows by 8 (2 + thresholds) bytes a cell and block.
         backend: Nearest-neighbour search, as in `torchcover.nearest`.
@@ -92,6 +95,7 @@ class CoverageMetric(MergeableMetric):
         blocks: int = 1,
         aggregations: Sequence[Aggregation] = (),
         regions: Sequence[Region] | None = None,
+        sensors: Sequence[str] = (),
         square_metres: bool = False,
         backend: str = "auto",
         memory_mb: float = 256.0,
@@ -108,16 +112,23 @@ class CoverageMetric(MergeableMetric):
             "blocks": blocks,
             "aggregations": tuple(aggregations),
             "square_metres": square_metres,
+            **({"sensors": tuple(sensors), "regions": regions} if sensors else {}),
         }
         super().__init__(meaning, **kwargs)
         self.grid = grid
         self.regions = regions
+        self.sensors = tuple(sensors)
         self.thresholds: tuple[float, ...] = tuple(float(threshold) for threshold in thresholds)
         self.max_radius = float(max_radius)
         self.blocks = blocks
         self.square_metres = square_metres
         over_area = [VisibleArea(self.thresholds, blocks)] if square_metres else []
-        self.aggregations: tuple[Aggregation, ...] = (MeanOfMeans(self.thresholds, blocks), *over_area, *aggregations)
+        self._failures = SensorFailures(
+            self.sensors, self.thresholds, grid, regions, self.max_radius, blocks, square_metres
+        )
+        redundancy = [self._failures] if sensors else []
+        self._of_grid: tuple[Aggregation, ...] = (MeanOfMeans(self.thresholds, blocks), *over_area, *aggregations)
+        self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *redundancy)
         self.backend = backend
         self.memory_mb = memory_mb
         self._add_states()
@@ -145,7 +156,7 @@ class CoverageMetric(MergeableMetric):
 
     def update(
         self,
-        sensor: Clouds,
+        sensor: SensorClouds,
         reference: Clouds,
         *,
         weights: Clouds | None = None,
@@ -155,6 +166,7 @@ class CoverageMetric(MergeableMetric):
 
         Args:
             sensor: (N, 3) points of the rig in the vehicle frame in metres, or a list of them. N = 0: a blind step.
+                Of a metric with `sensors`: name of the sensor -> its points, or a list of such dicts.
             reference: (M, 3) points of the reference sensor in the same frame, or a list of the same length. M = 0:
                 the step says nothing.
             weights: (M,) weight of each reference point in the mean over its cell in its step, or a list of the same
@@ -175,12 +187,12 @@ class CoverageMetric(MergeableMetric):
                 "weights: the square metres of each reference point are needed, as a SurfaceReference gives them; got "
                 "none (without square_metres=True, points may do without)"
             )
-        for step in checked_steps(sensor, reference, weights, index, first=int(self.steps)):
+        for step in checked_steps(sensor, reference, weights, index, names=self.sensors, first=int(self.steps)):
             self._add_step(step)
 
     def forward(
         self,
-        sensor: Clouds,
+        sensor: SensorClouds,
         reference: Clouds,
         *,
         weights: Clouds | None = None,
@@ -188,33 +200,34 @@ class CoverageMetric(MergeableMetric):
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
         if index is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
-            index = [int(self.steps) + step for step in range(len(as_list(sensor, "sensor")))]
+            index = [int(self.steps) + step for step in range(len(as_list(reference, "reference")))]
         coverage: Coverage = super().forward(sensor, reference, weights=weights, index=index)
         return coverage
 
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
     def _add_step(self, step: Step) -> None:
-        sensor, reference, weights, index = step
+        sensors, reference, weights, index = step
         inside, of, cell = self.grid.bins(reference)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
-        distance = nearest(
-            reference[inside],
-            sensor.to(reference.device),
-            max_distance=self.max_radius,
-            backend=self.backend,
-            memory_mb=self.memory_mb,
-        ).distance
+        each = [self._distance(reference[inside], cloud.to(reference.device)) for cloud in sensors.values()]
+        of_sensors = torch.stack(each) if self.sensors else None
+        distance = each[0] if of_sensors is None else of_sensors.amin(dim=0)
         device = self.points.device
         weights = None if weights is None else weights.to(reference.device)[inside[of]].to(device)
         block = self._block_of(index)
-        self._accumulate(block, cell.to(device), distance[of].to(device), weights)
+        of_sensors = None if of_sensors is None else of_sensors[:, of].to(device)
+        self._accumulate(block, cell.to(device), distance[of].to(device), weights, of_sensors)
         self.block_steps[block] += 1
         self.steps += 1
-        self.empty_sensor_steps += len(sensor) == 0
+        self.empty_sensor_steps += not any(map(len, sensors.values()))
         self.empty_reference_steps += len(reference) == 0
         self.inside_points += len(distance)
         self.outside_points += len(reference) - len(distance)
         self.saturated_points += (distance >= self.max_radius).sum().to(device)
+
+    def _distance(self, reference: Tensor, cloud: Tensor) -> Tensor:
+        found = nearest(reference, cloud, max_distance=self.max_radius, backend=self.backend, memory_mb=self.memory_mb)
+        return found.distance
 
     def _block_of(self, index: int) -> int:
         """The block of a step; makes room for it."""
@@ -224,14 +237,16 @@ class CoverageMetric(MergeableMetric):
             pair_up(self.metric_state, self._in_blocks)
         return index // int(self.block_length)
 
-    def _accumulate(self, block: int, cell: Tensor, distance: Tensor, weights: Tensor | None) -> None:
+    def _accumulate(
+        self, block: int, cell: Tensor, distance: Tensor, weights: Tensor | None, of_sensors: Tensor | None
+    ) -> None:
         # Before saturation: a point with nothing within `max_radius` is not detected at a threshold of `max_radius`.
         detected = [(distance <= threshold).double() for threshold in self.thresholds]
         radius = distance.clamp(max=distance.new_tensor(self.max_radius)).double()
         means = mean_per_cell(cell, torch.stack([radius, *detected]), self.grid.cells, weights)
         self.probed_steps[block, means.cell] += 1
         self.points[means.cell] += means.points
-        step = BinnedStep(cell, radius, weights, means, block, self.grid.cells)
+        step = BinnedStep(cell, radius, weights, means, block, self.grid.cells, of_sensors)
         for aggregation in self.aggregations:
             aggregation.update(self._sums_of(aggregation), step)
 
@@ -244,16 +259,25 @@ class CoverageMetric(MergeableMetric):
             max_radius=self.max_radius,
             probed_steps=probed_steps.view(self.grid.shape),
             points=self.points.view(self.grid.shape).clone(),
-            layers=[
-                Layer(layer.quantity, layer.values.view(self.grid.shape))
-                for aggregation in self.aggregations
-                for layer in aggregation.layers(self._sums_of(aggregation), probed_steps, self.max_radius)
-            ],
+            layers=[layer for one in self._of_grid for layer in self._layers(one, probed_steps)],
             blocks=self._blocks() if self.blocks > 1 else None,
             area=self._area() if self.square_metres else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
             regions=self.regions,
+            redundancy=self._redundancy(probed_steps) if self.sensors else None,
         )
+
+    def _layers(self, aggregation: Aggregation, probed_steps: Tensor) -> list[Layer]:
+        found = aggregation.layers(self._sums_of(aggregation), probed_steps, self.max_radius)
+        return [Layer(layer.quantity, layer.values.view(self.grid.shape)) for layer in found]
+
+    def _redundancy(self, probed_steps: Tensor) -> Redundancy:
+        layers = {layer.quantity.key: layer for layer in self._layers(self._failures, probed_steps)}
+        if not self.square_metres:
+            return Redundancy(self.sensors, layers, None)
+        sums = self._sums_of(self._failures)
+        places = PlaceSums(self.block_steps.clone(), sums["place_m2"].clone(), sums["place_sums"].clone())
+        return Redundancy(self.sensors, layers, places)
 
     def _blocks(self) -> Blocks:
         shape = self.grid.shape

@@ -1,5 +1,6 @@
 """Regions: named rectangles and polygons of cells that a number is given for."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -69,6 +70,8 @@ class Region:
             ((2.0, 5.0), tensor(6))
         """
         corners = tuple((float(x), float(y)) for x, y in corners_m)
+        if not all(math.isfinite(number) for corner in corners for number in corner):
+            raise ValueError(f"region {name!r}: corners need finite coordinates in metres; got {corners}")
         if len(set(corners)) < 3:
             raise ValueError(f"region {name!r}: three different corners or more are needed; got {len(set(corners))}")
         x, y = zip(*corners, strict=True)

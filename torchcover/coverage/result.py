@@ -18,8 +18,10 @@ from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.intervals import interval95
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import RADIUS, Quantity, by_area
+from torchcover.coverage.redundancy import Redundancy
+from torchcover.coverage.region_redundancy import over_known, over_place, region_redundancy
 from torchcover.coverage.regions import Region, check_regions, regions_within
-from torchcover.coverage.summary import Number, RegionSummary
+from torchcover.coverage.summary import Number, RegionRedundancy, RegionSummary
 
 
 class Coverage:
@@ -39,6 +41,7 @@ class Coverage:
         area: The sums over the visible surface, if the reference points had square metres.
         regions: What `summary` gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
             the grid if not given.
+        redundancy: What each sensor of the rig adds, if the metric was told of the sensors.
 
     Attributes:
         layers: By the key of their quantity: `coverage.layers["radius_m"].values`.
@@ -66,6 +69,7 @@ class Coverage:
         blocks: Blocks | None = None,
         area: AreaSums | None = None,
         regions: Sequence[Region] | None = None,
+        redundancy: Redundancy | None = None,
     ) -> None:
         self.grid = grid
         self.thresholds = tuple(thresholds)
@@ -77,6 +81,7 @@ class Coverage:
         self.blocks = blocks
         self.area = area
         self.regions = regions_within(grid) if regions is None else tuple(regions)
+        self.redundancy = redundancy
         self._estimates: dict[tuple[Region, str, Measure], RegionEstimate] = {}
 
     def __repr__(self) -> str:
@@ -231,6 +236,7 @@ class Coverage:
             "blocks": self.blocks,
             "area": self.area,
             "regions": self.regions,
+            "redundancy": self.redundancy,
         }
         write_coverage(parts, self.errors, Path(path))
 
@@ -257,7 +263,20 @@ class Coverage:
             numbers=self._numbers(self.estimate(region, height), self.measure),
             known=self._numbers(self.estimate(region, height, "known"), "known"),
             visible_m2=math.nan if self.area is None else self._visible_m2(self.area, band, cells),
+            redundancy=self._without_each(region, height),
         )
+
+    def _without_each(self, region: Region, height: str) -> RegionRedundancy | None:
+        """What each sensor adds; by area it is known of the regions only that the metric was told of."""
+        redundancy, band = self.redundancy, list(self.grid.heights).index(height)
+        if redundancy is None or (redundancy.places is not None and region not in self.regions):
+            return None
+        if redundancy.places is not None:
+            place = self.regions.index(region) * len(self.grid.heights) + band
+            return region_redundancy(redundancy, self.thresholds, over_place(redundancy.places, place))
+        known = region.mask(self.grid).to(self.radius.device) & (self.probed_steps[band] > 0)
+        with_all = self.estimate(region, height, "known").value
+        return region_redundancy(redundancy, self.thresholds, over_known(redundancy, with_all, band, known))
 
     def _visible_m2(self, area: AreaSums, band: int, cells: Tensor) -> float:
         total = float(area_in_blocks(area, band, cells.to(area.at.device))[:, 0].sum())

@@ -186,6 +186,10 @@ class SimulatedFrames(Dataset[Frame]):
             counts=seen.counts,
             boxes=_boxes(self.simulator.labels(index), clouds, seen.drawn) if self.boxes else None,
             instant=self.simulator.place_in_time(index),
+            sensor_points={
+                name: dict(zip((sensor.name for sensor in self.rigs[name].sensors), points, strict=True))
+                for name, points in seen.sensor_points.items()
+            },
         )
 
 

@@ -30,6 +30,7 @@ def evaluate(
     estimate: Measure | None = None,
     every_s: float | None = None,
     target_error: AnyTargetError | None = None,
+    redundancy: bool = False,
     device: AnyDevice = "cpu",
     workers: int = 0,
     skip_bad_frames: bool = False,
@@ -59,6 +60,8 @@ def evaluate(
             Not given: the surface, if the reference points have square metres.
         every_s: Time between two steps in seconds; not given: 10 in traffic, else what spreads them over the scenario.
         target_error: End once every number is this good: a `TargetError`, "0.1%", or ["0.1%", "0.02m"].
+        redundancy: Whether to find out by how many sensors places are seen, and what is lost when each sensor fails:
+            `Result.table.redundancy` and `Coverage.redundancy`.
         device: Where the search and the sums run: "cpu", "cuda", ...
         workers: Processes that make frames; 0 makes them in this one.
         skip_bad_frames: Skip and note frames that cannot be read, instead of ending with the first.
@@ -109,6 +112,7 @@ def compare(
     estimate: Measure | None = None,
     every_s: float | None = None,
     target_error: AnyTargetError | None = None,
+    redundancy: bool = False,
     device: AnyDevice = "cpu",
     workers: int = 0,
     skip_bad_frames: bool = False,
@@ -136,6 +140,7 @@ def compare(
         estimate: What the numbers are means over.
         every_s: Time between two steps in seconds.
         target_error: End once every number, and every difference, is this good.
+        redundancy: Whether to find out what is lost when each sensor of each rig fails.
         device: Where the search and the sums run.
         workers: Processes that make frames.
         skip_bad_frames: Whether to skip bad frames.

@@ -38,6 +38,7 @@ def run_identity(task: Task, settings: Settings, others: Mapping[str, AnyObserve
         "thresholds": settings.thresholds,
         "aggregations": settings.aggregations,
         "estimate": settings.estimate,
+        "redundancy": settings.redundancy,
         "target_error": settings.target_error,
         "observers": kinds,
         "ranks": ranks,

@@ -57,6 +57,7 @@ class Settings:
     estimate: Measure | None = None
     every_s: float | None = None
     target_error: TargetError | None = None
+    redundancy: bool = False
     device: str = "cpu"
     workers: int = 0
     skip_bad_frames: bool = False
@@ -111,11 +112,12 @@ class Settings:
         if any(setting is not None for setting in (self.reference_sensor, self.rays, self.every_s)):
             raise ValueError("reference, rays and every are for simulations; a recording has its reference points")
 
-    def metric(self, asked: Asked, weight_kind: WeightKind | None) -> CoverageMetric:
+    def metric(self, asked: Asked, weight_kind: WeightKind | None, sensors: Sequence[str] = ()) -> CoverageMetric:
         """An empty metric.
 
         Args:
             asked: What is asked about.
+            sensors: Names of the sensors, for redundancy.
             weight_kind: What the weights of reference points are.
 
         Raises:
@@ -132,6 +134,7 @@ class Settings:
             self.thresholds,
             usable_device(self.device),
             aggregations=self.aggregations,
+            sensors=sensors,
             square_metres=weight_kind == "m2" and self.estimate != "known",
         )
 
@@ -157,6 +160,7 @@ def new_metric(
     *,
     blocks: int = BLOCKS,
     aggregations: Sequence[Aggregation] = (),
+    sensors: Sequence[str] = (),
     square_metres: bool = False,
 ) -> CoverageMetric:
     """An empty metric of what is asked about, with standard errors unless there is one block only.
@@ -173,6 +177,7 @@ def new_metric(
         blocks=blocks,
         aggregations=aggregations,
         regions=asked.regions,
+        sensors=sensors,
         square_metres=square_metres,
         sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
     )

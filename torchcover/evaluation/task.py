@@ -5,7 +5,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from torchcover.data import Asked, ChosenRigs, FrameSource, RecordedFrames, SimulatedFrames, reference_called
+from torchcover.data import (
+    Asked,
+    BadFrameError,
+    ChosenRigs,
+    FrameSource,
+    RecordedFrames,
+    SimulatedFrames,
+    reference_called,
+)
 from torchcover.data.suspicion import suspicions
 from torchcover.evaluation.rig_names import AnyRig, distinct_names, given_as, is_document, loaded
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings, spread_s
@@ -43,6 +51,22 @@ class Task(NamedTuple):
     def place(self) -> str:
         """Where the frames come from, for a message."""
         return str(self.description["frames"] or self.description["scenario"])
+
+    def sensor_names(self) -> Mapping[str, Sequence[str]]:
+        """Name of each rig -> names of its sensors, from the first frame that can be used.
+
+        Raises:
+            ValueError: It does not know which points are of which sensor, or no frame can be used.
+        """
+        if isinstance(self.frames, SimulatedFrames):
+            return {name: [sensor.name for sensor in rig.sensors] for name, rig in self.frames.rigs.items()}
+        for index in range(len(self.frames)):
+            try:
+                frame = self.frames[index]
+            except BadFrameError:
+                continue  # the run itself skips it, or ends with it
+            return {name: list(frame.clouds_by_sensor(name)) for name in self.rigs}
+        raise ValueError("redundancy: no frame can be used")
 
 
 def task_of(rigs: Sequence[AnyRig], scenario: AnyScenario | None, frames: AnyFrames | None, settings: Settings) -> Task:
