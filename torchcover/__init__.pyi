@@ -16,6 +16,7 @@ from .coverage import Coverage as Coverage
 from .coverage import CoverageMetric as CoverageMetric
 from .coverage import Region as Region
 from .coverage import forward_regions as forward_regions
+from .data import RegionsOfInterest as RegionsOfInterest
 from .evaluation import compare as compare
 from .evaluation import evaluate as evaluate
 from .evaluation import survey_target as survey_target

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from torchcover.cli import options
+from torchcover.cli.asking import asked
 from torchcover.cli.running import checkpoint_in, finish, opened, sharing
 from torchcover.cli.targets import targets
 from torchcover.evaluation.interrupt import terminable
@@ -80,13 +81,18 @@ def evaluate(
     steps: options.Steps = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    region: options.Regions = None,
+    height: options.Heights = None,
+    grid: options.Grid = None,
+    ask: options.Ask = None,
+    cell: options.Cell = None,
     threshold: options.Thresholds = None,
     reference: options.Reference = None,
     rays: options.Rays = None,
     estimate: options.Estimate = None,
     every: options.Every = None,
     target_error: options.TargetErrors = None,
+    redundancy: options.Redundancy = False,
     error_maps: options.ErrorMaps = False,
     explain: options.Explain = False,
     device: options.Device = "cpu",
@@ -104,6 +110,7 @@ def evaluate(
             frames=opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
+            ask=asked(ask, region, height, grid),
             cell_m=cell,
             thresholds=threshold or (0.4,),
             reference_sensor=None if frames else reference,
@@ -111,6 +118,7 @@ def evaluate(
             estimate=estimate,
             every_s=every,
             target_error=target_error,
+            redundancy=redundancy,
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
@@ -132,13 +140,18 @@ def compare(
     steps: options.Steps = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    region: options.Regions = None,
+    height: options.Heights = None,
+    grid: options.Grid = None,
+    ask: options.Ask = None,
+    cell: options.Cell = None,
     threshold: options.Thresholds = None,
     reference: options.Reference = None,
     rays: options.Rays = None,
     estimate: options.Estimate = None,
     every: options.Every = None,
     target_error: options.TargetErrors = None,
+    redundancy: options.Redundancy = False,
     error_maps: options.ErrorMaps = False,
     explain: options.Explain = False,
     device: options.Device = "cpu",
@@ -156,6 +169,7 @@ def compare(
             frames=opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
+            ask=asked(ask, region, height, grid),
             cell_m=cell,
             thresholds=threshold or (0.4,),
             reference_sensor=None if frames else reference,
@@ -163,6 +177,7 @@ def compare(
             estimate=estimate,
             every_s=every,
             target_error=target_error,
+            redundancy=redundancy,
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
@@ -194,7 +209,7 @@ def study(
     every: options.Every = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    cell: Annotated[float, typer.Option(help="Side of a grid cell in metres.")] = 0.25,
     threshold: Annotated[float, typer.Option(help="Detection threshold in metres.")] = 0.4,
 ) -> None:
     """Measure error against run time for numbers of rays and of steps, and recommend a setting."""
