@@ -11,8 +11,10 @@ import typer
 from typer.main import get_command
 
 from torchcover.cli.app import app
+from torchcover.data import RegionsOfInterest
 from torchcover.data.recordings.folder_settings import read_folder_settings
 from torchcover.simulation import Rig, Scenario
+from torchcover.targets import Requirements
 
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -66,7 +68,7 @@ def test_a_command_can_be_given(words):
 
 
 # Whatever reads a document of YAML.
-READERS = (Rig.load, Scenario.load, read_folder_settings)
+READERS = (Rig.load, Scenario.load, RegionsOfInterest.load, Requirements.load, read_folder_settings)
 
 
 @pytest.mark.parametrize("text", list(blocks("yaml")))
