@@ -30,10 +30,15 @@ def opened(
             if given is not None:
                 raise ValueError(f"--{option}: for a recording, which --frames gives")
         return None
+    from rich.console import Console
+    from rich.markup import escape
+
     from torchcover.data import RecordedFrames, open_recording, reference_of_recording
 
+    with Console(stderr=True).status(f"opening {escape(str(frames))}"):  # seconds, where there are 100,000 frames
+        recording = open_recording(frames, recording_format)
     return RecordedFrames(
-        open_recording(frames, recording_format),
+        recording,
         rigs={names: names.split(",") for names in sensors} if sensors else None,
         reference=reference_of_recording(reference, window_s),
     )
