@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from torchcover.geometry import euler_from_rotation
 from torchcover.report.maps.sheet import Sheet
 
-# Okabe and Ito's colours, which the colour-blind can tell apart.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+# Okabe and Ito's colours, which the colour-blind can tell apart; then all of them darker, then lighter.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#777777")
+SHADES = ((1.0, 0.0), (0.5, 0.0), (0.5, 0.5))
 ARROW_POINTS = 20.0
 NUMBER_POINTS = 24.0
 OVERLAP_POINTS = 9.0
@@ -94,6 +95,18 @@ class SensorView:
         inside: NDArray[np.bool_] = np.logical_and(low <= elevation_deg, elevation_deg <= high)
         inside &= abs(azimuth_deg) <= self.horizontal_fov_deg / 2
         return inside
+
+
+def sensor_colour(at: int) -> str:
+    """The colour of a sensor by its number, from 0 on: no other of the first 21 has it.
+
+    Example:
+        >>> sensor_colour(0), sensor_colour(7), sensor_colour(14)
+        ('#0072b2', '#003959', '#80b9d9')
+    """
+    share, white = SHADES[at // len(COLOURS) % len(SHADES)]
+    red_green_blue = np.array([int(COLOURS[at % len(COLOURS)][digit : digit + 2], 16) for digit in (1, 3, 5)])
+    return "#" + "".join(f"{value:02x}" for value in np.rint(share * red_green_blue + 255 * white).astype(int).tolist())
 
 
 def draw_ego(axes: Axes, outline_m: NDArray[np.floating]) -> list[Artist]:
