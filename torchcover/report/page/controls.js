@@ -98,7 +98,7 @@ function fillGallery(page, controls) {
   const all = page.choices.flatMap((quantity, q) => quantity.bands.flatMap((band, b) => band.rigs.map((rig, r) => ({ quantity, band, rig, at: { quantity: q, band: b, rig: r } }))));
   part("gallery").replaceChildren(...all.map(({ quantity, band, rig, at }) => {
     const shown = page.shown(rig, false), button = made("button", "", { type: "button" }), figure = made("figure");
-    button.append(cropped(shown), made("figcaption", `${quantity.name}, ${band.name}: ${rig.name}`));
+    button.append(cropped(shown, page.content.ego), made("figcaption", `${quantity.name}, ${band.name}: ${rig.name}`));
     button.addEventListener("click", () => {
       Object.assign(page.state, at);
       controls.fillMenus();
@@ -111,7 +111,7 @@ function fillGallery(page, controls) {
 }
 
 // What is known of a map, on hatching.
-function cropped(shown) {
+function cropped(shown, ego) {
   const { raster } = shown, { x, y } = raster.known, canvas = made("canvas");
   const left = Math.round((x[0] - raster.x[0]) / raster.cell), top = Math.round((raster.y[1] - y[1]) / raster.cell);
   const columns = Math.round((x[1] - x[0]) / raster.cell), rows = Math.round((y[1] - y[0]) / raster.cell);
@@ -122,7 +122,24 @@ function cropped(shown) {
   pen.fillRect(0, 0, canvas.width, canvas.height);
   pen.imageSmoothingEnabled = false;
   pen.drawImage(shown.image, left, top, columns, rows, 0, 0, canvas.width, canvas.height);
+  const pixel = (low, high) => (larger * (high - low)) / raster.cell;
+  pen.beginPath();
+  for (const corner of ego || []) pen.lineTo(pixel(x[0], corner[0]), pixel(corner[1], y[1]));
+  pen.closePath();
+  pen.fillStyle = "white"; pen.fill();
+  pen.strokeStyle = "black"; pen.stroke();
   return canvas;
+}
+
+// On paper nothing can be opened.
+function printAll(page) {
+  let closed = [];
+  window.addEventListener("beforeprint", () => {
+    closed = [...document.querySelectorAll("details:not([open])")];
+    for (const one of closed) one.open = true;
+    page.draw();
+  });
+  window.addEventListener("afterprint", () => { for (const one of closed) one.open = false; page.draw(); });
 }
 
 async function start() {
@@ -132,6 +149,7 @@ async function start() {
   part("maps").hidden = false;
   const page = new MapPage(content, bytes);
   fillGallery(page, new Controls(page));
+  printAll(page);
   return page;
 }
 

@@ -77,7 +77,7 @@ class MapPage {
   draw() {
     const { choice } = this, shown = this.shown(choice, this.state.single);
     const rig = this.content.rigs.find((one) => one.name === choice.map.rig);
-    const outlines = this.content.outlines.map((line) => ({ ...line, closed: true, width: 1, dash: [2, 3] }));
+    const outlines = this.content.outlines.map((line) => ({ ...line, closed: true, width: 1.3, dash: [3, 5] }));
     const lines = choice.map.lines.map((line, at) => ({ ...line, closed: false, width: 2, dash: at ? [9, 3 * at] : [] }));
     this.view.draw(shown, {
       lines: [...outlines, ...lines], ego: this.content.ego, fields: this.state.fields,
