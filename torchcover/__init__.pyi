@@ -15,6 +15,7 @@ from .coverage import Coverage as Coverage
 from .coverage import CoverageMetric as CoverageMetric
 from .coverage import Region as Region
 from .coverage import forward_regions as forward_regions
+from .data import RegionsOfInterest as RegionsOfInterest
 from .evaluation import compare as compare
 from .evaluation import evaluate as evaluate
 from .neighbors import blind_spot_radius as blind_spot_radius

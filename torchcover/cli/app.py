@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from torchcover.cli import options
+from torchcover.cli.asking import asked
 from torchcover.cli.running import checkpoint_in, finish, opened, sharing
 from torchcover.evaluation.interrupt import terminable
 
@@ -75,13 +76,18 @@ def evaluate(
     steps: options.Steps = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    region: options.Regions = None,
+    height: options.Heights = None,
+    grid: options.Grid = None,
+    ask: options.Ask = None,
+    cell: options.Cell = None,
     threshold: options.Thresholds = None,
     reference: options.Reference = None,
     rays: options.Rays = None,
     estimate: options.Estimate = None,
     every: options.Every = None,
     target_error: options.TargetErrors = None,
+    redundancy: options.Redundancy = False,
     error_maps: options.ErrorMaps = False,
     explain: options.Explain = False,
     device: options.Device = "cpu",
@@ -99,6 +105,7 @@ def evaluate(
             frames=opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
+            ask=asked(ask, region, height, grid),
             cell_m=cell,
             thresholds=threshold or (0.4,),
             reference_sensor=None if frames else reference,
@@ -106,6 +113,7 @@ def evaluate(
             estimate=estimate,
             every_s=every,
             target_error=target_error,
+            redundancy=redundancy,
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
@@ -127,13 +135,18 @@ def compare(
     steps: options.Steps = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    region: options.Regions = None,
+    height: options.Heights = None,
+    grid: options.Grid = None,
+    ask: options.Ask = None,
+    cell: options.Cell = None,
     threshold: options.Thresholds = None,
     reference: options.Reference = None,
     rays: options.Rays = None,
     estimate: options.Estimate = None,
     every: options.Every = None,
     target_error: options.TargetErrors = None,
+    redundancy: options.Redundancy = False,
     error_maps: options.ErrorMaps = False,
     explain: options.Explain = False,
     device: options.Device = "cpu",
@@ -151,6 +164,7 @@ def compare(
             frames=opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
+            ask=asked(ask, region, height, grid),
             cell_m=cell,
             thresholds=threshold or (0.4,),
             reference_sensor=None if frames else reference,
@@ -158,6 +172,7 @@ def compare(
             estimate=estimate,
             every_s=every,
             target_error=target_error,
+            redundancy=redundancy,
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
@@ -189,7 +204,7 @@ def study(
     every: options.Every = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    cell: Annotated[float, typer.Option(help="Side of a grid cell in metres.")] = 0.25,
     threshold: Annotated[float, typer.Option(help="Detection threshold in metres.")] = 0.4,
 ) -> None:
     """Measure error against run time for numbers of rays and of steps, and recommend a setting."""

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import typer
 
-from torchcover.data import SimulatedFrames, reference_called, write_recording
+from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called, write_recording
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, spread_s
 from torchcover.simulation import Rig, Scenario
 
@@ -34,7 +34,7 @@ def run(
         steps=steps or DEFAULT_STEPS,
         seed=seed,
         every_s=spread_s(world, every_s),
-        reference_sensor=reference_called(reference, rays),
+        reference_sensor=reference_called(reference, rays, RegionsOfInterest().around(world.ego_box().outline_m)),
         boxes=True,
     )
     frames.simulator.check_run(frames.steps)

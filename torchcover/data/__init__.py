@@ -10,7 +10,8 @@ from torchcover.data.recorded import RecordedFrames, reference_of_recording
 from torchcover.data.recorded_reference import RecordedReference, Reference
 from torchcover.data.recorders import RECORDERS, write_recording
 from torchcover.data.recordings import FORMATS, Recording, RecordingFormat, Scan, open_recording
-from torchcover.data.reference import DEFAULT_REFERENCE, GRID_X_M, GRID_Y_M, reference_called, reference_of_objects
+from torchcover.data.reference import DEFAULT_REFERENCE, reference_called, reference_of_objects
+from torchcover.data.regions_of_interest import GRID_X_M, GRID_Y_M, Asked, RegionsOfInterest
 from torchcover.data.simulated import SimulatedFrames
 from torchcover.data.source import FrameSource
 
@@ -21,6 +22,7 @@ __all__ = [
     "GRID_Y_M",
     "RECORDERS",
     "AccumulatedReference",
+    "Asked",
     "Augmentation",
     "BadFrameError",
     "ChosenRigs",
@@ -32,6 +34,7 @@ __all__ = [
     "Recording",
     "RecordingFormat",
     "Reference",
+    "RegionsOfInterest",
     "Scan",
     "SimulatedFrames",
     "collate_frames",

@@ -119,7 +119,11 @@ def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -
         BadFileError: Not YAML, or a key is unknown, missing, doubled or has a wrong value; the message names the file
             and the key.
     """
-    path = _find(kind, path_or_name)
+    return read_document(model, _find(kind, path_or_name))
+
+
+def read_document(model: type[DocumentT], path: Path) -> DocumentT:
+    """Read a YAML file into a model; as `load_document`, of a path only."""
     content = read_mapping(path)
     try:
         return model.model_validate(content, context={"folder": path.parent})
@@ -206,6 +210,8 @@ def _content(value: Any) -> Any:  # noqa: ANN401  (whatever a document holds)
         return value.content()
     if isinstance(value, Path):
         return file_hash(value)
+    if isinstance(value, dict):
+        return {key: _content(each) for key, each in value.items()}
     return list(map(_content, value)) if isinstance(value, tuple | list) else value
 
 
@@ -217,4 +223,6 @@ def _shorten(value: Any) -> str:  # noqa: ANN401  (whatever stood in the file)
 def _kept(value: Any) -> Any:  # noqa: ANN401
     if isinstance(value, list):
         return tuple(map(_kept, value))
+    if isinstance(value, dict):
+        return {key: _kept(each) for key, each in value.items()}
     return value.item() if isinstance(value, np.generic) else value
