@@ -11,6 +11,7 @@ import typer
 from torchcover.cli import options
 from torchcover.cli.asking import asked
 from torchcover.cli.running import checkpoint_in, finish, opened, sharing
+from torchcover.cli.targets import targets
 from torchcover.evaluation.interrupt import terminable
 
 app = typer.Typer(
@@ -267,6 +268,9 @@ def show(
     from torchcover.cli.show import run
 
     run(name, scenario=scenario, rig=rig, step=step, seed=seed, out=out)
+
+
+app.command()(targets)
 
 
 @app.command("list")

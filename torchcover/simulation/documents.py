@@ -119,11 +119,16 @@ def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -
         BadFileError: Not YAML, or a key is unknown, missing, doubled or has a wrong value; the message names the file
             and the key.
     """
-    return read_document(model, _find(kind, path_or_name))
+    return load_path(model, _find(kind, path_or_name))
 
 
-def read_document(model: type[DocumentT], path: Path) -> DocumentT:
-    """Read a YAML file into a model; as `load_document`, of a path only."""
+def load_path(model: type[DocumentT], path: Path) -> DocumentT:
+    """Read a YAML file into a model of which none is built in.
+
+    Raises:
+        FileNotFoundError: No such file.
+        BadFileError: As for `load_document`.
+    """
     content = read_mapping(path)
     try:
         return model.model_validate(content, context={"folder": path.parent})
