@@ -301,5 +301,5 @@ def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():
     four = np.s_[10:12, 20:22]
     assert coarse.values[5, 10] == pytest.approx(np.average(known.values[four], weights=known.weights[four]))
     assert np.isnan(coarse.values[:, 350:]).all()
-    assert "2 x 2 cells are drawn as one" in notes[-1]
+    assert "Some maps show 2 x 2 cells as one" in notes[-1]
     assert notes[-1] in page_html(Page("rig", "lead", maps=[known] * 9))

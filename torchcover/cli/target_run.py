@@ -8,6 +8,7 @@ from rich.table import Table
 
 from torchcover.evaluation import claimed, save_targets, survey_target
 from torchcover.report import percent, text_table
+from torchcover.simulation import Rig
 from torchcover.targets import Heading, Place, Raster, Requirements, TargetMap, Verdict, check
 
 FAILED = 1
@@ -54,7 +55,7 @@ def run(
             heading=parsed_heading(heading),
         )
         verdicts = [] if requirements is None else check(requirements, seen)
-        files = save_targets(seen, out, verdicts)
+        files = save_targets(seen, out, verdicts, Rig.load(rig).sensors)
     _print(seen, verdicts, requirements)
     Console().print(f"Wrote {', '.join(path.name for path in files)} to {out}", markup=False, soft_wrap=True)
     return 0 if all(verdict.passed for verdict in verdicts) else FAILED

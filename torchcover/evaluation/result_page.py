@@ -55,7 +55,9 @@ def rig_document(name: str, sensors: Sequence[Sensor]) -> str:
     known = [sensor.model_dump(mode="json", exclude_unset=True) for sensor in sensors if isinstance(sensor, BaseModel)]
     if not known or len(known) < len(sensors):
         return ""
-    text: str = yaml.safe_dump({"name": name, "sensors": known}, sort_keys=False, allow_unicode=True)
+    text: str = yaml.safe_dump(
+        {"name": name, "sensors": known}, sort_keys=False, allow_unicode=True, default_flow_style=None
+    )
     return text
 
 
@@ -69,6 +71,8 @@ def _place(result: "Result") -> str:
 
 
 def _corners(region: Region) -> np.ndarray[Any, np.dtype[np.float64]]:
+    if region.corners_m:
+        return np.array(region.corners_m)
     (left, right), (low, high) = region.x, region.y
     return np.array([[left, low], [right, low], [right, high], [left, high]])
 
@@ -79,7 +83,7 @@ def _facts(result: "Result") -> dict[str, dict[str, str]]:
     steps = {"steps": next(iter(result.coverages.values())).counts["steps"]}
     run = {name: record[name] for name in OF_THE_RUN} | {"python": platform.python_version()} | _versions()
     rigs = {f"rig {name}": str(given) for name, given in result.rigs.items() if given is not None}
-    return {"Settings": rigs | _words(steps | settings), "Run": _words(run)}
+    return {"Settings": rigs | words_of(steps | settings), "Run": words_of(run)}
 
 
 def _versions() -> dict[str, str]:
@@ -92,7 +96,8 @@ def _versions() -> dict[str, str]:
     return found
 
 
-def _words(facts: Mapping[str, Any]) -> dict[str, str]:
+def words_of(facts: Mapping[str, Any]) -> dict[str, str]:
+    """Facts of a record as a page says them; without those that nobody knows."""
     return {name.replace("_", " "): _value(value) for name, value in facts.items() if value not in (None, [], {})}
 
 

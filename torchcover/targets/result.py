@@ -159,7 +159,7 @@ class TargetMap:
         row, column = np.nonzero(self.free)
         order = np.lexsort((self.distance_m[row, column], self.points[row, column]))
         row, column = row[order], column[order]
-        worst = []
+        worst: list[Place] = []
         while len(row) and len(worst) < count:
             worst.append(self.place(int(row[0]), int(column[0])))
             away_m = np.hypot(self.x_m[column] - worst[-1].x_m, self.y_m[row] - worst[-1].y_m)

@@ -48,7 +48,10 @@ function overSquares(values, weights, sides, columns) {
   return [means, together];
 }
 
-const FAINTEST = 0.3, INFINITE = [213, 94, 0];
+const FAINTEST = 0.3, APART = [213, 94, 0];
+
+// Infinity, and nothing at all where the scale is logarithmic, have a colour of their own.
+const isApart = (value, shown) => (value === Infinity && !shown.isDifference) || (value === 0 && shown.scale.log);
 
 // An image of one pixel a cell, the lowest row last; unknown cells are transparent.
 function coloured(shown, palette) {
@@ -57,8 +60,7 @@ function coloured(shown, palette) {
     const value = shown.values[cell];
     if (Number.isNaN(value)) continue;
     const pixel = 4 * ((rows - 1 - Math.floor(cell / columns)) * columns + (cell % columns));
-    const colour = value === Infinity && !shown.isDifference ? INFINITE : palette(value);
-    image.data.set(colour, pixel);
+    image.data.set(isApart(value, shown) ? APART : palette(value), pixel);
     image.data[pixel + 3] = 255 * opacity(shown, cell);
   }
   const canvas = document.createElement("canvas");
@@ -75,7 +77,16 @@ function opacity(shown, cell) {
 
 // The colours of a scale: from a value to [red, green, blue].
 function paletteOf(scale, luts) {
-  const lut = luts[scale.colours], span = scale.high - scale.low;
-  const table = Array.from({ length: 256 }, (_, at) => [0, 2, 4].map((byte) => parseInt(lut.substr(6 * at + byte, 2), 16)));
-  return (value) => table[Math.max(0, Math.min(255, Math.floor((256 * (value - scale.low)) / span)))];
+  const lut = luts[scale.colours], table = [];
+  for (let at = 0; at < 256; at++) table.push([0, 2, 4].map((byte) => parseInt(lut.substr(6 * at + byte, 2), 16)));
+  return (value) => table[Math.max(0, Math.min(255, Math.floor(256 * shareOf(value, scale))))];
+}
+
+// Where a value is between the ends of a scale, and back.
+function shareOf(value, { low, high, log }) {
+  return log ? Math.log(value / low) / Math.log(high / low) : (value - low) / (high - low);
+}
+
+function valueAt(share, { low, high, log }) {
+  return log ? low * (high / low) ** share : low + share * (high - low);
 }

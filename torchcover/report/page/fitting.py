@@ -10,12 +10,14 @@ from torchcover.report.page.map_content import ERROR_BITS, VALUE_BITS
 
 # Deflated and as base64, at most a quarter more characters.
 MOST_BYTES = 3.8e6
+# Of maps that are beside those with errors.
+MOST_HALVINGS = 2
 VALUE_BYTES, ERROR_BYTES = VALUE_BITS // 8, ERROR_BITS // 8
 NO_ERRORS = "Errors of single cells are left out, so that this file stays small: the .npz files have them."
 
 
 def fitted(maps: Sequence[PageMap], most_bytes: float = MOST_BYTES) -> tuple[list[PageMap], list[str]]:
-    """Leave out errors of cells, then take cells together, until the maps fit.
+    """Take cells together where maps have no errors beside some that have; leave out errors; take all cells together.
 
     Args:
         maps: All of a page.
@@ -24,14 +26,19 @@ def fitted(maps: Sequence[PageMap], most_bytes: float = MOST_BYTES) -> tuple[lis
     Returns:
         The maps, and what was left out in words.
     """
-    kept, notes, together = list(maps), [], 1
-    if bytes_of(kept) > most_bytes and any(one.errors is not None for one in kept):
+    kept, notes = list(maps), []
+    with_errors = [one.errors is not None for one in kept]
+    for _ in range(MOST_HALVINGS if any(with_errors) else 0):
+        if bytes_of(kept) > most_bytes:
+            kept = [one if has else coarser(one) for one, has in zip(kept, with_errors, strict=True)]
+    if bytes_of(kept) > most_bytes and any(with_errors):
         kept, notes = [replace(one, errors=None) for one in kept], [NO_ERRORS]
     while bytes_of(kept) > most_bytes:
-        kept, together = [coarser(one) for one in kept], 2 * together
-    if together > 1:
-        words = f"{together} x {together} cells are drawn as one, so that this file stays small"
-        notes.append(f"{words}: the .npz files have each.")
+        kept = [coarser(one) for one in kept]
+    sides = {round(one.cell_m / whole.cell_m) for one, whole in zip(kept, maps, strict=True)} - {1}
+    if sides:
+        words = " or ".join(f"{side} x {side}" for side in sorted(sides))
+        notes.append(f"Some maps show {words} cells as one, so that this file stays small: the .npz files have each.")
     return kept, notes
 
 

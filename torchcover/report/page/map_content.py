@@ -111,6 +111,7 @@ def _scale(scale: ColourScale) -> dict[str, Any]:
         "colours": scale.colormap,
         "low": scale.low,
         "high": scale.high,
+        "log": scale.logarithmic,
     }
 
 

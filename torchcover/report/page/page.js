@@ -96,12 +96,11 @@ class MapPage {
 
   fillLegend(shown) {
     const { map, against } = this.choice, entries = [`hatched: unknown, ${map.unknown}`];
-    const sum = (values) => values.reduce((count, value) => count + value, 0);
     if (shown.values.includes(Infinity) && !against) entries.push("orange: infinite, a step saw nothing");
+    if (shown.scale.log && shown.values.includes(0)) entries.push("orange: none");
     if (against) entries.push(`blue: ${this.choice.map.rig} is better; red: ${against.rig} is better`);
     if (shown.squares) entries.push(`squares are larger where points are few`);
     if (shown.full) entries.push("paler: less visible surface in a step than open ground has");
-    const names = [...this.content.outlines, ...map.lines].map((line) => line.name);
     if (this.content.outlines.length) entries.push(`dotted: ${this.content.outlines.map((line) => line.name).join(", ")}`);
     for (const [at, line] of map.lines.entries()) entries.push(`${at ? "dashed" : "thick"} line: ${line.name}`);
     part("legend").replaceChildren(...entries.map((words) => made("li", words)));
@@ -153,14 +152,15 @@ function said(value, error, unit, unknown) {
 }
 
 function barOf(scale, luts) {
-  const bar = made("div", "", { class: "bar" }), canvas = made("canvas", "", { width: 256, height: 1, "aria-hidden": "true" });
-  const palette = paletteOf(scale, luts), pen = canvas.getContext("2d"), step = (scale.high - scale.low) / 256;
+  const bar = made("div", "", { class: "bar" });
+  const canvas = made("canvas", "", { width: 256, height: 1, "aria-hidden": "true" });
+  const palette = paletteOf(scale, luts), pen = canvas.getContext("2d");
   for (let at = 0; at < 256; at++) {
-    pen.fillStyle = `rgb(${palette(scale.low + (at + 0.5) * step)})`;
+    pen.fillStyle = `rgb(${palette(valueAt((at + 0.5) / 256, scale))})`;
     pen.fillRect(at, 0, 1, 1);
   }
   const marks = made("div", "", { class: "ticks" });
-  for (let at = 0; at <= 4; at++) marks.append(made("span", figures(scale.low + (at / 4) * (scale.high - scale.low))));
+  for (let at = 0; at <= 4; at++) marks.append(made("span", figures(valueAt(at / 4, scale))));
   bar.append(made("div", `${scale.quantity} (${scale.unit})`), canvas, marks);
   return bar;
 }
