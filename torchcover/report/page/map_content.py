@@ -13,7 +13,7 @@ from torchcover.report.page.content import Array, Line, Page, PageMap
 
 VALUE_BITS, ERROR_BITS = 16, 8
 # The near field, in lengths of the ego to all sides.
-NEAR_LENGTHS = 2.0
+NEAR, NEAR_LENGTHS = "near the ego", 2.0
 # JSON knows no infinity; beyond every map all ranges are alike.
 FARTHEST_M = 1e6
 
@@ -83,17 +83,20 @@ def _raster(maps: Sequence[PageMap]) -> dict[str, Any]:
 
 
 def _views(page: Page) -> list[dict[str, Any]]:
-    """Places to look at: what was asked for, and near the ego."""
+    """Places to look at: what was asked for, and near the ego as far as there are cells."""
     views = [(line.name, line.points_m) for line in page.outlines]
     if page.ego_outline_m is not None:
         low, high = page.ego_outline_m.min(axis=0), page.ego_outline_m.max(axis=0)
         reach = NEAR_LENGTHS * (high[0] - low[0])
-        views.insert(0, ("near the ego", np.array([low - reach, high + reach])))
-    each = [(name, np.asarray(points).min(axis=0), np.asarray(points).max(axis=0)) for name, points in views]
-    return [
-        {"name": name, "x": [float(low[0]), float(high[0])], "y": [float(low[1]), float(high[1])]}
-        for name, low, high in each
-    ]
+        views.insert(0, (NEAR, np.array([low - reach, high + reach])))
+    ends = np.array([[(one.x[0], one.y[0]), (one.x[1], one.y[1])] for one in page.maps])
+    found = []
+    for name, points_m in views if page.maps else ():
+        low = np.maximum(points_m.min(axis=0), ends[:, 0].min(axis=0))
+        high = np.minimum(points_m.max(axis=0), ends[:, 1].max(axis=0))
+        if (low < high).all():
+            found.append({"name": name, "x": [low[0], high[0]], "y": [low[1], high[1]]})
+    return found
 
 
 def _lines(lines: Iterable[Line]) -> list[dict[str, Any]]:

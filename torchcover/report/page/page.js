@@ -160,7 +160,7 @@ function barOf(scale, luts) {
     pen.fillRect(at, 0, 1, 1);
   }
   const marks = made("div", "", { class: "ticks" });
-  for (let at = 0; at <= 4; at++) marks.append(made("span", figures(valueAt(at / 4, scale))));
+  for (let at = 0; at <= 4; at++) marks.append(made("span", tidy(+valueAt(at / 4, scale).toPrecision(3))));
   bar.append(made("div", `${scale.quantity} (${scale.unit})`), canvas, marks);
   return bar;
 }
