@@ -34,9 +34,7 @@ def measured(of_steps, *, without=None, by_sensor=True, **options):
 
 @pytest.mark.parametrize("square_metres", [True, False])
 def test_with_all_sensors_it_is_the_rig(square_metres):
-    by_sensor, union = (
-        measured(steps(), by_sensor=each, square_metres=square_metres).layers for each in (True, False)
-    )
+    by_sensor, union = (measured(steps(), by_sensor=each, square_metres=square_metres).layers for each in (True, False))
     assert by_sensor.keys() == union.keys()
     for key, layer in union.items():
         torch.testing.assert_close(by_sensor[key].values, layer.values, rtol=0, atol=0, equal_nan=True)
@@ -79,7 +77,9 @@ def test_how_many_sensors_see_a_point_is_counted():
         only = [({sensor: clouds[sensor]}, reference, weights) for clouds, reference, weights in steps()]
         alone.append(measured(only, by_sensor=False, square_metres=True))
     number = sum(each.layers["detection_area_0.3m"].values for each in alone)
-    torch.testing.assert_close(whole.redundancy.layers["sensors_0.3m"].values, number, rtol=1e-13, atol=0, equal_nan=True)
+    torch.testing.assert_close(
+        whole.redundancy.layers["sensors_0.3m"].values, number, rtol=1e-13, atol=0, equal_nan=True
+    )
     for at, row in enumerate(whole.summary()):
         expected = sum(each.summary()[at].numbers["detection_0.8m"].value for each in alone)
         seen_by = row.redundancy.seen_by

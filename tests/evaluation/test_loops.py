@@ -54,7 +54,9 @@ def drive(tmp_path):
 
 
 def errors(result):
-    return np.array([row[key] for row in result.summary for key in row if key.endswith("_error")], dtype=float)
+    # In front only: of the few cells of the near field so few rays say little.
+    rows = [row for row in result.summary if not row["region"].endswith("_3m")]
+    return np.array([row[key] for row in rows for key in row if key.endswith("_error")], dtype=float)
 
 
 def test_going_round_again_makes_no_error_smaller(drive):

@@ -66,7 +66,7 @@ def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
         (
             "columns: 8",
             "colums: 8",
-            r"sensors\.0\.columns: Field required; sensors\.0\.colums: Extra inputs",
+            r"doc\.yaml: sensors\.0\.colums: unknown key; columns is meant, which is missing$",
         ),
         ("columns: 8", "columns: 0", r"sensors\.0\.columns: .*greater than 0 \(got 0\)"),
         ("columns: 8", "columns: many", r"sensors\.0\.columns: .*integer.*got 'many'"),

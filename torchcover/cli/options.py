@@ -116,8 +116,9 @@ TargetErrors = Annotated[
     list[str] | None,
     typer.Option(
         "--target-error",
-        help="Stop once every number is this good: 0.1% (standard error of each detection, in percentage points) or "
-        "0.02m (of each radius); both may be given. --steps is then the most steps (4096).",
+        help="Stop once every number (of the usual regions, those in front) is this good: 0.1% (standard error of each "
+        "detection, in percentage points) or 0.02m (of each radius); both may be given. --steps is then the most steps "
+        "(4096).",
     ),
 ]
 Redundancy = Annotated[

@@ -114,13 +114,11 @@ def _sides_table(seen: TargetMap) -> Table:
     for name in dict.fromkeys(side.side for side in sides):
         of_side = [side for side in sides if side.side == name]
         shares = ("-" if side.cells == 0 else f"{percent(side.seen)} %" for side in of_side)
-        rows.append([name, *shares, f"{unseen_to_m[name]:.2f} m"])
+        rows.append([name, *shares, f"{unseen_to_m[name]:.2f} m" if unseen_to_m[name] else "nowhere"])
     headings = ("side", *(f"within {limit_m:g} m" for limit_m in within), "unseen to")
     length, width, height = seen.target_size_m
     title = f"{seen.rig} sees {seen.target} ({length:.2f} x {width:.2f} x {height:.2f} m), in {seen.scenario}"
-    return text_table(
-        headings, [rows], title=title, caption=f"Share of the free places with {seen.hits} points or more"
-    )
+    return text_table(headings, [rows], title=title, caption=f"Share of free places with {seen.hits} points or more")
 
 
 def _places_table(places: Sequence[Place], title: str) -> Table:

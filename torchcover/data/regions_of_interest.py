@@ -127,7 +127,7 @@ class RegionsOfInterest(Document):
         if named:
             check_regions(named, grid)
             _warn_of_hidden(named, vehicle)
-            return Asked(grid, named, (*(_area(region) for region in named), (grid.x, grid.y)))
+            return Asked(grid, named, (*(_area(region) for region in named), (grid.x, grid.y)), named)
         forward = tuple(region for region in forward_regions() if region.fits(grid))
         check_regions(forward, grid)
         near = () if vehicle is None else near_field_regions(*vehicle)
@@ -135,7 +135,7 @@ class RegionsOfInterest(Document):
         near = tuple(region for region in near if region.fits(grid) and region.mask(grid).any())
         around = (_around(near),) if near else ()
         usual = (*forward, *near) or (Region("grid", grid.x, grid.y),)
-        return Asked(grid, usual, (*map(_area, forward), *around, (grid.x, grid.y)))
+        return Asked(grid, usual, (*map(_area, forward), *around, (grid.x, grid.y)), forward or usual)
 
     def _grid(self, regions: tuple[Region, ...], cell_m: float) -> BevGrid:
         x = self.grid.x_m or _holding(GRID_X_M, [region.x for region in regions], cell_m)
@@ -150,11 +150,14 @@ class Asked(NamedTuple):
         grid: Cells and height bands.
         regions: Those that numbers are given for.
         areas: The rectangles that the reference sensor is aimed at, which hold them and the grid.
+        awaited: The regions whose errors a target error waits for: all that were asked for by name; in the usual table
+            not the near field, of which in traffic many steps see nothing that stands.
     """
 
     grid: BevGrid
     regions: tuple[Region, ...]
     areas: Areas
+    awaited: tuple[Region, ...]
 
     @property
     def bands_m(self) -> Bands:

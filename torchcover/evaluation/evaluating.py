@@ -59,7 +59,8 @@ def evaluate(
         estimate: What the number of a region is a mean over: "area", its visible surface, or "known", its known cells.
             Not given: the surface, if the reference points have square metres.
         every_s: Time between two steps in seconds; not given: 10 in traffic, else what spreads them over the scenario.
-        target_error: End once every number is this good: a `TargetError`, "0.1%", or ["0.1%", "0.02m"].
+        target_error: End once every number, of the usual regions those in front, is this good: a `TargetError`,
+            "0.1%", or ["0.1%", "0.02m"].
         redundancy: Whether to find out by how many sensors places are seen, and what is lost when each sensor fails:
             `Result.table.redundancy` and `Coverage.redundancy`.
         device: Where the search and the sums run: "cpu", "cuda", ...

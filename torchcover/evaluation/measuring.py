@@ -63,6 +63,7 @@ def measured(
         reference_record=frames.reference_record,
         device=settings.device,
         target_error=settings.target_error,
+        awaited=task.asked.awaited,
         sensors=task.sensors,
         ego_outline_m=frames.ego_outline_m,
         observed={name: observer.compute() for name, observer in others.items()},
@@ -96,7 +97,7 @@ def _observed(
         name: CoverageObserver(settings.metric(task.asked, kind, sensors.get(name, ())), name) for name in task.rigs
     }
     target = settings.target_error
-    watch = TargetWatch(target, coverage, task.asked.regions) if target else None
+    watch = TargetWatch(target, coverage, task.asked.awaited) if target else None
     observers: Sequence[AnyObserver] = [*coverage.values(), *others.values()]
     identity = run_identity(task, settings, others, ranks.size if ranks else 1) if ranks or checkpoint else {}
     if ranks:

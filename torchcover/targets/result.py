@@ -147,12 +147,11 @@ class TargetMap:
         return rows
 
     def unseen_to_m(self) -> dict[str, float]:
-        """For each side, how far from the vehicle the farthest free cell is that has not enough points; 0 if all have."""
+        """For each side, how far the farthest free cell is that has not enough points; 0 if all have."""
         unseen, side = self.free & ~self.enough, self.side
-        return {
-            name: float(self.distance_m[unseen & (side == number)].max(initial=0.0))
-            for number, name in enumerate(SIDES)
-        }
+        of_sides = [unseen & (side == number) for number in range(len(SIDES))]
+        farthest_m = [float(self.distance_m[there].max(initial=0.0)) for there in of_sides]
+        return dict(zip(SIDES, farthest_m, strict=True))
 
     def worst(self, count: int = 10, apart_m: float = 1.0) -> list[Place]:
         """The places with the fewest points, and of those the nearest first; no two within a distance of each other."""

@@ -86,7 +86,9 @@ def _draw_points(sheet: Sheet, points: Float64) -> list[Artist]:
         interpolation="nearest",
         cmap=ListedColormap([UNSEEN]),
     )
-    entries: list[Artist] = [Patch(facecolor=UNSEEN, label="no point at all")]
+    entries: list[Artist] = []
+    if (points == 0).any():
+        entries.append(Patch(facecolor=UNSEEN, label="no point at all"))
     if np.isnan(points).any():
         entries.append(Patch(label="no room for it", **UNKNOWN))
     return entries
