@@ -152,8 +152,15 @@ def draw_sensors(sheet: Sheet, sensors: Sequence[SensorView], *, named: bool = T
         return [Line2D([], [], linestyle="none", marker="o", label="sensor, with its direction", **DOT), view]
     if len(sensors) > 1:
         _draw_numbers(sheet, sensors)
-    numbers = [f"{number}  " if len(sensors) > 1 else "" for number in range(1, len(sensors) + 1)]
-    return [*(_legend_entry(sheet, *pair) for pair in zip(numbers, sensors, strict=True)), view]
+    marks = [f"${number}$" if len(sensors) > 1 else "o" for number in range(1, len(sensors) + 1)]
+    return [*(_legend_entry(sheet, *pair) for pair in zip(marks, sensors, strict=True)), view]
+
+
+def draw_places(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
+    """Draw each sensor as a dot, and nothing over the cells around it; returns legend entries."""
+    for sensor in sensors:
+        sheet.axes.plot(sensor.x_m, sensor.y_m, linestyle="none", marker="o", zorder=5, **DOT)
+    return [Line2D([], [], linestyle="none", marker="o", label="sensor", **DOT)] if sensors else []
 
 
 def draw_sectors(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
@@ -168,7 +175,7 @@ def draw_sectors(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
     """
     entries: list[Artist] = []
     for at, sensor in enumerate(sensors):
-        colour = COLOURS[at % len(COLOURS)]
+        colour = sensor_colour(at)
         _draw_wedge(sheet, sensor, facecolor=(colour, 0.3), edgecolor=colour, linewidth=1.0)
         entries.append(Patch(facecolor=(colour, 0.3), edgecolor=colour, label=f"field of view: {sensor.name}"))
     return entries
@@ -220,11 +227,14 @@ def _places(sheet: Sheet, sensors: Sequence[SensorView]) -> dict[tuple[float, fl
     return places
 
 
-def _legend_entry(sheet: Sheet, number: str, sensor: SensorView) -> Artist:
+def _legend_entry(sheet: Sheet, mark: str, sensor: SensorView) -> Artist:
     (left, right), (bottom, top) = sheet.axes.get_xlim(), sheet.axes.get_ylim()
     inside = left <= sensor.x_m <= right and bottom <= sensor.y_m <= top
-    label = f"{number}{sensor.name}{'' if inside else ' (beyond the map)'}"
-    return Line2D([], [], linestyle="none", marker="o", label=label, **DOT)
+    label = f"{sensor.name}{'' if inside else ' (beyond the map)'}"
+    style = (
+        DOT if mark == "o" else {"color": "black", "markeredgewidth": 0, "markersize": 3.5 * len(mark.strip("$")) + 2.5}
+    )
+    return Line2D([], [], linestyle="none", marker=mark, label=label, **style)
 
 
 def _ahead(sheet: Sheet, sensor: SensorView, points: float) -> tuple[float, float]:
