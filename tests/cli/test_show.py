@@ -32,6 +32,7 @@ def test_a_rig_is_drawn_on_the_ego_of_a_scenario(torchcover, worlds, drawn):
     assert min(imread(worlds / "new" / "out" / "both.png").shape[:2]) > 500
     vertices_m, _, sensors = drawn["args"]
     assert np.ptp(vertices_m, axis=0).tolist() == [4.0, 2.0, 1.0]
+    assert drawn["title"] == "both"  # as every command calls it, whatever its file says
     assert [sensor.name for sensor in sensors] == ["front", "rear"]
     assert sensors[1].vertical_fov_deg == pytest.approx((-30.0, 0.0))
     assert (sensors[1].horizontal_fov_deg, sensors[1].range_m) == (90.0, 60.0)

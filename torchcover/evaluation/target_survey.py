@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from torchcover.coverage import BevGrid
 from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.result_files import ResultFiles
-from torchcover.evaluation.rig_names import AnyRig, loaded
+from torchcover.evaluation.rig_names import AnyRig, as_called
 from torchcover.evaluation.settings import spread_s
 from torchcover.evaluation.target_page import target_page
 from torchcover.report import draw_targets, page_html
@@ -67,7 +67,7 @@ def survey_target(
         >>> seen.target, seen.counts["free"]
         ('dog_57cm', 8)
     """
-    rig = loaded(rig)
+    rig = as_called(rig)
     if scenario is not None and vehicle is not None:
         raise ValueError("vehicle: a scenario has its own ego; give one of the two")
     world = free_space(vehicle) if scenario is None else scenario

@@ -1,7 +1,7 @@
 """What a run shows: a table and its renderers, maps, drawings, a page. Imports matplotlib and rich: import it late."""
 
 from torchcover.report.drawings.four_views import draw_four_views
-from torchcover.report.drawings.frame import ActorMark, draw_depths, draw_scene
+from torchcover.report.drawings.frame import ActorMark, Standing, draw_depths, draw_scene
 from torchcover.report.drawings.rig import draw_rig
 from torchcover.report.drawings.targets import draw_targets
 from torchcover.report.drawings.work_precision import WorkPanel, draw_work_precision
@@ -38,6 +38,7 @@ __all__ = [
     "Remark",
     "Row",
     "SensorView",
+    "Standing",
     "Words",
     "WorkPanel",
     "as_markdown",
