@@ -6,6 +6,7 @@ from matplotlib.image import imread
 
 from torchcover.cli import show
 from torchcover.evaluation import scene_pictures, sensor_views
+from torchcover.evaluation.rig_names import as_called, distinct_names
 from torchcover.simulation import Rig, Scenario, builtin_names
 
 
@@ -32,7 +33,6 @@ def test_a_rig_is_drawn_on_the_ego_of_a_scenario(torchcover, worlds, drawn):
     assert min(imread(worlds / "new" / "out" / "both.png").shape[:2]) > 500
     vertices_m, _, sensors = drawn["args"]
     assert np.ptp(vertices_m, axis=0).tolist() == [4.0, 2.0, 1.0]
-    assert drawn["title"] == "both"  # as every command calls it, whatever its file says
     assert [sensor.name for sensor in sensors] == ["front", "rear"]
     assert sensors[1].vertical_fov_deg == pytest.approx((-30.0, 0.0))
     assert (sensors[1].horizontal_fov_deg, sensors[1].range_m) == (90.0, 60.0)
@@ -176,3 +176,8 @@ def test_a_warning_is_one_line_on_stderr_and_said_once(torchcover, worlds):
     assert ["car.obj: the mesh is not closed" in line for line in lines].count(True) == 1
     assert ["a: its body is 4,000 x 2,000 x 1,000 m" in line for line in lines].count(True) == 1
     assert len(lines) == 3
+
+
+def test_a_rig_has_the_name_of_its_file_in_every_command(worlds):
+    (worlds / "renamed.yaml").write_text((worlds / "both.yaml").read_text())
+    assert [as_called(worlds / "renamed.yaml").name] == distinct_names([worlds / "renamed.yaml"]) == ["renamed"]

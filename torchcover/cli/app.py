@@ -10,7 +10,7 @@ import typer
 
 from torchcover.cli import options
 from torchcover.cli.asking import asked
-from torchcover.cli.running import checkpoint_in, finish, opened, sharing
+from torchcover.cli.running import checkpoint_in, finish, logged, opened, sharing, watching
 from torchcover.cli.targets import targets
 from torchcover.evaluation.interrupt import terminable
 
@@ -90,6 +90,7 @@ def evaluate(
     target_error: options.TargetErrors = None,
     redundancy: options.Redundancy = False,
     error_maps: options.ErrorMaps = False,
+    rerun: options.Rerun = None,
     explain: options.Explain = False,
     device: options.Device = "cpu",
     workers: options.Workers = 0,
@@ -100,6 +101,7 @@ def evaluate(
     from torchcover.evaluation import evaluate
 
     with sharing(out) as ranks:
+        log = logged(rerun, ranks)
         result = evaluate(
             rig,
             scenario,
@@ -120,9 +122,10 @@ def evaluate(
             skip_bad_frames=skip_bad_frames,
             checkpoint=checkpoint_in(out, resume=resume),
             ranks=ranks,
+            observers=watching(log),
             progress=True,
         )
-        finish(result, out, ranks, error_maps=error_maps, explain=explain)
+        finish(result, out, ranks, log, error_maps=error_maps, explain=explain)
 
 
 @app.command()
@@ -149,6 +152,7 @@ def compare(
     target_error: options.TargetErrors = None,
     redundancy: options.Redundancy = False,
     error_maps: options.ErrorMaps = False,
+    rerun: options.Rerun = None,
     explain: options.Explain = False,
     device: options.Device = "cpu",
     workers: options.Workers = 0,
@@ -159,6 +163,7 @@ def compare(
     from torchcover.evaluation import compare
 
     with sharing(out) as ranks:
+        log = logged(rerun, ranks)
         result = compare(
             rigs or (),
             scenario,
@@ -179,9 +184,10 @@ def compare(
             skip_bad_frames=skip_bad_frames,
             checkpoint=checkpoint_in(out, resume=resume),
             ranks=ranks,
+            observers=watching(log),
             progress=True,
         )
-        finish(result, out, ranks, error_maps=error_maps, explain=explain)
+        finish(result, out, ranks, log, error_maps=error_maps, explain=explain)
 
 
 @app.command()
