@@ -33,7 +33,7 @@ def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
     assert summary["counts"]["both"]["steps"] == 2
     with (out / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len(rows) == len(summary["rows"]) == 20
+    assert len(rows) == len(summary["rows"]) == 24
     for row, same in zip(rows, summary["rows"], strict=True):
         assert row["rig"] == same["rig"]
         assert row["radius_m"] == ("" if same["radius_m"] is None else str(same["radius_m"]))

@@ -181,3 +181,8 @@ def test_a_warning_is_one_line_on_stderr_and_said_once(torchcover, worlds):
 def test_a_rig_has_the_name_of_its_file_in_every_command(worlds):
     (worlds / "renamed.yaml").write_text((worlds / "both.yaml").read_text())
     assert [as_called(worlds / "renamed.yaml").name] == distinct_names([worlds / "renamed.yaml"]) == ["renamed"]
+
+
+def test_it_prints_where_the_numbers_of_a_rig_come_from(torchcover, tmp_path):
+    code, printed, _ = torchcover("show", "nuscenes", "--out", tmp_path)
+    assert (code, " ".join(printed.split())[:60]) == (0, Rig.load("nuscenes").description[:60])

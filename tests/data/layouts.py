@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from tests.data.bags import ros2, ros2_database
 from torchcover.data.recordings import argoverse2, kitti_files, nuscenes
 from torchcover.geometry import euler_from_rotation, invert, rigid, rotation_from_euler, transform
 
@@ -197,4 +198,11 @@ def plain_folder(drive, root):
     return root
 
 
-LAYOUTS = {"kitti_raw": kitti_raw, "nuscenes": nuscenes_tables, "argoverse2": argoverse2_log, "folder": plain_folder}
+LAYOUTS = {
+    "kitti_raw": kitti_raw,
+    "nuscenes": nuscenes_tables,
+    "argoverse2": argoverse2_log,
+    "folder": plain_folder,
+    "ros2": ros2,
+    "ros2 database": ros2_database,
+}

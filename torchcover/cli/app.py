@@ -49,6 +49,10 @@ def main() -> None:
         _fail(str(error))
     except MemoryError as error:
         _fail(f"there is not enough memory ({error or 'for what was asked'}); ask for less, or use a larger machine")
+    except RuntimeError as error:
+        if type(error).__name__ != "OutOfMemoryError":  # of torch, which most mistakes are told without
+            raise
+        _fail(f"there is not enough memory ({str(error).splitlines()[0]}); ask for less, or use --device cpu")
     except (OverflowError, RecursionError) as error:
         _fail(f"a number is too large, or a file nested too deeply ({error})")
     if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
@@ -260,6 +264,22 @@ def record(
 
 
 @app.command()
+def rig(
+    frames: options.RecordingFrames,
+    recording_format: options.Format = None,
+    sensors: options.Sensors = None,
+    lidar: Annotated[
+        list[str] | None,
+        typer.Option(help="SENSOR=MODEL: a LiDAR scans as this model (see `list`), and is not estimated."),
+    ] = None,
+) -> None:
+    """Print the sensors of a recording as a rig: mounts, LiDARs and cameras for `show` and `evaluate`."""
+    from torchcover.cli.rig import run
+
+    run(frames, recording_format, sensors or (), lidar or ())
+
+
+@app.command()
 def show(
     name: Annotated[str, typer.Argument(help="Rig or scenario: a built-in name (see `list`) or a YAML file.")],
     scenario: Annotated[
@@ -280,11 +300,15 @@ app.command()(targets)
 
 
 @app.command("list")
-def list_builtin() -> None:
-    """List the built-in rigs and scenarios."""
+def list_builtin(
+    word: Annotated[
+        str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
+    ] = None,
+) -> None:
+    """List the built-in rigs, scenarios, LiDAR models and vehicles."""
     from torchcover.cli.listing import run
 
-    run()
+    run(word)
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)

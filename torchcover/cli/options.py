@@ -40,6 +40,7 @@ Frames = Annotated[
     Path | None,
     typer.Option(help="A recording instead of a simulation, of any layout in docs/formats.md."),
 ]
+RecordingFrames = Annotated[Path, typer.Option("--frames", help="The recording, of any layout in docs/recordings.md.")]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
 Sensors = Annotated[
     list[str] | None,

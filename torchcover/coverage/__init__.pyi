@@ -11,6 +11,7 @@ from .estimate import Measure as Measure
 from .grid import BevGrid as BevGrid
 from .layer import Layer as Layer
 from .metric import CoverageMetric as CoverageMetric
+from .number_metric import CoverageNumber as CoverageNumber
 from .paired import check_paired as check_paired
 from .paired import differences as differences
 from .quantity import Quantity as Quantity

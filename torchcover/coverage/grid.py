@@ -207,8 +207,8 @@ class BevGrid:
 
         def cells_of(points: Tensor) -> Tensor:
             x, y, z = (points[:, axis].double() for axis in range(3))
-            place = x_terms.index_select(0, _edges_below(x, x_bounds))
-            place += y_terms.index_select(0, _edges_below(y, y_bounds))
+            place = x_terms.index_select(0, _edges_below(x, x_bounds, *self.x))
+            place += y_terms.index_select(0, _edges_below(y, y_bounds, *self.y))
             in_tiers = [place + z_terms.index_select(0, _borders_below(z, borders)) for borders, z_terms in tiers]
             return torch.stack(in_tiers).clamp_(min=-1)
 
@@ -217,7 +217,7 @@ class BevGrid:
         return torch.cat([cells_of(some) for some in torch.split(points, part)], dim=1)
 
 
-def _edges_below(values: Tensor, bounds: Tensor) -> Tensor:
+def _edges_below(values: Tensor, bounds: Tensor, low: float, high: float) -> Tensor:
     """How many edges at equal distances are not above each value: what `torch.bucketize` gives, sooner.
 
     Divided by their distance first, then compared with, so that no rounding moves a point over a border.
@@ -225,8 +225,10 @@ def _edges_below(values: Tensor, bounds: Tensor) -> Tensor:
     Args:
         values: (N,) float64.
         bounds: (B + 3,) float64 edges between two NaN, which are never less, nor more.
+        low: The first edge; as a number, for which a GPU need not be waited for.
+        high: The last edge.
     """
-    low, high, cells = float(bounds[1]), float(bounds[-2]), len(bounds) - 3
+    cells = len(bounds) - 3
     fine = high - low <= MIN_CELL_SHARE * cells * max(abs(low), abs(high))  # the quotient would be off by more than one
     if fine or not math.isfinite(cells / (high - low)):
         return torch.bucketize(values.contiguous(), bounds[1:-1], right=True)

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -13,12 +13,17 @@ from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.blocks import AreaSums, Blocks, check_blocks, pair_up
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
+from torchcover.coverage.plotting import draw_coverage
 from torchcover.coverage.redundancy import PlaceSums, Redundancy, SensorFailures
 from torchcover.coverage.regions import Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.steps import Clouds, SensorClouds, Step, as_list, check_parameters, checked_steps
-from torchcover.metrics import MergeableMetric
+from torchcover.metrics import MergeableMetric, figure_of
 from torchcover.neighbors import nearest
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 # The states that have a row for each block, beside those of aggregations.
 PROBED_IN_BLOCKS = ("probed_steps", "block_steps")
@@ -171,7 +176,7 @@ class CoverageMetric(MergeableMetric):
                 the step says nothing.
             weights: (M,) weight of each reference point in the mean over its cell in its step, or a list of the same
                 length. For reference sensors whose density within a cell is not the one that is asked for: the
-                weights are the second divided by the first. Not given: every point weighs the same.
+                weights are the second divided by the first (`frame.reference_weights`). Not given: all weigh the same.
             index: Number of the step in time, 10^15 at most, or a list of them; it decides about the block, so that
                 steps of one number, as of an instant that is seen again, share one. Not given: counted on from the
                 steps so far.
@@ -278,6 +283,29 @@ class CoverageMetric(MergeableMetric):
         sums = self._sums_of(self._failures)
         places = PlaceSums(self.block_steps.clone(), sums["place_m2"].clone(), sums["place_sums"].clone())
         return Redundancy(self.sensors, layers, places)
+
+    def plot(
+        self,
+        val: Coverage | None = None,
+        ax: "Axes | None" = None,
+        *,
+        layer: str | None = None,
+        height: str | None = None,
+    ) -> "tuple[Figure, Axes]":
+        """Draw one layer in one height band, seen from above; see `torchcover.coverage.plotting.draw_coverage`.
+
+        Args:
+            val: What `compute` or `forward` returned; the coverage so far if not given.
+            ax: Where to; a new figure of pyplot's if not given.
+            layer: A key of `Coverage.layers`; the detection at the first threshold if not given.
+            height: Name of the band; the first if not given.
+
+        Returns:
+            The figure and the axes.
+        """
+        fig, ax = figure_of(ax)
+        draw_coverage(self.compute() if val is None else val, ax, layer, height)
+        return fig, ax
 
     def _blocks(self) -> Blocks:
         shape = self.grid.shape

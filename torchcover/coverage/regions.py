@@ -67,7 +67,7 @@ class Region:
         Example:
             >>> corner = Region.polygon("corner", [(2.0, 1.0), (5.0, 1.0), (2.0, 4.0)])
             >>> corner.x, corner.mask(BevGrid(x=(0.0, 8.0), y=(0.0, 8.0), cell=1.0)).sum()
-            ((2.0, 5.0), tensor(6))
+            ((2.0, 5.0), tensor(3))
         """
         corners = tuple((float(x), float(y)) for x, y in corners_m)
         if not all(math.isfinite(number) for corner in corners for number in corner):

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
 from torchcover.coverage.quantity import detection
 from torchcover.coverage.redundancy import SensorFailures
-from torchcover.neighbors import check_cloud
+from torchcover.neighbors import check_cloud, check_tensor
 
 # The aggregations that a metric has by itself, and the names that its own states begin with.
 BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, SensorFailures.name, "block", "probed"})
@@ -132,10 +132,7 @@ def as_list(clouds: Any, name: str) -> list[Any]:  # noqa: ANN401
     if isinstance(clouds, Tensor):
         return [clouds]
     if not isinstance(clouds, Sequence):
-        raise TypeError(
-            f"{name}: a torch tensor, or a list with one for each step, is needed; got {type(clouds).__name__} (an "
-            "array of NumPy's becomes one with torch.from_numpy)"
-        )
+        check_tensor(clouds, f"{name} (one, or a list with one for each step)")
     return list(clouds)
 
 
@@ -163,6 +160,7 @@ def _numbers(index: Any) -> list[int]:  # noqa: ANN401  (whatever the caller gav
 def _check_weights(weights: Tensor | None, points: int, name: str) -> None:
     if weights is None:
         return
+    check_tensor(weights, name)
     if weights.shape != (points,):
         raise ValueError(
             f"{name}: shape ({points},), one for each reference point, is needed; got {tuple(weights.shape)}"

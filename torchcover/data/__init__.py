@@ -8,6 +8,7 @@ from torchcover.data.clouds import read_cloud
 from torchcover.data.frame import Frame, FrameBatch, collate_frames
 from torchcover.data.recorded import RecordedFrames, reference_of_recording
 from torchcover.data.recorded_reference import RecordedReference, Reference
+from torchcover.data.recorded_rig import rig_document
 from torchcover.data.recorders import RECORDERS, write_recording
 from torchcover.data.recordings import FORMATS, Recording, RecordingFormat, Scan, open_recording
 from torchcover.data.reference import DEFAULT_REFERENCE, reference_called, reference_of_objects
@@ -44,6 +45,7 @@ __all__ = [
     "reference_called",
     "reference_of_objects",
     "reference_of_recording",
+    "rig_document",
     "rotate",
     "scale",
     "write_recording",

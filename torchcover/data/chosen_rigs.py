@@ -6,16 +6,15 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from torch.utils.data import Dataset
 
 from torchcover.data.frame import Frame
-from torchcover.data.source import FrameSource
+from torchcover.data.source import FrameDataset, FrameSource
 from torchcover.simulation import Sensor, WeightKind
 
 ValueT = TypeVar("ValueT")
 
 
-class ChosenRigs(Dataset[Frame]):
+class ChosenRigs(FrameDataset):
     """The same frames with the clouds of some rigs only, each under a name of one's own: a `FrameSource` of another.
 
     Args:

@@ -8,11 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.data.formats.arrays import Points
-from torchcover.data.recordings.recording import Scan
+from torchcover.data.recordings.recording import NO_RETURN_M, Scan
 from torchcover.geometry import BoundingBox, transform
 
-# A return from so near to the origin of its frame is one that never came, which drivers store as zeros.
-NO_RETURN_M = 1e-3
 # float32 resolves 8 mm here; clouds in world coordinates lie far beyond and would lose decimetres without a word.
 MAX_COORDINATE_M = 1e5
 

@@ -11,11 +11,11 @@ from typing import Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.utils.data import Dataset
 
 from torchcover.data.frame import Frame
 from torchcover.data.reference import reference_called, reference_of_objects
 from torchcover.data.regions_of_interest import RegionsOfInterest
+from torchcover.data.source import FrameDataset
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import with_hits
 from torchcover.simulation import Label, Observation, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
@@ -24,7 +24,7 @@ from torchcover.simulation import Label, Observation, ReferenceSensor, Rig, Scen
 MAX_STEPS = 1_000_000_000
 
 
-class SimulatedFrames(Dataset[Frame]):
+class SimulatedFrames(FrameDataset):
     """What a rig and the random reference sensor see of a scenario, step by step. A map-style torch Dataset.
 
     A frame depends on the scenario, the rig, the seed and its index, and on nothing else: not on workers, threads or

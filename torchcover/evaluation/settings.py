@@ -147,9 +147,10 @@ def usable_device(name: str) -> torch.device:
     """
     try:
         device = torch.device(name)
-        torch.zeros(1, device=device).item()  # the device `meta` has no values
-    except (RuntimeError, AssertionError) as error:
-        raise ValueError(f"device {name}: cannot be used here ({str(error).splitlines()[0]}); try cpu") from error
+        torch.zeros(1, device=device, dtype=torch.float64).item()  # the device `meta` has no values
+    except (RuntimeError, AssertionError, TypeError, ImportError) as error:
+        said = str(error).splitlines()[0].partition(". ")[0]  # some go on for pages
+        raise ValueError(f"device {name}: cannot be used here ({said}); try cpu") from error
     return device
 
 

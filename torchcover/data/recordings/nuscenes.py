@@ -2,13 +2,16 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
+from torchcover.cameras.calibration import read_nuscenes
 from torchcover.data.clouds import read_cloud
+from torchcover.data.recordings.calibrated import SensorCalibrations
 from torchcover.data.recordings.json_tables import beneath, read_table
 from torchcover.data.recordings.recording import Scan, check_times
 from torchcover.data.recordings.tracks import Seen, Tracks
@@ -70,6 +73,34 @@ class NuScenes:
         """The annotations; between two key frames, what lies between theirs."""
         return self._tracks.at(float(self.times_s[index]), invert(self.world_T_vehicle(index)))
 
+    def calibrations(self) -> SensorCalibrations:
+        """The LiDAR's mount, and the cameras of its first key frame.
+
+        Raises:
+            FileNotFoundError: A table is missing.
+            ValueError: A table that is none.
+        """
+        with naming(self._tables, "tables of nuScenes"):
+            first = self._sample_tokens[self.frames[0]]
+            rows = [
+                row
+                for row in read_table(self._tables / "sample_data.json").rows
+                if row["sample_token"] == first and row["is_key_frame"] and "/CAM_" in str(row["filename"])
+            ]
+            cameras = [
+                read_nuscenes(
+                    self._tables,
+                    Path(row["filename"]).parent.name,
+                    token=row["calibrated_sensor_token"],
+                    width=row["width"],
+                    height=row["height"],
+                )
+                for row in sorted(rows, key=lambda row: str(row["filename"]))
+            ]
+        placed = [replace(one, vehicle_T_camera=vehicle_T_ego @ np.asarray(one.vehicle_T_camera)) for one in cameras]
+        source = f"calibrated_sensor.json for {self.names[self.frames[0]]}"
+        return SensorCalibrations(source, {CHANNEL: vehicle_T_ego @ self._mounts[self.frames[0]]}, tuple(placed))
+
     def _read(self, tables: Path, scenes: Sequence[str] | None) -> None:
         samples = self._samples(tables, scenes)
         poses, calibrations = read_table(tables / "ego_pose.json"), read_table(tables / "calibrated_sensor.json")
@@ -87,6 +118,7 @@ class NuScenes:
         self._files = [beneath(self.path, row["filename"]) for row in data]
         self._poses = [pose_of(poses.row(row["ego_pose_token"])) for row in data]
         self._mounts = [pose_of(calibrations.row(row["calibrated_sensor_token"])) for row in data]
+        self._sample_tokens = [row["sample_token"] for row in data]
         self._tables, self._sample_times = tables, samples
 
     @cached_property
