@@ -30,6 +30,7 @@ BENCHMARKS = (
     "resumes",
     "scaling",
     "mutated_files",
+    "targets",
 )
 
 

@@ -41,7 +41,7 @@ def yaws(heading: Heading, target: BoundingBox, vehicle: BoundingBox, positions_
         [180.0, -90.0]
     """
     if heading in ("narrow", "wide"):
-        towards_m = -from_outline_m(vehicle, positions_m)
+        towards_m = 0.0 - from_outline_m(vehicle, positions_m)  # no -0.0, which is another angle
         length_m, width_m, _ = target.size_m
         # Whoever looks along the longer side sees the narrow one.
         along_x = (length_m >= width_m) == (heading == "narrow")
