@@ -75,6 +75,10 @@ SCRIPT = """
   const before = page.view.centre[0];
   press("ArrowRight");
   found.keyed = [page.view.centre[0] > before, text("readout")];
+  const ends = () => [...document.querySelectorAll("#bar .ticks span")].map((one) => +one.textContent);
+  choose("view", 2);
+  const [whole] = [ends(), choose("view", 1)];
+  found.ends = [whole, ends()];
   found.gallery = [...document.querySelectorAll("#gallery figcaption")].map((one) => one.textContent);
   document.querySelectorAll("#gallery button")[4].click();
   found.from_gallery = map.getAttribute("aria-label");
@@ -206,6 +210,12 @@ def test_a_map_is_moved_and_read_by_pointer_and_by_keys(seen):
     moved, words = found["keyed"]
     assert moved
     assert words.startswith("x ")
+
+
+def test_lengths_have_the_colours_of_the_place_that_is_looked_at(seen, named):
+    whole, region = (ends[-1] for ends in seen[0]["ends"])
+    largest = max(coverage.layers["radius_area_m"].values.nan_to_num().max().item() for coverage in named.values())
+    assert 0 < region < whole <= 1.05 * largest
 
 
 def test_names_are_text(seen):

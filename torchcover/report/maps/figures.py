@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage, check_paired
 from torchcover.report.maps.arrays import draw_map, draw_side_by_side
-from torchcover.report.maps.colours import difference_scale
+from torchcover.report.maps.colours import difference_scale, scale_of
 from torchcover.report.maps.overlay import SensorView
 from torchcover.report.maps.subjects import Subject, error_subjects_of, subjects_of
 from torchcover.report.maps.window import Window, asked_and_known, near_field
@@ -158,7 +158,9 @@ def _figures(coverages: Mapping[str, Coverage], setting: _Setting, *, errors: bo
         yield from draw_rigs(subject, shown.grid, bands, setting)
         yield from _draw_differences(subject, shown.grid, bands, setting)
         if near is not None:
-            yield _draw_near(_within(whole, near), near.grid, bands, setting)
+            around = _within(whole, near)
+            own = scale_of(around.quantity, torch.stack(list(around.values.values())))
+            yield _draw_near(replace(around, scale=own), near.grid, bands, setting)
     for whole in error_subjects_of(coverages) if errors else ():
         yield from draw_rigs(_within(whole, shown), shown.grid, bands, setting)
 

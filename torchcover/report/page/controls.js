@@ -13,6 +13,7 @@ class Controls {
       part(name).addEventListener("change", (event) => { page.state[name] = event.target.checked; page.refresh(); });
     }
     part("menus").addEventListener("submit", (event) => event.preventDefault());
+    part("recolour").addEventListener("click", () => { page.fitColours(); page.refresh(); });
     part("closer").addEventListener("click", () => this.zoom(FURTHER));
     part("farther").addEventListener("click", () => this.zoom(1 / FURTHER));
     this.listen(part("map"));
@@ -28,6 +29,7 @@ class Controls {
     if (name === "quantity") page.state.band = kept(page.quantity.bands, old.band);
     if (name !== "rig") page.state.rig = kept(page.band.rigs, old.rig);
     this.fillMenus();
+    page.fitColours();
     page.refresh();
   }
 
@@ -49,6 +51,7 @@ class Controls {
     const { page } = this, { views } = page.content, { selectedIndex } = part("view");
     const { x, y } = selectedIndex < views.length ? views[selectedIndex] : page.content.rasters[page.choice.map.raster].known;
     page.view.fit(x, y);
+    page.fitColours();
     page.refresh();
   }
 

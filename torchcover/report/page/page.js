@@ -11,7 +11,7 @@ function made(tag, text, attributes = {}) {
 
 class MapPage {
   constructor(content, bytes) {
-    Object.assign(this, { content, bytes, decoded: new Map(), kept: new Map() });
+    Object.assign(this, { content, bytes, decoded: new Map(), kept: new Map(), highs: new Map() });
     this.view = new MapView(part("map"));
     this.state = { quantity: 0, band: 0, rig: 0, single: false, fields: false };
     this.probe = null;
@@ -54,8 +54,9 @@ class MapPage {
   }
 
   // The cells of a map, or of a difference, as they are drawn: values, weights, their image.
-  shown(choice, single) {
-    const key = `${single} ${this.content.maps.indexOf(choice.map)} ${Boolean(choice.against)}`;
+  // Its colours are those of the place that is looked at where `high` is given, else those of all maps.
+  shown(choice, single, high = null) {
+    const key = `${single} ${this.content.maps.indexOf(choice.map)} ${Boolean(choice.against)} ${high}`;
     if (this.kept.has(key)) return this.kept.get(key);
     const { map, against } = choice, raster = this.content.rasters[map.raster];
     let values = this.numbers(map.values, raster), weights = this.numbers(map.weights, raster);
@@ -67,15 +68,45 @@ class MapPage {
       [values, weights] = overSquares(values, weights, squares, raster.columns);
     }
     if (against) values = values.map((value, cell) => (value === expected[cell] ? 0 : value - expected[cell]));
-    const scale = against ? map.difference : map.scale;
+    const scale = { ...(against ? map.difference : map.scale) };
+    if (high !== null) { scale.high = high; scale.low = against ? -high : scale.low; }
     const shown = { raster, values, weights, squares, full: map.full, isDifference: Boolean(against), scale };
     shown.image = coloured(shown, paletteOf(scale, this.content.luts));
     this.kept.set(key, shown);
     return shown;
   }
 
+  // What is looked at now: lengths in the colours of this place, the same for all bands and rigs.
+  get now() {
+    return this.shown(this.choice, this.state.single, this.highs.get(this.isOf(this.choice)) ?? null);
+  }
+
+  isOf(choice) { return `${this.quantity.name} ${Boolean(choice.against)}`; }
+
+  fitColours() {
+    const [left, top] = this.view.toMetres(MARGIN.left, MARGIN.top);
+    const { width, height } = this.view.area;
+    const [right, bottom] = this.view.toMetres(MARGIN.left + width, MARGIN.top + height);
+    const found = new Map();
+    for (const choice of this.quantity.bands.flatMap((band) => band.rigs)) {
+      if (choice.map.scale.unit !== "m") continue;
+      const { raster, values } = this.shown(choice, false), sizes = found.get(this.isOf(choice)) || [];
+      found.set(this.isOf(choice), sizes);
+      for (let cell = 0; cell < values.length; cell++) {
+        const x = raster.x[0] + ((cell % raster.columns) + 0.5) * raster.cell;
+        const y = raster.y[0] + (Math.floor(cell / raster.columns) + 0.5) * raster.cell;
+        if (x > left && x < right && y > bottom && y < top && Number.isFinite(values[cell])) sizes.push(Math.abs(values[cell]));
+      }
+    }
+    for (const [of, sizes] of found) {
+      sizes.sort((a, b) => a - b);
+      const high = sizes[Math.floor(0.98 * (sizes.length - 1))];
+      if (high > 0) this.highs.set(of, +high.toPrecision(2));
+    }
+  }
+
   draw() {
-    const { choice } = this, shown = this.shown(choice, this.state.single);
+    const { choice } = this, shown = this.now;
     const rig = this.content.rigs.find((one) => one.name === choice.map.rig);
     const outlines = this.content.outlines.map((line) => ({ ...line, closed: true, width: 1.3, dash: [3, 5] }));
     const lines = choice.map.lines.map((line, at) => ({ ...line, closed: false, width: 2, dash: at ? [9, 3 * at] : [] }));
@@ -87,7 +118,7 @@ class MapPage {
   }
 
   refresh() {
-    const shown = this.shown(this.choice, this.state.single);
+    const shown = this.now;
     part("bar").replaceChildren(barOf(shown.scale, this.content.luts));
     this.fillLegend(shown);
     this.draw();
@@ -129,7 +160,7 @@ class MapPage {
     }
     const weights = this.numbers(map.weights, raster);
     if (weights && !Number.isNaN(weights[cell])) parts.push(`${map.weight_name}: ${figures(weights[cell])}`);
-    const shown = this.shown(this.choice, this.state.single);
+    const shown = this.now;
     if (shown.squares && shown.squares[cell] > 1 && !Number.isNaN(shown.values[cell])) {
       parts.push(`its square of ${tidy(shown.squares[cell] * raster.cell)} m: ${figures(shown.values[cell])} ${unit}`);
     }
