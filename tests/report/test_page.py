@@ -49,6 +49,7 @@ SCRIPT = """
   point("pointermove", 3.6, 2.4);
   found.hover = text("readout");
   found.label = map.getAttribute("aria-label");
+  found.edge = [-5.5, -4.5].map((x) => { point("pointermove", x, 2.4); return text("readout"); });
   point("pointermove", 100.5, 100.5);
   found.beyond = text("readout");
   choose("band", 1);
@@ -61,6 +62,7 @@ SCRIPT = """
   found.other_quantity = text("readout");
   choose("rig", 2);
   found.difference = text("readout");
+  found.drawn = page.shown(page.choice, true).values[7 * 20 + 11];
   found.difference_legend = text("legend");
   choose("quantity", 0); choose("band", 0); choose("rig", 0);
   const squares = map.toDataURL();
@@ -171,6 +173,9 @@ def test_the_hover_shows_the_cell_as_it_is_in_the_file(seen, named, tmp_path):
     assert found["label"] == f"{TITLE}, ground, z -0.5 to 0.5 m, {NASTY}"
     assert close(*numbers(found["hover"], "m"), radius[0], error[0])
     assert float(re.search("in all steps: ([0-9.]+)", found["hover"])[1]) == pytest.approx(m2, rel=6e-4)
+    unknown, known = found["edge"]  # nothing was ever probed behind x = -5 m
+    assert unknown.endswith(": unknown, no visible surface found")
+    assert "unknown" not in known
     assert found["beyond"] == "x 100 to 101 m, y 100 to 101 m: beyond the grid"
     assert close(*numbers(found["other_band"], "m"), radius[1], error[1])
     assert close(*numbers(found["other_rig"], "m"), of_many[1], its_error[1])
@@ -185,6 +190,7 @@ def test_a_difference_says_what_both_are(seen, named):
     words = seen[0]["difference"]
     difference, *each = numbers(words, "percentage points") + numbers(words, "%")
     assert difference[0] == pytest.approx(values[1] - values[0], rel=2e-3)
+    assert seen[0]["drawn"] == pytest.approx(values[1] - values[0], rel=2e-3)
     assert difference[1] == pytest.approx(np.hypot(*errors), rel=0.06)
     assert close(each[0], values[1], errors[1])
     assert close(each[1], values[0], errors[0])
