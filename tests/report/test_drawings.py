@@ -173,6 +173,17 @@ def scene(**options) -> Picture:
     return Picture(draw_scene((-20.0, 30.0), (-10.0, 10.0), **(given | options)))
 
 
+def test_what_stands_is_drawn_the_darker_the_higher_and_the_ground_is_not():
+    squares = [(box(x, 5)[:3], height) for x, height in ((10, 0.0), (15, 0.3), (20, 8.0))]
+    standing = Standing(np.array([corners for corners, _ in squares]), np.array([height for _, height in squares]))
+    picture = scene(standing=standing)
+    ground, kerb, house = (picture.at(0, x + 1, 4.6).mean() for x in (10, 15, 20))
+    assert ground == 1.0
+    assert 1.0 > kerb > house + 0.1
+    entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
+    assert entries[0] == "what stands there, the darker the higher"
+
+
 def test_actors_are_where_they_are_in_the_colour_of_their_category():
     actors = [ActorMark("car", box(20, 5)), ActorMark("car", box(10, -5)), ActorMark("bus", box(-10, 5))]
     picture = scene(actors=[*actors, ActorMark("car", box(99, 0))])
