@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover.geometry import BoundingBox
+from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import PaperReference, Scenario, Simulator
+from torchcover.simulation.bodies import merge
+from torchcover.simulation.shapes import Box
 from torchcover.targets import STATES, Raster, Target, counting, survey
 from torchcover.targets.placing import yaws
 from torchcover.targets.surface import SAMPLES, Surface
@@ -171,3 +173,11 @@ def test_the_surface_is_spread_by_area_and_leaves_out_what_is_inside():
     near = np.unpackbits(surface.near(hits, 0.4), axis=1).astype(bool)
     distance = np.linalg.norm(hits[:, None] - surface.points_m, axis=2)
     np.testing.assert_array_equal(near, distance <= 0.4)
+
+
+def test_a_target_hides_its_own_rear():
+    """Two plates of a square metre, one behind the other."""
+    front, rear = (Box(type="box", size_m=(0.02, 1, 1)).mesh().moved(rigid(np.eye(3), [x, 0, 0])) for x in (0.1, -0.1))
+    raster = Raster((11.0, 13.0), (-1.0, 1.0), 2.0)
+    seen = survey(rig(), world(), Target("plates", merge([front, rear])), raster, heading="wide")
+    assert seen.visible_m2[0, 0] == pytest.approx(1.0, abs=0.35)
