@@ -21,6 +21,7 @@ BENCHMARKS = (
     "even_reference",
     "ray_budget",
     "recorded_measure",
+    "reading",
     "accumulated_reference",
     "calibration",
     "training_overhead",

@@ -22,7 +22,7 @@ from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
 from torchcover.data.recordings import kitti_files
 from torchcover.data.recordings.argoverse2 import read_feather
-from torchcover.data.recordings.carla import read_carla_sensors
+from torchcover.data.recordings.carla_files import read_carla_sensors
 from torchcover.data.recordings.folder_settings import read_folder_settings
 from torchcover.data.recordings.folder_tables import PoseTable
 from torchcover.data.recordings.folder_tables import read_boxes as read_labels

@@ -1,10 +1,12 @@
 """`torchcover record`."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import typer
 
 from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called, write_recording
+from torchcover.evaluation.progress import progress_of
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, spread_s
 from torchcover.simulation import Rig, Scenario
 
@@ -38,5 +40,12 @@ def run(
         boxes=True,
     )
     frames.simulator.check_run(frames.steps)
-    write_recording(frames, out, layout)
+    write_recording(frames, out, layout, progress=_with_a_bar)
     typer.echo(f"Wrote {len(frames)} frames to {out}; read them with: torchcover evaluate --frames {out}")
+
+
+def _with_a_bar(steps: range) -> Iterator[int]:
+    with progress_of(len(steps), "record", shown=True) as bar:
+        for step in steps:
+            yield step
+            bar.advance(len(steps))

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, PositiveFloat, model_validator
 
 from torchcover.coverage import BevGrid, Region, check_regions, forward_regions, near_field_regions
 from torchcover.coverage.grid import PAPER_HEIGHTS
-from torchcover.simulation.documents import Coordinate, Document, load_path
+from torchcover.simulation.documents import Coordinate, Document, read_document
 from torchcover.simulation.reference_sensor import Areas, Bands
 
 # Holds the paper's regions, and the space beside and behind the vehicle.
@@ -105,7 +105,7 @@ class RegionsOfInterest(Document):
             FileNotFoundError: No such file.
             BadFileError: Not YAML, or a wrong key or value; the message names the file and the key.
         """
-        return load_path(cls, Path(path))
+        return read_document(cls, Path(path))
 
     def around(self, ego_outline_m: NDArray[np.float64] | None = None, cell_m: float | None = None) -> "Asked":
         """What follows for one vehicle.

@@ -122,10 +122,10 @@ def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -
         BadFileError: Not YAML, or a key is unknown, missing, doubled or has a wrong value; the message names the file
             and the key.
     """
-    return load_path(model, _find(kind, path_or_name))
+    return read_document(model, _find(kind, path_or_name))
 
 
-def load_path(model: type[DocumentT], path: Path) -> DocumentT:
+def read_document(model: type[DocumentT], path: Path) -> DocumentT:
     """Read a YAML file into a model of which none is built in.
 
     Raises:

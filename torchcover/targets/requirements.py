@@ -6,7 +6,7 @@ from typing import Annotated, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from torchcover.simulation.documents import Document, load_path
+from torchcover.simulation.documents import Document, read_document
 from torchcover.targets.result import SIDES, Place, TargetMap
 from torchcover.targets.target import TARGETS
 
@@ -80,7 +80,7 @@ class Requirements(Document):
             FileNotFoundError: No such file.
             BadFileError: Not such a document; the message names the file and the key.
         """
-        return load_path(cls, Path(path))
+        return read_document(cls, Path(path))
 
 
 class Verdict(NamedTuple):

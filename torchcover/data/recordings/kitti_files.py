@@ -8,12 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import Calibration, split_matrix
-from torchcover.files import BadFileError, naming, read_short_text, reads
+from torchcover.files import BadFileError, check_memory, decode, naming, read_short_text, reads
 from torchcover.geometry import BoundingBox, check_rigid, invert, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
 
 # Of the WGS84 ellipsoid, as in the development kit.
 EARTH_RADIUS_M = 6_378_137.0
+# Of a line of time stamps, once it is an object of Python, for each byte of the file.
+BYTES_PER_BYTE = 8
 # lat, lon, alt, roll, pitch, yaw, velocities, accelerations, rates, accuracies, status.
 OXTS_COLUMNS = 30
 # The LiDAR is 0.76 m before the rear axle and 1.73 m above the ground, the centre of the car's box 1.337 m before the
@@ -188,11 +190,13 @@ def read_timestamps(path: Path) -> NDArray[np.float64]:
     Raises:
         BadFileError: A line that is no time.
     """
-    lines = read_short_text(path).split("\n")
+    check_memory(BYTES_PER_BYTE * path.stat().st_size)
+    lines = decode(path.read_bytes()).split("\n")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # of time zones, which NumPy would leave out with a warning
-            times = np.array([np.datetime64(line.strip().replace(" ", "T"), "ns") for line in lines if line.strip()])
+            words = [line.strip().replace(" ", "T") for line in lines if line.strip()]
+            times = np.array(words, dtype="datetime64[ns]")
     except (ValueError, UserWarning) as error:
         raise ValueError(f"lines of date and time are needed: {error}") from error
     seconds: NDArray[np.float64] = (times - times[0]) / np.timedelta64(1, "s")
