@@ -224,6 +224,26 @@ def test_lengths_have_the_colours_of_the_place_that_is_looked_at(seen, named):
     assert 0 < region < whole <= 1.05 * largest
 
 
+def test_a_wide_table_fits_the_paper_and_breaks_no_short_heading(tmp_path):
+    """Eight sensors on A4 with margins of 12 mm: 186 mm."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here: nobody looks at the page")
+    sensors = [f"{what}_{side}" for what in ("camera", "lidar") for side in ("front", "rear", "left", "right")]
+    headings = ["region", "height", "sensors that see\nit", "by two or more\n(%)", *sensors, "most lost with"]
+    row = [Words("behind"), Words("ground"), *[Words("unknown")] * 10, Words("camera_right")]
+    text = page_html(Page("rig", "lead", tables=[PageTable("", headings, [row])])).replace("@media print", "@media all")
+    script = """
+      const [table, first] = [document.querySelector("table"), document.querySelector("thead th")];
+      document.body.style.width = "186mm";
+      const words = document.createRange();
+      words.selectNodeContents(first);
+      document.title = [table.scrollWidth <= document.body.clientWidth, words.getClientRects().length].join();
+    """
+    dom, console = browsed(text, tmp_path / "page.html", script)
+    assert console == []
+    assert "<title>true,1</title>" in dom
+
+
 def test_names_are_text(seen):
     found = seen[0]
     assert found["title"] == NASTY

@@ -45,7 +45,7 @@ def test_with_a_tiny_error_only_nothing_is_0_percent_and_only_all_is_100(share):
 @given(st.floats(-2.0, 2.0), st.floats(1e-9, 1.0))
 def test_a_difference_has_a_sign_and_none_is_minus_nothing(difference, error):
     words = difference_words(Difference(difference, error, None), "m").split(" ± ")[0]
-    assert words[0] == ("-" if float(words) < 0 else "+")
+    assert words[0] == ("-" if float(words) < 0 else "+" if float(words) else "0")
     if float(words):
         assert math.copysign(1, difference) == math.copysign(1, float(words))
 
@@ -68,6 +68,7 @@ def test_what_has_no_error_at_all_is_shown_as_such():
     assert number_words(Number(0.2, 0.0), "m") == "0.20 ± 0"
     assert difference_words(Difference(0.0, 0.0, False), "share") == "0 ± 0"
     assert difference_words(Difference(0.0, math.nan, None), "m") == "0"
+    assert difference_words(Difference(-1e-6, math.nan, None), "share") == "0.0"
 
 
 def test_infinity_and_the_unknown_have_neither_digits_nor_errors():

@@ -83,6 +83,9 @@ def test_sides_part_the_places_at_corners_of_45_degrees():
     }  # fmt: skip
     closed = replace(seen, state=np.ones_like(seen.state))
     assert all(row.cells == 0 and np.isnan(row.seen) for row in closed.sides())
+    assert np.isnan(list(closed.unseen_to_m().values())).all()
+    half = replace(seen, seen=np.where(seen.free, 0.5, np.nan))
+    assert {row.seen for row in half.sides()} == {0.5}  # in every other step, however many points the others have
 
 
 def test_the_worst_places_have_the_fewest_points_and_keep_apart():
@@ -117,7 +120,7 @@ def test_what_is_unknown_is_not_met():
     verdict = judged(seen_where(lambda x, y: 9, share=share), {"within_m": 4, "share": 0.1})[0]
     assert verdict.passed  # the corner is farther away
     share[10, 0] = np.nan
-    verdict = judged(seen_where(lambda x, y: 9, share=share), {"within_m": 4, "share": 0.0})[0]
+    verdict = judged(seen_where(lambda x, y: 9, share=share), {"within_m": 4, "share": 0.01})[0]
     assert (verdict.passed, verdict.failed, verdict.unknown) == (False, 1, 1)
 
 
@@ -125,9 +128,10 @@ def test_what_is_unknown_is_not_met():
     ("requirement", "message"),
     [
         ({"target": "dog", "within_m": 1, "points": 1}, "no requirement is about the target 'child_110cm'.* about dog"),
-        ({"within_m": 5, "points": 1}, "raster ends 4 m from the vehicle"),
+        ({"within_m": 5, "points": 1}, "the front within 5 m spans x = 2 to 7 m, and the raster -6 to 6 m"),
         ({"within_m": 0.1, "points": 1}, "there is no free cell"),
         ({"within_m": 1}, "nothing is required: give points"),
+        ({"within_m": 1, "points": 0, "share": 0}, "nothing is required: give points"),
         ({"within_m": 1, "sides": [], "points": 1}, "sides"),
         ({"within_m": 0, "points": 1}, "within_m"),
         ({"within_m": 1, "points": 1, "pionts": 2}, "pionts"),
@@ -138,11 +142,30 @@ def test_a_requirement_that_says_nothing_is_an_error(requirement, message):
         judged(seen_where(lambda x, y: 9), requirement)
 
 
+@pytest.mark.parametrize("side", ["front", "rear", "left", "right"])
+def test_a_side_that_the_raster_holds_in_part_is_not_judged(side):
+    """Within 2 m of the front, the side reaches from x = 2 to 4 m and 1.41 m beyond both flanks; likewise the others."""
+    need = {"within_m": 2, "sides": [side], "points": 5}
+    turned = {"front": (1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}[side]
+    along = 0 if turned[0] else 1
+    forward = turned[along] > 0
+
+    def raster(near, far, aside):
+        ahead = (near, far) if forward else (-far, -near)
+        return Raster(*((ahead, (-aside, aside)) if along == 0 else ((-aside, aside), ahead)), 0.5)
+
+    edge, flank = ((2.0, 1.0), (1.0, 2.0))[along]
+    assert judged(seen_where(lambda x, y: 9, raster=raster(edge, edge + 2, flank + 1.5)), need)[0].passed
+    for near, far, aside in ((edge + 0.5, edge + 2, flank + 1.5), (edge, edge + 1.5, 9), (edge, edge + 2, flank + 1)):
+        with pytest.raises(ValueError, match="take a larger one"):
+            judged(seen_where(lambda x, y: 9, raster=raster(near, far, aside)), need)
+
+
 def test_the_files_hold_what_the_map_holds(tmp_path):
     seen = seen_where(lambda x, y: np.abs(x) + 0.5, raster=Raster((-3.0, 3.0), (-2.0, 2.0), 1.0))
     verdicts = judged(seen, {"within_m": 1, "points": 1})
     names = [path.name for path in save_targets(seen, tmp_path, verdicts)]
-    assert names == ["targets.csv", "targets.npz", "targets.png", "summary.json"]
+    assert names == ["targets.csv", "targets.npz", "report.html", "targets.png", "summary.json"]
     with np.load(tmp_path / "targets.npz") as arrays:
         np.testing.assert_array_equal(arrays["points"], seen.points)
         np.testing.assert_array_equal(arrays["first_seen_m"], seen.first_seen_m())

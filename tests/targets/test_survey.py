@@ -138,6 +138,12 @@ def test_what_hides_a_target_hides_its_points_and_what_stands_there_takes_its_ro
     assert (seen.steps == (seen.state == FREE)).all()
 
 
+def test_a_raster_within_the_vehicle_is_occupied_everywhere():
+    seen = survey(rig(), world(), Target.load("pole"), Raster((-1.0, 1.0), (-0.5, 0.5), 0.5))
+    assert (seen.state == OCCUPIED).all()
+    assert np.isnan(seen.points).all()
+
+
 def test_a_target_that_no_random_place_sees_has_an_unknown_share():
     """A child behind a high wall all along."""
     wall = {"name": "w", "shape": {"type": "box", "size_m": [0.2, 60, 9]}, "poses": [{"x_m": 4.0}]}

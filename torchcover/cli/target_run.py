@@ -1,5 +1,6 @@
 """What `torchcover targets` does and prints."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -119,11 +120,18 @@ def _sides_table(seen: TargetMap) -> Table:
     for name in dict.fromkeys(side.side for side in sides):
         of_side = [side for side in sides if side.side == name]
         shares = ("-" if side.cells == 0 else f"{percent(side.seen)} %" for side in of_side)
-        rows.append([name, *shares, f"{unseen_to_m[name]:.2f} m" if unseen_to_m[name] else "nowhere"])
+        rows.append([name, *shares, _unseen(unseen_to_m[name])])
     headings = ("side", *(f"within {limit_m:g} m" for limit_m in within), "unseen to")
     length, width, height = seen.target_size_m
     title = f"{seen.rig} sees {seen.target} ({length:.2f} x {width:.2f} x {height:.2f} m), in {seen.scenario}"
-    return text_table(headings, [rows], title=title, caption=f"Share of free places with {seen.hits} points or more")
+    caption = f"Share of free places with {seen.hits} points or more" + ", mean over the steps" * (seen.step_count > 1)
+    return text_table(headings, [rows], title=title, caption=caption)
+
+
+def _unseen(to_m: float) -> str:
+    if math.isnan(to_m):
+        return "-"
+    return f"{to_m:.2f} m" if to_m else "nowhere"
 
 
 def _places_table(places: Sequence[Place], title: str) -> Table:

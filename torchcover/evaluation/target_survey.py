@@ -1,6 +1,6 @@
 """What a rig sees of a target: names and defaults in, a map and its files out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -159,7 +159,7 @@ def target_record(seen: TargetMap, verdicts: Sequence[Verdict] = ()) -> dict[str
         **seen.settings(),
         "cells": seen.counts,
         "sides": [_known(side._asdict()) for side in seen.sides()],
-        "unseen_to_m": seen.unseen_to_m(),
+        "unseen_to_m": _known(seen.unseen_to_m()),
         "worst": [_known(place._asdict()) for place in seen.worst()],
         "requirements": [_judged(verdict) for verdict in verdicts],
     }
@@ -170,5 +170,5 @@ def _judged(verdict: Verdict) -> dict[str, Any]:
     return {**verdict._asdict(), "requirement": verdict.requirement.words, "worst": worst}
 
 
-def _known(record: dict[str, Any]) -> dict[str, Any]:
+def _known(record: Mapping[str, Any]) -> dict[str, Any]:
     return {key: None if isinstance(value, float) and np.isnan(value) else value for key, value in record.items()}

@@ -208,8 +208,9 @@ def difference_words(difference: Difference, unit: Unit) -> str:
     value, error = shown.factor * difference.value, shown.factor * difference.error
     inexact = error > 100 * ROUND_OFF
     decimals = decimals_of(error, shown.max_decimals) if inexact else shown.decimals
-    # Adding 0 turns -0.0 into 0.0.
-    words = f"{round(value, decimals) + 0.0:+.{decimals}f}" if inexact or value else "0"
+    # What rounds to nothing has no sign: a loss too small to be shown is no gain. Adding 0 turns -0.0 into 0.0.
+    shown_value = round(value, decimals) + 0.0
+    words = f"{shown_value:{'+' if shown_value else ''}.{decimals}f}" if inexact or value else "0"
     if math.isnan(error):
         return words
     return f"{words} ± {_error_words(difference.error, unit, 100 * ROUND_OFF / shown.factor)}"

@@ -1,5 +1,6 @@
 """What a rig must see of a target, and whether it does."""
 
+import math
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple, Self
 
@@ -41,8 +42,8 @@ class Requirement(Document):
 
     @model_validator(mode="after")
     def _check_names_something(self) -> Self:
-        if not self.least:
-            raise ValueError("nothing is required: give points, sensors, share or seen")
+        if not any(self.least.values()):
+            raise ValueError("nothing is required: give points, sensors, share or seen, one of them above 0")
         return self
 
     @property
@@ -135,13 +136,22 @@ def _judged(requirement: Requirement, seen: TargetMap, tell: int) -> Verdict:
 
 
 def _check_reach(requirement: Requirement, seen: TargetMap) -> None:
-    """A raster that ends too early would let pass what was never looked at."""
+    """A raster that ends too early, or begins too late, would let pass what was never looked at."""
     (x0, y0, _), (x1, y1, _) = seen.vehicle.lower_m, seen.vehicle.upper_m
-    raster = seen.raster
-    reach_m = {"front": raster.x[1] - x1, "rear": x0 - raster.x[0], "left": raster.y[1] - y1, "right": y0 - raster.y[0]}
+    raster, within_m = seen.raster, requirement.within_m
+    # A side ends where it is as far aside as ahead.
+    aside_m = within_m / math.sqrt(2)
+    low_x, high_x, low_y, high_y = x0 - aside_m, x1 + aside_m, y0 - aside_m, y1 + aside_m
+    areas = {
+        "front": ((x1, x1 + within_m), (low_y, high_y)),
+        "rear": ((x0 - within_m, x0), (low_y, high_y)),
+        "left": ((low_x, high_x), (y1, y1 + within_m)),
+        "right": ((low_x, high_x), (y0 - within_m, y0)),
+    }
     for name in requirement.sides or SIDES:
-        if reach_m[name] < requirement.within_m - ROUNDING:
-            raise ValueError(
-                f"requirement {requirement.words!r}: the raster ends {max(reach_m[name], 0.0):.3g} m from the vehicle "
-                f"({name}); take a larger one"
-            )
+        for axis, (low_m, high_m), ours_m in zip("xy", areas[name], (raster.x, raster.y), strict=True):
+            if ours_m[0] > low_m + ROUNDING or ours_m[1] < high_m - ROUNDING:
+                raise ValueError(
+                    f"requirement {requirement.words!r}: the {name} within {within_m:g} m spans {axis} = {low_m:.4g} "
+                    f"to {high_m:.4g} m, and the raster {ours_m[0]:g} to {ours_m[1]:g} m; take a larger one"
+                )

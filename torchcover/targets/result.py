@@ -35,7 +35,7 @@ class Place(NamedTuple):
 
 
 class SideShare(NamedTuple):
-    """Of the cells of one side within a distance: how many are free, and the share of them where the target is seen."""
+    """Of the cells of one side within a distance: how many are free, and the share of the steps with enough points."""
 
     side: str
     within_m: float
@@ -143,15 +143,17 @@ class TargetMap:
             for limit_m in within_m:
                 there = self.free & (side == number) & (distance_m <= limit_m)
                 cells = int(there.sum())
-                rows.append(SideShare(name, limit_m, cells, float(self.enough[there].mean()) if cells else math.nan))
+                rows.append(SideShare(name, limit_m, cells, float(self.seen[there].mean()) if cells else math.nan))
         return rows
 
     def unseen_to_m(self) -> dict[str, float]:
-        """For each side, how far the farthest free cell is that has not enough points; 0 if all have."""
-        unseen, side = self.free & ~self.enough, self.side
-        of_sides = [unseen & (side == number) for number in range(len(SIDES))]
-        farthest_m = [float(self.distance_m[there].max(initial=0.0)) for there in of_sides]
-        return dict(zip(SIDES, farthest_m, strict=True))
+        """For each side, how far the farthest free cell without enough points is; 0 if all have them, NaN if none is."""
+        farthest_m = {}
+        for number, name in enumerate(SIDES):
+            there = self.free & (self.side == number)
+            unseen_m = self.distance_m[there & ~self.enough]
+            farthest_m[name] = float(unseen_m.max(initial=0.0)) if there.any() else math.nan
+        return farthest_m
 
     def worst(self, count: int = 10, apart_m: float = 1.0) -> list[Place]:
         """The places with the fewest points, and of those the nearest first; no two within a distance of each other."""

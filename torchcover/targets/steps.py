@@ -18,7 +18,7 @@ from torchcover.simulation.shell import position_in_shell
 from torchcover.simulation.stage import Stages
 from torchcover.simulation.surroundings import Surroundings
 from torchcover.targets.placing import blocked
-from torchcover.targets.surface import Surface
+from torchcover.targets.surface import SAMPLES, Surface
 from torchcover.targets.target import Target
 
 Bools = NDArray[np.bool_]
@@ -134,7 +134,9 @@ class Steps:
                     for poses in _chunks(self._poses)
                 ]
             )
-        return np.stack([np.concatenate(of_place) for of_place in seen])
+        # Some of none, where the vehicle is everywhere.
+        none = np.empty((0, SAMPLES // 8), dtype=np.uint8)
+        return np.stack([np.concatenate([none, *of_place]) for of_place in seen])
 
     def _disturbed(self, mounted: MountedSensor, ends_m: Float32, index: int, number: int) -> SensorStep:
         """Let the simulator's own noise and drop-out fall on a point a metre along every ray."""

@@ -91,7 +91,8 @@ def _cell(cell: Words, kind: str) -> str:
 
 
 def _broken(heading: str) -> str:
-    return "<br>".join(escape(line) for line in heading.split("\n"))
+    lines = (escape(line).replace("_", "_<wbr>") for line in heading.split("\n"))
+    return "<br>".join(lines)
 
 
 def _rig(rig: PageRig, ego_outline_m: Array | None, number: int) -> str:
