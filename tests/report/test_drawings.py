@@ -122,6 +122,16 @@ def test_a_full_turn_is_a_fan_to_the_front_and_one_to_the_rear():
     assert [text.get_text() for text in picture.figure.axes[1].texts].count("1") == 2
 
 
+def test_the_numbers_of_many_sensors_stand_on_the_paper_however_short_the_vehicle():
+    sensors = [view(yaw, at=(0.0, 0.0, 0.5), name=f"s{yaw}") for yaw in np.linspace(0, 2 * np.pi, 8, endpoint=False)]
+    figure = draw_rig(0.2 * VERTICES, FACES, sensors, title="Robot")
+    axes = figure.axes[0]
+    (x0, x1), (y0, y1) = axes.get_xlim(), axes.get_ylim()
+    numbers_m = {text.get_text(): text.get_position() for text in axes.texts if text.get_text().isdigit()}
+    assert sorted(numbers_m) == list("12345678")
+    assert all(x0 < x < x1 and y0 < y < y1 for x, y in numbers_m.values())
+
+
 def test_a_sensor_that_looks_sideways_is_marked_though_it_has_no_fan():
     picture = rig(view(yaw=90.0), view())
     labels = [text.get_text() for text in picture.figure.axes[1].texts]

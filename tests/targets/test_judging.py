@@ -144,7 +144,7 @@ def test_a_requirement_that_says_nothing_is_an_error(requirement, message):
 
 @pytest.mark.parametrize("side", ["front", "rear", "left", "right"])
 def test_a_side_that_the_raster_holds_in_part_is_not_judged(side):
-    """Within 2 m of the front, the side reaches from x = 2 to 4 m and 1.41 m beyond both flanks; likewise the others."""
+    """Within 2 m of the front, the side spans x = 2 to 4 m and 1.41 m beyond both flanks; likewise the others."""
     need = {"within_m": 2, "sides": [side], "points": 5}
     turned = {"front": (1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}[side]
     along = 0 if turned[0] else 1

@@ -147,7 +147,7 @@ class TargetMap:
         return rows
 
     def unseen_to_m(self) -> dict[str, float]:
-        """For each side, how far the farthest free cell without enough points is; 0 if all have them, NaN if none is."""
+        """For each side, how far the farthest free cell without enough points is; 0 if all have, NaN if none is."""
         farthest_m = {}
         for number, name in enumerate(SIDES):
             there = self.free & (self.side == number)

@@ -28,8 +28,9 @@ Points = NDArray[np.float64]
 WIDTH_IN = 7.5
 # Around the vehicle, in its lengths, but no less than this.
 AROUND_LENGTHS, AROUND_M, ABOVE_M = 0.75, 2.0, 1.5
-# Numbers stand at different distances along their directions, so that one does not hide another.
-FIRST_NUMBER_M, NUMBER_STEP_M, NUMBER_PLACES = 0.9, 0.35, 8
+# Numbers stand at different distances along their directions, so that one does not hide another: shares of what the
+# drawing shows around the vehicle.
+FIRST_NUMBER, NUMBER_STEP, NUMBER_PLACES = 0.4, 0.07, 8
 NUMBER_SHARE = 0.09
 HIGHEST_RANGES_IN = 4.5
 # What a range without limit is drawn with.
@@ -55,7 +56,7 @@ def draw_rig(
         A figure of its own, outside pyplot: horizontal fields of view from above, which go on beyond the paper; from
         the side, sections through each sensor along the vehicle, down to the ground; and how far they reach.
     """
-    x, y, top_m = _around(vertices_m, sensors)
+    x, y, top_m, around_m = _around(vertices_m, sensors)
     beyond_m = float(np.hypot(x[1] - x[0], y[1] - y[0]))
     ranges_m = [min(sensor.range_m, UNLIMITED_M) for sensor in sensors]
     wide = [_sector(sensor, range_m) for sensor, range_m in zip(sensors, ranges_m, strict=True)]
@@ -66,7 +67,7 @@ def draw_rig(
     side.axhspan(GROUND_M, 0.0, facecolor="#d8d4cc", edgecolor="black", linewidth=0.8)
     for at, sensor in enumerate(sensors):
         near_m, place = min(ranges_m[at], beyond_m), sensor.position_m
-        number_m = FIRST_NUMBER_M + NUMBER_STEP_M * (at % NUMBER_PLACES)
+        number_m = around_m * (FIRST_NUMBER + NUMBER_STEP * (at % NUMBER_PLACES))
         _draw_sensor(above, at, place[:2], [_sector(sensor, near_m)], [_along(_sector(sensor, number_m))])
         fans, ends = _fans(sensor, near_m), [_along(fan) for fan in _fans(sensor, number_m)]
         _draw_sensor(side, at, place[[0, 2]], fans, ends)
@@ -86,12 +87,13 @@ def draw_rig(
     return figure
 
 
-def _around(vertices_m: Points, sensors: Sequence[SensorView]) -> tuple[Bounds, Bounds, float]:
-    """Bounds x and y around the vehicle and its sensors, and the top in z."""
+def _around(vertices_m: Points, sensors: Sequence[SensorView]) -> tuple[Bounds, Bounds, float, float]:
+    """Bounds x and y around the vehicle and its sensors, the top in z, and how far around it is."""
     every = np.vstack([vertices_m, *(sensor.position_m[None] for sensor in sensors)])
     low, high = every.min(axis=0).tolist(), every.max(axis=0).tolist()
     around_m = max(AROUND_M, AROUND_LENGTHS * (high[0] - low[0]))
-    return (low[0] - around_m, high[0] + around_m), (low[1] - around_m, high[1] + around_m), high[2] + ABOVE_M
+    x, y = ((low[axis] - around_m, high[axis] + around_m) for axis in (0, 1))
+    return x, y, high[2] + ABOVE_M, around_m
 
 
 def _bounds_of_ranges(polygons: Sequence[Points]) -> tuple[Bounds, Bounds]:
