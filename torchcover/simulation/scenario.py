@@ -12,7 +12,7 @@ from torchcover.simulation.bodies import Body, Shape, VehicleShape, mover_mesh
 from torchcover.simulation.documents import Document, PathBeside, Pose, load_document
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.tracks import read_boxes, read_trajectory
-from torchcover.simulation.traffic import Highway, Parking, Urban
+from torchcover.simulation.traffic import TRAFFIC, Procedural
 from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World, steps_of
 

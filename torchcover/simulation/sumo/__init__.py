@@ -1,0 +1,1 @@
+"""Traffic and road networks of SUMO."""
