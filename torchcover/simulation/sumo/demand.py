@@ -74,8 +74,8 @@ def write_routes(
     ]
     if (everybody := sum(number for _, _, number in groups)) > MAX_AGENTS:
         raise ValueError(
-            f"traffic of about {everybody:,.0f} vehicles and people; at most {MAX_AGENTS:,} are drawn: lower the numbers "
-            "to a kilometre, or take a piece of the network"
+            f"traffic of about {everybody:,.0f} vehicles and people; at most {MAX_AGENTS:,} are drawn: lower the "
+            "numbers to a kilometre, or take a piece of the network"
         )
     for mix, ways, number in groups:
         on_foot = mix is PEOPLE

@@ -2,6 +2,7 @@
 
 from array import array
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -157,10 +158,8 @@ def record(pieces: Iterable[bytes], window: Window) -> Recorded:
         ValueError: Not such data, or without angles.
     """
     collector = _Collector(window)
-    try:
+    with suppress(_Enough):
         feed_xml(pieces, collector.start)
-    except _Enough:
-        pass
     if not collector.seen_s:
         raise ValueError("floating car data of SUMO with at least one <timestep> is needed")
     return Recorded(tuple(_tracks(collector)), collector.begin_s, collector.seen_s[-1])

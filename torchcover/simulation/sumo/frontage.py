@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.ground import Ground, tilts_deg
+from torchcover.simulation.sumo.network import Lane
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.city import FREE_AT_CORNERS_M, PARKED, PARKED_GAP_M
 from torchcover.simulation.traffic.fleet import Fleet
-from torchcover.simulation.traffic.scenery import block, few, post, prism, tree
+from torchcover.simulation.traffic.scenery import few, post, prism, tree
 
 Numbers = NDArray[np.float64]
 
@@ -35,9 +36,7 @@ class Frontage:
         generator: Draws everything.
     """
 
-    def __init__(
-        self, vicinity: Vicinity, ground: Ground, built_share: float, generator: np.random.Generator
-    ) -> None:
+    def __init__(self, vicinity: Vicinity, ground: Ground, built_share: float, generator: np.random.Generator) -> None:
         self._vicinity = vicinity
         self._ground = ground
         self._built_share = built_share
@@ -55,7 +54,7 @@ class Frontage:
 
     def _edges(self) -> Iterator[tuple[Numbers, Numbers]]:
         """(K, 2) the outer edges of the outermost lanes, on both sides of each street, and (K,) ways along them."""
-        outer = {}
+        outer: dict[str, tuple[Lane, float]] = {}
         for number, lane in enumerate(self._vicinity.lanes):
             if lane.use in ("road", "bay", "sidewalk") and number not in self._vicinity.decks:
                 outer.setdefault(lane.edge, (lane, -1.0 if not self._vicinity.left_hand else 1.0))

@@ -3,7 +3,6 @@
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from torchcover.simulation.shapes import Mesh
@@ -71,11 +70,12 @@ class Slopes(NamedTuple):
         # The triangles share the diagonal from here to across.
         lower = here + x * (right - here) + y * (across - right)
         upper = here + y * (above - here) + x * (across - above)
-        return np.where(x >= y, lower, upper)
+        heights_m: Numbers = np.where(x >= y, lower, upper)
+        return heights_m
 
     def mesh(self) -> Mesh:
         """The squares that are wanted, as one sheet."""
-        rows, columns = self.corners_m.shape
+        columns = self.corners_m.shape[1]
         row, column = np.nonzero(self.wanted)
         here = row * columns + column
         right, above, across = here + 1, here + columns, here + columns + 1
@@ -98,8 +98,8 @@ def ground_of(vicinity: Vicinity) -> Plain | Slopes:
     columns, rows = (np.ceil((upper_m - lower_m) / CELL_M).astype(np.int64) + 1).tolist()
     if columns * rows > MAX_CORNERS:
         raise ValueError(
-            f"the ground of {columns * CELL_M / 1000:.1f} x {rows * CELL_M / 1000:.1f} km around the ego's way has too many "
-            "squares; shorten the duration"
+            f"the ground of {columns * CELL_M / 1000:.1f} x {rows * CELL_M / 1000:.1f} km around the ego's way has too "
+            "many squares; shorten the duration"
         )
     total, weight = _spread((places_m[:, :2] - lower_m) / CELL_M, places_m[:, 2], rows, columns)
     middles_m = lower_m + CELL_M * (np.indices((rows - 1, columns - 1))[::-1].reshape(2, -1).T + 0.5)
@@ -152,4 +152,5 @@ def tilts_deg(ground: Ground, places_m: Numbers, yaw_deg: Numbers, size_m: tuple
     ]
     # Up at the front is a negative pitch; up at the left lowers the right side.
     pitch, roll = np.arctan2(-rises[0], 2 * size_m[0] / 3), np.arctan2(rises[1], size_m[1])
-    return np.rad2deg(np.stack([pitch, roll], axis=1))
+    tilts: Numbers = np.rad2deg(np.stack([pitch, roll], axis=1))
+    return tilts

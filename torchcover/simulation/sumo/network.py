@@ -33,8 +33,8 @@ class Lane(NamedTuple):
         width_m: Its width.
         line_m: (K, 3) its middle, in the direction of travel, K >= 2; of a corner its outline instead, K >= 3.
         speed_mps: What is allowed.
-        classes: Of vehicles that may use it; None for all but those in `barred`.
-        barred: Classes that may not.
+        classes: Of vehicles that may use it, or "all".
+        barred: Classes that may not, or "all".
     """
 
     edge: str
@@ -42,12 +42,12 @@ class Lane(NamedTuple):
     width_m: float
     line_m: Numbers
     speed_mps: float
-    classes: frozenset[str] | None
+    classes: frozenset[str]
     barred: frozenset[str]
 
     def allows(self, vehicle_class: str) -> bool:
         """Whether vehicles of a class may use it."""
-        return vehicle_class not in self.barred if self.classes is None else vehicle_class in self.classes
+        return not {"all", vehicle_class} & self.barred and bool({"all", vehicle_class} & self.classes)
 
 
 class Network(NamedTuple):
@@ -132,22 +132,22 @@ def _lane(edge: ElementTree.Element, item: ElementTree.Element) -> Lane | None:
     if not np.isfinite(line_m).all():
         raise ValueError(f"lane {name!r}: its shape has NaN or infinite numbers")
     line_m = _without_repeats(line_m)
-    classes = frozenset(item.get("allow", "").split()) or None
+    classes = frozenset(item.get("allow", "all").split())
     barred = frozenset(item.get("disallow", "").split())
     use = _use(edge.get("function", "normal"), classes, barred)
     if use is None or len(line_m) < (3 if use == "corner" else 2):
         return None  # a lane without length has no surface either
-    return Lane(edge.get("id", ""), use, width_m, line_m, speed_mps, None if classes == {"all"} else classes, barred)
+    return Lane(edge.get("id", ""), use, width_m, line_m, speed_mps, classes, barred)
 
 
-def _use(function: str, classes: frozenset[str] | None, barred: frozenset[str]) -> Use | None:
+def _use(function: str, classes: frozenset[str], barred: frozenset[str]) -> Use | None:
     if function == "walkingarea":
         return "corner"
     if function == "crossing":
         return "crossing"
-    if function not in ("normal", "internal") or (classes is not None and classes <= NO_ROADS):
+    if function not in ("normal", "internal") or classes <= NO_ROADS:
         return None
-    if classes == {"pedestrian"}:
+    if classes == frozenset({"pedestrian"}):
         return "sidewalk"
     if function == "internal":
         return "turn"
@@ -174,7 +174,8 @@ def _without_repeats(line_m: Numbers) -> Numbers:
     if len(line_m) == 0:
         return line_m
     steps = np.linalg.norm(np.diff(line_m[:, :2], axis=0), axis=1)
-    return line_m[np.concatenate([[True], steps > SAME_PLACE_M])]
+    kept: Numbers = line_m[np.concatenate([[True], steps > SAME_PLACE_M])]
+    return kept
 
 
 def _number(item: ElementTree.Element, key: str, otherwise: float) -> float:

@@ -44,9 +44,7 @@ class Placing:
                 f"{other.kind} {other.track.name} {number}",
                 CATEGORIES[other.kind],
                 fleet.meshes[other.kind],
-                Trajectory(
-                    other.track.times_s, *self._poses(other), transient=not other.track.covers(duration_s)
-                ),
+                Trajectory(other.track.times_s, *self._poses(other), transient=not other.track.covers(duration_s)),
             )
             for number, other in enumerate(others)
         )
@@ -67,23 +65,19 @@ class Placing:
     def _poses(self, walker: Walker) -> tuple[Numbers, Numbers]:
         """(K, 3) places and (K, 3) angles of a body at the times of its track."""
         middle_m, yaw_deg = walker.middle_m - self._origin_m, walker.track.yaw_deg
+        on_foot, slope_deg = walker.track.on_foot, walker.track.slope_deg
+        back_m = 0.0 if on_foot else walker.size_m[0] / 2
         heights_m = self._ground.heights_m(middle_m)
-        angles_deg = np.zeros((len(yaw_deg), 3))
-        angles_deg[:, 0] = yaw_deg
-        if not isinstance(self._ground, Plain):
-            angles_deg[:, 1:] = 0.0 if walker.track.on_foot else tilts_deg(self._ground, middle_m, yaw_deg, walker.size_m)
-            climbs = np.sin(np.deg2rad(walker.track.slope_deg))
-            on_deck_m = walker.track.places_m[:, 2] - climbs * walker.size_m[0] / 2 * (not walker.track.on_foot)
-            above = on_deck_m > heights_m + BRIDGE_M
-            heights_m = np.where(above, on_deck_m, heights_m)
-            if not walker.track.on_foot:
-                angles_deg[above, 1], angles_deg[above, 2] = -walker.track.slope_deg[above], 0.0
-        else:
-            above = np.zeros(len(heights_m), dtype=bool)
-        if walker.track.on_foot:
-            raised = np.where(self._pavement.holds(middle_m) & ~above, PAVEMENT_M, 0.0)
-            heights_m = heights_m + _smooth(raised, walker.track.times_s)
-        return np.column_stack([middle_m, heights_m]), angles_deg
+        on_deck_m = walker.track.places_m[:, 2] - back_m * np.sin(np.deg2rad(slope_deg))
+        up = on_deck_m > heights_m + BRIDGE_M
+        angles_deg = np.column_stack([yaw_deg, np.zeros((len(yaw_deg), 2))])
+        if on_foot:
+            raised_m = np.where(self._pavement.holds(middle_m) & ~up, PAVEMENT_M, 0.0)
+            heights_m = heights_m + _smooth(raised_m, walker.track.times_s)
+        elif not isinstance(self._ground, Plain):
+            angles_deg[:, 1:] = tilts_deg(self._ground, middle_m, yaw_deg, walker.size_m)
+            angles_deg[up, 1], angles_deg[up, 2] = -slope_deg[up], 0.0
+        return np.column_stack([middle_m, np.where(up, on_deck_m, heights_m)]), angles_deg
 
 
 def _smooth(heights_m: Numbers, times_s: Numbers) -> Numbers:

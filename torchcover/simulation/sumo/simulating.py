@@ -13,9 +13,7 @@ STEP_S = 0.2
 LANE_CHANGE_S = 3.0
 
 
-def simulate(
-    network: Path, routes: Sequence[Path], begin_s: float, seed: int, *, drawn: bool
-) -> Iterator[bytes]:
+def simulate(network: Path, routes: Sequence[Path], begin_s: float, seed: int, *, drawn: bool) -> Iterator[bytes]:
     """Floating car data of a simulation, from a time on and for as long as they are asked for.
 
     Args:

@@ -94,15 +94,15 @@ class Streets(Document):
         for edge in edges:
             name, start, end = (edge.get(key, "") for key in ("id", "from", "to"))
             streets.setdefault((min(start, end), max(start, end)), []).append((name, start, end))
-        ways, built, rows = [], [], []
+        built: list[tuple[set[str], shapely.LineString]] = []
+        rows = []
         for (first, last), directions in streets.items():
             way_m = self._bent(np.array(nodes[first]), np.array(nodes[last]), generator)
             lanes = self._lanes(generator)
             way = shapely.LineString(way_m)
-            if any(not {first, last} & met and way.distance(other) < APART_M for met, other in zip(built, ways, strict=True)):
+            if any(not {first, last} & ends and way.distance(other) < APART_M for ends, other in built):
                 continue
-            ways.append(way)
-            built.append({first, last})
+            built.append(({first, last}, way))
             shape_m = np.column_stack([way_m, hills.at(way_m)])
             for name, start, end in directions:
                 shape = " ".join(

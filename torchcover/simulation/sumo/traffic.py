@@ -29,8 +29,6 @@ from torchcover.simulation.world import Actor
 
 Numbers = NDArray[np.float64]
 
-# Of the simulation; bodies move straight on in between.
-STEP_S = 0.2
 # Traffic that is drawn sets off everywhere at once, and needs some time to get into motion and to queue at lights.
 WARM_UP_S = 40.0
 USUAL_BEGIN_S = 60.0
@@ -71,9 +69,9 @@ class Sumo(Procedural):
             given = [key for key in ("routes", "fcd", "ego_id", "ego_type", "begin_s") if getattr(self, key)]
             if given:
                 raise ValueError(f"random draws all traffic; leave out {', '.join(given)}, or random")
-            of_streets = {"network", "lanes", "speed_mps", "bend", "hills_m"} & self.random.model_fields_set
+            of_streets = sorted({"network", "lanes", "speed_mps", "bend", "hills_m"} & self.random.model_fields_set)
             if self.net is not None and of_streets:
-                raise ValueError(f"random: {', '.join(sorted(of_streets))} are for streets that are drawn; there is a net")
+                raise ValueError(f"random: {', '.join(of_streets)} are for streets that are drawn; there is a net")
         return self
 
     def _build(
@@ -122,5 +120,6 @@ class Sumo(Procedural):
         if self.fcd is not None:
             return read_floating(self.fcd, Window(self.begin_s or -np.inf, duration_s, self.ego_id))
         begin_s = WARM_UP_S if self.random is not None else USUAL_BEGIN_S if self.begin_s is None else self.begin_s
-        pieces = simulate(network_file, routes, begin_s, int(generator.integers(1 << 31)), drawn=self.random is not None)
+        seed, drawn = int(generator.integers(1 << 31)), self.random is not None
+        pieces = simulate(network_file, routes, begin_s, seed, drawn=drawn)
         return record(pieces, Window(begin_s, duration_s, self.ego_id))

@@ -7,7 +7,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from torchcover.simulation.sumo.network import Lane, Network, Use
+from torchcover.simulation.sumo.network import Network, Use
 from torchcover.simulation.traffic.assemble import HORIZON_M
 
 Numbers = NDArray[np.float64]
@@ -37,31 +37,24 @@ class Vicinity:
         self.lower_m, self.upper_m = way_m.min(axis=0) - HORIZON_M, way_m.max(axis=0) + HORIZON_M
         self.left_hand = network.left_hand
         shift_m = np.array([*origin_m, 0.0])
-        self.lanes = tuple(
-            lane._replace(line_m=lane.line_m - shift_m)
-            for lane, near in zip(network.lanes, self._near([lane.line_m for lane in network.lanes], shift_m), strict=True)
-            if near
-        )
-        self.junctions = tuple(
-            outline_m - shift_m
-            for outline_m, near in zip(network.junctions, self._near(network.junctions, shift_m), strict=True)
-            if near
-        )
+        near = self._near([lane.line_m for lane in network.lanes], shift_m)
+        lanes = (network.lanes[number] for number in near.tolist())
+        self.lanes = tuple(lane._replace(line_m=lane.line_m - shift_m) for lane in lanes)
+        near = self._near(network.junctions, shift_m)
+        self.junctions = tuple(network.junctions[number] - shift_m for number in near.tolist())
 
-    def _near(self, lines_m: Sequence[Numbers], shift_m: Numbers) -> NDArray[np.bool_]:
-        """Which lines may be seen from the way."""
+    def _near(self, lines_m: Sequence[Numbers], shift_m: Numbers) -> NDArray[np.int64]:
+        """Numbers of the lines that may be seen from the way."""
         if not lines_m:
-            return np.zeros(0, dtype=bool)
+            return np.empty(0, dtype=np.int64)
         first = np.concatenate([[0], np.cumsum([len(line) for line in lines_m])[:-1]])
-        places_m = np.concatenate(lines_m) - shift_m
+        places_m = (np.concatenate(lines_m) - shift_m)[:, :2]
         low_m, high_m = np.minimum.reduceat(places_m, first), np.maximum.reduceat(places_m, first)
-        near: NDArray[np.bool_] = (
-            (low_m[:, :2] <= self.upper_m + BEYOND_M) & (high_m[:, :2] >= self.lower_m - BEYOND_M)
-        ).all(axis=1)
-        at = np.flatnonzero(near)
-        boxes = shapely.box(low_m[at, 0], low_m[at, 1], high_m[at, 0], high_m[at, 1])
-        near[at] = shapely.dwithin(boxes, self.way, HORIZON_M + BEYOND_M)
-        return near
+        meet = (low_m <= self.upper_m + BEYOND_M) & (high_m >= self.lower_m - BEYOND_M)
+        near = np.flatnonzero(meet.all(axis=1))
+        boxes = shapely.box(*low_m[near].T, *high_m[near].T)
+        seen: NDArray[np.int64] = near[shapely.dwithin(boxes, self.way, HORIZON_M + BEYOND_M)]
+        return seen
 
     def sees(self, places_m: Numbers) -> NDArray[np.bool_]:
         """(N,) whether (N, 2) places may be seen from the way."""
@@ -123,7 +116,8 @@ def _lines(lines_m: Sequence[Numbers]) -> NDArray[np.object_]:
     if not lines_m:
         return np.empty(0, dtype=object)
     count = [len(line) for line in lines_m]
-    found: NDArray[np.object_] = shapely.linestrings(np.concatenate(lines_m), indices=np.repeat(np.arange(len(count)), count))
+    of_line = np.repeat(np.arange(len(count)), count)
+    found: NDArray[np.object_] = shapely.linestrings(np.concatenate(lines_m), indices=of_line)
     return found
 
 
