@@ -26,26 +26,28 @@ def parse_xml(path: Path) -> ElementTree.Element:
     return ElementTree.fromstring(text)  # which resolves nothing that lies outside
 
 
-def feed_xml(pieces: Iterable[bytes], start: Callable[[str, dict[str, str]], None]) -> None:
+def feed_xml(pieces: Iterable[bytes], start: Callable[[str, list[str]], None]) -> None:
     """Read XML that may be of any length, one start tag after the other; nothing of it is kept.
 
     Args:
         pieces: Its bytes.
-        start: Called with the name and the attributes of each element; what it raises ends the reading.
+        start: Called with the name of each element, and with the names and values of its attributes in turn; what it
+            raises ends the reading.
 
     Raises:
         ValueError: Not XML, or it declares entities.
 
     Example:
         >>> feed_xml([b"<a x='1'", b"><b/></a>"], lambda name, attributes: print(name, attributes))
-        a {'x': '1'}
-        b {}
+        a ['x', '1']
+        b []
     """
 
     def refuse(*_: object) -> NoReturn:
         raise ValueError("an XML file without entities is needed")
 
     parser = expat.ParserCreate()
+    parser.ordered_attributes = True
     parser.EntityDeclHandler = refuse
     parser.StartElementHandler = start
     try:

@@ -1,6 +1,5 @@
 """Floating car data: where everybody is at each time, as SUMO writes it while it runs, or into a file."""
 
-from array import array
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from itertools import pairwise
@@ -72,65 +71,67 @@ class _Collector:
 
     def __init__(self, window: Window) -> None:
         self._window = window
-        self._waits_for = window.from_name
-        self.begin_s, self._time_s, self._keeps = window.begin_s, -np.inf, False
-        self._end_s = np.inf
+        self.begin_s, self.last_s, self._end_s = np.nan, -np.inf, np.inf
+        self._now: dict[str, list[list[str]]] = {"vehicle": [], "person": []}
         self.number: dict[tuple[bool, str], int] = {}
         self.kinds: list[str] = []
         self.times_s: list[float] = []
-        self.of = array("q")
-        self.step = array("q")
-        self.rows = array("d")
-        self.seen_s: list[float] = []
+        self.of: list[int] = []
+        self.rows: list[Numbers] = []
+        self.counts: list[int] = []
 
-    def start(self, name: str, attributes: dict[str, str]) -> None:
+    def start(self, name: str, attributes: list[str]) -> None:
         """A tag; see `feed_xml`."""
-        if name == "timestep":
-            self._step(float(attributes["time"]))
-        elif name in ("vehicle", "person") and self._time_s >= self._window.begin_s - TIME_SLACK_S:
-            if self._waits_for is not None and attributes["id"] == self._waits_for:
-                self._begin()
-            if self._keeps or self._waits_for is not None:
-                self._keep(name == "person", attributes)
+        if name in self._now:
+            self._now[name].append(attributes)
+        elif name == "timestep":
+            self.end_step()
+            time_s = float(attributes[attributes.index("time") + 1])
+            if time_s <= self.last_s:
+                raise ValueError(f"the times of its steps must ascend; {time_s:g} s follows {self.last_s:g} s")
+            if time_s > self._end_s + TIME_SLACK_S:
+                raise _Enough
+            self.last_s = time_s
 
-    def _step(self, time_s: float) -> None:
-        if time_s <= self._time_s:
-            raise ValueError(f"the times of its steps must ascend; {time_s:g} s follows {self._time_s:g} s")
-        self._time_s = time_s
-        self.seen_s = [*self.seen_s[:1], time_s]
-        if time_s > self._end_s + TIME_SLACK_S:
-            raise _Enough
-        if time_s < self._window.begin_s - TIME_SLACK_S:
-            return
-        if self._waits_for is not None:
-            # Whoever is written before the one that is waited for belongs to the same step: kept until the next one.
-            del self.of[:], self.step[:], self.rows[:], self.times_s[:]
-        elif not self._keeps:
-            self._begin()
-        self.times_s.append(time_s)
+    def end_step(self) -> None:
+        """Keep what was told of the step, if it is in the window."""
+        now = {name: rows for name, rows in self._now.items() if rows}
+        self._now = {"vehicle": [], "person": []}
+        if np.isnan(self.begin_s):
+            waits = self._window.from_name is not None and not any(
+                self._window.from_name in row for row in now.get("vehicle", ())
+            )
+            if waits or self.last_s < self._window.begin_s - TIME_SLACK_S or not np.isfinite(self.last_s):
+                return
+            self.begin_s, self._end_s = self.last_s, self.last_s + self._window.duration_s
+        self.times_s.append(self.last_s)
+        self.counts.append(sum(map(len, now.values())))
+        for name, rows in now.items():
+            columns = self._columns(rows)
+            for who, kind in zip(columns["id"], columns.get("type", ("",) * len(rows)), strict=True):
+                number = self.number.setdefault((name == "person", who), len(self.kinds))
+                if number == len(self.kinds):
+                    self.kinds.append(kind)
+                self.of.append(number)
+            zeros = ("0",) * len(rows)
+            numbers = [columns[name] for name in ("x", "y", "angle")]
+            numbers += [columns.get(name, zeros) for name in ("z", "slope")]
+            self.rows.append(np.array([list(map(float, column)) for column in numbers]).T)
 
-    def _begin(self) -> None:
-        self._waits_for, self._keeps = None, True
-        self.begin_s, self._end_s = self._time_s, self._time_s + self._window.duration_s
-
-    def _keep(self, on_foot: bool, attributes: dict[str, str]) -> None:
-        try:
-            name, kind = attributes["id"], attributes.get("type", "")
-            self.rows.extend([
-                float(attributes["x"]), float(attributes["y"]), float(attributes.get("z", 0.0)),
-                float(attributes["angle"]), float(attributes.get("slope", 0.0)),
-            ])  # fmt: skip
-        except KeyError as error:
+    def _columns(self, rows: list[list[str]]) -> dict[str, tuple[str, ...]]:
+        """The values of each attribute; all rows have the same ones."""
+        names = rows[0][::2]
+        if any(row[::2] != names for row in rows):
+            shared = sorted(set(names).intersection(*(row[::2] for row in rows)))
+            rows = [[part for name in shared for part in (name, row[2 * row[::2].index(name) + 1])] for row in rows]
+            names = shared
+        missing = [name for name in ("id", "x", "y", "angle") if name not in names]
+        if missing:
             raise ValueError(
-                f"t = {self._time_s:g} s: a vehicle or person without {error.args[0]}; id, x, y and angle are needed "
-                f"of each (sumo --fcd-output.attributes {ATTRIBUTES})"
-            ) from error
-        key = on_foot, name
-        if key not in self.number:
-            self.number[key] = len(self.kinds)
-            self.kinds.append(kind)
-        self.of.append(self.number[key])
-        self.step.append(len(self.times_s) - 1)
+                f"t = {self.last_s:g} s: a vehicle or person without {', '.join(missing)}; id, x, y and angle are "
+                f"needed of each (sumo --fcd-output.attributes {ATTRIBUTES})"
+            )
+        return dict(zip(names, list(zip(*rows, strict=True))[1::2], strict=True))
 
 
 class Recorded(NamedTuple):
@@ -160,9 +161,10 @@ def record(pieces: Iterable[bytes], window: Window) -> Recorded:
     collector = _Collector(window)
     with suppress(_Enough):
         feed_xml(pieces, collector.start)
-    if not collector.seen_s:
+        collector.end_step()
+    if not np.isfinite(collector.last_s):
         raise ValueError("floating car data of SUMO with at least one <timestep> is needed")
-    return Recorded(tuple(_tracks(collector)), collector.begin_s, collector.seen_s[-1])
+    return Recorded(tuple(_tracks(collector)), collector.begin_s, collector.last_s)
 
 
 @reads("floating car data of SUMO")
@@ -179,8 +181,9 @@ def read_floating(path: Path, window: Window) -> Recorded:
 
 def _tracks(collector: _Collector) -> Iterator[Track]:
     times_s = np.array(collector.times_s) - collector.begin_s
-    of, step = np.array(collector.of, dtype=np.int64), np.array(collector.step, dtype=np.int64)
-    rows = np.array(collector.rows, dtype=np.float64).reshape(-1, 5)
+    of = np.array(collector.of, dtype=np.int64)
+    step = np.repeat(np.arange(len(times_s)), collector.counts)
+    rows = np.concatenate([*collector.rows, np.empty((0, 5))])
     if not np.isfinite(rows).all():
         raise ValueError(f"{int((~np.isfinite(rows)).any(axis=1).sum())} of {len(rows)} positions are NaN or infinite")
     usual_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
@@ -197,7 +200,7 @@ def _tracks(collector: _Collector) -> Iterator[Track]:
             raise ValueError(f"{name!r} is there twice at t = {collector.begin_s + own_s[taken_s.argmin()]:g} s")
         breaks = np.flatnonzero((taken_s > MAX_STEPS * usual_s + TIME_SLACK_S) | (way_m > FASTEST_MPS * taken_s)) + 1
         for first, end in pairwise([0, *breaks.tolist(), len(own)]):
-            x_m, y_m, z_m, angle_deg, slope_deg = rows[own[first:end]].T
+            x_m, y_m, angle_deg, z_m, slope_deg = rows[own[first:end]].T
             yield Track(
                 name=name,
                 kind=collector.kinds[number],

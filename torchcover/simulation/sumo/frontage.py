@@ -1,4 +1,4 @@
-"""What stands along streets: houses, trees, lamp posts; and the cars in the bays."""
+"""What stands along streets: houses, trees and lamp posts."""
 
 from collections.abc import Iterator
 
@@ -7,11 +7,10 @@ import shapely
 from numpy.typing import NDArray
 
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sumo.ground import Ground, tilts_deg
+from torchcover.simulation.sumo.ground import Ground
 from torchcover.simulation.sumo.network import Lane
 from torchcover.simulation.sumo.vicinity import Vicinity
-from torchcover.simulation.traffic.city import FREE_AT_CORNERS_M, PARKED, PARKED_GAP_M
-from torchcover.simulation.traffic.fleet import Fleet
+from torchcover.simulation.traffic.roads import Line
 from torchcover.simulation.traffic.scenery import few, post, prism, tree
 
 Numbers = NDArray[np.float64]
@@ -19,11 +18,12 @@ Numbers = NDArray[np.float64]
 WIDTH_M, DEPTH_M, HEIGHT_M = (9.0, 24.0), (9.0, 15.0), (5.0, 24.0)
 SET_BACK_M, GAP_M = (0.8, 6.0), (0.3, 6.0)
 PIECE_EVERY_M = (9.0, 20.0)
+LAMP_SHARE = 0.35
+LAMP_RADIUS_M, CROWN_M = 0.1, (1.0, 1.6)
+CLEAR_BELOW_CROWN_M, TREE_M = (2.8, 3.4), (5.0, 8.5)
 # Nothing stands nearer to a lane than this.
 CLEAR_M = 0.4
 SUNK_M = 1.0
-LAMP_SHARE = 0.35
-CROWN_M = (1.0, 1.6)
 
 
 class Frontage:
@@ -45,45 +45,41 @@ class Frontage:
 
     def meshes(self) -> tuple[Mesh, ...]:
         """Houses in one mesh, trees and lamp posts in another."""
-        edges = list(self._edges())
-        lots = [lot for edge in edges for lot in self._lots(*edge)]
-        houses_m = self._free(np.array(lots).reshape(-1, 4, 2))
-        walls = shapely.STRtree(shapely.polygons(houses_m))
-        pieces = [piece for edge in edges for piece in self._pieces(*edge, walls)]
-        return few([self._house(outline_m) for outline_m in houses_m], pieces)
+        sides = list(self._sides())
+        lots_m = np.concatenate([np.empty((0, 4, 2)), *(self._lots(side) for side in sides)])
+        houses_m = self._free(lots_m)
+        return few(self._houses(houses_m), self._trees_and_lamps(sides, houses_m))
 
-    def _edges(self) -> Iterator[tuple[Numbers, Numbers]]:
-        """(K, 2) the outer edges of the outermost lanes, on both sides of each street, and (K,) ways along them."""
-        outer: dict[str, tuple[Lane, float]] = {}
+    def _sides(self) -> Iterator[Line]:
+        """The outer edges of streets, so that what stands along them is on the right."""
+        of_edge: dict[str, list[Lane]] = {}
         for number, lane in enumerate(self._vicinity.lanes):
             if lane.use in ("road", "bay", "sidewalk") and number not in self._vicinity.decks:
-                outer.setdefault(lane.edge, (lane, -1.0 if not self._vicinity.left_hand else 1.0))
-        for lane, side in outer.values():
-            line_m = lane.line_m[:, :2]
-            steps = np.gradient(line_m, axis=0)
-            left = np.stack([-steps[:, 1], steps[:, 0]], axis=1) / np.linalg.norm(steps, axis=1, keepdims=True)
-            edge_m = line_m + side * lane.width_m / 2 * left
-            # Houses are on the right side of what is drawn here.
-            edge_m = edge_m if side < 0 else edge_m[::-1]
-            ways_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(edge_m, axis=0), axis=1))])
-            yield edge_m, ways_m
+                of_edge.setdefault(lane.edge, []).append(lane)
+        inwards = -1 if self._vicinity.left_hand else 1
+        for lanes in of_edge.values():
+            for lane, left in ((lanes[0], -inwards), (lanes[-1], inwards)):
+                side = Line(lane.line_m[:, :2]).shifted(left * lane.width_m / 2)
+                side = side.reversed() if left > 0 else side
+                # Next to the innermost lane there are those of the other direction, unless it is a one-way street.
+                beside = _right_of(side.poses(side.length_m / 2), 2 * CLEAR_M + 0.5)
+                if lane is lanes[0] or len(self._taken.query(shapely.Point(beside), predicate="intersects")) == 0:
+                    yield side
 
-    def _lots(self, edge_m: Numbers, ways_m: Numbers) -> Iterator[Numbers]:
-        """(4, 2) outlines of houses along an edge, counter-clockwise."""
-        way_m = self._drawn((0.0, 5.0))
-        while way_m < ways_m[-1]:
-            width_m = self._drawn(WIDTH_M)
-            start_m, end_m = (_at(edge_m, ways_m, at_m) for at_m in (way_m, way_m + width_m))
-            front_m, back_m = (set_back := self._drawn(SET_BACK_M)), set_back + self._drawn(DEPTH_M)
-            built = self._generator.random() < self._built_share
-            along = end_m - start_m
-            if built and np.linalg.norm(along) > WIDTH_M[0] / 2:
-                along /= np.linalg.norm(along)
-                right = np.array([along[1], -along[0]])
-                yield np.stack([
-                    start_m + back_m * right, end_m + back_m * right, end_m + front_m * right, start_m + front_m * right
-                ])  # fmt: skip
-            way_m += width_m + self._drawn(GAP_M)
+    def _lots(self, side: Line) -> Numbers:
+        """(N, 4, 2) outlines of houses along a side, counter-clockwise."""
+        lots, way_m = [], self._drawn((0.0, 5.0))
+        while way_m < side.length_m:
+            end_m, front_m = way_m + self._drawn(WIDTH_M), self._drawn(SET_BACK_M)
+            if self._generator.random() < self._built_share and end_m < side.length_m:
+                lots.append((way_m, end_m, front_m, front_m + self._drawn(DEPTH_M)))
+            way_m = end_m + self._drawn(GAP_M)
+        start_m, end, front, back = np.array(lots).reshape(-1, 4).T
+        corner_m, other_m = side.poses(start_m), side.poses(end)
+        # A house has straight walls, whatever the street does.
+        corner_m[:, 2] = other_m[:, 2] = np.rad2deg(np.arctan2(*(other_m - corner_m)[:, 1::-1].T))
+        corners = ((corner_m, back), (other_m, back), (other_m, front), (corner_m, front))
+        return np.stack([_right_of(poses, right_m[:, None]) for poses, right_m in corners], axis=1)
 
     def _free(self, outlines_m: Numbers) -> Numbers:
         """Those that stand neither on a street nor in one that came before."""
@@ -96,61 +92,58 @@ class Frontage:
                 free[one] = False
         return outlines_m[free]
 
-    def _house(self, outline_m: Numbers) -> Mesh:
-        heights_m = self._ground.heights_m(outline_m)
-        top_m = float(heights_m.max()) + self._drawn(HEIGHT_M)
-        return prism([outline_m, outline_m], [float(heights_m.min()) - SUNK_M, top_m])
+    def _houses(self, outlines_m: Numbers) -> list[Mesh]:
+        heights_m = self._ground.heights_m(outlines_m.reshape(-1, 2)).reshape(-1, 4)
+        tops_m = heights_m.max(axis=1) + self._generator.uniform(*HEIGHT_M, len(heights_m))
+        bottoms_m = heights_m.min(axis=1) - SUNK_M
+        levels = zip(bottoms_m.tolist(), tops_m.tolist(), strict=True)
+        return [prism([outline, outline], level) for outline, level in zip(outlines_m, levels, strict=True)]
 
-    def _pieces(self, edge_m: Numbers, ways_m: Numbers, walls: shapely.STRtree) -> Iterator[Mesh]:
-        """Trees and lamp posts between the street and the houses."""
-        way_m = self._drawn(PIECE_EVERY_M)
-        while way_m < ways_m[-1]:
-            is_lamp = self._generator.random() < LAMP_SHARE
-            radius_m = 0.1 if is_lamp else self._drawn(CROWN_M)
-            place_m, ahead_m = (_at(edge_m, ways_m, at_m) for at_m in (way_m, way_m + 0.5))
-            along = (ahead_m - place_m) / max(float(np.linalg.norm(ahead_m - place_m)), 1e-9)
-            foot_m = place_m + (CLEAR_M + 0.1 + radius_m) * np.array([along[1], -along[0]])
-            way_m += self._drawn(PIECE_EVERY_M)
-            around = shapely.Point(foot_m).buffer(radius_m, quad_segs=2)
-            wanted = self._built_share > 0 or not is_lamp
-            if wanted and not any(len(tree.query(around, predicate="intersects")) for tree in (self._taken, walls)):
-                yield from self._piece(foot_m, along, None if is_lamp else radius_m)
-
-    def _piece(self, foot_m: Numbers, along: Numbers, crown_m: float | None) -> list[Mesh]:
-        height_m = float(self._ground.heights_m(foot_m[None])[0])
-        if crown_m is not None:
-            clear_m, top_m = self._drawn((2.8, 3.4)), self._drawn((5.0, 8.5))
-            return tree(foot_m, height_m, clear_m, top_m, crown_m)
-        left, half = np.array([-along[1], along[0]]), 0.06 * along
-        ends = [foot_m - half - 0.1 * left, foot_m + half - 0.1 * left]
-        arm = [*ends, *(end + 2.1 * left for end in ends[::-1])]
-        return [post(foot_m, 0.09, height_m, 7.0), prism([arm, arm], [height_m + 7.05, height_m + 7.2])]
-
-    def park(self, fleet: Fleet, share: float) -> None:
-        """Put cars into a share of the room of the bays."""
-        for lane in self._vicinity.lanes:
-            if lane.use != "bay":
-                continue
-            line_m = lane.line_m[:, :2]
-            ways_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line_m, axis=0), axis=1))])
-            way_m, end_m = FREE_AT_CORNERS_M, float(ways_m[-1]) - FREE_AT_CORNERS_M
-            while way_m < end_m:
-                kind = fleet.draw_kind(PARKED)
-                size_m = fleet.length_m(kind), fleet.width_m(kind)
-                length_m = size_m[0] + PARKED_GAP_M + self._drawn((0.0, 0.5))
-                if self._generator.random() < share and way_m + length_m < end_m and size_m[1] < lane.width_m:
-                    tail_m, nose_m = (_at(line_m, ways_m, at_m) for at_m in (way_m, way_m + size_m[0]))
-                    place_m, along = (tail_m + nose_m)[None] / 2, nose_m - tail_m
-                    yaw_deg = np.rad2deg(np.arctan2(along[1:], along[:1]))
-                    tilt_deg = tilts_deg(self._ground, place_m, yaw_deg, size_m)[0]
-                    height_m = float(self._ground.heights_m(place_m)[0])
-                    fleet.park(kind, (*place_m[0].tolist(), float(yaw_deg[0])), height_m, (tilt_deg[0], tilt_deg[1]))
-                way_m += length_m
+    def _trees_and_lamps(self, sides: list[Line], houses_m: Numbers) -> list[Mesh]:
+        """Between the streets and the houses, where there is room."""
+        poses, radii = [np.empty((0, 3))], []
+        for side in sides:
+            ways_m = np.cumsum(self._generator.uniform(*PIECE_EVERY_M, int(side.length_m / PIECE_EVERY_M[0])))
+            ways_m = ways_m[ways_m < side.length_m]
+            is_lamp = self._generator.random(len(ways_m)) < LAMP_SHARE
+            own = np.where(is_lamp, LAMP_RADIUS_M, self._generator.uniform(*CROWN_M, len(ways_m)))
+            there = side.poses(ways_m)
+            there[:, :2] = _right_of(there, (CLEAR_M + 0.1 + own)[:, None])
+            keep = ~is_lamp | (self._built_share > 0)
+            poses.append(there[keep])
+            radii.append(own[keep])
+        feet = np.concatenate(poses)
+        radius_m = np.concatenate([np.empty(0), *radii])
+        around = shapely.buffer(shapely.points(feet[:, :2]), radius_m, quad_segs=2)
+        free = np.ones(len(feet), dtype=bool)
+        for others in (self._taken, shapely.STRtree(shapely.polygons(houses_m))):
+            free[others.query(around, predicate="intersects")[0]] = False
+        feet, radius_m = feet[free], radius_m[free]
+        heights_m = self._ground.heights_m(feet[:, :2])
+        pieces: list[Mesh] = []
+        for foot, radius, height in zip(feet, radius_m.tolist(), heights_m.tolist(), strict=True):
+            if radius == LAMP_RADIUS_M:
+                pieces += _lamp(foot, height)
+            else:
+                clear_m, top_m = self._drawn(CLEAR_BELOW_CROWN_M), self._drawn(TREE_M)
+                pieces += tree(foot[:2], height, clear_m, top_m, radius)
+        return pieces
 
     def _drawn(self, bounds: tuple[float, float]) -> float:
         return float(self._generator.uniform(*bounds))
 
 
-def _at(line_m: Numbers, ways_m: Numbers, way_m: float) -> Numbers:
-    """(2,) the place on a line after a way; beyond the end, the end."""
-    return np.array([np.interp(way_m, ways_m, line_m[:, 0]), np.interp(way_m, ways_m, line_m[:, 1])])
+def _lamp(pose: Numbers, height_m: float) -> list[Mesh]:
+    """A post with an arm over the street, which is on its left."""
+    yaw = np.deg2rad(pose[2])
+    along, left = 0.06 * np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+    ends = [pose[:2] - along - 0.1 * left, pose[:2] + along - 0.1 * left]
+    arm = [*ends, *(end + 2.1 * left for end in ends[::-1])]
+    return [post(pose[:2], 0.09, height_m, 7.0), prism([arm, arm], [height_m + 7.05, height_m + 7.2])]
+
+
+def _right_of(poses: Numbers, right_m: float | Numbers) -> Numbers:
+    """(..., 2) places to the right of (..., 3) poses x, y, yaw."""
+    yaw = np.deg2rad(poses[..., 2])
+    there: Numbers = poses[..., :2] + right_m * np.stack([np.sin(yaw), -np.cos(yaw)], axis=-1)
+    return there

@@ -6,14 +6,19 @@ from pathlib import Path
 from torchcover.files import parse_xml, reads
 from torchcover.simulation.sumo.floating import ATTRIBUTES
 from torchcover.simulation.sumo.programs import output_of, run
+from torchcover.simulation.traffic.assemble import HORIZON_M
 
 # Of the simulation; bodies move straight on in between.
 STEP_S = 0.2
 # A lane change takes a moment, instead of none.
 LANE_CHANGE_S = 3.0
+# Places are those of fronts, of bodies that may be as long as this.
+BEYOND_M = 50.0
 
 
-def simulate(network: Path, routes: Sequence[Path], begin_s: float, seed: int, *, drawn: bool) -> Iterator[bytes]:
+def simulate(
+    network: Path, routes: Sequence[Path], begin_s: float, seed: int, *, around: str | None, drawn: bool
+) -> Iterator[bytes]:
     """Floating car data of a simulation, from a time on and for as long as they are asked for.
 
     Args:
@@ -21,6 +26,7 @@ def simulate(network: Path, routes: Sequence[Path], begin_s: float, seed: int, *
         routes: Who drives and walks.
         begin_s: From when on it is told where they are.
         seed: Of the simulation.
+        around: Only those near to this vehicle are told of.
         drawn: Whether the traffic was drawn: then nobody is taken out of a jam.
 
     Raises:
@@ -28,6 +34,9 @@ def simulate(network: Path, routes: Sequence[Path], begin_s: float, seed: int, *
         ValueError: It fails; with its own message.
     """
     options = ["--time-to-teleport", "-1"] if drawn else []
+    if around is not None:
+        options += ["--device.fcd.explicit", around, "--person-device.fcd.explicit", around]
+        options += ["--device.fcd.radius", str(HORIZON_M + BEYOND_M)]
     return output_of(
         "sumo", "--net-file", network, "--route-files", ",".join(map(str, routes)), "--seed", str(seed),
         "--step-length", str(STEP_S), "--device.fcd.begin", str(begin_s), "--fcd-output", "stdout",

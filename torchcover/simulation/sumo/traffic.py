@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 
 from torchcover.simulation.documents import PathBeside
 from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.sumo.bays import park
 from torchcover.simulation.sumo.crowd import crowd
 from torchcover.simulation.sumo.demand import EGO_TYPE, write_routes
 from torchcover.simulation.sumo.floating import Recorded, Window, read_floating, record
@@ -92,7 +93,7 @@ class Sumo(Procedural):
         pavement = Pavement(vicinity, ground)
         frontage = Frontage(vicinity, ground, self.built_share, generator)
         static = (ground.mesh(), *few(pavement.meshes(), decks(vicinity)), *frontage.meshes())
-        frontage.park(fleet, self.parked_share)
+        park(vicinity, ground, fleet, self.parked_share, generator)
         placing = Placing(ground, pavement, origin_m)
         driver = placing.ego(found.ego, times_s, fleet.meshes[EGO], generator)
         return static, driver, placing.actors(found.others, fleet, float(times_s[-1]))
@@ -121,5 +122,5 @@ class Sumo(Procedural):
             return read_floating(self.fcd, Window(self.begin_s or -np.inf, duration_s, self.ego_id))
         begin_s = WARM_UP_S if self.random is not None else USUAL_BEGIN_S if self.begin_s is None else self.begin_s
         seed, drawn = int(generator.integers(1 << 31)), self.random is not None
-        pieces = simulate(network_file, routes, begin_s, seed, drawn=drawn)
+        pieces = simulate(network_file, routes, begin_s, seed, around=self.ego_id, drawn=drawn)
         return record(pieces, Window(begin_s, duration_s, self.ego_id))

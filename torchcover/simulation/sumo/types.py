@@ -85,7 +85,8 @@ def read_types(path: Path) -> dict[str, VehicleType]:
     """
     found: dict[str, VehicleType] = {}
 
-    def start(name: str, attributes: dict[str, str]) -> None:
+    def start(name: str, names_and_values: list[str]) -> None:
+        attributes = dict(zip(names_and_values[::2], names_and_values[1::2], strict=True))
         if name == "vType" and "id" in attributes:
             vehicle_class = attributes.get("vClass", "passenger")
             length_m = float(attributes.get("length", USUAL_LENGTH_M.get(vehicle_class, CAR_LENGTH_M)))
