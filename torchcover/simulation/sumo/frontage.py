@@ -54,7 +54,7 @@ class Frontage:
         """The outer edges of streets, so that what stands along them is on the right."""
         of_edge: dict[str, list[Lane]] = {}
         for number, lane in enumerate(self._vicinity.lanes):
-            if lane.use in ("road", "bay", "sidewalk") and number not in self._vicinity.decks:
+            if lane.use in ("road", "bay", "shoulder", "sidewalk") and number not in self._vicinity.decks:
                 of_edge.setdefault(lane.edge, []).append(lane)
         inwards = -1 if self._vicinity.left_hand else 1
         for lanes in of_edge.values():
@@ -83,6 +83,8 @@ class Frontage:
 
     def _free(self, outlines_m: Numbers) -> Numbers:
         """Those that stand neither on a street nor in one that came before."""
+        # Farther away there may be streets that nobody knows of here.
+        outlines_m = outlines_m[self._vicinity.sees(outlines_m.reshape(-1, 2)).reshape(-1, 4).all(axis=1)]
         polygons = shapely.polygons(outlines_m)
         free = np.ones(len(polygons), dtype=bool)
         free[self._taken.query(polygons, predicate="intersects")[0]] = False

@@ -20,7 +20,7 @@ MAX_WIDTH_M = 100.0
 NO_ROADS = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car", "ship"})
 SAME_PLACE_M = 1e-3
 
-Use = Literal["road", "turn", "bay", "sidewalk", "crossing", "corner"]
+Use = Literal["road", "turn", "bay", "shoulder", "sidewalk", "crossing", "corner"]
 
 
 class Lane(NamedTuple):
@@ -28,8 +28,8 @@ class Lane(NamedTuple):
 
     Args:
         edge: Name of the street, in one direction, that it is part of.
-        use: "road" and "turn" (on a junction) are for vehicles, a "bay" for nobody but those who park; a "sidewalk", a
-            "crossing" and a "corner", which joins these two, are for those on foot.
+        use: "road" and "turn" (on a junction) are for vehicles, a "bay" for those who park, a "shoulder" for nobody; a
+            "sidewalk", a "crossing" and a "corner", which joins these two, are for those on foot.
         width_m: Its width.
         line_m: (K, 3) its middle, in the direction of travel, K >= 2; of a corner its outline instead, K >= 3.
         speed_mps: What is allowed.
@@ -134,13 +134,13 @@ def _lane(edge: ElementTree.Element, item: ElementTree.Element) -> Lane | None:
     line_m = _without_repeats(line_m)
     classes = frozenset(item.get("allow", "all").split())
     barred = frozenset(item.get("disallow", "").split())
-    use = _use(edge.get("function", "normal"), classes, barred)
+    use = _use(edge.get("function", "normal"), item.get("type", ""), classes, barred)
     if use is None or len(line_m) < (3 if use == "corner" else 2):
         return None  # a lane without length has no surface either
     return Lane(edge.get("id", ""), use, width_m, line_m, speed_mps, classes, barred)
 
 
-def _use(function: str, classes: frozenset[str], barred: frozenset[str]) -> Use | None:
+def _use(function: str, kind: str, classes: frozenset[str], barred: frozenset[str]) -> Use | None:
     if function == "walkingarea":
         return "corner"
     if function == "crossing":
@@ -151,7 +151,9 @@ def _use(function: str, classes: frozenset[str], barred: frozenset[str]) -> Use 
         return "sidewalk"
     if function == "internal":
         return "turn"
-    return "bay" if "all" in barred else "road"
+    if kind.lower() == "parking":
+        return "bay"
+    return "shoulder" if "all" in barred else "road"
 
 
 def _connections(root: ElementTree.Element, number: dict[tuple[str, str | None], int]) -> tuple[tuple[int, int], ...]:

@@ -32,7 +32,7 @@ class Pavement:
     def __init__(self, vicinity: Vicinity, ground: Ground) -> None:
         self._ground = ground
         walked = shapely.union_all(vicinity.surfaces("sidewalk", "corner"))
-        driven = shapely.union_all(vicinity.surfaces("road", "turn", "bay", "crossing"))
+        driven = shapely.union_all(vicinity.surfaces("road", "turn", "bay", "shoulder", "crossing"))
         parts = shapely.get_parts(shapely.difference(walked, driven))
         self.parts = parts[(shapely.get_type_id(parts) == 3) & (shapely.area(parts) > SMALLEST_M2)]
         self._tree = shapely.STRtree(self.parts)

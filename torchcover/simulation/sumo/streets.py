@@ -1,5 +1,6 @@
 """A town's streets, drawn: SUMO's plan of a network with lanes, bays, curves and hills of our own."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Annotated, Literal
 from xml.etree import ElementTree
@@ -48,7 +49,7 @@ class Streets(Document):
     lanes: Annotated[int, Field(ge=1, le=3)] = 2
     speed_mps: Annotated[float, Field(ge=5.0, le=35.0)] = 13.9
     bend: Annotated[float, Field(ge=0.0, le=0.1)] = 0.06
-    hills_m: Annotated[float, Field(ge=0.0, le=5.0)] = 1.0
+    hills_m: Annotated[float, Field(ge=0.0, le=5.0)] = 0.5
     traffic_per_km: MostVehicles = 14.0
     buses_per_km: MostVehicles = 0.6
     cyclists_per_km: MostPeople = 1.5
@@ -94,20 +95,22 @@ class Streets(Document):
         for edge in edges:
             name, start, end = (edge.get(key, "") for key in ("id", "from", "to"))
             streets.setdefault((min(start, end), max(start, end)), []).append((name, start, end))
-        built: list[tuple[set[str], shapely.LineString]] = []
+        ways: dict[tuple[str, str], shapely.LineString] = {}
+        for ends in streets:
+            start_m, end_m = (np.array(nodes[end]) for end in ends)
+            way = shapely.LineString(self._bent(start_m, end_m, generator))
+            if all(set(ends) & set(others) or way.distance(other) >= APART_M for others, other in ways.items()):
+                ways[ends] = way
         rows = []
-        for (first, last), directions in streets.items():
-            way_m = self._bent(np.array(nodes[first]), np.array(nodes[last]), generator)
-            lanes = self._lanes(generator)
-            way = shapely.LineString(way_m)
-            if any(not {first, last} & ends and way.distance(other) < APART_M for ends, other in built):
-                continue
-            built.append(({first, last}, way))
-            shape_m = np.column_stack([way_m, hills.at(way_m)])
-            for name, start, end in directions:
-                shape = " ".join(
-                    f"{x:.3f},{y:.3f},{z:.3f}" for x, y, z in (shape_m if start == first else shape_m[::-1])
-                )
+        for ends in _without_dead_ends(list(ways)):
+            way_m, lanes = shapely.get_coordinates(ways[ends]), self._lanes(generator)
+            # Junctions are level: so are the ends of all that meet there.
+            share = np.linspace(0.0, 1.0, BEND_PIECES + 1)
+            from_m, to_m = hills.at(way_m[[0, -1]])
+            climb_m = from_m + (to_m - from_m) * share**2 * (3 - 2 * share)
+            places = [f"{x:.3f},{y:.3f},{z:.3f}" for (x, y), z in zip(way_m, climb_m, strict=True)]
+            for name, start, end in streets[ends]:
+                shape = " ".join(places if start == ends[0] else places[::-1])
                 rows.append(
                     f"<edge id={quoteattr(name)} from={quoteattr(start)} to={quoteattr(end)} "
                     f'numLanes="{lanes.count("<lane")}" speed="{self.speed_mps:.2f}" shape="{shape}">{lanes}</edge>'
@@ -126,7 +129,7 @@ class Streets(Document):
         """One side of a street, from the houses inwards."""
         lanes = [('allow="pedestrian"', generator.uniform(*SIDEWALK_M))]
         if generator.random() < WITH_BAYS:
-            lanes.append(('disallow="all"', BAY_M))
+            lanes.append(('type="parking" disallow="all"', BAY_M))
         if self.cyclists_per_km > 0 and generator.random() < WITH_BICYCLE_LANES:
             lanes.append(('allow="bicycle"', BICYCLE_LANE_M))
         lanes += [('disallow="pedestrian"', LANE_M)] * int(generator.integers(1, self.lanes + 1))
@@ -147,6 +150,17 @@ class _Hills:
         """(N,) heights at (N, 2) places."""
         heights_m: Numbers = self._height_m * np.sin(places_m @ self._waves_per_m + self._phase).sum(axis=1)
         return heights_m
+
+
+def _without_dead_ends(streets: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Those that go on at both ends; all, if none does."""
+    kept = streets
+    while True:
+        met = Counter(end for ends in kept for end in ends)
+        fewer = [ends for ends in kept if all(met[end] > 1 for end in ends)]
+        if len(fewer) == len(kept):
+            return kept or streets
+        kept = fewer
 
 
 def _options(plan: str, generator: np.random.Generator) -> list[str]:
