@@ -127,10 +127,7 @@ def _candidates(
         if there:
             return there[:1]
         if not own:
-            some = sorted({walker.track.name for walker in walkers if not walker.track.on_foot})
-            raise ValueError(
-                f"ego_id: no vehicle {name!r} after t = {begin_s:g} s; there are {len(some)}: {', '.join(some[:5])}..."
-            )
+            raise ValueError(f"ego_id: no vehicle {name!r} up to t = {recorded.last_s:g} s, where the data end")
         gone_s = begin_s + float(own[0].track.times_s[-1])
         raise ValueError(
             f"ego_id: {name!r} is not there all the time {when}: it leaves the network, teleports or has a gap after "

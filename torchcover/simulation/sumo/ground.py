@@ -15,6 +15,7 @@ CELL_M = 5.0
 # Beyond what may be seen, so that nobody looks past its end.
 MARGIN_M = 40.0
 MAX_CORNERS = 4_000_000
+VERGE_SHARE = 1e-3
 # Rounds of smoothing between the streets, at each scale; the streets' own heights stay.
 SMOOTHINGS = 4
 
@@ -108,13 +109,19 @@ def ground_of(vicinity: Vicinity) -> Plain | Slopes:
 
 
 def _spread(cells: Numbers, heights_m: Numbers, rows: int, columns: int) -> tuple[Numbers, Numbers]:
-    """(rows, columns) sums of heights, and of weights, of (N, 2) places for the four corners around each."""
-    low = np.clip(cells.astype(np.int64), 0, [columns - 2, rows - 2])
-    x, y = (cells - low).T
+    """(rows, columns) sums of heights, and of weights, of (N, 2) places for the corners around each.
+
+    The next but one have a share, too, that counts for nothing where anything else does: the verges of a street.
+    """
+    low = np.floor(cells).astype(np.int64)
+    inside = ((low >= 1) & (low < [columns - 2, rows - 2])).all(axis=1)
+    low, (x, y), heights_m = low[inside], (cells[inside] - low[inside]).T, heights_m[inside]
     total, weight = np.zeros(rows * columns), np.zeros(rows * columns)
-    for right in (0, 1):
-        for above in (0, 1):
-            share = np.clip((x if right else 1 - x) * (y if above else 1 - y), 0.0, 1.0)
+    for right in (-1, 0, 1, 2):
+        for above in (-1, 0, 1, 2):
+            across, along = np.abs(x - right), np.abs(y - above)
+            share = np.clip(1 - across, 0, 1) * np.clip(1 - along, 0, 1)
+            share += VERGE_SHARE * np.clip(2 - across, 0, 1) * np.clip(2 - along, 0, 1)
             corner = (low[:, 1] + above) * columns + low[:, 0] + right
             total += np.bincount(corner, share * heights_m, rows * columns)
             weight += np.bincount(corner, share, rows * columns)

@@ -8,9 +8,10 @@ from torchcover.files import feed_xml, reads
 
 PIECE_BYTES = 1 << 18
 
-# SUMO's classes, and the kinds of bodies (`fleet.CATEGORIES`) among which the length decides; for all others cars do.
+# SUMO's classes (and children), and the kinds of bodies (`fleet.CATEGORIES`) among which the length decides; for all others cars do.
 BODIES: Mapping[str, tuple[str, ...]] = {
-    "pedestrian": ("adult", "child"),
+    "pedestrian": ("adult",),
+    "child": ("child",),
     "wheelchair": ("adult",),
     "bicycle": ("cyclist",),
     "scooter": ("cyclist",),
@@ -67,11 +68,11 @@ def type_of(name: str, on_foot: bool, known: Mapping[str, VehicleType]) -> Vehic
         >>> type_of("DEFAULT_BIKETYPE", False, {}).vehicle_class
         'bicycle'
     """
+    if on_foot:  # all have one class, and the same length
+        return VehicleType("child" if "child" in name.lower() else "pedestrian", USUAL_LENGTH_M["pedestrian"])
     if name in known:
         return known[name]
-    # Who is drawn from a distribution has its name and a number behind it.
-    found = next((vehicle_class for word, vehicle_class in WORDS if word in name.lower()), "passenger")
-    vehicle_class = "pedestrian" if on_foot else found
+    vehicle_class = next((found for word, found in WORDS if word in name.lower()), "passenger")
     return VehicleType(vehicle_class, USUAL_LENGTH_M.get(vehicle_class, CAR_LENGTH_M))
 
 
