@@ -14,8 +14,8 @@ CONNECTED = '<connection from="a" to="b" fromLane="0" toLane="0"/><connection fr
 
 def test_lanes_are_for_those_who_may_use_them(tmp_path):
     lanes = [
-        (WALK, 2, LINE), ('disallow="all" type="parking"', 2.3, LINE), ('disallow="all"', 1, LINE), ('allow="rail"', 3, LINE),
-        ('allow="bicycle"', 1.5, LINE), (DRIVE, 3.2, LINE),
+        (WALK, 2, LINE), ('disallow="all" type="parking"', 2.3, LINE), ('disallow="all"', 1, LINE),
+        ('allow="rail"', 3, LINE), ('allow="bicycle"', 1.5, LINE), (DRIVE, 3.2, LINE),
     ]  # fmt: skip
     path = write_net(
         tmp_path / "a.net.xml",

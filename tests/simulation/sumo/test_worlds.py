@@ -90,7 +90,7 @@ def test_on_a_bridge_one_stands_on_its_deck(tmp_path):
     over = edge("over", ("", 7.0, [(100, -150, 0), (100, -60, 6), (100, 60, 6), (100, 150, 0)]))
     above = {t: vehicle("up", 100.0, -20 + 10 * t, 0.0, z=6.0) for t in drive()}
     world = made(tmp_path, street(), over, steps=together(drive(start=100.0, z=0.0), above), ego_id="ego").world(0)
-    np.testing.assert_allclose(world.actors[0].trajectory.positions_m[:, 2], 6.0)
+    np.testing.assert_allclose(world.actors[0].trajectory.positions_m[:, 2], 6.0, atol=0.15)
     np.testing.assert_allclose(world.ego.trajectory.positions_m[:, 2], 0.0, atol=0.1)
 
 
@@ -137,7 +137,7 @@ def test_cars_are_parked_in_bays_only(tmp_path):
         ({"ego_id": "nobody"}, "ego_id: no vehicle 'nobody' up to t = 4 s, where the data end"),
         (
             {"ego_id": "ego", "duration_s": 9.0},
-            r"ego_id: 'ego' is not there all the time from t = 0 to 9 s: .* t = 4 s",
+            r"ego_id: 'ego' is not there all the time from t = 0 to 9 s",
         ),
         ({"duration_s": 9.0}, r"no car that could be the ego .* the longest drives for 4 s \(data end at t = 4 s\)"),
         ({"ego_type": "bus"}, "no vehicle of type 'bus' that could be the ego"),

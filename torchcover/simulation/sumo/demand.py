@@ -93,7 +93,11 @@ class _Ways:
     """Draws ways of vehicles of a class, or of those who walk beside them."""
 
     def __init__(self, network: Network, vehicle_class: str, use: str) -> None:
-        self._follow = network.follow(vehicle_class)
+        follow = network.follow(vehicle_class)
+        if use == "sidewalk":
+            walked = {lane.edge for lane in network.lanes if lane.use == use}
+            follow = {edge: tuple(walked & set(after)) for edge, after in follow.items() if edge in walked}
+        self._follow = {edge: tuple(sorted(after)) for edge, after in follow.items()}
         lanes = [
             lane
             for lane in network.lanes

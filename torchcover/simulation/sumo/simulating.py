@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from xml.etree import ElementTree
 
 from torchcover.files import parse_xml, reads
 from torchcover.simulation.sumo.floating import ATTRIBUTES
@@ -27,13 +28,13 @@ def simulate(
         begin_s: From when on it is told where they are.
         seed: Of the simulation.
         around: Only those near to this vehicle are told of.
-        drawn: Whether the traffic was drawn: then nobody is taken out of a jam.
+        drawn: Whether the traffic was drawn: then nobody is taken out of a jam, and ways may end anywhere.
 
     Raises:
         ImportError: SUMO is not installed.
         ValueError: It fails; with its own message.
     """
-    options = ["--time-to-teleport", "-1"] if drawn else []
+    options = ["--time-to-teleport", "-1", "--ignore-route-errors"] if drawn else []
     if around is not None:
         options += ["--device.fcd.explicit", around, "--person-device.fcd.explicit", around]
         options += ["--device.fcd.radius", str(HORIZON_M + BEYOND_M)]
@@ -62,4 +63,9 @@ def from_opendrive(path: Path, folder: Path) -> Path:
         "netconvert", "--opendrive-files", path, "--output-file", network, "--precision", "3",
         "--opendrive.import-all-lanes", "--opendrive.curve-resolution", "2", "--walkingareas", "--crossings.guess",
     )  # fmt: skip
+    converted = parse_xml(network)
+    for lane in converted.iter("lane"):
+        if lane.get("type") == "sidewalk" and lane.get("allow") is None:
+            lane.set("allow", "pedestrian")  # netconvert lets cars onto sidewalks that lead to no crossing
+    ElementTree.ElementTree(converted).write(network)
     return network

@@ -8,7 +8,8 @@ from torchcover.files import feed_xml, reads
 
 PIECE_BYTES = 1 << 18
 
-# SUMO's classes (and children), and the kinds of bodies (`fleet.CATEGORIES`) among which the length decides; for all others cars do.
+# SUMO's classes (and children), and the kinds of bodies (`fleet.CATEGORIES`) among which the length decides; cars are
+# those of all others.
 BODIES: Mapping[str, tuple[str, ...]] = {
     "pedestrian": ("adult",),
     "child": ("child",),
