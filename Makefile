@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lowest lint types doctest smoke bench paper clean
+.PHONY: demo test lowest lint types doctest docs smoke bench paper clean
 
 demo: STEPS ?= 24
 demo: $(VENV)/.ready  ## evaluate a built-in rig in the built-in courtyard; writes to out/demo
@@ -30,9 +30,14 @@ lint: $(VENV)/.ready
 
 types: $(VENV)/.ready
 	$(BIN)/mypy
+	$(BIN)/mypy tests/typing
 
-doctest: $(VENV)/.ready  ## the examples in the docstrings and in the documentation
-	$(BIN)/python -m pytest --doctest-modules torchcover --doctest-glob='*.md' README.md docs
+doctest: $(VENV)/.ready  ## the examples in the docstrings; tests/test_documentation.py runs those of the documentation
+	$(BIN)/python -m pytest --doctest-modules torchcover
+
+docs: $(VENV)/.ready  ## the pages, with those made from the code, in out/site
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet
 
 smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the repository
 	PYTHON="$(PYTHON)" bash .ci/smoke $(BIN)/python

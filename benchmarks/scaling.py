@@ -42,6 +42,7 @@ def main():
     parser.add_argument("--ranks", action="store_true", help="wall times of ranks and workers too: on a quiet machine")
     options = parser.parse_args([] if __name__ != "__main__" else None)
     torch.set_num_threads(1)
+    times(1)  # what is imported and compiled at the first step is a part of the start
     steps = STEPS_A_WORLD * options.worlds
     table(("traffic", "bodies that move", "triangles", "a world (s)", "a step (s)"), list(by_traffic(steps)))
     of_rays = {rays: step_s(steps, rays=rays) for rays in RAYS}

@@ -1,4 +1,4 @@
-"""Packets beside pykdtree, and scipy, Open3D and nanoflann where installed: one thread each, trees built every time."""
+"""Packets beside pykdtree, scipy, Open3D and nanoflann, Warp beside CuPy on a GPU: trees built every time."""
 
 import json
 import os
@@ -34,29 +34,38 @@ def main():
 
 
 def measure():
-    """Ratios of processor time."""
+    """Ratios of processor time; where there is a GPU, of wall time on it."""
     torch.set_num_threads(1)
-    others = {"pykdtree": pykdtree, "scipy": scipy} | optional()
+    searches = {"packets": packets, "pykdtree": pykdtree, "scipy": scipy} | optional()
+    result = {"torch": torch.__version__, "threads": 1}
+    result["figures"] = compared(searches, ("packets", "pykdtree"), time.process_time)
+    if torch.cuda.is_available():
+        print(f"\nOn {torch.cuda.get_device_name()}, seconds of wall time:\n")
+        searches = on_cuda()
+        result["on_cuda"] = compared(searches, searches, time.perf_counter)
+    RESULT.parent.mkdir(parents=True, exist_ok=True)
+    RESULT.write_text(json.dumps(result, indent=1))
+    print(f"\nAll figures: {RESULT}")
+
+
+def compared(searches, of_large, clock):
+    """Print the seconds of the first search and ratios of the others to it; of large clouds those `of_large` alone."""
+    ours, *others = searches
     figures = []
 
     def rows():
         for name, query, points in cases():
             few = len(query) + len(points) < SLOW
-            compared = others if few else {"pykdtree": pykdtree}
-            searches = [
-                lambda search=search, q=query, p=points: search(q, p) for search in (packets, *compared.values())
-            ]
-            seconds, ratios = compare(*searches, rounds=3 if few else 1, clock=time.process_time)
-            times = dict(zip(("packets", *compared), seconds, strict=True))
+            names = [search for search in searches if few or search in of_large]
+            timed = [lambda search=searches[each], q=query, p=points: search(q, p) for each in names]
+            seconds, ratios = compare(*timed, rounds=3 if few else 1, clock=clock)
+            times, ratio = (dict(zip(names, numbers, strict=True)) for numbers in (seconds, ratios))
             figures.append({"case": name, "queries": len(query), "points": len(points), "seconds": times})
-            faster = dict(zip(compared, ratios[1:], strict=True))
             counts = f"{len(query):,}", f"{len(points):,}"
-            yield name, *counts, times["packets"], *(faster.get(other, "") for other in others)
+            yield name, *counts, times[ours], *(ratio.get(other, "") for other in others)
 
-    table(("clouds", "queries", "points", "packets (s)", *(f"{other} / packets" for other in others)), rows())
-    RESULT.parent.mkdir(parents=True, exist_ok=True)
-    RESULT.write_text(json.dumps({"torch": torch.__version__, "threads": 1, "figures": figures}, indent=1))
-    print(f"\nAll figures: {RESULT}")
+    table(("clouds", "queries", "points", f"{ours} (s)", *(f"{other} / {ours}" for other in others)), rows())
+    return figures
 
 
 def cases():
@@ -117,6 +126,26 @@ def optional():
             return index.kneighbors(query)
 
         found["nanoflann"] = nanoflann_search
+    except ImportError:
+        pass
+    return found
+
+
+def on_cuda():
+    """Searches of clouds that are brought to the first GPU, CuPy's where it is installed. Never run."""
+
+    def warp(query, points):
+        nearest(torch.from_numpy(query).cuda(), torch.from_numpy(points).cuda(), backend="warp").index.cpu()
+
+    found = {"warp": warp}
+    try:
+        import cupy
+        from cupyx.scipy.spatial import KDTree as CupyTree
+
+        def cupy_search(query, points):
+            CupyTree(cupy.asarray(points)).query(cupy.asarray(query))[1].get()
+
+        found["CuPy"] = cupy_search
     except ImportError:
         pass
     return found

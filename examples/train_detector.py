@@ -51,11 +51,11 @@ MATCH_M = 2.0
 # Data.
 
 
-def in_region(boxes):
-    """The cars whose centre lies in the region."""
+def in_region(boxes, categories=("car",)):
+    """The cars whose centre lies in the region; `categories` is what they are called."""
     x, y, _ = boxes.centre_m.T
     inside = (x >= X_M[0]) & (x < X_M[1]) & (y >= Y_M[0]) & (y < Y_M[1])
-    return boxes.select(inside).of_category("car")
+    return boxes.select(inside).of_category(*categories)
 
 
 def thinned(cloud):
@@ -251,16 +251,19 @@ class Training(lightning.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def train(rig, training_frames, validation_frames, options, console):
-    """Train one rig's detector; its module, and its coverage by region."""
+def coverage_metric(*, square_metres):
+    """The metric of the region; with the defaults as many blocks as drives, which know nothing of each other."""
+    grid = BevGrid(x=X_M, y=Y_M, cell=1.6, heights={"body": (0.3, 2.0)})
+    return CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=16, square_metres=square_metres)
+
+
+def train(rig, training_frames, validation_frames, metric, options, console):
+    """Train one rig's detector, with the coverage beside it; its module, and the coverage."""
     lightning.seed_everything(options.seed, verbose=False)
     loaders = [
         DataLoader(training_frames, batch_size=8, shuffle=True, drop_last=True, collate_fn=collate_frames),
         DataLoader(validation_frames, batch_size=8, collate_fn=collate_frames),
     ]
-    grid = BevGrid(x=X_M, y=Y_M, cell=1.6, heights={"body": (0.3, 2.0)})
-    # As many blocks as drives, with the defaults: errors of drives that know nothing of each other.
-    metric = CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=16, square_metres=True)
     coverage = CoverageCallback(metric, regions=REGIONS, rig=rig, fixed_frames=True)
     visibility = {
         f.index: box_visibility(f.clouds[rig], f.reference, f.boxes, reference_weights=f.reference_weights)
@@ -402,7 +405,8 @@ def main():
     validation_frames = simulate(options.validate, options.seed + 1, surface, "validation frames", keep_clouds=True)
     results = {}
     for rig in RIGS:
-        results[rig] = train(rig, training_frames, validation_frames, options, console)
+        metric = coverage_metric(square_metres=True)
+        results[rig] = train(rig, training_frames, validation_frames, metric, options, console)
     report(results, console)
     draw(results, options.out / "detector.png")
     console.print(f"Wrote {options.out / 'detector.png'} and event files for TensorBoard beside it")

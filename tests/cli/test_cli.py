@@ -5,13 +5,15 @@ import io
 import json
 import subprocess
 import sys
+from itertools import count
 
 import numpy as np
 import pytest
+import torch
 from rich.console import Console
 
-from torchcover import Coverage, CoverageMetric
-from torchcover.simulation import REFERENCE_SENSORS
+from torchcover import Coverage, CoverageMetric, nearest
+from torchcover.simulation import REFERENCE_SENSORS, builtin_documents, builtin_names
 
 
 @pytest.fixture
@@ -210,6 +212,8 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["evaluate", "front_roof_128", "--steps", "many"], "--steps"),
         (["evaluate", "front_roof_128", "--seed", "-1"], "--seed"),
         (["evaluate", "front_roof_128", "--device", "abacus"], "device abacus: cannot be used here"),
+        (["evaluate", "front_roof_128", "--device", "cuda:99"], "device cuda:99: cannot be used here"),
+        (["evaluate", "front_roof_128", "--device", "hpu"], "device hpu: cannot be used here"),
         (["evaluate", "front_roof_128", "--colour"], "No such option"),
         (["evaluate", "front_roof_128", "--target-error", "5"], "target error 5: a positive number with its unit"),
         (["evaluate", "front_roof_128", "--target-error", "-1m"], "target error -1m: a positive number"),
@@ -220,7 +224,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         ),
         (
             ["evaluate", "front_roof_128", "--reference", "even", "--rays", "7"],
-            "rays: at least 2 for each of 4 areas are needed; got 7",
+            "rays: at least 2 for each of 5 areas are needed; got 7",
         ),
         (["evaluate", "front_roof_128", "--estimate", "best"], "'best' is not one of 'area', 'known'"),
         (
@@ -276,16 +280,32 @@ def test_a_folder_may_be_called_what_rich_takes_for_markup(torchcover, recording
 def test_an_output_without_the_signs_of_the_tables_gets_question_marks_not_an_error(torchcover, monkeypatch):
     buffer = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(buffer, encoding="ascii"))
-    monkeypatch.setattr("torchcover.cli.listing.run", lambda: Console().print("0.3 ± 0.1"))
+    monkeypatch.setattr("torchcover.cli.listing.run", lambda word: Console().print("0.3 ± 0.1"))
     assert torchcover("list")[0] == 0
     assert buffer.getvalue() == b"0.3 ? 0.1\n"
 
 
-def test_list_names_everything_built_in(torchcover):
+def test_list_names_everything_built_in_and_what_it_is_made_of(torchcover):
     code, printed, _ = torchcover("list")
+    lines = [line.split(maxsplit=1) for line in printed.splitlines()]
+    said = {name: rest[0] for name, *rest in filter(None, lines) if rest}
     assert code == 0
-    for name in ("front_roof_128", "front_grille_128", "courtyard"):
-        assert name in printed
+    for kind in ("rigs", "scenarios", "lidars", "vehicles"):
+        assert set(builtin_names(kind)) <= set(said)
+    assert said["nuscenes_cameras"].startswith("6 cameras  The six cameras of the nuScenes cars (Renault Zoe)")
+    assert said["velodyne_vlp16"].startswith("16 rows, 100 m   Velodyne VLP-16.")
+    assert said["courtyard"].startswith("static")
+
+
+def test_list_with_a_word_prints_what_has_it_and_all_that_is_said_of_it(torchcover):
+    code, printed, _ = torchcover("list", "PANDAR64")
+    assert (code, "hesai_pandar64" in printed, "velodyne_vlp16" in printed) == (0, True, False)
+    assert " ".join(builtin_documents("lidars")["hesai_pandar64"]["description"].split()) in printed
+    code, _, said = torchcover("list", "no such thing")
+    assert (code, said) == (
+        2,
+        "torchcover: nothing built in with 'no such thing'; torchcover list prints all there is\n",
+    )
 
 
 def test_version_and_help(torchcover):
@@ -323,5 +343,29 @@ def test_a_grid_that_does_not_fit_into_memory_ends_in_one_line(torchcover, tmp_p
     assert code == 2
     assert complaints.strip() == (
         "torchcover: a cell of 0.05 m: there is not enough memory for the sums of 12,800,000 cells in 16 blocks; "
-        "use larger cells"
+        "use larger cells, or a smaller grid"
     )
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (MemoryError("cuda:0: the search among 7 points"), "(cuda:0: the search among 7 points); ask for less"),
+        (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 7.00 GiB.\nGPU 0 ..."), "7.00 GiB.); ask"),
+    ],
+)
+def test_out_of_memory_on_a_gpu_ends_in_one_line_and_keeps_what_was_measured(
+    torchcover, recording, tmp_path, monkeypatch, error, told
+):
+    def search(*arguments, **options):
+        if next(calls) == 2:
+            raise error
+        return nearest(*arguments, **options)
+
+    calls = count()
+    monkeypatch.setattr("torchcover.coverage.metric.nearest", search)
+    code, _, complaints = torchcover("evaluate", "--frames", recording, "--cell", 4, "--out", tmp_path / "out")
+    assert code == 2
+    assert complaints.splitlines()[-1].startswith("torchcover: there is not enough memory (")
+    assert told in complaints.splitlines()[-1]
+    assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["steps"] == 2

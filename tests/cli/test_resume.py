@@ -24,10 +24,14 @@ def test_a_run_goes_on_to_the_same_files(torchcover, worlds, monkeypatch, comman
     code, _, said = torchcover(*arguments, "--steps", 2, "--out", "parts", "--resume")
     assert (code, "parts/checkpoint.npz is not there: the run starts with its first step" in said) == (0, True)
     code, _, said = torchcover(*arguments, "--steps", 5, "--out", "parts", "--resume")
-    assert (code, "is not there" in said) == (0, False)
+    assert (code, "is not there" in said, "replaced" in said) == (0, False, False)
     assert files_of(worlds / "parts") == files_of(worlds / "whole")
     code, _, said = torchcover(*arguments, "--steps", 5, "--out", "parts", "--resume", "--seed", 1)
     assert code == 2
     assert "parts/checkpoint.npz: a checkpoint of another run: seed (0 there, 1 here); resume with the" in said
-    assert torchcover(*arguments, "--steps", 1, "--out", "parts")[0] == 0  # anew
+    code, _, said = torchcover(*arguments, "--steps", 1, "--out", "parts")  # anew
+    assert (code, "parts/checkpoint.npz will be replaced; to go on from it, stop now and add --resume" in said) == (
+        0,
+        True,
+    )
     assert files_of(worlds / "parts") != files_of(worlds / "whole")

@@ -175,3 +175,8 @@ def test_a_warning_is_one_line_on_stderr_and_said_once(torchcover, worlds):
     assert ["car.obj: the mesh is not closed" in line for line in lines].count(True) == 1
     assert ["a: its body is 4,000 x 2,000 x 1,000 m" in line for line in lines].count(True) == 1
     assert len(lines) == 3
+
+
+def test_it_prints_where_the_numbers_of_a_rig_come_from(torchcover, tmp_path):
+    code, printed, _ = torchcover("show", "nuscenes", "--out", tmp_path)
+    assert (code, " ".join(printed.split())[:60]) == (0, Rig.load("nuscenes").description[:60])

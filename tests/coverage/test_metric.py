@@ -180,6 +180,7 @@ def test_everything_that_happened_is_counted():
         "empty_sensor_steps": 1,
         "empty_reference_steps": 1,
         "saturated_points": 4,
+        "inside_points": 5,
         "outside_points": 2,
     }
 
@@ -352,8 +353,8 @@ BAD = torch.tensor([[0.0, 0.0, math.nan], [0.0, 0.0, 0.0], [math.inf, 0.0, 0.0]]
         ([ORIGIN], [ORIGIN, ORIGIN], ValueError, "1 sensor clouds for 2 reference clouds; one pair a step"),
         (torch.zeros(4, 2), ORIGIN, ValueError, r"sensor\[0\]: shape \(N, 3\) is needed; got \(4, 2\)"),
         ([ORIGIN], [torch.zeros(1, 3, dtype=torch.int64)], TypeError, r"reference\[0\]: .*got torch.int64"),
-        (ORIGIN.numpy(), ORIGIN, TypeError, r"sensor: a torch tensor, or a list .* got ndarray .*torch.from_numpy"),
-        (ORIGIN, ORIGIN.numpy(), TypeError, r"reference: a torch tensor, or a list with one for each step"),
+        (ORIGIN.numpy(), ORIGIN, TypeError, r"sensor \(one, or a list .* NumPy array of float32; torch.from_numpy"),
+        (ORIGIN, ORIGIN.numpy(), TypeError, r"reference \(one, or a list with one for each step"),
         ([[0.0, 0.0, 0.0]], [ORIGIN], TypeError, r"sensor\[0\]: a floating-point torch tensor is needed; got list"),
     ],
 )

@@ -62,6 +62,7 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
         assert list(frame.clouds) == list(source.rigs)
         assert frame.weight_kind == source.weight_kind
         assert all(cloud.dtype == torch.float32 for cloud in (*frame.clouds.values(), frame.reference))
+    assert [frame.index for frame in source] == [frame.index for frame in source] == [0, 1]
     with pytest.raises(IndexError):
         source[2]
     assert set(source.sensors) <= set(source.rigs)

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 
 from torchcover import Scenario
 from torchcover.data import Frame, SimulatedFrames, collate_frames
-from torchcover.detection import Boxes, points_in_boxes
+from torchcover.detection import Boxes, box_visibility, match, points_in_boxes
 from torchcover.detection.inside import SKIN_M
 from torchcover.simulation import PaperReference, Rig
 
@@ -276,3 +276,22 @@ def test_boxes_move_with_their_frame():
     there = collate_frames([frame]).to("cpu").boxes[0]
     assert there is not frame.boxes
     assert same(there, frame.boxes)
+
+
+@pytest.mark.parametrize(
+    ("call", "name"),
+    [
+        (lambda a, t, boxes: Boxes.from_rows(a), "rows"),
+        (lambda a, t, boxes: Boxes.from_mmdet3d(a), "rows"),
+        (lambda a, t, boxes: points_in_boxes(a, boxes), "points"),
+        (lambda a, t, boxes: match(a, t[:, 0], t, "distance", 2.0), "detections"),
+        (lambda a, t, boxes: match(t, a[:, 0], t, "distance", 2.0), "scores"),
+        (lambda a, t, boxes: match(t, t[:, 0], a, "distance", 2.0), "truth"),
+        (lambda a, t, boxes: box_visibility(a[:, :3], t[:, :3], boxes, reference_weights=None), "sensor"),
+        (lambda a, t, boxes: box_visibility(t[:, :3], t[:, :3], boxes, reference_weights=a[:, 0]), "reference_weights"),
+    ],
+)
+def test_an_array_of_numpy_is_refused_by_its_name(call, name):
+    rows = torch.ones(2, 7)
+    with pytest.raises(TypeError, match=rf"^{name}: .* got a NumPy array of float32; torch.from_numpy\(array\) makes"):
+        call(rows.numpy(), rows, Boxes.from_rows(rows))

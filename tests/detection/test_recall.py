@@ -2,6 +2,7 @@
 
 import math
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -369,3 +370,22 @@ def test_bad_frames_are_refused_and_leave_the_state_alone(changes, message):
 def test_a_frame_in_which_nobody_looked_for_objects_is_refused():
     with pytest.raises(TypeError, match=r"boxes: Boxes are needed, .* got NoneType"):
         RecallByVisibility().update(torch.empty(0, 7), None, torch.empty(0))
+
+
+def test_a_plot_of_recall_has_a_point_and_its_wilson_interval_for_every_bin_with_objects():
+    metric = RecallByVisibility(visibility_borders=(0.5,), score_thresholds=(0.0, 0.5))
+    rows = torch.tensor([row(10 * k, 0) for k in range(1, 4)])
+    metric.update(rows[:2], Boxes.from_rows(rows), torch.tensor([0.9, 0.1, math.nan]), torch.tensor([0.9, 0.3]))
+    curve = metric.compute().over("visibility")
+    for at, score in enumerate((None, 0.5)):
+        figure, axes = metric.plot(score_threshold=score)
+        points, (bars,) = axes.lines[0].get_xydata(), axes.collections
+        assert points[:, 0].tolist() == [0, 1, 3]
+        assert points[:, 1].tolist() == curve.recall.value[at, [0, 1, 3]].tolist() == [[1, 1, 0], [0, 1, 0]][at]
+        ends = np.array([segment[:, 1] for segment in bars.get_segments()])
+        expected = torch.stack([curve.recall.low[at], curve.recall.high[at]], dim=1)[[0, 1, 3]]
+        np.testing.assert_allclose(ends, expected, atol=1e-12)
+        assert [label.get_text().split("\n")[1] for label in axes.get_xticklabels()] == ["1", "1", "0", "1"]
+        plt.close(figure)
+    with pytest.raises(ValueError, match=r"score_threshold: one of \(0.0, 0.5\) is needed; got 0.4"):
+        metric.plot(score_threshold=0.4)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import pytest
 import torch
 from torchmetrics import Metric, MetricCollection
@@ -89,6 +90,20 @@ def test_the_inputs_are_as_they_were(case):
 
 
 @EVERY
+@pytest.mark.parametrize("in_a_list", [False, True])
+def test_an_array_of_numpy_is_refused_by_its_name_and_nothing_is_added(case, in_a_list):
+    metric = case.over(case.steps[:1])
+    before, step = states(metric), case.steps[1]
+    tensors = [name for name, value in step.items() if isinstance(value, torch.Tensor)]
+    assert tensors
+    for name in tensors:
+        given = {**step, name: step[name].numpy()}
+        with pytest.raises(TypeError, match=rf"^{name}.* got a NumPy array of float.*; torch.from_numpy\(array\)"):
+            metric.update(**(in_lists([given]) if in_a_list else given))
+    assert_states(metric, before)
+
+
+@EVERY
 def test_forward_gives_the_step_and_adds_it(case):
     metric = case.make()
     for step in case.steps:
@@ -118,6 +133,24 @@ def test_reset_forgets_every_step(case):
     metric.update(**case.steps[5])
     assert_same(metric.compute(), case.over(case.steps[5:6]).compute())
     assert_states(case.make(), states(case.over([])))
+
+
+@EVERY
+def test_plot_gives_figure_and_axes_and_changes_nothing(case):
+    metric = case.over(case.steps[:3])
+    before, other = states(metric), case.over(case.steps[3:6]).compute()
+    try:
+        figure, axes = metric.plot()
+        assert (axes.figure, axes) == metric.plot(metric.compute(), axes) == (figure, axes)
+        wide, (left, right) = plt.subplots(1, 2)
+        assert metric.plot(other, right) == (wide, right)
+        assert (left.has_data(), right.has_data()) == (False, True)
+        assert MetricCollection({"one": metric}).plot(ax=[left]) == [(wide, left)]
+        with pytest.raises(TypeError, match=r"^val: "):
+            metric.plot([other])
+    finally:
+        plt.close("all")
+    assert_states(metric, before)
 
 
 # What the state is.

@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 from pykdtree.kdtree import KDTree
 
 from torchcover import blind_spot_radius, nearest
-from torchcover.neighbors import BACKENDS, cdist, check_cloud, choice
+from torchcover.neighbors import BACKENDS, cdist, check_cloud, choice, kdtree
 
 DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
 # Rounding of the search decides between points that are this close to equally near; the distance is rounded once.
 ULPS = {torch.float32: 4 * 2.0**-23, torch.float64: 4 * 2.0**-52}
 
-INSTALLED = sorted(BACKENDS if find_spec("numba") else BACKENDS.keys() - {"packets"})
+LIBRARIES = {"packets": "numba", "warp": "warp"}
+INSTALLED = sorted(name for name in BACKENDS if name not in LIBRARIES or find_spec(LIBRARIES[name]))
 backends = pytest.mark.parametrize("backend", INSTALLED)
 
 
@@ -320,7 +321,7 @@ def test_auto_chooses_by_size_and_is_as_exact(counts, chosen, monkeypatch):
 )
 def test_auto_takes_packets_for_large_clouds_in_float32(counts, dtype, chosen, monkeypatch):
     """Stood in for by what any machine has: which is chosen, not what it finds."""
-    monkeypatch.setattr(choice, "_packets_work", lambda: True)
+    monkeypatch.setattr(choice, "_works", lambda *_: True)
     for name in BACKENDS.keys() - {chosen}:
         monkeypatch.setitem(BACKENDS, name, f"not.chosen.{name}")
     monkeypatch.setitem(BACKENDS, chosen, "torchcover.neighbors.cdist")
@@ -330,10 +331,10 @@ def test_auto_takes_packets_for_large_clouds_in_float32(counts, dtype, chosen, m
 
 @pytest.fixture
 def untried():
-    """Whether numba works is asked anew, and afterwards again."""
-    choice._packets_work.cache_clear()
+    """Whether numba and Warp work is asked anew, and afterwards again."""
+    choice._works.cache_clear()
     yield
-    choice._packets_work.cache_clear()
+    choice._works.cache_clear()
 
 
 LARGE = (random_cloud(200, 50), random_cloud(20_000, 51))
@@ -354,7 +355,7 @@ def test_with_a_broken_numba_the_tree_searches_and_says_so_once(monkeypatch, tmp
     (tmp_path / "broken_backend.py").write_text("raise OSError('libllvm: no such file\\nand a trace')")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(BACKENDS, "packets", "broken_backend")
-    with pytest.warns(UserWarning, match="the KD-tree searches instead of packets.*libllvm: no such file$") as said:
+    with pytest.warns(UserWarning, match="the KD-tree searches, as backend 'packets' .*libllvm: no such file$") as said:
         found = [nearest(*LARGE) for _ in range(2)]
     assert len(said) == 1
     assert torch.equal(found[0].index, nearest(*LARGE, backend="kdtree").index)
@@ -484,7 +485,7 @@ def test_other_shapes_are_refused(backend, shape):
     [
         (torch.zeros(2, 3, dtype=torch.int32), "torch.int32"),
         (torch.zeros(2, 3, dtype=torch.complex64), "torch.complex64"),
-        (np.zeros((2, 3)), "ndarray"),
+        (np.zeros((2, 3)), "a NumPy array of float64"),
         ([[0.0, 0.0, 0.0]], "list"),
     ],
 )
@@ -510,15 +511,15 @@ def test_a_memory_budget_that_is_none_is_refused(budget):
 
 
 def test_an_unknown_backend_is_refused_with_the_known_ones():
-    with pytest.raises(ValueError, match="backend: one of auto, cdist, kdtree, packets is needed; got 'faiss'"):
+    with pytest.raises(ValueError, match="backend: one of auto, cdist, kdtree, packets, warp is needed; got 'faiss'"):
         nearest(random_cloud(2, 38), random_cloud(2, 39), backend="faiss")
 
 
-def on_another_device(count):
+def on_another_device(count, name="meta"):
     """A tensor that is not on the CPU, on any machine; its coordinates pass as finite."""
 
     class Elsewhere(torch.Tensor):
-        device = torch.device("meta")
+        device = torch.device(name)
 
     return torch.zeros(count, 3).as_subclass(Elsewhere)
 
@@ -528,20 +529,114 @@ def test_two_devices_are_refused():
         nearest(random_cloud(2, 40), on_another_device(2))
 
 
-@pytest.mark.parametrize("backend", ["kdtree", "packets"])
-def test_the_trees_are_for_the_cpu(backend):
-    with pytest.raises(ValueError, match=f"backend '{backend}' runs on the CPU; the clouds are on meta"):
+@pytest.mark.parametrize(("backend", "kinds"), [("kdtree", "cpu"), ("packets", "cpu"), ("warp", "cpu and cuda")])
+def test_the_trees_are_not_for_any_device(backend, kinds):
+    with pytest.raises(ValueError, match=f"backend '{backend}' runs on {kinds}; the clouds are on meta"):
         nearest(on_another_device(2), on_another_device(3), backend=backend)
 
 
-def test_many_pairs_on_a_device_are_searched_on_the_cpu_and_it_says_so_once(monkeypatch):
-    """Never run on a GPU: the choice, and the way there and back."""
+# Without a GPU: which backend is chosen for one, and what is said. Never run on one.
+
+
+@pytest.fixture
+def unsaid():
     choice._say_that_the_cpu_searches.cache_clear()
+    yield
+    choice._say_that_the_cpu_searches.cache_clear()
+
+
+@pytest.mark.parametrize(("device", "faster"), [("meta", "all"), ("cuda", "all; faster still: .*torchcover.warp.*")])
+def test_many_pairs_on_a_device_are_searched_on_the_cpu_and_it_says_so_once(monkeypatch, unsaid, device, faster):
     monkeypatch.setattr(choice, "MAX_PAIRS_ON_THE_DEVICE", 5)
-    assert choice.choose_search(on_another_device(1), on_another_device(5), "auto") is cdist.search
-    with pytest.warns(UserWarning, match="clouds on meta with more than 5 pairs are searched on the CPU") as said:
-        searches = [choice.choose_search(on_another_device(2), on_another_device(3), "auto") for _ in range(2)]
-    assert len(said) == 1
+    monkeypatch.setattr(choice, "_works", lambda backend, *_: backend != "warp")
+    few, many = ([on_another_device(count, device) for count in counts] for counts in ((1, 5), (2, 3)))
+    assert choice.choose_search(*few, "auto") is cdist.search
+    said = f"clouds on {device} with more than 5 pairs are searched on the CPU, .* to compare them {faster}$"
+    with pytest.warns(UserWarning, match=said) as warned:
+        searches = [choice.choose_search(*many, "auto") for _ in range(2)]
+    assert len(warned) == 1
     query, points = random_cloud(20, 60), random_cloud(300, 61)
     expected = nearest(query, points, backend="kdtree").index
     assert all(torch.equal(search(query, points, math.inf, 1.0), expected) for search in searches)
+
+
+@pytest.mark.parametrize(("device", "chosen"), [("cuda", "warp"), ("meta", "cdist")])
+def test_auto_takes_warp_on_cuda_alone(monkeypatch, device, chosen):
+    """Stood in for by what any machine has."""
+    asked = []
+    monkeypatch.setattr(choice, "_works", lambda *what: asked.append(what[:2]) or True)
+    monkeypatch.setitem(BACKENDS, "warp", "not.chosen.warp")
+    monkeypatch.setitem(BACKENDS, chosen, "torchcover.neighbors.kdtree")
+    search = choice.choose_search(on_another_device(9, device), on_another_device(9, device), "auto")
+    assert search is kdtree.search
+    assert asked == [("warp", torch.device("cuda"))] * (device == "cuda")
+
+
+def test_without_warp_the_log_says_how_to_get_it(monkeypatch, caplog, untried):
+    monkeypatch.setitem(BACKENDS, "warp", "no.such.module")
+    with caplog.at_level("INFO", logger="torchcover"):
+        works = [choice._works("warp", torch.device("cpu"), "others search") for _ in range(2)]
+    assert works == [False, False]
+    (line,) = caplog.messages
+    assert line.startswith("nearest: others search; warp is faster: pip install 'torchcover[warp]'")
+
+
+def test_warp_that_cannot_use_the_device_is_not_used_and_that_is_said_once(monkeypatch, untried):
+    """As on a GPU of another make, which torch calls cuda too. On `meta`, where there are no numbers to search."""
+    monkeypatch.setitem(BACKENDS, "warp", "torchcover.neighbors.kdtree")
+    with pytest.warns(UserWarning, match="^nearest: others search, as backend 'warp' does not work here: ") as said:
+        works = [choice._works("warp", torch.device("meta"), "others search") for _ in range(2)]
+    assert works == [False, False]
+    assert len(said) == 1
+
+
+@pytest.mark.parametrize(("backend", "extra"), [("packets", "fast"), ("warp", "warp")])
+def test_a_broken_backend_that_was_named_is_an_error_of_one_line(monkeypatch, tmp_path, backend, extra):
+    (tmp_path / "broken_backend.py").write_text("raise OSError('libllvm: no such file\\nand a trace')")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(BACKENDS, backend, "broken_backend")
+    with pytest.raises(ImportError) as raised:
+        nearest(*LARGE, backend=backend)
+    assert str(raised.value) == (
+        f"backend '{backend}' does not work here (libllvm: no such file); try 'auto', or "
+        f"pip install 'torchcover[{extra}]' anew"
+    )
+
+
+# Where the memory of a GPU is too small
+
+
+class SmallMemory:
+    """A search that can be asked so many queries at a time, within so many megabytes."""
+
+    def __init__(self, most, search):
+        self.most, self.search, self.parts = most, search, []
+
+    def __call__(self, query, points, max_distance, memory_mb):
+        if len(query) > self.most:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 7.00 GiB.\nGPU 0 has ...")
+        self.parts.append((len(query), memory_mb))
+        return self.search(query, points, max_distance, memory_mb)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_out_of_memory_the_queries_are_asked_in_parts(monkeypatch, dtype):
+    query, points = random_cloud(5001, 62, dtype=dtype), random_cloud(400, 63, dtype=dtype)
+    inputs = [cloud.requires_grad_() for cloud in (query, points)]
+    expected = nearest(query, points, max_distance=9.0)
+    expected_gradients = torch.autograd.grad(expected.distance.nan_to_num(posinf=0).sum(), inputs)
+    small = SmallMemory(1300, kdtree.search)
+    monkeypatch.setattr("torchcover.neighbors.query.choose_search", lambda *_: small)
+    found = nearest(query, points, max_distance=9.0, memory_mb=8.0)
+    gradients = torch.autograd.grad(found.distance.nan_to_num(posinf=0).sum(), inputs)
+    assert small.parts == [(1251, 2.0)] * 3 + [(1248, 2.0)]
+    assert torch.equal(found.index, expected.index)
+    assert torch.equal(found.distance, expected.distance)
+    torch.testing.assert_close(gradients, expected_gradients, rtol=1e-6, atol=1e-6)
+
+
+def test_out_of_memory_for_a_few_queries_is_an_error_with_the_size(monkeypatch):
+    monkeypatch.setattr("torchcover.neighbors.query.choose_search", lambda *_: SmallMemory(0, kdtree.search))
+    said = "^cpu: the search among 400 points for 3,000 queries, 750 at a time: CUDA out of memory.*7.00 GiB.$"
+    with pytest.raises(MemoryError, match=said):
+        nearest(random_cloud(3000, 64), random_cloud(400, 65))

@@ -1,8 +1,10 @@
-"""The laws of the search in packets: exact in float32, smallest index of a tie, whatever the order and the threads."""
+"""Of packets and of Warp: exact in their type, smallest index of a tie, whatever the order, the parts, the threads."""
 
+import math
 import os
 import subprocess
 import sys
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from torchcover import nearest
 
 ROOT = Path(__file__).parents[2]
 INSTALLED = find_spec("numba") is not None
+BACKENDS = [name for name, library in (("packets", "numba"), ("warp", "warp")) if find_spec(library)]
 if INSTALLED:
     from torchcover.neighbors import packets
     from torchcover.neighbors.morton import along_the_curve
@@ -46,6 +49,12 @@ def grid(side):
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
+def sphere(count, seed):
+    """All at about the same distance from the origin: which one is nearest to it, rounding decides."""
+    directions = generator(seed).normal(size=(count, 3))
+    return (10 * directions / np.linalg.norm(directions, axis=1, keepdims=True)).astype(np.float32)
+
+
 CLOUDS = {
     "random": (uniform(700, 1), uniform(3000, 2)),
     "scan": (uniform(700, 3, [-30, -30, 0], [30, 30, 3]), scan(40, 120)),
@@ -55,6 +64,7 @@ CLOUDS = {
     "queries all equal": (np.ones((200, 3), np.float32), uniform(3000, 9)),
     "on a line": (line(500, 10), line(3000, 11)),
     "in a plane": (uniform(500, 12) * np.float32([1, 1, 0]), uniform(3000, 13) * np.float32([1, 1, 0])),
+    "on a sphere": (uniform(300, 28) * np.float32(1e-7), sphere(3000, 29)),
     "far apart": (uniform(300, 14), uniform(3000, 15) + np.float32([1e6, 0, 0])),
     "one far away": (uniform(300, 16), np.concatenate([uniform(3000, 17), np.float32([[1e9, -1e9, 0]])])),
     "huge": (uniform(300, 18) * np.float32(2e7), uniform(3000, 19) * np.float32(2e7)),
@@ -63,18 +73,20 @@ CLOUDS = {
     "one query": (uniform(1, 24), uniform(3000, 25)),
     "17 points": (uniform(65, 26), uniform(17, 27)),
 }
-clouds = pytest.mark.parametrize("name", CLOUDS if INSTALLED else [])
+clouds = pytest.mark.parametrize("name", CLOUDS)
+backends = pytest.mark.parametrize("backend", BACKENDS)
 if_installed = pytest.mark.parametrize("installed", [True] if INSTALLED else [])
 
 
 def slow_twin(query, points):
-    """The same sums in float32, one after the other: the first of the least."""
+    """The same sums in the type of the clouds, one after the other: the first of the least."""
     x, y, z = (query[:, None, axis] - points[None, :, axis] for axis in range(3))
     return (x * x + y * y + z * z).argmin(axis=1)
 
 
-def search(query, points, max_distance=np.inf):
-    return packets.search(torch.from_numpy(query), torch.from_numpy(points), max_distance, 1.0).numpy()
+def search(query, points, backend):
+    clouds = (torch.from_numpy(cloud) for cloud in (query, points))
+    return import_module(f"torchcover.neighbors.{backend}").search(*clouds, math.inf, 1.0).numpy()
 
 
 @pytest.fixture
@@ -85,29 +97,43 @@ def threads():
 
 
 @clouds
-def test_the_index_is_the_slow_twins(name):
+@backends
+def test_the_index_is_the_slow_twins(name, backend):
     query, points = CLOUDS[name]
-    np.testing.assert_array_equal(search(query, points), slow_twin(query, points))
+    np.testing.assert_array_equal(search(query, points, backend), slow_twin(query, points))
 
 
 @clouds
-def test_the_order_of_the_queries_and_the_threads_change_nothing(name, threads, monkeypatch):
+@pytest.mark.parametrize("backend", [name for name in BACKENDS if name == "warp"])
+def test_in_float64_too(name, backend):
+    """With coordinates that float32 does not hold, and ties where there were some."""
+    query, points = (cloud.astype(np.float64) / 3 for cloud in CLOUDS[name])
+    np.testing.assert_array_equal(search(query, points, backend), slow_twin(query, points))
+
+
+@clouds
+@backends
+def test_the_order_of_the_queries_their_parts_and_the_threads_change_nothing(name, backend, threads, monkeypatch):
     query, points = CLOUDS[name]
     threads(1)
-    expected = search(query, points)
+    expected = search(query, points, backend)
     order = generator(30).permutation(len(query))
     threads(3)
-    monkeypatch.setattr(packets, "SHARE", 70)
-    np.testing.assert_array_equal(search(query[order], points), expected[order])
+    if backend == "packets":
+        monkeypatch.setattr(packets, "SHARE", 70)
+    np.testing.assert_array_equal(search(query[order], points, backend), expected[order])
+    parts = [search(part, points, backend) for part in np.array_split(query, 3) if len(part)]
+    np.testing.assert_array_equal(np.concatenate(parts), expected)
 
 
 @clouds
+@backends
 @pytest.mark.parametrize("quantile", [0.0, 0.5, 1.0])
-def test_a_bound_only_leaves_out_what_is_beyond(name, quantile):
+def test_a_bound_only_leaves_out_what_is_beyond(name, backend, quantile):
     query, points = (torch.from_numpy(cloud) for cloud in CLOUDS[name])
-    everything = nearest(query, points, backend="packets")
+    everything = nearest(query, points, backend=backend)
     limit = float(everything.distance.quantile(quantile, interpolation="nearest"))
-    bounded = nearest(query, points, max_distance=limit, backend="packets")
+    bounded = nearest(query, points, max_distance=limit, backend=backend)
     within = everything.distance <= limit
     assert torch.equal(bounded.index, everything.index.where(within, -1))
     assert torch.equal(bounded.distance, everything.distance.where(within, torch.inf))
@@ -148,10 +174,21 @@ def run(code, **environment):
     )
 
 
-def test_without_numba_the_backend_says_what_to_install():
-    code = "import sys; sys.modules['numba'] = None; import torch, torchcover; "
-    done = run(code + "torchcover.nearest(*torch.zeros(2, 1, 3), backend='packets')")
-    assert done.stderr.splitlines()[-1].endswith("needs numba: pip install 'torchcover[fast]'")
+def test_without_its_library_a_backend_says_what_to_install():
+    done = run("""
+import sys
+sys.modules["numba"] = sys.modules["warp"] = None
+import torch, torchcover
+for backend in ("packets", "warp"):
+    try:
+        torchcover.nearest(*torch.zeros(2, 1, 3), backend=backend)
+    except ModuleNotFoundError as error:
+        print(error)
+""")
+    assert done.stdout.splitlines() == [
+        "backend 'packets' needs numba: pip install 'torchcover[fast]'",
+        "backend 'warp' needs Warp: pip install 'torchcover[warp]'",
+    ], done.stderr
 
 
 @if_installed

@@ -63,9 +63,13 @@ class Search:
         return torch.as_tensor(np.asarray(rows)).to(device=self.device, dtype=dtype).reshape(-1, 3)
 
 
-INSTALLED = sorted(BACKENDS if find_spec("numba") else BACKENDS.keys() - {"packets"})
+CPU_ONLY = ("kdtree", "packets")
+LIBRARIES = {"packets": "numba", "warp": "warp"}
+INSTALLED = sorted(name for name in BACKENDS if name not in LIBRARIES or find_spec(LIBRARIES[name]))
 CPU_SEARCHES = (*(Search(backend) for backend in INSTALLED), Search("cdist", memory_mb=8.0))
-CUDA_SEARCHES = (Search("auto", "cuda"), Search("cdist", "cuda"))
+CUDA_SEARCHES = tuple(
+    Search(backend, "cuda") for backend in ("auto", "cdist", "warp") if backend in ("auto", *INSTALLED)
+)
 
 
 def longdouble_distance(reference, sensor):

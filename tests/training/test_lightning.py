@@ -3,6 +3,7 @@
 import gc
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import lightning.pytorch as pl
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.utilities import CombinedLoader
+from matplotlib.figure import Figure
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
@@ -363,6 +365,46 @@ def test_a_logger_that_takes_images_gets_pixels(tmp_path):
         assert image.dtype == np.uint8
         assert image.shape[2] == 3
         assert image.std() > 20, "an empty picture"
+
+
+class TakesFigures(TakesImages):
+    """A logger whose experiment takes figures, with the signature of somebody's `log_figure`."""
+
+    log_image = None
+
+    def __init__(self, log_figure, **attributes):
+        super().__init__()
+        self.experiment = SimpleNamespace(log_figure=log_figure)
+        vars(self).update(attributes)
+
+
+def test_mlflow_gets_a_file_for_every_figure_and_step(tmp_path, blank_maps):
+    taken = {}
+
+    def log_figure(run_id, figure, artifact_file, *, save_kwargs=None):  # that of MlflowClient
+        figure.savefig(tmp_path / "drawn.png")
+        taken[artifact_file] = run_id
+
+    logger = TakesFigures(log_figure, run_id="a1b2")
+    make_trainer(tmp_path, CoverageCallback(make_metric()), logger=logger, max_epochs=2).fit(
+        Validated(), loader(2), loader(3)
+    )
+    names = [f"coverage/val/{name}/step_0000000{step}.png" for step in (0, 1) for name in ("radius", "blank")]
+    assert taken == dict.fromkeys(names, "a1b2")
+    assert (tmp_path / "drawn.png").stat().st_size > 100
+
+
+def test_comet_gets_figures_by_name_and_step(tmp_path, blank_maps):
+    taken = []
+
+    def log_figure(figure_name=None, figure=None, overwrite=False, step=None):  # that of comet_ml.Experiment
+        taken.append((figure_name, type(figure), step))
+
+    logger = TakesFigures(log_figure)
+    make_trainer(tmp_path, CoverageCallback(make_metric()), logger=logger, max_epochs=2).fit(
+        Validated(), loader(2), loader(3)
+    )
+    assert taken == [(f"coverage/val/{name}", Figure, step) for step in (0, 1) for name in ("radius", "blank")]
 
 
 def test_a_logger_that_takes_no_figures_gets_numbers_and_one_warning(tmp_path):

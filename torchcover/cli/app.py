@@ -9,7 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from torchcover.cli import options
+from torchcover.cli.asking import asked
 from torchcover.cli.running import checkpoint_in, finish, opened, sharing
+from torchcover.cli.targets import targets
 from torchcover.evaluation.interrupt import terminable
 
 app = typer.Typer(
@@ -47,6 +49,10 @@ def main() -> None:
         _fail(str(error))
     except MemoryError as error:
         _fail(f"there is not enough memory ({error or 'for what was asked'}); ask for less, or use a larger machine")
+    except RuntimeError as error:
+        if type(error).__name__ != "OutOfMemoryError":  # of torch, which most mistakes are told without
+            raise
+        _fail(f"there is not enough memory ({str(error).splitlines()[0]}); ask for less, or use --device cpu")
     except (OverflowError, RecursionError) as error:
         _fail(f"a number is too large, or a file nested too deeply ({error})")
     if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
@@ -75,13 +81,18 @@ def evaluate(
     steps: options.Steps = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    region: options.Regions = None,
+    height: options.Heights = None,
+    grid: options.Grid = None,
+    ask: options.Ask = None,
+    cell: options.Cell = None,
     threshold: options.Thresholds = None,
     reference: options.Reference = None,
     rays: options.Rays = None,
     estimate: options.Estimate = None,
     every: options.Every = None,
     target_error: options.TargetErrors = None,
+    redundancy: options.Redundancy = False,
     error_maps: options.ErrorMaps = False,
     explain: options.Explain = False,
     device: options.Device = "cpu",
@@ -99,6 +110,7 @@ def evaluate(
             frames=opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
+            ask=asked(ask, region, height, grid),
             cell_m=cell,
             thresholds=threshold or (0.4,),
             reference_sensor=None if frames else reference,
@@ -106,6 +118,7 @@ def evaluate(
             estimate=estimate,
             every_s=every,
             target_error=target_error,
+            redundancy=redundancy,
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
@@ -127,13 +140,18 @@ def compare(
     steps: options.Steps = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    region: options.Regions = None,
+    height: options.Heights = None,
+    grid: options.Grid = None,
+    ask: options.Ask = None,
+    cell: options.Cell = None,
     threshold: options.Thresholds = None,
     reference: options.Reference = None,
     rays: options.Rays = None,
     estimate: options.Estimate = None,
     every: options.Every = None,
     target_error: options.TargetErrors = None,
+    redundancy: options.Redundancy = False,
     error_maps: options.ErrorMaps = False,
     explain: options.Explain = False,
     device: options.Device = "cpu",
@@ -151,6 +169,7 @@ def compare(
             frames=opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
+            ask=asked(ask, region, height, grid),
             cell_m=cell,
             thresholds=threshold or (0.4,),
             reference_sensor=None if frames else reference,
@@ -158,6 +177,7 @@ def compare(
             estimate=estimate,
             every_s=every,
             target_error=target_error,
+            redundancy=redundancy,
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
@@ -189,7 +209,7 @@ def study(
     every: options.Every = None,
     seed: options.Seed = 0,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    cell: Annotated[float, typer.Option(help="Side of a grid cell in metres.")] = 0.25,
     threshold: Annotated[float, typer.Option(help="Detection threshold in metres.")] = 0.4,
 ) -> None:
     """Measure error against run time for numbers of rays and of steps, and recommend a setting."""
@@ -238,6 +258,22 @@ def record(
 
 
 @app.command()
+def rig(
+    frames: options.RecordingFrames,
+    recording_format: options.Format = None,
+    sensors: options.Sensors = None,
+    lidar: Annotated[
+        list[str] | None,
+        typer.Option(help="SENSOR=MODEL: a LiDAR scans as this model (see `list`), and is not estimated."),
+    ] = None,
+) -> None:
+    """Print the sensors of a recording as a rig: mounts, LiDARs and cameras for `show` and `evaluate`."""
+    from torchcover.cli.rig import run
+
+    run(frames, recording_format, sensors or (), lidar or ())
+
+
+@app.command()
 def show(
     name: Annotated[str, typer.Argument(help="Rig or scenario: a built-in name (see `list`) or a YAML file.")],
     scenario: Annotated[
@@ -254,12 +290,19 @@ def show(
     run(name, scenario=scenario, rig=rig, step=step, seed=seed, out=out)
 
 
+app.command()(targets)
+
+
 @app.command("list")
-def list_builtin() -> None:
-    """List the built-in rigs and scenarios."""
+def list_builtin(
+    word: Annotated[
+        str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
+    ] = None,
+) -> None:
+    """List the built-in rigs, scenarios, LiDAR models and vehicles."""
     from torchcover.cli.listing import run
 
-    run()
+    run(word)
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)

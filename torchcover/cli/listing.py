@@ -1,22 +1,67 @@
 """`torchcover list`."""
 
 import re
+import shutil
+import sys
+import textwrap
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from typing import Any
 
-from rich.console import Console
-from rich.table import Table
+import typer
 
-from torchcover.simulation import builtin_descriptions
+from torchcover.simulation import builtin_documents
 
 
-def run() -> None:
-    """Print the built-in rigs, scenarios and LiDAR models, with the first sentence of their descriptions."""
-    console = Console()
-    for kind in ("rigs", "scenarios", "lidars"):
-        table = Table("name", "description", title=kind, title_justify="left", box=None, padding=(0, 2, 0, 0))
-        for name, description in builtin_descriptions(kind).items():
-            table.add_row(name, _first_sentence(description))
-        console.print(table)
-        console.print()
+def run(word: str | None) -> None:
+    """Print the built-in rigs, scenarios, LiDAR models and vehicles: what each consists of, and its first sentence.
+
+    Args:
+        word: Only those with it in a column; their descriptions are then printed whole.
+
+    Raises:
+        ValueError: There is none with that word.
+    """
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+    found = False
+    for kind, what_of in (("rigs", _sensors), ("scenarios", _traffic), ("lidars", _rows), ("vehicles", None)):
+        rows = []
+        for name, document in builtin_documents(kind).items():
+            cells = [name, what_of(document)] if what_of else [name]
+            description = " ".join(document["description"].split())
+            if word is None or word.lower() in " ".join((*cells, description)).lower():
+                rows.append((*cells, _first_sentence(description) if word is None else description))
+        if rows:
+            typer.echo("\n".join((kind, *_lines(rows, width, one_line_each=word is None))) + "\n")
+            found = True
+    if not found:
+        raise ValueError(f"nothing built in with {word!r}; torchcover list prints all there is")
+
+
+def _lines(rows: list[tuple[str, ...]], width: int | None, *, one_line_each: bool) -> Iterator[str]:
+    """The rows under each other; what does not fit is cut off, or goes on in the last column."""
+    *short, _ = zip(*rows, strict=True)
+    widths = [max(map(len, cells)) for cells in short]
+    for *cells, description in rows:
+        before = "  ".join(("", *(f"{cell:{most}}" for cell, most in zip(cells, widths, strict=True)), ""))
+        room = max(20, width - len(before)) if width else max(1, len(description))
+        shown = f"{description[: room - 1]}…" if one_line_each and len(description) > room else description
+        yield textwrap.fill(shown, len(before) + room, initial_indent=before, subsequent_indent=" " * len(before))
+
+
+def _sensors(rig: Mapping[str, Any]) -> str:
+    types = Counter(sensor["type"] for sensor in rig["sensors"])
+    words = {"lidar": "LiDAR", "camera": "camera"}
+    return ", ".join(f"{count} {words.get(kind, kind)}{'s' * (count > 1)}" for kind, count in types.items())
+
+
+def _traffic(scenario: Mapping[str, Any]) -> str:
+    return f"{scenario['traffic']['type']} traffic" if "traffic" in scenario else "static"
+
+
+def _rows(lidar: Mapping[str, Any]) -> str:
+    rows = lidar["channels"] if "channels" in lidar else len(lidar["elevations_deg"])
+    return f"{rows} rows, {lidar['max_range_m']:g} m"
 
 
 def _first_sentence(text: str) -> str:

@@ -1,10 +1,12 @@
 """`torchcover record`."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import typer
 
-from torchcover.data import SimulatedFrames, reference_called, write_recording
+from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called, write_recording
+from torchcover.evaluation.progress import progress_of
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, spread_s
 from torchcover.simulation import Rig, Scenario
 
@@ -34,9 +36,16 @@ def run(
         steps=steps or DEFAULT_STEPS,
         seed=seed,
         every_s=spread_s(world, every_s),
-        reference_sensor=reference_called(reference, rays),
+        reference_sensor=reference_called(reference, rays, RegionsOfInterest().around(world.ego_box().outline_m)),
         boxes=True,
     )
     frames.simulator.check_run(frames.steps)
-    write_recording(frames, out, layout)
+    write_recording(frames, out, layout, progress=_with_a_bar)
     typer.echo(f"Wrote {len(frames)} frames to {out}; read them with: torchcover evaluate --frames {out}")
+
+
+def _with_a_bar(steps: range) -> Iterator[int]:
+    with progress_of(len(steps), "record", shown=True) as bar:
+        for step in steps:
+            yield step
+            bar.advance(len(steps))

@@ -40,12 +40,14 @@ def opened(
 
 
 def checkpoint_in(out: Path, *, resume: bool) -> "Checkpoint":
-    """The checkpoint in the folder of the results; who wants to go on from one is told if there is none."""
+    """The checkpoint in the folder of the results; one line if it is not what the user may think."""
     from torchcover.evaluation import Checkpoint
 
     path = out / "checkpoint.npz"
     if resume and not path.exists():
         typer.echo(f"torchcover: {path} is not there: the run starts with its first step", err=True)
+    elif path.exists() and not resume:
+        typer.echo(f"torchcover: {path} will be replaced; to go on from it, stop now and add --resume", err=True)
     return Checkpoint(path, resume)
 
 

@@ -17,7 +17,7 @@ DEFAULT_RIG = "front_roof_128"
 
 
 def run(name: str, *, scenario: str | None, rig: str | None, step: int | None, seed: int | None, out: Path) -> None:
-    """Draw what has this name into `out/NAME.png`, and the depth images of a rig's cameras into `out/NAME_depth.png`.
+    """Print what it says of itself; draw it to `out/NAME.png`, what a rig's cameras measure to `out/NAME_depth.png`.
 
     Raises:
         ValueError: The name of neither or of both, an option for the other kind, or a document that is not valid.
@@ -29,17 +29,21 @@ def run(name: str, *, scenario: str | None, rig: str | None, step: int | None, s
         shown = Rig.load(name)
         if not cameras_of(shown):
             _refuse("a scenario or cameras", {"--step": step, "--seed": seed}, f"{name!r} is a rig without cameras")
-        world = Scenario.load(scenario or DEFAULT_SCENARIO)
+        world, description = Scenario.load(scenario or DEFAULT_SCENARIO), shown.description
         figures = rig_pictures(shown, world, step=step or 0, seed=seed or 0)
     else:
         _refuse("a rig", {"--scenario": scenario}, f"{name!r} is a scenario")
         world, seen_by = Scenario.load(name), Rig.load(rig or DEFAULT_RIG)
+        description = world.description
         figures = [("", scenario_picture(world, seen_by, step=step or 0, seed=seed or 0))]
+    console = Console()
+    if description:
+        console.print(" ".join(description.split()), markup=False, highlight=False)
     for suffix, figure in figures:
         path = out / f"{Path(name).stem}{suffix}.png"
         out.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=figure.dpi)
-        Console().print(f"Wrote {path}", markup=False, soft_wrap=True)
+        console.print(f"Wrote {path}", markup=False, soft_wrap=True)
 
 
 def _is_rig(name: str) -> bool:

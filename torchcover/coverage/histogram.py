@@ -41,7 +41,7 @@ def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float
     Returns:
         (Q, C) quantiles; infinite in the last bin if its upper edge is; NaN in a column without weight.
     """
-    cumulative = histogram.cumsum(dim=0)
+    edges, cumulative = edges.to(histogram.device), histogram.cumsum(dim=0)
     total = cumulative[-1]
     rows = []
     for level in levels:

@@ -6,16 +6,15 @@ from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from torch.utils.data import Dataset
 
 from torchcover.data.frame import Frame
-from torchcover.data.source import FrameSource
+from torchcover.data.source import FrameDataset, FrameSource
 from torchcover.simulation import Sensor, WeightKind
 
 ValueT = TypeVar("ValueT")
 
 
-class ChosenRigs(Dataset[Frame]):
+class ChosenRigs(FrameDataset):
     """The same frames with the clouds of some rigs only, each under a name of one's own: a `FrameSource` of another.
 
     Args:
@@ -74,7 +73,9 @@ class ChosenRigs(Dataset[Frame]):
     def __getitem__(self, index: int) -> Frame:
         frame = self.frames[index]
         boxes = None if frame.boxes is None else replace(frame.boxes, hits=self._chosen(frame.boxes.hits))
-        return replace(frame, clouds={name: frame.cloud_of(of) for name, of in self.names.items()}, boxes=boxes)
+        points = None if frame.sensor_points is None else self._chosen(frame.sensor_points)
+        clouds = {name: frame.cloud_of(of) for name, of in self.names.items()}
+        return replace(frame, clouds=clouds, boxes=boxes, sensor_points=points)
 
     def _chosen(self, by_rig: Mapping[str, ValueT]) -> dict[str, ValueT]:
         return {name: by_rig[of] for name, of in self.names.items() if of in by_rig}

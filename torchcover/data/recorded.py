@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.utils.data import Dataset
 
 from torchcover.data.accumulated_reference import AccumulatedReference
 from torchcover.data.bad_frame import BadFrameError
@@ -17,6 +16,7 @@ from torchcover.data.frame import Frame
 from torchcover.data.in_vehicle import InVehicle, in_vehicle, joined
 from torchcover.data.recorded_reference import RecordedReference, Reference
 from torchcover.data.recordings import Recording, open_recording
+from torchcover.data.source import FrameDataset
 from torchcover.detection.inside import with_hits
 from torchcover.simulation import Sensor, WeightKind
 
@@ -24,7 +24,7 @@ from torchcover.simulation import Sensor, WeightKind
 RESULTS = frozenset({".lock", "summary.json", "checkpoint.npz"})
 
 
-class RecordedFrames(Dataset[Frame]):
+class RecordedFrames(FrameDataset):
     """What the sensors of a recording saw beside a reference, instant by instant. A map-style torch Dataset.
 
     Points that are not finite, never came back (they lie in the sensor) or lie on the vehicle itself are in neither
@@ -125,7 +125,7 @@ class RecordedFrames(Dataset[Frame]):
         """Read one frame.
 
         Raises:
-            IndexError: There are fewer frames; also what ends a `for` loop.
+            IndexError: There are fewer frames.
             BadFrameError: One of its files cannot be used.
         """
         position = operator.index(index)
@@ -160,6 +160,9 @@ class RecordedFrames(Dataset[Frame]):
             weight_kind=self.weight_kind,
             boxes=boxes,
             instant=None if self.recording.instants is None else self.recording.instants[instant],
+            sensor_points={
+                rig: {sensor: len(scans[sensor].points_m) for sensor in of} for rig, of in self.sensors_of_rigs.items()
+            },
         )
 
     @property

@@ -11,10 +11,11 @@ from typing import Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.utils.data import Dataset
 
 from torchcover.data.frame import Frame
 from torchcover.data.reference import reference_called, reference_of_objects
+from torchcover.data.regions_of_interest import RegionsOfInterest
+from torchcover.data.source import FrameDataset
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import with_hits
 from torchcover.simulation import Label, Observation, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
@@ -23,7 +24,7 @@ from torchcover.simulation import Label, Observation, ReferenceSensor, Rig, Scen
 MAX_STEPS = 1_000_000_000
 
 
-class SimulatedFrames(Dataset[Frame]):
+class SimulatedFrames(FrameDataset):
     """What a rig and the random reference sensor see of a scenario, step by step. A map-style torch Dataset.
 
     A frame depends on the scenario, the rig, the seed and its index, and on nothing else: not on workers, threads or
@@ -39,8 +40,9 @@ class SimulatedFrames(Dataset[Frame]):
         steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
             traffic, the same instants are seen again, which `Frame.instant` and `Frame.counts` say.
         seed: Seed of the traffic and of the reference sensor's poses.
-        reference_sensor: The reference sensor, such as `PaperReference()`. If not given, a `SurfaceReference`:
-            `reference_called()`, and `reference_of_objects()` with boxes, at up to twice the time.
+        reference_sensor: The reference sensor, such as `PaperReference()`. If not given, a `SurfaceReference` that is
+            aimed at the usual regions: `reference_called`, and `reference_of_objects` with boxes, at up to twice the
+            time.
         every_s: Time between one frame and the next, a multiple of the scenario's time step; that step if not given.
             Steps that follow each other are alike: with the same number of frames, a longer time shows more, and in
             traffic, which starts anew, the frames are spread over more cities.
@@ -74,10 +76,12 @@ class SimulatedFrames(Dataset[Frame]):
     ) -> None:
         if not 1 <= steps <= MAX_STEPS:
             raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
+        world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
         if reference_sensor is None:
-            reference_sensor = reference_of_objects() if boxes else reference_called()
+            asked = RegionsOfInterest().around(world.ego_box().outline_m)
+            reference_sensor = reference_of_objects(asked) if boxes else reference_called(asked=asked)
         self.simulator = Simulator(
-            scenario if isinstance(scenario, Scenario) else Scenario.load(scenario),
+            world,
             _rigs(rig, rigs),
             reference_sensor,
             seed=seed,
@@ -182,6 +186,10 @@ class SimulatedFrames(Dataset[Frame]):
             counts=seen.counts,
             boxes=_boxes(self.simulator.labels(index), clouds, seen.drawn) if self.boxes else None,
             instant=self.simulator.place_in_time(index),
+            sensor_points={
+                name: dict(zip((sensor.name for sensor in self.rigs[name].sensors), points, strict=True))
+                for name, points in seen.sensor_points.items()
+            },
         )
 
 

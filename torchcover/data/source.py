@@ -1,10 +1,12 @@
 """What every source of frames says of itself, be it a simulation, a folder or another format."""
 
-from collections.abc import Collection, Mapping, Sequence
+from abc import abstractmethod
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+from torch.utils.data import Dataset
 
 from torchcover.data.frame import Frame
 from torchcover.simulation import Sensor, WeightKind
@@ -70,3 +72,15 @@ class FrameSource(Protocol):
             BadFrameError: It cannot be used; the others can.
         """
         ...
+
+
+class FrameDataset(Dataset[Frame]):
+    """A map-style torch Dataset of frames that a `for` loop goes through in order."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of frames."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        """The frames, one after the other."""
+        return (self[index] for index in range(len(self)))

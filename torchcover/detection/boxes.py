@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from torchcover.detection.box_layouts import headings, upright_rows
+from torchcover.neighbors import check_tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +107,7 @@ class Boxes:
         Raises:
             ValueError: Another shape, or as the constructor.
         """
+        check_tensor(rows, "rows")
         if rows.ndim != 2 or rows.shape[1] != 7:
             raise ValueError(f"rows: shape (K, 7) is needed, x y z length width height yaw; got {tuple(rows.shape)}")
         return cls(rows[:, :3], rows[:, 3:6], rows[:, 6], **others)  # type: ignore[arg-type]
@@ -123,6 +125,7 @@ class Boxes:
             >>> Boxes.from_mmdet3d(torch.tensor([[5.0, 0.0, -1.6, 0.8, 0.6, 1.8, 0.0]])).centre_m[0, 2].item()
             -0.7...
         """
+        check_tensor(rows, "rows")
         if rows.ndim != 2 or rows.shape[1] not in (7, 9):
             raise ValueError(f"rows: shape (K, 7) or (K, 9) is needed; got {tuple(rows.shape)}")
         centred = rows[:, :7].clone()
@@ -263,9 +266,7 @@ def check_boxes(boxes: object) -> None:
 
 
 def _check_numbers(name: str, tensor: Tensor) -> None:
-    if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
-        arrived = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
-        raise TypeError(f"{name}: a floating-point torch tensor is needed; got {arrived}")
+    check_tensor(tensor, name, floating=True)
     if not tensor.isfinite().all():
         bad = int((~tensor.reshape(len(tensor), -1).isfinite()).any(dim=1).sum())
         raise ValueError(f"{name}: {bad} of {len(tensor)} boxes have NaN or infinite numbers; leave them out")

@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchcover.detection.boxes import Boxes, check_boxes
 from torchcover.detection.visibility import BoxVisibility
+from torchcover.neighbors import check_tensor
 
 
 class DetectedFrame:
@@ -33,6 +34,9 @@ class DetectedFrame:
         detection_visibility: BoxVisibility | Tensor | None,
     ) -> None:
         check_boxes(boxes)
+        check_tensor(detections, "detections")
+        if scores is not None:
+            check_tensor(scores, "scores")
         if detections.ndim != 2 or detections.shape[1] < 7:
             raise ValueError(
                 f"detections: shape (N, 7) is needed, x y z length width height yaw; got {tuple(detections.shape)}"
@@ -63,6 +67,7 @@ class DetectedFrame:
 
 def _shares(visibility: BoxVisibility | Tensor, count: int, name: str) -> Tensor:
     share = visibility.share if isinstance(visibility, BoxVisibility) else visibility
+    check_tensor(share, name)
     share = share.detach().cpu().double()
     if share.shape != (count,) or ((share < 0) | (share > 1)).any():
         raise ValueError(

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcover.detection.boxes import Boxes
+from torchcover.neighbors import check_tensor
 
 # A body's points lie on its box as often as in it; rounding of coordinates may put them on either side.
 SKIN_M = 0.01
@@ -35,11 +36,15 @@ def points_in_boxes(points: Tensor, boxes: Boxes, *, skin_m: float = SKIN_M) -> 
     Returns:
         `Inside(box, point)`.
 
+    Raises:
+        TypeError: The points are no tensor.
+
     Example:
         >>> boxes = Boxes.from_rows(torch.tensor([[10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]]))
         >>> points_in_boxes(torch.tensor([[11.9, 0.9, 1.9], [12.1, 0.0, 1.0], [10.0, 0.0, 0.0]]), boxes)
         Inside(box=tensor([0]), point=tensor([0]))
     """
+    check_tensor(points, "points")
     if len(boxes) == 0 or len(points) == 0:
         none = torch.empty(0, dtype=torch.int64, device=points.device)
         return Inside(none, none)

@@ -6,6 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchcover.neighbors import check_tensor
+
 MatchBy = Literal["distance", "iou"]
 
 
@@ -55,6 +57,7 @@ def match(detections: Tensor, scores: Tensor, truth: Tensor, by: MatchBy, thresh
 
     Raises:
         ValueError: Another `by`, or not one score for each detection.
+        TypeError: What is no tensor.
 
     Example:
         >>> truth = torch.tensor([[10.0, 0.0, 0.7, 4.5, 1.8, 1.4, 0.0]])
@@ -63,6 +66,8 @@ def match(detections: Tensor, scores: Tensor, truth: Tensor, by: MatchBy, thresh
     """
     if by not in ("distance", "iou"):
         raise ValueError(f"by: 'distance' or 'iou' is needed; got {by!r}")
+    for name, given in (("detections", detections), ("scores", scores), ("truth", truth)):
+        check_tensor(given, name)
     if scores.shape != (len(detections),):
         raise ValueError(f"scores: one for each of {len(detections)} detections is needed; got {tuple(scores.shape)}")
     if by == "distance":

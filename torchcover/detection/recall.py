@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import torch
 from torch import Tensor
@@ -11,9 +11,13 @@ from torch import Tensor
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.detected_frame import DetectedFrame
 from torchcover.detection.matching import MatchBy, match
-from torchcover.detection.recall_curve import DetectionCounts
+from torchcover.detection.recall_curve import DetectionCounts, draw_recall
 from torchcover.detection.visibility import BoxVisibility
-from torchcover.metrics import MergeableMetric
+from torchcover.metrics import MergeableMetric, figure_of
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 T = TypeVar("T")
 
@@ -169,6 +173,40 @@ class RecallByVisibility(MergeableMetric):
             score_thresholds=self.score_thresholds,
             steps=int(self.steps),
         )
+
+    def plot(
+        self,
+        val: DetectionCounts | None = None,
+        ax: "Axes | None" = None,
+        *,
+        over: Literal["visibility", "distance"] = "visibility",
+        score_threshold: float | None = None,
+    ) -> "tuple[Figure, Axes]":
+        """Draw recall over visibility or distance, with its 95 % Wilson intervals and the number of objects.
+
+        Args:
+            val: What `compute` or `forward` returned; the counts so far if not given.
+            ax: Where to; a new figure of pyplot's if not given.
+            over: What the bins are of.
+            score_threshold: One of `score_thresholds`; the first if not given.
+
+        Returns:
+            The figure and the axes.
+
+        Raises:
+            TypeError: `val` is no `DetectionCounts`.
+            ValueError: No such score threshold.
+        """
+        counts = self.compute() if val is None else val
+        if not isinstance(counts, DetectionCounts):
+            raise TypeError(f"val: DetectionCounts, as of compute(), are needed; got {type(counts).__name__}")
+        score = counts.score_thresholds[0] if score_threshold is None else score_threshold
+        if score not in counts.score_thresholds:
+            raise ValueError(f"score_threshold: one of {counts.score_thresholds} is needed; got {score}")
+        fig, ax = figure_of(ax)
+        draw_recall(counts.over(over), counts.score_thresholds.index(score), ax)
+        ax.set_xlabel(f"{over} of the object; below, objects")
+        return fig, ax
 
 
 def _check_parameters(

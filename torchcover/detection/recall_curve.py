@@ -2,9 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
+import numpy as np
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 # Two-sided 95 %.
 NORMAL_QUANTILE = 1.959963984540054
@@ -130,3 +134,20 @@ class DetectionCounts:
                     flat[f"objects/{axis}{name}"] = float(curve.recall.trials[row, column])
                     flat[f"detections{at}/{axis}{name}"] = float(curve.precision.trials[row, column])
         return flat
+
+
+def draw_recall(curve: Curve, row: int, ax: "Axes") -> None:
+    """Draw recall at one score threshold: a point and its interval for each bin that has objects.
+
+    Args:
+        curve: Recall over bins.
+        row: Number of the score threshold.
+        ax: Where to.
+    """
+    value, low, high = (t[row].cpu().numpy() for t in (curve.recall.value, curve.recall.low, curve.recall.high))
+    there = np.flatnonzero(curve.recall.trials[row].cpu().numpy())
+    interval = np.stack([value - low, high - value])[:, there].clip(min=0.0)  # of rounding
+    ax.errorbar(there, value[there], interval, fmt="o", capsize=3)
+    labels = [f"{name}\n{objects}" for name, objects in zip(curve.bins, curve.recall.trials[row].tolist(), strict=True)]
+    ax.set_xticks(range(len(labels)), labels)
+    ax.set(xlim=(-0.5, len(labels) - 0.5), ylim=(0.0, 1.03), ylabel="recall")

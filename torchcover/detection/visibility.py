@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchcover.detection.boxes import Boxes, check_boxes
 from torchcover.detection.inside import points_in_boxes
-from torchcover.neighbors import blind_spot_radius, check_cloud
+from torchcover.neighbors import blind_spot_radius, check_cloud, check_tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,10 +134,13 @@ def _check(sensor: Tensor, reference: Tensor, threshold: float, weights: Tensor 
     check_cloud(sensor, "sensor")
     if not threshold >= 0:
         raise ValueError(f"threshold: a distance >= 0 in metres is needed; got {threshold}")
-    if weights is not None and weights.shape != (len(reference),):
+    if weights is None:
+        return
+    check_tensor(weights, "reference_weights")
+    if weights.shape != (len(reference),):
         raise ValueError(
             f"reference_weights: shape ({len(reference)},) is needed, one for each reference point; got "
             f"{tuple(weights.shape)}"
         )
-    if weights is not None and not (weights.isfinite() & (weights > 0)).all():
+    if not (weights.isfinite() & (weights > 0)).all():
         raise ValueError("reference_weights: finite weights > 0 are needed")

@@ -14,8 +14,10 @@ BACKENDS = {
     "cdist": "torchcover.neighbors.cdist",
     "kdtree": "torchcover.neighbors.kdtree",
     "packets": "torchcover.neighbors.packets",
+    "warp": "torchcover.neighbors.warp",
 }
-ON_THE_CPU = frozenset({"kdtree", "packets"})
+# The kinds of devices that each runs on; "cdist" on any.
+DEVICES = {"kdtree": ("cpu",), "packets": ("cpu",), "warp": ("cpu", "cuda")}
 
 # On the CPU brute force beats the tree only for few queries against many points, where building it does not pay
 # (docs/measured/performance.md, crossover).
@@ -26,6 +28,9 @@ PACKETS_PAY = 20_000
 # So many pairs take longer to compare on a GPU than to search on the CPU, by the bandwidth of its memory: 4 bytes a
 # pair, written and read, at 1 TB/s. Never run on a GPU.
 MAX_PAIRS_ON_THE_DEVICE = 10**9
+
+# What brings the libraries that are not always there.
+INSTALL = {"packets": "pip install 'torchcover[fast]'", "warp": "pip install 'torchcover[warp]'"}
 
 Search = Callable[[Tensor, Tensor, float, float], Tensor]
 log = logging.getLogger("torchcover")
@@ -43,19 +48,29 @@ def choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
         A function of query, points, largest distance and memory in megabytes.
 
     Raises:
-        ValueError: An unknown backend, or one for the CPU where the clouds are on another device.
-        ImportError: A backend was named whose library is missing.
+        ValueError: An unknown backend, or one for other devices than that of the clouds.
+        ImportError: A backend was named whose library is missing, or does not work.
     """
     on_cpu = query.device.type == "cpu"
     if backend == "auto":
         return _on_the_cpu(query, points) if on_cpu else _on_a_device(query, points)
     if backend not in BACKENDS:
         raise ValueError(f"backend: one of {', '.join(['auto', *BACKENDS])} is needed; got {backend!r}")
-    if backend in ON_THE_CPU and not on_cpu:
+    kinds = DEVICES.get(backend)
+    if kinds and query.device.type not in kinds:
         raise ValueError(
-            f"backend {backend!r} runs on the CPU; the clouds are on {query.device}: use 'cdist' or 'auto'"
+            f"backend {backend!r} runs on {' and '.join(kinds)}; the clouds are on {query.device}: use 'cdist' or "
+            "'auto'"
         )
-    return _search_of(backend)
+    try:
+        return _search_of(backend)
+    except ModuleNotFoundError:  # which says what to install
+        raise
+    except Exception as error:  # whatever a broken compiler raises
+        raise ImportError(
+            f"backend {backend!r} does not work here ({_first_line(error)}); try 'auto', or "
+            f"{INSTALL.get(backend, 'pip install torchcover')} anew"
+        ) from error
 
 
 def _search_of(backend: str) -> Search:
@@ -67,15 +82,21 @@ def _on_the_cpu(query: Tensor, points: Tensor) -> Search:
     if len(query) <= MAX_QUERIES_COMPARED and len(points) >= MANY_POINTS:
         return _search_of("cdist")
     # Packets are for float32, and where there are few queries, most of the time goes into sorting the points.
-    if query.dtype != torch.float64 and len(query) + len(points) >= PACKETS_PAY and _packets_work():
+    if (
+        query.dtype != torch.float64
+        and len(query) + len(points) >= PACKETS_PAY
+        and _works("packets", query.device, "the KD-tree searches")
+    ):
         return _search_of("packets")
     return _search_of("kdtree")
 
 
 def _on_a_device(query: Tensor, points: Tensor) -> Search:
+    if query.device.type == "cuda" and _works("warp", query.device, "all pairs are compared, or the CPU searches"):
+        return _search_of("warp")
     if len(query) * len(points) <= MAX_PAIRS_ON_THE_DEVICE:
         return _search_of("cdist")
-    _say_that_the_cpu_searches(str(query.device))
+    _say_that_the_cpu_searches(query.device)
     return _through_the_cpu
 
 
@@ -85,26 +106,31 @@ def _through_the_cpu(query: Tensor, points: Tensor, max_distance: float, memory_
 
 
 @lru_cache
-def _say_that_the_cpu_searches(device: str) -> None:
+def _say_that_the_cpu_searches(device: torch.device) -> None:
+    faster = f"; faster still: {INSTALL['warp']}" if device.type == "cuda" else ""
     warnings.warn(
         f"nearest: clouds on {device} with more than {MAX_PAIRS_ON_THE_DEVICE:,} pairs are searched on the CPU, which "
-        "is faster than to compare them all",
+        f"is faster than to compare them all{faster}",
         stacklevel=2,
     )
 
 
 @lru_cache
-def _packets_work() -> bool:
-    """Whether numba can be used; says once what is used instead."""
+def _works(backend: str, device: torch.device, instead: str) -> bool:
+    """Whether a backend finds a point here; says once what is used instead."""
     try:
-        _search_of("packets")
+        point = torch.zeros(1, 3, device=device)
+        _search_of(backend)(point, point, 1.0, 1.0)
     except ModuleNotFoundError as error:
-        log.info("nearest: the KD-tree searches; packets are faster: pip install 'torchcover[fast]' (%s)", error)
+        log.info("nearest: %s; %s is faster: %s (%s)", instead, backend, INSTALL[backend], error)
         return False
-    except Exception as error:  # whatever a broken compiler raises: the KD-tree is as exact
-        problem = str(error).strip().partition("\n")[0]
+    except Exception as error:  # whatever a broken compiler raises: the others are as exact
         warnings.warn(
-            f"nearest: the KD-tree searches instead of packets, as numba does not work: {problem}", stacklevel=2
+            f"nearest: {instead}, as backend {backend!r} does not work here: {_first_line(error)}", stacklevel=2
         )
         return False
     return True
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0] or type(error).__name__

@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from pykdtree.kdtree import KDTree
 from torch import Tensor
 
+from torchcover.neighbors.reach import reach
+
 # About how many points are looked at for equal ones.
 SAMPLE = 1024
 # Points in a leaf of the tree. Against pykdtree's 16, building it takes less than half the time; asking takes no more.
@@ -27,10 +29,7 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
     Returns:
         (N,) int64 indices into `points`, or -1.
     """
-    # The tree compares squares with `<`, in its own type; the caller decides what is within, from the differences.
-    # The square of the bound may not vanish: `max_distance` 0 still finds a point at distance 0.
-    least = 2 * math.sqrt(torch.finfo(query.dtype).tiny)
-    bound = None if math.isinf(max_distance) else max(max_distance * (1 + 1e-5), least)
+    bound = None if math.isinf(max_distance) else reach(max_distance, query.dtype)
     coordinates, number = _distinct(np.ascontiguousarray(points.numpy()))
     _, index = KDTree(coordinates, leafsize=LEAF).query(np.ascontiguousarray(query.numpy()), distance_upper_bound=bound)
     found = torch.from_numpy(index.astype(np.int64))

@@ -9,7 +9,6 @@ passed over. Of several points at the same squared distance in float32 the one w
 result is the same for any order, division and number of threads.
 """
 
-import math
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -20,6 +19,7 @@ from torch import Tensor
 from torchcover.neighbors import kdtree
 from torchcover.neighbors.compiled import Array, compiled, inlined
 from torchcover.neighbors.morton import INDEX_MASK, along_the_curve
+from torchcover.neighbors.reach import reach
 
 PACKET = 64  # queries
 LEAF = 16  # points
@@ -46,9 +46,7 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
     if query.dtype != torch.float32 or max(len(query), len(points)) > INDEX_MASK:
         return kdtree.search(query, points, max_distance, memory_mb)
     queries, tree_points = (np.require(cloud.numpy(), requirements=["C", "A"]) for cloud in (query, points))
-    # As for the KD-tree: squares are compared, and the caller decides what is within, from the differences.
-    least = 2 * math.sqrt(torch.finfo(torch.float32).tiny)
-    bound = HUGE if max_distance > 1e19 else np.float32(max(max_distance * (1 + 1e-5), least) ** 2)
+    bound = HUGE if max_distance > 1e19 else np.float32(reach(max_distance, torch.float32) ** 2)
     found = np.empty(len(queries), np.int64)
     with ThreadPoolExecutor(torch.get_num_threads()) as pool:
         # With a single thread the pool is never asked, and starts none.

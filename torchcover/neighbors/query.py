@@ -1,15 +1,19 @@
 """The blind spot radius, and the exact nearest-neighbour search beneath it."""
 
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from torchcover.neighbors.checks import check_cloud
 from torchcover.neighbors.choice import choose_search
 
 # Queries that are measured together on a CPU.
 PART = 32_768
+# Fewer queries than this at a time do not make much room on a GPU.
+LEAST_PART = 1024
 
 
 class Nearest(NamedTuple):
@@ -72,7 +76,7 @@ def nearest(
     once. So backends agree to the last bits, and gradients flow to both inputs whichever backend was used.
 
     * Ties: any one of the points at the same distance; which one depends on the backend, the distance does not.
-      "packets" names the smallest index among those at the same distance in float32.
+      "packets" and "warp" name the smallest index among those at the same distance in the type of the search.
     * `max_distance` is inclusive, and compared after rounding it to the type of the distance.
     * float16 and bfloat16 coordinates are widened to float32 (exactly), mixed types to the wider one.
     * At distance 0 the gradient is taken as 0.
@@ -84,7 +88,8 @@ def nearest(
         points: (M, 3) floating-point coordinates on the same device. M = 0 is allowed.
         max_distance: Only points within this distance count. A finite value makes the search faster.
         backend: "cdist" (any device), "kdtree" (CPU), "packets" (CPU, float32; needs `torchcover[fast]`; wider types
-            are left to the KD-tree) or "auto" (by device, type and size; packets only where numba is installed).
+            are left to the KD-tree), "warp" (CUDA, and slowly CPU; needs `torchcover[warp]`; never run on a GPU) or
+            "auto" (by device, type and size; packets and Warp only where they are installed).
         memory_mb: Most memory in megabytes that "cdist" may use for the pairs under comparison, beside a few arrays as
             long as the clouds.
 
@@ -94,9 +99,10 @@ def nearest(
 
     Raises:
         ValueError: A shape other than (N, 3); NaN or infinite coordinates; two devices; a negative or NaN
-            `max_distance`; an unknown backend, or one for the CPU with tensors that are not there.
+            `max_distance`; an unknown backend, or one for other devices than that of the tensors.
         TypeError: An input is not a tensor of a floating-point type.
-        ImportError: "packets" without numba.
+        ImportError: "packets" without numba, "warp" without Warp, or where these do not work.
+        MemoryError: The memory of a GPU is too small, even for a few queries at a time.
 
     Example:
         >>> points = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
@@ -111,35 +117,37 @@ def nearest(
 def _nearest(query: Tensor, points: Tensor, max_distance: float, backend: str, memory_mb: float) -> Nearest:
     query, points = _check_together(query, points, max_distance, memory_mb)
     search = choose_search(query, points, backend)
-    if len(query) == 0 or len(points) == 0:
-        index = torch.full((len(query),), -1, dtype=torch.int64, device=query.device)
-    else:
-        # Under autocast a matrix product would be rounded to bfloat16.
-        with torch.no_grad(), torch.autocast(query.device.type, enabled=False):
-            index = search(*_rescale(query, points, max_distance), memory_mb)
-    return _distance_to(query, points, index, max_distance)
+
+    def found(query: Tensor, memory_mb: float) -> Nearest:
+        if len(query) == 0 or len(points) == 0:
+            index = torch.full((len(query),), -1, dtype=torch.int64, device=query.device)
+        else:
+            # Under autocast a matrix product would be rounded to bfloat16.
+            with torch.no_grad(), torch.autocast(query.device.type, enabled=False):
+                index = search(*_rescale(query, points, max_distance), memory_mb)
+        return _distance_to(query, points, index, max_distance)
+
+    return _in_parts_that_fit(found, query, points, memory_mb)
 
 
-def check_cloud(cloud: Tensor, name: str) -> None:
-    """Raise unless `cloud` is a floating-point tensor of shape (N, 3) with finite coordinates.
-
-    Args:
-        cloud: What arrived.
-        name: What the caller calls it, for the message.
-
-    Raises:
-        TypeError: Not a tensor of a floating-point type.
-        ValueError: Another shape, or NaN or infinite coordinates (the message says how many points have them).
-    """
-    if not isinstance(cloud, Tensor) or not cloud.is_floating_point():
-        arrived = cloud.dtype if isinstance(cloud, Tensor) else type(cloud).__name__
-        raise TypeError(f"{name}: a floating-point torch tensor is needed; got {arrived}")
-    if cloud.ndim != 2 or cloud.shape[1] != 3:
-        raise ValueError(f"{name}: shape (N, 3) is needed; got {tuple(cloud.shape)}")
-    # A sum is finite only if all its terms are; one that overflows is looked at term by term.
-    if not cloud.detach().sum().isfinite() and not cloud.isfinite().all():
-        bad = int((~cloud.detach().isfinite()).any(dim=1).sum())
-        raise ValueError(f"{name}: {bad} of {len(cloud)} points have NaN or infinite coordinates; drop them first")
+def _in_parts_that_fit(
+    found: Callable[[Tensor, float], Nearest], query: Tensor, points: Tensor, memory_mb: float
+) -> Nearest:
+    """All queries at once, or as many as there is memory for on the device."""
+    part = max(1, len(query))
+    while True:
+        try:
+            parts = [found(some, memory_mb) for some in torch.split(query, part)]
+            return parts[0] if len(parts) == 1 else Nearest(*map(torch.cat, zip(*parts, strict=True)))
+        except torch.cuda.OutOfMemoryError as error:
+            # Nothing of the error is kept, for its traceback holds on to the memory.
+            said = str(error).partition("\n")[0]
+        if part <= LEAST_PART:
+            raise MemoryError(
+                f"{query.device}: the search among {len(points):,} points for {len(query):,} queries, {part:,} at a "
+                f"time: {said}"
+            )
+        part, memory_mb = -(-part // 2), memory_mb / 2
 
 
 def _check_together(query: Tensor, points: Tensor, max_distance: float, memory_mb: float) -> tuple[Tensor, Tensor]:

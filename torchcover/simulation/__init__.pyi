@@ -1,4 +1,4 @@
-from .builtin import builtin_descriptions as builtin_descriptions
+from .builtin import builtin_documents as builtin_documents
 from .builtin import builtin_names as builtin_names
 from .camera_sensor import CameraSensor as CameraSensor
 from .documents import Document as Document

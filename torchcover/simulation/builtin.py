@@ -2,6 +2,7 @@
 
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 from torchcover.files import parse_yaml
 
@@ -11,18 +12,18 @@ def builtin_names(kind: str) -> list[str]:
     return sorted(path.stem for path in builtin_folder(kind).glob("*.yaml"))
 
 
-def builtin_descriptions(kind: str) -> dict[str, str]:
-    """What the built-in documents of a kind say of themselves, by name; nothing else of them is read.
+def builtin_documents(kind: str) -> dict[str, dict[str, Any]]:
+    """The built-in documents of a kind as they are written, by name.
+
+    Args:
+        kind: "rigs", "scenarios", "vehicles" or "lidars".
 
     Example:
-        >>> builtin_descriptions("scenarios")["courtyard"].split(",")[0]
+        >>> builtin_documents("scenarios")["courtyard"]["description"].split(",")[0]
         'A static yard'
     """
     folder = builtin_folder(kind)
-    return {
-        name: parse_yaml((folder / f"{name}.yaml").read_text(encoding="utf-8"))["description"]
-        for name in builtin_names(kind)
-    }
+    return {name: parse_yaml((folder / f"{name}.yaml").read_text(encoding="utf-8")) for name in builtin_names(kind)}
 
 
 def builtin_folder(kind: str) -> Path:

@@ -11,12 +11,20 @@ from numpy.typing import NDArray
 from torchcover.coverage import Coverage
 from torchcover.report import band_figures
 
+# Takes the tag of a figure, the figure, and where on its axis.
+Taker = Callable[[str, Figure, int], Any]
+
 
 def log_maps(coverage: Coverage, loggers: Sequence[Any], prefix: str, step: int) -> list[str]:
     """Hand the maps to every logger that takes figures or images.
 
-    A logger takes them by `log_image(key, images, step)`, by `add_figure(tag, figure, step)`, or by an `add_figure` of
-    its `experiment`, as TensorBoard's.
+    A logger takes them by one of these, the first that it has:
+
+    * `log_image(key, images, step)`, as that of Weights & Biases;
+    * `add_figure(tag, figure, step)`, its own or that of its `experiment`, as TensorBoard's;
+    * `experiment.log_figure(run_id, figure, artifact_file)`, if it has a `run_id`, as MLflow's: into the file
+      `TAG/step_STEP.png` of the run;
+    * `experiment.log_figure(figure_name, figure, step)`, as Comet's.
 
     Args:
         coverage: What `CoverageMetric.compute` returned.
@@ -36,13 +44,18 @@ def log_maps(coverage: Coverage, loggers: Sequence[Any], prefix: str, step: int)
     return [type(logger).__name__ for logger, take in takers if take is None]
 
 
-def _taker(logger: Any) -> Callable[[str, Figure, int], Any] | None:  # noqa: ANN401  (any logger)
+def _taker(logger: Any) -> Taker | None:  # noqa: ANN401  (any logger)
     if callable(log_image := getattr(logger, "log_image", None)):
         return lambda tag, figure, step: log_image(key=tag, images=[rgb_image(figure)], step=step)
-    for owner in (logger, getattr(logger, "experiment", None)):
+    experiment = getattr(logger, "experiment", None)
+    for owner in (logger, experiment):
         if callable(add_figure := getattr(owner, "add_figure", None)):
-            taker: Callable[[str, Figure, int], Any] = add_figure
+            taker: Taker = add_figure
             return taker
+    if callable(log_figure := getattr(experiment, "log_figure", None)):
+        if hasattr(logger, "run_id"):
+            return lambda tag, figure, step: log_figure(logger.run_id, figure, f"{tag}/step_{step:08d}.png")
+        return lambda tag, figure, step: log_figure(figure_name=tag, figure=figure, step=step)
     return None
 
 

@@ -42,7 +42,8 @@ class CoverageCallback(Callback):
         every_n_steps: With `stage="train"`: also log the coverage of the epoch so far after every n batches.
         fixed_frames: With `stage="validation"`: say that the frames are the same at every epoch. Each is then measured
             when it first comes in a fit, later epochs log the numbers again, and maps are logged where frames were
-            added; a warning says so. With several processes, the sampler must not shuffle.
+            added; a warning says so. They do not depend on the model: `ModelCheckpoint` has nothing to monitor in
+            them. With several processes, the sampler must not shuffle.
         maps: Whether to log maps.
         rig: Which of several rigs in a frame; part of the tags if given.
         frames_of: Gives the frames of a batch: a `FrameBatch` or a sequence of `Frame`, one for each sample, in order.

@@ -1,0 +1,118 @@
+"""Numbers of the coverage under torchmetrics' own tracker and collection."""
+
+import math
+import pickle
+
+import matplotlib.pyplot as plt
+import pytest
+import torch
+from torchmetrics import MetricCollection
+from torchmetrics.wrappers import MetricTracker
+
+from torchcover import BevGrid, CoverageMetric, Region, nearest
+from torchcover.coverage import CoverageNumber, metric
+
+GRID = BevGrid(x=(0.0, 8.0), y=(-2.0, 2.0), cell=1.0, heights={"low": (-1.0, 0.5), "high": (0.5, 2.0)})
+NEAR, FAR = Region("near", (0.0, 4.0), (-2.0, 2.0)), Region("far", (4.0, 8.0), (-2.0, 2.0))
+OPTIONS = {"thresholds": (0.4, 1.0), "max_radius": 9.0}
+# Named so that neither the order of names nor that of making is that of the directions.
+NUMBERS = {
+    "d_far": ("detection_1m", FAR, "high"),
+    "a_radius": ("radius_m", NEAR, "low"),
+    "c_near": ("detection_0.4m", NEAR, "low"),
+    "b_radius": ("radius_m", FAR, "high"),
+}
+
+
+def step(seed, points=60):
+    generator = torch.Generator().manual_seed(seed)
+    clouds = [torch.rand(n, 3, generator=generator) * torch.tensor([8.0, 4.0, 3.0]) for n in (points, 200)]
+    return [cloud - torch.tensor([0.0, 2.0, 1.0]) for cloud in clouds]
+
+
+def numbers(**options):
+    return {name: CoverageNumber(*which, GRID, **OPTIONS, **options) for name, which in NUMBERS.items()}
+
+
+def scalar(coverage, name):
+    quantity, region, height = NUMBERS[name]
+    return coverage.scalars([NEAR, FAR])[f"{quantity}/{region.name}/{height}"]
+
+
+@pytest.mark.parametrize("options", [{}, {"square_metres": True, "blocks": 8}])
+def test_a_number_is_that_of_the_summary(options):
+    whole, each = CoverageMetric(GRID, **OPTIONS, **options), numbers(**options)
+    for seed in range(3):
+        clouds, weights = step(seed), torch.rand(200, generator=torch.Generator().manual_seed(seed)) + 0.1
+        for one in (whole, *each.values()):
+            one.update(*clouds, weights=weights)
+    for name, one in each.items():
+        found = pickle.loads(pickle.dumps(one)).compute()
+        assert (found.shape, found.dtype) == ((), torch.float64)
+        assert found.item() == scalar(whole.compute(), name)
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_the_tracker_finds_the_best_in_the_direction_of_the_number(name):
+    tracker = MetricTracker(numbers()[name])
+    for seed, points in enumerate((5, 400, 40)):  # the second sees most
+        tracker.increment()
+        tracker.update(*step(seed, points))
+    best, at = tracker.best_metric(return_step=True)
+    assert at == 1
+    assert best == tracker.compute_all()[1].item()
+    assert tracker.maximize == name.endswith(("far", "near"))
+
+
+def test_in_a_collection_every_number_has_its_direction_and_each_step_is_measured_once(monkeypatch):
+    searched = []
+    monkeypatch.setattr(metric, "nearest", lambda *a, **o: (searched.append(1), nearest(*a, **o))[1])
+    tracker = MetricTracker(MetricCollection(numbers()))
+    truths = []
+    for epoch, points in enumerate((5, 400, 40)):
+        tracker.increment()
+        whole = CoverageMetric(GRID, **OPTIONS)
+        for seed in range(epoch, epoch + 3):
+            searched.clear()
+            tracker.update(*step(seed, points))
+            whole.update(*step(seed, points))
+        assert len(searched) == 2  # the collection's, which knows after the first step that all share their sums
+        truths.append(whole.compute())
+        assert tracker.compute() == tracker.compute() == {name: scalar(truths[-1], name) for name in NUMBERS}
+    best, at = tracker.best_metric(return_step=True)
+    assert at == dict.fromkeys(NUMBERS, 1)
+    assert best == {name: scalar(truths[1], name) for name in NUMBERS}
+
+
+def test_a_number_that_is_unknown_is_nan_and_the_best_of_nothing():
+    tracker = MetricTracker(CoverageNumber("radius_m", NEAR, "low", GRID))
+    for reference in (torch.empty(0, 3), torch.tensor([[1.0, 0.0, 0.0]])):
+        tracker.increment()
+        tracker.update(torch.zeros(1, 3), reference)
+    assert tracker.compute_all()[1] == 1.0
+    assert math.isnan(tracker.best_metric())
+
+
+def test_a_plot_shows_the_values():
+    number = numbers()["a_radius"]
+    values = [number(*step(seed)) for seed in range(3)]
+    try:
+        figure, axes = number.plot(values)
+        assert axes.lines[0].get_ydata().tolist() == [value.item() for value in values]
+        assert number.plot(ax=axes) == (figure, axes)
+    finally:
+        plt.close("all")
+
+
+@pytest.mark.parametrize(
+    ("which", "message"),
+    [
+        (("detection_2m", NEAR, "low"), r"quantity: one of radius_m, detection_0.4m, detection_1m is needed; got"),
+        (("known_share", NEAR, "low"), r"quantity: one of radius_m"),
+        (("radius_m", NEAR, "ground"), r"height: one of low, high is needed; got 'ground'"),
+        (("radius_m", Region("wide", (0.0, 9.0), (-2.0, 2.0)), "low"), r"region 'wide' spans"),
+    ],
+)
+def test_what_there_is_not_is_refused_at_once(which, message):
+    with pytest.raises(ValueError, match=message):
+        CoverageNumber(*which, GRID, **OPTIONS)

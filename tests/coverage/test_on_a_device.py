@@ -1,0 +1,127 @@
+"""The sums of a metric on another device: nothing is mixed, nothing comes back. Without a GPU, by pretending one."""
+
+import numpy as np
+import pytest
+import torch
+from torch.overrides import TorchFunctionMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+from torchcover import BevGrid, CoverageMetric
+from torchcover.coverage import Maximum, PooledMean, Quantiles, Region, StepQuantiles
+from torchcover.detection import Boxes, box_visibility
+from torchcover.neighbors import choice
+
+GPU = torch.device("cuda", 0)
+# What takes tensors of two devices.
+MOVES = ("to", "cpu", "numpy", "tolist", "copy_")
+
+
+class OnGpu(torch.Tensor):
+    """A tensor that says that it is on a GPU."""
+
+    device = GPU
+    __torch_function__ = torch._C._disabled_torch_function_impl
+
+
+def is_device(leaf):
+    return isinstance(leaf, torch.device)
+
+
+def goal_of(name, args, kwargs):
+    """The device that is asked for, if one is."""
+    given = [kwargs.get("device"), *(args[1:] if name == "to" else ()), "cpu" if name == "cpu" else None]
+    devices = [one.device if isinstance(one, torch.Tensor) else one for one in given]
+    return next((torch.device(one) for one in devices if isinstance(one, torch.device | str)), None)
+
+
+class PretendedGpu(TorchFunctionMode):
+    """Refuses what a GPU refuses or would copy silently, and lists what is copied from it, by its size."""
+
+    def __init__(self):
+        super().__init__()
+        self.to_host = []
+
+    def __torch_function__(self, function, types, args=(), kwargs=None):
+        kwargs, name = kwargs or {}, function.__name__
+        tensors = [leaf for leaf in tree_leaves((args, kwargs)) if isinstance(leaf, torch.Tensor)]
+        there = any(isinstance(tensor, OnGpu) for tensor in tensors)
+        goal = goal_of(name, args, kwargs)
+        if there and name not in MOVES:
+            here = [tuple(tensor.shape) for tensor in tensors if not isinstance(tensor, OnGpu) and tensor.dim()]
+            assert not here, f"{name}: one on the GPU, and on the CPU {here}"
+        elif isinstance(tensors[0] if tensors else None, OnGpu) and (name != "to" or (goal and goal != GPU)):
+            self.to_host.append((name, tensors[0].numel()))
+        args, kwargs = tree_map(
+            lambda leaf: torch.device("cpu") if is_device(leaf) else leaf, (args, dict(kwargs)), is_leaf=is_device
+        )
+        kind = (OnGpu if goal == GPU else torch.Tensor) if goal else OnGpu if there else torch.Tensor
+        return tree_map(
+            lambda leaf: leaf.as_subclass(kind) if isinstance(leaf, torch.Tensor) else leaf, function(*args, **kwargs)
+        )
+
+
+def on_gpu(*clouds):
+    return [cloud.as_subclass(OnGpu) for cloud in clouds]
+
+
+def as_values(tensor):
+    return tensor.as_subclass(torch.Tensor).numpy()
+
+
+def each_step():
+    random = torch.Generator().manual_seed(0)
+    for _ in range(10):
+        sensor, reference = (torch.rand(count, 3, generator=random) * 22 - 1 for count in (60, 500))
+        yield sensor, reference, torch.rand(500, generator=random) + 0.1
+
+
+def test_the_sums_stay_on_the_device():
+    grid = BevGrid(x=(0.0, 20.0), y=(0.0, 20.0), cell=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
+    every = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), StepQuantiles((0.9,)))
+    # 8 blocks for 10 steps, so that some are added up in pairs.
+    options = {"max_radius": 30.0, "blocks": 8, "aggregations": every, "square_metres": True}
+    here, there = (CoverageMetric(grid, (0.4, 1.0), backend="cdist", **options) for _ in range(2))
+    for sensor, reference, weights in each_step():
+        here.update(sensor, reference, weights=weights)
+    with PretendedGpu() as gpu:
+        for name in there._defaults:
+            setattr(there, name, getattr(there, name).as_subclass(OnGpu))
+        for clouds in each_step():
+            sensor, reference, weights = on_gpu(*clouds)
+            there.update(sensor, reference, weights=weights)
+        found = there.compute()
+        assert gpu.to_host == []
+        assert all(isinstance(layer.values, OnGpu) for layer in found.layers.values())
+        scalars = found.scalars([Region("front", (0.0, 20.0), (5.0, 15.0))])
+    expected = here.compute()
+    for key, layer in expected.layers.items():
+        np.testing.assert_array_equal(as_values(found.layers[key].values), layer.values.numpy())
+    assert scalars == expected.scalars([Region("front", (0.0, 20.0), (5.0, 15.0))])
+    assert max((count for _, count in gpu.to_host), default=0) <= 2 * 20 * 20
+
+
+def test_what_was_seen_of_boxes_stays_on_the_device(monkeypatch):
+    monkeypatch.setattr(choice, "_works", lambda *_: False)
+    boxes = Boxes.from_rows(
+        torch.tensor([[5.0, 5, 5, 8, 8, 8, 0.3], [15.0, 15, 15, 8, 8, 8, 0], [99.0, 0, 0, 1, 1, 1, 0]])
+    )
+    sensor, reference, weights = next(each_step())
+    expected = box_visibility(sensor, reference, boxes, reference_weights=weights)
+    with PretendedGpu() as gpu:
+        clouds = on_gpu(sensor, reference)
+        found = box_visibility(*clouds, boxes, reference_weights=weights.as_subclass(OnGpu))
+    assert isinstance(found.share, OnGpu)
+    np.testing.assert_array_equal(as_values(found.share), expected.share.numpy())
+    assert all(count <= len(boxes) for _, count in gpu.to_host)
+
+
+def test_what_is_pretended_is_noticed():
+    with PretendedGpu() as gpu:
+        (there,) = on_gpu(torch.rand(4))
+        assert (there + 1).device == there[1:].device == torch.ones(2, device=there.device).device == GPU
+        with pytest.raises(AssertionError, match="add: one on the GPU, and on the CPU"):
+            there + torch.rand(4)
+        with pytest.raises(AssertionError, match="getitem"):
+            torch.rand(4)[there.long()]
+        assert there.cpu().device == there.to("cpu").device == torch.device("cpu")
+        assert gpu.to_host == [("cpu", 4), ("to", 4)]

@@ -1,0 +1,75 @@
+"""The map that `CoverageMetric.plot` draws."""
+
+import math
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import torch
+from matplotlib import colormaps
+
+from torchcover import BevGrid, CoverageMetric
+
+GRID = BevGrid(x=(5.0, 8.0), y=(-1.0, 1.0), cell=1.0, heights={"low": (-1.0, 0.0), "high": (0.0, 1.0)})
+AHEAD = torch.tensor([[5.5, -0.5, 0.5]])  # in the first cell of the band "high"
+
+
+@pytest.fixture(autouse=True)
+def closed():
+    yield
+    plt.close("all")
+
+
+def metric_over(sensor, reference, **options):
+    metric = CoverageMetric(GRID, **options)
+    metric.update(sensor, reference, weights=torch.ones(len(reference)))
+    return metric
+
+
+def drawn(axes):
+    return axes.collections[0]
+
+
+def test_the_map_holds_the_layer_in_its_place_and_the_vehicle_is_at_the_origin():
+    sensor = torch.tensor([[5.5, -0.5, 0.5]])
+    metric = metric_over(sensor, sensor + torch.tensor([[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]]), max_radius=9.0)
+    _, axes = metric.plot(height="high", layer="radius_m")
+    corners = drawn(axes).get_coordinates()
+    assert (corners[0, 0].tolist(), corners[-1, -1].tolist()) == ([5.0, -1.0], [8.0, 1.0])
+    values = drawn(axes).get_array()
+    np.testing.assert_array_equal(values.mask, [[False, True, True], [True, True, False]])
+    np.testing.assert_allclose(values.compressed(), [0.0, math.sqrt(5)], rtol=1e-6)
+    assert axes.lines[0].get_xydata().tolist() == [[0.0, 0.0]]
+    assert (axes.get_xlim(), axes.get_ylim()) == ((0.0, 8.0), (-1.0, 1.0))
+    assert axes.get_title() == "mean blind spot radius, high, 1 steps (grey: unknown)"
+
+
+@pytest.mark.parametrize(
+    ("options", "title"),
+    [
+        ({}, "detection within 0.4 m, low, 1 steps (grey: unknown)"),
+        ({"thresholds": ()}, "mean blind spot radius, low, 1 steps (grey: unknown)"),
+        ({"square_metres": True}, "detection within 0.4 m, by area, low, 1 steps (grey: unknown)"),
+    ],
+)
+def test_detection_of_the_first_band_unless_something_else_is_asked_for(options, title):
+    _, axes = metric_over(AHEAD, AHEAD, **options).plot()
+    assert axes.get_title() == title
+
+
+def test_dark_is_blind_even_where_the_radius_is_infinite_and_grey_is_unknown():
+    metric = metric_over(torch.empty(0, 3), AHEAD)
+    darkest = colormaps["viridis"](0.0)
+    for layer in ("radius_m", "detection_0.4m"):
+        figure, axes = metric.plot(layer=layer, height="high")
+        figure.canvas.draw()
+        assert tuple(drawn(axes).get_facecolors()[0]) == pytest.approx(darkest)
+        assert drawn(axes).get_facecolors()[1][3] == 0.0
+
+
+def test_layers_and_bands_that_there_are_not_are_refused():
+    metric = metric_over(AHEAD, AHEAD)
+    with pytest.raises(ValueError, match=r"layer: one of radius_m, detection_0.4m is needed; got 'detection'"):
+        metric.plot(layer="detection")
+    with pytest.raises(ValueError, match=r"height: one of low, high is needed; got 'ground'"):
+        metric.plot(height="ground")
