@@ -72,7 +72,14 @@ def scenario_picture(scenario: Scenario, rig: Rig, *, step: int = 0, seed: int =
         reference=frame.reference.numpy(),
         title=f"{scenario.name}, step {step}",
         subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name}",
+        path_m=_path_m(scene.world, time_s),
     )
+
+
+def _path_m(world: World, time_s: float) -> Matrix | None:
+    """(T, 2) where the ego is at all times, in the vehicle frame of one; None if it rests."""
+    ego = world.ego.trajectory
+    return transform(invert(ego.at(time_s)), ego.positions_m)[:, :2] if ego.moves else None
 
 
 def _actor_marks(world: World, time_s: float) -> list[ActorMark]:
