@@ -96,20 +96,24 @@ def test_on_a_bridge_one_stands_on_its_deck(tmp_path):
 
 @pytest.mark.parametrize("z", [(0.0, 0.0), (0.0, 12.0)])
 def test_houses_stand_beside_streets_and_apart(z, tmp_path):
-    world = made(tmp_path, street(z=z), built_share=1.0, ego_id="ego").world(0)
+    # At right angles, so that lots of either lie on the other and on its lots.
+    north = edge("north", ("", 3.5, [(100, -200, z[1] / 4), (100, 200, z[1] / 4)]))
+    world = made(tmp_path, street(z=z), north, built_share=1.0, ego_id="ego").world(0)
     ground, _, houses, _ = world.static
     outlines_m = houses.vertices_m.reshape(-1, 8, 3)[:, :4, :2]
     polygons = shapely.polygons(outlines_m)
-    assert len(polygons) > 15
+    assert len(polygons) > 25
     assert all(polygon.exterior.is_ccw for polygon in polygons)
-    taken = shapely.box(-50.0, -3.75, 350.0, 1.75)
-    assert shapely.distance(polygons, taken).min() > 0.4
-    assert sum(shapely.STRtree(polygons).query(polygons, predicate="intersects")[0]) == sum(range(len(polygons)))
-    sides = np.sign(outlines_m[:, :, 1].mean(axis=1))
-    assert {-1.0, 1.0} == set(sides)  # of a one-way street, too
+    # The world begins 47 m along the street.
+    taken = [shapely.box(-47.0, -3.75, 353.0, 1.75), shapely.box(51.25, -200.0, 54.75, 200.0)]
+    assert min(shapely.distance(polygons, piece).min() for piece in taken) > 0.4
+    one, other = shapely.STRtree(polygons).query(polygons, predicate="intersects")
+    assert (one == other).all()
+    middles_m = outlines_m.mean(axis=1)
+    east = np.abs(middles_m[:, 0] - 53.0) > 40.0
+    assert {-1.0, 1.0} == set(np.sign(middles_m[east, 1]))  # of a one-way street, too
     heights_m = houses.vertices_m[:, 2].reshape(-1, 8)
-    lowest = ground.vertices_m[:, 2].min()
-    assert heights_m[:, 4:].min() - lowest > 4.9
+    assert heights_m[:, 4:].min() - ground.vertices_m[:, 2].min() > 4.9
 
 
 def test_open_country_has_trees_only(tmp_path):
