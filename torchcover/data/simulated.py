@@ -47,12 +47,14 @@ class SimulatedFrames(FrameDataset):
         boxes: Whether frames have `boxes`: one for each object within the reference's range, with how many points each
             rig has in it, and how many the reference drew on it. An object's name is its own within a run of the
             scenario.
+        vehicle: What carries the rigs: a built-in vehicle, or the YAML file of one. Not given: the scenario's own ego,
+            else the vehicle that the rigs name, else an SUV.
 
     Raises:
         FileNotFoundError: An unknown name or file.
-        ValueError: A document that is not valid, neither or both of `rig` and `rigs`, a number of steps below 1, a
-            negative seed, a time that is no multiple of the time step. From indexing: a sensor inside a body or
-            below the ground, an actor that overlaps the ego.
+        ValueError: A document that is not valid, neither or both of `rig` and `rigs`, rigs that name different vehicles
+            in a scenario that leaves it to them, a number of steps below 1, a negative seed, a time that is no multiple
+            of the time step. From indexing: a sensor inside a body or below the ground, an actor that overlaps the ego.
 
     Example:
         >>> frames = SimulatedFrames("courtyard", "front_roof_128", steps=2, seed=0)
@@ -71,6 +73,7 @@ class SimulatedFrames(FrameDataset):
         reference_sensor: ReferenceSensor | None = None,
         every_s: float | None = None,
         boxes: bool = False,
+        vehicle: str | Path | None = None,
     ) -> None:
         if not 1 <= steps <= MAX_STEPS:
             raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
@@ -82,6 +85,7 @@ class SimulatedFrames(FrameDataset):
             reference_sensor,
             seed=seed,
             every_s=every_s,
+            vehicle=vehicle,
         )
         self.steps = steps
         self.boxes = boxes
@@ -123,8 +127,13 @@ class SimulatedFrames(FrameDataset):
 
     @property
     def description(self) -> Mapping[str, object]:
-        """The scenario's name and the seed."""
-        return {"scenario": self.scenario.name, "frames": None, "seed": self.seed}
+        """The names of the scenario and of the vehicle, and the seed."""
+        return {
+            "scenario": self.scenario.name,
+            "vehicle": self.scenario.ego_name,
+            "frames": None,
+            "seed": self.seed,
+        }
 
     @property
     def weight_kind(self) -> WeightKind | None:

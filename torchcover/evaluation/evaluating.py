@@ -1,6 +1,7 @@
 """Evaluate a rig, or compare several: what a notebook calls, and the command line too."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from torchcover.coverage import Aggregation, Measure
 from torchcover.evaluation.checkpoint import AnyCheckpoint
@@ -21,6 +22,7 @@ def evaluate(
     frames: AnyFrames | None = None,
     steps: int | None = None,
     seed: int = 0,
+    vehicle: str | Path | None = None,
     cell_m: float = 0.25,
     thresholds: AnyThresholds = (0.4,),
     aggregations: Sequence[Aggregation] = (),
@@ -46,6 +48,8 @@ def evaluate(
         frames: A recording, or any source of frames, instead.
         steps: Steps to simulate (64; with a target error at most, 4096), or frames to use at most (all).
         seed: Seed of the simulation.
+        vehicle: What carries the rig: a built-in vehicle, or the YAML file of one. Not given: the scenario's own ego,
+            else the vehicle that the rig names, else an SUV.
         cell_m: Side of a grid cell in metres.
         thresholds: Detection thresholds in metres, or a single one.
         aggregations: Maps beside the mean of means, as in `CoverageMetric`.
@@ -97,6 +101,7 @@ def compare(
     frames: AnyFrames | None = None,
     steps: int | None = None,
     seed: int = 0,
+    vehicle: str | Path | None = None,
     cell_m: float = 0.25,
     thresholds: AnyThresholds = (0.4,),
     aggregations: Sequence[Aggregation] = (),
@@ -123,6 +128,7 @@ def compare(
         frames: Frames of several rigs.
         steps: Steps.
         seed: Seed.
+        vehicle: What carries all rigs; needed where they name different ones.
         cell_m: Side of a grid cell in metres.
         thresholds: Detection thresholds in metres.
         aggregations: Maps beside the mean of means.

@@ -35,7 +35,7 @@ class Result:
         regions: Those that numbers are given for.
         run: How the run went; None if nobody knows, for they were saved.
         rigs: What the user called each rig, by its name; None for the rig of a recording that nobody named.
-        source: Where the frames came from: `scenario`, `frames`, `seed`.
+        source: Where the frames came from: `scenario`, `vehicle`, `frames`, `seed`.
         reference_record: Where the reference comes from, as `FrameSource.reference_record` says; None if nobody knows.
         device: Where it ran; None if nobody knows.
         target_error: What was aimed at.
@@ -196,7 +196,9 @@ class Result:
             return [*on_failure, *record["notes"]]
         rays, every_s = record["rays_per_step"], record["every_s"]
         sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
-        return [*on_failure, sensor, *self._on_repetitions]
+        vehicle = self.source.get("vehicle")
+        carried = [f"Vehicle: {vehicle}."] if vehicle else []
+        return [*on_failure, *carried, sensor, *self._on_repetitions]
 
     @property
     def cut_short(self) -> str:

@@ -23,6 +23,7 @@ class StudyPlan:
     Args:
         rig: A built-in name or a YAML file.
         scenario: Likewise.
+        vehicle: What carries the rig, as in `evaluate`.
         rays: Numbers of rays of the reference sensor at each step.
         steps: Most steps of a run.
         runs: Runs of so many steps that errors are averaged over; shorter ones are their parts, so that there are more.
@@ -40,6 +41,7 @@ class StudyPlan:
 
     rig: str | Path
     scenario: str | Path = DEFAULT_SCENARIO
+    vehicle: str | None = None
     rays: tuple[int, ...] = (1024, 4096, 16_384)
     steps: int = 128
     runs: int = 2
@@ -66,7 +68,14 @@ class StudyPlan:
     def frames(self, seed: int, steps: int) -> SimulatedFrames:
         """The frames of a run."""
         scenario = Scenario.load(self.scenario)
-        return SimulatedFrames(scenario, self.rig, steps=steps, seed=seed, every_s=spread_s(scenario, self.every_s))
+        return SimulatedFrames(
+            scenario,
+            self.rig,
+            steps=steps,
+            seed=seed,
+            every_s=spread_s(scenario, self.every_s),
+            vehicle=self.vehicle,
+        )
 
     def metric(self, blocks: int) -> CoverageMetric:
         """An empty metric."""

@@ -3,6 +3,7 @@
 import copy
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 
 from torchcover.geometry import BoundingBox
 from torchcover.simulation.disturbance import disturb
+from torchcover.simulation.ego import with_ego
 from torchcover.simulation.instant import Instant, Scan
 from torchcover.simulation.labels import Label, labels
 from torchcover.simulation.memory import check_fits
@@ -39,9 +41,11 @@ class Simulator:
         reference_sensor: The reference sensor.
         seed: Seed of the traffic, of the reference sensor, and of noise and drop-out.
         every_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
+        vehicle: What carries the rigs, as in `with_ego`.
 
     Raises:
-        ValueError: A negative seed, a time that is no multiple of the time step, more rays than there is memory for.
+        ValueError: Rigs that name different vehicles, a negative seed, a time that is no multiple of the time step,
+            more rays than there is memory for.
 
     Example:
         >>> from torchcover.simulation import PaperReference
@@ -60,10 +64,11 @@ class Simulator:
         *,
         seed: int = 0,
         every_s: float | None = None,
+        vehicle: str | Path | None = None,
     ) -> None:
         if seed < 0:
             raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
-        self.scenario = scenario
+        self.scenario = scenario = with_ego(scenario, rigs, vehicle)
         self.rigs = rigs
         self.reference_sensor = reference_sensor
         self.seed = seed
