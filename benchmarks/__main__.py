@@ -21,6 +21,7 @@ BENCHMARKS = (
     "even_reference",
     "ray_budget",
     "recorded_measure",
+    "reading",
     "accumulated_reference",
     "calibration",
     "training_overhead",
@@ -30,6 +31,7 @@ BENCHMARKS = (
     "resumes",
     "scaling",
     "mutated_files",
+    "targets",
 )
 
 

@@ -22,11 +22,12 @@ from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
 from torchcover.data.recordings import kitti_files
 from torchcover.data.recordings.argoverse2 import read_feather
-from torchcover.data.recordings.carla import read_carla_sensors
+from torchcover.data.recordings.carla_files import read_carla_sensors
 from torchcover.data.recordings.folder_settings import read_folder_settings
 from torchcover.data.recordings.folder_tables import PoseTable
 from torchcover.data.recordings.folder_tables import read_boxes as read_labels
 from torchcover.data.recordings.json_tables import read_table
+from torchcover.data.recordings.ros2 import Ros2
 from torchcover.data.recordings.tracklets import read_tracklets
 from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
 from torchcover.simulation import Rig, Scenario
@@ -231,6 +232,16 @@ def recording_files(folder):
     ):
         yield Kind(path.name, path.read_bytes(), read)
     yield Kind("label_2.txt", KITTI_LABEL, kitti_files.read_labels)
+    yield Kind("drive.mcap", (places["ros2"] / "drive.mcap").read_bytes(), bag)
+    yield Kind("drive.db3", (places["ros2 database"] / "drive.db3").read_bytes(), bag)
+
+
+def bag(path):
+    """Read all of a bag."""
+    recording = Ros2(path)
+    for index in recording.frames:
+        for sensor in recording.sensors:
+            recording.scan(sensor, index)
 
 
 KITTI_LABEL = b"Car 0.00 0 1.5 100 100 200 200 1.5 1.6 3.9 1.0 1.6 20.0 1.5\n" * 3

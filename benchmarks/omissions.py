@@ -7,9 +7,9 @@ import numpy as np
 from benchmarks.timing import compare, table
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import PaperReference, Rig, Scenario
-from torchcover.simulation.instant import Scan, cast_from, rotate
+from torchcover.simulation.instant import Scan, cast_from
 from torchcover.simulation.mounted import MountedSensor
-from torchcover.simulation.rays import into_tiles
+from torchcover.simulation.rays import into_tiles, rotate
 from torchcover.simulation.scene import Scene
 
 RANGE_M = 120.0

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from benchmarks.timing import table
-from torchcover.data import SimulatedFrames, reference_called
+from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.checkpoint_file import write_checkpoint
 from torchcover.evaluation.settings import new_metric
@@ -75,8 +75,9 @@ def frames_of(steps, *, rays=16_384, rigs=1, scenario=SCENARIO):
 
 
 def observers_of(frames, cell_m=0.25):
+    asked = RegionsOfInterest().around(cell_m=cell_m)
     return [
-        CoverageObserver(new_metric(cell_m, (0.4,), torch.device("cpu"), square_metres=True), name)
+        CoverageObserver(new_metric(asked, (0.4,), torch.device("cpu"), square_metres=True), name)
         for name in frames.rigs
     ]
 

@@ -3,6 +3,7 @@
 import doctest
 import re
 import shlex
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -10,8 +11,10 @@ import typer
 from typer.main import get_command
 
 from torchcover.cli.app import app
+from torchcover.data import RegionsOfInterest
 from torchcover.data.recordings.folder_settings import read_folder_settings
 from torchcover.simulation import Rig, Scenario
+from torchcover.targets import Requirements
 
 ROOT = Path(__file__).parent.parent
 PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
@@ -41,7 +44,7 @@ def commands():
     for parameter in blocks("console"):
         for line in re.sub(r"\\\n", " ", parameter.values[0]).splitlines():
             if line.startswith("$ "):
-                words = shlex.split(line[2:], comments=True)
+                words = list(takewhile(lambda word: word not in (">", "|"), shlex.split(line[2:], comments=True)))
                 yield pytest.param(words, id=f"{parameter.id} {' '.join(words)}"[:80])
 
 
@@ -65,7 +68,7 @@ def test_a_command_can_be_given(words):
 
 
 # Whatever reads a document of YAML.
-READERS = (Rig.load, Scenario.load, read_folder_settings)
+READERS = (Rig.load, Scenario.load, RegionsOfInterest.load, Requirements.load, read_folder_settings)
 
 
 @pytest.mark.parametrize("text", list(blocks("yaml")))

@@ -224,7 +224,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         ),
         (
             ["evaluate", "front_roof_128", "--reference", "even", "--rays", "7"],
-            "rays: at least 2 for each of 4 areas are needed; got 7",
+            "rays: at least 2 for each of 5 areas are needed; got 7",
         ),
         (["evaluate", "front_roof_128", "--estimate", "best"], "'best' is not one of 'area', 'known'"),
         (
@@ -343,7 +343,7 @@ def test_a_grid_that_does_not_fit_into_memory_ends_in_one_line(torchcover, tmp_p
     assert code == 2
     assert complaints.strip() == (
         "torchcover: a cell of 0.05 m: there is not enough memory for the sums of 12,800,000 cells in 16 blocks; "
-        "use larger cells"
+        "use larger cells, or a smaller grid"
     )
 
 

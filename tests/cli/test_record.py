@@ -10,7 +10,9 @@ from torchcover import Coverage
 def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_path):
     options = ("--scenario", worlds / "yard.yaml", "--steps", 3, "--seed", 2, "--rays", 1024)
     measured, read, recording = (tmp_path / name for name in ("simulated", "read", "recording"))
-    code, printed, _ = torchcover("record", worlds / "both.yaml", *options, "--out", recording)
+    code, printed, told = torchcover("record", worlds / "both.yaml", *options, "--out", recording)
+    assert "record" in told
+    assert "3/3" in told  # the bar
     assert (code, len(printed.splitlines())) == (0, 1)
     assert printed.startswith(f"Wrote 3 frames to {recording}; ")
     cell = ("--cell", 1, "--threshold", 0.4, "--threshold", 1)

@@ -180,6 +180,7 @@ def test_everything_that_happened_is_counted():
         "empty_sensor_steps": 1,
         "empty_reference_steps": 1,
         "saturated_points": 4,
+        "inside_points": 5,
         "outside_points": 2,
     }
 

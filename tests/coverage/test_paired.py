@@ -8,8 +8,7 @@ import torch
 from scipy import stats
 
 from torchcover.coverage import BevGrid, CoverageMetric, Region, differences
-from torchcover.coverage.intervals import student_t95
-from torchcover.coverage.paired import is_significant
+from torchcover.coverage.intervals import is_significant, student_t95
 
 SQUARE = BevGrid(x=(0.0, 10.0), y=(-5.0, 5.0), cell=1.0)
 NEAR = Region("near", (0.0, 5.0), (-5.0, 5.0))

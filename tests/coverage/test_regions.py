@@ -77,3 +77,46 @@ def test_regions_without_a_cell_are_found_before_a_run():
     check_regions([Region("all", x=GRID.x, y=GRID.y)], GRID)
     with pytest.raises(ValueError, match="region 'gap' holds no cell centre; use smaller cells than"):
         check_regions([Region("gap", x=(0.3, 0.7), y=(0.0, 1.0))], GRID)
+
+
+@pytest.mark.parametrize(
+    ("x", "y"), [((-4.0, 4.0), (-2.0, 2.0)), ((0.25, 1.25), (-0.3, 0.25)), ((-1.1, 0.6), (0.75, 2.0))]
+)
+def test_a_rectangle_given_by_its_corners_is_the_rectangle(x, y):
+    # 0.25, -0.25 and so on are centres of cells: on an edge.
+    corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
+    for order in (corners, corners[::-1], [*corners, corners[0]]):
+        polygon = Region.polygon("r", order)
+        assert (polygon.x, polygon.y) == (x, y)
+        assert torch.equal(polygon.mask(GRID), Region("r", x, y).mask(GRID))
+
+
+def test_polygons_that_share_an_edge_share_no_cell_and_leave_none_out():
+    # The edge goes through centres.
+    left = Region.polygon("left", [(-4.0, -2.0), (0.25, -2.0), (2.25, 2.0), (-4.0, 2.0)])
+    right = Region.polygon("right", [(0.25, -2.0), (4.0, -2.0), (4.0, 2.0), (2.25, 2.0)])
+    assert torch.equal(left.mask(GRID), ~right.mask(GRID))
+    assert 0 < left.mask(GRID).sum() < 128
+
+
+@pytest.mark.parametrize(
+    ("corners", "message"),
+    [
+        ([(0.0, 0.0), (1.0, 1.0), (1.0, 0.0), (0.0, 1.0)], r"its edges cross .*Self-intersection\[0.5 0.5\]"),
+        ([(0.0, 0.0), (1.0, 0.0)], "three different corners or more are needed; got 2"),
+        ([(0.0, 0.0), (1.0, 0.0), (math.nan, 1.0)], "corners need finite coordinates"),
+    ],
+)
+def test_corners_that_are_no_polygon_are_refused(corners, message):
+    with pytest.raises(ValueError, match=f"region 'r': {message}"):
+        Region.polygon("r", corners)
+
+
+def test_a_polygon_has_the_bounds_of_its_corners():
+    with pytest.raises(ValueError, match="region 'r': its corners have other bounds than"):
+        Region("r", (0.0, 2.0), (0.0, 1.0), ((0.0, 0.0), (1.0, 0.0), (0.0, 1.0)))
+
+
+def test_a_name_is_given_once():
+    with pytest.raises(ValueError, match="regions: each name may be given once; got 'r' again"):
+        check_regions([Region("r", (0.0, 1.0), (0.0, 1.0)), Region("r", (0.0, 2.0), (0.0, 1.0))], GRID)

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from tests.data.bags import ros2, ros2_database
 from torchcover.data.recordings import argoverse2, kitti_files, nuscenes
 from torchcover.geometry import euler_from_rotation, invert, rigid, rotation_from_euler, transform
 
@@ -197,4 +198,53 @@ def plain_folder(drive, root):
     return root
 
 
-LAYOUTS = {"kitti_raw": kitti_raw, "nuscenes": nuscenes_tables, "argoverse2": argoverse2_log, "folder": plain_folder}
+CARLA_POSE = ("x", "y", "z", "roll", "pitch", "yaw")
+CARLA_BOX = ("id", "category", *CARLA_POSE, "extent_x", "extent_y", "extent_z")
+
+
+def carla_row(matrix):
+    """x, y, z, roll, pitch, yaw of a right-handed pose in CARLA's axes."""
+    yaw, pitch, roll = euler_from_rotation(matrix[:3, :3])
+    x, y, z = matrix[:3, 3]
+    return [float(number) for number in (x, -y, z, roll, -pitch, -yaw)]
+
+
+def carla_folder(drive, root):
+    """Two ticks an instant, `left` makes half a turn in each; the origin of the actor is not under its middle."""
+    vehicle_T_actor = rigid(np.eye(3), [-0.1, 0.2, 0.0])
+    box = {"location": {"x": 0.1, "y": 0.2, "z": 0.75}, "extent": {"x": 2.0, "y": 1.0, "z": 0.75}}
+    (root / "vehicle.json").write_text(json.dumps(box))
+    listed, poses = [], []
+    for sensor in drive.sensors:
+        mount = carla_row(invert(vehicle_T_actor) @ drive.vehicle_T_sensor(sensor))
+        turns = {"rotation_frequency": "10" if sensor == "left" else "20"}
+        listed.append(
+            {"id": sensor, "type": LIDAR_OF_CARLA, **dict(zip(CARLA_POSE, mount, strict=True)), **turns, "range": "90"}
+        )
+        (root / sensor).mkdir()
+    (root / "sensors.json").write_text(json.dumps(listed))
+    for tick in range(2 * drive.steps):
+        instant, name = (tick - 1) / 2, f"{tick + 90}"
+        poses.append([name, 0.1 * instant + 7, *carla_row(drive.world_T_vehicle(instant) @ vehicle_T_actor)])
+        for sensor in drive.sensors:
+            points_m = drive.scan(sensor, instant).points_m * [1, -1, 1]
+            half = points_m[tick % 2 :: 2] if sensor == "left" else points_m
+            np.save(root / sensor / f"{name}.npy", np.c_[half, np.ones(len(half))].astype(np.float32))
+        row = ["17", "vehicle.car", *carla_row(drive.world_T_car(instant)), 2.0, 1.0, 0.75]
+        table(root / "boxes" / f"{name}.csv", CARLA_BOX, [row])
+    table(root / "poses.csv", ("frame", "time_s", *CARLA_POSE), poses)
+    return root
+
+
+LIDAR_OF_CARLA = "sensor.lidar.ray_cast"
+
+
+LAYOUTS = {
+    "kitti_raw": kitti_raw,
+    "nuscenes": nuscenes_tables,
+    "argoverse2": argoverse2_log,
+    "carla": carla_folder,
+    "folder": plain_folder,
+    "ros2": ros2,
+    "ros2 database": ros2_database,
+}

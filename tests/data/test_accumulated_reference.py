@@ -8,6 +8,7 @@ import torch
 
 from tests.data.drives import Drive
 from torchcover.data import AccumulatedReference, RecordedFrames
+from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox, invert, transform
 
 FAR_M = (513_248.0, 5_403_655.0, 260.0)
@@ -35,6 +36,21 @@ def test_every_point_is_where_its_surface_is_at_the_instant(origin_m, index):
     assert len(reference) == len(wall_m) + len(car_m)  # each once, however often it was seen
     assert distances_m(reference, np.concatenate([wall_m, car_m])).max() < 1e-4
     assert distances_m(car_m, reference).max() < 1e-4
+
+
+class TightlyDrawn(Drive):
+    """The boxes end 8 cm before the surfaces."""
+
+    def boxes(self, index):
+        rows = super().boxes(index).rows
+        rows[:, 3:5] -= 0.2
+        return Boxes.from_rows(rows, ids=("car",))
+
+
+def test_what_sticks_out_of_its_box_moves_with_it():
+    drive = TightlyDrawn()
+    reference = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2].reference
+    assert distances_m(reference, np.concatenate([standing(drive, 2), moving(drive, 2)])).max() < 1e-4
 
 
 def test_nothing_says_that_it_moves_so_it_is_smeared():

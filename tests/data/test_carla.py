@@ -1,14 +1,17 @@
-"""A folder of CARLA's LiDARs: its left-handed axes are turned, in clouds, mounts and poses alike."""
+"""A folder of CARLA: its left-handed axes are turned, in clouds, mounts and poses alike; parts of turns are joined."""
 
 import json
 
 import numpy as np
 import pytest
+import torch
+from PIL import Image
 
-from tests.data.layouts import table
+from tests.data.layouts import CARLA_BOX, table
 from tests.data.test_accumulated_reference import distances_m
-from torchcover.data import BadFrameError, RecordedFrames, open_recording
+from torchcover.data import AccumulatedReference, BadFrameError, RecordedFrames, open_recording
 from torchcover.data.recordings.carla import Carla
+from torchcover.files import BadFileError
 from torchcover.geometry import transform
 
 MOUNT = {"x": 0.7, "y": 0.4, "z": 1.6, "roll": 5.0, "pitch": 10.0, "yaw": 30.0}
@@ -77,23 +80,133 @@ def test_poses_are_turned_as_the_clouds_are(tmp_path):
     assert len(RecordedFrames(recording)[0].reference) > 10  # of the other frame
 
 
-def test_frames_that_come_faster_than_turns_are_told(tmp_path):
-    recorded(tmp_path)
-    listed = json.loads((tmp_path / "sensors.json").read_text())
-    table(tmp_path / "poses.csv", ("frame", "time_s", *POSE), [("8", 0.0, *[0.0] * 6), ("10", 0.05, *[0.0] * 6)])
-    listed[1]["rotation_frequency"] = "20"
-    (tmp_path / "sensors.json").write_text(json.dumps(listed))
-    open_recording(tmp_path)
-    listed[1]["rotation_frequency"] = 10.0
-    (tmp_path / "sensors.json").write_text(json.dumps(listed))
-    with pytest.warns(UserWarning, match=r"roof: a file holds 50% of a turn at most \(10 turns a second, "):
+def turning(folder, rotation_frequency, ticks_s=(0.0, 0.05, 0.1, 0.15, 0.2)):
+    """A LiDAR at the vehicle's origin that sees one point of the world and one of the vehicle's own, x = 1, a tick."""
+    (folder / "roof").mkdir(parents=True)
+    listed = [{"id": "roof", "type": "sensor.lidar.ray_cast", "rotation_frequency": rotation_frequency}]
+    (folder / "sensors.json").write_text(json.dumps(listed))
+    rows = []
+    for tick, time_s in enumerate(ticks_s):
+        rows.append((tick, time_s, 2.0 * tick, 0.0, 0.0, 0.0, 0.0, 90.0))  # drives on, its nose to the right
+        np.save(folder / "roof" / f"{tick}.npy", np.array([[0.0, 10.0 + tick, 0.5], [1.0, 0.0, 0.5]]))
+    table(folder / "poses.csv", ("frame", "time_s", *POSE), rows)
+    box = {"location": {"x": 0, "y": 0, "z": 0.75}, "extent": {"x": 2, "y": 1, "z": 0.75}}
+    (folder / "vehicle.json").write_text(json.dumps(box))
+    return folder
+
+
+def test_parts_of_a_turn_are_joined_where_the_world_stands_still(tmp_path):
+    recording = open_recording(turning(tmp_path, 10.0))
+    assert (recording.names, recording.times_s.tolist()) == (("1", "3"), [0.05, 0.15])  # the fifth makes no turn
+    for index, last in enumerate((1, 3)):
+        scan = recording.scan("roof", index)
+        assert scan.vehicle_T_sensor is None
+        # Nose to the right: the world's x is the vehicle's left. The earlier part is 2 m further back.
+        expected = [[0.0, -10.0 - last, 0.5], [1, 0, 0.5], [0.0, -10.0 - (last - 1) - 2.0, 0.5], [1, 0, 0.5]]
+        np.testing.assert_allclose(scan.points_m, expected, atol=1e-12)
+        np.testing.assert_allclose(recording.world_T_vehicle(index)[:3, 3], [2.0 * last, 0.0, 0.0], atol=1e-12)
+    frames = RecordedFrames(recording, reference=AccumulatedReference(1.0))
+    assert len(frames[0].sensor) == 2
+    assert frames[0].counts["sensor_own_vehicle"] == 2
+
+
+@pytest.mark.parametrize(
+    ("turns", "names"), [(20.0, "01234"), (19.9, "01234"), (7.0, "2"), (4.0, "4"), (50.0, "01234")]
+)
+def test_an_instant_is_as_many_frames_as_make_a_turn(tmp_path, turns, names):
+    assert "".join(open_recording(turning(tmp_path, turns)).names) == names
+
+
+def test_too_few_frames_for_a_turn(tmp_path):
+    with pytest.raises(ValueError, match=r"a turn of its LiDARs takes 20 frames; there are 5"):
+        open_recording(turning(tmp_path, 1.0))
+
+
+def test_without_times_a_sector_is_told_as_one(tmp_path):
+    turning(tmp_path, 10.0)
+    (tmp_path / "poses.csv").unlink()
+    with pytest.warns(UserWarning, match=r"0\.npy: roof: nothing in 270 degrees; if a file holds a part of a turn, "):
+        open_recording(tmp_path)
+    recorded(tmp_path / "whole")
+    listed = json.loads((tmp_path / "whole" / "sensors.json").read_text())
+    listed[1]["rotation_frequency"] = 10
+    (tmp_path / "whole" / "sensors.json").write_text(json.dumps(listed))
+    open_recording(tmp_path / "whole")  # 50 points everywhere around
+
+
+CAMERA = {"id": "head", "type": "sensor.camera.depth", "image_size_x": "4", "image_size_y": "3", "fov": "80", **MOUNT}
+
+
+def photographed(folder, codes, **changed):
+    """A depth image with these codes in 24 bits, as CARLA's `save_to_disk` writes it."""
+    (folder / "head").mkdir(parents=True)
+    (folder / "sensors.json").write_text(json.dumps([{**CAMERA, **changed}]))
+    bits = np.array(codes)[..., None] >> np.array([0, 8, 16])
+    image = np.concatenate([(bits & 255).astype(np.uint8), np.full((*bits.shape[:2], 1), 255, np.uint8)], axis=2)
+    Image.fromarray(image).save(folder / "head" / "000.png")
+    return folder
+
+
+def test_pixels_of_a_depth_camera_are_where_carla_has_them(tmp_path):
+    codes = np.random.default_rng(1).integers(10_000, 2_000_000, (3, 4))
+    codes[0, 1], codes[2, 2] = 2**24 - 1, 0  # sky, and nothing at all
+    recording = open_recording(photographed(tmp_path, codes))
+    (seen,) = [transform(scan.vehicle_T_sensor, scan.points_m) for scan in [recording.scan("head", 0)]]
+    focal = 4 / (2 * np.tan(np.deg2rad(80) / 2))
+    expected = []
+    for (row, column), code in np.ndenumerate(codes):
+        if 0 < code < 2**24 - 1:
+            depth_m = 1000 * code / (2**24 - 1)
+            right, down = (column + 0.5 - 2) / focal, (row + 0.5 - 1.5) / focal
+            expected.append([depth_m, depth_m * right, -depth_m * down])
+    np.testing.assert_allclose(seen, mirrored(transform(carla_matrix(**MOUNT), np.array(expected))), atol=1e-4)
+
+
+def test_a_camera_that_does_not_fit_its_image_is_told(tmp_path):
+    photographed(tmp_path, np.ones((5, 4), int))
+    with pytest.raises(BadFileError, match=r"head.000\.png: .*depth must be \(3, 4\)"):
+        open_recording(tmp_path).scan("head", 0)
+    photographed(tmp_path / "other", np.ones((3, 4), int), fov=None)
+    with pytest.raises(ValueError, match=r"sensors\.json: .*a camera needs width .* and fov, in degrees"):
+        open_recording(tmp_path / "other")
+    photographed(tmp_path / "cloud", np.ones((3, 4), int))
+    np.save(tmp_path / "cloud" / "head" / "001.npy", np.zeros((1, 3)))
+    with pytest.raises(ValueError, match=r"001\.npy: not a depth image; allowed are files ending in \.png"):
+        open_recording(tmp_path / "cloud")
+
+
+def test_objects_are_where_they_are_seen_from_the_vehicle(tmp_path):
+    turning(tmp_path, 20.0)
+    row = ["17", "walker", 4.0, 10.0, 1.0, 0.0, 0.0, 90.0, 0.3, 0.2, 0.9]
+    for tick in range(5):
+        table(tmp_path / "boxes" / f"{tick}.csv", (*CARLA_BOX, "velocity_x", "velocity_y"), [[*row, 3.0, 0.5]])
+    boxes = open_recording(tmp_path).boxes(1)  # the vehicle is at x = 2, its nose to the right
+    torch.testing.assert_close(boxes.rows, torch.tensor([[10.0, 2.0, 1.0, 0.6, 0.4, 1.8, 0.0]]), atol=1e-6, rtol=0)
+    torch.testing.assert_close(boxes.velocity_mps, torch.tensor([[0.5, 3.0]]), atol=1e-6, rtol=0)
+    assert (boxes.ids, boxes.categories) == (("17",), ("walker",))
+    (tmp_path / "poses.csv").unlink()
+    with pytest.raises(ValueError, match=r"boxes/ are in the world; poses\.csv is needed"):
+        open_recording(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("box", "message"),
+    [
+        ("{extent: {x: 1, y: 1, z: 1}}", "location: Field required"),
+        ("[]", "location and extent, each with x, y, z"),
+        ("{location: {x: 0, y: 0, z: 0}, extent: {x: 0, y: 1, z: 1}}", "lower < upper on every axis"),
+    ],
+)
+def test_a_bad_box_of_the_vehicle_is_told(tmp_path, box, message):
+    (recorded(tmp_path) / "vehicle.json").write_text(box)
+    with pytest.raises(BadFileError, match=rf"vehicle\.json: .*{message}"):
         open_recording(tmp_path)
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("[]", r"LiDARs \(.*\) of different id are needed; got none"),
+        ("[]", r"LiDARs \(.*\) or depth cameras \(.*\) of different id are needed; got none"),
         ("{}", r"a list of sensors with id and type is needed; : Input should be a valid list"),
         ('[{"id": "../a", "type": "sensor.lidar.ray_cast"}]', r"0\.id: String should match pattern"),
         ('[{"type": "sensor.lidar.ray_cast"}]', r"0\.id: Field required"),

@@ -153,6 +153,9 @@ def test_bad_boxes_are_a_bad_frame(tmp_path, row, message):
         file.write(row)
     with pytest.raises(BadFrameError, match=rf"^f2 \(frame 0\): .*f2\.csv: {message}"):
         RecordedFrames(tmp_path)[0]
+    table(tmp_path / "boxes" / "f2.csv", (*BOX, "drawn_points", "id", "category"), [(*[1.0] * 7, 0.5, "", "")])
+    with pytest.raises(BadFrameError, match=r"f2\.csv: drawn_points: whole numbers are needed; got 0\.5"):
+        RecordedFrames(tmp_path)[0]
     (tmp_path / "boxes" / "f2.csv").unlink()
     with pytest.raises(ValueError, match=r"1 missing in boxes/ \(f2\)"):
         RecordedFrames(tmp_path)

@@ -51,6 +51,9 @@ def test_a_plain_folder_gives_the_frames_that_were_written(both, tmp_path):
         assert torch.equal(read.reference, written.reference)
         assert torch.equal(read.reference_weights, written.reference_weights)
         assert torch.equal(read.boxes.rows, written.boxes.rows)
+        assert written.boxes.velocity_mps.isfinite().all()
+        assert torch.equal(read.boxes.velocity_mps, written.boxes.velocity_mps)
+        assert torch.equal(read.boxes.drawn_points, written.boxes.drawn_points)
         assert (read.boxes.ids, read.boxes.categories) == (written.boxes.ids, written.boxes.categories)
         assert torch.equal(*(next(iter(frame.boxes.hits.values())) for frame in (read, written)))
         assert read.place_in_time == written.place_in_time

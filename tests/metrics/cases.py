@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torchmetrics import Metric
 
-from torchcover import BevGrid, CoverageMetric
+from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.coverage import Maximum, PooledMean, Quantiles, StepQuantiles
 from torchcover.detection import Boxes, RecallByVisibility
 
@@ -100,6 +100,31 @@ def coverage(steps: int, changes: Mapping[str, Step], **options: Any) -> Case:
     )
 
 
+def by_sensor(steps: int) -> Case:
+    def apart(step: Step) -> Step:
+        return {**step, "sensor": {"roof": step["sensor"][:12], "rear": step["sensor"][12:]}}
+
+    regions = (
+        Region("left", (-2.0, 2.0), (0.0, 1.0)),
+        Region.polygon("corner", [(-2.0, -1.0), (2.0, -1.0), (0.0, 1.0)]),
+    )
+    whole = coverage(
+        steps,
+        {
+            "sensors in another order": {"sensors": ("rear", "roof")},
+            "regions": {"regions": regions[:1]},
+            "square_metres": {"square_metres": False},
+        },
+        blocks=8,
+        square_metres=True,
+        sensors=("roof", "rear"),
+        regions=regions,
+    )
+    # Regions are within the other cases' grid only.
+    changes = {name: change for name, change in whole.changes.items() if name != "grid"}
+    return replace(whole, steps=[apart(step) for step in whole.steps], bland=apart(whole.bland), changes=changes)
+
+
 # Detection.
 
 
@@ -132,6 +157,7 @@ CASES = {
         blocks=8,
         aggregations=ALL,
     ),
+    "coverage, by sensor": by_sensor(24),
     "coverage, by area": coverage(24, {"square_metres": {"square_metres": False}}, blocks=8, square_metres=True),
     "recall": Case(
         lambda **changed: RecallByVisibility(**{"score_thresholds": (0.0, 0.5), **changed}),

@@ -6,9 +6,9 @@ import pytest
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.simulation import EvenReference, Lidar, PaperReference, Pose, Scenario
 from torchcover.simulation.culling import blocks_towards, boxes_in_cone, outlines, rays_towards
-from torchcover.simulation.instant import cast_from, rotate, rotate_each
+from torchcover.simulation.instant import cast_from
 from torchcover.simulation.mounted import MountedSensor
-from torchcover.simulation.rays import into_tiles, unit_directions
+from torchcover.simulation.rays import into_tiles, rotate, rotate_each, unit_directions
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Plane
 from torchcover.simulation.trajectory import Trajectory

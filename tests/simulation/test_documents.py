@@ -66,7 +66,7 @@ def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
         (
             "columns: 8",
             "colums: 8",
-            r"sensors\.0\.columns: Field required; sensors\.0\.colums: Extra inputs",
+            r"doc\.yaml: sensors\.0\.colums: unknown key; columns is meant, which is missing$",
         ),
         ("columns: 8", "columns: 0", r"sensors\.0\.columns: .*greater than 0 \(got 0\)"),
         ("columns: 8", "columns: many", r"sensors\.0\.columns: .*integer.*got 'many'"),
@@ -133,7 +133,7 @@ def test_whole_numbers_lists_and_numpys_numbers_may_stand_for_what_is_kept():
 
 
 def test_a_bad_sensor_does_not_make_the_list_of_sensors_too_short(tmp_path):
-    with pytest.raises(ValueError, match=r"sensors\.0\.colums: Extra inputs") as caught:
+    with pytest.raises(ValueError, match=r"sensors\.0\.colums: unknown key") as caught:
         Rig.load(write(tmp_path, RIG.replace("columns: 8", "colums: 8")))
     assert "at least 1" not in str(caught.value)
 

@@ -26,8 +26,11 @@ def procedural(**ego):
     return Scenario.model_validate({"name": "s", "traffic": {"type": "parking", "duration_s": 1.0}, "ego": ego or None})
 
 
-def length_m(scenario, *rigs, **options):
-    simulator = Simulator(scenario, {str(k): each for k, each in enumerate(rigs)}, SMALL, **options)
+def length_m(scenario, *rigs, vehicle=None):
+    carried = {str(k): each for k, each in enumerate(rigs)}
+    if vehicle is not None:
+        scenario = with_ego(scenario, carried, vehicle)
+    simulator = Simulator(scenario, carried, SMALL)
     box = simulator.scenario.ego_box()
     assert scenario.traffic is not None or simulator.scene_of(0)[0].ego_box == box
     return box.size_m[0]
@@ -99,6 +102,6 @@ def test_frames_say_which_vehicle_it_was_and_are_others_on_another():
 
 
 def test_a_sensor_inside_an_ego_that_is_not_its_own_is_told_so():
-    simulator = Simulator(Scenario.load("courtyard"), {"z": Rig.load("nuscenes_cameras")}, SMALL, vehicle="suv")
+    frames = SimulatedFrames("courtyard", "nuscenes_cameras", steps=1, reference_sensor=SMALL, vehicle="suv")
     with pytest.raises(ValueError, match=r"inside the ego of 'courtyard', suv, .*\(--vehicle renault_zoe\)"):
-        simulator.step(0)
+        frames[0]

@@ -12,11 +12,14 @@ SIZES_M = {
     "adult": (0.305, 0.52, 1.75),
     "bus": (12.0, 2.55, 3.10),
     "child": (0.209, 0.36, 1.20),
+    "child_110cm": (0.1917, 0.33, 1.10),
     "chrysler_pacifica": (5.176, 2.022, 1.777),
     "cyclist": (1.80, 0.60, 1.75),
+    "dog_57cm": (0.98, 0.22, 0.69),
     "ford_fusion": (4.869, 1.852, 1.476),
     "hatchback": (4.28, 1.79, 1.46),
     "motorcycle": (2.10, 0.80, 1.50),
+    "pole_100cm": (0.075, 0.075, 1.00),
     "renault_zoe": (4.084, 1.730, 1.562),
     "sedan": (4.77, 1.83, 1.46),
     "suv": (4.90, 1.94, 1.63),
@@ -34,7 +37,7 @@ AXLES_M = {
     "volkswagen_passat_estate": (1.337, 2.709),
 }
 CARS = ("hatchback", "sedan", "suv", "van", *AXLES_M)
-WITH_WHEELS = tuple(sorted(set(SIZES_M) - {"adult", "child"}))
+WITH_WHEELS = tuple(sorted(set(SIZES_M) - {"adult", "child", "child_110cm", "dog_57cm", "pole_100cm"}))
 
 
 def load(name):
@@ -154,7 +157,7 @@ def test_mirrors_end_within_the_width(name):
 
 
 def test_riders_and_walkers_have_a_head_on_top():
-    for name in ("adult", "child", "cyclist", "motorcycle"):
+    for name in ("adult", "child", "child_110cm", "cyclist", "motorcycle"):
         mesh = load(name).mesh()
         top = mesh.vertices_m[mesh.vertices_m[:, 2] > SIZES_M[name][2] - 0.05]
         assert np.ptp(top[:, 1]) < 0.2

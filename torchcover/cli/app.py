@@ -9,7 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from torchcover.cli import options
+from torchcover.cli.asking import asked
 from torchcover.cli.running import checkpoint_in, finish, opened, sharing
+from torchcover.cli.targets import targets
 from torchcover.evaluation.interrupt import terminable
 
 app = typer.Typer(
@@ -80,13 +82,18 @@ def evaluate(
     seed: options.Seed = 0,
     vehicle: options.Vehicle = None,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    region: options.Regions = None,
+    height: options.Heights = None,
+    grid: options.Grid = None,
+    ask: options.Ask = None,
+    cell: options.Cell = None,
     threshold: options.Thresholds = None,
     reference: options.Reference = None,
     rays: options.Rays = None,
     estimate: options.Estimate = None,
     every: options.Every = None,
     target_error: options.TargetErrors = None,
+    redundancy: options.Redundancy = False,
     error_maps: options.ErrorMaps = False,
     explain: options.Explain = False,
     device: options.Device = "cpu",
@@ -105,6 +112,7 @@ def evaluate(
             steps=steps,
             seed=seed,
             vehicle=vehicle,
+            ask=asked(ask, region, height, grid),
             cell_m=cell,
             thresholds=threshold or (0.4,),
             reference_sensor=None if frames else reference,
@@ -112,6 +120,7 @@ def evaluate(
             estimate=estimate,
             every_s=every,
             target_error=target_error,
+            redundancy=redundancy,
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
@@ -134,13 +143,18 @@ def compare(
     seed: options.Seed = 0,
     vehicle: options.Vehicle = None,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    region: options.Regions = None,
+    height: options.Heights = None,
+    grid: options.Grid = None,
+    ask: options.Ask = None,
+    cell: options.Cell = None,
     threshold: options.Thresholds = None,
     reference: options.Reference = None,
     rays: options.Rays = None,
     estimate: options.Estimate = None,
     every: options.Every = None,
     target_error: options.TargetErrors = None,
+    redundancy: options.Redundancy = False,
     error_maps: options.ErrorMaps = False,
     explain: options.Explain = False,
     device: options.Device = "cpu",
@@ -159,6 +173,7 @@ def compare(
             steps=steps,
             seed=seed,
             vehicle=vehicle,
+            ask=asked(ask, region, height, grid),
             cell_m=cell,
             thresholds=threshold or (0.4,),
             reference_sensor=None if frames else reference,
@@ -166,6 +181,7 @@ def compare(
             estimate=estimate,
             every_s=every,
             target_error=target_error,
+            redundancy=redundancy,
             device=device,
             workers=workers,
             skip_bad_frames=skip_bad_frames,
@@ -198,7 +214,7 @@ def study(
     seed: options.Seed = 0,
     vehicle: options.Vehicle = None,
     out: options.Out = Path("out"),
-    cell: options.Cell = 0.25,
+    cell: Annotated[float, typer.Option(help="Side of a grid cell in metres.")] = 0.25,
     threshold: Annotated[float, typer.Option(help="Detection threshold in metres.")] = 0.4,
 ) -> None:
     """Measure error against run time for numbers of rays and of steps, and recommend a setting."""
@@ -260,6 +276,22 @@ def record(
 
 
 @app.command()
+def rig(
+    frames: options.RecordingFrames,
+    recording_format: options.Format = None,
+    sensors: options.Sensors = None,
+    lidar: Annotated[
+        list[str] | None,
+        typer.Option(help="SENSOR=MODEL: a LiDAR scans as this model (see `list`), and is not estimated."),
+    ] = None,
+) -> None:
+    """Print the sensors of a recording as a rig: mounts, LiDARs and cameras for `show` and `evaluate`."""
+    from torchcover.cli.rig import run
+
+    run(frames, recording_format, sensors or (), lidar or ())
+
+
+@app.command()
 def show(
     name: Annotated[str, typer.Argument(help="Rig or scenario: a built-in name (see `list`) or a YAML file.")],
     scenario: Annotated[
@@ -275,6 +307,9 @@ def show(
     from torchcover.cli.show import run
 
     run(name, scenario=scenario, rig=rig, vehicle=vehicle, step=step, seed=seed, out=out)
+
+
+app.command()(targets)
 
 
 @app.command("list")

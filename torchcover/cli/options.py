@@ -40,6 +40,7 @@ Frames = Annotated[
     Path | None,
     typer.Option(help="A recording instead of a simulation, of any layout in docs/formats.md."),
 ]
+RecordingFrames = Annotated[Path, typer.Option("--frames", help="The recording, of any layout in docs/recordings.md.")]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
 Sensors = Annotated[
     list[str] | None,
@@ -58,8 +59,8 @@ Seed = Annotated[int, typer.Option(min=0, help="Seed of the simulation.")]
 Vehicle = Annotated[
     str | None,
     typer.Option(
-        help="What carries the rig: a built-in vehicle or a YAML file. Not given: the scenario's own ego, else the "
-        "vehicle that the rig names, else an SUV."
+        help="What carries the rig: a built-in vehicle, a YAML file or a mesh in metres. Not given: the scenario's own "
+        "ego, else the vehicle that the rig names, else an SUV."
     ),
 ]
 Out = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
@@ -69,7 +70,25 @@ RecordingOut = Annotated[
 Layout = Annotated[
     str, typer.Option("--format", help="`folder`, or `kitti`: KITTI's object layout, of a rig of one LiDAR.")
 ]
-Cell = Annotated[float, typer.Option(help="Side of a grid cell in metres.")]
+Regions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--region",
+        help="Region NAME:x0,x1,y0,y1 in metres, forward and to the left; may be repeated. Not given: the paper's in "
+        "front, and the near field on the four sides of the vehicle.",
+    ),
+]
+Heights = Annotated[
+    list[str] | None,
+    typer.Option("--height", help="Height band NAME:z0,z1 in metres; may be repeated, and overlap (ground, obstacle)."),
+]
+Grid = Annotated[
+    str | None, typer.Option(help="Extent x0,x1,y0,y1 of the grid in metres (-40,160,-40,40, more if regions need it).")
+]
+Ask = Annotated[
+    Path | None, typer.Option(help="The same, and polygons, in a YAML file; an option replaces what it says.")
+]
+Cell = Annotated[float | None, typer.Option(help="Side of a grid cell in metres (0.25).")]
 Thresholds = Annotated[
     list[float] | None, typer.Option("--threshold", help="Detection threshold in metres (0.4); may be repeated.")
 ]
@@ -105,9 +124,14 @@ TargetErrors = Annotated[
     list[str] | None,
     typer.Option(
         "--target-error",
-        help="Stop once every number is this good: 0.1% (standard error of each detection, in percentage points) or "
-        "0.02m (of each radius); both may be given. --steps is then the most steps (4096).",
+        help="Stop once every number (of the usual regions, those in front) is this good: 0.1% (standard error of each "
+        "detection, in percentage points) or 0.02m (of each radius); both may be given. --steps is then the most steps "
+        "(4096).",
     ),
+]
+Redundancy = Annotated[
+    bool,
+    typer.Option("--redundancy", help="Say by how many sensors places are seen, and what is lost when each one fails."),
 ]
 ErrorMaps = Annotated[bool, typer.Option("--error-maps", help="Draw maps of the standard errors too.")]
 Explain = Annotated[bool, typer.Option("--explain", help="Say what was left out because the scene did not need it.")]

@@ -20,13 +20,16 @@ from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import Quantity
+from torchcover.coverage.redundancy import PlaceSums, Redundancy, redundancy_quantities
+from torchcover.coverage.regions import Region
 from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 Arrays = dict[str, NDArray[Any]]
 # Steps, cells, what is divided by, sums.
 IN_BLOCKS = ("block_steps", "block_cell", "block_probed_steps", "block_sums")
 OVER_AREA = ("area_steps", "area_cell", "area_m2", "area_sums")
+OVER_PLACES = ("place_steps", "place_m2", "place_sums")
 BlockSumsT = TypeVar("BlockSumsT", bound=BlockSums)
 
 
@@ -42,6 +45,8 @@ class CoverageParts(TypedDict):
     counts: Mapping[str, int]
     blocks: Blocks | None
     area: AreaSums | None
+    regions: Sequence[Region]
+    redundancy: Redundancy | None
 
 
 def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Path) -> None:
@@ -52,7 +57,7 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         errors: Maps of standard errors by the key of their quantity, for NumPy users.
         path: The file.
     """
-    grid, blocks, area = parts["grid"], parts["blocks"], parts["area"]
+    grid, blocks, area, redundancy = parts["grid"], parts["blocks"], parts["area"], parts["redundancy"]
     header = {
         "format": FORMAT_VERSION,
         "grid": {"x": grid.x, "y": grid.y, "cell": grid.cell, "heights": dict(grid.heights)},
@@ -62,10 +67,17 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         "counts": parts["counts"],
         "blocks": 1 if blocks is None else len(blocks.steps),
         "square_metres": area is not None,
+        "regions": [asdict(region) for region in parts["regions"]],
+        "sensors": None if redundancy is None else redundancy.sensors,
+        "redundancy": [] if redundancy is None else [asdict(layer.quantity) for layer in redundancy.layers.values()],
     }
     tensors = {"probed_steps": parts["probed_steps"], "points": parts["points"]}
     tensors |= {layer.quantity.key: layer.values for layer in parts["layers"]}
     tensors |= {f"{key}_error": error for key, error in errors.items()}
+    if redundancy is not None:
+        tensors |= {key: layer.values for key, layer in redundancy.layers.items()}
+        if redundancy.places is not None:
+            tensors |= dict(zip(OVER_PLACES, redundancy.places, strict=True))
     arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
     arrays |= {} if blocks is None else _listed(blocks, IN_BLOCKS)
     arrays |= {} if area is None else _listed(area, OVER_AREA)
@@ -107,10 +119,9 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
     stored = header["grid"]
     heights = {name: (band[0], band[1]) for name, band in stored["heights"].items()}
     grid = BevGrid(x=tuple(stored["x"]), y=tuple(stored["y"]), cell=stored["cell"], heights=heights)
-    quantities = [Quantity(**quantity) for quantity in header["layers"]]
-    for name in ("probed_steps", "points", *(quantity.key for quantity in quantities)):
-        if arrays[name].shape != grid.shape:
-            raise ValueError(f"{name} has shape {arrays[name].shape}, the grid {grid.shape}")
+    layers = _layers(header["layers"], grid, arrays)
+    for name in ("probed_steps", "points"):
+        _check_shape(name, grid, arrays)
     _check_spread(grid, arrays)
     return {
         "grid": grid,
@@ -118,11 +129,46 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
         "max_radius": header["max_radius"],
         "probed_steps": torch.from_numpy(arrays["probed_steps"]),
         "points": torch.from_numpy(arrays["points"]),
-        "layers": [Layer(quantity, torch.from_numpy(arrays[quantity.key])) for quantity in quantities],
+        "layers": layers,
         "counts": header["counts"],
         "blocks": None if header["blocks"] == 1 else _read_listed(Blocks, IN_BLOCKS, header, grid, arrays),
         "area": _read_listed(AreaSums, OVER_AREA, header, grid, arrays) if header["square_metres"] else None,
+        "regions": [_region(stored) for stored in header["regions"]],
+        "redundancy": None if header["sensors"] is None else _redundancy(header, grid, arrays),
     }
+
+
+def _redundancy(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> Redundancy:
+    layers = _layers(header["redundancy"], grid, arrays)
+    sensors = tuple(header["sensors"])
+    if [layer.quantity for layer in layers] != list(redundancy_quantities(sensors, header["thresholds"])):
+        raise ValueError(f"other layers of redundancy than those of the sensors {', '.join(sensors)}")
+    places = None
+    if header["square_metres"]:
+        places = PlaceSums(*(torch.from_numpy(arrays[name]) for name in OVER_PLACES))
+        count = len(header["regions"]) * len(grid.heights)
+        values = 1 + len(header["thresholds"]) + len(layers)
+        blocks = header["blocks"]
+        if [tuple(one.shape) for one in places] != [(blocks,), (blocks, count), (blocks, values, count)]:
+            raise ValueError(f"sums over {count} regions and bands of shape {tuple(places.sums.shape)}")
+    return Redundancy(sensors, {layer.quantity.key: layer for layer in layers}, places)
+
+
+def _layers(stored: Sequence[dict[str, Any]], grid: BevGrid, arrays: Arrays) -> list[Layer]:
+    quantities = [Quantity(**quantity) for quantity in stored]
+    for quantity in quantities:
+        _check_shape(quantity.key, grid, arrays)
+    return [Layer(quantity, torch.from_numpy(arrays[quantity.key])) for quantity in quantities]
+
+
+def _check_shape(name: str, grid: BevGrid, arrays: Arrays) -> None:
+    if arrays[name].shape != grid.shape:
+        raise ValueError(f"{name} has shape {arrays[name].shape}, the grid {grid.shape}")
+
+
+def _region(stored: Mapping[str, Any]) -> Region:
+    corners = tuple((x, y) for x, y in stored["corners_m"])
+    return Region(stored["name"], tuple(stored["x"]), tuple(stored["y"]), corners)
 
 
 def _listed(blocks: BlockSums, names: Sequence[str]) -> Arrays:

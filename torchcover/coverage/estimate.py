@@ -72,11 +72,21 @@ def estimate_area(area: AreaSums, band: int, cells: Tensor) -> RegionEstimate:
         NaN where no square metre was seen.
     """
     each = area_in_blocks(area, band, cells)
-    m2, sums = each[:, 0], each[:, 1:]
+    return estimate_ratio(each[:, 0], each[:, 1:], area.steps)
+
+
+def estimate_ratio(m2: Tensor, sums: Tensor, steps: Tensor) -> RegionEstimate:
+    """Ratios of sums in blocks, and what they become without each block.
+
+    Args:
+        m2: (B,) what is divided by.
+        sums: (B, Q) sums.
+        steps: (B,) steps in each block.
+    """
     whole = sums.sum(dim=0) / m2.sum()
-    used = area.steps.nonzero().flatten().tolist() if len(area.steps) > 1 else []
+    used = steps.nonzero().flatten().tolist() if len(steps) > 1 else []
     left_out = [_without(sums, block).sum(dim=0) / _without(m2, block).sum() for block in used]
-    return RegionEstimate(whole, torch.stack(left_out) if left_out else whole[None][:0], area.steps[used])
+    return RegionEstimate(whole, torch.stack(left_out) if left_out else whole[None][:0], steps[used])
 
 
 def area_in_blocks(area: AreaSums, band: int, cells: Tensor) -> Tensor:

@@ -3,8 +3,8 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from types import MappingProxyType
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -28,6 +28,18 @@ MAX_BORDERS_COMPARED = 32
 OUTSIDE = -(2**40)
 
 
+class Bins(NamedTuple):
+    """Where points are in a grid.
+
+    `inside` (M,) int64 numbers of the points that are in any cell, ascending. For each of K pairs of a point and a cell
+    that it is in: `of` (K,) which of these points, `cell` (K,) int64 the number of the cell.
+    """
+
+    inside: Tensor
+    of: Tensor
+    cell: Tensor
+
+
 @dataclass(frozen=True)
 class BevGrid:
     """Square cells over x and y in the vehicle frame, in height bands over z.
@@ -38,12 +50,12 @@ class BevGrid:
         x: Lower and upper bound forward, in metres.
         y: Lower and upper bound to the left, in metres.
         cell: Side of a cell in metres. The extents must be multiples of it.
-        heights: Name of each height band -> lower and upper bound of z in metres. Bands may not overlap; gaps are
-            allowed. The default is the paper's: ground [-0.5, 0.5) and obstacle [0.5, 2.0).
+        heights: Name of each height band -> lower and upper bound of z in metres. Bands may overlap, and leave gaps.
+            The default is the paper's: ground [-0.5, 0.5) and obstacle [0.5, 2.0).
 
     Raises:
         ValueError: Inverted or infinite bounds, a cell that is not positive, an extent that is not a multiple of the
-            cell, no band, overlapping bands, or more than 1e8 cells.
+            cell, no band, or more than 1e8 cells.
 
     Example:
         >>> grid = BevGrid(x=(0.0, 20.0), y=(-5.0, 5.0), cell=0.5)
@@ -125,7 +137,7 @@ class BevGrid:
         return _centres(self.y, self.cell)
 
     def cell_of(self, points: Tensor) -> Tensor:
-        """Number of the cell of each point.
+        """Number of the cell of each point, in a grid whose bands do not overlap.
 
         Args:
             points: (N, 3) coordinates in metres, any floating-point type.
@@ -134,32 +146,75 @@ class BevGrid:
             (N,) int64 cell numbers; -1 for a point outside every cell or band.
 
         Raises:
-            ValueError: Another shape.
+            ValueError: Another shape, or bands that overlap, so that a point has several cells: see `bins`.
         """
+        if len(self._tiers) > 1:
+            raise ValueError("the height bands overlap, so that a point may be in several cells: use `bins`")
+        return self._cells_of(points)[0]
+
+    def bins(self, points: Tensor) -> Bins:
+        """The cells that points are in, several where bands overlap.
+
+        Args:
+            points: As in `cell_of`.
+
+        Raises:
+            ValueError: Another shape.
+
+        Example:
+            >>> bands = {"dog": (0.05, 0.5), "child": (0.1, 1.1)}
+            >>> grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights=bands)
+            >>> grid.bins(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.3], [1.5, 0.5, 0.9]]))
+            Bins(inside=tensor([1, 2]), of=tensor([0, 0, 1]), cell=tensor([0, 2, 3]))
+        """
+        cells = self._cells_of(points)
+        within = cells >= 0
+        inside = within.any(dim=0).nonzero().squeeze(1)
+        if len(cells) == 1:
+            return Bins(inside, torch.arange(len(inside), device=inside.device), cells[0, inside])
+        tier, of = within[:, inside].nonzero(as_tuple=True)
+        return Bins(inside, of, cells[tier, inside[of]])
+
+    @property
+    def _tiers(self) -> list[list[int]]:
+        """The numbers of the bands, from below, shared out so that those of a tier do not overlap."""
+        bounds, tiers = list(self.heights.values()), list[list[int]]()
+        for band in sorted(range(len(bounds)), key=bounds.__getitem__):
+            free = [tier for tier in tiers if bounds[tier[-1]][1] <= bounds[band][0]]
+            if free:
+                free[0].append(band)
+            else:
+                tiers.append([band])
+        return tiers
+
+    def _cells_of(self, points: Tensor) -> Tensor:
+        """(tiers, N) int64 cell numbers, -1 for none."""
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"points: shape (N, 3) is needed; got {tuple(points.shape)}")
         points = points.detach()
-        bands, rows, columns = self.shape
+        _, rows, columns = self.shape
         x_bounds, y_bounds = (
             _with_ends(edges, math.nan).to(points.device) for edges in (self.x_edges_m, self.y_edges_m)
         )
-        # Between the borders of sorted bands lie, in turn, a band and a gap (which may be empty).
-        order = sorted(range(bands), key=lambda band: list(self.heights.values())[band])
-        borders = [border for band in order for border in list(self.heights.values())[band]]
-        between = [term for band in order for term in (band * rows * columns, OUTSIDE)][:-1]
-        steps = torch.arange(columns), torch.arange(rows) * columns, torch.tensor(between)
-        x_terms, y_terms, z_terms = (_with_ends(terms, OUTSIDE).to(points.device) for terms in steps)
+        steps = torch.arange(columns), torch.arange(rows) * columns
+        x_terms, y_terms = (_with_ends(terms, OUTSIDE).to(points.device) for terms in steps)
+        # Between the borders of the bands of a tier lie, in turn, a band and a gap (which may be empty).
+        bounds, tiers = list(self.heights.values()), []
+        for bands in self._tiers:
+            terms = torch.tensor([term for band in bands for term in (band * rows * columns, OUTSIDE)][:-1])
+            borders = [border for band in bands for border in bounds[band]]
+            tiers.append((borders, _with_ends(terms, OUTSIDE).to(points.device)))
 
         def cells_of(points: Tensor) -> Tensor:
             x, y, z = (points[:, axis].double() for axis in range(3))
-            cell = x_terms.index_select(0, _edges_below(x, x_bounds, *self.x))
-            cell += y_terms.index_select(0, _edges_below(y, y_bounds, *self.y))
-            cell += z_terms.index_select(0, _borders_below(z, borders))
-            return cell.clamp_(min=-1)
+            place = x_terms.index_select(0, _edges_below(x, x_bounds, *self.x))
+            place += y_terms.index_select(0, _edges_below(y, y_bounds, *self.y))
+            in_tiers = [place + z_terms.index_select(0, _borders_below(z, borders)) for borders, z_terms in tiers]
+            return torch.stack(in_tiers).clamp_(min=-1)
 
         # In parts that stay in the processor's cache; a GPU takes all at once.
         part = PART if points.device.type == "cpu" else max(len(points), 1)
-        return torch.cat([cells_of(some) for some in torch.split(points, part)])
+        return torch.cat([cells_of(some) for some in torch.split(points, part)], dim=1)
 
 
 def _edges_below(values: Tensor, bounds: Tensor, low: float, high: float) -> Tensor:
@@ -220,10 +275,6 @@ def _check_heights(heights: Mapping[str, tuple[float, float]]) -> None:
         raise ValueError("heights: at least one height band is needed, for example {'ground': (-0.5, 0.5)}")
     for name, band in heights.items():
         _check_bounds(f"heights[{name!r}]", band)
-    ordered = sorted(heights.items(), key=lambda item: item[1])
-    for (below, (_, top)), (above, (bottom, _)) in pairwise(ordered):
-        if bottom < top:
-            raise ValueError(f"heights: bands {below!r} and {above!r} overlap between z = {bottom:g} and {top:g} m")
 
 
 def _count(bounds: tuple[float, float], cell: float) -> int:

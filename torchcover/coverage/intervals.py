@@ -69,3 +69,23 @@ def student_t95(degrees_of_freedom: int) -> float:
         (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
     )
     return sum(term / float(degrees_of_freedom) ** power for power, term in enumerate(terms))
+
+
+def is_significant(difference: float, error: float, degrees_of_freedom: int) -> bool | None:
+    """Whether a difference is more than chance, by Student's t at 95 %.
+
+    Args:
+        difference: The difference.
+        error: Its standard error; NaN if unknown.
+        degrees_of_freedom: Blocks that the error comes from, less one.
+
+    Returns:
+        None if the error is unknown.
+
+    Example:
+        >>> is_significant(0.3, 0.1, 15), is_significant(0.2, 0.1, 15), is_significant(0.2, float("nan"), 3)
+        (True, False, None)
+    """
+    if math.isnan(error):
+        return None
+    return abs(difference) > max(student_t95(degrees_of_freedom) * error, ROUND_OFF)

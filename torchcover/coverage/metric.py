@@ -14,8 +14,10 @@ from torchcover.coverage.blocks import AreaSums, Blocks, check_blocks, pair_up
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.plotting import draw_coverage
+from torchcover.coverage.redundancy import PlaceSums, Redundancy, SensorFailures
+from torchcover.coverage.regions import Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.steps import Clouds, Step, as_list, check_parameters, checked_steps
+from torchcover.coverage.steps import Clouds, SensorClouds, Step, as_list, check_parameters, checked_steps
 from torchcover.metrics import MergeableMetric, figure_of
 from torchcover.neighbors import nearest
 
@@ -54,6 +56,10 @@ class CoverageMetric(MergeableMetric):
             long run. The state grows with it: 24 bytes a cell and block.
         aggregations: Maps beside the mean of means, from `torchcover.coverage`: `Maximum()`, `PooledMean()`,
             `Quantiles(levels)`, `StepQuantiles(levels)`, or a class of one's own; at most one of each.
+        regions: What the result gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
+            the grid if not given. The sums do not depend on it.
+        sensors: Names of the rig's sensors, for `Coverage.redundancy`: then `update` takes a cloud for each by its
+            name, and what the rig is without each of them is known as well.
         square_metres: Whether the weights of reference points are square metres of surface, as `SurfaceReference` gives
             them: then there is an estimate by area too. The state grows by 8 (2 + thresholds) bytes a cell and block.
         backend: Nearest-neighbour search, as in `torchcover.nearest`.
@@ -62,7 +68,8 @@ class CoverageMetric(MergeableMetric):
 
     Raises:
         ValueError: A threshold that is negative, not finite, over `max_radius`, or given twice; a `max_radius` that is
-            not positive; a number of blocks that is neither 1 nor even and 8 or more; two aggregations of one kind.
+            not positive; a number of blocks that is neither 1 nor even and 8 or more; two aggregations of one kind; a
+            region beyond the grid, or without a cell centre.
 
     Example:
         >>> metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)}))
@@ -81,6 +88,7 @@ class CoverageMetric(MergeableMetric):
     empty_sensor_steps: Tensor
     empty_reference_steps: Tensor
     saturated_points: Tensor
+    inside_points: Tensor
     outside_points: Tensor
 
     def __init__(
@@ -91,6 +99,8 @@ class CoverageMetric(MergeableMetric):
         max_radius: float = math.inf,
         blocks: int = 1,
         aggregations: Sequence[Aggregation] = (),
+        regions: Sequence[Region] | None = None,
+        sensors: Sequence[str] = (),
         square_metres: bool = False,
         backend: str = "auto",
         memory_mb: float = 256.0,
@@ -98,6 +108,8 @@ class CoverageMetric(MergeableMetric):
     ) -> None:
         check_parameters(thresholds, max_radius, aggregations)
         check_blocks(blocks)
+        regions = regions_within(grid) if regions is None else tuple(regions)
+        check_regions(regions, grid)
         meaning = {
             "grid": grid,
             "thresholds": tuple(float(threshold) for threshold in thresholds),
@@ -105,15 +117,23 @@ class CoverageMetric(MergeableMetric):
             "blocks": blocks,
             "aggregations": tuple(aggregations),
             "square_metres": square_metres,
+            **({"sensors": tuple(sensors), "regions": regions} if sensors else {}),
         }
         super().__init__(meaning, **kwargs)
         self.grid = grid
+        self.regions = regions
+        self.sensors = tuple(sensors)
         self.thresholds: tuple[float, ...] = tuple(float(threshold) for threshold in thresholds)
         self.max_radius = float(max_radius)
         self.blocks = blocks
         self.square_metres = square_metres
         over_area = [VisibleArea(self.thresholds, blocks)] if square_metres else []
-        self.aggregations: tuple[Aggregation, ...] = (MeanOfMeans(self.thresholds, blocks), *over_area, *aggregations)
+        self._failures = SensorFailures(
+            self.sensors, self.thresholds, grid, regions, self.max_radius, blocks, square_metres
+        )
+        redundancy = [self._failures] if sensors else []
+        self._of_grid: tuple[Aggregation, ...] = (MeanOfMeans(self.thresholds, blocks), *over_area, *aggregations)
+        self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *redundancy)
         self.backend = backend
         self.memory_mb = memory_mb
         self._add_states()
@@ -141,7 +161,7 @@ class CoverageMetric(MergeableMetric):
 
     def update(
         self,
-        sensor: Clouds,
+        sensor: SensorClouds,
         reference: Clouds,
         *,
         weights: Clouds | None = None,
@@ -151,6 +171,7 @@ class CoverageMetric(MergeableMetric):
 
         Args:
             sensor: (N, 3) points of the rig in the vehicle frame in metres, or a list of them. N = 0: a blind step.
+                Of a metric with `sensors`: name of the sensor -> its points, or a list of such dicts.
             reference: (M, 3) points of the reference sensor in the same frame, or a list of the same length. M = 0:
                 the step says nothing.
             weights: (M,) weight of each reference point in the mean over its cell in its step, or a list of the same
@@ -171,12 +192,12 @@ class CoverageMetric(MergeableMetric):
                 "weights: the square metres of each reference point are needed, as a SurfaceReference gives them; got "
                 "none (without square_metres=True, points may do without)"
             )
-        for step in checked_steps(sensor, reference, weights, index, first=int(self.steps)):
+        for step in checked_steps(sensor, reference, weights, index, names=self.sensors, first=int(self.steps)):
             self._add_step(step)
 
     def forward(
         self,
-        sensor: Clouds,
+        sensor: SensorClouds,
         reference: Clouds,
         *,
         weights: Clouds | None = None,
@@ -184,33 +205,34 @@ class CoverageMetric(MergeableMetric):
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
         if index is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
-            index = [int(self.steps) + step for step in range(len(as_list(sensor, "sensor")))]
+            index = [int(self.steps) + step for step in range(len(as_list(reference, "reference")))]
         coverage: Coverage = super().forward(sensor, reference, weights=weights, index=index)
         return coverage
 
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
     def _add_step(self, step: Step) -> None:
-        sensor, reference, weights, index = step
-        cell = self.grid.cell_of(reference)
-        inside = cell >= 0
+        sensors, reference, weights, index = step
+        inside, of, cell = self.grid.bins(reference)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
-        distance = nearest(
-            reference[inside],
-            sensor.to(reference.device),
-            max_distance=self.max_radius,
-            backend=self.backend,
-            memory_mb=self.memory_mb,
-        ).distance
+        each = [self._distance(reference[inside], cloud.to(reference.device)) for cloud in sensors.values()]
+        of_sensors = torch.stack(each) if self.sensors else None
+        distance = each[0] if of_sensors is None else of_sensors.amin(dim=0)
         device = self.points.device
-        weights = None if weights is None else weights.to(reference.device)[inside].to(device)
+        weights = None if weights is None else weights.to(reference.device)[inside[of]].to(device)
         block = self._block_of(index)
-        self._accumulate(block, cell[inside].to(device), distance.to(device), weights)
+        of_sensors = None if of_sensors is None else of_sensors[:, of].to(device)
+        self._accumulate(block, cell.to(device), distance[of].to(device), weights, of_sensors)
         self.block_steps[block] += 1
         self.steps += 1
-        self.empty_sensor_steps += len(sensor) == 0
+        self.empty_sensor_steps += not any(map(len, sensors.values()))
         self.empty_reference_steps += len(reference) == 0
+        self.inside_points += len(distance)
         self.outside_points += len(reference) - len(distance)
         self.saturated_points += (distance >= self.max_radius).sum().to(device)
+
+    def _distance(self, reference: Tensor, cloud: Tensor) -> Tensor:
+        found = nearest(reference, cloud, max_distance=self.max_radius, backend=self.backend, memory_mb=self.memory_mb)
+        return found.distance
 
     def _block_of(self, index: int) -> int:
         """The block of a step; makes room for it."""
@@ -220,14 +242,16 @@ class CoverageMetric(MergeableMetric):
             pair_up(self.metric_state, self._in_blocks)
         return index // int(self.block_length)
 
-    def _accumulate(self, block: int, cell: Tensor, distance: Tensor, weights: Tensor | None) -> None:
+    def _accumulate(
+        self, block: int, cell: Tensor, distance: Tensor, weights: Tensor | None, of_sensors: Tensor | None
+    ) -> None:
         # Before saturation: a point with nothing within `max_radius` is not detected at a threshold of `max_radius`.
         detected = [(distance <= threshold).double() for threshold in self.thresholds]
         radius = distance.clamp(max=distance.new_tensor(self.max_radius)).double()
         means = mean_per_cell(cell, torch.stack([radius, *detected]), self.grid.cells, weights)
         self.probed_steps[block, means.cell] += 1
         self.points[means.cell] += means.points
-        step = BinnedStep(cell, radius, weights, means, block, self.grid.cells)
+        step = BinnedStep(cell, radius, weights, means, block, self.grid.cells, of_sensors)
         for aggregation in self.aggregations:
             aggregation.update(self._sums_of(aggregation), step)
 
@@ -240,15 +264,25 @@ class CoverageMetric(MergeableMetric):
             max_radius=self.max_radius,
             probed_steps=probed_steps.view(self.grid.shape),
             points=self.points.view(self.grid.shape).clone(),
-            layers=[
-                Layer(layer.quantity, layer.values.view(self.grid.shape))
-                for aggregation in self.aggregations
-                for layer in aggregation.layers(self._sums_of(aggregation), probed_steps, self.max_radius)
-            ],
+            layers=[layer for one in self._of_grid for layer in self._layers(one, probed_steps)],
             blocks=self._blocks() if self.blocks > 1 else None,
             area=self._area() if self.square_metres else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
+            regions=self.regions,
+            redundancy=self._redundancy(probed_steps) if self.sensors else None,
         )
+
+    def _layers(self, aggregation: Aggregation, probed_steps: Tensor) -> list[Layer]:
+        found = aggregation.layers(self._sums_of(aggregation), probed_steps, self.max_radius)
+        return [Layer(layer.quantity, layer.values.view(self.grid.shape)) for layer in found]
+
+    def _redundancy(self, probed_steps: Tensor) -> Redundancy:
+        layers = {layer.quantity.key: layer for layer in self._layers(self._failures, probed_steps)}
+        if not self.square_metres:
+            return Redundancy(self.sensors, layers, None)
+        sums = self._sums_of(self._failures)
+        places = PlaceSums(self.block_steps.clone(), sums["place_m2"].clone(), sums["place_sums"].clone())
+        return Redundancy(self.sensors, layers, places)
 
     def plot(
         self,

@@ -1,15 +1,12 @@
 """Comparisons are paired: rigs at the same instants, measured against the same reference."""
 
-import math
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import torch
 
-from torchcover.coverage.errors import ROUND_OFF
-from torchcover.coverage.intervals import student_t95
 from torchcover.coverage.regions import Region
 from torchcover.coverage.result import Coverage
+from torchcover.coverage.summary import Difference, differences_of
 
 
 def check_paired(coverages: Mapping[str, Coverage]) -> None:
@@ -45,21 +42,6 @@ def _same_steps(a: Coverage, b: Coverage) -> bool:
     return same and torch.equal(a.blocks.steps, b.blocks.steps)
 
 
-class Difference(NamedTuple):
-    """What a rig has more than the first one, in the same steps and against the same reference points.
-
-    Args:
-        value: Metres, or a share in [-1, 1]; NaN if unknown.
-        error: Standard error of `value` itself, which is less than that of the two numbers: what makes a step easy or
-            hard for both rigs cancels out. NaN if there are not enough blocks.
-        significant: Whether the difference is more than chance, by Student's t at 95 %; None if that is unknown.
-    """
-
-    value: float
-    error: float
-    significant: bool | None
-
-
 def differences(coverages: Mapping[str, Coverage], region: Region, height: str) -> dict[str, dict[str, Difference]]:
     """The differences of every rig, the first one too, to the first.
 
@@ -75,32 +57,5 @@ def differences(coverages: Mapping[str, Coverage], region: Region, height: str) 
     first, quantities = next(iter(estimates.values())), next(iter(coverages.values())).quantities
     found = {}
     for name, estimate in estimates.items():
-        # Two infinite numbers are equal; their difference would be NaN, which means unknown.
-        values = (estimate.value - first.value).where(estimate.value != first.value, 0.0)
-        errors = estimate.minus(first).error
-        freedom = len(estimate.steps) - 1
-        found[name] = {
-            quantity.key: Difference(value, error, is_significant(value, error, freedom))
-            for quantity, value, error in zip(quantities, values.tolist(), errors.tolist(), strict=True)
-        }
+        found[name] = dict(zip((one.key for one in quantities), differences_of(estimate, first), strict=True))
     return found
-
-
-def is_significant(difference: float, error: float, degrees_of_freedom: int) -> bool | None:
-    """Whether a difference is more than chance, by Student's t at 95 %.
-
-    Args:
-        difference: The difference.
-        error: Its standard error; NaN if unknown.
-        degrees_of_freedom: Blocks that the error comes from, less one.
-
-    Returns:
-        None if the error is unknown.
-
-    Example:
-        >>> is_significant(0.3, 0.1, 15), is_significant(0.2, 0.1, 15), is_significant(0.2, float("nan"), 3)
-        (True, False, None)
-    """
-    if math.isnan(error):
-        return None
-    return abs(difference) > max(student_t95(degrees_of_freedom) * error, ROUND_OFF)

@@ -3,8 +3,8 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-# "m" is metres; a "share" lies in [0, 1], and tables and maps show it in percent.
-Unit = Literal["m", "share"]
+# "m" is metres, "sensors" a number of them; a "share" lies in [0, 1], and tables and maps show it in percent.
+Unit = Literal["m", "share", "sensors"]
 
 
 @dataclass(frozen=True)
@@ -14,7 +14,7 @@ class Quantity:
     Args:
         key: Its name in files, dicts and loggers; with `_error` behind it, that of its standard error.
         title: What tables and maps call it, without its unit.
-        unit: "m", or "share" for a number in [0, 1].
+        unit: "m", "share" for a number in [0, 1], or "sensors".
         lower_is_better: Whether less of it is better.
 
     Example:
@@ -53,6 +53,28 @@ def detection(threshold_m: float) -> Quantity:
     return Quantity(
         f"detection_{threshold_m:g}m", f"detection within {threshold_m:g} m", "share", lower_is_better=False
     )
+
+
+def sensors_seeing(threshold_m: float) -> Quantity:
+    """The number of sensors of a rig whose radius is at most a threshold in metres."""
+    title = f"sensors that see within {threshold_m:g} m"
+    return Quantity(f"sensors_{threshold_m:g}m", title, "sensors", lower_is_better=False)
+
+
+def seen_by_two(threshold_m: float) -> Quantity:
+    """The share of reference points that two sensors or more see within a threshold in metres."""
+    title = f"seen by two sensors or more within {threshold_m:g} m"
+    return Quantity(f"seen_by_two_{threshold_m:g}m", title, "share", lower_is_better=False)
+
+
+def without(sensor: str, quantity: Quantity) -> Quantity:
+    """A number of the rig without one of its sensors.
+
+    Example:
+        >>> without("roof", detection(0.4)).key
+        'detection_0.4m_without_roof'
+    """
+    return replace(quantity, key=f"{quantity.key}_without_{sensor}", title=f"{quantity.title}, without {sensor}")
 
 
 def by_area(quantity: Quantity) -> Quantity:

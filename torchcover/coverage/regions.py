@@ -1,24 +1,38 @@
-"""Regions: named rectangles of cells that a number is given for."""
+"""Regions: named rectangles and polygons of cells that a number is given for."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
 from torchcover.coverage.grid import BevGrid
 
+if TYPE_CHECKING:
+    from shapely import Polygon
+
+# How far around the vehicle its near field reaches.
+NEAR_FIELD_M = 3.0
+# A centre on an edge counts as this share of a cell further along x and y: it belongs to one of two neighbours, as in
+# the half-open bins of a rectangle.
+ON_AN_EDGE = 1e-6, 0.6e-6
+
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle in the vehicle frame, half-open on both axes. A cell belongs to it if its centre does.
+    """A rectangle in the vehicle frame, half-open on both axes, or a polygon. A cell belongs to it if its centre does.
 
     Args:
         name: What tables and loggers call it.
         x: Lower and upper bound forward, in metres.
         y: Lower and upper bound to the left, in metres.
+        corners_m: Corners x, y of a polygon, in either direction, which has these bounds; see `Region.polygon`.
 
     Raises:
-        ValueError: No name, or bounds that are inverted or not finite.
+        ValueError: No name, bounds that are inverted or not finite, a polygon that crosses or touches itself, or has
+            other bounds.
 
     Example:
         >>> Region("rear", x=(-10.0, -2.5), y=(-2.5, 2.5)).mask(BevGrid(x=(-10.0, 10.0), y=(-5.0, 5.0), cell=0.5)).sum()
@@ -28,6 +42,7 @@ class Region:
     name: str
     x: tuple[float, float]
     y: tuple[float, float]
+    corners_m: tuple[tuple[float, float], ...] = ()
 
     def __post_init__(self) -> None:
         if not self.name:
@@ -35,6 +50,62 @@ class Region:
         for axis, (low, high) in (("x", self.x), ("y", self.y)):
             if not (-float("inf") < low < high < float("inf")):
                 raise ValueError(f"region {self.name!r}: {axis} needs finite bounds, lower first; got {(low, high)}")
+        if self.corners_m:
+            self._check_polygon()
+
+    @classmethod
+    def polygon(cls, name: str, corners_m: Sequence[tuple[float, float]]) -> "Region":
+        """The region within some corners.
+
+        Args:
+            name: What tables and loggers call it.
+            corners_m: Three or more corners x, y in metres, one after the other around it.
+
+        Raises:
+            ValueError: Fewer corners, one that is not finite, edges that cross or touch each other.
+
+        Example:
+            >>> corner = Region.polygon("corner", [(2.0, 1.0), (5.0, 1.0), (2.0, 4.0)])
+            >>> corner.x, corner.mask(BevGrid(x=(0.0, 8.0), y=(0.0, 8.0), cell=1.0)).sum()
+            ((2.0, 5.0), tensor(3))
+        """
+        corners = tuple((float(x), float(y)) for x, y in corners_m)
+        if not all(math.isfinite(number) for corner in corners for number in corner):
+            raise ValueError(f"region {name!r}: corners need finite coordinates in metres; got {corners}")
+        if len(set(corners)) < 3:
+            raise ValueError(f"region {name!r}: three different corners or more are needed; got {len(set(corners))}")
+        x, y = zip(*corners, strict=True)
+        return cls(name, (min(x), max(x)), (min(y), max(y)), corners)
+
+    def _check_polygon(self) -> None:
+        import shapely
+
+        polygon = self._polygon
+        if not polygon.is_valid:
+            raise ValueError(
+                f"region {self.name!r}: its edges cross or touch each other ({shapely.is_valid_reason(polygon)}); give "
+                "the corners one after the other around it"
+            )
+        (x_low, y_low, x_high, y_high), bounds = polygon.bounds, (self.x[0], self.y[0], self.x[1], self.y[1])
+        if (x_low, y_low, x_high, y_high) != bounds:
+            raise ValueError(f"region {self.name!r}: its corners have other bounds than x = {self.x}, y = {self.y}")
+
+    @property
+    def _polygon(self) -> "Polygon":
+        from shapely import Polygon
+
+        return Polygon(self.corners_m)
+
+    def fits(self, grid: BevGrid) -> bool:
+        """Whether it lies within the grid.
+
+        Example:
+            >>> Region("far", (0.0, 90.0), (-1.0, 1.0)).fits(BevGrid(x=(0.0, 80.0), y=(-20.0, 20.0)))
+            False
+        """
+        return all(
+            bounds[0] <= low and high <= bounds[1] for (low, high), bounds in ((self.x, grid.x), (self.y, grid.y))
+        )
 
     def mask(self, grid: BevGrid) -> Tensor:
         """(Y, X) bool: the cells of the grid that belong to the region.
@@ -42,24 +113,42 @@ class Region:
         Raises:
             ValueError: The region reaches beyond the grid, so that its number would be about something smaller.
         """
-        for axis, region, bounds in (("x", self.x, grid.x), ("y", self.y, grid.y)):
-            if region[0] < bounds[0] or region[1] > bounds[1]:
-                raise ValueError(
-                    f"region {self.name!r} spans {axis} = {region[0]:g} to {region[1]:g} m, beyond the grid's "
-                    f"{bounds[0]:g} to {bounds[1]:g} m; enlarge the grid or leave the region out"
-                )
+        if not self.fits(grid):
+            axis, region, bounds = next(
+                side
+                for side in (("x", self.x, grid.x), ("y", self.y, grid.y))
+                if side[1][0] < side[2][0] or side[1][1] > side[2][1]
+            )
+            raise ValueError(
+                f"region {self.name!r} spans {axis} = {region[0]:g} to {region[1]:g} m, beyond the grid's "
+                f"{bounds[0]:g} to {bounds[1]:g} m; enlarge the grid or leave the region out"
+            )
         x, y = grid.x_centres_m, grid.y_centres_m
-        return ((y >= self.y[0]) & (y < self.y[1]))[:, None] & ((x >= self.x[0]) & (x < self.x[1]))
+        if not self.corners_m:
+            return ((y >= self.y[0]) & (y < self.y[1]))[:, None] & ((x >= self.x[0]) & (x < self.x[1]))
+        import shapely
+
+        polygon = self._polygon
+        shapely.prepare(polygon)
+        further_x, further_y = (share * grid.cell for share in ON_AN_EDGE)
+        return torch.from_numpy(
+            shapely.contains_xy(polygon, (x + further_x)[None, :].numpy(), (y + further_y)[:, None].numpy())
+        )
 
 
 def check_regions(regions: Sequence[Region], grid: BevGrid) -> None:
     """Refuse regions that no number of a grid can be given for.
 
     Raises:
-        ValueError: One reaches beyond the grid, or holds no cell centre.
+        ValueError: One reaches beyond the grid, or holds no cell centre; two have one name.
     """
+    names = [region.name for region in regions]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"regions: each name may be given once; got {', '.join(map(repr, twice))} again")
     for region in regions:
-        if not region.mask(grid).any():
+        with torch.device("cpu"):  # on the device `meta` nothing is true or false
+            empty = not region.mask(grid).any()
+        if empty:
             raise ValueError(f"region {region.name!r} holds no cell centre; use smaller cells than {grid.cell:g} m")
 
 
@@ -70,14 +159,7 @@ def regions_within(grid: BevGrid) -> tuple[Region, ...]:
         >>> [region.name for region in regions_within(BevGrid(x=(0.0, 100.0), y=(-40.0, 40.0)))]
         ['20m', '80m']
     """
-    return tuple(
-        region
-        for region in forward_regions()
-        if grid.x[0] <= region.x[0]
-        and region.x[1] <= grid.x[1]
-        and grid.y[0] <= region.y[0]
-        and region.y[1] <= grid.y[1]
-    )
+    return tuple(region for region in forward_regions() if region.fits(grid))
 
 
 def forward_regions(ranges: Sequence[float] = (20.0, 80.0, 160.0)) -> tuple[Region, ...]:
@@ -91,6 +173,33 @@ def forward_regions(ranges: Sequence[float] = (20.0, 80.0, 160.0)) -> tuple[Regi
 
     Example:
         >>> forward_regions((20,))
-        (Region(name='20m', x=(0.0, 20.0), y=(-5.0, 5.0)),)
+        (Region(name='20m', x=(0.0, 20.0), y=(-5.0, 5.0), corners_m=()),)
     """
     return tuple(Region(f"{reach:g}m", (0.0, float(reach)), (-reach / 4, reach / 4)) for reach in ranges)
+
+
+def near_field_regions(
+    x: tuple[float, float], y: tuple[float, float], reach_m: float = NEAR_FIELD_M
+) -> tuple[Region, ...]:
+    """The near field on the four sides of a vehicle; those in front and at the rear have the corners.
+
+    Args:
+        x: Rear and front end of the vehicle, in metres.
+        y: Right and left side.
+        reach_m: How far the regions reach from it.
+
+    Returns:
+        Four regions that do not overlap: "front_3m", "rear_3m", "left_3m", "right_3m".
+
+    Example:
+        >>> [(each.name, each.x, each.y) for each in near_field_regions((-0.5, 0.5), (-0.4, 0.4))][1:3]
+        [('rear_3m', (-3.5, -0.5), (-3.4, 3.4)), ('left_3m', (-0.5, 0.5), (0.4, 3.4))]
+    """
+    across = y[0] - reach_m, y[1] + reach_m
+    sides = {
+        "front": ((x[1], x[1] + reach_m), across),
+        "rear": ((x[0] - reach_m, x[0]), across),
+        "left": (x, (y[1], across[1])),
+        "right": (x, (across[0], y[0])),
+    }
+    return tuple(Region(f"{side}_{reach_m:g}m", *bounds) for side, bounds in sides.items())

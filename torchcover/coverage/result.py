@@ -18,8 +18,10 @@ from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.intervals import interval95
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import RADIUS, Quantity, by_area
+from torchcover.coverage.redundancy import Redundancy
+from torchcover.coverage.region_redundancy import over_known, over_place, region_redundancy
 from torchcover.coverage.regions import Region, check_regions, regions_within
-from torchcover.coverage.summary import Number, RegionSummary
+from torchcover.coverage.summary import Number, RegionRedundancy, RegionSummary
 
 
 class Coverage:
@@ -37,6 +39,9 @@ class Coverage:
         counts: What happened on the way, one number for each name in `COUNTS`.
         blocks: The sums in blocks of contiguous steps, if errors were asked for.
         area: The sums over the visible surface, if the reference points had square metres.
+        regions: What `summary` gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
+            the grid if not given.
+        redundancy: What each sensor of the rig adds, if the metric was told of the sensors.
 
     Attributes:
         layers: By the key of their quantity: `coverage.layers["radius_m"].values`.
@@ -47,6 +52,7 @@ class Coverage:
         "empty_sensor_steps",
         "empty_reference_steps",
         "saturated_points",
+        "inside_points",
         "outside_points",
     )
 
@@ -62,6 +68,8 @@ class Coverage:
         counts: Mapping[str, int],
         blocks: Blocks | None = None,
         area: AreaSums | None = None,
+        regions: Sequence[Region] | None = None,
+        redundancy: Redundancy | None = None,
     ) -> None:
         self.grid = grid
         self.thresholds = tuple(thresholds)
@@ -72,6 +80,8 @@ class Coverage:
         self.counts = dict(counts)
         self.blocks = blocks
         self.area = area
+        self.regions = regions_within(grid) if regions is None else tuple(regions)
+        self.redundancy = redundancy
         self._estimates: dict[tuple[Region, str, Measure], RegionEstimate] = {}
 
     def __repr__(self) -> str:
@@ -132,7 +142,7 @@ class Coverage:
         """One row for each region and height band.
 
         Args:
-            regions: Regions within the grid; the paper's `forward_regions()` that fit the grid if not given.
+            regions: Regions within the grid; `self.regions` if not given.
 
         Returns:
             Rows in the order of the regions, then of the bands.
@@ -140,7 +150,7 @@ class Coverage:
         Raises:
             ValueError: A region reaches beyond the grid, or holds no cell centre.
         """
-        wanted = regions_within(self.grid) if regions is None else regions
+        wanted = self.regions if regions is None else regions
         return [self._summarise(region, height) for region in wanted for height in self.grid.heights]
 
     @property
@@ -225,6 +235,8 @@ class Coverage:
             "counts": self.counts,
             "blocks": self.blocks,
             "area": self.area,
+            "regions": self.regions,
+            "redundancy": self.redundancy,
         }
         write_coverage(parts, self.errors, Path(path))
 
@@ -251,7 +263,20 @@ class Coverage:
             numbers=self._numbers(self.estimate(region, height), self.measure),
             known=self._numbers(self.estimate(region, height, "known"), "known"),
             visible_m2=math.nan if self.area is None else self._visible_m2(self.area, band, cells),
+            redundancy=self._without_each(region, height),
         )
+
+    def _without_each(self, region: Region, height: str) -> RegionRedundancy | None:
+        """What each sensor adds; by area it is known of the regions only that the metric was told of."""
+        redundancy, band = self.redundancy, list(self.grid.heights).index(height)
+        if redundancy is None or (redundancy.places is not None and region not in self.regions):
+            return None
+        if redundancy.places is not None:
+            place = self.regions.index(region) * len(self.grid.heights) + band
+            return region_redundancy(redundancy, self.thresholds, over_place(redundancy.places, place))
+        known = region.mask(self.grid).to(self.radius.device) & (self.probed_steps[band] > 0)
+        with_all = self.estimate(region, height, "known").value
+        return region_redundancy(redundancy, self.thresholds, over_known(redundancy, with_all, band, known))
 
     def _visible_m2(self, area: AreaSums, band: int, cells: Tensor) -> float:
         total = float(area_in_blocks(area, band, cells.to(area.at.device))[:, 0].sum())

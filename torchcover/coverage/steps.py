@@ -2,7 +2,7 @@
 
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any, NamedTuple, TypeAlias
 
@@ -10,22 +10,28 @@ from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
 from torchcover.coverage.quantity import detection
+from torchcover.coverage.redundancy import SensorFailures
 from torchcover.neighbors import check_cloud, check_tensor
 
 # The aggregations that a metric has by itself, and the names that its own states begin with.
-BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, "block", "probed"})
+BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, SensorFailures.name, "block", "probed"})
 
 # Steps are numbered in int64, and blocks double until one holds the last.
 MAX_NUMBER = 10**15
 
 # One step, or a list with an entry for each.
 Clouds: TypeAlias = Tensor | Sequence[Tensor]
+# Of a rig whose sensors are told apart: by their names.
+SensorClouds: TypeAlias = Clouds | Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]]
 
 
 class Step(NamedTuple):
-    """One step: two clouds in the vehicle frame, weights of the reference points, and its number in time."""
+    """One step: clouds in the vehicle frame, weights of the reference points, and its number in time.
 
-    sensor: Tensor
+    `sensors` has those of the rig by the names of the sensors; one without a name if they are not told apart.
+    """
+
+    sensors: Mapping[str, Tensor]
     reference: Tensor
     weights: Tensor | None
     number: int
@@ -67,7 +73,13 @@ def _check_aggregations(aggregations: Sequence[Aggregation]) -> None:
 
 
 def checked_steps(
-    sensor: Clouds, reference: Clouds, weights: Clouds | None, index: int | Sequence[int] | None, first: int
+    sensor: SensorClouds,
+    reference: Clouds,
+    weights: Clouds | None,
+    index: int | Sequence[int] | None,
+    *,
+    names: Sequence[str] = (),
+    first: int,
 ) -> list[Step]:
     """The steps of an update, in order.
 
@@ -76,6 +88,7 @@ def checked_steps(
         reference: Reference points.
         weights: Their weights.
         index: Numbers of the steps in time.
+        names: Of the sensors, where they are told apart.
         first: Number of the first step if `index` is not given.
 
     Raises:
@@ -83,7 +96,9 @@ def checked_steps(
             not positive and finite, an index that is negative or above 10^15.
         TypeError: A cloud is not a floating-point tensor, an index not a whole number.
     """
-    sensors, references = as_list(sensor, "sensor"), as_list(reference, "reference")
+    rigs = [sensor] if isinstance(sensor, Mapping) else as_list(sensor, "sensor")
+    sensors = [_by_name(rig, names) for rig in rigs]
+    references = as_list(reference, "reference")
     count = len(references)
     every_weights: Sequence[Tensor | None] = [None] * count if weights is None else as_list(weights, "weights")
     numbers = list(range(first, first + count)) if index is None else _numbers(index)
@@ -95,7 +110,8 @@ def checked_steps(
         )
     steps = [Step(*parts) for parts in zip(sensors, references, every_weights, numbers, strict=True)]
     for at, step in enumerate(steps):
-        check_cloud(step.sensor, f"sensor[{at}]")
+        for name, cloud in step.sensors.items():
+            check_cloud(cloud, f"sensor[{at}]" + f"[{name!r}]" * bool(name))
         check_cloud(step.reference, f"reference[{at}]")
         _check_weights(step.weights, len(step.reference), f"weights[{at}]")
         if not 0 <= step.number <= MAX_NUMBER:
@@ -103,7 +119,7 @@ def checked_steps(
     return steps
 
 
-def as_list(clouds: Clouds, name: str) -> list[Tensor]:
+def as_list(clouds: Any, name: str) -> list[Any]:  # noqa: ANN401
     """A list with an entry for each step.
 
     Args:
@@ -118,6 +134,19 @@ def as_list(clouds: Clouds, name: str) -> list[Tensor]:
     if not isinstance(clouds, Sequence):
         check_tensor(clouds, f"{name} (one, or a list with one for each step)")
     return list(clouds)
+
+
+def _by_name(rig: Any, names: Sequence[str]) -> Mapping[str, Tensor]:  # noqa: ANN401  (whatever the caller gave)
+    if not names:
+        if isinstance(rig, Mapping):
+            raise TypeError(
+                "sensor: one cloud a step is needed; got clouds by name, for which the metric needs sensors="
+            )
+        return {"": rig}
+    if not isinstance(rig, Mapping) or set(rig) != set(names):
+        arrived = ", ".join(rig) if isinstance(rig, Mapping) else type(rig).__name__
+        raise ValueError(f"sensor: the clouds of {', '.join(names)}, by these names, are needed; got {arrived}")
+    return {name: rig[name] for name in names}
 
 
 def _numbers(index: Any) -> list[int]:  # noqa: ANN401  (whatever the caller gave)

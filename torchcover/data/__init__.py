@@ -8,9 +8,11 @@ from torchcover.data.clouds import read_cloud
 from torchcover.data.frame import Frame, FrameBatch, collate_frames
 from torchcover.data.recorded import RecordedFrames, reference_of_recording
 from torchcover.data.recorded_reference import RecordedReference, Reference
+from torchcover.data.recorded_rig import rig_document
 from torchcover.data.recorders import RECORDERS, write_recording
 from torchcover.data.recordings import FORMATS, Recording, RecordingFormat, Scan, open_recording
-from torchcover.data.reference import DEFAULT_REFERENCE, GRID_X_M, GRID_Y_M, reference_called, reference_of_objects
+from torchcover.data.reference import DEFAULT_REFERENCE, reference_called, reference_of_objects
+from torchcover.data.regions_of_interest import GRID_X_M, GRID_Y_M, Asked, RegionsOfInterest
 from torchcover.data.simulated import SimulatedFrames
 from torchcover.data.source import FrameSource
 
@@ -21,6 +23,7 @@ __all__ = [
     "GRID_Y_M",
     "RECORDERS",
     "AccumulatedReference",
+    "Asked",
     "Augmentation",
     "BadFrameError",
     "ChosenRigs",
@@ -32,6 +35,7 @@ __all__ = [
     "Recording",
     "RecordingFormat",
     "Reference",
+    "RegionsOfInterest",
     "Scan",
     "SimulatedFrames",
     "collate_frames",
@@ -41,6 +45,7 @@ __all__ = [
     "reference_called",
     "reference_of_objects",
     "reference_of_recording",
+    "rig_document",
     "rotate",
     "scale",
     "write_recording",

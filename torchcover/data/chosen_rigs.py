@@ -73,7 +73,9 @@ class ChosenRigs(FrameDataset):
     def __getitem__(self, index: int) -> Frame:
         frame = self.frames[index]
         boxes = None if frame.boxes is None else replace(frame.boxes, hits=self._chosen(frame.boxes.hits))
-        return replace(frame, clouds={name: frame.cloud_of(of) for name, of in self.names.items()}, boxes=boxes)
+        points = None if frame.sensor_points is None else self._chosen(frame.sensor_points)
+        clouds = {name: frame.cloud_of(of) for name, of in self.names.items()}
+        return replace(frame, clouds=clouds, boxes=boxes, sensor_points=points)
 
     def _chosen(self, by_rig: Mapping[str, ValueT]) -> dict[str, ValueT]:
         return {name: by_rig[of] for name, of in self.names.items() if of in by_rig}

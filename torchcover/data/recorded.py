@@ -160,6 +160,9 @@ class RecordedFrames(FrameDataset):
             weight_kind=self.weight_kind,
             boxes=boxes,
             instant=None if self.recording.instants is None else self.recording.instants[instant],
+            sensor_points={
+                rig: {sensor: len(scans[sensor].points_m) for sensor in of} for rig, of in self.sensors_of_rigs.items()
+            },
         )
 
     @property

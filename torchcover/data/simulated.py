@@ -14,10 +14,21 @@ from numpy.typing import NDArray
 
 from torchcover.data.frame import Frame
 from torchcover.data.reference import reference_called, reference_of_objects
+from torchcover.data.regions_of_interest import RegionsOfInterest
 from torchcover.data.source import FrameDataset
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import with_hits
-from torchcover.simulation import Label, Observation, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
+from torchcover.simulation import (
+    Label,
+    Observation,
+    ReferenceSensor,
+    Rig,
+    Scenario,
+    Sensor,
+    Simulator,
+    WeightKind,
+    with_ego,
+)
 
 # What takes years.
 MAX_STEPS = 1_000_000_000
@@ -39,16 +50,17 @@ class SimulatedFrames(FrameDataset):
         steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
             traffic, the same instants are seen again, which `Frame.instant` and `Frame.counts` say.
         seed: Seed of the traffic and of the reference sensor's poses.
-        reference_sensor: The reference sensor, such as `PaperReference()`. If not given, a `SurfaceReference`:
-            `reference_called()`, and `reference_of_objects()` with boxes, at up to twice the time.
+        reference_sensor: The reference sensor, such as `PaperReference()`. If not given, a `SurfaceReference` that is
+            aimed at the usual regions: `reference_called`, and `reference_of_objects` with boxes, at up to twice the
+            time.
         every_s: Time between one frame and the next, a multiple of the scenario's time step; that step if not given.
             Steps that follow each other are alike: with the same number of frames, a longer time shows more, and in
             traffic, which starts anew, the frames are spread over more cities.
         boxes: Whether frames have `boxes`: one for each object within the reference's range, with how many points each
             rig has in it, and how many the reference drew on it. An object's name is its own within a run of the
             scenario.
-        vehicle: What carries the rigs: a built-in vehicle, or the YAML file of one. Not given: the scenario's own ego,
-            else the vehicle that the rigs name, else an SUV.
+        vehicle: What carries the rigs: a built-in vehicle, the YAML file of one, or a mesh file. Not given: the scenario's
+            own ego, else the vehicle that the rigs name, else an SUV.
 
     Raises:
         FileNotFoundError: An unknown name or file.
@@ -77,15 +89,17 @@ class SimulatedFrames(FrameDataset):
     ) -> None:
         if not 1 <= steps <= MAX_STEPS:
             raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
+        carried = _rigs(rig, rigs)
+        world = with_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), carried, vehicle)
         if reference_sensor is None:
-            reference_sensor = reference_of_objects() if boxes else reference_called()
+            asked = RegionsOfInterest().around(world.ego_box().outline_m)
+            reference_sensor = reference_of_objects(asked) if boxes else reference_called(asked=asked)
         self.simulator = Simulator(
-            scenario if isinstance(scenario, Scenario) else Scenario.load(scenario),
-            _rigs(rig, rigs),
+            world,
+            carried,
             reference_sensor,
             seed=seed,
             every_s=every_s,
-            vehicle=vehicle,
         )
         self.steps = steps
         self.boxes = boxes
@@ -191,6 +205,10 @@ class SimulatedFrames(FrameDataset):
             counts=seen.counts,
             boxes=_boxes(self.simulator.labels(index), clouds, seen.drawn) if self.boxes else None,
             instant=self.simulator.place_in_time(index),
+            sensor_points={
+                name: dict(zip((sensor.name for sensor in self.rigs[name].sensors), points, strict=True))
+                for name, points in seen.sensor_points.items()
+            },
         )
 
 

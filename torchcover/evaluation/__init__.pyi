@@ -29,6 +29,11 @@ from .target_error import TargetError as TargetError
 from .target_error import TargetWatch as TargetWatch
 from .target_error import standings as standings
 from .target_outcome import outcome as outcome
+from .target_survey import free_space as free_space
+from .target_survey import save_targets as save_targets
+from .target_survey import survey_target as survey_target
+from .target_survey import target_picture as target_picture
+from .target_survey import target_record as target_record
 from .work_points import WorkPoint as WorkPoint
 from .work_points import cheapest as cheapest
 from .work_points import pareto_front as pareto_front

@@ -10,7 +10,7 @@ from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.rig_names import AnyRig, given_as
 from torchcover.evaluation.saved import compare_saved, saved_among
-from torchcover.evaluation.settings import AnyDevice, AnyThresholds, Settings
+from torchcover.evaluation.settings import AnyAsk, AnyDevice, AnyThresholds, Settings
 from torchcover.evaluation.target_error import AnyTargetError
 from torchcover.evaluation.task import AnyFrames, AnyScenario, task_of
 
@@ -23,7 +23,8 @@ def evaluate(
     steps: int | None = None,
     seed: int = 0,
     vehicle: str | Path | None = None,
-    cell_m: float = 0.25,
+    ask: AnyAsk | None = None,
+    cell_m: float | None = None,
     thresholds: AnyThresholds = (0.4,),
     aggregations: Sequence[Aggregation] = (),
     reference_sensor: str | None = None,
@@ -31,6 +32,7 @@ def evaluate(
     estimate: Measure | None = None,
     every_s: float | None = None,
     target_error: AnyTargetError | None = None,
+    redundancy: bool = False,
     device: AnyDevice = "cpu",
     workers: int = 0,
     skip_bad_frames: bool = False,
@@ -48,9 +50,11 @@ def evaluate(
         frames: A recording, or any source of frames, instead.
         steps: Steps to simulate (64; with a target error at most, 4096), or frames to use at most (all).
         seed: Seed of the simulation.
-        vehicle: What carries the rig: a built-in vehicle, or the YAML file of one. Not given: the scenario's own ego,
-            else the vehicle that the rig names, else an SUV.
-        cell_m: Side of a grid cell in metres.
+        vehicle: What carries the rig: a built-in vehicle, the YAML file of one, or a mesh file. Not given: the
+            scenario's own ego, else the vehicle that the rig names, else an SUV.
+        ask: Regions, height bands and grid: `RegionsOfInterest`, or the path of a YAML file; not given: the paper's
+            regions in front, and the near field on the four sides of the vehicle.
+        cell_m: Side of a grid cell in metres, whatever `ask` says; 0.25 if neither does.
         thresholds: Detection thresholds in metres, or a single one.
         aggregations: Maps beside the mean of means, as in `CoverageMetric`.
         reference_sensor: Name of the reference sensor, as in `torchcover.simulation.REFERENCE_SENSORS`; "surface" if
@@ -59,7 +63,10 @@ def evaluate(
         estimate: What the number of a region is a mean over: "area", its visible surface, or "known", its known cells.
             Not given: the surface, if the reference points have square metres.
         every_s: Time between two steps in seconds; not given: 10 in traffic, else what spreads them over the scenario.
-        target_error: End once every number is this good: a `TargetError`, "0.1%", or ["0.1%", "0.02m"].
+        target_error: End once every number, of the usual regions those in front, is this good: a `TargetError`,
+            "0.1%", or ["0.1%", "0.02m"].
+        redundancy: Whether to find out by how many sensors places are seen, and what is lost when each sensor fails:
+            `Result.table.redundancy` and `Coverage.redundancy`.
         device: Where the search and the sums run: "cpu", "cuda", ...
         workers: Processes that make frames; 0 makes them in this one.
         skip_bad_frames: Skip and note frames that cannot be read, instead of ending with the first.
@@ -82,7 +89,7 @@ def evaluate(
     Example:
         >>> result = evaluate("front_roof_32", steps=2, cell_m=1.0, rays=1024)
         >>> result.coverage.counts["steps"], [row["region"] for row in result.summary][::2]
-        (2, ['20m', '80m', '160m'])
+        (2, ['20m', '80m', '160m', 'front_3m', 'rear_3m', 'left_3m', 'right_3m'])
     """
     settings = Settings.among(locals())
     named = [] if rig is None else [rig]
@@ -102,7 +109,8 @@ def compare(
     steps: int | None = None,
     seed: int = 0,
     vehicle: str | Path | None = None,
-    cell_m: float = 0.25,
+    ask: AnyAsk | None = None,
+    cell_m: float | None = None,
     thresholds: AnyThresholds = (0.4,),
     aggregations: Sequence[Aggregation] = (),
     reference_sensor: str | None = None,
@@ -110,6 +118,7 @@ def compare(
     estimate: Measure | None = None,
     every_s: float | None = None,
     target_error: AnyTargetError | None = None,
+    redundancy: bool = False,
     device: AnyDevice = "cpu",
     workers: int = 0,
     skip_bad_frames: bool = False,
@@ -129,6 +138,7 @@ def compare(
         steps: Steps.
         seed: Seed.
         vehicle: What carries all rigs; needed where they name different ones.
+        ask: Regions, height bands and grid.
         cell_m: Side of a grid cell in metres.
         thresholds: Detection thresholds in metres.
         aggregations: Maps beside the mean of means.
@@ -137,6 +147,7 @@ def compare(
         estimate: What the numbers are means over.
         every_s: Time between two steps in seconds.
         target_error: End once every number, and every difference, is this good.
+        redundancy: Whether to find out what is lost when each sensor of each rig fails.
         device: Where the search and the sums run.
         workers: Processes that make frames.
         skip_bad_frames: Whether to skip bad frames.

@@ -56,13 +56,14 @@ def measured(
         run.raise_failure()  # within a step: the rigs have not seen the same
     result = Result(
         coverages=coverages,
-        regions=settings.regions,
+        regions=task.asked.regions,
         run=run,
         rigs=task.given,
         source=task.description,
         reference_record=frames.reference_record,
         device=settings.device,
         target_error=settings.target_error,
+        awaited=task.asked.awaited,
         sensors=task.sensors,
         ego_outline_m=frames.ego_outline_m,
         observed={name: observer.compute() for name, observer in others.items()},
@@ -91,9 +92,12 @@ def _observed(
     """All that was seen, by all ranks."""
     if ranks:
         settings = replace(settings, device=ranks.device(settings.device))
-    coverage = {name: CoverageObserver(settings.metric(task.frames.weight_kind), name) for name in task.rigs}
+    kind, sensors = task.frames.weight_kind, task.sensor_names() if settings.redundancy else {}
+    coverage = {
+        name: CoverageObserver(settings.metric(task.asked, kind, sensors.get(name, ())), name) for name in task.rigs
+    }
     target = settings.target_error
-    watch = TargetWatch(target, coverage, settings.regions) if target else None
+    watch = TargetWatch(target, coverage, task.asked.awaited) if target else None
     observers: Sequence[AnyObserver] = [*coverage.values(), *others.values()]
     identity = run_identity(task, settings, others, ranks.size if ranks else 1) if ranks or checkpoint else {}
     if ranks:

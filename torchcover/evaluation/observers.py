@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
+from torch import Tensor
+
 from torchcover.coverage import Coverage, CoverageMetric
 from torchcover.data import Frame
 
@@ -82,11 +84,18 @@ class CoverageObserver:
 
         Raises:
             ValueError: As `CoverageMetric.update`, several rigs and none was named, or reference points without the
-                square metres that the metric wants.
+                square metres that the metric wants, or nobody knows which points are of which sensor and it wants
+                that.
         """
         frame.check_weights(square_metres=self.metric.square_metres)
-        sensor = frame.sensor if self.rig is None else frame.cloud_of(self.rig)
+        sensor = self._by_sensor(frame) if self.metric.sensors else self._whole(frame)
         self.metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.place_in_time)
+
+    def _whole(self, frame: Frame) -> Tensor:
+        return frame.sensor if self.rig is None else frame.cloud_of(self.rig)
+
+    def _by_sensor(self, frame: Frame) -> dict[str, Tensor]:
+        return frame.clouds_by_sensor(self.rig)
 
     def compute(self) -> Coverage:
         """The coverage so far."""

@@ -55,7 +55,7 @@ def left_out(
         Omission(what, frame_counts[count], frame_counts[of]) for what, count, of in COUNTED if frame_counts.get(count)
     ]
     outside = sum(coverage.counts["outside_points"] for coverage in coverages)
-    inside = sum(int(coverage.points.sum()) for coverage in coverages)
+    inside = sum(coverage.counts["inside_points"] for coverage in coverages)
     if outside:
         found.append(Omission("reference points outside every cell: not searched for", outside, inside + outside))
     asked_for = {aggregation.name for aggregation in aggregations}

@@ -39,6 +39,7 @@ class Result:
         reference_record: Where the reference comes from, as `FrameSource.reference_record` says; None if nobody knows.
         device: Where it ran; None if nobody knows.
         target_error: What was aimed at.
+        awaited: The regions that it was about.
         sensors: The sensors of the rigs that they are known of, for the maps.
         ego_outline_m: (K, 2) corners x, y of the ego in metres, for the maps.
         observed: What the user's own observers computed, by their names.
@@ -54,6 +55,7 @@ class Result:
     reference_record: Mapping[str, Any] | None
     device: str | None
     target_error: TargetError | None = None
+    awaited: Sequence[Region] = ()
     sensors: Mapping[str, Sequence[Sensor]] = field(default_factory=dict)
     ego_outline_m: NDArray[Any] | None = None
     observed: Mapping[str, Any] = field(default_factory=dict)
@@ -163,7 +165,7 @@ class Result:
     @property
     def _outcome(self) -> tuple[dict[str, Any] | None, list[str]]:
         confirmed = self.run is not None and self.run.reached
-        return outcome(self.target_error, self.coverages, self.regions, confirmed=confirmed)
+        return outcome(self.target_error, self.coverages, self.awaited, confirmed=confirmed)
 
     @property
     def _first(self) -> Coverage:

@@ -5,6 +5,7 @@ import json
 from collections.abc import Mapping
 
 from torchcover import __version__
+from torchcover.data import Asked
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
@@ -33,10 +34,11 @@ def run_identity(task: Task, settings: Settings, others: Mapping[str, AnyObserve
         "torchcover": __version__,
         **task.frames.content,
         "rigs": task.rigs,
-        "cell_m": settings.cell_m,
+        **_asked(task.asked),
         "thresholds": settings.thresholds,
         "aggregations": settings.aggregations,
         "estimate": settings.estimate,
+        "redundancy": settings.redundancy,
         "target_error": settings.target_error,
         "observers": kinds,
         "ranks": ranks,
@@ -53,6 +55,16 @@ def differences(here: Mapping[str, str], there: Mapping[str, str]) -> str:
     """
     names = [name for name in sorted(here.keys() | there.keys()) if here.get(name) != there.get(name)]
     return ", ".join(f"{name} {_change(here.get(name, 'none'), there.get(name, 'none'))}" for name in names)
+
+
+def _asked(asked: Asked) -> dict[str, object]:
+    grid = asked.grid
+    return {
+        "cell_m": grid.cell,
+        "grid": [grid.x, grid.y],
+        "heights": list(grid.heights.items()),
+        "regions": [[region.name, region.x, region.y, region.corners_m] for region in asked.regions],
+    }
 
 
 def _change(here: str, there: str) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from torchcover.coverage import Coverage, regions_within
+from torchcover.coverage import Coverage
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.rig_names import AnyRig, distinct
 
@@ -39,7 +39,7 @@ def compare_saved(files: Sequence[str | Path]) -> Result:
     first = next(iter(coverages.values()))
     return Result(
         coverages=coverages,
-        regions=regions_within(first.grid),
+        regions=first.regions,
         run=None,
         rigs={name: str(file) for name, file in zip(names, files, strict=True)},
         source={"scenario": None, "vehicle": None, "frames": None, "seed": None},

@@ -5,13 +5,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from numbers import Real
+from pathlib import Path
 from typing import Any, Self, get_args
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.coverage import Aggregation, BevGrid, CoverageMetric, Measure, Region, check_regions, forward_regions
-from torchcover.data import GRID_X_M, GRID_Y_M
+from torchcover.coverage import Aggregation, CoverageMetric, Measure
+from torchcover.data import Asked, RegionsOfInterest
 from torchcover.evaluation.target_error import AnyTargetError, TargetError
 from torchcover.simulation import Scenario, WeightKind
 from torchcover.simulation.memory import check_fits
@@ -28,7 +31,9 @@ BLOCKS = 16
 STATE_COPIES = 2
 # A process with torch and the geometry of a small scenario.
 BYTES_PER_WORKER = 300e6
+TOO_MANY_CELLS = "use larger cells, or a smaller grid"
 
+AnyAsk = RegionsOfInterest | str | Path
 AnyThresholds = float | Iterable[float]
 AnyDevice = str | torch.device
 
@@ -44,7 +49,8 @@ class Settings:
     steps: int | None = None
     seed: int = 0
     vehicle: str | None = None
-    cell_m: float = 0.25
+    ask: RegionsOfInterest | None = None
+    cell_m: float | None = None
     thresholds: tuple[float, ...] = (0.4,)
     aggregations: tuple[Aggregation, ...] = ()
     reference_sensor: str | None = None
@@ -52,6 +58,7 @@ class Settings:
     estimate: Measure | None = None
     every_s: float | None = None
     target_error: TargetError | None = None
+    redundancy: bool = False
     device: str = "cpu"
     workers: int = 0
     skip_bad_frames: bool = False
@@ -75,6 +82,7 @@ class Settings:
         given["thresholds"] = _thresholds(given["thresholds"])
         given["aggregations"] = _aggregations(given["aggregations"])
         given["target_error"] = _target(given["target_error"])
+        given["ask"] = _asked(given["ask"])
         given["device"] = str(given["device"])
         given["vehicle"] = given["vehicle"] and str(given["vehicle"])
         return cls(**given)
@@ -86,10 +94,16 @@ class Settings:
             return self.steps
         return DEFAULT_STEPS if self.target_error is None else MAX_STEPS
 
-    @property
-    def regions(self) -> tuple[Region, ...]:
-        """Those that numbers are given for."""
-        return forward_regions()
+    def asked(self, ego_outline_m: NDArray[np.float64] | None) -> Asked:
+        """Regions, height bands and grid for one vehicle.
+
+        Args:
+            ego_outline_m: (K, 2) its corners x, y; None if nobody knows.
+
+        Raises:
+            ValueError: As `RegionsOfInterest.around`.
+        """
+        return (self.ask or RegionsOfInterest()).around(ego_outline_m, self.cell_m)
 
     def check_recording(self) -> None:
         """Find out whether anything was set that a recording decides itself.
@@ -102,10 +116,12 @@ class Settings:
         if any(setting is not None for setting in (self.reference_sensor, self.rays, self.every_s)):
             raise ValueError("reference, rays and every are for simulations; a recording has its reference points")
 
-    def metric(self, weight_kind: WeightKind | None) -> CoverageMetric:
+    def metric(self, asked: Asked, weight_kind: WeightKind | None, sensors: Sequence[str] = ()) -> CoverageMetric:
         """An empty metric.
 
         Args:
+            asked: What is asked about.
+            sensors: Names of the sensors, for redundancy.
             weight_kind: What the weights of reference points are.
 
         Raises:
@@ -118,10 +134,11 @@ class Settings:
                 "simulation gives; leave it out for means over the known cells"
             )
         return new_metric(
-            self.cell_m,
+            asked,
             self.thresholds,
             usable_device(self.device),
             aggregations=self.aggregations,
+            sensors=sensors,
             square_metres=weight_kind == "m2" and self.estimate != "known",
         )
 
@@ -142,22 +159,21 @@ def usable_device(name: str) -> torch.device:
 
 
 def new_metric(
-    cell_m: float,
+    asked: Asked,
     thresholds: tuple[float, ...],
     device: torch.device,
     *,
     blocks: int = BLOCKS,
     aggregations: Sequence[Aggregation] = (),
+    sensors: Sequence[str] = (),
     square_metres: bool = False,
 ) -> CoverageMetric:
-    """An empty metric over the grid of every evaluation, with standard errors unless there is one block only.
+    """An empty metric of what is asked about, with standard errors unless there is one block only.
 
     Raises:
-        ValueError: A cell or a threshold that makes no sense, a region without a cell, or more cells than there is
-            memory for.
+        ValueError: A threshold that makes no sense, or more cells than there is memory for.
     """
-    grid = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=cell_m)
-    check_regions(forward_regions(), grid)
+    grid = asked.grid
     build = partial(
         CoverageMetric,
         grid,
@@ -165,6 +181,8 @@ def new_metric(
         max_radius=grid.diagonal_m,
         blocks=blocks,
         aggregations=aggregations,
+        regions=asked.regions,
+        sensors=sensors,
         square_metres=square_metres,
         sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
     )
@@ -173,12 +191,12 @@ def new_metric(
             need = STATE_COPIES * sum(
                 state.nbytes for state in build().metric_state.values() if isinstance(state, Tensor)
             )
-        check_fits(f"the sums of {grid.cells:,} cells in {blocks} blocks", need, "use larger cells")
+        check_fits(f"the sums of {grid.cells:,} cells in {blocks} blocks", need, TOO_MANY_CELLS)
         return build().to(device)
     except RuntimeError as error:  # what torch raises when there is no memory left on the device
         raise ValueError(
-            f"a cell of {cell_m:g} m: there is not enough memory for the sums of {grid.cells:,} cells in {blocks} "
-            "blocks; use larger cells"
+            f"a cell of {grid.cell:g} m: there is not enough memory for the sums of {grid.cells:,} cells in {blocks} "
+            f"blocks; {TOO_MANY_CELLS}"
         ) from error
 
 
@@ -215,6 +233,14 @@ def _aggregations(given: Any) -> tuple[Aggregation, ...]:  # noqa: ANN401
     if not isinstance(given, Sequence):  # what is in it the metric checks
         raise TypeError(f"aggregations: a sequence of objects such as [Maximum()] is needed; got {given!r}")
     return tuple(given)
+
+
+def _asked(given: AnyAsk | None) -> RegionsOfInterest | None:
+    if given is None or isinstance(given, RegionsOfInterest):
+        return given
+    if not isinstance(given, str | Path):
+        raise TypeError(f"ask: RegionsOfInterest(...) or the path of a YAML file is needed; got {given!r}")
+    return RegionsOfInterest.load(given)
 
 
 def _target(given: AnyTargetError | None) -> TargetError | None:

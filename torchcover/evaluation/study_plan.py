@@ -6,9 +6,9 @@ from pathlib import Path
 import torch
 
 from torchcover.coverage import CoverageMetric
-from torchcover.data import SimulatedFrames
+from torchcover.data import Asked, RegionsOfInterest, SimulatedFrames, reference_called
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, new_metric, spread_s
-from torchcover.simulation import Scenario
+from torchcover.simulation import ReferenceSensor, Rig, Scenario, with_ego
 
 # The long run's seed is far away from any other.
 LONG_RUN_SEED = 1_000_003
@@ -75,8 +75,19 @@ class StudyPlan:
             seed=seed,
             every_s=spread_s(scenario, self.every_s),
             vehicle=self.vehicle,
+            reference_sensor=self.reference_sensor(),
         )
+
+    def reference_sensor(self, rays: int | None = None) -> ReferenceSensor:
+        """The reference sensor, aimed as that of `evaluate`."""
+        return reference_called(rays=rays, asked=self.asked)
+
+    @property
+    def asked(self) -> Asked:
+        """What `evaluate` is asked about, too."""
+        scenario = with_ego(Scenario.load(self.scenario), {str(self.rig): Rig.load(self.rig)}, self.vehicle)
+        return RegionsOfInterest().around(scenario.ego_box().outline_m, self.cell_m)
 
     def metric(self, blocks: int) -> CoverageMetric:
         """An empty metric."""
-        return new_metric(self.cell_m, (self.threshold_m,), torch.device("cpu"), blocks=blocks, square_metres=True)
+        return new_metric(self.asked, (self.threshold_m,), torch.device("cpu"), blocks=blocks, square_metres=True)

@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory
 import torch
 from torch import Tensor
 
-from torchcover.data import SimulatedFrames, reference_called
+from torchcover.data import SimulatedFrames
 from torchcover.evaluation.observers import CoverageObserver
 from torchcover.evaluation.progress import progress_of
 from torchcover.evaluation.study_plan import StudyPlan
@@ -103,7 +103,7 @@ def tried(plan: StudyPlan, one_step_s: float, *, progress: bool) -> Tried:
     steps, part = plan.runs * plan.lengths[-1], plan.lengths[0]
     base = plan.frames(plan.seed, steps)
     trials = [
-        Trial(rays, base.with_reference_sensor(reference_called(rays=rays)), CoverageObserver(plan.metric(blocks=1)))
+        Trial(rays, base.with_reference_sensor(plan.reference_sensor(rays)), CoverageObserver(plan.metric(blocks=1)))
         for rays in plan.rays
     ]
     worlds, first, scene, first_step_s = Clock(), trials[0], None, 0.0

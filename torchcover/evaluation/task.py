@@ -5,7 +5,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from torchcover.data import ChosenRigs, FrameSource, RecordedFrames, SimulatedFrames, reference_called
+from torchcover.data import (
+    Asked,
+    BadFrameError,
+    ChosenRigs,
+    FrameSource,
+    RecordedFrames,
+    SimulatedFrames,
+    reference_called,
+)
 from torchcover.data.suspicion import suspicions
 from torchcover.evaluation.rig_names import AnyRig, distinct_names, given_as, is_document, loaded
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings, spread_s
@@ -23,6 +31,7 @@ class Task(NamedTuple):
         given: Name of each rig -> what the user called it; None if nobody named it.
         sensors: Name of each rig -> its sensors, where they are known.
         description: Where the frames come from, in words.
+        asked: What is asked about.
         steps: Frames to use at most; None for all.
     """
 
@@ -30,6 +39,7 @@ class Task(NamedTuple):
     given: Mapping[str, str | None]
     sensors: Mapping[str, Sequence[Sensor]]
     description: Mapping[str, object]
+    asked: Asked
     steps: int | None = None
 
     @property
@@ -41,6 +51,22 @@ class Task(NamedTuple):
     def place(self) -> str:
         """Where the frames come from, for a message."""
         return str(self.description["frames"] or self.description["scenario"])
+
+    def sensor_names(self) -> Mapping[str, Sequence[str]]:
+        """Name of each rig -> names of its sensors, from the first frame that can be used.
+
+        Raises:
+            ValueError: It does not know which points are of which sensor, or no frame can be used.
+        """
+        if isinstance(self.frames, SimulatedFrames):
+            return {name: [sensor.name for sensor in rig.sensors] for name, rig in self.frames.rigs.items()}
+        for index in range(len(self.frames)):
+            try:
+                frame = self.frames[index]
+            except BadFrameError:
+                continue  # the run itself skips it, or ends with it
+            return {name: list(frame.clouds_by_sensor(name)) for name in self.rigs}
+        raise ValueError("redundancy: no frame can be used")
 
 
 def task_of(rigs: Sequence[AnyRig], scenario: AnyScenario | None, frames: AnyFrames | None, settings: Settings) -> Task:
@@ -86,19 +112,20 @@ def _simulation(rigs: Sequence[AnyRig], scenario: AnyScenario, settings: Setting
     carried = {name: loaded(rig) for name, rig in zip(names, rigs, strict=True)}
     loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     world = with_ego(loaded_world, carried, settings.vehicle)
+    asked = settings.asked(world.ego_box().outline_m)
     frames = SimulatedFrames(
         world,
         rigs=carried,
         steps=settings.simulated_steps,
         seed=settings.seed,
         every_s=spread_s(world, settings.every_s),
-        reference_sensor=reference_called(settings.reference_sensor, settings.rays),
+        reference_sensor=reference_called(settings.reference_sensor, settings.rays, asked),
     )
     frames.simulator.check_run(frames.steps)
     given = {name: given_as(rig) for name, rig in zip(names, rigs, strict=True)}
     # A path says more than the name within the file.
     description = {**frames.description, "scenario": world.name if loaded_world is scenario else str(scenario)}
-    return Task(frames, given, frames.sensors, description, _most_steps(frames, settings))
+    return Task(frames, given, frames.sensors, description, asked, _most_steps(frames, settings))
 
 
 def _most_steps(frames: SimulatedFrames, settings: Settings) -> int | None:
@@ -118,4 +145,5 @@ def _recording(rigs: Sequence[AnyRig], frames: FrameSource, settings: Settings) 
     # A name that is in the recording may be a name only; any other has to be that of a rig.
     documents = {name: rig for name, rig in named.items() if is_document(rig) or name not in frames.rigs}
     sensors = {**chosen.sensors, **{name: loaded(rig).sensors for name, rig in documents.items()}}
-    return Task(chosen, given, sensors, frames.description, settings.steps)
+    asked = settings.asked(frames.ego_outline_m)
+    return Task(chosen, given, sensors, frames.description, asked, settings.steps)

@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from torchcover.coverage.blocks import MIN_BLOCKS
+from torchcover.report.failures import sensors_of, single_point_of_failure
 from torchcover.report.table import CoverageTable
 from torchcover.report.wording import span, steps_and_cell
 
@@ -88,10 +89,11 @@ def notes_on(table: CoverageTable) -> list[str]:
 
 
 def marks_on(table: CoverageTable) -> dict[str, str]:
-    """What the marks of a comparison mean, by their names; empty for one rig."""
-    if len(table.rigs) == 1:
+    """What the marks of differences mean, by their names; empty where there are none."""
+    several, by_sensor = len(table.rigs) > 1, any(sensors_of(rows) for rows in table.rows.values())
+    marks = {"best": "the best of its row; equal numbers are all marked, unknown ones never."} if several else {}
+    if not (several or by_sensor):
         return {}
-    marks = {"best": "the best of its row; equal numbers are all marked, unknown ones never."}
     if table.first.blocks is not None:
         chance = "more than chance, by Student's t at 95 %: of 20 rows without a difference, one is marked."
         marks["significant"] = chance
@@ -101,7 +103,9 @@ def marks_on(table: CoverageTable) -> dict[str, str]:
 def _of_rig(table: CoverageTable, rig: str) -> list[str]:
     bands = ", ".join(f"{name} z {span(band)}" for name, band in table.grid.heights.items())
     first = f"{steps_and_cell(table.conditions[rig].counts['steps'], table.grid)}; {bands}."
-    return [first, *(SENTENCES[remark.name](remark, table, rig) for remark in remarks_on(table, rig))]
+    sentences = (SENTENCES[remark.name](remark, table, rig) for remark in remarks_on(table, rig))
+    failure = single_point_of_failure(table, rig)
+    return [first, *sentences, *([failure] if failure else [])]
 
 
 def _too_few_blocks(remark: Remark, _: CoverageTable, __: str) -> str:

@@ -181,4 +181,4 @@ def _conditions(coverage: Coverage) -> Conditions:
     blocks = coverage.blocks
     used = None if blocks is None else int((blocks.steps > 0).sum())
     longest = None if blocks is None else int(blocks.steps.max())
-    return Conditions(dict(coverage.counts), used, longest, int(coverage.points.sum()))
+    return Conditions(dict(coverage.counts), used, longest, coverage.counts["inside_points"])

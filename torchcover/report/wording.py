@@ -33,6 +33,7 @@ class ShownUnit(NamedTuple):
 UNITS: Mapping[Unit, ShownUnit] = MappingProxyType(
     {
         "m": ShownUnit("m", "m", 1.0, 2, 4, math.inf),
+        "sensors": ShownUnit("sensors", "sensors", 1.0, 2, 3, math.inf),
         "share": ShownUnit("%", "percentage points", 100.0, 1, 3, 100.0),
     }
 )

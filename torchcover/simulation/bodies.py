@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import shapes
-from torchcover.simulation.documents import Document, NameOrFile, Pose, load_document
+from torchcover.simulation.documents import Document, NameOrFile, Pose, is_file_name, load_document
 from torchcover.simulation.plausible import warn_of_mover, warn_of_scenery
 from torchcover.simulation.shapes import Mesh
 
@@ -116,6 +116,19 @@ def called(shape: Shape) -> str:
     if isinstance(shape, VehicleShape):
         return Path(shape.vehicle).name
     return shape.path.name if isinstance(shape, shapes.MeshFile) else shape.type
+
+
+def body_called(name_or_path: str | Path) -> VehicleShape | shapes.MeshFile:
+    """The shape that a name or a path means: a vehicle's, unless it is a file that is no YAML.
+
+    Example:
+        >>> body_called("suv").type, body_called("robot.stl").type
+        ('vehicle', 'mesh')
+    """
+    path = Path(name_or_path)
+    if path.suffix == "" or is_file_name(path):
+        return VehicleShape(type="vehicle", vehicle=str(name_or_path))
+    return shapes.MeshFile(type="mesh", path=path)
 
 
 def merge(meshes: list[Mesh]) -> Mesh:

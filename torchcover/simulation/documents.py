@@ -2,6 +2,7 @@
 
 import hashlib
 from collections.abc import Sequence
+from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 from reprlib import Repr
@@ -19,6 +20,8 @@ from torchcover.simulation.builtin import builtin_folder, builtin_names
 # Mistakes of one document that a message tells, and characters of what arrived.
 MAX_TOLD = 5
 MAX_QUOTED = 60
+# Keys and numbers, from the document on.
+Place = tuple[int | str, ...]
 # Looks at no more of a value than it writes: a list of lists of lists may be endless.
 _QUOTE = Repr()
 _QUOTE.maxlevel, _QUOTE.maxstring, _QUOTE.maxlong, _QUOTE.maxother = 2, MAX_QUOTED, MAX_QUOTED, MAX_QUOTED
@@ -119,7 +122,16 @@ def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -
         BadFileError: Not YAML, or a key is unknown, missing, doubled or has a wrong value; the message names the file
             and the key.
     """
-    path = _find(kind, path_or_name)
+    return read_document(model, _find(kind, path_or_name))
+
+
+def read_document(model: type[DocumentT], path: Path) -> DocumentT:
+    """Read a YAML file into a model of which none is built in.
+
+    Raises:
+        FileNotFoundError: No such file.
+        BadFileError: As for `load_document`.
+    """
     content = read_mapping(path)
     try:
         return model.model_validate(content, context={"folder": path.parent})
@@ -145,12 +157,31 @@ def read_mapping(path: Path) -> dict[str, Any]:
 def explain(error: ValidationError) -> str:
     """What pydantic found, in one line: the key, what is wrong, what arrived."""
     details = [detail for detail in error.errors(include_url=False) if not _follows_from_another(detail)]
-    told = [_told(detail) for detail in islice(details, MAX_TOLD)]
+    meant = _misspelt(details)
+    details = [detail for detail in details if detail["loc"] not in meant.values()]
+    told = [_told(detail, meant.get(detail["loc"])) for detail in islice(details, MAX_TOLD)]
     more = len(details) - len(told)
     return "; ".join([*told, f"and {more} more mistakes"] if more else told)
 
 
-def _told(detail: ErrorDetails) -> str:
+def _misspelt(details: Sequence[ErrorDetails]) -> dict[Place, Place]:
+    """Keys that nobody knows -> those that are missing beside them and look like them."""
+    missing = [detail["loc"] for detail in details if detail["type"] == "missing"]
+    meant: dict[Place, Place] = {}
+    for detail in details:
+        if detail["type"] != "extra_forbidden":
+            continue
+        *place, key = detail["loc"]
+        beside = {str(other[-1]): other for other in missing if list(other[:-1]) == place}
+        alike = get_close_matches(str(key)[:MAX_QUOTED], beside, n=1)
+        if alike and beside[alike[0]] not in meant.values():
+            meant[detail["loc"]] = beside[alike[0]]
+    return meant
+
+
+def _told(detail: ErrorDetails, meant: Place | None = None) -> str:
+    if meant:
+        return f"{'.'.join(map(str, detail['loc']))}: unknown key; {meant[-1]} is meant, which is missing"
     key = ".".join(str(part)[:MAX_QUOTED] for part in detail["loc"]) or "document"
     arrived = "" if detail["type"] in ("missing", "value_error") else f" (got {_shorten(detail['input'])})"
     return f"{key}: {detail['msg'].removeprefix('Value error, ')}{arrived}"
@@ -219,6 +250,8 @@ def _content(value: Any) -> Any:  # noqa: ANN401  (whatever a document holds)
         return value.content()
     if isinstance(value, Path):
         return file_hash(value)
+    if isinstance(value, dict):
+        return {key: _content(each) for key, each in value.items()}
     return list(map(_content, value)) if isinstance(value, tuple | list) else value
 
 
@@ -230,4 +263,6 @@ def _shorten(value: Any) -> str:  # noqa: ANN401  (whatever stood in the file)
 def _kept(value: Any) -> Any:  # noqa: ANN401
     if isinstance(value, list):
         return tuple(map(_kept, value))
+    if isinstance(value, dict):
+        return {key: _kept(each) for key, each in value.items()}
     return value.item() if isinstance(value, np.generic) else value

@@ -3,10 +3,10 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from torchcover.simulation.bodies import Shape, Vehicle, VehicleShape
-from torchcover.simulation.documents import load_document
+from torchcover.simulation.bodies import Shape, VehicleShape, body_called
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import DEFAULT_EGO, Mover, Scenario
+from torchcover.simulation.shapes import MeshFile
 
 
 def with_ego(scenario: Scenario, rigs: Mapping[str, Rig], vehicle: str | Path | None = None) -> Scenario:
@@ -17,7 +17,7 @@ def with_ego(scenario: Scenario, rigs: Mapping[str, Rig], vehicle: str | Path | 
     Args:
         scenario: The scenario.
         rigs: What is carried; those that name no vehicle go on any.
-        vehicle: A built-in vehicle, or the path of a YAML file.
+        vehicle: A built-in vehicle, the YAML file of one, or a mesh file in metres.
 
     Raises:
         ValueError: The rigs name different vehicles, and nothing else decides; or a vehicle that cannot be used.
@@ -30,7 +30,7 @@ def with_ego(scenario: Scenario, rigs: Mapping[str, Rig], vehicle: str | Path | 
         'van'
     """
     ego = scenario.ego or Mover()
-    shape = ego.shape if vehicle is None else _vehicle("vehicle", str(vehicle))
+    shape = ego.shape if vehicle is None else _body("vehicle", body_called(vehicle))
     return scenario.model_copy(update={"ego": ego.model_copy(update={"shape": shape or _of_rigs(rigs)})})
 
 
@@ -45,12 +45,13 @@ def _of_rigs(rigs: Mapping[str, Rig]) -> Shape:
     if not named:
         return DEFAULT_EGO
     name, vehicle = next(iter(named.items()))
-    return _vehicle(f"rig {name!r}: vehicle", vehicle)
+    return _body(f"rig {name!r}: vehicle", VehicleShape(type="vehicle", vehicle=vehicle))
 
 
-def _vehicle(owner: str, path_or_name: str) -> VehicleShape:
+def _body(owner: str, shape: VehicleShape | MeshFile) -> VehicleShape | MeshFile:
+    """The shape, once its file was found."""
     try:
-        load_document(Vehicle, "vehicles", path_or_name)
+        shape.content()
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{owner}: {error}") from error
-    return VehicleShape(type="vehicle", vehicle=path_or_name)
+    return shape

@@ -11,7 +11,16 @@ from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation.paper_reference import paper_density_at
 from torchcover.simulation.ray_pattern import cast_pattern
 from torchcover.simulation.rays import Tile, into_tiles
-from torchcover.simulation.reference_sensor import Area, Areas, ReferenceScan, WeightKind, check_areas, check_reach
+from torchcover.simulation.reference_sensor import (
+    PAPER_BANDS_M,
+    Area,
+    Areas,
+    Bands,
+    ReferenceScan,
+    WeightKind,
+    check_areas,
+    check_reach,
+)
 from torchcover.simulation.shell import position_in_shell
 from torchcover.simulation.surroundings import Surroundings
 
@@ -72,12 +81,13 @@ class EvenReference:
         check_reach(self.shell_m, self.max_range_m)
 
     @classmethod
-    def from_rays(cls, areas: Areas, rays: int | None) -> Self:
+    def from_rays(cls, areas: Areas, rays: int | None, bands_m: Bands = PAPER_BANDS_M) -> Self:
         """One that asks about some areas.
 
         Args:
             areas: As above.
             rays: About how many rays; 262,144 if not given.
+            bands_m: Not used.
 
         Raises:
             ValueError: As for the class.

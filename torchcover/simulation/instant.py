@@ -3,17 +3,16 @@
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from itertools import pairwise
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import transform
-from torchcover.simulation.culling import Outlines, blocks_towards, boxes_in_cone, outlines, rays_towards
+from torchcover.simulation.culling import Outlines, outlines
 from torchcover.simulation.moving import Moving
 from torchcover.simulation.raycaster import Hits, RayCaster
-from torchcover.simulation.rays import TILE_ROWS, Tile, into_tiles, unit_directions
+from torchcover.simulation.rays import TILE_ROWS, Tile, into_tiles, rotate, unit_directions
 
 # Directions all around, to find out whether a place lies inside a body.
 ALL_AROUND = unit_directions(np.linspace(-85.0, 85.0, 12)[:, None], np.arange(0.0, 360.0, 30.0)[None])
@@ -25,8 +24,6 @@ CLEAR_RADII = 2.0
 
 Matrix = NDArray[np.float64]
 Float32 = NDArray[np.float32]
-Numbers = NDArray[np.int64]
-AnyFloat = TypeVar("AnyFloat", np.float32, np.float64)
 
 
 class Scan(NamedTuple):
@@ -202,51 +199,19 @@ class Instant:
 
         The hits are brought up to date.
         """
-        farthest_m = float(hits.range_m.max(initial=0.0))
-        near = boxes_in_cone(bodies, vehicle_R_sensor @ tile.axis, tile.half_angle, farthest_m)
-        if ego_is_known:
-            near = near[self.moving.body[near] != self.ego]
-        if len(near) == 0:
+        leaving_out = self.ego if ego_is_known else None
+        (part, ray, range_m), casts = self.moving.meetings(
+            origin_m, vehicle_R_sensor, tile, directions, hits.range_m, bodies, leaving_out=leaving_out
+        )
+        if casts == 0:
             return 0
-        of_near, block = np.nonzero(blocks_towards(bodies.kept(near), tile, vehicle_R_sensor, hits.range_m))
-        part, ray = rays_towards(bodies, near[of_near], tile.blocks[block], directions, hits.range_m)
-        if len(ray) == 0:
-            return 0
-        range_m, met = self._cast_pairs(origin_m, directions, part, ray, hits.range_m)
         # The nearest counts; of two that coincide, the last in the order of the bodies.
-        part, ray, range_m = part[met], ray[met], range_m[met]
         nearest_m = np.full(len(hits.range_m), np.inf, dtype=np.float32)
         np.minimum.at(nearest_m, ray, range_m)
         first = range_m == nearest_m[ray]
         hits.range_m[ray[first]] = range_m[first]
         hits.body[ray[first]] = self.moving.body[part[first]]
-        return len(met)
-
-    def _cast_pairs(
-        self, origin_m: Matrix, directions: Float32, part: Numbers, ray: Numbers, limit_m: Float32
-    ) -> tuple[Float32, NDArray[np.bool_]]:
-        """Cast K pairs of a ray and a body that moves: (K,) where the ray ends, and whether it met the body."""
-        moving, places_m = self.moving, self.moving.from_there_m(origin_m)
-        casters, kind = moving.kinds
-        touched = moving.touched_by(origin_m, places_m)
-        # Bodies of one kind are cast at together. A ray that starts on a face is cast as one that leaves it.
-        group = np.where(touched, len(casters) + np.arange(len(moving)), kind)[part]
-        order = np.argsort(group, kind="stable")
-        part, ray, group = part[order], ray[order], group[order]
-        towards = rotate_each(moving.part_T_vehicle[:, :3, :3].astype(np.float32)[part], directions.take(ray, axis=1))
-        starts_m, limit_m = places_m.astype(np.float32)[part], limit_m[ray]
-        first, answers = np.flatnonzero(np.diff(group, prepend=-1)).tolist(), []
-        for start, end in pairwise([*first, len(group)]):
-            some, body = slice(start, end), part[start]
-            if touched[body]:
-                answers.append(moving.casters[body].cast(places_m[body], towards[:, some], limit_m[some]))
-            else:
-                caster = casters[group[start]]
-                answers.append(caster.cast_from_each(starts_m[some], towards[:, some], limit_m[some]))
-        range_m, met = np.empty_like(limit_m), np.empty(len(order), dtype=bool)
-        range_m[order] = np.concatenate([answer.range_m for answer in answers])
-        met[order] = np.concatenate([answer.body for answer in answers]) >= 0
-        return range_m, met
+        return casts
 
 
 def _limit(tile: Tile, max_range_m: float) -> Float32:
@@ -269,17 +234,3 @@ def cast_from(
     """Cast rays of the vehicle frame at a caster in its own frame."""
     towards = rotate(part_T_vehicle[:3, :3], directions)
     return caster.cast(transform(part_T_vehicle, origin_m[None])[0], towards, limit_m)
-
-
-def rotate(rotation: Matrix, directions: Float32) -> Float32:
-    """Turn (3, n) directions. What becomes of one does not depend on the others."""
-    if np.array_equal(rotation, np.eye(3)):
-        return directions
-    return rotate_each(rotation.astype(np.float32)[None], directions)
-
-
-def rotate_each(rotations: NDArray[AnyFloat], directions: NDArray[AnyFloat]) -> NDArray[AnyFloat]:
-    """Turn each of (3, n) directions by its own of (n, 3, 3) rotations, to the bits of `rotate`."""
-    # No matrix product: BLAS rounds a single column differently, and wakes threads of its own for many.
-    (x, y, z), rows = directions, rotations.swapaxes(0, 1)
-    return np.stack([row[:, 0] * x + row[:, 1] * y + row[:, 2] * z for row in rows])

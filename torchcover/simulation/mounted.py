@@ -2,6 +2,9 @@
 
 from collections.abc import Sequence
 
+import numpy as np
+from numpy.typing import NDArray
+
 from torchcover.simulation.instant import Instant, Scan
 from torchcover.simulation.rays import Tile
 from torchcover.simulation.scene import Scene
@@ -23,7 +26,7 @@ class MountedSensor:
     def __init__(self, sensor: Sensor, tiles: Sequence[Tile], scene: Scene) -> None:
         self.sensor = sensor
         self.vehicle_T_sensor = sensor.mount.matrix()
-        self._tiles = tiles
+        self.tiles = tiles
         self._own_m = scene.own_m(self.vehicle_T_sensor, tiles, max_range_m=sensor.max_range_m)
         self._at_rest = not scene.moves
         self._seen: Scan | None = None
@@ -39,7 +42,7 @@ class MountedSensor:
             return self._seen
         scan = instant.scan(
             self.vehicle_T_sensor,
-            self._tiles,
+            self.tiles,
             min_range_m=self.sensor.min_range_m,
             max_range_m=self.sensor.max_range_m,
             own_m=self._own_m,
@@ -48,3 +51,20 @@ class MountedSensor:
         if self._at_rest:
             self._seen = scan
         return scan
+
+    def ends_m(self, instant: Instant) -> NDArray[np.float32]:
+        """Where each of its rays ends: at what it hits first, the ego's body included, or at the sensor's range.
+
+        Args:
+            instant: From `Scene.at`.
+
+        Returns:
+            (n,) metres, in the order of the tiles.
+        """
+        bodies, own = instant.outlines(self.vehicle_T_sensor[:3, 3]), self._own_m or [None] * len(self.tiles)
+        ends_m = []
+        for tile, own_m in zip(self.tiles, own, strict=True):
+            limit_m = np.full(tile.directions.shape[1], self.sensor.max_range_m, dtype=np.float32)
+            _, hits, _ = instant.cast(self.vehicle_T_sensor, tile, limit_m, bodies, own_m)
+            ends_m.append(hits.range_m)
+        return np.concatenate(ends_m)

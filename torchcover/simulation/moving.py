@@ -3,16 +3,29 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import invert
-from torchcover.simulation.culling import SLACK_M
+from torchcover.simulation.culling import SLACK_M, Outlines, blocks_towards, boxes_in_cone, rays_towards
 from torchcover.simulation.raycaster import RayCaster
+from torchcover.simulation.rays import Tile, rotate_each
+from torchcover.simulation.solids import Solid
 
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
+
+
+class Meetings(NamedTuple):
+    """L times that a ray meets a body: (L,) number of the body in `Moving`, of the ray in its tile, and where."""
+
+    part: Numbers
+    ray: Numbers
+    range_m: Float32
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +47,20 @@ class Moving:
     corners_m: Float64
     centre_m: Float64
     radius_m: Float64
+
+    @classmethod
+    def placed(cls, solids: Sequence[Solid], vehicle_T_part: Float64, body: Numbers) -> Self:
+        """Bodies of these kinds, (P,), where they are, (P, 4, 4), with their numbers, (P,)."""
+        outlines_m = np.array([solid.outline_m for solid in solids]).reshape(-1, 9, 3)
+        outlines_m = outlines_m @ vehicle_T_part[:, :3, :3].swapaxes(1, 2) + vehicle_T_part[:, None, :3, 3]
+        return cls(
+            casters=[solid.caster for solid in solids],
+            vehicle_T_part=vehicle_T_part,
+            body=body,
+            corners_m=outlines_m[:, :8],
+            centre_m=outlines_m[:, 8],
+            radius_m=np.array([solid.radius_m for solid in solids]),
+        )
 
     def __len__(self) -> int:
         return len(self.casters)
@@ -63,3 +90,66 @@ class Moving:
         back = rotation.swapaxes(1, 2)
         place: Float64 = ((place_m + (back @ translation)[..., 0])[:, None] @ back)[:, 0]
         return place
+
+    def meetings(
+        self,
+        origin_m: Float64,
+        vehicle_R_sensor: Float64,
+        tile: Tile,
+        directions: Float32,
+        limit_m: Float32,
+        bodies: Outlines,
+        *,
+        leaving_out: int | None = None,
+    ) -> tuple[Meetings, int]:
+        """Where the rays of one tile meet each body, as if it were alone.
+
+        Args:
+            origin_m: (3,) where they start.
+            vehicle_R_sensor: (3, 3) rotation of the sensor.
+            tile: n of its rays.
+            directions: (3, n) the same in the vehicle frame.
+            limit_m: (n,) where they end.
+            bodies: These bodies as they look from there, from `outlines`.
+            leaving_out: Number of a body that they are not cast at.
+
+        Returns:
+            The meetings, and at how many pairs of a ray and a body it was cast.
+        """
+        near = boxes_in_cone(bodies, vehicle_R_sensor @ tile.axis, tile.half_angle, float(limit_m.max(initial=0.0)))
+        if leaving_out is not None:
+            near = near[self.body[near] != leaving_out]
+        part, ray = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+        if len(near):
+            of_near, block = np.nonzero(blocks_towards(bodies.kept(near), tile, vehicle_R_sensor, limit_m))
+            part, ray = rays_towards(bodies, near[of_near], tile.blocks[block], directions, limit_m)
+        if len(ray) == 0:
+            return Meetings(part, ray, np.empty(0, dtype=np.float32)), 0
+        range_m, met = self._cast_pairs(origin_m, directions, part, ray, limit_m)
+        return Meetings(part[met], ray[met], range_m[met]), len(met)
+
+    def _cast_pairs(
+        self, origin_m: Float64, directions: Float32, part: Numbers, ray: Numbers, limit_m: Float32
+    ) -> tuple[Float32, NDArray[np.bool_]]:
+        """Cast K pairs of a ray and a body: (K,) where the ray ends, and whether it met the body."""
+        places_m = self.from_there_m(origin_m)
+        casters, kind = self.kinds
+        touched = self.touched_by(origin_m, places_m)
+        # Bodies of one kind are cast at together. A ray that starts on a face is cast as one that leaves it.
+        group = np.where(touched, len(casters) + np.arange(len(self)), kind)[part]
+        order = np.argsort(group, kind="stable")
+        part, ray, group = part[order], ray[order], group[order]
+        towards = rotate_each(self.part_T_vehicle[:, :3, :3].astype(np.float32)[part], directions.take(ray, axis=1))
+        starts_m, limit_m = places_m.astype(np.float32)[part], limit_m[ray]
+        first, answers = np.flatnonzero(np.diff(group, prepend=-1)).tolist(), []
+        for start, end in pairwise([*first, len(group)]):
+            some, body = slice(start, end), part[start]
+            if touched[body]:
+                answers.append(self.casters[body].cast(places_m[body], towards[:, some], limit_m[some]))
+            else:
+                caster = casters[group[start]]
+                answers.append(caster.cast_from_each(starts_m[some], towards[:, some], limit_m[some]))
+        range_m, met = np.empty_like(limit_m), np.empty(len(order), dtype=bool)
+        range_m[order] = np.concatenate([answer.range_m for answer in answers])
+        met[order] = np.concatenate([answer.body for answer in answers]) >= 0
+        return range_m, met

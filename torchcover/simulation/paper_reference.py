@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.simulation.ray_pattern import cast_pattern
 from torchcover.simulation.rays import Tile, into_tiles, unit_directions
-from torchcover.simulation.reference_sensor import Areas, ReferenceScan, WeightKind, check_reach
+from torchcover.simulation.reference_sensor import PAPER_BANDS_M, Areas, Bands, ReferenceScan, WeightKind, check_reach
 from torchcover.simulation.shell import position_in_shell
 from torchcover.simulation.surroundings import Surroundings
 
@@ -69,12 +69,13 @@ class PaperReference:
         check_reach(self.shell_m, self.max_range_m)
 
     @classmethod
-    def from_rays(cls, areas: Areas, rays: int | None) -> Self:
+    def from_rays(cls, areas: Areas, rays: int | None, bands_m: Bands = PAPER_BANDS_M) -> Self:
         """The paper's, or a smaller or larger square of rows and columns; it looks everywhere, whatever is asked about.
 
         Args:
             areas: Not used.
             rays: About how many rays; 1024 x 1024 if not given.
+            bands_m: Not used.
 
         Raises:
             ValueError: Fewer than 1 ray.

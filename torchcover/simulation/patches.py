@@ -5,8 +5,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.simulation.instant import rotate
 from torchcover.simulation.outward import outward_faces
+from torchcover.simulation.rays import rotate
 from torchcover.simulation.shapes import Mesh
 
 Float32 = NDArray[np.float32]

@@ -146,7 +146,7 @@ class RayCaster:
         """Which bodies rays first meet from behind, as rays that start inside a closed body do.
 
         Args:
-            origin_m: (3,) common origin of the rays.
+            origin_m: (3,) common origin of the rays, or (N, 3) of each.
             directions: (3, N) unit directions.
 
         Returns:

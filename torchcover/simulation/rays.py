@@ -1,6 +1,7 @@
 """The directions of a sensor's rays, in tiles: neighbours together, so that a tile is a narrow cone."""
 
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,8 @@ TILE_COLUMNS = 256
 
 # Rows and columns in a block of a tile: what is cast at a body is first looked for by the block.
 BLOCK = 8
+
+AnyFloat = TypeVar("AnyFloat", np.float32, np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,3 +108,17 @@ def _blocks(has_ray: NDArray[np.bool_]) -> NDArray[np.int64]:
     pixels = np.where(filled, pixels, first)[filled.any(axis=1)]
     numbers: NDArray[np.int64] = has_ray.cumsum()[pixels] - 1
     return numbers
+
+
+def rotate(rotation: NDArray[np.float64], directions: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Turn (3, n) directions. What becomes of one does not depend on the others."""
+    if np.array_equal(rotation, np.eye(3)):
+        return directions
+    return rotate_each(rotation.astype(np.float32)[None], directions)
+
+
+def rotate_each(rotations: NDArray[AnyFloat], directions: NDArray[AnyFloat]) -> NDArray[AnyFloat]:
+    """Turn each of (3, n) directions by its own of (n, 3, 3) rotations, to the bits of `rotate`."""
+    # No matrix product: BLAS rounds a single column differently, and wakes threads of its own for many.
+    (x, y, z), rows = directions, rotations.swapaxes(0, 1)
+    return np.stack([row[:, 0] * x + row[:, 1] * y + row[:, 2] * z for row in rows])

@@ -11,6 +11,11 @@ from torchcover.simulation.surroundings import Surroundings
 # A rectangle of the ground in the vehicle frame in metres: ((x_low, x_high), (y_low, y_high)).
 Area = tuple[tuple[float, float], tuple[float, float]]
 Areas = tuple[Area, ...]
+# Heights in the vehicle frame in metres: (low, high) of each.
+Bands = tuple[tuple[float, float], ...]
+
+# The paper's heights: ground, and what stands on it.
+PAPER_BANDS_M: Bands = ((-0.5, 0.5), (0.5, 2.0))
 
 # What the weights of points are: "density", a ratio of densities of rays, good for means within a cell of a step; or
 # "m2", the visible square metres that each point stands for, good for sums over any cells and steps.
@@ -55,12 +60,13 @@ class ReferenceSensor(Protocol):
     """What the weights of its points are; None if all of them count the same. The same in every scan."""
 
     @classmethod
-    def from_rays(cls, areas: Areas, rays: int | None) -> Self:
+    def from_rays(cls, areas: Areas, rays: int | None, bands_m: Bands = PAPER_BANDS_M) -> Self:
         """The sensor for a question.
 
         Args:
             areas: The rectangles of the ground that are asked about; they may overlap.
             rays: About how many rays it casts at a step; None for the number that it does best with.
+            bands_m: The heights that are asked about; they may overlap too.
 
         Raises:
             ValueError: Areas or a number of rays that it cannot do with.

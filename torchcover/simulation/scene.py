@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, euler_from_rotation, invert, overlap, rotation_from_euler
-from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant, rotate
+from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.moving import Moving
 from torchcover.simulation.patches import Bounds
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.rays import Tile
+from torchcover.simulation.rays import Tile, rotate
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.solids import Solids
 from torchcover.simulation.surface import Surface, bounds_along
@@ -224,16 +224,7 @@ class Scene:
         vehicle_T_part = vehicle_T_world @ poses_at([actor.trajectory for actor in actors], time_s)
         # The ego is where it is, to the last bit: what a sensor sees of it is the same at every step.
         vehicle_T_part[[actor is self.world.ego for actor in actors]] = np.eye(4)
-        outlines_m = np.array([solid.outline_m for solid in solids]).reshape(-1, 9, 3)
-        outlines_m = outlines_m @ vehicle_T_part[:, :3, :3].swapaxes(1, 2) + vehicle_T_part[:, None, :3, 3]
-        return Moving(
-            casters=[solid.caster for solid in solids],
-            vehicle_T_part=vehicle_T_part,
-            body=self._first_moving + numbers,
-            corners_m=outlines_m[:, :8],
-            centre_m=outlines_m[:, 8],
-            radius_m=np.array([solid.radius_m for solid in solids]),
-        )
+        return Moving.placed(solids, vehicle_T_part, self._first_moving + numbers)
 
 
 def level_axes(world_T_vehicle: Matrix) -> Matrix:

@@ -3,7 +3,6 @@
 import copy
 import math
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -36,12 +35,12 @@ class Simulator:
     are cast on as many threads as torch uses (`torch.set_num_threads`).
 
     Args:
-        scenario: The world. Beyond its end a given one plays again; traffic starts anew with other random numbers.
+        scenario: The world, with the ego of `with_ego`. Beyond its end a given one plays again; traffic starts anew with
+            other random numbers.
         rigs: The sensors, by the name under which `Observation.clouds` has their points.
         reference_sensor: The reference sensor.
         seed: Seed of the traffic, of the reference sensor, and of noise and drop-out.
         every_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
-        vehicle: What carries the rigs, as in `with_ego`.
 
     Raises:
         ValueError: Rigs that name different vehicles, a negative seed, a time that is no multiple of the time step,
@@ -64,11 +63,10 @@ class Simulator:
         *,
         seed: int = 0,
         every_s: float | None = None,
-        vehicle: str | Path | None = None,
     ) -> None:
         if seed < 0:
             raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
-        self.scenario = scenario = with_ego(scenario, rigs, vehicle)
+        self.scenario = scenario = with_ego(scenario, rigs)
         self.rigs = rigs
         self.reference_sensor = reference_sensor
         self.seed = seed

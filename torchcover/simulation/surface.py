@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import invert, transform
-from torchcover.simulation.instant import Instant, rotate_each
+from torchcover.simulation.instant import Instant
 from torchcover.simulation.patches import Bounds, Patches
+from torchcover.simulation.rays import rotate_each
 from torchcover.simulation.shapes import Mesh
 
 Float64 = NDArray[np.float64]

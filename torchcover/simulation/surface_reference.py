@@ -9,7 +9,15 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation.patches import Bounds
-from torchcover.simulation.reference_sensor import Areas, ReferenceScan, WeightKind, check_areas, check_reach
+from torchcover.simulation.reference_sensor import (
+    PAPER_BANDS_M,
+    Areas,
+    Bands,
+    ReferenceScan,
+    WeightKind,
+    check_areas,
+    check_reach,
+)
 from torchcover.simulation.shell import position_in_shell
 from torchcover.simulation.sight import Sight, sight
 from torchcover.simulation.surface_points import SurfacePoints, SurfaceStrata
@@ -17,11 +25,7 @@ from torchcover.simulation.surroundings import Surroundings
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
-Bands = tuple[tuple[float, float], ...]
-
 DEFAULT_RAYS = 16_384
-# The paper's heights: ground, and what stands on it.
-PAPER_BANDS_M = ((-0.5, 0.5), (0.5, 2.0))
 # How far above the surface a ray to it ends, in metres, and as a share of the coordinates that casting rounds.
 ABOVE_M = 1e-3
 ABOVE_SHARE = 5e-7
@@ -91,17 +95,18 @@ class SurfaceReference:
         check_reach(self.shell_m, self.max_range_m)
 
     @classmethod
-    def from_rays(cls, areas: Areas, rays: int | None) -> Self:
+    def from_rays(cls, areas: Areas, rays: int | None, bands_m: Bands = PAPER_BANDS_M) -> Self:
         """One that asks about some areas.
 
         Args:
             areas: As above.
             rays: About how many rays; 16,384 if not given.
+            bands_m: As above.
 
         Raises:
             ValueError: As for the class.
         """
-        return cls(areas, DEFAULT_RAYS if rays is None else rays)
+        return cls(areas, DEFAULT_RAYS if rays is None else rays, bands_m=bands_m)
 
     def scan(self, surroundings: Surroundings) -> ReferenceScan:
         """Draw points, and keep those that are seen; see `ReferenceSensor.scan`."""

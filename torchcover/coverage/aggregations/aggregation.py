@@ -34,6 +34,8 @@ class BinnedStep(NamedTuple):
         means: Over the points of each cell: the radius, then the detection at each threshold.
         block: Number of the block that the step belongs to.
         cells: Number of cells of the grid.
+        of_sensors: (S, N) distance to the nearest point of each sensor, infinite beyond `max_radius`; None unless the
+            metric knows the sensors.
     """
 
     cell: Tensor
@@ -42,6 +44,7 @@ class BinnedStep(NamedTuple):
     means: CellMeans
     block: int
     cells: int
+    of_sensors: Tensor | None = None
 
 
 class Aggregation(ABC):

@@ -5,9 +5,12 @@ import string
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry.rigid import blocks
+
 # Beyond, float32 does not resolve a centimetre; no sensor reaches as far.
 MAX_COORDINATE_M = 1e5
 SMALLEST_NORMAL = float(np.finfo(np.float32).tiny)
+FIRST_NORMAL = np.uint32(0x0080_0000)  # its bits
 # Largest shares of points in a cloud. A few coordinates are lost alone, and a few points lie on the diagonal.
 MAX_PARTLY_FINITE = 0.05
 MAX_DIAGONAL = 0.1
@@ -15,8 +18,6 @@ MAX_DIAGONAL = 0.1
 MIN_POINTS = 16
 MIN_STATISTICS = 100
 MAX_INTENSITY, MAX_RING = 255, 255
-# A column of which so large a share lies so far off on both sides of 0 holds coordinates.
-MIN_FAR, FAR_M = 0.05, 2.0
 # A column in which more than a share lies this far on either side of 0 holds coordinates.
 FAR_M, MIN_FAR = 2.0, 0.05
 PRINTABLE = string.printable.encode()
@@ -62,9 +63,10 @@ def check_records(data: bytes, columns: int) -> NDArray[np.float32]:
             f"{len(data) % record_bytes} bytes are left over: truncated, or {_likelier(data, columns)}"
         )
     records = np.frombuffer(data, "<f4").reshape(-1, columns)
-    if not data.strip(b"\0"):
+    if not any(data):
         raise ValueError(f"all of its {len(data)} bytes are zero: it was never written")
-    complaint = _complaint(records[:, :3]) or _of_other_columns(records)
+    coordinates = _plainly_coordinates(records)
+    complaint = (None if coordinates else _complaint(records[:, :3])) or _of_other_columns(records)
     if complaint:
         raise ValueError(
             f"{complaint}, so it holds no {SUFFIXES[columns]}; likelier is {_likelier(data, columns)}. "
@@ -104,6 +106,21 @@ def _complaint(points: NDArray[np.float32]) -> str | None:
     return None
 
 
+def _plainly_coordinates(records: NDArray[np.float32]) -> bool:
+    """Whether there is nothing to complain of; in a fraction of the time, for numbers are looked at side by side."""
+    diagonal = 0
+    for rows in blocks(len(records)):
+        part = records[rows]
+        if not (part.max() <= MAX_COORDINATE_M and part.min() >= -MAX_COORDINATE_M):
+            return False  # NaN is neither
+        magnitude = part.view("<u4") & np.uint32(0x7FFF_FFFF)
+        if (magnitude - np.uint32(1)).min() < FIRST_NORMAL - 1:  # 0 becomes the largest
+            return False
+        alike = part[np.flatnonzero(part[:, 0] == part[:, 1])]
+        diagonal += int(np.count_nonzero((alike[:, 0] == alike[:, 2]) & (alike[:, 0] != 0)))
+    return diagonal <= MAX_DIAGONAL * len(records)
+
+
 def _of_other_columns(records: NDArray[np.float32]) -> str | None:
     """Why the rows have another number of columns; only where they lack what theirs would have."""
     columns = records.shape[1]
@@ -125,13 +142,17 @@ def _of_unknown_columns(records: NDArray[np.float32]) -> str | None:
     last, name = records[:, -1], {4: "an intensity", 5: "a ring"}[records.shape[1]]
     if len(records) < MIN_STATISTICS:
         return None
-    if (last < -FAR_M).mean() > MIN_FAR and (last > FAR_M).mean() > MIN_FAR:
+    if _share(last < -FAR_M) > MIN_FAR and _share(last > FAR_M) > MIN_FAR:
         return f"its last column is not {name} but has coordinates in it"
     if records.shape[1] == 4:  # rows of eight, cut in halves
-        signs = [(records[side::2, 1:3] < 0).mean(axis=0).min() for side in (0, 1)]
+        signs = [min(_share(records[side::2, axis] < 0) for axis in (1, 2)) for side in (0, 1)]
         if min(signs) == 0 and max(signs) > MIN_FAR:
             return "every second point has no negative y or z, and the others have"
     return None
+
+
+def _share(which: NDArray[np.bool_]) -> float:
+    return np.count_nonzero(which) / len(which)
 
 
 def _is_intensity(values: NDArray[np.float32]) -> bool:

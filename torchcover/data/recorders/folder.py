@@ -8,7 +8,7 @@ import numpy as np
 
 from torchcover.data.recorders.step import Step
 from torchcover.data.recordings.folder import BOXES, POSES_FILE, REFERENCE, SETTINGS_FILE
-from torchcover.data.recordings.folder_tables import BOX, PLACE, ROTATION
+from torchcover.data.recordings.folder_tables import PLACE, ROTATION, write_boxes
 from torchcover.data.simulated import SimulatedFrames
 from torchcover.files import write_npz
 from torchcover.geometry import BoundingBox, invert, quaternion_from_rotation, transform
@@ -56,10 +56,7 @@ class FolderRecorder:
             arrays["weights"] = frame.reference_weights.numpy()
         write_npz(self._folder / REFERENCE / f"{step.name}.npz", arrays)
         if frame.boxes is not None:
-            names = zip(frame.boxes.ids, frame.boxes.categories, strict=True)
-            rows = [[*row, *name] for row, name in zip(frame.boxes.rows.tolist(), names, strict=True)]
-            with (self._folder / BOXES / f"{step.name}.csv").open("w", newline="", encoding="utf-8") as file:
-                csv.writer(file).writerows([[*BOX, "id", "category"], *rows])
+            write_boxes(self._folder / BOXES / f"{step.name}.csv", frame.boxes)
         pose = step.world_T_vehicle
         wxyz = quaternion_from_rotation(pose[:3, :3])
         self._append([step.name, step.time_s, *pose[:3, 3].tolist(), *wxyz.tolist(), frame.place_in_time])

@@ -1,6 +1,7 @@
 """Write what a simulated rig saw as a recording, for any tool that reads its layout."""
 
 import os
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Protocol
 
@@ -21,7 +22,13 @@ class RecorderOfLayout(Protocol):
 RECORDERS: dict[str, RecorderOfLayout] = {"folder": FolderRecorder, "kitti": KittiRecorder}
 
 
-def write_recording(frames: SimulatedFrames, folder: str | os.PathLike[str], layout: str = "folder") -> None:
+def write_recording(
+    frames: SimulatedFrames,
+    folder: str | os.PathLike[str],
+    layout: str = "folder",
+    *,
+    progress: Callable[[range], Iterable[int]] = iter,
+) -> None:
     """Write what a simulated rig saw: clouds, the reference, boxes where the frames have them, mounts and poses.
 
     Args:
@@ -29,6 +36,7 @@ def write_recording(frames: SimulatedFrames, folder: str | os.PathLike[str], lay
         folder: Where to; made if it does not exist.
         layout: A name in `RECORDERS`: "folder" (`FolderRecording` reads it, with the numbers of the simulation), or
             "kitti" (KITTI's object layout, of one LiDAR).
+        progress: Is given the numbers of the steps and passes them on, as `tqdm.tqdm` does.
 
     Raises:
         ValueError: An unknown layout, a folder that is not empty, several rigs, or sensors that the layout cannot hold.
@@ -51,5 +59,5 @@ def write_recording(frames: SimulatedFrames, folder: str | os.PathLike[str], lay
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ValueError(f"{folder}: {'not empty' if folder.is_dir() else 'a file'}; a new or empty folder is needed")
     recorder = RECORDERS[layout](folder, frames)
-    for index in range(len(frames)):
+    for index in progress(range(len(frames))):
         recorder.write(simulated_step(frames, index))

@@ -1,7 +1,7 @@
 """A log of Argoverse 2's sensor data set (Wilson et al., NeurIPS 2021): both LiDARs, poses and cuboids."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -9,10 +9,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.cameras.calibration import Calibration
+from torchcover.data.recordings.calibrated import SensorCalibrations
 from torchcover.data.recordings.recording import Scan, check_times
 from torchcover.data.recordings.tracks import Seen, Tracks
 from torchcover.detection.boxes import Boxes
-from torchcover.files import check_memory, reads
+from torchcover.files import check_memory, naming, reads
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 
@@ -88,6 +90,25 @@ class Argoverse2:
             return None
         return self._tracks.at(float(self._times_ns[index] - self._times_ns[0]) * 1e-9, vehicle_T_ego)
 
+    def calibrations(self) -> SensorCalibrations:
+        """The mounts of both LiDARs, and the cameras with the distortion of their lenses.
+
+        Raises:
+            FileNotFoundError: The log has no `calibration/`.
+            ValueError: Other tables, or no such LiDAR in them.
+        """
+        folder = self.path / "calibration"
+        poses = read_feather(folder / "egovehicle_SE3_sensor.feather", ("sensor_name", *_POSE))
+        lenses = read_feather(folder / "intrinsics.feather", ("sensor_name", *_LENS))
+        with naming(folder, "calibrations of Argoverse 2"):
+            ego_T = {str(name): pose for name, pose in zip(poses["sensor_name"], _poses_of(poses), strict=True)}
+            missing = ({*LASERS} | {str(name) for name in lenses["sensor_name"]}) - ego_T.keys()
+            if missing:
+                raise ValueError(f"egovehicle_SE3_sensor.feather has no {', '.join(sorted(missing))}")
+            rows = [dict(zip(lenses, row, strict=True)) for row in zip(*lenses.values(), strict=True)]
+            cameras = tuple(_camera(row, vehicle_T_ego @ ego_T[str(row["sensor_name"])]) for row in rows)
+        return SensorCalibrations("calibration/", {name: vehicle_T_ego @ ego_T[name] for name in LASERS}, cameras)
+
     @cached_property
     def _tracks(self) -> Tracks | None:
         """The cuboids of each sweep, in the frame of the ego at that time."""
@@ -109,7 +130,7 @@ class Argoverse2:
 
     def _read_poses(self) -> list[Matrix]:
         path = self.path / "city_SE3_egovehicle.feather"
-        columns = read_feather(path, ("timestamp_ns", "qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"))
+        columns = read_feather(path, ("timestamp_ns", *_POSE))
         times_ns = columns["timestamp_ns"].astype(np.int64)
         order = np.argsort(times_ns, kind="stable")
         after = np.searchsorted(times_ns[order], self._times_ns).clip(1, len(order) - 1)
@@ -121,15 +142,33 @@ class Argoverse2:
             raise ValueError(
                 f"{path}: the pose nearest to the sweep {self.names[worst]} is {gaps[worst] * 1e-9:.3f} s off"
             )
-        rotations = np.column_stack([columns[name] for name in ("qw", "qx", "qy", "qz")])[nearest]
-        places = np.column_stack([columns[name] for name in ("tx_m", "ty_m", "tz_m")])[nearest]
-        return [rigid(rotation_from_quaternion(one), place) for one, place in zip(rotations, places, strict=True)]
+        return _poses_of({name: column[nearest] for name, column in columns.items()})
 
 
-_CUBOIDS = (
-    *("timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m"),
-    *("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m"),
-)
+_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_CUBOIDS = ("timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *_POSE)
+_LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "height_px", "width_px")
+
+
+def _poses_of(columns: Mapping[str, NDArray[Any]]) -> list[Matrix]:
+    """(4, 4) of each row."""
+    rotations = np.column_stack([columns[name] for name in _POSE[:4]])
+    places = np.column_stack([columns[name] for name in _POSE[4:]])
+    return [rigid(rotation_from_quaternion(one), place) for one, place in zip(rotations, places, strict=True)]
+
+
+def _camera(row: Mapping[str, Any], vehicle_T_camera: Matrix) -> Calibration:
+    """A camera with the radial distortion of its lens."""
+    fx, fy, cx, cy, k1, k2, k3 = (float(row[name]) for name in _LENS[:7])
+    return Calibration(
+        int(row["width_px"]),
+        int(row["height_px"]),
+        *(fx, fy, cx, cy),
+        model="brown_conrady",
+        coefficients=(k1, k2, 0.0, 0.0, k3),
+        vehicle_T_camera=vehicle_T_camera,
+        name=str(row["sensor_name"]),
+    )
 
 
 @reads("a feather table")

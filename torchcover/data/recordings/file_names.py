@@ -1,5 +1,6 @@
 """Files of frames in a folder: one a frame, in natural order."""
 
+import os
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -8,15 +9,19 @@ from pathlib import Path
 from torchcover.data.clouds import READERS, split_name
 
 MAX_NAMES_SHOWN = 5
+CLOUDS = f"a cloud; allowed are files ending in {', '.join(READERS)}"
 
 
-def frame_files(folder: Path, like: Sequence[str] | None = None, beside: Collection[str] = ()) -> dict[str, Path]:
-    """The clouds in a folder by the names of their frames, in natural order (frame2 before frame10).
+def frame_files(
+    folder: Path, like: Sequence[str] | None = None, beside: Collection[str] = (), *, images: bool = False
+) -> dict[str, Path]:
+    """The clouds, or depth images, in a folder by the names of their frames, in natural order (frame2 before frame10).
 
     Args:
         folder: Where they are.
         like: Names that there have to be, and no others.
         beside: Names of files that may be there and are no clouds.
+        images: Whether depth images in PNG are wanted, and no clouds.
 
     Raises:
         FileNotFoundError: No such folder.
@@ -25,18 +30,22 @@ def frame_files(folder: Path, like: Sequence[str] | None = None, beside: Collect
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder; clouds are needed in it, one a frame")
     clouds: dict[str, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.name in beside or path.name.startswith("."):  # what file managers and version control leave behind
+    with os.scandir(folder) as entries:
+        found = sorted((entry.name, entry.is_dir()) for entry in entries)
+    for file, is_folder in found:
+        if file in beside or file.startswith("."):  # what file managers and version control leave behind
             continue
-        name, suffix = split_name(path.name)
-        if not suffix or path.is_dir():
-            raise ValueError(f"{path}: not a cloud; allowed are files ending in {', '.join(READERS)}")
+        name, suffix = split_name(file, (".png",)) if images else split_name(file)
+        if not suffix or is_folder:
+            wanted = "a depth image; allowed are files ending in .png" if images else CLOUDS
+            raise ValueError(f"{folder / file}: not {wanted}")
         if name in clouds:
-            raise ValueError(f"{folder}: two files for the frame {name}: {clouds[name].name} and {path.name}")
-        clouds[name] = path
+            raise ValueError(f"{folder}: two files for the frame {name}: {clouds[name].name} and {file}")
+        clouds[name] = folder / file
     if like is not None:
         check_same_names(folder.parent, {folder.name: clouds, "the others": dict.fromkeys(like)})
-    return {name: clouds[name] for name in sorted(clouds, key=natural)}
+    numbers = all(map(str.isdecimal, clouds))  # which need not be taken apart
+    return {name: clouds[name] for name in sorted(clouds, key=_number if numbers else natural)}
 
 
 def check_same_names(folder: Path, files: Mapping[str, Mapping[str, object]]) -> None:
@@ -83,6 +92,10 @@ def natural(name: str) -> tuple[list[str | int], str]:
     # Text and number alternate, starting with text, so that two keys always compare; the name itself breaks a tie.
     parts = re.split(r"(\d+)", name)
     return [int(part) if position % 2 else part for position, part in enumerate(parts)], name
+
+
+def _number(name: str) -> tuple[int, str]:
+    return int(name), name
 
 
 def some_of(names: Sequence[str]) -> str:

@@ -11,6 +11,7 @@ from torchcover.data.recordings.kitti_object import KittiObject
 from torchcover.data.recordings.kitti_raw import KittiRaw
 from torchcover.data.recordings.nuscenes import NuScenes
 from torchcover.data.recordings.recording import Recording
+from torchcover.data.recordings.ros2 import Ros2
 
 
 class RecordingFormat(Protocol):
@@ -37,6 +38,7 @@ FORMATS: dict[str, RecordingFormat] = {
     "kitti_raw": KittiRaw,
     "kitti_object": KittiObject,
     "carla": Carla,
+    "ros2": Ros2,
     "folder": FolderRecording,
 }
 

@@ -7,18 +7,23 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import read_short_text, reads
-from torchcover.geometry import BoundingBox, check_rigid, rigid, rotation_from_euler
+from torchcover.cameras.calibration import Calibration, split_matrix
+from torchcover.files import BadFileError, check_memory, decode, naming, read_short_text, reads
+from torchcover.geometry import BoundingBox, check_rigid, invert, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
 
 # Of the WGS84 ellipsoid, as in the development kit.
 EARTH_RADIUS_M = 6_378_137.0
+# Of a line of time stamps, once it is an object of Python, for each byte of the file.
+BYTES_PER_BYTE = 8
 # lat, lon, alt, roll, pitch, yaw, velocities, accelerations, rates, accuracies, status.
 OXTS_COLUMNS = 30
 # The LiDAR is 0.76 m before the rear axle and 1.73 m above the ground, the centre of the car's box 1.337 m before the
 # axle: as in the rig `kitti`, where the sources are. The car is a Volkswagen Passat B6 estate of 4.77 x 1.82 m; nothing
 # but the car and what is mounted on it can be in that outline, up to a little above the LiDAR.
 vehicle_T_velodyne = rigid(np.eye(3), [-0.577, 0.0, 1.73])
+# Of the rectified images; those of the days differ by a few pixels.
+IMAGE_SIZE = (1242, 375)
 BODY = BoundingBox((-2.387, -0.91, 0.05), (2.387, 0.91, 1.93))
 
 
@@ -64,6 +69,65 @@ def transform_of(calibration: dict[str, NDArray[np.float64]], key: str, path: Pa
     matrix = np.eye(4)
     matrix[:3, : numbers.size // 3] = numbers.reshape(3, -1)
     return check_rigid(matrix, f"{path}: {key}")
+
+
+def read_rigid(path: Path) -> Matrix:
+    """(4, 4) the transform of a file with `R` and `T`, such as `calib_velo_to_cam.txt`.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is not what it is meant to be.
+    """
+    numbers = read_calibration(path)
+    translation_m = numbers.get("T", np.empty(0))
+    if translation_m.size != 3:
+        raise BadFileError(f"{path}: T with 3 numbers is needed; got {translation_m.size}")
+    return rigid(transform_of(numbers, "R", path)[:3, :3], translation_m)
+
+
+def read_rectified(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, ...]:
+    """The cameras of `calib_cam_to_cam.txt`: pinholes, for their images are rectified.
+
+    Args:
+        path: The file, with `P_rect_00`, `S_rect_00` and so on.
+        vehicle_T_camera0: Where the first camera is, before it is rectified.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is not what it is meant to be.
+    """
+    numbers = read_calibration(path)
+    vehicle_T_rectified = vehicle_T_camera0 @ invert(transform_of(numbers, "R_rect_00", path))
+    found = []
+    for name in (f"{number:02d}" for number in range(4)):
+        matrix, size = numbers.get(f"P_rect_{name}", np.empty(0)), numbers.get(f"S_rect_{name}", np.empty(0))
+        if matrix.size != 12 or size.size != 2:
+            arrived = f"{matrix.size} and {size.size}"
+            raise BadFileError(f"{path}: 12 numbers of P_rect_{name} and 2 of S_rect_{name} are needed; got {arrived}")
+        matrix = matrix.reshape(3, 4)
+        with naming(path, "a KITTI calibration"):
+            intrinsics = split_matrix(matrix[:, :3], f"P_rect_{name}")
+            if 0.0 in intrinsics[:2]:
+                raise ValueError(f"P_rect_{name} has no focal length")
+            # P = K [I | t]: the rectified cameras differ from each other by a translation only.
+            rectified_T_camera = invert(rigid(np.eye(3), np.linalg.solve(matrix[:, :3], matrix[:, 3])))
+        pose = vehicle_T_rectified @ rectified_T_camera
+        found.append(Calibration(int(size[0]), int(size[1]), *intrinsics, vehicle_T_camera=pose, name=f"image_{name}"))
+    return tuple(found)
+
+
+@reads("a PNG image")
+def png_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image; its pixels are not read.
+
+    Raises:
+        BadFileError: It is none.
+    """
+    with path.open("rb") as file:
+        head = file.read(24)
+    if len(head) < 24 or head[:8] != b"\x89PNG\r\n\x1a\n":
+        raise ValueError("not a PNG image")
+    return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:], "big")
 
 
 @reads("KITTI labels")
@@ -126,11 +190,13 @@ def read_timestamps(path: Path) -> NDArray[np.float64]:
     Raises:
         BadFileError: A line that is no time.
     """
-    lines = read_short_text(path).split("\n")
+    check_memory(BYTES_PER_BYTE * path.stat().st_size)
+    lines = decode(path.read_bytes()).split("\n")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # of time zones, which NumPy would leave out with a warning
-            times = np.array([np.datetime64(line.strip().replace(" ", "T"), "ns") for line in lines if line.strip()])
+            words = [line.strip().replace(" ", "T") for line in lines if line.strip()]
+            times = np.array(words, dtype="datetime64[ns]")
     except (ValueError, UserWarning) as error:
         raise ValueError(f"lines of date and time are needed: {error}") from error
     seconds: NDArray[np.float64] = (times - times[0]) / np.timedelta64(1, "s")

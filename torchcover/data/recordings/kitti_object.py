@@ -6,10 +6,14 @@ from typing import ClassVar
 
 import numpy as np
 
+from torchcover.cameras.calibration import read_kitti
 from torchcover.data.clouds import read_cloud
+from torchcover.data.recordings.calibrated import SensorCalibrations
 from torchcover.data.recordings.file_names import check_same_names, frame_files
 from torchcover.data.recordings.kitti_files import (
     BODY,
+    IMAGE_SIZE,
+    png_size,
     read_calibration,
     read_labels,
     transform_of,
@@ -67,6 +71,25 @@ class KittiObject:
 
     def world_T_vehicle(self, index: int) -> None:
         """Nobody knows."""
+
+    def calibrations(self) -> SensorCalibrations:
+        """The rectified cameras of the first frame; the layout has the sizes of their images only where there are some.
+
+        Raises:
+            FileNotFoundError: It has no calibration.
+            ValueError: It is not what it is meant to be.
+        """
+        name = self.names[0]
+        calibration = self.path / "calib" / f"{name}.txt"
+        images = [path for number in range(4) if (path := self.path / f"image_{number}" / f"{name}.png").exists()]
+        width, height = png_size(images[0]) if images else IMAGE_SIZE
+        cameras = [
+            read_kitti(calibration, number, width=width, height=height, vehicle_T_lidar=vehicle_T_velodyne)
+            for number in range(4)
+        ]
+        told = f"{images[0].parent.name}/{name}.png" if images else "the data set's usual ones, for there are no images"
+        source = f"calib/{name}.txt, the LiDAR where KITTI's is, sizes of images {width} x {height} ({told})"
+        return SensorCalibrations(source, {"velodyne": vehicle_T_velodyne}, tuple(cameras))
 
     def boxes(self, index: int) -> Boxes | None:
         """The labels, if there are any files of them.

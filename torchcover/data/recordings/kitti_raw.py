@@ -10,20 +10,21 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.data.clouds import read_cloud
+from torchcover.data.recordings.calibrated import SensorCalibrations
 from torchcover.data.recordings.file_names import check_same_names, frame_files
 from torchcover.data.recordings.kitti_files import (
     BODY,
-    read_calibration,
     read_oxts,
+    read_rectified,
+    read_rigid,
     read_timestamps,
-    transform_of,
     vehicle_T_velodyne,
     world_T_imu,
 )
 from torchcover.data.recordings.recording import Scan, check_times
 from torchcover.data.recordings.tracklets import read_tracklets
 from torchcover.detection.boxes import Boxes
-from torchcover.geometry.rigid import Matrix, check_rigid, invert
+from torchcover.geometry.rigid import Matrix, invert
 
 
 class KittiRaw:
@@ -81,6 +82,22 @@ class KittiRaw:
         """
         return world_T_imu(self._oxts(index), self._latitude_deg) @ self._imu_T_vehicle
 
+    def calibrations(self) -> SensorCalibrations:
+        """The rectified cameras of the day, where its `calib_cam_to_cam.txt` is there.
+
+        Raises:
+            FileNotFoundError: `calib_velo_to_cam.txt` is missing beside it.
+            ValueError: They are not what they are meant to be.
+        """
+        day = self.path.parent
+        cameras = day / "calib_cam_to_cam.txt"
+        mounts = {"velodyne": vehicle_T_velodyne}
+        if not cameras.exists():
+            return SensorCalibrations(f"the LiDAR where KITTI's is; no cameras, for there is no {cameras.name}", mounts)
+        camera_T_velodyne = read_rigid(day / "calib_velo_to_cam.txt")
+        placed = read_rectified(cameras, vehicle_T_velodyne @ invert(camera_T_velodyne))
+        return SensorCalibrations(f"the LiDAR where KITTI's is, {cameras.name}", mounts, placed)
+
     def boxes(self, index: int) -> Boxes | None:
         """The tracklets of that instant; None without the file."""
         if not self._tracklets.exists():
@@ -99,8 +116,4 @@ class KittiRaw:
         return read_tracklets(self._tracklets, vehicle_T_velodyne)
 
     def _calibrated(self) -> Matrix:
-        path = self.path.parent / "calib_imu_to_velo.txt"
-        numbers = read_calibration(path)
-        rows = np.column_stack([transform_of(numbers, "R", path)[:3, :3], numbers.get("T", np.full(3, np.nan))])
-        velodyne_T_imu = check_rigid(np.vstack([rows, [0.0, 0.0, 0.0, 1.0]]), f"{path}: R and T")
-        return invert(velodyne_T_imu) @ invert(vehicle_T_velodyne)
+        return invert(read_rigid(self.path.parent / "calib_imu_to_velo.txt")) @ invert(vehicle_T_velodyne)

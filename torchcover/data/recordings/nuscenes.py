@@ -2,14 +2,18 @@
 
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from torchcover.cameras.calibration import read_nuscenes
 from torchcover.data.clouds import read_cloud
-from torchcover.data.recordings.json_tables import beneath, read_table
+from torchcover.data.recordings.calibrated import SensorCalibrations
+from torchcover.data.recordings.json_tables import check_beneath, read_table
 from torchcover.data.recordings.recording import Scan, check_times
 from torchcover.data.recordings.tracks import Seen, Tracks
 from torchcover.detection.boxes import Boxes
@@ -59,16 +63,45 @@ class NuScenes:
 
     def scan(self, sensor: str, index: int) -> Scan:
         """Read a sweep."""
-        path = self._files[index]
+        path = self.path / self._files[index]
         return Scan(read_cloud(path), vehicle_T_ego @ self._mounts[index], str(path))
 
     def world_T_vehicle(self, index: int) -> Matrix:
         """The pose of the ego when the sweep was made."""
-        return self._poses[index] @ invert(vehicle_T_ego)
+        world_T_ego = rigid(rotation_from_quaternion(self._rotations[index]), self._places_m[index])
+        return world_T_ego @ invert(vehicle_T_ego)
 
     def boxes(self, index: int) -> Boxes:
         """The annotations; between two key frames, what lies between theirs."""
         return self._tracks.at(float(self.times_s[index]), invert(self.world_T_vehicle(index)))
+
+    def calibrations(self) -> SensorCalibrations:
+        """The LiDAR's mount, and the cameras of its first key frame.
+
+        Raises:
+            FileNotFoundError: A table is missing.
+            ValueError: A table that is none.
+        """
+        with naming(self._tables, "tables of nuScenes"):
+            first = self._sample_tokens[self.frames[0]]
+            rows = [
+                row
+                for row in read_table(self._tables / "sample_data.json").rows
+                if row["sample_token"] == first and row["is_key_frame"] and "/CAM_" in str(row["filename"])
+            ]
+            cameras = [
+                read_nuscenes(
+                    self._tables,
+                    Path(row["filename"]).parent.name,
+                    token=row["calibrated_sensor_token"],
+                    width=row["width"],
+                    height=row["height"],
+                )
+                for row in sorted(rows, key=lambda row: str(row["filename"]))
+            ]
+        placed = [replace(one, vehicle_T_camera=vehicle_T_ego @ np.asarray(one.vehicle_T_camera)) for one in cameras]
+        source = f"calibrated_sensor.json for {self.names[self.frames[0]]}"
+        return SensorCalibrations(source, {CHANNEL: vehicle_T_ego @ self._mounts[self.frames[0]]}, tuple(placed))
 
     def _read(self, tables: Path, scenes: Sequence[str] | None) -> None:
         samples = self._samples(tables, scenes)
@@ -79,14 +112,19 @@ class NuScenes:
             if _is_lidar(row) and row["sample_token"] in samples
         ]
         data.sort(key=lambda row: row["timestamp"])
-        self.names = tuple(Path(row["filename"]).name.removesuffix(".pcd.bin") for row in data)
+        self.names = tuple(row["filename"].rpartition("/")[2].removesuffix(".pcd.bin") for row in data)
         self.frames = [number for number, row in enumerate(data) if row["is_key_frame"]]
         if not self.frames:
             raise ValueError(f"no key frame of {CHANNEL}")
         self.times_s = check_times(np.array([row["timestamp"] for row in data]) * 1e-6, len(data), CHANNEL)
-        self._files = [beneath(self.path, row["filename"]) for row in data]
-        self._poses = [pose_of(poses.row(row["ego_pose_token"])) for row in data]
-        self._mounts = [pose_of(calibrations.row(row["calibrated_sensor_token"])) for row in data]
+        self._files = [check_beneath(self.path, row["filename"]) for row in data]
+        driven = [poses.row(row["ego_pose_token"]) for row in data]
+        self._rotations = np.array([row["rotation"] for row in driven], dtype=np.float64)
+        self._places_m = np.array([row["translation"] for row in driven], dtype=np.float64)
+        _check_poses(self._rotations, self._places_m)
+        mounts = {token: pose_of(calibrations.row(token)) for token in {row["calibrated_sensor_token"] for row in data}}
+        self._mounts = [mounts[row["calibrated_sensor_token"]] for row in data]
+        self._sample_tokens = [row["sample_token"] for row in data]
         self._tables, self._sample_times = tables, samples
 
     @cached_property
@@ -133,6 +171,21 @@ def pose_of(row: dict[str, Any]) -> Matrix:
     if not np.isfinite(matrix).all():
         raise ValueError(f"translation: three finite numbers are needed; got {row['translation']}")
     return matrix
+
+
+def _check_poses(rotations: NDArray[np.float64], places_m: NDArray[np.float64]) -> None:
+    """Whether (F, 4) quaternions and (F, 3) places are those of poses.
+
+    Raises:
+        ValueError: Not so many numbers, or not finite ones, or a quaternion of norm 0.
+    """
+    if rotations.shape[1:] != (4,) or places_m.shape[1:] != (3,):
+        raise ValueError("every pose needs a rotation of 4 numbers and a translation of 3")
+    if not (np.isfinite(rotations).all() and np.isfinite(places_m).all()):
+        bad = ~np.isfinite(np.column_stack([rotations, places_m])).all(axis=1)
+        raise ValueError(f"{np.count_nonzero(bad)} of {len(rotations)} poses have numbers that are not finite")
+    if not rotations.any(axis=1).all():
+        raise ValueError("a quaternion of norm 0 is no rotation; the identity is [1, 0, 0, 0] (w, x, y, z)")
 
 
 def _is_lidar(row: dict[str, Any]) -> bool:

@@ -14,6 +14,9 @@ from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix
 from torchcover.simulation import WeightKind
 
+# A return from so near to the origin of its frame is one that never came, which drivers store as zeros.
+NO_RETURN_M = 1e-3
+
 
 @dataclass(frozen=True)
 class Scan:

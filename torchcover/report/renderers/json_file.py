@@ -34,6 +34,10 @@ def table_dict(table: CoverageTable) -> dict[str, Any]:
             "cell_m": grid.cell,
             "heights_m": {name: list(band) for name, band in grid.heights.items()},
         },
+        "regions": {
+            row.region.name: {"x_m": row.region.x, "y_m": row.region.y, "corners_m": row.region.corners_m}
+            for row in table.rows[table.rigs[0]]
+        },
         "thresholds_m": list(table.thresholds),
         "max_radius_m": _number(table.max_radius),
         "blocks": table.first.blocks,

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from torchcover.coverage import Quantity, RegionSummary
 from torchcover.coverage.estimate import Measure
+from torchcover.report.failures import decisive, failure_headings, failure_title, failure_words, sensors_of
 from torchcover.report.table import CoverageTable, Row
 from torchcover.report.wording import (
     capitalised,
@@ -73,14 +74,16 @@ def parts_of(table: CoverageTable) -> list[Part]:
 
     Returns:
         For one rig one part, a column for each quantity. For several the paper's layout: a part for each quantity, a
-        column for each rig; and, if there are errors, as many parts with the differences to the first rig.
+        column for each rig; and, if there are errors, as many parts with the differences to the first rig. With
+        redundancy a part for each rig more, a column for each of its sensors.
     """
+    failures = [_of_failures(table, rig) for rig in table.rigs if sensors_of(table.rows[rig])]
     if len(table.rigs) == 1:
-        return [_of_one_rig(table)]
+        return [_of_one_rig(table), *failures]
     parts = [_of_quantity(table, quantity) for quantity in table.quantities]
     if table.first.blocks is not None:
         parts += [_of_differences(table, quantity) for quantity in table.quantities]
-    return parts
+    return [*parts, *failures]
 
 
 def _of_one_rig(table: CoverageTable) -> Part:
@@ -99,6 +102,16 @@ def _of_differences(table: CoverageTable, quantity: Quantity) -> Part:
     cells = [[_difference(row, quantity) for row in rows[1:]] for rows in table.places]
     title = f"Difference to {first}: {difference_heading(quantity)}"
     return _part(table, title, (quantity,), others, cells, of_differences=True)
+
+
+def _of_failures(table: CoverageTable, rig: str) -> Part:
+    rows = []
+    for row in table.rows[rig]:
+        cells = [Words(text, "significant" if marked else "") for text, marked in failure_words(table, row)]
+        rows.append((Words(row.summary.region), Words(row.summary.height), *cells))
+    headings = (*PLACE_HEADINGS, *failure_headings(table, rig))
+    bands = len(table.grid.heights)
+    return Part(failure_title(table, rig), (decisive(table),), True, headings, tuple(rows), bands)
 
 
 def _part(

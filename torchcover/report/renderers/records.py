@@ -1,11 +1,16 @@
 """A table as records, one for each rig, region and band: what CSV and JSON have in common."""
 
+import math
 from collections.abc import Callable
 
+from torchcover.coverage import Difference, Number
+from torchcover.coverage.redundancy import redundancy_quantities
+from torchcover.report.failures import sensors_of
 from torchcover.report.table import CoverageTable, Row
 
 Record = dict[str, object]
 Columns = dict[str, Callable[[Row], object]]
+UNKNOWN, NO_CHANGE = Number(math.nan, math.nan), Difference(math.nan, math.nan, None)
 
 
 def records_of(table: CoverageTable) -> list[Record]:
@@ -29,6 +34,14 @@ def columns_of(table: CoverageTable) -> Columns:
     columns |= _conditions(table)
     for key in keys if len(table.rigs) > 1 else ():
         columns |= _compared(key)
+    sensors = dict.fromkeys(sensor for rows in table.rows.values() for sensor in sensors_of(rows))
+    if sensors:
+        columns |= {"indispensable_sensor": _indispensable}
+        for quantity in redundancy_quantities((), table.thresholds):
+            columns |= _seen_by(quantity.key)
+    for sensor in sensors:
+        for key in keys:
+            columns |= _without(sensor, key)
     return columns
 
 
@@ -54,6 +67,38 @@ def _compared(key: str) -> Columns:
         f"{key}_difference": lambda row: row.differences[key].value,
         f"{key}_difference_error": lambda row: row.differences[key].error,
         f"{key}_difference_significant": lambda row: row.differences[key].significant,
+    }
+
+
+def _indispensable(row: Row) -> object:
+    return "" if row.summary.redundancy is None else row.summary.redundancy.indispensable or ""
+
+
+def _seen_by(key: str) -> Columns:
+    def number(row: Row) -> Number:
+        return row.summary.redundancy.seen_by[key] if row.summary.redundancy else UNKNOWN
+
+    return {key: lambda row: number(row).value, f"{key}_error": lambda row: number(row).error}
+
+
+def _without(sensor: str, key: str) -> Columns:
+    """NaN for a rig that has no such sensor."""
+
+    def number(row: Row) -> Number:
+        redundancy = row.summary.redundancy
+        return redundancy.without.get(sensor, {}).get(key, UNKNOWN) if redundancy else UNKNOWN
+
+    def change(row: Row) -> Difference:
+        redundancy = row.summary.redundancy
+        return redundancy.change.get(sensor, {}).get(key, NO_CHANGE) if redundancy else NO_CHANGE
+
+    without = f"{key}_without_{sensor}"
+    return {
+        without: lambda row: number(row).value,
+        f"{without}_error": lambda row: number(row).error,
+        f"{without}_change": lambda row: change(row).value,
+        f"{without}_change_error": lambda row: change(row).error,
+        f"{without}_change_significant": lambda row: change(row).significant,
     }
 
 

@@ -1,0 +1,133 @@
+"""Regions, height bands, the grid and redundancy on the command line."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+import torchcover as package
+from torchcover import Coverage, Region, RegionsOfInterest
+
+SMALL = ["--steps", 9, "--cell", 0.5, "--threshold", 2, "--rays", 1024]
+ASKED = [
+    *("--region", "behind:-6,-2,-2,2", "--region", "ahead:2,6,-2,2"),
+    *("--height", "dog:-0.1,0.5", "--height", "child:-0.1,1.1", "--grid", "-10,10,-10,10"),
+]
+
+
+@pytest.fixture
+def evaluate(torchcover, worlds):
+    def run(*options, rig="both", out="out"):
+        scenario = ["--scenario", worlds / "yard.yaml", "--out", worlds / out]
+        return torchcover("evaluate", worlds / f"{rig}.yaml", *scenario, *SMALL, *options)
+
+    return run
+
+
+def rows_of(folder):
+    with (folder / "summary.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(evaluate, worlds):
+    code, printed, _ = evaluate(*ASKED)
+    assert code == 0
+    assert "dog z -0.1 to 0.5 m, child z -0.1 to 1.1 m" in printed
+    rows = rows_of(worlds / "out")
+    assert [(row["region"], row["height"]) for row in rows] == [
+        (region, height) for region in ("behind", "ahead") for height in ("dog", "child")
+    ]
+    assert float(rows[0]["known_share"]) == 1.0  # the reference is aimed at it
+    (worlds / "ask.yaml").write_text(
+        "regions: {ahead: {x_m: [2, 6], y_m: [-2, 2]}}\n"
+        "heights: {dog: [-0.1, 0.5], child: [-0.1, 1.1]}\n"
+        "grid: {x_m: [-10, 10], y_m: [-10, 10]}\n"
+    )
+    assert evaluate("--ask", worlds / "ask.yaml", *ASKED[:4], out="file")[0] == 0
+    assert (worlds / "file" / "summary.csv").read_text() == (worlds / "out" / "summary.csv").read_text()
+    ask = RegionsOfInterest(
+        regions={"behind": {"x_m": (-6.0, -2.0), "y_m": (-2.0, 2.0)}, "ahead": {"x_m": (2.0, 6.0), "y_m": (-2.0, 2.0)}},
+        heights={"dog": (-0.1, 0.5), "child": (-0.1, 1.1)},
+        grid={"x_m": (-10.0, 10.0), "y_m": (-10.0, 10.0)},
+    )
+    settings = {"steps": 9, "cell_m": 0.5, "thresholds": 2.0, "rays": 1024}
+    result = package.evaluate(worlds / "both.yaml", worlds / "yard.yaml", ask=ask, **settings)
+    loaded = Coverage.load(worlds / "out" / "coverage.npz")
+    np.testing.assert_array_equal(result.coverage.radius, loaded.radius)
+    assert loaded.regions[0] == Region("behind", (-6.0, -2.0), (-2.0, 2.0))
+    assert str(loaded.summary()) == str(result.coverage.summary())
+    record = json.loads((worlds / "out" / "summary.json").read_text())
+    assert record["regions"]["behind"] == {"x_m": [-6.0, -2.0], "y_m": [-2.0, 2.0], "corners_m": []}
+
+
+def test_the_sensor_behind_is_what_the_place_behind_depends_on(evaluate, torchcover, worlds):
+    code, printed, _ = evaluate(*ASKED, "--redundancy")
+    assert code == 0
+    assert "Single point of failure: " in printed
+    by_place = {(row["region"], row["height"]): row for row in rows_of(worlds / "out")}
+    for region, sensor, other in (("behind", "rear", "front"), ("ahead", "front", "rear")):
+        row = by_place[region, "dog"]
+        assert row["indispensable_sensor"] == sensor
+        assert float(row[f"detection_2m_without_{sensor}_change"]) < -0.2
+        assert float(row[f"detection_2m_without_{other}_change"]) == 0.0
+        assert float(row["sensors_2m"]) == pytest.approx(float(row["detection_2m"]))  # never both
+    # Without the sensor behind it is the rig without it, in the same frames.
+    assert evaluate(*ASKED, rig="low", out="alone")[0] == 0
+    for row in rows_of(worlds / "alone"):
+        found = by_place[row["region"], row["height"]]
+        for key in ("radius_m", "detection_2m"):
+            assert float(found[f"{key}_without_rear"]) == pytest.approx(float(row[key]), rel=1e-12)
+    code, printed, _ = torchcover("compare", worlds / "out" / "coverage.npz", worlds / "alone" / "coverage.npz")
+    assert code == 0
+    assert "behind" in printed
+    assert "out: change of detection" in " ".join(printed.split())
+
+
+def test_a_run_goes_on_with_the_same_question_only(evaluate):
+    asked = [*ASKED, "--redundancy"]
+    assert evaluate(*asked)[0] == 0
+    assert evaluate(*asked, "--resume")[0] == 0
+    for changed, what in (
+        (asked[:-1], "redundancy"),
+        ([*ASKED[2:], "--redundancy"], "regions"),
+        ([*ASKED[:4], "--height", "dog:0,0.5", *ASKED[8:], "--redundancy"], "heights"),
+        ([*asked, "--grid", "-9,9,-9,9"], "grid"),
+    ):
+        code, _, complaints = evaluate(*changed, "--resume")
+        assert code == 2
+        assert what in complaints
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--region", "1,2,3,4"], "--region 1,2,3,4: NAME:x0,x1,y0,y1 is needed"),
+        (["--region", "a:1,2,3"], "--region a:1,2,3: 4 numbers x0,x1,y0,y1 in metres are needed"),
+        (["--region", "a:1,2,3,x"], "--region a:1,2,3,x: 4 numbers"),
+        (["--region", "a:2,1,0,1"], "regions.a.x_m: the lower bound must be below the upper one; got 2 to 1 m"),
+        (["--region", "a:nan,1,0,1"], "regions.a.x_m.0: Input should be"),
+        (["--region", "a:0,1,0,1", "--region", "a:0,2,0,1"], "the name 'a' is given already"),
+        (["--region", "a:0,50,0,1", "--grid", "-9,9,-9,9"], "region 'a' spans x = 0 to 50 m, beyond the grid's"),
+        (["--region", "a:0,0.1,0,1"], "region 'a' holds no cell centre; use smaller cells than 0.5 m"),
+        (["--height", "a:1,1"], "heights.a: the lower bound must be below the upper one; got 1 to 1 m"),
+        (["--height", "a:0,1", "--height", "a:0,2"], "the name 'a' is given already"),
+        (["--grid", "0,1,2"], "--grid 0,1,2: 4 numbers x0,x1,y0,y1 in metres are needed"),
+        (["--grid", "-2000,2000,-2000,2000"], "128,000,000 cells, over 100,000,000: use larger cells"),
+        (["--grid", "-1500,1500,-1500,1500"], "sums of 72,000,000 cells in 16 blocks"),
+        (["--ask", "nowhere.yaml"], "nowhere.yaml"),
+    ],
+)
+def test_what_asks_nothing_ends_in_one_line(evaluate, options, message):
+    code, _, complaints = evaluate(*options)
+    assert code == 2
+    assert message in complaints
+    assert len(complaints.strip().splitlines()) == 1
+
+
+@pytest.mark.filterwarnings("always:region:UserWarning")
+def test_a_region_within_the_vehicle_is_unknown_and_a_line_says_why(evaluate, worlds):
+    code, _, said = evaluate("--region", "hold:-1,1,-0.5,0.5")
+    assert code == 0
+    assert "warning: region 'hold' lies within the vehicle (x = -2 to 2 m, y = -1 to 1 m)" in said
+    assert [(row["detection_2m"], row["known_cells"]) for row in rows_of(worlds / "out")] == [("", "0")] * 2

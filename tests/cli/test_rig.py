@@ -1,0 +1,40 @@
+"""`torchcover rig`: a simulated rig is found in what it recorded."""
+
+import numpy as np
+import yaml
+
+from torchcover import Rig
+
+
+def test_a_recorded_rig_is_found_again(torchcover, worlds, tmp_path):
+    recording, found = tmp_path / "recording", tmp_path / "found.yaml"
+    few = ("--scenario", worlds / "yard.yaml", "--steps", 2, "--rays", 64)
+    torchcover("record", worlds / "both.yaml", *few, "--out", recording)
+    code, printed, error = torchcover("rig", "--frames", recording)
+    assert (code, error) == (0, "")
+    found.write_text(printed)
+    rig, true = Rig.load(found), Rig.load(worlds / "both.yaml")
+    assert rig.name == "recording"
+    assert "7 rows (those that returned anything), 30 columns" in rig.description
+    for lidar, of in zip(rig.sensors, true.sensors, strict=True):
+        # Behind the vehicle there is nothing that a level ray hits.
+        returned_deg = np.sort(of.rows_deg())[::-1][of.name == "rear" :]
+        np.testing.assert_allclose(lidar.rows_deg(), returned_deg, atol=5e-4)
+        assert (lidar.name, lidar.columns, lidar.horizontal_fov_deg) == (of.name, 30, 90.0)
+        np.testing.assert_allclose(lidar.mount.matrix(), of.mount.matrix(), atol=1e-6)
+        assert lidar.max_range_m <= 60.1
+    assert torchcover("evaluate", found, *few, "--cell", 1, "--out", tmp_path / "out")[0] == 0
+    code, printed, _ = torchcover("rig", "--frames", recording, "--sensors", "rear", "--lidar", "rear=velodyne_vlp16")
+    (sensor,) = yaml.safe_load(printed)["sensors"]
+    assert (code, sensor["name"], sensor["model"]) == (0, "rear", "velodyne_vlp16")
+
+
+def test_what_rig_refuses(torchcover, worlds, tmp_path):
+    for options, told in (
+        (("--frames", tmp_path / "none"), "none: no such recording"),
+        (("--frames", tmp_path, "--lidar", "roof"), "--lidar roof: SENSOR=MODEL is needed"),
+        (("--frames", tmp_path, "--format", "ros"), "no such format of recordings; there are"),
+    ):
+        code, printed, error = torchcover("rig", *options)
+        assert (code, printed, len(error.splitlines())) == (2, "", 1)
+        assert told in error

@@ -1,0 +1,60 @@
+"""Bands may overlap: each says what it would say alone."""
+
+import pytest
+import torch
+
+from torchcover import BevGrid, CoverageMetric
+from torchcover.coverage import Maximum
+
+BANDS = {"child": (0.1, 1.1), "dog": (0.05, 0.5), "all": (-1.0, 2.0), "above": (1.1, 2.0)}
+
+
+def grid_of(heights):
+    return BevGrid(x=(-2.0, 2.0), y=(-1.0, 1.0), cell=0.5, heights=heights)
+
+
+def measured(heights, **options):
+    metric = CoverageMetric(grid_of(heights), max_radius=3.0, blocks=8, aggregations=[Maximum()], **options)
+    for index in range(12):
+        generator = torch.Generator().manual_seed(index)
+        sensor, reference = (torch.randn(count, 3, generator=generator) for count in (20, 200))
+        metric.update(sensor, reference, weights=torch.rand(200, generator=generator) + 0.1)
+    return metric.compute()
+
+
+@pytest.mark.parametrize("square_metres", [False, True])
+def test_each_of_several_overlapping_bands_is_what_it_is_alone(square_metres):
+    together = measured(BANDS, square_metres=square_metres)
+    for number, (name, band) in enumerate(BANDS.items()):
+        alone = measured({name: band}, square_metres=square_metres)
+        assert torch.equal(together.points[number], alone.points[0])
+        for key, layer in alone.layers.items():
+            torch.testing.assert_close(
+                together.layers[key].values[number], layer.values[0], equal_nan=True, rtol=0, atol=0
+            )
+        for key, error in alone.errors.items():
+            torch.testing.assert_close(together.errors[key][number], error[0], equal_nan=True, rtol=0, atol=0)
+
+
+def test_a_point_in_several_bands_is_counted_once():
+    together, widest = measured(BANDS), measured({"all": BANDS["all"]})
+    assert together.counts == widest.counts
+    assert together.points.sum() > together.counts["inside_points"] == widest.points.sum()
+
+
+def test_bins_are_the_cells_of_each_band():
+    points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1))
+    bins = grid_of(BANDS).bins(points)
+    found = set(zip(bins.inside[bins.of].tolist(), bins.cell.tolist(), strict=True))
+    expected = set()
+    for number, (name, band) in enumerate(BANDS.items()):
+        cells = grid_of({name: band}).cell_of(points)
+        expected |= {(at, cell + number * 32) for at, cell in enumerate(cells.tolist()) if cell >= 0}
+    assert found == expected
+    assert len(bins.cell) == len(expected)
+    assert bins.inside.tolist() == sorted({at for at, _ in expected})
+
+
+def test_where_bands_overlap_a_point_has_no_single_cell():
+    with pytest.raises(ValueError, match="the height bands overlap, so that a point may be in several cells: use"):
+        grid_of(BANDS).cell_of(torch.zeros(1, 3))

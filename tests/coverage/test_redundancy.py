@@ -1,0 +1,136 @@
+"""What a rig is without each of its sensors: what the metric of the others says."""
+
+import math
+
+import pytest
+import torch
+
+from torchcover import BevGrid, Coverage, CoverageMetric, Region
+from torchcover.coverage import differences
+
+GRID = BevGrid(x=(-2.0, 2.0), y=(-1.0, 1.0), cell=0.5, heights={"low": (-2.0, 0.3), "high": (0.0, 2.0)})
+REGIONS = [Region("left", (-2.0, 2.0), (0.0, 1.0)), Region.polygon("corner", [(-2.0, -1.0), (2.0, -1.0), (-2.0, 1.0)])]
+SENSORS = ("roof", "left", "rear")
+OPTIONS = {"thresholds": (0.3, 0.8), "max_radius": 3.0, "blocks": 8, "regions": REGIONS}
+
+
+def steps(count=16, empty=()):
+    for index in range(count):
+        generator = torch.Generator().manual_seed(index)
+        clouds = {name: torch.randn(9, 3, generator=generator) for name in SENSORS}
+        clouds |= {name: torch.empty(0, 3) for name in empty}
+        # Sums of powers of two are exact in any order.
+        weights = 2.0 ** torch.randint(-3, 3, (300,), generator=generator)
+        yield clouds, torch.randn(300, 3, generator=generator), weights
+
+
+def measured(of_steps, *, without=None, by_sensor=True, **options):
+    metric = CoverageMetric(GRID, **{**OPTIONS, **options}, sensors=SENSORS if by_sensor else ())
+    for clouds, reference, weights in of_steps:
+        rest = torch.cat([cloud for name, cloud in clouds.items() if name != without])
+        metric.update(clouds if by_sensor else rest, reference, weights=weights)
+    return metric.compute()
+
+
+@pytest.mark.parametrize("square_metres", [True, False])
+def test_with_all_sensors_it_is_the_rig(square_metres):
+    by_sensor, union = (measured(steps(), by_sensor=each, square_metres=square_metres).layers for each in (True, False))
+    assert by_sensor.keys() == union.keys()
+    for key, layer in union.items():
+        torch.testing.assert_close(by_sensor[key].values, layer.values, rtol=0, atol=0, equal_nan=True)
+
+
+@pytest.mark.parametrize("empty", [(), ("left",)])
+@pytest.mark.parametrize("square_metres", [True, False])
+def test_without_a_sensor_it_is_the_rig_of_the_others(square_metres, empty):
+    whole = measured(steps(empty=empty), square_metres=square_metres)
+    alone = measured(steps(empty=empty), by_sensor=False, square_metres=square_metres)
+    for sensor in SENSORS:
+        rest = measured(steps(empty=empty), without=sensor, by_sensor=False, square_metres=square_metres)
+        for quantity in rest.quantities:
+            key = quantity.key.replace("_", "_area_", 1) if square_metres else quantity.key
+            found = whole.redundancy.layers[f"{quantity.key}_without_{sensor}"].values
+            exact = {"rtol": 0, "atol": 0} if square_metres and "detection" in key else {"rtol": 1e-13, "atol": 1e-15}
+            torch.testing.assert_close(found, rest.layers[key].values, equal_nan=True, **exact)
+        for found, expected, full in zip(whole.summary(), rest.summary(), alone.summary(), strict=True):
+            region = next(region for region in REGIONS if region.name == found.region)
+            compared = differences({"all": alone, "rest": rest}, region, found.height)["rest"]
+            for key, number in expected.numbers.items():
+                own = found.redundancy.without[sensor][key]
+                assert own.value == pytest.approx(number.value, rel=1e-13)
+                change = found.redundancy.change[sensor][key]
+                assert change.value == pytest.approx(number.value - full.numbers[key].value, rel=1e-9, abs=1e-13)
+                if square_metres:
+                    assert own.error == pytest.approx(number.error, rel=1e-9)
+                    assert change.error == pytest.approx(compared[key].error, rel=1e-6, abs=1e-12)
+                    assert change.significant == compared[key].significant
+                else:
+                    assert math.isnan(own.error)
+                    assert math.isnan(change.error)
+
+
+def test_how_many_sensors_see_a_point_is_counted():
+    whole = measured(steps(), square_metres=True)
+    # The mean number is the sum of what each sees alone.
+    alone = []
+    for sensor in SENSORS:
+        only = [({sensor: clouds[sensor]}, reference, weights) for clouds, reference, weights in steps()]
+        alone.append(measured(only, by_sensor=False, square_metres=True))
+    number = sum(each.layers["detection_area_0.3m"].values for each in alone)
+    torch.testing.assert_close(
+        whole.redundancy.layers["sensors_0.3m"].values, number, rtol=1e-13, atol=0, equal_nan=True
+    )
+    for at, row in enumerate(whole.summary()):
+        expected = sum(each.summary()[at].numbers["detection_0.8m"].value for each in alone)
+        seen_by = row.redundancy.seen_by
+        assert seen_by["sensors_0.8m"].value == pytest.approx(expected, rel=1e-13)
+        assert 0 < seen_by["seen_by_two_0.8m"].value < row.numbers["detection_0.8m"].value
+        assert seen_by["sensors_0.8m"].error > 0
+
+
+def test_a_twin_makes_a_sensor_dispensable_and_the_only_one_is_indispensable():
+    def twins():
+        for clouds, reference, weights in steps():
+            yield {"roof": clouds["roof"], "left": clouds["roof"], "rear": torch.empty(0, 3)}, reference, weights
+
+    for row in measured(twins(), square_metres=True).summary():
+        assert row.redundancy.indispensable is None
+        assert {change.value for changes in row.redundancy.change.values() for change in changes.values()} == {0.0}
+        assert row.redundancy.seen_by["seen_by_two_0.3m"].value == row.numbers["detection_0.3m"].value
+    for row in measured(steps(empty=("left", "rear")), square_metres=True).summary():
+        assert row.redundancy.indispensable == "roof"
+        assert row.redundancy.without["roof"]["radius_m"].value == 3.0
+        assert row.redundancy.without["roof"]["detection_0.8m"].value == 0.0
+
+
+@pytest.mark.parametrize("square_metres", [True, False])
+def test_a_file_keeps_it(tmp_path, square_metres):
+    whole = measured(steps(), square_metres=square_metres)
+    whole.save(tmp_path / "c.npz")
+    loaded = Coverage.load(tmp_path / "c.npz")
+    assert loaded.regions == tuple(REGIONS)
+    assert str(loaded.summary()) == str(whole.summary())
+    assert loaded.redundancy.layers.keys() == whole.redundancy.layers.keys()
+
+
+def test_a_region_that_the_metric_was_not_told_of_has_no_redundancy_by_area():
+    other = Region("other", (0.0, 2.0), (-1.0, 1.0))
+    assert measured(steps(2), square_metres=True).summary([other])[0].redundancy is None
+    assert measured(steps(2)).summary([other])[0].redundancy is not None
+
+
+@pytest.mark.parametrize(
+    ("sensor", "message"),
+    [
+        (torch.zeros(1, 3), "the clouds of roof, left, rear, by these names, are needed; got Tensor"),
+        ({"roof": torch.zeros(1, 3)}, "the clouds of roof, left, rear, by these names, are needed; got roof"),
+    ],
+)
+def test_other_clouds_are_refused(sensor, message):
+    with pytest.raises(ValueError, match=message):
+        CoverageMetric(GRID, sensors=SENSORS).update(sensor, torch.zeros(1, 3))
+
+
+def test_clouds_by_name_need_a_metric_that_knows_the_names():
+    with pytest.raises(TypeError, match="got clouds by name, for which the metric needs sensors="):
+        CoverageMetric(GRID).update({"roof": torch.zeros(1, 3)}, torch.zeros(1, 3))

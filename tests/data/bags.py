@@ -1,0 +1,133 @@
+"""Bags of ROS 2, written with rosbags."""
+
+import numpy as np
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from torchcover.geometry import invert, quaternion_from_rotation, rigid, rotation_from_euler
+
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
+T0_NS = 1_700_000_000_000_000_000
+CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+
+
+def made(name, *values):
+    return TYPES.types[name](*values)
+
+
+def header(time_ns, frame):
+    seconds, nanoseconds = divmod(int(time_ns), 1_000_000_000)
+    return made("std_msgs/msg/Header", made("builtin_interfaces/msg/Time", seconds, nanoseconds), frame)
+
+
+def cloud(columns, time_ns, frame, *, height=1, gap=0, end=0, order="<"):
+    """A cloud of arrays by name, with bytes between the fields and at the end of each row."""
+    names, arrays = list(columns), [np.asarray(column) for column in columns.values()]
+    formats = [np.dtype(array.dtype).newbyteorder(order) for array in arrays]
+    offsets = np.cumsum([gap, *(kind.itemsize + gap for kind in formats)])
+    layout = np.dtype(
+        {"names": names, "formats": formats, "offsets": offsets[:-1].tolist(), "itemsize": int(offsets[-1])}
+    )
+    table = np.zeros(len(arrays[0]), layout)
+    for name, array in zip(names, arrays, strict=True):
+        table[name] = array
+    width = len(table) // height
+    rows = [table[k * width : (k + 1) * width].tobytes() + bytes(end) for k in range(height)]
+    fields = [
+        made("sensor_msgs/msg/PointField", name, int(offset), CODES[array.dtype.str[1:]], 1)
+        for name, offset, array in zip(names, offsets, arrays, strict=False)
+    ]
+    data = np.frombuffer(b"".join(rows), np.uint8)
+    step = layout.itemsize
+    return made(
+        "sensor_msgs/msg/PointCloud2",
+        *(header(time_ns, frame), height, width, fields, order == ">", step, step * width + end, data, False),
+    )
+
+
+def points(points_m, **others):
+    """The columns of a cloud."""
+    return {axis: np.asarray(points_m)[:, k].astype(np.float32) for k, axis in enumerate("xyz")} | others
+
+
+def place(matrix, kind):
+    """Position and orientation, as a `Transform` or a `Pose`."""
+    w, x, y, z = map(float, quaternion_from_rotation(matrix[:3, :3]))
+    name = "Vector3" if kind == "Transform" else "Point"
+    return made(
+        f"geometry_msgs/msg/{kind}",
+        made(f"geometry_msgs/msg/{name}", *map(float, matrix[:3, 3])),
+        made("geometry_msgs/msg/Quaternion", x, y, z, w),
+    )
+
+
+def link(parent, child, matrix, time_ns=0):
+    return made("geometry_msgs/msg/TransformStamped", header(time_ns, parent), child, place(matrix, "Transform"))
+
+
+def tree(*links):
+    return made("tf2_msgs/msg/TFMessage", list(links))
+
+
+def odometry(matrix, time_ns, child="base_link"):
+    zero = made("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+    twist = made("geometry_msgs/msg/TwistWithCovariance", made("geometry_msgs/msg/Twist", zero, zero), np.zeros(36))
+    pose = made("geometry_msgs/msg/PoseWithCovariance", place(matrix, "Pose"), np.zeros(36))
+    return made("nav_msgs/msg/Odometry", header(time_ns, "odom"), child, pose, twist)
+
+
+def posed(matrix, time_ns):
+    return made("geometry_msgs/msg/PoseStamped", header(time_ns, "map"), place(matrix, "Pose"))
+
+
+def bag(path, messages, storage="mcap"):
+    """Write (topic, time of recording, message) in this order."""
+    plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
+    with Writer(path, version=9, storage_plugin=plugin) as writer:
+        connections = {}
+        for topic, time_ns, message in messages:
+            kind = message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=TYPES)
+            writer.write(connections[topic], int(time_ns), TYPES.serialize_cdr(message, kind))
+    return path
+
+
+# A sensor stands on a mast, which is turned, on the roof.
+roof_T_mast = rigid(rotation_from_euler(30.0, 0.0, 0.0), [0.1, 0.0, 0.4])
+vehicle_T_roof = rigid(np.eye(3), [0.0, 0.0, 1.4])
+
+
+def mounts(drive):
+    """The tree of a drive's frames: `left` is mounted through two others, `right` on the vehicle."""
+    mast_T_left = invert(vehicle_T_roof @ roof_T_mast) @ drive.vehicle_T_sensor("left")
+    return [
+        link("base_link", "roof", vehicle_T_roof),
+        link("mast", "left", mast_T_left),
+        link("roof", "mast", roof_T_mast),
+        link("base_link", "right", drive.vehicle_T_sensor("right")),
+    ]
+
+
+def of_drive(drive, poses=odometry, topic="/poses"):
+    """The messages of a drive; they are recorded 20 ms after their stamps, the two sensors' at different times."""
+    messages = [("/tf_static", T0_NS, tree(*mounts(drive)))]
+    for index in range(drive.steps):
+        time_ns = T0_NS + round(1e9 * drive.times_s[index])
+        messages.append((topic, time_ns + 1_000_000, poses(drive.world_T_vehicle(index), time_ns)))
+        for number, sensor in enumerate(drive.sensors):
+            message = cloud(points(drive.scan(sensor, index).points_m), time_ns, sensor)
+            messages.append((f"/{sensor}", time_ns + 20_000_000 + number, message))
+    return messages
+
+
+def ros2(drive, root):
+    return bag(root / "drive", of_drive(drive))
+
+
+def in_map(pose, time_ns):
+    return tree(link("map", "base_link", pose, time_ns))
+
+
+def ros2_database(drive, root):
+    return bag(root / "drive", of_drive(drive, in_map, "/tf"), "sqlite3")

@@ -1,0 +1,130 @@
+"""What is asked about: the document, and what follows from it for one vehicle."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover import Region, RegionsOfInterest
+from torchcover.coverage import near_field_regions
+
+ROBOT_M = np.array([[0.5, 0.4], [-0.5, 0.4], [-0.5, -0.4], [0.5, -0.4]])
+SIDES = ["front_3m", "rear_3m", "left_3m", "right_3m"]
+
+
+def rectangle(x, y):
+    return {"x_m": x, "y_m": y}
+
+
+def test_the_usual_table_has_the_papers_regions_and_the_near_field_of_the_vehicle():
+    asked = RegionsOfInterest().around(ROBOT_M)
+    assert [region.name for region in asked.regions] == ["20m", "80m", "160m", *SIDES]
+    assert (asked.grid.x, asked.grid.y, asked.grid.cell, asked.bands_m) == (
+        (-40.0, 160.0),
+        (-40.0, 40.0),
+        0.25,
+        ((-0.5, 0.5), (0.5, 2.0)),
+    )
+    # One area for all of the near field, and the grid last.
+    assert asked.areas[3:] == (((-3.5, 3.5), (-3.4, 3.4)), (asked.grid.x, asked.grid.y))
+    assert [region.name for region in RegionsOfInterest().around().regions] == ["20m", "80m", "160m"]
+
+
+@pytest.mark.parametrize("cell", [0.1, 0.25, 0.5])
+def test_the_near_field_is_all_that_is_within_its_reach_of_the_vehicle_and_nothing_twice(cell):
+    asked = RegionsOfInterest().around(ROBOT_M, cell)
+    covered = sum(region.mask(asked.grid).long() for region in asked.regions if region.name in SIDES)
+    x, y = asked.grid.x_centres_m, asked.grid.y_centres_m[:, None]
+    around = (x >= -3.5) & (x < 3.5) & (y >= -3.4) & (y < 3.4)
+    vehicle = (x >= -0.5) & (x < 0.5) & (y >= -0.4) & (y < 0.4)
+    assert torch.equal(covered, (around & ~vehicle).long())
+
+
+def test_what_the_grid_does_not_hold_is_not_in_the_usual_table():
+    small = RegionsOfInterest(grid={"x_m": (-5.0, 5.0), "y_m": (-5.0, 5.0), "cell_m": 0.5}).around(ROBOT_M)
+    assert [region.name for region in small.regions] == SIDES
+    assert [region.name for region in RegionsOfInterest().around(ROBOT_M, 8.0).regions] == ["20m", "80m", "160m"]
+    elsewhere = RegionsOfInterest(grid={"x_m": (50.0, 55.0), "y_m": (-5.0, 5.0)}).around(ROBOT_M)
+    assert elsewhere.regions == (Region("grid", (50.0, 55.0), (-5.0, 5.0)),)
+    assert elsewhere.areas == (((50.0, 55.0), (-5.0, 5.0)),)
+
+
+def test_a_region_beyond_the_usual_grid_makes_it_larger_by_whole_cells():
+    asked = RegionsOfInterest(regions={"side": rectangle((-41.1, 0.0), (30.0, 55.0))}).around(ROBOT_M)
+    assert (asked.grid.x, asked.grid.y) == ((-41.25, 160.0), (-40.0, 55.0))
+    assert asked.areas == (((-41.1, 0.0), (30.0, 55.0)), (asked.grid.x, asked.grid.y))
+
+
+def test_a_region_beyond_a_grid_that_was_given_is_refused():
+    given = {"x_m": (-5.0, 5.0), "y_m": (-5.0, 5.0)}
+    with pytest.raises(ValueError, match="region 'side' spans x = 0 to 6 m, beyond the grid's -5 to 5 m; enlarge"):
+        RegionsOfInterest(regions={"side": rectangle((0.0, 6.0), (0.0, 1.0))}, grid=given).around(ROBOT_M)
+
+
+def test_a_region_within_the_vehicle_is_warned_of():
+    hidden = RegionsOfInterest(regions={"hold": rectangle((-0.4, 0.4), (-0.3, 0.3))})
+    with pytest.warns(UserWarning, match="region 'hold' lies within the vehicle"):
+        hidden.around(ROBOT_M)
+    assert hidden.around().regions[0].name == "hold"  # of no vehicle nobody can say so
+
+
+def test_a_region_between_the_centres_of_cells_is_refused():
+    with pytest.raises(ValueError, match=r"region 'thin' holds no cell centre; use smaller cells than 0.25 m"):
+        RegionsOfInterest(regions={"thin": rectangle((0.0, 0.1), (0.0, 1.0))}).around(ROBOT_M)
+
+
+def test_yaml_and_python_say_the_same(tmp_path):
+    (tmp_path / "ask.yaml").write_text(
+        "regions:\n"
+        "  behind: {x_m: [-4, -0.5], y_m: [-1, 1]}\n"
+        "  corner: {polygon_m: [[0.5, 0.4], [3.5, 0.4], [0.5, 3.4]]}\n"
+        "heights: {dog: [0.05, 0.5], child: [0.1, 1.1]}\n"
+        "grid: {x_m: [-10, 10], y_m: [-10, 10], cell_m: 0.1}\n"
+    )
+    told = RegionsOfInterest.load(tmp_path / "ask.yaml")
+    assert told == RegionsOfInterest(
+        regions={
+            "behind": rectangle((-4.0, -0.5), (-1.0, 1.0)),
+            "corner": {"polygon_m": ((0.5, 0.4), (3.5, 0.4), (0.5, 3.4))},
+        },
+        heights={"dog": (0.05, 0.5), "child": (0.1, 1.1)},
+        grid={"x_m": (-10.0, 10.0), "y_m": (-10.0, 10.0), "cell_m": 0.1},
+    )
+    asked = told.around(ROBOT_M)
+    assert asked.grid.heights == {"dog": (0.05, 0.5), "child": (0.1, 1.1)}
+    assert asked.areas[1] == ((0.5, 3.5), (0.4, 3.4))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("regions: {a: {x_m: [1, 1], y_m: [0, 1]}}", "regions.a.x_m: the lower bound must be below the upper one"),
+        ("regions: {a: {x_m: [.nan, 1], y_m: [0, 1]}}", r"regions.a.x_m.0: Input should be"),
+        ("regions: {a: {x_m: [0, 1]}}", "regions.a: give x_m and y_m, two bounds each, or the corners of polygon_m"),
+        ("regions: {a: {polygon_m: [[0, 0], [1, 1], [1, 0], [0, 1]]}}", "regions.a: .*edges cross .*Self-intersection"),
+        ("regions: {a: {polygon_m: [[0, 0], [1, 1], [2, 2]]}}", "regions.a: .*edges cross"),
+        ("regions: {a: {polygon_m: [[0, 0], [1, 1]]}}", "three different corners or more are needed; got 2"),
+        ("heights: {low: [0.5, 0.5]}", "heights.low: the lower bound must be below the upper one; got 0.5 to 0.5 m"),
+        ("heights: {low: [0, 1], low: [0, 2]}", "low"),
+        ("grid: {cell_m: 0}", "grid.cell_m: Input should be greater than 0"),
+        ("regions: {a: {x: [0, 1], y: [0, 1]}}", "regions.a.x: .*regions.a.y: "),
+    ],
+)
+def test_what_asks_nothing_is_refused(tmp_path, content, message):
+    (tmp_path / "ask.yaml").write_text(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        RegionsOfInterest.load(tmp_path / "ask.yaml")
+    assert str(tmp_path / "ask.yaml") in str(caught.value)
+
+
+def test_more_cells_than_there_is_memory_for_are_refused_in_one_line():
+    given = {"x_m": (-1000.0, 1000.0), "y_m": (-1000.0, 1000.0), "cell_m": 0.1}
+    with pytest.raises(ValueError, match="800,000,000 cells, over 100,000,000: use larger cells"):
+        RegionsOfInterest(grid=given).around()
+
+
+def test_the_sides_are_named_by_their_reach():
+    names = [region.name for region in near_field_regions((-1.0, 1.0), (-1.0, 1.0), reach_m=1.5)]
+    assert names == ["front_1.5m", "rear_1.5m", "left_1.5m", "right_1.5m"]
+    assert math.prod(near_field_regions((-1.0, 1.0), (-1.0, 1.0))[2].x) == -1.0

@@ -1,0 +1,225 @@
+"""What is read off a map: sides, the nearest seen place, the worst; requirements; files; the picture."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+from torchcover.evaluation import free_space, save_targets, survey_target, target_picture, target_record
+from torchcover.geometry import BoundingBox
+from torchcover.report.drawings.targets import UNSEEN
+from torchcover.simulation import with_ego
+from torchcover.targets import Raster, Requirements, Target, TargetMap, check
+
+CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
+OUTLINE = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
+
+
+def seen_where(points, *, raster=None, state=None, share=None, hits=5):
+    """A map with a number of points that is a function of x and y, of two sensors that share them evenly."""
+    raster = raster or Raster((-6.0, 6.0), (-5.0, 5.0), 0.5)
+    x, y = raster.positions_m.T
+    number = np.broadcast_to(np.asarray(points(x, y), dtype=np.float64), x.shape).reshape(raster.shape)
+    if state is None:
+        within = (np.abs(x) < 2) & (np.abs(y) < 1)
+        state = within.astype(np.uint8).reshape(raster.shape)
+    number = np.where(state == 0, number, np.nan)
+    return TargetMap(
+        rig="<rig>",
+        scenario="s",
+        target="child_110cm",
+        target_size_m=(0.2, 0.3, 1.1),
+        heading="narrow",
+        raster=raster,
+        vehicle=CAR,
+        vehicle_outline_m=OUTLINE,
+        sensor_names=("a", "b"),
+        sensors_m=np.zeros((2, 2)),
+        hits=hits,
+        threshold_m=0.4,
+        seed=0,
+        step_count=1,
+        state=state,
+        steps=(state == 0).astype(np.int64),
+        sensor_points=np.stack([number / 2, number / 2]),
+        sensors=np.where(number / 2 >= hits, 2.0, 0.0),
+        seen=(number >= hits) * 1.0,
+        share=np.where(state == 0, 1.0, np.nan) if share is None else share,
+        visible_m2=number * 0 + 1.0,
+    )
+
+
+def judged(seen, *requirements):
+    return check(Requirements.model_validate({"requirements": list(requirements)}), seen)
+
+
+def test_the_first_seen_place_is_where_the_way_out_meets_enough_points():
+    """Seen from 3.5 m ahead of the middle on; to the left from 2 m on, less a gap that comes later; never behind."""
+    seen = seen_where(lambda x, y: np.where((x > 3.5) | ((y > 2) & ~((y > 3) & (y < 4))), 9, 0))
+    first = seen.first_seen_m()
+    assert first.shape == (360, 2)
+    assert first[0] == pytest.approx([3.5, 0.0], abs=0.13)
+    assert first[90] == pytest.approx([0.0, 2.0], abs=0.13)
+    assert np.isnan(first[180]).all()
+    assert np.isnan(first[270]).all()
+    everywhere = seen_where(lambda x, y: 9).first_seen_m()
+    assert everywhere[0] == pytest.approx([2.0, 0.0], abs=0.13)
+    np.testing.assert_allclose(np.arctan2(*everywhere.T[::-1]) % (2 * np.pi), np.deg2rad(np.arange(360)), atol=1e-9)
+
+
+def test_sides_part_the_places_at_corners_of_45_degrees():
+    seen = seen_where(lambda x, y: np.where(x > 0, 9, 4))
+    assert (np.bincount(seen.side.ravel() + 1) == [32, 104, 104, 120, 120]).all()
+    by_side = {(row.side, row.within_m): row for row in seen.sides()}
+    assert by_side["front", 1.0].seen == 1.0
+    assert by_side["rear", 3.0].seen == 0.0
+    assert by_side["left", 2.0].seen == by_side["right", 2.0].seen == 0.5
+    assert by_side["left", 1.0].cells == 16 + 2
+    assert seen.unseen_to_m() == {
+        "front": 0.0, "rear": pytest.approx(np.hypot(3.75, 3.75)),
+        "left": pytest.approx(np.hypot(3.25, 3.75)), "right": pytest.approx(np.hypot(3.25, 3.75)),
+    }  # fmt: skip
+    closed = replace(seen, state=np.ones_like(seen.state))
+    assert all(row.cells == 0 and np.isnan(row.seen) for row in closed.sides())
+
+
+def test_the_worst_places_have_the_fewest_points_and_keep_apart():
+    seen = seen_where(lambda x, y: np.abs(x) + np.abs(y))
+    worst = seen.worst(3)
+    assert [place.points for place in worst] == sorted(place.points for place in worst)
+    assert worst[0].points == np.nanmin(seen.points) == 1.5
+    places = np.array([[place.x_m, place.y_m] for place in worst])
+    assert np.linalg.norm(places[:, None] - places, axis=2)[~np.eye(3, dtype=bool)].min() >= 1.0
+    assert len(seen.worst(10_000, apart_m=0.1)) == seen.counts["free"]
+
+
+def test_a_requirement_is_met_where_every_free_place_in_reach_meets_it():
+    seen = seen_where(lambda x, y: np.where(x > 1, 9, 4))
+    passed, failed = judged(
+        seen,
+        {"target": "child", "within_m": 2, "sides": ["front"], "points": 9, "sensors": 0, "share": 1.0, "seen": 1},
+        {"within_m": 1, "points": 5},
+    )
+    assert (passed.passed, passed.failed, passed.worst) == (True, 0, ())
+    assert passed.cells == ((seen.side == 0) & (seen.distance_m <= 2)).sum()
+    assert (failed.passed, failed.unknown) == (False, 0)
+    assert failed.failed == (seen.free & (seen.distance_m <= 1) & (seen.points < 5)).sum()
+    assert all(place.points == 4 for place in failed.worst)
+    assert failed.worst[0].distance_m == 0.25
+    assert not judged(seen, {"within_m": 2, "sides": ["front"], "sensors": 1})[0].passed
+
+
+def test_what_is_unknown_is_not_met():
+    share = seen_where(lambda x, y: 9).share.copy()
+    share[0, 0] = np.nan
+    verdict = judged(seen_where(lambda x, y: 9, share=share), {"within_m": 4, "share": 0.1})[0]
+    assert verdict.passed  # the corner is farther away
+    share[10, 0] = np.nan
+    verdict = judged(seen_where(lambda x, y: 9, share=share), {"within_m": 4, "share": 0.0})[0]
+    assert (verdict.passed, verdict.failed, verdict.unknown) == (False, 1, 1)
+
+
+@pytest.mark.parametrize(
+    ("requirement", "message"),
+    [
+        ({"target": "dog", "within_m": 1, "points": 1}, "no requirement is about the target 'child_110cm'.* about dog"),
+        ({"within_m": 5, "points": 1}, "raster ends 4 m from the vehicle"),
+        ({"within_m": 0.1, "points": 1}, "there is no free cell"),
+        ({"within_m": 1}, "nothing is required: give points"),
+        ({"within_m": 1, "sides": [], "points": 1}, "sides"),
+        ({"within_m": 0, "points": 1}, "within_m"),
+        ({"within_m": 1, "points": 1, "pionts": 2}, "pionts"),
+    ],
+)
+def test_a_requirement_that_says_nothing_is_an_error(requirement, message):
+    with pytest.raises(ValueError, match=message):
+        judged(seen_where(lambda x, y: 9), requirement)
+
+
+def test_the_files_hold_what_the_map_holds(tmp_path):
+    seen = seen_where(lambda x, y: np.abs(x) + 0.5, raster=Raster((-3.0, 3.0), (-2.0, 2.0), 1.0))
+    verdicts = judged(seen, {"within_m": 1, "points": 1})
+    names = [path.name for path in save_targets(seen, tmp_path, verdicts)]
+    assert names == ["targets.csv", "targets.npz", "targets.png", "summary.json"]
+    with np.load(tmp_path / "targets.npz") as arrays:
+        np.testing.assert_array_equal(arrays["points"], seen.points)
+        np.testing.assert_array_equal(arrays["first_seen_m"], seen.first_seen_m())
+        assert json.loads(str(arrays["settings"]))["raster"] == {"x": [-3, 3], "y": [-2, 2], "step_m": 1}
+        assert arrays["x_m"].tolist() == [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
+    rows = list(csv.DictReader((tmp_path / "targets.csv").read_text().splitlines()))
+    assert len(rows) == 24
+    assert (rows[0]["x_m"], rows[0]["points"], rows[0]["points_a"], rows[0]["state"]) == ("-2.5", "3", "1.5", "free")
+    assert (rows[8]["state"], rows[8]["points"], rows[8]["side"]) == ("occupied", "", "")
+    record = json.loads((tmp_path / "summary.json").read_text())
+    assert record["cells"] == {"free": 16, "occupied": 8, "outside": 0, "share_unknown": 0}
+    assert record["requirements"][0]["passed"] is True
+    assert target_record(replace(seen, state=np.ones_like(seen.state)))["sides"][0]["seen"] is None
+
+
+def test_the_picture_shows_cells_where_they_are():
+    seen = seen_where(lambda x, y: np.where(y > 0, 0, 100))
+    figure = target_picture(seen)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    pixels = np.asarray(canvas.buffer_rgba())[..., :3]
+
+    def at(x, y):
+        column, row = figure.axes[0].transData.transform((x, y))
+        return "#" + "".join(f"{value:02x}" for value in pixels[len(pixels) - 1 - int(row), int(column)])
+
+    assert at(-5.3, 4.3) == at(5.3, 1.3) == UNSEEN
+    assert at(5.3, -4.3) not in (UNSEEN, "#ffffff")
+    assert at(1.9, 0.9) == at(-1.9, -0.9) == "#ffffff"  # the vehicle, true to scale
+    assert at(5.25, 0.0) < "#202020"  # the line between seen and not
+    assert figure.axes[0].get_legend() is not None
+
+
+def test_names_become_bodies(tmp_path):
+    (tmp_path / "post.yaml").write_text(
+        "name: my post\nparts: [{name: p, shape: {type: box, size_m: [0.2, 0.2, 0.5]}, poses: [{z_m: -3}]}]\n"
+    )
+    post = Target.load(tmp_path / "post.yaml")
+    assert (post.name, post.solid.box.lower_m[2]) == ("post", 0.0)  # it stands on the ground
+    (tmp_path / "plate.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    assert Target.load(tmp_path / "plate.obj").solid.box.size_m == (1.0, 1.0, 1.0)
+    assert with_ego(free_space(), {}, tmp_path / "plate.obj").ego_box().size_m == (1.0, 1.0, 1.0)
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 3 2\n")
+    with pytest.raises(ValueError, match="lower < upper"):
+        Target.load(tmp_path / "flat.obj")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"raster": Raster((3.0, 3.2), (0.0, 0.2), 0.2)}, "larger than the raster of 0.2 x 0.2 m"),
+        ({"steps": 0}, "steps"),
+        ({"hits": 0}, "hits"),
+        ({"threshold_m": -1.0}, "threshold"),
+        ({"heading": "up"}, "narrow, wide or degrees"),
+        ({"target": "moon"}, "'moon' is neither"),
+        ({"steps": 10**9}, "use fewer steps"),
+    ],
+)
+def test_an_option_that_cannot_be_is_an_error(options, message):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
+        survey_target("front_roof_32", **{"target": "child", **options})
+
+
+@pytest.mark.parametrize(
+    ("bounds", "message"),
+    [
+        (((-1000.0, 1000.0), (-1000.0, 1000.0), 0.5), "16,000,000 cells; at most 1,000,000"),
+        (((0.0, 1.0), (0.0, 1.0), 0.3), "no whole number of steps"),
+        (((1.0, 0.0), (0.0, 1.0), 0.5), "low < high"),
+        (((0.0, np.inf), (0.0, 1.0), 0.5), "finite"),
+        (((0.0, 1.0), (0.0, 1.0), 0.0), "step above 0"),
+        (((0.0, 1.0), (0.0, 1.0), np.nan), "step above 0"),
+        (((0.0, 1.0), (0.0, 1.0), 9.0), "no whole number of steps"),
+    ],
+)
+def test_a_raster_that_cannot_be_is_an_error(bounds, message):
+    with pytest.raises(ValueError, match=message):
+        Raster(*bounds)

@@ -1,0 +1,182 @@
+"""What a rig sees of a target is what the simulator gives with that target in the world."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover.geometry import BoundingBox, rigid
+from torchcover.simulation import PaperReference, Scenario, Simulator
+from torchcover.simulation.bodies import merge
+from torchcover.simulation.shapes import Box
+from torchcover.targets import STATES, Raster, Target, counting, survey
+from torchcover.targets.placing import yaws
+from torchcover.targets.surface import SAMPLES, Surface
+
+from .worlds import EGO, RASTER, WALL, drive, lidar, on_target, rig, world
+
+FREE, OCCUPIED, OUTSIDE = range(len(STATES))
+REFERENCE = PaperReference(rows=2, columns=2)
+CAMERA = {
+    "type": "camera", "name": "cam", "mount": {"x_m": 2.1, "z_m": 0.8}, "width": 90, "height": 50, "fov_deg": 100,
+    "max_range_m": 3.5, "min_range_m": 1.0,
+}  # fmt: skip
+
+
+def with_target(scenario, name, x_m, y_m, yaw_rad):
+    """The scenario with a target that stands there, in a world whose ego is at its origin."""
+    shape = {"type": "vehicle", "vehicle": name}
+    pose = {"x_m": float(x_m), "y_m": float(y_m), "yaw_deg": float(np.rad2deg(yaw_rad))}
+    content = scenario.model_dump(exclude_unset=True)
+    actors = [*content.get("actors", ()), {"name": "t", "category": "c", "shape": shape, "pose": pose}]
+    return Scenario.model_validate({**content, "actors": actors})
+
+
+@pytest.mark.parametrize(("name", "heading"), [("child", "narrow"), ("dog", "wide"), ("pole", 30.0)])
+def test_points_are_those_of_a_simulation_with_the_target_in_the_world(name, heading):
+    target, scenario = Target.load(name), world(WALL)
+    sensors = rig(lidar(), lidar("corner", mount={"x_m": 2.1, "y_m": 1.1, "z_m": 0.6, "yaw_deg": 45}), CAMERA)
+    seen = survey(sensors, scenario, target, RASTER, heading=heading)
+    yaw = yaws(heading, target.solid.box, seen.vehicle, RASTER.positions_m).reshape(RASTER.shape)
+    compared = 0
+    for row, column in [(0, 0), (4, 9), (4, 12), (6, 12), (5, 13), (8, 7), (2, 10), (5, 2)]:
+        assert seen.state[row, column] == FREE
+        x_m, y_m = seen.x_m[column], seen.y_m[row]
+        simulator = Simulator(with_target(scenario, target.name, x_m, y_m, yaw[row, column]), {"r": sensors}, REFERENCE)
+        step = simulator.step(0)
+        ends = np.cumsum(step.sensor_points["r"])
+        clouds = np.split(step.clouds["r"], ends[:-1])
+        counts = [on_target(cloud, target, x_m, y_m, yaw[row, column]) for cloud in clouds]
+        assert seen.sensor_points[:, row, column].tolist() == counts
+        assert seen.sensors[row, column] == sum(count >= 5 for count in counts)
+        compared += sum(count > 0 for count in counts)
+    assert compared > 8
+
+
+def test_points_are_the_mean_over_the_steps_of_a_world_that_moves(tmp_path):
+    """The ego drives past a wall that hides the target at first, and another car drives through the places."""
+    ego = {**EGO, "trajectory": drive(tmp_path, (0, 0, 0, 0), (1, 4, 0, 0))}
+    passing = {
+        "name": "a", "category": "car", "shape": {"type": "box", "size_m": [2, 1, 1]},
+        "trajectory": drive(tmp_path, (0, 0, 3.5, 0), (1, 8, 3.5, 0), name="a.csv"),
+    }  # fmt: skip
+    scenario = world(WALL, ego=ego, actors=[passing], duration_s=1.0, time_step_s=0.5)
+    target, sensors = Target.load("adult"), rig(lidar("low", mount={"x_m": 2.1, "z_m": 1.3}))
+    seen = survey(sensors, scenario, target, RASTER, steps=3, heading=0.0)
+    # In the last of these places the other car stands at first.
+    for row, column, free in [(6, 11, (0, 1, 2)), (7, 5, (0, 1, 2)), (2, 12, (0, 1, 2)), (8, 7, (1, 2))]:
+        counts = []
+        for index in free:
+            pose = seen.x_m[column] + 2.0 * index, seen.y_m[row], 0.0
+            step = Simulator(with_target(scenario, target.name, *pose), {"r": sensors}, REFERENCE).step(index)
+            counts.append(on_target(step.clouds["r"], target, seen.x_m[column], seen.y_m[row], 0.0))
+        assert seen.points[row, column] == pytest.approx(np.mean(counts))
+        assert seen.seen[row, column] == pytest.approx(np.mean(np.array(counts) >= 5))
+    # The car is at (0, 3.5), then at (2, 3.5) and (4, 3.5) as the ego sees it: each cell is taken once at most.
+    assert seen.steps[8].tolist() == [3, 3, 3, 3, 3, 3, 2, 2, 2, 2, 2, 2, 3, 3]
+    assert (seen.state[8] == FREE).all()
+
+
+def test_a_place_does_not_depend_on_the_raster_the_chunks_or_the_threads(monkeypatch):
+    target, sensors = Target.load("dog"), rig(lidar(dropout=0.2, range_noise_m=0.05))
+    whole = survey(sensors, world(WALL), target, RASTER, steps=2, seed=3)
+    part = survey(sensors, world(WALL), target, Raster((2.0, 7.0), (-2.0, 3.0), 1.0), steps=2, seed=3)
+    for name in ("sensor_points", "sensors", "seen", "share", "state", "visible_m2"):
+        np.testing.assert_array_equal(getattr(whole, name)[..., 3:8, 9:], getattr(part, name))
+    monkeypatch.setattr(counting, "CHUNK", 7)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    again = survey(sensors, world(WALL), target, RASTER, steps=2, seed=3)
+    torch.set_num_threads(threads)
+    np.testing.assert_array_equal(again.points, whole.points)
+    np.testing.assert_array_equal(again.share, whole.share)
+
+
+def test_rays_that_drop_out_are_missing_and_noise_moves_points_only():
+    target, raster = Target.load("adult"), Raster((2.0, 6.0), (-2.0, 2.0), 1.0)
+    exact = survey(rig(), world(), target, raster).points.sum()
+    noisy = survey(rig(lidar(range_noise_m=0.02)), world(), target, raster, steps=2).points.sum()
+    assert noisy == exact > 200
+    thinned = survey(rig(lidar(dropout=0.25)), world(), target, raster, steps=32).points.sum()
+    # A standard error is 1 %.
+    assert thinned == pytest.approx(0.75 * exact, rel=0.04)
+    assert survey(rig(lidar(dropout=1.0)), world(), target, raster).share.max() == 0.0
+
+
+def test_left_and_right_are_alike_for_a_symmetric_rig():
+    seen = survey(rig(lidar(columns=250)), world(), Target.load("dog"), RASTER)
+    np.testing.assert_allclose(seen.points, seen.points[::-1], atol=2)
+
+
+def test_the_narrow_side_gets_fewer_points_than_the_wide_one():
+    target = Target.load("cyclist")
+    narrow, wide = (survey(rig(), world(), target, RASTER, heading=heading) for heading in ("narrow", "wide"))
+    both = narrow.free & wide.free & (narrow.distance_m > 2)
+    assert narrow.points[both].sum() < 0.7 * wide.points[both].sum()
+
+
+@pytest.mark.parametrize(("heading", "yaw_deg"), [("narrow", [90, 0, 180]), ("wide", [0, -90, 90]), (17.0, [17] * 3)])
+def test_a_side_is_turned_to_the_nearest_point_of_the_vehicle(heading, yaw_deg):
+    """Of a body that is longer than wide; the vehicle is to its left, in front of it, and behind it."""
+    car, dog = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), BoundingBox((-0.5, -0.1, 0.0), (0.5, 0.1, 0.7))
+    places = np.array([[1.5, -3.0], [-3.0, 0.5], [4.0, 0.0]])
+    turned = np.rad2deg(yaws(heading, dog, car, places))
+    np.testing.assert_allclose(np.cos(np.deg2rad(turned - yaw_deg)), 1.0, atol=1e-12)
+
+
+def test_what_hides_a_target_hides_its_points_and_what_stands_there_takes_its_room():
+    building = {"name": "b", "shape": {"type": "box", "size_m": [4, 4, 6]}, "poses": [{"x_m": 5.0, "y_m": 3.0}]}
+    seen = survey(rig(), world(building), Target.load("child"), RASTER)
+    names = np.array(STATES)[seen.state]
+    assert (names[3:7, 5:9] == "occupied").sum() == 8
+    assert (names[4:6, 5:9] == "occupied").all()
+    # Inside the building, and through its walls.
+    assert (names[6:, 10:] == "outside").all()
+    assert (names[:4] == "free").all()
+    for array in (seen.points, seen.sensors, seen.seen, seen.share, seen.visible_m2):
+        np.testing.assert_array_equal(np.isnan(array), seen.state != FREE)
+    assert seen.counts == {"free": 116, "occupied": 8, "outside": 16, "share_unknown": 0}
+    assert (seen.steps == (seen.state == FREE)).all()
+
+
+def test_a_target_that_no_random_place_sees_has_an_unknown_share():
+    """A child behind a high wall all along."""
+    wall = {"name": "w", "shape": {"type": "box", "size_m": [0.2, 60, 9]}, "poses": [{"x_m": 4.0}]}
+    seen = survey(rig(), world(wall), Target.load("child"), Raster((2.5, 5.5), (0.0, 1.0), 1.0))
+    assert 0 < seen.share[0, 0] <= 1
+    assert np.isnan(seen.share[0, 2])
+    assert (seen.points[0, 2], seen.visible_m2[0, 2]) == (0.0, 0.0)
+    assert seen.counts["share_unknown"] == 1
+
+
+def test_the_share_is_that_of_the_surface_which_is_near_a_measured_point():
+    """One row of rays at 1 m meets a wall of 2 m: what is within 0.3 m of it, of the side that faces the vehicle."""
+    mesh = Box(type="box", size_m=(0.02, 4.0, 2.0)).mesh()
+    level = lidar(mount={"z_m": 1.0}, channels=1, vertical_fov_deg=[0, 0], columns=36000)
+    ego = {"shape": {"type": "box", "size_m": [4.0, 2.0, 0.5]}}
+    raster = Raster((4.0, 12.0), (-4.0, 4.0), 8.0)
+    seen = survey(rig(level), world(ego=ego), Target("wall", mesh), raster, threshold_m=0.3, heading="wide")
+    assert seen.share[0, 0] == pytest.approx(0.3, abs=2.5 / np.sqrt(SAMPLES) * 0.3)
+    assert seen.visible_m2[0, 0] == pytest.approx(8.0, rel=0.15)  # the ego hides its foot from low places
+    all_of_it = survey(rig(level), world(ego=ego), Target("wall", mesh), raster, threshold_m=5.0, heading="wide")
+    assert all_of_it.share[0, 0] == 1.0
+
+
+def test_the_surface_is_spread_by_area_and_leaves_out_what_is_inside():
+    """A box with another one inside it has the surface of the outer one; near agrees with distances."""
+    target = Target.load("adult")
+    surface = Surface.of(target)
+    corners = target.mesh.vertices_m[target.mesh.faces]
+    whole = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    assert 0.6 * whole < surface.m2_each * SAMPLES < 0.97 * whole
+    hits = np.random.default_rng(0).normal(size=(500, 3))
+    near = np.unpackbits(surface.near(hits, 0.4), axis=1).astype(bool)
+    distance = np.linalg.norm(hits[:, None] - surface.points_m, axis=2)
+    np.testing.assert_array_equal(near, distance <= 0.4)
+
+
+def test_a_target_hides_its_own_rear():
+    """Two plates of a square metre, one behind the other."""
+    front, rear = (Box(type="box", size_m=(0.02, 1, 1)).mesh().moved(rigid(np.eye(3), [x, 0, 0])) for x in (0.1, -0.1))
+    raster = Raster((11.0, 13.0), (-1.0, 1.0), 2.0)
+    seen = survey(rig(), world(), Target("plates", merge([front, rear])), raster, heading="wide")
+    assert seen.visible_m2[0, 0] == pytest.approx(1.0, abs=0.35)

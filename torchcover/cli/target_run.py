@@ -1,0 +1,144 @@
+"""What `torchcover targets` does and prints."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from torchcover.evaluation import claimed, save_targets, survey_target
+from torchcover.report import percent, text_table
+from torchcover.targets import Heading, Place, Raster, Requirements, TargetMap, Verdict, check
+
+FAILED = 1
+
+
+def run(
+    rig: str,
+    target: str,
+    scenario: str | None,
+    *,
+    vehicle: str | None,
+    raster: str | None,
+    steps: int | None,
+    every_s: float | None,
+    seed: int,
+    hits: int,
+    threshold_m: float,
+    heading: str,
+    require: Path | None,
+    out: Path,
+) -> int:
+    """Survey a target, write and print what is seen, judge it.
+
+    Returns:
+        1 if a requirement is not met, else 0.
+
+    Raises:
+        ValueError: An option or a file that cannot be used.
+        FileNotFoundError: An unknown name or file.
+    """
+    requirements = None if require is None else Requirements.load(require)  # before the work, not after it
+    with claimed(out):
+        seen = survey_target(
+            rig,
+            target,
+            scenario,
+            vehicle=vehicle,
+            raster=None if raster is None else parsed_raster(raster),
+            steps=steps,
+            every_s=every_s,
+            seed=seed,
+            hits=hits,
+            threshold_m=threshold_m,
+            heading=parsed_heading(heading),
+        )
+        verdicts = [] if requirements is None else check(requirements, seen)
+        files = save_targets(seen, out, verdicts)
+    _print(seen, verdicts, requirements)
+    Console().print(f"Wrote {', '.join(path.name for path in files)} to {out}", markup=False, soft_wrap=True)
+    return 0 if all(verdict.passed for verdict in verdicts) else FAILED
+
+
+def parsed_raster(text: str) -> Raster:
+    """The raster of `x0,x1,y0,y1,step`, in metres.
+
+    Raises:
+        ValueError: Other than five numbers, or what `Raster` refuses.
+
+    Example:
+        >>> parsed_raster("-4,4,-3,3,0.5").shape
+        (12, 16)
+    """
+    try:
+        x0, x1, y0, y1, step_m = map(float, text.split(","))
+    except ValueError as error:
+        raise ValueError(f"--raster: x0,x1,y0,y1,step in metres, as in -8,8,-5,5,0.2; got {text!r}") from error
+    return Raster((x0, x1), (y0, y1), step_m)
+
+
+def parsed_heading(text: str) -> Heading:
+    """`narrow`, `wide`, or degrees.
+
+    Raises:
+        ValueError: Anything else.
+    """
+    if text in ("narrow", "wide"):
+        return text  # type: ignore[return-value]  # one of the two literals
+    try:
+        return float(text)
+    except ValueError as error:
+        raise ValueError(f"--heading: narrow, wide or degrees are needed; got {text!r}") from error
+
+
+def _print(seen: TargetMap, verdicts: Sequence[Verdict], requirements: Requirements | None) -> None:
+    console = Console()
+    console.print(_sides_table(seen))
+    console.print(_places_table(seen.worst(), "The places with the fewest points, 1 m apart"))
+    if unknown := seen.counts["share_unknown"]:
+        console.print(f"{unknown:,} places show no surface to any random place: their share is unknown.")
+    for verdict in verdicts:
+        console.print(_sentence(verdict), markup=False, soft_wrap=True)
+        if verdict.worst:
+            console.print(_places_table(verdict.worst, "where not, the nearest first"))
+    for left in () if requirements is None else requirements.requirements:
+        if not left.is_about(seen.target):
+            console.print(f"not checked, as it is not about {seen.target}: {left.words}", markup=False, soft_wrap=True)
+
+
+def _sides_table(seen: TargetMap) -> Table:
+    sides = seen.sides()
+    within = list(dict.fromkeys(side.within_m for side in sides))
+    rows, unseen_to_m = [], seen.unseen_to_m()
+    for name in dict.fromkeys(side.side for side in sides):
+        of_side = [side for side in sides if side.side == name]
+        shares = ("-" if side.cells == 0 else f"{percent(side.seen)} %" for side in of_side)
+        rows.append([name, *shares, f"{unseen_to_m[name]:.2f} m" if unseen_to_m[name] else "nowhere"])
+    headings = ("side", *(f"within {limit_m:g} m" for limit_m in within), "unseen to")
+    length, width, height = seen.target_size_m
+    title = f"{seen.rig} sees {seen.target} ({length:.2f} x {width:.2f} x {height:.2f} m), in {seen.scenario}"
+    return text_table(headings, [rows], title=title, caption=f"Share of free places with {seen.hits} points or more")
+
+
+def _places_table(places: Sequence[Place], title: str) -> Table:
+    rows = [
+        (
+            place.side,
+            f"{place.x_m:.2f}",
+            f"{place.y_m:.2f}",
+            f"{place.distance_m:.2f}",
+            f"{place.points:.4g}",
+            f"{place.sensors:.3g}",
+            "unknown" if place.share != place.share else f"{percent(place.share)} %",
+        )
+        for place in places
+    ]
+    return text_table(("side", "x (m)", "y (m)", "distance (m)", "points", "sensors", "surface"), [rows], title=title)
+
+
+def _sentence(verdict: Verdict) -> str:
+    words = f"{'PASS' if verdict.passed else 'FAIL'} {verdict.requirement.words}"
+    if verdict.passed:
+        return f"{words}: at all of {verdict.cells:,} places"
+    unknown = f", of which {verdict.unknown:,} are unknown" if verdict.unknown else ""
+    return f"{words}: not at {verdict.failed:,} of {verdict.cells:,} places{unknown}"

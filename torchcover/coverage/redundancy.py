@@ -1,0 +1,152 @@
+"""Redundancy: by how many sensors of a rig a place is seen, and what is lost when one of them fails."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import ClassVar, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchcover.coverage.aggregations import Aggregation, BinnedStep, State
+from torchcover.coverage.binning import mean_per_cell
+from torchcover.coverage.grid import BevGrid
+from torchcover.coverage.layer import Layer
+from torchcover.coverage.quantity import RADIUS, Quantity, detection, seen_by_two, sensors_seeing, without
+from torchcover.coverage.regions import Region
+
+
+class PlaceSums(NamedTuple):
+    """Sums over the visible surface of P regions and bands, region by region, in B blocks of steps.
+
+    `steps` (B,) int64 steps in each block; `m2` (B, P) float64 square metres; `sums` (B, Q + V, P) those times the
+    radius and the detections with all sensors, then times each of `redundancy_quantities`.
+    """
+
+    steps: Tensor
+    m2: Tensor
+    sums: Tensor
+
+
+@dataclass(frozen=True)
+class Redundancy:
+    """What a `CoverageMetric` with `sensors` knows of them.
+
+    Args:
+        sensors: Their names.
+        layers: Over the grid, by the key of their quantity: for each threshold by how many sensors the points of a
+            cell are seen ("sensors_0.4m") and the share that two or more see ("seen_by_two_0.4m"); for each sensor the
+            radius and the detection without it ("radius_m_without_roof"). By area if the coverage is, else means of
+            means.
+        places: The sums behind the numbers of the regions; None unless the coverage is by area.
+    """
+
+    sensors: tuple[str, ...]
+    layers: Mapping[str, Layer]
+    places: PlaceSums | None
+
+
+def redundancy_quantities(sensors: Sequence[str], thresholds: Sequence[float]) -> tuple[Quantity, ...]:
+    """What there is a layer, and a number of each region, of: in the order in which they are summed up.
+
+    Example:
+        >>> [each.key for each in redundancy_quantities(["roof"], [0.4])]
+        ['sensors_0.4m', 'seen_by_two_0.4m', 'radius_m_without_roof', 'detection_0.4m_without_roof']
+    """
+    several = [each(threshold) for threshold in thresholds for each in (sensors_seeing, seen_by_two)]
+    single = (RADIUS, *map(detection, thresholds))
+    return (*several, *(without(sensor, quantity) for sensor in sensors for quantity in single))
+
+
+@dataclass(frozen=True)
+class SensorFailures(Aggregation):
+    """Sums of how many sensors see a point, and of what the rig would be without each of them.
+
+    The radius of a rig is the smallest of those of its sensors, so that the radius without a sensor is the smallest of
+    the others', and no search is made for it.
+
+    Args:
+        sensors: Names of the sensors, in the order of `BinnedStep.of_sensors`.
+        thresholds: Detection thresholds in metres.
+        grid: Cells and height bands.
+        regions: Those whose numbers have errors.
+        max_radius: Saturation of the radius in metres.
+        blocks: Blocks of contiguous steps for the errors.
+        square_metres: Whether weights are square metres.
+    """
+
+    name: ClassVar[str] = "redundancy"
+    words: ClassVar[str] = "redundancy"
+
+    sensors: tuple[str, ...]
+    thresholds: tuple[float, ...]
+    grid: BevGrid
+    regions: tuple[Region, ...]
+    max_radius: float
+    blocks: int = 1
+    square_metres: bool = False
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """As `redundancy_quantities`."""
+        return redundancy_quantities(self.sensors, self.thresholds)
+
+    def states(self, cells: int) -> dict[str, State]:
+        """`sums` (V, C): means of each step, or with square metres those times them, and `m2` (C); both by region."""
+        values, places = len(self.quantities), len(self.regions) * len(self.grid.heights)
+        with_all = 1 + len(self.thresholds)
+        zero = torch.zeros((), dtype=torch.float64)
+        states = {"sums": State(zero.expand(values, cells))}
+        if self.square_metres:
+            states["m2"] = State(zero.expand(cells))
+            states["place_m2"] = State(zero.expand(self.blocks, places), in_blocks=True)
+            states["place_sums"] = State(zero.expand(self.blocks, with_all + values, places), in_blocks=True)
+        return states
+
+    def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
+        """Add the points of a step."""
+        assert step.of_sensors is not None  # a metric with this aggregation has them
+        cell, _, weight, mean = mean_per_cell(step.cell, self._values(step.of_sensors), step.cells, step.weight)
+        if not self.square_metres:
+            sums["sums"][:, cell] += mean
+            return
+        sums["m2"][cell] += weight
+        sums["sums"][:, cell] += mean * weight
+        # Row by row in one order, so that what a sensor adds nothing to is the same without it, to the last bit.
+        products = torch.cat([step.means.mean, mean]) * weight
+        for place, member in enumerate(self._members(cell)):
+            sums["place_m2"][step.block, place] += weight[member].sum()
+            sums["place_sums"][step.block, :, place] += products[:, member].sum(dim=1)
+
+    def _values(self, of_sensors: Tensor) -> Tensor:
+        """(V, N) float64 of (S, N) distances to the nearest point of each sensor, infinite where none is near."""
+        nearest, which = of_sensors.min(dim=0)
+        rows = []
+        for threshold in self.thresholds:
+            seeing = (of_sensors <= threshold).sum(dim=0)
+            rows += [seeing.double(), (seeing >= 2).double()]
+        # Without any sensor but the nearest the radius stays as it is.
+        second = of_sensors.scatter(0, which[None], torch.inf).amin(dim=0)
+        for number in range(len(self.sensors)):
+            radius = torch.where(which == number, second, nearest)
+            rows.append(radius.clamp(max=radius.new_tensor(self.max_radius)).double())
+            rows += [(radius <= threshold).double() for threshold in self.thresholds]
+        return torch.stack(rows)
+
+    def _members(self, cell: Tensor) -> Tensor:
+        """(P, K) bool: whether a cell is of a place."""
+        bands, rows, columns = self.grid.shape
+        of_band = torch.arange(bands, device=cell.device)[:, None] == cell // (rows * columns)
+        of_region = self._masks.to(cell.device)[:, cell % (rows * columns)]
+        return (of_region[:, None] & of_band).flatten(0, 1)
+
+    @cached_property
+    def _masks(self) -> Tensor:
+        """(R, Y * X) bool."""
+        empty = torch.empty((0, *self.grid.shape[1:]), dtype=torch.bool)
+        return torch.cat([empty, *(region.mask(self.grid)[None] for region in self.regions)]).flatten(1)
+
+    def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
+        """One for each quantity; 0 / 0, which is NaN, where nothing was seen."""
+        values = sums["sums"] / (sums["m2"] if self.square_metres else probed_steps)
+        return list(map(Layer, self.quantities, values))

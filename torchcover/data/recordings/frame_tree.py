@@ -1,0 +1,75 @@
+"""Frames of ROS that are mounted on each other: a tree of static transforms."""
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from torchcover.geometry import invert, rigid, rotation_from_quaternion
+from torchcover.geometry.rigid import Matrix
+
+
+class FrameTree:
+    """Transforms of frames from their parents.
+
+    Args:
+        transforms: Messages `geometry_msgs/msg/TransformStamped`; of two for the same frame the later counts.
+
+    Raises:
+        ValueError: A transform that is none, or frames in a loop.
+    """
+
+    def __init__(self, transforms: Iterable[Any]) -> None:
+        self._parents: dict[str, tuple[str, Matrix]] = {}
+        for one in transforms:
+            child, parent = frame_name(one.child_frame_id), frame_name(one.header.frame_id)
+            self._parents[child] = (parent, pose_of(one.transform.translation, one.transform.rotation, child))
+        for frame in self._parents:
+            self._way(frame)
+
+    @property
+    def frames(self) -> set[str]:
+        """All that are named."""
+        return set(self._parents) | {parent for parent, _ in self._parents.values()}
+
+    def parent(self, frame: str) -> tuple[str, Matrix] | None:
+        """What it is mounted on, and `that_T_frame`; None for a root."""
+        return self._parents.get(frame)
+
+    def between(self, destination: str, source: str) -> Matrix | None:
+        """(4, 4) `destination_T_source`; None if the one is not mounted on what the other is."""
+        from_source, from_destination = self._way(source), self._way(destination)
+        common = next((frame for frame in from_source if frame in from_destination), None)
+        return None if common is None else invert(from_destination[common]) @ from_source[common]
+
+    def _way(self, frame: str) -> dict[str, Matrix]:
+        """Each frame from this one to the root of its tree -> `that_T_this`."""
+        way = {frame: np.eye(4)}
+        this, here_T_frame = frame, np.eye(4)
+        while this in self._parents:
+            this, parent_T_this = self._parents[this]
+            if this in way:
+                raise ValueError(f"the frames {' -> '.join([*way, this])} are mounted on each other in a loop")
+            here_T_frame = parent_T_this @ here_T_frame
+            way[this] = here_T_frame
+        return way
+
+
+def frame_name(stored: str) -> str:
+    """The name of a frame; older tools begin it with a slash."""
+    return str(stored).removeprefix("/")
+
+
+def pose_of(place: Any, rotation: Any, name: str) -> Matrix:  # noqa: ANN401  (of types that rosbags has made)
+    """(4, 4) of a place (or translation) and a quaternion.
+
+    Raises:
+        ValueError: Not finite, or a quaternion of norm 0.
+    """
+    place_m = np.array([place.x, place.y, place.z], dtype=np.float64)
+    if not np.isfinite(place_m).all():
+        raise ValueError(f"{name}: three finite coordinates are needed; got {place_m.tolist()}")
+    try:
+        return rigid(rotation_from_quaternion([rotation.w, rotation.x, rotation.y, rotation.z]), place_m)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error

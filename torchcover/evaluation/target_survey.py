@@ -1,0 +1,161 @@
+"""What a rig sees of a target: names and defaults in, a map and its files out."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from torchcover.coverage import BevGrid
+from torchcover.evaluation.interrupt import held_back
+from torchcover.evaluation.result_files import ResultFiles
+from torchcover.evaluation.rig_names import AnyRig, loaded
+from torchcover.evaluation.settings import spread_s
+from torchcover.report import draw_targets
+from torchcover.simulation import Scenario, with_ego
+from torchcover.simulation.bodies import Body
+from torchcover.simulation.scenario import Mover
+from torchcover.simulation.shapes import Plane
+from torchcover.targets import Heading, Raster, Target, TargetMap, Verdict, survey, write_arrays, write_csv
+
+# Steps of a world in which something moves, or a sensor is noisy; else they are all alike.
+DEFAULT_STEPS = 16
+GROUND_M = 2000.0
+
+
+def survey_target(
+    rig: AnyRig,
+    target: Target | str | Path = "child",
+    scenario: Scenario | str | Path | None = None,
+    *,
+    vehicle: str | Path | None = None,
+    raster: Raster | None = None,
+    steps: int | None = None,
+    every_s: float | None = None,
+    seed: int = 0,
+    hits: int = 5,
+    threshold_m: float = 0.4,
+    heading: Heading = "narrow",
+) -> TargetMap:
+    """Put a target at every place around a vehicle, and see what its rig gets of it.
+
+    Args:
+        rig: The rig, its built-in name, or its YAML file.
+        target: "child", "adult", "dog", "cyclist", "pole", a built-in vehicle, the YAML file of one, or a mesh file.
+        scenario: The world: a scenario, a built-in name or a YAML file; flat ground with nothing on it if not given.
+        vehicle: What carries the rig, as for `evaluate`, or a mesh file.
+        raster: Where to put it; within 5 m of the vehicle in steps of 0.2 m if not given.
+        steps: How many steps are averaged; 1 where all are alike, else 16.
+        every_s: Time between two of them; as for `evaluate` if not given.
+        seed: Of traffic, random places, noise and drop-out.
+        hits: How many points are enough to see it.
+        threshold_m: How near a measured point on the target must be to a point of its surface, for the share.
+        heading: Which side of it the vehicle sees: "narrow" (fewest points), "wide" (most), or its yaw in degrees.
+
+    Returns:
+        The map; see `TargetMap`.
+
+    Raises:
+        FileNotFoundError: An unknown name or file.
+        ValueError: A file that cannot be used, a number out of its bounds.
+
+    Example:
+        >>> seen = survey_target("front_roof_128", "dog", raster=Raster((3.0, 7.0), (-1.0, 1.0), 1.0))
+        >>> seen.target, seen.counts["free"]
+        ('dog_57cm', 8)
+    """
+    rig = loaded(rig)
+    world = free_space() if scenario is None else scenario
+    world = with_ego(world if isinstance(world, Scenario) else Scenario.load(world), {rig.name: rig}, vehicle)
+    alike = world.instants == 1 and not any(sensor.range_noise_m or sensor.dropout for sensor in rig.sensors)
+    return survey(
+        rig,
+        world,
+        target if isinstance(target, Target) else Target.load(target),
+        raster,
+        steps=(1 if alike else DEFAULT_STEPS) if steps is None else steps,
+        every_s=spread_s(world, every_s),
+        seed=seed,
+        hits=hits,
+        threshold_m=threshold_m,
+        heading=heading,
+    )
+
+
+def free_space() -> Scenario:
+    """Flat ground with nothing on it but what carries the rig.
+
+    Example:
+        >>> free_space().instants
+        1
+    """
+    ground = Body(name="ground", shape=Plane(type="plane", size_m=(GROUND_M, GROUND_M)))
+    return Scenario(name="free space", ego=Mover(), bodies=(ground,))
+
+
+def target_picture(seen: TargetMap) -> Figure:
+    """The points on the target at every place, with the line at which it is first seen.
+
+    Args:
+        seen: From `survey_target`.
+    """
+    length, width, height = seen.target_size_m
+    heading = f"{seen.heading} side to the vehicle" if isinstance(seen.heading, str) else f"yaw {seen.heading:g}°"
+    steps = f"{seen.step_count} step{'s' if seen.step_count > 1 else ''}"
+    return draw_targets(
+        seen.points,
+        seen.enough,
+        BevGrid(x=seen.raster.x, y=seen.raster.y, cell=seen.raster.step_m),
+        vehicle_outline_m=seen.vehicle_outline_m,
+        vehicle_box_m=seen.vehicle.outline_m,
+        sensors_m=seen.sensors_m,
+        hits=seen.hits,
+        title=f"{seen.rig}: points on {seen.target}",
+        subtitle=f"{length:.2f} x {width:.2f} x {height:.2f} m, {heading}; {seen.scenario}, {steps}",
+    )
+
+
+def save_targets(seen: TargetMap, folder: str | Path, verdicts: Sequence[Verdict] = ()) -> list[Path]:
+    """Write the files of the command line: the numbers first, then the picture.
+
+    Args:
+        seen: From `survey_target`.
+        folder: Where to write `targets.csv`, `targets.npz`, `targets.png` and `summary.json`. Made if it does not
+            exist; files of an earlier run that its `summary.json` lists are deleted.
+        verdicts: From `torchcover.targets.check`, for `summary.json`.
+
+    Returns:
+        The files.
+    """
+    record = target_record(seen, verdicts)
+    with ResultFiles(Path(folder)) as files:
+        with held_back():  # the numbers are safe before anything ends this
+            files.add("targets.csv", lambda path: write_csv(seen, path))
+            files.add("targets.npz", lambda path: write_arrays(seen, path))
+            files.publish(record)
+        figure = target_picture(seen)
+        files.add("targets.png", lambda path: figure.savefig(path, dpi=figure.dpi))
+        files.publish(record)
+    return files.paths
+
+
+def target_record(seen: TargetMap, verdicts: Sequence[Verdict] = ()) -> dict[str, Any]:
+    """Settings, counts, shares of the sides, worst places and verdicts, for JSON; None for what is unknown."""
+    return {
+        **seen.settings(),
+        "cells": seen.counts,
+        "sides": [_known(side._asdict()) for side in seen.sides()],
+        "unseen_to_m": seen.unseen_to_m(),
+        "worst": [_known(place._asdict()) for place in seen.worst()],
+        "requirements": [_judged(verdict) for verdict in verdicts],
+    }
+
+
+def _judged(verdict: Verdict) -> dict[str, Any]:
+    worst = [_known(place._asdict()) for place in verdict.worst]
+    return {**verdict._asdict(), "requirement": verdict.requirement.words, "worst": worst}
+
+
+def _known(record: dict[str, Any]) -> dict[str, Any]:
+    return {key: None if isinstance(value, float) and np.isnan(value) else value for key, value in record.items()}

@@ -1,0 +1,78 @@
+"""Redundancy in words: by how many sensors places are seen, and what is lost when each one fails."""
+
+import math
+from collections.abc import Sequence
+from textwrap import fill
+
+from torchcover.coverage import Number, RegionRedundancy
+from torchcover.coverage.quantity import RADIUS, Quantity, seen_by_two, sensors_seeing
+from torchcover.report.table import CoverageTable, Row
+from torchcover.report.wording import UNKNOWN, difference_heading, difference_words, number_words, percent
+
+MAX_HEADING_CHARS = 16
+NONE = "none"
+
+
+def decisive(table: CoverageTable) -> Quantity:
+    """What sensors are judged by: the detection at the first threshold, or the radius where there is none."""
+    return table.quantities[min(1, len(table.quantities) - 1)]
+
+
+def sensors_of(rows: Sequence[Row]) -> tuple[str, ...]:
+    """The sensors that the rows of a rig have numbers without; none if that was not asked for."""
+    known = (row.summary.redundancy for row in rows)
+    return next((tuple(redundancy.without) for redundancy in known if redundancy), ())
+
+
+def failure_title(table: CoverageTable, rig: str) -> str:
+    """What stands above the part of the table that is about one rig."""
+    beginning = f"{rig}: change" if len(table.rigs) > 1 else "Change"
+    return f"{beginning} of {difference_heading(decisive(table))} when one sensor fails"
+
+
+def failure_headings(table: CoverageTable, rig: str) -> list[str]:
+    """Of its columns, but for the place."""
+    several = [fill(heading, MAX_HEADING_CHARS) for heading in ("sensors that see it", "by two or more (%)")]
+    return [*(several if table.thresholds else ()), *sensors_of(table.rows[rig]), "most lost with"]
+
+
+def failure_words(table: CoverageTable, row: Row) -> list[tuple[str, bool]]:
+    """The cells of one row but for the place, each with whether it is marked as more than chance."""
+    redundancy, key = row.summary.redundancy, decisive(table).key
+    sensors = sensors_of(table.rows[row.rig])
+    if redundancy is None:
+        return [(UNKNOWN, False)] * len(failure_headings(table, row.rig))
+    words = []
+    for threshold in table.thresholds[:1]:
+        words.append((number_words(redundancy.seen_by[sensors_seeing(threshold).key], "sensors"), False))
+        words.append((percent(redundancy.seen_by[seen_by_two(threshold).key].value), False))
+    for sensor in sensors:
+        change = redundancy.change[sensor][key]
+        words.append((difference_words(change, decisive(table).unit), bool(change.significant)))
+    known = not math.isnan(row.summary.numbers[key].value)
+    return [*words, (redundancy.indispensable or (NONE if known else UNKNOWN), False)]
+
+
+def single_point_of_failure(table: CoverageTable, rig: str) -> str:
+    """The sensor of a rig with which most is lost, and where; no words if redundancy was not asked for."""
+    quantity, rows = decisive(table), table.rows[rig]
+    if not sensors_of(rows):
+        return ""
+    worst = max(rows, key=lambda row: _loss(row.summary.redundancy, quantity))
+    redundancy = worst.summary.redundancy
+    if redundancy is None or redundancy.indispensable is None:
+        return "No single point of failure: whichever sensor fails, nothing that is known changes."
+    sensor = redundancy.indispensable
+    before, after = worst.summary.numbers[quantity.key].value, redundancy.without[sensor][quantity.key].value
+    whole, rest = (number_words(Number(value, math.nan), quantity.unit) for value in (before, after))
+    unit = "m" if quantity.unit == "m" else "%"
+    where = f"{worst.summary.region} {worst.summary.height}"
+    change = f"{quantity.title} is {rest} {unit} in {where}, not {whole} {unit}"
+    return f"Single point of failure: {sensor}; without it {change}."
+
+
+def _loss(redundancy: RegionRedundancy | None, quantity: Quantity) -> float:
+    if redundancy is None or redundancy.indispensable is None:
+        return 0.0
+    change = redundancy.change[redundancy.indispensable][quantity.key].value
+    return change if quantity.key == RADIUS.key else -change

@@ -1,0 +1,16 @@
+from .files import write_arrays as write_arrays
+from .files import write_csv as write_csv
+from .placing import Heading as Heading
+from .raster import Raster as Raster
+from .requirements import Requirement as Requirement
+from .requirements import Requirements as Requirements
+from .requirements import Verdict as Verdict
+from .requirements import check as check
+from .result import SIDES as SIDES
+from .result import STATES as STATES
+from .result import Place as Place
+from .result import SideShare as SideShare
+from .result import TargetMap as TargetMap
+from .survey import survey as survey
+from .target import TARGETS as TARGETS
+from .target import Target as Target

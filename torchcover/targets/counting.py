@@ -1,0 +1,179 @@
+"""The points that a rig gets from a target: it is cast alone, and then the scene's depth says which rays arrive."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchcover.simulation.culling import outlines
+from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.moving import Moving
+from torchcover.simulation.rays import rotate
+from torchcover.targets.steps import SensorStep, Step
+from torchcover.targets.surface import Surface
+from torchcover.targets.target import Target
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+# Positions that are cast at together. A constant, so that nothing depends on threads.
+CHUNK = 256
+
+
+class Sums(NamedTuple):
+    """Sums over the steps in which there was room, for P positions.
+
+    `points` (sensors, P), `sensors` (P,) how many had enough points, `seen` (P,) steps with enough points, `steps` (P,)
+    with room, `visible` and `near` (P,) pairs of a place and a point of the surface that it sees, and those of them
+    that are within the threshold of a measured point.
+    """
+
+    points: Numbers
+    sensors: Numbers
+    seen: Numbers
+    steps: Numbers
+    visible: Numbers
+    near: Numbers
+
+
+class _Met(NamedTuple):
+    """Where the rays of one sensor meet the target, were it alone, in the order of positions and rays.
+
+    `position`, `ray` and `range_m` (N,), `direction` (N, 3).
+    """
+
+    position: Numbers
+    ray: Numbers
+    range_m: Float32
+    direction: Float32
+
+
+def count(
+    target: Target,
+    surface: Surface,
+    vehicle_T_target: Float64,
+    mounted: Sequence[MountedSensor],
+    steps: Sequence[Step],
+    *,
+    hits: int,
+    threshold_m: float,
+) -> Sums:
+    """Count what a rig gets from a target at P places.
+
+    Args:
+        target: The body.
+        surface: Its surface.
+        vehicle_T_target: (P, 4, 4) where it stands.
+        mounted: The sensors.
+        steps: What `Steps` gives.
+        hits: How many points are enough.
+        threshold_m: How near a measured point must be to a point of the surface.
+
+    Returns:
+        `Sums`, which do not depend on the number of threads.
+    """
+    farthest_m = [np.max([step.sensors[k].ends_m for step in steps], axis=0) for k in range(len(mounted))]
+
+    def count_some(first: int) -> Sums:
+        some = slice(first, first + CHUNK)
+        poses = vehicle_T_target[some]
+        met = [_meetings(target, poses, *sensor) for sensor in zip(mounted, farthest_m, strict=True)]
+        cut = [Step(step.sensors, step.free[some], step.visible[:, some]) for step in steps]
+        return _sums(surface, poses, mounted, met, cut, hits, threshold_m)
+
+    firsts, threads = range(0, max(len(vehicle_T_target), 1), CHUNK), torch.get_num_threads()
+    if threads <= 1 or len(firsts) <= 1:
+        parts = list(map(count_some, firsts))
+    else:
+        with ThreadPoolExecutor(threads) as pool:
+            parts = list(pool.map(count_some, firsts))
+    return Sums._make(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
+
+
+def _meetings(target: Target, vehicle_T_target: Float64, mounted: MountedSensor, farthest_m: Float32) -> _Met:
+    solids, body = [target.solid] * len(vehicle_T_target), np.arange(len(vehicle_T_target))
+    placed = Moving.placed(solids, vehicle_T_target, body)
+    origin_m, vehicle_R_sensor = mounted.vehicle_T_sensor[:3, 3], mounted.vehicle_T_sensor[:3, :3]
+    bodies, first, parts = outlines(placed.corners_m, origin_m), 0, []
+    for tile in mounted.tiles:
+        rays = tile.directions.shape[1]
+        directions = rotate(vehicle_R_sensor, tile.directions)
+        limit_m = farthest_m[first : first + rays]
+        met, _ = placed.meetings(origin_m, vehicle_R_sensor, tile, directions, limit_m, bodies)
+        parts.append(_Met(met.part, first + met.ray, met.range_m, directions.take(met.ray, axis=1).T))
+        first += rays
+    together = _Met._make(np.concatenate(column) for column in zip(*parts, strict=True))
+    # A ray that fills up the block of a tile is cast more than once.
+    _, once = np.unique(together.position * first + together.ray, return_index=True)
+    once = once[together.range_m[once] >= mounted.sensor.min_range_m]
+    return _Met._make(column[once] for column in together)
+
+
+def _sums(
+    surface: Surface,
+    vehicle_T_target: Float64,
+    mounted: Sequence[MountedSensor],
+    met: Sequence[_Met],
+    steps: Sequence[Step],
+    hits: int,
+    threshold_m: float,
+) -> Sums:
+    count = len(vehicle_T_target)
+    sums = Sums(np.zeros((len(mounted), count), dtype=np.int64), *(np.zeros(count, dtype=np.int64) for _ in range(5)))
+    # Without noise a ray meets the target at the same place in every step.
+    exact = [
+        surface.near(_in_target(sensor, one, vehicle_T_target, None), threshold_m)
+        for sensor, one in zip(mounted, met, strict=True)
+    ]
+    for step in steps:
+        points = np.zeros_like(sums.points)
+        near = np.zeros((count, exact[0].shape[1]), dtype=np.uint8)
+        for k, (sensor, one, seen) in enumerate(zip(mounted, met, step.sensors, strict=True)):
+            arrived = np.flatnonzero(_arrive(one, seen))
+            points[k] = np.bincount(one.position[arrived], minlength=count)
+            if seen.noise_m is None:
+                bits = exact[k][arrived]
+            else:
+                noisy = _Met._make(column[arrived] for column in one)
+                bits = surface.near(_in_target(sensor, noisy, vehicle_T_target, seen.noise_m), threshold_m)
+            near |= _any_of_each(one.position[arrived], bits, count)
+        _add(sums, step, points, near, hits)
+    return sums
+
+
+def _arrive(met: _Met, seen: SensorStep) -> NDArray[np.bool_]:
+    """(N,) whether nothing is in the way of a ray, and it gives a point."""
+    arrived: NDArray[np.bool_] = met.range_m <= seen.ends_m[met.ray]
+    return arrived if seen.kept is None else arrived & seen.kept[met.ray]
+
+
+def _in_target(mounted: MountedSensor, met: _Met, vehicle_T_target: Float64, noise_m: Float64 | None) -> Float64:
+    """(N, 3) the measured points in the frame of the target."""
+    range_m = met.range_m.astype(np.float64) + (0.0 if noise_m is None else noise_m[met.ray])
+    from_origin_m = mounted.vehicle_T_sensor[:3, 3] + met.direction * range_m[:, None]
+    from_origin_m -= vehicle_T_target[met.position, :3, 3]
+    hits_m: Float64 = np.einsum("nji,nj->ni", vehicle_T_target[met.position, :3, :3], from_origin_m)
+    return hits_m
+
+
+def _any_of_each(position: Numbers, bits: NDArray[np.uint8], count: int) -> NDArray[np.uint8]:
+    """(count, bytes) all bits of each position's rows together; positions ascend."""
+    together = np.zeros((count, bits.shape[1]), dtype=np.uint8)
+    first = np.flatnonzero(np.diff(position, prepend=-1))
+    if len(first):
+        together[position[first]] = np.bitwise_or.reduceat(bits, first, axis=0)
+    return together
+
+
+def _add(sums: Sums, step: Step, points: Numbers, near: NDArray[np.uint8], hits: int) -> None:
+    free = step.free
+    sums.points[:] += points * free
+    sums.sensors[:] += (points >= hits).sum(axis=0) * free
+    sums.seen[:] += (points.sum(axis=0) >= hits) & free
+    sums.steps[:] += free
+    sums.visible[:] += np.unpackbits(step.visible, axis=2).sum(axis=(0, 2), dtype=np.int64) * free
+    sums.near[:] += np.unpackbits(step.visible & near, axis=2).sum(axis=(0, 2), dtype=np.int64) * free

@@ -1,0 +1,132 @@
+"""How a target stands at each place, and whether there is room for it."""
+
+import math
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import BoundingBox
+from torchcover.simulation.instant import Instant
+from torchcover.targets.raster import from_outline_m
+
+Bools = NDArray[np.bool_]
+Float64 = NDArray[np.float64]
+
+# "narrow" turns the narrower side of the target's box to the vehicle, "wide" the wider one; degrees are its yaw.
+Heading = Literal["narrow", "wide"] | float
+
+# A kerb, and ground that rises: what is lower than this under a target takes no room from it.
+STEP_UP_M = 0.2
+# A wall may touch the outermost of a target: by this share of the way from its middle.
+TOUCHING_SHARE = 0.05
+
+
+def yaws(heading: Heading, target: BoundingBox, vehicle: BoundingBox, positions_m: Float64) -> Float64:
+    """(P,) yaw of a target in radians at (P, 2) places.
+
+    Args:
+        heading: "narrow", "wide", or degrees about z, 0 as the vehicle.
+        target: The target's box.
+        vehicle: The vehicle's box, to whose nearest point the side is turned.
+        positions_m: Where the target stands.
+
+    Raises:
+        ValueError: Another word, or degrees that are no number.
+
+    Example:
+        >>> wall = BoundingBox((-0.1, -1.0, 0.0), (0.1, 1.0, 1.0))
+        >>> car = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
+        >>> np.rad2deg(yaws("wide", wall, car, np.array([[5.0, 0.0], [0.0, 5.0]]))).tolist()
+        [180.0, -90.0]
+    """
+    if heading in ("narrow", "wide"):
+        towards_m = 0.0 - from_outline_m(vehicle, positions_m)  # no -0.0, which is another angle
+        length_m, width_m, _ = target.size_m
+        # Whoever looks along the longer side sees the narrow one.
+        along_x = (length_m >= width_m) == (heading == "narrow")
+        yaw: Float64 = np.arctan2(towards_m[:, 1], towards_m[:, 0]) - (0.0 if along_x else math.pi / 2)
+        return yaw
+    if isinstance(heading, str) or not math.isfinite(heading):
+        raise ValueError(f"heading: narrow, wide or degrees are needed; got {heading!r}")
+    return np.full(len(positions_m), math.radians(heading))
+
+
+def poses(positions_m: Float64, yaw_rad: Float64) -> Float64:
+    """(P, 4, 4) `vehicle_T_target` of targets on the plane z = 0 of the vehicle frame."""
+    matrices = np.tile(np.eye(4), (len(positions_m), 1, 1))
+    cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
+    matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1] = cos, -sin, sin, cos
+    matrices[:, :2, 3] = positions_m
+    return matrices
+
+
+def overlapping(box: BoundingBox, vehicle_T_target: Float64, corners_m: Float64) -> Bools:
+    """(P,) whether a target's box shares space with another box that stands upright; touching is not sharing.
+
+    Args:
+        box: The target's, in its frame.
+        vehicle_T_target: (P, 4, 4) where it stands.
+        corners_m: (8, 3) of the other box in the vehicle frame, in the order of `BoundingBox.corners_m`.
+    """
+    target_m = box.corners_m @ vehicle_T_target[:, :3, :3].swapaxes(1, 2) + vehicle_T_target[:, None, :3, 3]
+    sides = np.stack([corners_m[4] - corners_m[0], corners_m[2] - corners_m[0], [0.0, 0.0, 1.0]])
+    axes = np.concatenate(
+        [np.broadcast_to(sides, (len(target_m), 3, 3)), vehicle_T_target[:, :3, :2].swapaxes(1, 2)], 1
+    )
+    ours_m = np.einsum("pak,pck->pac", axes, target_m)
+    theirs_m = np.einsum("pak,ck->pac", axes, corners_m)
+    apart = (ours_m.min(axis=2) >= theirs_m.max(axis=2)) | (theirs_m.min(axis=2) >= ours_m.max(axis=2))
+    overlaps: Bools = ~apart.any(axis=1)
+    return overlaps
+
+
+def holding(box: BoundingBox, vehicle_T_target: Float64, place_m: Float64) -> Bools:
+    """(P,) whether a target's box holds a (3,) place of the vehicle frame."""
+    there_m = np.einsum("pji,pj->pi", vehicle_T_target[:, :3, :3], place_m - vehicle_T_target[:, :3, 3])
+    held: Bools = ((there_m > box.lower_m) & (there_m < box.upper_m)).all(axis=1)
+    return held
+
+
+def blocked(instant: Instant, box: BoundingBox, samples_m: Float64, vehicle_T_target: Float64) -> Bools:
+    """(P,) whether anything but the ego takes a target's room.
+
+    What moves does so with its box. Of what rests, its faces are asked: whether one lies between the middle of the
+    target and a point of its surface, or the middle is behind one. Kerbs of up to 0.2 m do not count.
+
+    Args:
+        instant: The scene.
+        box: The target's box in its frame.
+        samples_m: (M, 3) points of its surface in its frame.
+        vehicle_T_target: (P, 4, 4) where it stands.
+    """
+    taken = np.zeros(len(vehicle_T_target), dtype=bool)
+    reach_m = float(np.linalg.norm(box.corners_m, axis=1).max())
+    for k in np.flatnonzero(instant.moving.body != instant.ego).tolist():
+        away_m = np.linalg.norm(vehicle_T_target[:, :3, 3] - instant.moving.centre_m[k], axis=1)
+        near = np.flatnonzero(away_m <= instant.moving.radius_m[k] + reach_m)
+        taken[near] |= overlapping(box, vehicle_T_target[near], instant.moving.corners_m[k])
+    return taken | _meets_static(instant, box, samples_m, vehicle_T_target)
+
+
+def _meets_static(instant: Instant, box: BoundingBox, samples_m: Float64, vehicle_T_target: Float64) -> Bools:
+    height_m = box.upper_m[2]
+    middle_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
+    low_m = min(STEP_UP_M, height_m / 2)
+    ends_m = np.column_stack([samples_m[:, :2], np.maximum(samples_m[:, 2], low_m)])
+    ways_m = (ends_m - middle_m) * (1 - TOUCHING_SHARE)
+    ways_m = ways_m[np.linalg.norm(ways_m, axis=1) > 0]
+    static_T_target = instant.static_T_vehicle @ vehicle_T_target
+    starts_m = static_T_target[:, :3, :3] @ middle_m + static_T_target[:, :3, 3]
+    towards_m = np.einsum("pij,mj->pmi", static_T_target[:, :3, :3], ways_m).reshape(-1, 3)
+    length_m = np.tile(np.linalg.norm(ways_m, axis=1), len(starts_m))
+    directions = (towards_m / length_m[:, None]).T.astype(np.float32)
+    origins_m = starts_m.astype(np.float32).repeat(len(ways_m), axis=0)
+    hits = instant.static.cast_from_each(origins_m, directions, length_m.astype(np.float32))
+    met: Bools = (hits.body >= 0) & (hits.body != instant.ego)
+    up = np.zeros((3, len(starts_m)), dtype=np.float32)
+    up[:] = (instant.static_T_vehicle[:3, 2])[:, None]
+    behind = instant.static.met_from_behind(starts_m, up)
+    inside = (behind >= 0) & (behind != instant.ego)
+    blocked: Bools = met.reshape(len(starts_m), -1).any(axis=1) | inside
+    return blocked

@@ -1,0 +1,224 @@
+"""What a rig sees of a target, for every place around the vehicle."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import BoundingBox
+from torchcover.targets.placing import Heading
+from torchcover.targets.raster import Raster, from_outline_m
+
+Float64 = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+# What a cell is: there is room for the target in a step at least; the vehicle is there; there is none in any step.
+STATES = ("free", "occupied", "outside")
+FREE, OCCUPIED, OUTSIDE = range(3)
+SIDES = ("front", "rear", "left", "right")
+DIRECTIONS = 360
+WITHIN_M = (1.0, 2.0, 3.0)
+
+
+class Place(NamedTuple):
+    """A target at one cell: where it stands, how far from the vehicle's outline, on which side, what is seen of it."""
+
+    x_m: float
+    y_m: float
+    distance_m: float
+    side: str
+    points: float
+    sensors: float
+    share: float
+
+
+class SideShare(NamedTuple):
+    """Of the cells of one side within a distance: how many are free, and the share of them where the target is seen."""
+
+    side: str
+    within_m: float
+    cells: int
+    seen: float
+
+
+@dataclass(frozen=True, eq=False)
+class TargetMap:
+    """What a rig sees of a target, for every cell of a raster. Rows are y, columns are x; NaN where it cannot stand.
+
+    Args:
+        rig: Name of the rig.
+        scenario: Name of the world.
+        target: Name of the target.
+        target_size_m: Extent of its box.
+        heading: How it stands; see `Heading`.
+        raster: The cells.
+        vehicle: Box of the vehicle.
+        vehicle_outline_m: (K, 2) what is drawn of it.
+        sensor_names: Of the rig.
+        sensors_m: (S, 2) where they are, seen from above.
+        hits: How many points are enough.
+        threshold_m: How near a point of its surface must be to a measured one.
+        seed: Of the simulation.
+        step_count: How many steps were simulated.
+        state: (Y, X) uint8, a number of `STATES`.
+        steps: (Y, X) in how many of them the target had room.
+        sensor_points: (S, Y, X) mean number of points of each sensor on it.
+        sensors: (Y, X) mean number of sensors with enough points each.
+        seen: (Y, X) share of the steps with enough points of all sensors together.
+        share: (Y, X) share of its visible surface within the threshold; NaN too where none is visible.
+        visible_m2: (Y, X) its visible surface.
+    """
+
+    rig: str
+    scenario: str
+    target: str
+    target_size_m: tuple[float, float, float]
+    heading: Heading
+    raster: Raster
+    vehicle: BoundingBox
+    vehicle_outline_m: Float64
+    sensor_names: tuple[str, ...]
+    sensors_m: Float64
+    hits: int
+    threshold_m: float
+    seed: int
+    step_count: int
+    state: NDArray[np.uint8]
+    steps: Numbers
+    sensor_points: Float64
+    sensors: Float64
+    seen: Float64
+    share: Float64
+    visible_m2: Float64
+
+    @property
+    def x_m(self) -> Float64:
+        """(X,) middles of the columns."""
+        return self.raster.x_m
+
+    @property
+    def y_m(self) -> Float64:
+        """(Y,) middles of the rows."""
+        return self.raster.y_m
+
+    @property
+    def points(self) -> Float64:
+        """(Y, X) mean number of points on it, of all sensors."""
+        points: Float64 = self.sensor_points.sum(axis=0)
+        return points
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """(Y, X) whether it can stand there."""
+        free: NDArray[np.bool_] = self.state == FREE
+        return free
+
+    @property
+    def enough(self) -> NDArray[np.bool_]:
+        """(Y, X) whether it is seen: the mean number of points is `hits` at least."""
+        enough: NDArray[np.bool_] = np.nan_to_num(self.points) >= self.hits
+        return enough & self.free
+
+    @property
+    def distance_m(self) -> Float64:
+        """(Y, X) from the middle of each cell to the vehicle's box, seen from above; 0 within it."""
+        away_m: Float64 = np.linalg.norm(from_outline_m(self.vehicle, self.raster.positions_m), axis=1)
+        return away_m.reshape(self.raster.shape)
+
+    @property
+    def side(self) -> NDArray[np.int64]:
+        """(Y, X) number in `SIDES` of the side that each cell is on, from corners at 45 degrees; -1 within the box."""
+        x, y = from_outline_m(self.vehicle, self.raster.positions_m).T
+        ahead = np.abs(x) >= np.abs(y)
+        side = np.where(ahead, np.where(x > 0, 0, 1), np.where(y > 0, 2, 3))
+        side[(x == 0) & (y == 0)] = -1
+        return side.reshape(self.raster.shape)
+
+    def sides(self, within_m: tuple[float, ...] = WITHIN_M) -> list[SideShare]:
+        """Where it is seen, side by side: for each side, within each distance; NaN where no cell is free."""
+        side, distance_m, rows = self.side, self.distance_m, []
+        for number, name in enumerate(SIDES):
+            for limit_m in within_m:
+                there = self.free & (side == number) & (distance_m <= limit_m)
+                cells = int(there.sum())
+                rows.append(SideShare(name, limit_m, cells, float(self.enough[there].mean()) if cells else math.nan))
+        return rows
+
+    def unseen_to_m(self) -> dict[str, float]:
+        """For each side, how far the farthest free cell is that has not enough points; 0 if all have."""
+        unseen, side = self.free & ~self.enough, self.side
+        of_sides = [unseen & (side == number) for number in range(len(SIDES))]
+        farthest_m = [float(self.distance_m[there].max(initial=0.0)) for there in of_sides]
+        return dict(zip(SIDES, farthest_m, strict=True))
+
+    def worst(self, count: int = 10, apart_m: float = 1.0) -> list[Place]:
+        """The places with the fewest points, and of those the nearest first; no two within a distance of each other."""
+        row, column = np.nonzero(self.free)
+        order = np.lexsort((self.distance_m[row, column], self.points[row, column]))
+        row, column = row[order], column[order]
+        worst: list[Place] = []
+        while len(row) and len(worst) < count:
+            worst.append(self.place(int(row[0]), int(column[0])))
+            away_m = np.hypot(self.x_m[column] - worst[-1].x_m, self.y_m[row] - worst[-1].y_m)
+            row, column = row[away_m >= apart_m], column[away_m >= apart_m]
+        return worst
+
+    def place(self, row: int, column: int) -> Place:
+        """What is seen at one cell."""
+        side = int(self.side[row, column])
+        return Place(
+            x_m=float(self.x_m[column]),
+            y_m=float(self.y_m[row]),
+            distance_m=float(self.distance_m[row, column]),
+            side="" if side < 0 else SIDES[side],
+            points=float(self.points[row, column]),
+            sensors=float(self.sensors[row, column]),
+            share=float(self.share[row, column]),
+        )
+
+    def first_seen_m(self) -> Float64:
+        """(360, 2) where it is first seen on the way out from the vehicle's middle, degree by degree from x towards y.
+
+        The way begins at the vehicle's box and ends at the first cell with enough points; NaN if no cell of it has.
+        """
+        middle_m = (np.array(self.vehicle.lower_m[:2]) + np.array(self.vehicle.upper_m[:2])) / 2
+        angles = np.deg2rad(np.arange(DIRECTIONS) * 360.0 / DIRECTIONS)
+        ways = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+        corner = np.array([[self.raster.x[0], self.raster.y[0]], [self.raster.x[1], self.raster.y[1]]])
+        reach_m = float(np.linalg.norm(np.abs(corner - middle_m).max(axis=0)))
+        lengths_m = np.arange(0.0, reach_m, self.raster.step_m / 4)
+        places_m = middle_m + lengths_m[None, :, None] * ways[:, None]
+        cell = np.floor((places_m - corner[0]) / self.raster.step_m).astype(np.int64)
+        rows, columns = self.raster.shape
+        inside = ((cell >= 0) & (cell < [columns, rows])).all(axis=2)
+        column, row = np.clip(cell, 0, [columns - 1, rows - 1]).transpose(2, 0, 1)
+        beyond = (from_outline_m(self.vehicle, places_m.reshape(-1, 2)) != 0).any(axis=1).reshape(inside.shape)
+        seen = inside & beyond & self.enough[row, column]
+        first = seen.argmax(axis=1)
+        found: Float64 = places_m[np.arange(DIRECTIONS), first]
+        found[~seen.any(axis=1)] = math.nan
+        return found
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """How many cells there are of each state, and how many are free and have an unknown share."""
+        states = {name: int((self.state == number).sum()) for number, name in enumerate(STATES)}
+        return {**states, "share_unknown": int((self.free & np.isnan(self.share)).sum())}
+
+    def settings(self) -> dict[str, Any]:
+        """What it is of, for JSON."""
+        return {
+            "rig": self.rig,
+            "scenario": self.scenario,
+            "target": self.target,
+            "target_size_m": list(self.target_size_m),
+            "heading": self.heading,
+            "raster": {"x": list(self.raster.x), "y": list(self.raster.y), "step_m": self.raster.step_m},
+            "sensors": list(self.sensor_names),
+            "hits": self.hits,
+            "threshold_m": self.threshold_m,
+            "seed": self.seed,
+            "steps": self.step_count,
+        }

@@ -1,0 +1,159 @@
+"""What one step has for every place: where rays end without a target, where there is room, what is visible."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchcover.geometry import BoundingBox, rigid
+from torchcover.simulation.disturbance import disturb
+from torchcover.simulation.instant import Instant, Scan
+from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.rig import Rig
+from torchcover.simulation.scenario import Scenario
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.shell import position_in_shell
+from torchcover.simulation.stage import Stages
+from torchcover.simulation.surroundings import Surroundings
+from torchcover.targets.placing import blocked
+from torchcover.targets.surface import Surface
+from torchcover.targets.target import Target
+
+Bools = NDArray[np.bool_]
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+
+# From so many random places in all the visible surface is looked at, and from one at each step at least.
+PLACES = 8
+# The shell of the reference sensors.
+SHELL_M = 0.5
+POSITIONS_AT_ONCE = 4096
+RIG = "rig"
+
+
+class SensorStep(NamedTuple):
+    """One sensor at one step, ray by ray in the order of its tiles.
+
+    `ends_m` (n,) is where each ends without a target; `kept` (n,) whether it may give a point, None for all; `noise_m`
+    (n,) what is added to a measured range, None for nothing.
+    """
+
+    ends_m: Float32
+    kept: Bools | None
+    noise_m: Float64 | None
+
+
+class Step(NamedTuple):
+    """One step: `sensors` of the rig; `free` (P,) where there is room; `visible` (places, P, bytes) as `seen_from`."""
+
+    sensors: Sequence[SensorStep]
+    free: Bools
+    visible: NDArray[np.uint8]
+
+
+class Steps:
+    """The steps of a run.
+
+    Args:
+        rig: The sensors.
+        scenario: The world.
+        target: What is placed.
+        surface: Its surface.
+        vehicle_T_target: (P, 4, 4) where.
+        steps: How many steps.
+        every_steps: Time steps of the scenario between one and the next.
+        seed: Of traffic, random places, noise and drop-out.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        scenario: Scenario,
+        target: Target,
+        surface: Surface,
+        vehicle_T_target: Float64,
+        *,
+        steps: int,
+        every_steps: int,
+        seed: int,
+    ) -> None:
+        self._scenario, self._target, self._surface, self._poses = scenario, target, surface, vehicle_T_target
+        self._steps, self._every_steps, self._seed = steps, every_steps, seed
+        self.places = max(1, -(-PLACES // steps))
+        self._stages = Stages(scenario, {RIG: rig}, seed)
+        sensor_reach_m = [float(np.linalg.norm(s.mount.matrix()[:3, 3])) + s.max_range_m for s in rig.sensors]
+        raster_reach_m = float(np.linalg.norm(vehicle_T_target[:, :3, 3], axis=1).max(initial=0.0))
+        self._within_m = max([raster_reach_m + target.solid.reach_m, *sensor_reach_m])
+
+    @property
+    def mounted(self) -> Sequence[MountedSensor]:
+        """The sensors; their rays are the same at every step."""
+        return self._stages.of_run(self._scenario.locate(0)[0]).mounted[RIG]
+
+    def __iter__(self) -> Iterator[Step]:
+        """One after the other.
+
+        Raises:
+            FileNotFoundError: A mesh, vehicle or trajectory file is missing.
+            ValueError: A sensor or an actor that is where none can be.
+        """
+        resting: tuple[list[Float32], Bools] | None = None
+        for index in range(self._steps):
+            run, step = self._scenario.locate(index * self._every_steps)
+            stage = self._stages.of_run(run)
+            instant = stage.scene.at(step, within_m=self._within_m)
+            stage.check_mounts(instant)
+            # Where nothing moves, the first answer holds.
+            ends_m, free = resting or ([m.ends_m(instant) for m in stage.mounted[RIG]], self._free(instant))
+            if not stage.scene.moves and self._scenario.traffic is None:
+                resting = ends_m, free
+            sensors = [
+                self._disturbed(m, ends, index, k)
+                for k, (m, ends) in enumerate(zip(stage.mounted[RIG], ends_m, strict=True), 1)
+            ]
+            yield Step(sensors, free, self._visible(stage.scene, instant, index))
+
+    def _free(self, instant: Instant) -> Bools:
+        box, samples_m = self._target.solid.box, self._surface.points_m
+        taken = [blocked(instant, box, samples_m, poses) for poses in _chunks(self._poses)]
+        return ~np.concatenate([np.empty(0, dtype=bool), *taken])
+
+    def _visible(self, scene: Scene, instant: Instant, index: int) -> NDArray[np.uint8]:
+        generator = np.random.default_rng([self._seed, index])
+        surroundings = Surroundings(
+            scene, instant, generator, f"{self._scenario.name} step {index}", torch.get_num_threads()
+        )
+        seen = []
+        for _ in range(self.places):
+            pose, _ = surroundings.free_pose(_pose_in_shell)
+            seen.append(
+                [
+                    self._surface.seen_from(pose[:3, 3], self._target, poses, instant, threads=surroundings.threads)
+                    for poses in _chunks(self._poses)
+                ]
+            )
+        return np.stack([np.concatenate(of_place) for of_place in seen])
+
+    def _disturbed(self, mounted: MountedSensor, ends_m: Float32, index: int, number: int) -> SensorStep:
+        """Let the simulator's own noise and drop-out fall on a point a metre along every ray."""
+        sensor, rays = mounted.sensor, len(ends_m)
+        if not (sensor.range_noise_m or sensor.dropout):
+            return SensorStep(ends_m, None, None)
+        generator = np.random.default_rng([self._seed, index, number])
+        ahead = np.tile(np.array([[1.0, 0.0, 0.0]], dtype=np.float32), (rays, 1))
+        scan = disturb(
+            Scan(ahead, np.arange(rays), rays, 0), np.zeros(3), sensor.range_noise_m, sensor.dropout, generator
+        )
+        kept, noise_m = np.zeros(rays, dtype=bool), np.zeros(rays)
+        kept[scan.ray], noise_m[scan.ray] = True, scan.points[:, 0].astype(np.float64) - 1.0
+        return SensorStep(ends_m, kept, noise_m if sensor.range_noise_m else None)
+
+
+def _pose_in_shell(ego: BoundingBox, generator: np.random.Generator) -> Float64:
+    return rigid(np.eye(3), position_in_shell(ego, SHELL_M, generator))
+
+
+def _chunks(poses: Float64) -> list[Float64]:
+    return [poses[first : first + POSITIONS_AT_ONCE] for first in range(0, len(poses), POSITIONS_AT_ONCE)]

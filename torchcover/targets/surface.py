@@ -1,0 +1,112 @@
+"""The surface of a target: points spread over it, which of them a place sees, and which are near a measured point."""
+
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
+from torchcover.simulation.outward import outward_faces
+from torchcover.simulation.sight import SHORTER, sight
+from torchcover.simulation.surface_points import PLANE_STEPS
+from torchcover.simulation.surface_reference import ABOVE_M
+from torchcover.targets.target import Target
+
+Bools = NDArray[np.bool_]
+Bits = NDArray[np.uint8]
+Float64 = NDArray[np.float64]
+
+# A byte of bits has 8 of them.
+SAMPLES = 64
+# Drawn for each that is kept: what lies inside another part of the body is nobody's surface.
+DRAWN_FOR_EACH = 16
+# Rows of distances that are held at once.
+HITS_AT_ONCE = 65_536
+
+
+class Surface(NamedTuple):
+    """Points that stand for equal shares of a target's outer surface.
+
+    `points_m` (M, 3) in the target's frame; `normals` (M, 3) of length one; `two_sided` (M,) whether both sides may be
+    looked at, as of what is not closed; `m2_each` the square metres that each stands for.
+    """
+
+    points_m: Float64
+    normals: Float64
+    two_sided: Bools
+    m2_each: float
+
+    @classmethod
+    def of(cls, target: Target) -> Self:
+        """Spread the points: equal steps of area over all faces, less what lies within another part of the body."""
+        corners_m = target.mesh.vertices_m[target.mesh.faces]
+        across = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+        twice_m2 = np.linalg.norm(across, axis=1)
+        drawn = SAMPLES * DRAWN_FOR_EACH
+        up_to = np.cumsum(twice_m2)
+        face = np.searchsorted(up_to, (np.arange(drawn) + 0.5) / drawn * up_to[-1], side="right")
+        a, b = (np.arange(drawn) * np.array(PLANE_STEPS)[:, None] + 0.5) % 1
+        a, b = np.where(a + b > 1, 1 - a, a)[:, None], np.where(a + b > 1, 1 - b, b)[:, None]
+        points_m = (1 - a - b) * corners_m[face, 0] + a * corners_m[face, 1] + b * corners_m[face, 2]
+        normals, two_sided = across[face] / twice_m2[face][:, None], ~outward_faces(target.mesh)[face]
+        outer = np.flatnonzero(two_sided | ~_enclosed(target, points_m + ABOVE_M * normals))
+        kept = outer[(np.arange(SAMPLES) + 0.5).astype(np.int64) * len(outer) // SAMPLES]
+        m2_each = float(up_to[-1]) / 2 * len(outer) / drawn / SAMPLES
+        return cls(points_m[kept], normals[kept], two_sided[kept], m2_each)
+
+    def seen_from(
+        self, place_m: Float64, target: Target, vehicle_T_target: Float64, instant: Instant, *, threads: int = 1
+    ) -> Bits:
+        """Which of the points a place sees, the target itself and everything else in the way.
+
+        Args:
+            place_m: (3,) in the vehicle frame.
+            target: Whose surface it is.
+            vehicle_T_target: (P, 4, 4) where it stands.
+            instant: The scene without it.
+            threads: Number of threads; the result does not depend on it.
+
+        Returns:
+            (P, M / 8) bits.
+        """
+        target_R_vehicle = vehicle_T_target[:, :3, :3].swapaxes(1, 2)
+        there_m = (target_R_vehicle @ (place_m - vehicle_T_target[:, :3, 3])[..., None])[..., 0]
+        above = np.einsum("pmi,mi->pm", there_m[:, None] - self.points_m, self.normals)
+        position, sample = np.nonzero((above > 0) | self.two_sided)
+        side = np.where(self.two_sided[sample], np.sign(above[position, sample]), 1.0)
+        ends_m = self.points_m[sample] + ABOVE_M * side[:, None] * self.normals[sample]
+        ways_m = ends_m - there_m[position]
+        length_m = np.linalg.norm(ways_m, axis=1)
+        hits = target.solid.caster.cast_from_each(
+            there_m[position].astype(np.float32),
+            (ways_m / length_m[:, None]).T.astype(np.float32),
+            (length_m * (1 - SHORTER)).astype(np.float32),
+        )
+        open_ways = np.flatnonzero(hits.body < 0)
+        position, sample = position[open_ways], sample[open_ways]
+        in_vehicle_m = np.einsum("nij,nj->ni", vehicle_T_target[position, :3, :3], ends_m[open_ways])
+        in_vehicle_m += vehicle_T_target[position, :3, 3]
+        seen = np.zeros((len(vehicle_T_target), SAMPLES), dtype=bool)
+        seen[position, sample] = sight(instant, place_m, in_vehicle_m.astype(np.float32), threads=threads).seen
+        return np.packbits(seen, axis=1)
+
+    def near(self, hits_m: Float64, within_m: float) -> Bits:
+        """(N, M / 8) bits: which of the points are within a distance of each of (N, 3) points in the target's frame."""
+        near = np.empty((len(hits_m), SAMPLES // 8), dtype=np.uint8)
+        own = (self.points_m**2).sum(axis=1)
+        for first in range(0, len(hits_m), HITS_AT_ONCE):
+            some = hits_m[first : first + HITS_AT_ONCE]
+            # In float64 nothing is lost where it could matter: both are within metres of the target's origin.
+            squared = (some**2).sum(axis=1)[:, None] + own - 2 * some @ self.points_m.T
+            near[first : first + HITS_AT_ONCE] = np.packbits(squared <= within_m**2, axis=1)
+        return near
+
+
+def _enclosed(target: Target, points_m: Float64) -> Bools:
+    """(N,) whether no ray gets out from a place."""
+    rays = ALL_AROUND_RAYS.shape[1]
+    origins_m = points_m.astype(np.float32).repeat(rays, axis=0)
+    directions = np.tile(ALL_AROUND_RAYS, len(points_m))
+    hits = target.solid.caster.cast_from_each(origins_m, directions, np.full(len(origins_m), np.inf, dtype=np.float32))
+    enclosed: Bools = np.all((hits.body >= 0).reshape(-1, rays), axis=1)
+    return enclosed

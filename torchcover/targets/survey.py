@@ -1,0 +1,168 @@
+"""Put a target at every place around a vehicle, and see what its rig gets of it."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.simulation.ego import with_ego
+from torchcover.simulation.memory import check_fits
+from torchcover.simulation.rig import Rig
+from torchcover.simulation.scenario import Scenario
+from torchcover.targets.counting import Sums, count
+from torchcover.targets.placing import Heading, holding, overlapping, poses, yaws
+from torchcover.targets.raster import Raster
+from torchcover.targets.result import FREE, OCCUPIED, OUTSIDE, TargetMap
+from torchcover.targets.steps import PLACES, Steps
+from torchcover.targets.surface import SAMPLES, Surface
+from torchcover.targets.target import Target
+
+Float64 = NDArray[np.float64]
+
+# Of one step: where each ends, whether it is kept, and noise. Of one cell: poses, sums, and what is made on the way.
+BYTES_PER_RAY = 13
+BYTES_PER_CELL = 500
+
+HITS = 5
+THRESHOLD_M = 0.4
+
+
+def survey(
+    rig: Rig,
+    scenario: Scenario,
+    target: Target,
+    raster: Raster | None = None,
+    *,
+    steps: int = 1,
+    every_s: float | None = None,
+    seed: int = 0,
+    hits: int = HITS,
+    threshold_m: float = THRESHOLD_M,
+    heading: Heading = "narrow",
+) -> TargetMap:
+    """What a rig sees of a target, for every place around the vehicle.
+
+    Rays are those of `Simulator`: a target gives a point for every ray of a sensor that meets it before anything else,
+    the vehicle's own body included, within the sensor's ranges, less those that drop out. All places see the same rays
+    drop out.
+
+    Args:
+        rig: The sensors.
+        scenario: The world, whose ego carries them. The target is in none of it: other targets hide nothing.
+        target: What is placed, on the plane z = 0 of the vehicle frame.
+        raster: Where; within 5 m of the vehicle in steps of 0.2 m if not given.
+        steps: How many steps are averaged.
+        every_s: Time between two of them; the scenario's time step if not given.
+        seed: Of traffic, random places, noise and drop-out.
+        hits: How many points are enough to see it.
+        threshold_m: How near a measured point on the target must be to a point of its surface, for the share.
+        heading: Which side of it the vehicle sees: "narrow" (fewest points), "wide" (most), or its yaw in degrees.
+
+    Raises:
+        FileNotFoundError: A mesh, vehicle or trajectory file is missing.
+        ValueError: A number out of its bounds, a target larger than the raster, or what `Simulator` refuses.
+
+    Example:
+        >>> courtyard, pole = Scenario.load("courtyard"), Target.load("pole")
+        >>> seen = survey(Rig.load("front_roof_128"), courtyard, pole, Raster((4.0, 8.0), (-1.0, 1.0), 1.0))
+        >>> seen.points.shape, bool((seen.points > 0).any())
+        ((2, 4), True)
+    """
+    _check(steps, seed, hits, threshold_m)
+    scenario = with_ego(scenario, {rig.name: rig})
+    vehicle = scenario.ego_box()
+    raster = Raster.around(vehicle) if raster is None else raster
+    _check_size(target, raster)
+    _check_memory(rig, raster, steps)
+    positions_m, box = raster.positions_m, target.solid.box
+    vehicle_T_target = poses(positions_m, yaws(heading, box, vehicle, positions_m))
+    occupied = overlapping(box, vehicle_T_target, vehicle.corners_m)
+    for sensor in rig.sensors:
+        occupied |= holding(box, vehicle_T_target, sensor.mount.matrix()[:3, 3])
+    surface, elsewhere = Surface.of(target), np.flatnonzero(~occupied)
+    every_steps = 1 if every_s is None else scenario.steps_in(every_s)
+    around = vehicle_T_target[elsewhere]
+    run = Steps(rig, scenario, target, surface, around, steps=steps, every_steps=every_steps, seed=seed)
+    sums = count(target, surface, around, run.mounted, list(run), hits=hits, threshold_m=threshold_m)
+    state = np.full(len(positions_m), OCCUPIED, dtype=np.uint8)
+    state[elsewhere] = np.where(sums.steps > 0, FREE, OUTSIDE)
+    return TargetMap(
+        rig=rig.name,
+        scenario=scenario.name,
+        target=target.name,
+        target_size_m=box.size_m,
+        heading=heading,
+        raster=raster,
+        vehicle=vehicle,
+        vehicle_outline_m=_outline_m(scenario),
+        sensor_names=tuple(sensor.name for sensor in rig.sensors),
+        sensors_m=np.array([sensor.mount.matrix()[:2, 3] for sensor in rig.sensors]),
+        hits=hits,
+        threshold_m=threshold_m,
+        seed=seed,
+        step_count=steps,
+        state=state.reshape(raster.shape),
+        **_means(sums, elsewhere, raster, surface.m2_each / run.places),
+    )
+
+
+def _means(sums: Sums, at: NDArray[np.intp], raster: Raster, m2_each: float) -> dict[str, NDArray[Any]]:
+    """The fields of `TargetMap` that are arrays: means over the steps in which there was room."""
+
+    def spread(values: NDArray[Any], empty: float) -> NDArray[Any]:
+        everywhere = np.full((*values.shape[:-1], raster.shape[0] * raster.shape[1]), empty, dtype=values.dtype)
+        everywhere[..., at] = values
+        return everywhere.reshape(*values.shape[:-1], *raster.shape)
+
+    steps = np.where(sums.steps > 0, sums.steps, np.nan)
+    visible = np.where(sums.visible > 0, sums.visible, np.nan)
+    return {
+        "steps": spread(sums.steps, 0),
+        "sensor_points": spread(sums.points / steps, np.nan),
+        "sensors": spread(sums.sensors / steps, np.nan),
+        "seen": spread(sums.seen / steps, np.nan),
+        "share": spread(sums.near / visible, np.nan),
+        "visible_m2": spread(sums.visible / steps * m2_each, np.nan),
+    }
+
+
+def _outline_m(scenario: Scenario) -> Float64:
+    """(K, 2) the smallest convex outline of the vehicle, seen from above."""
+    from shapely import MultiPoint
+
+    return np.array(MultiPoint(scenario.ego_mesh().vertices_m[:, :2]).convex_hull.exterior.coords)[:-1]
+
+
+def _check(steps: int, seed: int, hits: int, threshold_m: float) -> None:
+    if steps < 1:
+        raise ValueError(f"steps: a number >= 1 is needed; got {steps}")
+    if seed < 0:
+        raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
+    if hits < 1:
+        raise ValueError(f"hits: a number of points >= 1 is needed; got {hits}")
+    if not 0 < threshold_m < math.inf:
+        raise ValueError(f"threshold: metres above 0 are needed; got {threshold_m}")
+
+
+def _check_size(target: Target, raster: Raster) -> None:
+    length_m, width_m, _ = target.solid.box.size_m
+    wide_m, high_m = raster.x[1] - raster.x[0], raster.y[1] - raster.y[0]
+    if max(length_m, width_m) > max(wide_m, high_m) or min(length_m, width_m) > min(wide_m, high_m):
+        raise ValueError(
+            f"target {target.name!r} is {length_m:.3g} x {width_m:.3g} m, larger than the raster of {wide_m:.3g} x "
+            f"{high_m:.3g} m; take a larger raster, or set the unit of its mesh in a vehicle file"
+        )
+
+
+def _check_memory(rig: Rig, raster: Raster, steps: int) -> None:
+    rays, cells = sum(sensor.rays for sensor in rig.sensors), raster.shape[0] * raster.shape[1]
+    places = max(PLACES, steps)
+    needed_bytes = BYTES_PER_RAY * rays * steps + cells * (
+        BYTES_PER_CELL + places * SAMPLES // 8 + 8 * len(rig.sensors)
+    )
+    check_fits(
+        f"{cells:,} places and {steps:,} steps of {rays:,} rays",
+        needed_bytes,
+        "use fewer steps or a larger step of the raster",
+    )
