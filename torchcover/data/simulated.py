@@ -59,8 +59,8 @@ class SimulatedFrames(FrameDataset):
         boxes: Whether frames have `boxes`: one for each object within the reference's range, with how many points each
             rig has in it, and how many the reference drew on it. An object's name is its own within a run of the
             scenario.
-        vehicle: What carries the rigs: a built-in vehicle, the YAML file of one, or a mesh file. Not given: the scenario's
-            own ego, else the vehicle that the rigs name, else an SUV.
+        vehicle: What carries the rigs: a built-in vehicle, the YAML file of one, or a mesh file. Not given: the
+            scenario's own ego, else the vehicle that the rigs name, else an SUV.
 
     Raises:
         FileNotFoundError: An unknown name or file.

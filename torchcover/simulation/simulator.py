@@ -35,8 +35,8 @@ class Simulator:
     are cast on as many threads as torch uses (`torch.set_num_threads`).
 
     Args:
-        scenario: The world, with the ego of `with_ego`. Beyond its end a given one plays again; traffic starts anew with
-            other random numbers.
+        scenario: The world; `with_ego` gives it its ego. Beyond its end a given one plays again; traffic starts anew
+            with other random numbers.
         rigs: The sensors, by the name under which `Observation.clouds` has their points.
         reference_sensor: The reference sensor.
         seed: Seed of the traffic, of the reference sensor, and of noise and drop-out.
