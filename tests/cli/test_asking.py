@@ -131,3 +131,9 @@ def test_a_region_within_the_vehicle_is_unknown_and_a_line_says_why(evaluate, wo
     assert code == 0
     assert "warning: region 'hold' lies within the vehicle (x = -2 to 2 m, y = -1 to 1 m)" in said
     assert [(row["detection_2m"], row["known_cells"]) for row in rows_of(worlds / "out")] == [("", "0")] * 2
+
+
+def test_where_nothing_was_seen_no_sensor_is_called_dispensable(evaluate):
+    code, printed, _ = evaluate("--region", "sky:2,6,-2,2", "--height", "sky:50,60", "--redundancy")
+    assert (code, "unknown: nothing that was asked about was seen." in " ".join(printed.split())) == (0, True)
+    assert "No single point of failure" not in printed

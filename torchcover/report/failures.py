@@ -60,6 +60,8 @@ def single_point_of_failure(table: CoverageTable, rig: str) -> str:
         return ""
     worst = max(rows, key=lambda row: _loss(row.summary.redundancy, quantity))
     redundancy = worst.summary.redundancy
+    if all(math.isnan(row.summary.numbers[quantity.key].value) for row in rows):
+        return "Whether one sensor is indispensable is unknown: nothing that was asked about was seen."
     if redundancy is None or redundancy.indispensable is None:
         return "No single point of failure: whichever sensor fails, nothing that is known changes."
     sensor = redundancy.indispensable
