@@ -6,8 +6,8 @@ BIN := $(VENV)/bin
 .PHONY: demo test lowest lint types doctest docs smoke bench paper clean
 
 demo: STEPS ?= 24
-demo: $(VENV)/.ready  ## evaluate a built-in rig in the built-in courtyard; writes to out/demo
-	$(BIN)/torchcover evaluate front_roof_128 --scenario courtyard --steps $(STEPS) --out out/demo
+demo: $(VENV)/.ready  ## evaluate a built-in rig in city traffic; writes to out/demo
+	$(BIN)/torchcover evaluate front_roof_128 --scenario urban --steps $(STEPS) --workers 2 --out out/demo
 
 # One thread in each process: the tests are dealt out to as many processes as there are cores.
 test: $(VENV)/.ready  ## every test

@@ -74,12 +74,15 @@ def test_rigs_with_one_name_get_columns_and_files_of_their_own(torchcover, world
 
 def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
     *_, out = compare(torchcover, worlds, "low", "both")
-    assert sorted(path.name for path in (out / "maps").iterdir()) == sorted(
+    metrics = "radius_area_m", "detection_area_2m"
+    of_bands = [
         f"{prefix}{metric}_{band}{suffix}.png"
-        for metric in ("radius_area_m", "detection_area_2m")
+        for metric in metrics
         for band in ("ground", "obstacle")
         for prefix, suffix in (("", ""), ("difference_", "_both_minus_low"))
-    )
+    ]
+    near = [f"near_{metric}.png" for metric in metrics]
+    assert sorted(path.name for path in (out / "maps").iterdir()) == sorted([*of_bands, *near])
 
 
 def test_errors_are_drawn_if_asked_for_and_differences_come_with_theirs(torchcover, worlds):

@@ -6,6 +6,7 @@ from matplotlib.image import imread
 
 from torchcover.cli import show
 from torchcover.evaluation import scene_pictures, sensor_views
+from torchcover.evaluation.rig_names import as_called, distinct_names
 from torchcover.simulation import Rig, Scenario, builtin_names
 
 
@@ -175,6 +176,11 @@ def test_a_warning_is_one_line_on_stderr_and_said_once(torchcover, worlds):
     assert ["car.obj: the mesh is not closed" in line for line in lines].count(True) == 1
     assert ["a: its body is 4,000 x 2,000 x 1,000 m" in line for line in lines].count(True) == 1
     assert len(lines) == 3
+
+
+def test_a_rig_has_the_name_of_its_file_in_every_command(worlds):
+    (worlds / "renamed.yaml").write_text((worlds / "both.yaml").read_text())
+    assert [as_called(worlds / "renamed.yaml").name] == distinct_names([worlds / "renamed.yaml"]) == ["renamed"]
 
 
 def test_it_prints_where_the_numbers_of_a_rig_come_from(torchcover, tmp_path):

@@ -40,7 +40,7 @@ def test_the_exit_code_is_the_verdict(call, worlds, requirement, code, words):
     assert "not checked, as it is not about adult: dog within 1 m: points >= 1" in printed
     assert "dome sees adult" in " ".join(printed.split())
     record = json.loads((worlds / "out" / "summary.json").read_text())
-    assert record["files"] == ["targets.csv", "targets.npz", "targets.png"]
+    assert record["files"] == ["targets.csv", "targets.npz", "report.html", "targets.png"]
     assert [one["passed"] for one in record["requirements"]] == [code == 0]
 
 

@@ -30,6 +30,7 @@ def test_the_summary_and_the_table_say_which_vehicle_it_was(torchcover, free):
         code, printed, error = run(torchcover, free, "evaluate", free / "low.yaml", *options)
         assert (code, f"Vehicle: {vehicle}." in " ".join(printed.split())) == (0, True), error
         assert json.loads((free / "out" / "summary.json").read_text())["vehicle"] == vehicle
+        assert f"on {vehicle}" in (free / "out" / "report.html").read_text()
 
 
 def test_rigs_of_different_vehicles_are_compared_on_one_that_is_named(torchcover, free):

@@ -12,9 +12,8 @@ from matplotlib.figure import Figure
 
 from torchcover import BevGrid
 from torchcover.geometry import rigid, rotation_from_euler
-from torchcover.report import ActorMark, SensorView, draw_depths, draw_four_views, draw_rig, draw_scene
+from torchcover.report import ActorMark, SensorView, Standing, draw_depths, draw_four_views, draw_rig, draw_scene
 from torchcover.report.drawings.frame import REFERENCE, SENSOR, SKY
-from torchcover.report.drawings.rig import FIRST_REACH_M
 from torchcover.report.maps.overlay import COLOURS
 
 VERTICES = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (0.0, 1.5)])
@@ -88,7 +87,21 @@ def test_from_above_the_sector_lies_about_the_yaw():
     assert picture.tinted(0, 0.0, 3.0)
     assert not picture.tinted(0, 2.5, 1.2)
     assert not picture.tinted(0, 0.0, -1.2)
-    assert not picture.tinted(0, 0.0, FIRST_REACH_M + 0.3)
+    assert picture.tinted(0, 0.4, 3.9)  # to the edge, for nobody's range ends before it
+
+
+def test_ranges_are_drawn_as_far_as_they_are():
+    picture = rig(view(range_m=50.0), view(yaw=180.0, range_m=20.0))
+    assert picture.tinted(2, 45.0, 3.0)
+    assert not picture.tinted(2, 54.0, 3.0)
+    assert picture.tinted(2, -15.0, 2.0)
+    assert not picture.tinted(2, -22.0, 2.0)
+
+
+def test_no_two_of_many_sensors_look_alike():
+    sensors = [view(yaw=17.0 * k, name=f"{k}") for k in range(21)]
+    legend = rig(*sensors).figure.axes[2].get_legend()
+    assert len({to_rgb(entry.get_color()) for entry in legend.legend_handles}) == 21
 
 
 def test_from_the_side_the_fan_lies_about_the_pitch_and_ends_at_the_ground():
@@ -132,10 +145,12 @@ def test_every_sensor_is_named_with_its_angles_and_nothing_is_clipped():
     pixels = picture.pixels
     for border in (pixels[:5], pixels[-5:], pixels[:, :5], pixels[:, -5:]):
         assert (border == 1.0).all()
-    above, side = picture.figure.axes
-    assert (above.get_ylabel(), side.get_xlabel(), side.get_ylabel()) == ("y left (m)", "x forward (m)", "z up (m)")
+    above, side, ranges = picture.figure.axes
+    labels = above.get_ylabel(), side.get_ylabel(), ranges.get_ylabel(), ranges.get_xlabel()
+    assert labels == ("y left (m)", "z up (m)", "y left (m)", "x forward (m)")
     assert not above.get_tightbbox().overlaps(side.get_tightbbox())
-    for axes in (above, side):
+    assert not side.get_tightbbox().overlaps(ranges.get_tightbbox())
+    for axes in (above, side, ranges):
         width, height = axes.get_window_extent().size
         assert width / np.ptp(axes.get_xlim()) == pytest.approx(height / np.ptp(axes.get_ylim()))
 
@@ -146,8 +161,27 @@ def box(x: float, y: float) -> np.ndarray:
 
 def scene(**options) -> Picture:
     nothing = np.zeros((0, 3), dtype=np.float32)
-    given = {"ego_outline_m": box(0, 0), "actors": [], "sensor": nothing, "reference": nothing, "title": "Scene"}
+    bare = Standing(np.zeros((0, 3, 2)), np.zeros(0))
+    given = {
+        "standing": bare,
+        "ego_outline_m": box(0, 0),
+        "actors": [],
+        "sensor": nothing,
+        "reference": nothing,
+        "title": "Scene",
+    }
     return Picture(draw_scene((-20.0, 30.0), (-10.0, 10.0), **(given | options)))
+
+
+def test_what_stands_is_drawn_the_darker_the_higher_and_the_ground_is_not():
+    squares = [(box(x, 5)[:3], height) for x, height in ((10, 0.0), (15, 0.3), (20, 8.0))]
+    standing = Standing(np.array([corners for corners, _ in squares]), np.array([height for _, height in squares]))
+    picture = scene(standing=standing)
+    ground, kerb, house = (picture.at(0, x + 1, 4.6).mean() for x in (10, 15, 20))
+    assert ground == 1.0
+    assert 1.0 > kerb > house + 0.1
+    entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
+    assert entries[0] == "what stands there, the darker the higher"
 
 
 def test_actors_are_where_they_are_in_the_colour_of_their_category():

@@ -179,7 +179,9 @@ def test_several_sensors_are_numbered_and_those_close_together_share_a_label():
     labels = [text.get_text() for text in picture.axes.texts]
     assert "1, 2" in labels
     assert "3" in labels
-    assert picture.legend[1:5] == ["1  a", "2  b", "3  c", "4  $away$ (beyond the map)"]
+    assert picture.legend[1:5] == ["a", "b", "c", "$away$ (beyond the map)"]
+    marks = [entry.get_marker() for entry in picture.axes.get_legend().legend_handles[1:5]]
+    assert marks == ["$1$", "$2$", "$3$", "$4$"]
     assert picture.pixels.size < draw(flat()).pixels.size * 1.3  # the paper does not follow it
 
 

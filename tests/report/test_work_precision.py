@@ -1,6 +1,7 @@
 """The diagram of error against run time."""
 
 import math
+from itertools import pairwise
 
 from torchcover.report import WorkPanel, draw_work_precision
 
@@ -30,3 +31,19 @@ def test_it_has_a_line_for_each_setting_the_front_and_the_floor_where_there_is_o
 def test_lines_look_different_and_more_than_there_are_markers_are_drawn_too():
     drawn = lines(draw_work_precision([panel("abcdefghij")], title=""))
     assert len({(line.get_color(), line.get_marker()) for line in drawn.values()}) == 11
+
+
+def test_no_number_of_an_axis_lies_on_another():
+    figure = draw_work_precision([WorkPanel("error (%)", {"a": [(3.0, 0.9), (60.0, 0.3)]}, [], math.nan)], title="")
+    figure.canvas.draw()
+    (axes,) = figure.axes
+    for axis, side in ((axes.xaxis, 0), (axes.yaxis, 1)):
+        labels = [label for label in axis.get_ticklabels(which="both") if label.get_text()]
+        inside = [
+            label
+            for label in labels
+            if axis.get_view_interval()[0] <= label.get_position()[side] <= axis.get_view_interval()[1]
+        ]
+        assert len(inside) >= 2
+        spans = sorted(label.get_window_extent().get_points()[:, side].tolist() for label in inside)
+        assert all(before[1] < after[0] for before, after in pairwise(spans))

@@ -10,7 +10,7 @@ import typer
 
 from torchcover.cli import options
 from torchcover.cli.asking import asked
-from torchcover.cli.running import checkpoint_in, finish, opened, sharing
+from torchcover.cli.running import checkpoint_in, finish, logged, opened, sharing, watching
 from torchcover.cli.targets import targets
 from torchcover.evaluation.interrupt import terminable
 
@@ -95,6 +95,7 @@ def evaluate(
     target_error: options.TargetErrors = None,
     redundancy: options.Redundancy = False,
     error_maps: options.ErrorMaps = False,
+    rerun: options.Rerun = None,
     explain: options.Explain = False,
     device: options.Device = "cpu",
     workers: options.Workers = 0,
@@ -105,6 +106,7 @@ def evaluate(
     from torchcover.evaluation import evaluate
 
     with sharing(out) as ranks:
+        log = logged(rerun, ranks)
         result = evaluate(
             rig,
             scenario,
@@ -126,9 +128,10 @@ def evaluate(
             skip_bad_frames=skip_bad_frames,
             checkpoint=checkpoint_in(out, resume=resume),
             ranks=ranks,
+            observers=watching(log),
             progress=True,
         )
-        finish(result, out, ranks, error_maps=error_maps, explain=explain)
+        finish(result, out, ranks, log, error_maps=error_maps, explain=explain)
 
 
 @app.command()
@@ -156,6 +159,7 @@ def compare(
     target_error: options.TargetErrors = None,
     redundancy: options.Redundancy = False,
     error_maps: options.ErrorMaps = False,
+    rerun: options.Rerun = None,
     explain: options.Explain = False,
     device: options.Device = "cpu",
     workers: options.Workers = 0,
@@ -166,6 +170,7 @@ def compare(
     from torchcover.evaluation import compare
 
     with sharing(out) as ranks:
+        log = logged(rerun, ranks)
         result = compare(
             rigs or (),
             scenario,
@@ -187,9 +192,10 @@ def compare(
             skip_bad_frames=skip_bad_frames,
             checkpoint=checkpoint_in(out, resume=resume),
             ranks=ranks,
+            observers=watching(log),
             progress=True,
         )
-        finish(result, out, ranks, error_maps=error_maps, explain=explain)
+        finish(result, out, ranks, log, error_maps=error_maps, explain=explain)
 
 
 @app.command()

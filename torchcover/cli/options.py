@@ -134,6 +134,10 @@ Redundancy = Annotated[
     typer.Option("--redundancy", help="Say by how many sensors places are seen, and what is lost when each one fails."),
 ]
 ErrorMaps = Annotated[bool, typer.Option("--error-maps", help="Draw maps of the standard errors too.")]
+Rerun = Annotated[
+    Path | None,
+    typer.Option(help="Write clouds, boxes, rigs and maps to this .rrd file for the Rerun viewer (extra `rerun`)."),
+]
 Explain = Annotated[bool, typer.Option("--explain", help="Say what was left out because the scene did not need it.")]
 Device = Annotated[str, typer.Option(help="Where the search and the sums run: cpu, cuda, cuda:1, ...")]
 Workers = Annotated[int, typer.Option(min=0, help="Processes that make frames; 0 makes them in this one.")]

@@ -23,7 +23,9 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
     maps = sum(path.suffix == ".png" for path in files)
     coverages = f"{len(result.coverages)} coverage files" if result.is_comparison else "coverage.npz"
     console.print(
-        f"Wrote summary.json, summary.csv, {coverages} and {maps} maps to {out}", markup=False, soft_wrap=True
+        f"Wrote report.html, summary.json, summary.csv, {coverages} and {maps} maps to {out}",
+        markup=False,
+        soft_wrap=True,
     )
 
 

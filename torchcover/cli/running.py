@@ -11,6 +11,8 @@ if TYPE_CHECKING:
 
     from torchcover.data import FrameSource
     from torchcover.evaluation import Checkpoint, Ranks, Result
+    from torchcover.evaluation.observers import AnyObserver
+    from torchcover.evaluation.rerun_log import RerunLog
 
 
 def opened(
@@ -30,10 +32,15 @@ def opened(
             if given is not None:
                 raise ValueError(f"--{option}: for a recording, which --frames gives")
         return None
+    from rich.console import Console
+    from rich.markup import escape
+
     from torchcover.data import RecordedFrames, open_recording, reference_of_recording
 
+    with Console(stderr=True).status(f"opening {escape(str(frames))}"):  # seconds, where there are 100,000 frames
+        recording = open_recording(frames, recording_format)
     return RecordedFrames(
-        open_recording(frames, recording_format),
+        recording,
         rigs={names: names.split(",") for names in sensors} if sensors else None,
         reference=reference_of_recording(reference, window_s),
     )
@@ -60,12 +67,45 @@ def sharing(out: Path) -> "Iterator[Ranks | None]":
         yield ranks
 
 
-def finish(result: "Result", out: Path, ranks: "Ranks | None", *, error_maps: bool, explain: bool) -> None:
+def logged(path: Path | None, ranks: "Ranks | None") -> "RerunLog | None":
+    """The recording for the Rerun viewer, if there is to be one.
+
+    Raises:
+        ValueError: Several processes share the run, or rerun-sdk is not installed.
+    """
+    if path is None:
+        return None
+    if ranks is not None:
+        raise ValueError(f"--rerun {path}: several processes cannot write one file; run it without torchrun")
+    from torchcover.evaluation.rerun_log import RerunLog
+
+    try:
+        return RerunLog(path)
+    except ImportError as error:
+        raise ValueError(f"--rerun {error}") from error
+
+
+def watching(log: "RerunLog | None") -> "dict[str, AnyObserver] | None":
+    """What looks at the frames beside the coverage."""
+    return None if log is None else {"rerun": log}
+
+
+def finish(
+    result: "Result",
+    out: Path,
+    ranks: "Ranks | None",
+    log: "RerunLog | None" = None,
+    *,
+    error_maps: bool,
+    explain: bool,
+) -> None:
     """Results are safe before anything is printed; then the command ends as the run did."""
     from torchcover.cli.printing import print_result
 
     if ranks is None or ranks.rank == 0:
         files = result.save(out, error_maps=error_maps)
         print_result(result, files, out, explain=explain)
+        if log is not None:
+            log.finish(result)
     if result.run is not None:
         result.run.raise_failure()

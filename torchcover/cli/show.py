@@ -8,9 +8,10 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from torchcover.evaluation import cameras_of, rig_pictures, scenario_picture
+from torchcover.evaluation.rig_names import as_called
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
 from torchcover.files import BadFileError
-from torchcover.simulation import Rig, Scenario, builtin_names
+from torchcover.simulation import Scenario, builtin_names
 from torchcover.simulation.documents import read_mapping
 
 DEFAULT_RIG = "front_roof_128"
@@ -35,14 +36,14 @@ def run(
     figures: Iterable[tuple[str, Figure]]
     if _is_rig(name):
         _refuse("a scenario", {"--rig": rig}, f"{name!r} is a rig")
-        shown = Rig.load(name)
+        shown = as_called(name)
         if not cameras_of(shown):
             _refuse("a scenario or cameras", {"--step": step, "--seed": seed}, f"{name!r} is a rig without cameras")
         world, description = Scenario.load(scenario or DEFAULT_SCENARIO), shown.description
         figures = rig_pictures(shown, world, vehicle=vehicle, step=step or 0, seed=seed or 0)
     else:
         _refuse("a rig", {"--scenario": scenario}, f"{name!r} is a scenario")
-        world, seen_by = Scenario.load(name), Rig.load(rig or DEFAULT_RIG)
+        world, seen_by = Scenario.load(name), as_called(rig or DEFAULT_RIG)
         description = world.description
         figures = [("", scenario_picture(world, seen_by, vehicle=vehicle, step=step or 0, seed=seed or 0))]
     console = Console()

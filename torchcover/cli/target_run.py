@@ -7,7 +7,9 @@ from rich.console import Console
 from rich.table import Table
 
 from torchcover.evaluation import claimed, save_targets, survey_target
+from torchcover.evaluation.rerun_log import write_target
 from torchcover.report import percent, text_table
+from torchcover.simulation import Rig
 from torchcover.targets import Heading, Place, Raster, Requirements, TargetMap, Verdict, check
 
 FAILED = 1
@@ -27,6 +29,7 @@ def run(
     threshold_m: float,
     heading: str,
     require: Path | None,
+    rerun: Path | None,
     out: Path,
 ) -> int:
     """Survey a target, write and print what is seen, judge it.
@@ -54,7 +57,10 @@ def run(
             heading=parsed_heading(heading),
         )
         verdicts = [] if requirements is None else check(requirements, seen)
-        files = save_targets(seen, out, verdicts)
+        sensors = Rig.load(rig).sensors
+        files = save_targets(seen, out, verdicts, sensors)
+        if rerun is not None:
+            write_target(seen, sensors, rerun)
     _print(seen, verdicts, requirements)
     Console().print(f"Wrote {', '.join(path.name for path in files)} to {out}", markup=False, soft_wrap=True)
     return 0 if all(verdict.passed for verdict in verdicts) else FAILED

@@ -39,6 +39,7 @@ def targets(
         Path | None, typer.Option(help="YAML file of requirements: exit code 1 if one is not met.")
     ] = None,
     seed: options.Seed = 0,
+    rerun: Annotated[Path | None, typer.Option(help="Write the map to this .rrd file, for the Rerun viewer.")] = None,
     out: options.Out = Path("out/targets"),
 ) -> None:
     """Put a body at every place around the vehicle: how much of it is seen, where not, and whether that is enough."""
@@ -57,6 +58,7 @@ def targets(
         threshold_m=threshold,
         heading=heading,
         require=require,
+        rerun=rerun,
         out=out,
     )
     raise typer.Exit(code)

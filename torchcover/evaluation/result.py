@@ -16,10 +16,11 @@ from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.omissions import Omission
 from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.result_files import ResultFiles
+from torchcover.evaluation.result_page import page_of
 from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.evaluation.target_error import TargetError
 from torchcover.evaluation.target_outcome import outcome
-from torchcover.report import RENDERERS, CoverageTable, file_stems, map_figures, table_dict
+from torchcover.report import RENDERERS, CoverageTable, file_stems, map_figures, page_html, table_dict
 from torchcover.simulation import Sensor
 
 # What `summary.json` says of how the run went.
@@ -74,6 +75,12 @@ class Result:
         return next(iter(self.coverages.values()))
 
     @property
+    def vehicle(self) -> str | None:
+        """What carried the rigs in a simulation."""
+        vehicle = self.source.get("vehicle")
+        return None if vehicle is None else str(vehicle)
+
+    @property
     def is_comparison(self) -> bool:
         """Whether it is about several rigs."""
         return len(self.coverages) > 1
@@ -120,7 +127,13 @@ class Result:
             The stem of the file name, and a figure of its own, outside pyplot.
         """
         views = {name: sensor_views(sensors) for name, sensors in self.sensors.items()}
-        return map_figures(self.coverages, ego_outline_m=self.ego_outline_m, sensors=views, errors=errors)
+        return map_figures(
+            self.coverages,
+            ego_outline_m=self.ego_outline_m,
+            sensors=views,
+            vehicle=self.vehicle,
+            errors=errors,
+        )
 
     def save(self, folder: str | Path, *, error_maps: bool = False) -> list[Path]:
         """Write the files of the command line: first the numbers, then the maps.
@@ -128,9 +141,9 @@ class Result:
         At any time `summary.json` lists files of one run; those of an earlier one stay until the new numbers are there.
 
         Args:
-            folder: Where to write: `coverage.npz`, or `coverage/RIG.npz` for several; `summary.csv`, `maps/STEM.png`,
-                `summary.json`. Made if it does not exist. Files of an earlier run that this one does not write are
-                deleted: those that its `summary.json` lists.
+            folder: Where to write: `coverage.npz`, or `coverage/RIG.npz` for several; `summary.csv`, `report.html`,
+                `maps/STEM.png`, `summary.json`. Made if it does not exist. Files of an earlier run that this one does
+                not write are deleted: those that its `summary.json` lists.
             error_maps: Whether to draw maps of the standard errors too.
 
         Returns:
@@ -149,6 +162,7 @@ class Result:
                 files.add("summary.csv", lambda path: path.write_text(RENDERERS["csv"](self.table), encoding="utf-8"))
                 record = self.record
                 files.publish(record)
+            files.add("report.html", lambda path: path.write_text(page_html(page_of(self)), encoding="utf-8"))
             for stem, figure in self.maps(errors=error_maps):
                 files.add(f"maps/{stem}.png", partial(_draw, figure))
             files.publish(record)
@@ -198,8 +212,7 @@ class Result:
             return [*on_failure, *record["notes"]]
         rays, every_s = record["rays_per_step"], record["every_s"]
         sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
-        vehicle = self.source.get("vehicle")
-        carried = [f"Vehicle: {vehicle}."] if vehicle else []
+        carried = [f"Vehicle: {self.vehicle}."] if self.vehicle else []
         return [*on_failure, *carried, sensor, *self._on_repetitions]
 
     @property

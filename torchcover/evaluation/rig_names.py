@@ -44,6 +44,16 @@ def loaded(rig: AnyRig) -> Rig:
     return rig if isinstance(rig, Rig) else Rig.load(rig)
 
 
+def as_called(rig: AnyRig) -> Rig:
+    """The rig itself, under the name that tables and files of every command have for it.
+
+    Raises:
+        FileNotFoundError: As `loaded`.
+        ValueError: As `loaded`.
+    """
+    return loaded(rig).model_copy(update={"name": _stem(rig)})
+
+
 def is_document(rig: AnyRig) -> bool:
     """Whether there is more to it than a name: a rig, the path of one, or the name of a built-in one."""
     return isinstance(rig, Rig) or _is_file(rig) or str(rig) in builtin_names("rigs")

@@ -9,10 +9,11 @@ from torchcover.data import GRID_X_M, GRID_Y_M, SimulatedFrames
 from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
-from torchcover.report import ActorMark, draw_depths, draw_rig, draw_scene
+from torchcover.report import ActorMark, Standing, draw_depths, draw_rig, draw_scene
 from torchcover.simulation import CameraSensor, PaperReference, Rig, Scenario
 from torchcover.simulation.world import Actor, World
 
+FLAT = 0.9  # the least cosine between a face's normal and z
 # A picture needs fewer points than a measurement.
 REFERENCE = PaperReference(rows=256, columns=512)
 
@@ -73,6 +74,7 @@ def scenario_picture(
     return draw_scene(
         GRID_X_M,
         GRID_Y_M,
+        standing=_standing(scene.world, time_s),
         ego_outline_m=scene.ego_box.outline_m,
         actors=_actor_marks(scene.world, time_s),
         sensor=frame.sensor.numpy(),
@@ -86,9 +88,30 @@ def _frames(scenario: Scenario, rig: Rig, vehicle: str | None, step: int, seed: 
     return SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, vehicle=vehicle, reference_sensor=REFERENCE)
 
 
+def _standing(world: World, time_s: float) -> Standing:
+    """The scenery within the picture, from above."""
+    vehicle_T_world = invert(world.ego.trajectory.at(time_s))
+    low, high = np.array([(GRID_X_M[end], GRID_Y_M[end]) for end in (0, 1)])
+    triangles, heights = [np.empty((0, 3, 2))], [np.empty(0)]
+    for mesh in world.static:
+        corners = transform(vehicle_T_world, mesh.vertices_m)[mesh.faces]
+        inside = ((corners[..., :2].max(axis=1) > low) & (corners[..., :2].min(axis=1) < high)).all(axis=1)
+        triangles.append(corners[inside][..., :2])
+        heights.append(_heights_m(corners[inside]))
+    return Standing(np.concatenate(triangles), np.concatenate(heights))
+
+
+def _heights_m(corners_m: Matrix) -> Matrix:
+    """(F,) the highest point of each of (F, 3, 3) faces; of flat ones the lowest, for the ground may be a slope."""
+    normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    flat = np.abs(normals[:, 2]) > FLAT * np.linalg.norm(normals, axis=1)
+    heights_m: Matrix = np.where(flat, corners_m[..., 2].min(axis=1), corners_m[..., 2].max(axis=1))
+    return heights_m
+
+
 def _actor_marks(world: World, time_s: float) -> list[ActorMark]:
     vehicle_T_world = invert(world.ego.trajectory.at(time_s))
-    there = [actor for actor in world.actors if np.isfinite(actor.trajectory.positions_at(np.array([time_s]))).all()]
+    there = [actor for actor in world.objects if np.isfinite(actor.trajectory.positions_at(np.array([time_s]))).all()]
     return [ActorMark(actor.category, _footprint_m(actor, vehicle_T_world, time_s)) for actor in there]
 
 

@@ -10,10 +10,11 @@ from matplotlib.figure import Figure
 from torchcover.coverage import BevGrid
 from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.result_files import ResultFiles
-from torchcover.evaluation.rig_names import AnyRig, loaded
+from torchcover.evaluation.rig_names import AnyRig, as_called
 from torchcover.evaluation.settings import spread_s
-from torchcover.report import draw_targets
-from torchcover.simulation import Scenario, with_ego
+from torchcover.evaluation.target_page import target_page
+from torchcover.report import draw_targets, page_html
+from torchcover.simulation import Scenario, Sensor, with_ego
 from torchcover.simulation.bodies import Body
 from torchcover.simulation.scenario import Mover
 from torchcover.simulation.shapes import Plane
@@ -65,7 +66,7 @@ def survey_target(
         >>> seen.target, seen.counts["free"]
         ('dog_57cm', 8)
     """
-    rig = loaded(rig)
+    rig = as_called(rig)
     world = free_space() if scenario is None else scenario
     world = with_ego(world if isinstance(world, Scenario) else Scenario.load(world), {rig.name: rig}, vehicle)
     alike = world.instants == 1 and not any(sensor.range_noise_m or sensor.dropout for sensor in rig.sensors)
@@ -116,14 +117,17 @@ def target_picture(seen: TargetMap) -> Figure:
     )
 
 
-def save_targets(seen: TargetMap, folder: str | Path, verdicts: Sequence[Verdict] = ()) -> list[Path]:
-    """Write the files of the command line: the numbers first, then the picture.
+def save_targets(
+    seen: TargetMap, folder: str | Path, verdicts: Sequence[Verdict] = (), sensors: Sequence[Sensor] = ()
+) -> list[Path]:
+    """Write the files of the command line: the numbers first, then the page and the picture.
 
     Args:
         seen: From `survey_target`.
-        folder: Where to write `targets.csv`, `targets.npz`, `targets.png` and `summary.json`. Made if it does not
-            exist; files of an earlier run that its `summary.json` lists are deleted.
-        verdicts: From `torchcover.targets.check`, for `summary.json`.
+        folder: Where to write `targets.csv`, `targets.npz`, `report.html`, `targets.png` and `summary.json`. Made if it
+            does not exist; files of an earlier run that its `summary.json` lists are deleted.
+        verdicts: From `torchcover.targets.check`, for `summary.json` and the page.
+        sensors: Those of the rig, for the page.
 
     Returns:
         The files.
@@ -134,6 +138,8 @@ def save_targets(seen: TargetMap, folder: str | Path, verdicts: Sequence[Verdict
             files.add("targets.csv", lambda path: write_csv(seen, path))
             files.add("targets.npz", lambda path: write_arrays(seen, path))
             files.publish(record)
+        page = target_page(seen, verdicts, sensors)
+        files.add("report.html", lambda path: path.write_text(page_html(page), encoding="utf-8"))
         figure = target_picture(seen)
         files.add("targets.png", lambda path: figure.savefig(path, dpi=figure.dpi))
         files.publish(record)

@@ -1,7 +1,7 @@
-"""What a run shows: one table and its renderers, maps, and drawings. Imports matplotlib and rich, so import it late."""
+"""What a run shows: a table and its renderers, maps, drawings, a page. Imports matplotlib and rich: import it late."""
 
 from torchcover.report.drawings.four_views import draw_four_views
-from torchcover.report.drawings.frame import ActorMark, draw_depths, draw_scene
+from torchcover.report.drawings.frame import ActorMark, Standing, draw_depths, draw_scene
 from torchcover.report.drawings.rig import draw_rig
 from torchcover.report.drawings.targets import draw_targets
 from torchcover.report.drawings.work_precision import WorkPanel, draw_work_precision
@@ -9,6 +9,9 @@ from torchcover.report.maps.arrays import draw_map, draw_side_by_side
 from torchcover.report.maps.colours import ColourScale, difference_scale, error_scale, scale_of
 from torchcover.report.maps.figures import band_figures, file_stems, map_figures, write_figures
 from torchcover.report.maps.overlay import SensorView
+from torchcover.report.page.content import Line, Page, PageMap, PageRig, PageTable
+from torchcover.report.page.maps_of import maps_of
+from torchcover.report.page.writing import page_html
 from torchcover.report.remarks import Remark, marks_on, notes_on, remarks_on
 from torchcover.report.renderers import RENDERERS
 from torchcover.report.renderers.json_file import json_record, table_dict
@@ -26,10 +29,16 @@ __all__ = [
     "ActorMark",
     "ColourScale",
     "CoverageTable",
+    "Line",
+    "Page",
+    "PageMap",
+    "PageRig",
+    "PageTable",
     "Part",
     "Remark",
     "Row",
     "SensorView",
+    "Standing",
     "Words",
     "WorkPanel",
     "as_markdown",
@@ -49,9 +58,11 @@ __all__ = [
     "file_stems",
     "json_record",
     "map_figures",
+    "maps_of",
     "marks_on",
     "narrowest_width",
     "notes_on",
+    "page_html",
     "parts_of",
     "percent",
     "print_table",

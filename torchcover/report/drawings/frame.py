@@ -8,6 +8,7 @@ from itertools import accumulate
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
@@ -35,7 +36,10 @@ Points = NDArray[np.floating]
 Image = NDArray[np.floating]
 
 WIDTH_IN = 13.0
-REFERENCE, SENSOR = "#c8c8c8", "#3b6ea5"
+REFERENCE, SENSOR = "#e0b878", "#3b6ea5"
+# Kerbs are drawn, the road is not; greys of what is low and of what is high.
+LOWEST_STANDING_M = 0.08
+LOW_GREY, HIGH_GREY, GREY_HEIGHT_M = 0.92, 0.55, 3.0
 # These have the same colours in every picture; others take what follows.
 CATEGORIES = ("car", "truck", "bus", "cyclist", "motorcycle", "pedestrian")
 COLOURS = ("#d55e00", "#7a3fa0", "#e6b400", "#009e73", "#8b5a2b", "#d62598", "#a3122f", "#555555", "#000000")
@@ -60,10 +64,24 @@ class ActorMark:
     outline_m: Points
 
 
+@dataclass(frozen=True, eq=False)
+class Standing:
+    """What stands in a frame and never moves.
+
+    Args:
+        triangles_m: (F, 3, 2) its faces from above, x, y in the vehicle frame in metres.
+        height_m: (F,) how high each reaches above the ground under the vehicle.
+    """
+
+    triangles_m: Points
+    height_m: Points
+
+
 def draw_scene(
     x: Bounds,
     y: Bounds,
     *,
+    standing: Standing,
     ego_outline_m: Points,
     actors: Sequence[ActorMark],
     sensor: Points,
@@ -76,6 +94,7 @@ def draw_scene(
     Args:
         x: Bounds forward in metres.
         y: Bounds to the left in metres.
+        standing: What stands there.
         ego_outline_m: (K, 2) corners of the ego in the vehicle frame in metres.
         actors: The others; what lies beyond the bounds is left out.
         sensor: (N, 3) points of the rig.
@@ -86,10 +105,11 @@ def draw_scene(
     Returns:
         A figure of its own, outside pyplot.
     """
-    figure, (axes,) = stack_views(x, [y], width_in=WIDTH_IN)
+    figure, (axes,) = stack_views([(x, y)], width_in=WIDTH_IN)
     axes.set(xlabel="x forward (m)", ylabel="y left (m)")
     inside = [actor for actor in actors if _is_inside(actor.outline_m, x, y)]
     entries = [
+        *_draw_standing(axes, standing),
         *_draw_cloud(axes, reference, REFERENCE, "reference points"),
         *_draw_cloud(axes, sensor, SENSOR, "points of the rig"),
         *_draw_actors(axes, inside),
@@ -99,6 +119,21 @@ def draw_scene(
     write_legend(axes, entries, columns=4)
     fit_paper(figure)
     return figure
+
+
+def _draw_standing(axes: Axes, standing: Standing) -> list[Artist]:
+    """Faces from above, the highest last; the ground itself is not drawn."""
+    stands = standing.height_m > LOWEST_STANDING_M
+    height_m = standing.height_m[stands]
+    order = np.argsort(height_m)
+    grey = HIGH_GREY + (LOW_GREY - HIGH_GREY) * np.exp(-height_m[order] / GREY_HEIGHT_M)
+    colours = np.repeat(grey[:, None], 3, axis=1)
+    faces = list(standing.triangles_m[stands][order])
+    axes.add_collection(PolyCollection(faces, facecolors=colours, edgecolors=colours, linewidths=0.4, zorder=0.5))
+    if not faces:
+        return []
+    words = "what stands there, the darker the higher"
+    return [Patch(facecolor=str((LOW_GREY + HIGH_GREY) / 2), edgecolor="none", label=words)]
 
 
 def _draw_cloud(axes: Axes, points: Points, colour: str, label: str) -> list[Artist]:

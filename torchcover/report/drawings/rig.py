@@ -1,7 +1,7 @@
-"""A rig on its vehicle, from above and from the side, with the fields of view of its sensors."""
+"""A rig on its vehicle, from above and from the side: the fields of view of its sensors, and how far they reach."""
 
 from collections.abc import Sequence
-from itertools import chain
+from typing import Any
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -12,9 +12,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from torchcover.report.maps.overlay import COLOURS, SensorView
+from torchcover.report.maps.overlay import SensorView, sensor_colour
 from torchcover.report.maps.sheet import (
     HEADING_POINTS,
+    Bounds,
     fit_paper,
     stack_views,
     write_heading,
@@ -25,9 +26,14 @@ from torchcover.report.maps.sheet import (
 Points = NDArray[np.float64]
 
 WIDTH_IN = 7.5
-MARGIN_M = 0.6
-# Fields of view are drawn to different distances, so that one does not hide another.
-FIRST_REACH_M, REACH_STEP_M = 4.0, 0.6
+# Around the vehicle, in its lengths, but no less than this.
+AROUND_LENGTHS, AROUND_M, ABOVE_M = 0.75, 2.0, 1.5
+# Numbers stand at different distances along their directions, so that one does not hide another.
+FIRST_NUMBER_M, NUMBER_STEP_M, NUMBER_PLACES = 0.9, 0.35, 8
+NUMBER_SHARE = 0.09
+HIGHEST_RANGES_IN = 4.5
+# What a range without limit is drawn with.
+UNLIMITED_M = 300.0
 ARC_POINTS = 241
 GROUND_M = -0.4
 LIGHT = np.array([0.3, -0.5, 0.81])
@@ -46,30 +52,61 @@ def draw_rig(
         subtitle: Second line, smaller.
 
     Returns:
-        A figure of its own, outside pyplot: horizontal fields of view from above; from the side, sections through
-        each sensor along the vehicle, down to the ground.
+        A figure of its own, outside pyplot: horizontal fields of view from above, which go on beyond the paper; from
+        the side, sections through each sensor along the vehicle, down to the ground; and how far they reach.
     """
-    reaches_m = [FIRST_REACH_M + REACH_STEP_M * at for at in range(len(sensors))]
-    sectors = [[_sector(sensor, reach_m)] for sensor, reach_m in zip(sensors, reaches_m, strict=True)]
-    fans = [_fans(sensor, reach_m) for sensor, reach_m in zip(sensors, reaches_m, strict=True)]
-    from_above, from_side = [vertices_m[:, :2], *chain(*sectors)], [vertices_m[:, [0, 2]], *chain(*fans)]
-    x, y, top_m = _bounds(from_above + from_side, 0), _bounds(from_above, 1), _bounds(from_side, 1)[1]
-    figure, (above, side) = stack_views(x, [y, (GROUND_M, top_m)], width_in=WIDTH_IN)
-    _draw_body(above, vertices_m, faces, axis=2)
-    _draw_body(side, vertices_m, faces, axis=1)
+    x, y, top_m = _around(vertices_m, sensors)
+    beyond_m = float(np.hypot(x[1] - x[0], y[1] - y[0]))
+    ranges_m = [min(sensor.range_m, UNLIMITED_M) for sensor in sensors]
+    wide = [_sector(sensor, range_m) for sensor, range_m in zip(sensors, ranges_m, strict=True)]
+    views = [(x, y), (x, (GROUND_M, top_m)), _bounds_of_ranges([vertices_m[:, :2], *wide])]
+    figure, (above, side, ranges) = stack_views(views, width_in=WIDTH_IN)
+    for axes, axis in ((above, 2), (side, 1), (ranges, 2)):
+        _draw_body(axes, vertices_m, faces, axis=axis)
     side.axhspan(GROUND_M, 0.0, facecolor="#d8d4cc", edgecolor="black", linewidth=0.8)
     for at, sensor in enumerate(sensors):
-        _draw_sensor(above, at, sensor.position_m[:2], sectors[at])
-        _draw_sensor(side, at, sensor.position_m[[0, 2]], fans[at])
-    above.set_ylabel("y left (m)")
+        near_m, place = min(ranges_m[at], beyond_m), sensor.position_m
+        number_m = FIRST_NUMBER_M + NUMBER_STEP_M * (at % NUMBER_PLACES)
+        _draw_sensor(above, at, place[:2], [_sector(sensor, near_m)], [_along(_sector(sensor, number_m))])
+        fans, ends = _fans(sensor, near_m), [_along(fan) for fan in _fans(sensor, number_m)]
+        _draw_sensor(side, at, place[[0, 2]], fans, ends)
+        inwards = 1.0 - NUMBER_SHARE * (at % NUMBER_PLACES)
+        _draw_sensor(ranges, at, place[:2], [wide[at]], [_along(_sector(sensor, inwards * ranges_m[at]))])
+    for axes in (above, ranges):
+        axes.set_ylabel("y left (m)")
     above.tick_params(labelbottom=False)
-    side.set(xlabel="x forward (m)", ylabel="z up (m)")
-    write_heading(above, "from above: horizontal fields of view")
+    side.set(ylabel="z up (m)")
+    ranges.set(xlabel="x forward (m)")
+    write_heading(above, "from above: horizontal fields of view, which go on beyond the paper")
     write_heading(side, "from the side: sections through each sensor along the vehicle, down to the ground")
+    write_heading(ranges, "from above: how far they reach")
     write_title(above, title, subtitle, lift_points=HEADING_POINTS)
-    write_legend(side, [_entry(at, sensor) for at, sensor in enumerate(sensors)], columns=2)
+    write_legend(ranges, [_entry(at, sensor) for at, sensor in enumerate(sensors)], columns=2)
     fit_paper(figure)
     return figure
+
+
+def _around(vertices_m: Points, sensors: Sequence[SensorView]) -> tuple[Bounds, Bounds, float]:
+    """Bounds x and y around the vehicle and its sensors, and the top in z."""
+    every = np.vstack([vertices_m, *(sensor.position_m[None] for sensor in sensors)])
+    low, high = every.min(axis=0).tolist(), every.max(axis=0).tolist()
+    around_m = max(AROUND_M, AROUND_LENGTHS * (high[0] - low[0]))
+    return (low[0] - around_m, high[0] + around_m), (low[1] - around_m, high[1] + around_m), high[2] + ABOVE_M
+
+
+def _bounds_of_ranges(polygons: Sequence[Points]) -> tuple[Bounds, Bounds]:
+    """Bounds of all of them, wide enough that the view is not too high."""
+    every = np.concatenate(polygons)
+    margin_m = 0.05 * float(np.ptp(every, axis=0).max())
+    (left, low), (right, high) = every.min(axis=0) - margin_m, every.max(axis=0) + margin_m
+    missing_m = max(0.0, WIDTH_IN / HIGHEST_RANGES_IN * float(high - low) - float(right - left))
+    return (float(left) - missing_m / 2, float(right) + missing_m / 2), (float(low), float(high))
+
+
+def _along(outline: Points) -> Points:
+    """The middle of an arc, where its number stands."""
+    middle: Points = outline[len(outline) // 2]
+    return middle
 
 
 def _sector(sensor: SensorView, reach_m: float) -> Points:
@@ -101,11 +138,6 @@ def _runs(seen: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
     return [piece for piece in pieces if seen[piece[0]]]
 
 
-def _bounds(polygons: Sequence[Points], axis: int) -> tuple[float, float]:
-    values = np.concatenate([polygon[:, axis] for polygon in polygons])
-    return float(values.min()) - MARGIN_M, float(values.max()) + MARGIN_M
-
-
 def _draw_body(axes: Axes, vertices_m: Points, faces: NDArray[np.int64], axis: int) -> None:
     """Draw a body, shaded, seen along an axis: 2 is from above, 1 from the right."""
     corners = vertices_m[faces]
@@ -119,25 +151,27 @@ def _draw_body(axes: Axes, vertices_m: Points, faces: NDArray[np.int64], axis: i
     axes.add_collection(PolyCollection(list(shown), facecolors=colours, edgecolors=colours, linewidths=0.3, zorder=1))
 
 
-def _draw_sensor(axes: Axes, at: int, place: Points, views: Sequence[Points]) -> None:
-    colour = COLOURS[at % len(COLOURS)]
+def _draw_sensor(axes: Axes, at: int, place: Points, views: Sequence[Points], numbers: Sequence[Points]) -> None:
+    colour = sensor_colour(at)
     for outline in views:
-        axes.add_patch(Polygon(outline, facecolor=colour, edgecolor="none", alpha=0.13, zorder=2))
+        axes.add_patch(Polygon(outline, facecolor=colour, edgecolor="none", alpha=0.1, zorder=2))
         axes.add_patch(Polygon(outline, fill=False, edgecolor=colour, linewidth=1.0, zorder=3))
-    axes.plot(*place, marker="o", markersize=5, markerfacecolor=colour, markeredgecolor="white", zorder=5)
-    for end in [outline[len(outline) // 2] for outline in views] or [place]:
-        disc = {"boxstyle": "circle,pad=0.25", "facecolor": colour, "edgecolor": "white"}
-        axes.text(end[0], end[1], str(at + 1), color="white", fontsize=7, ha="center", va="center", bbox=disc, zorder=6)
+    axes.plot(*place, marker="o", markersize=4, markerfacecolor=colour, markeredgecolor="white", zorder=5)
+    for end in numbers or [place]:
+        disc = {"boxstyle": "circle,pad=0.2", "facecolor": colour, "edgecolor": "white"}
+        words: dict[str, Any] = {"color": "white", "fontsize": 6.5, "ha": "center", "va": "center", "clip_on": True}
+        axes.text(end[0], end[1], str(at + 1), bbox=disc, zorder=6, **words)
 
 
 def _entry(at: int, sensor: SensorView) -> Artist:
     low, high = sensor.vertical_fov_deg
-    words = f"{sensor.horizontal_fov_deg:.1f}° wide, {low:.1f}° to {high:.1f}° high, to {sensor.range_m:g} m"
+    reach = f"to {sensor.range_m:g} m" if np.isfinite(sensor.range_m) else "without a limit"
+    words = f"{sensor.horizontal_fov_deg:.1f}° wide, {low:.1f}° to {high:.1f}° high, {reach}"
     return Line2D(
         [],
         [],
         linestyle="none",
         marker="o",
-        color=COLOURS[at % len(COLOURS)],
+        color=sensor_colour(at),
         label=f"{at + 1}  {sensor.name}: {words}",
     )

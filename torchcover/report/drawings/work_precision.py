@@ -8,6 +8,7 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
 
 MARKERS = "osD^vP*X"
 COLORMAP = "viridis"
@@ -64,6 +65,11 @@ def _draw_panel(axes: Axes, panel: WorkPanel) -> None:
     if math.isfinite(panel.floor):
         axes.axhline(panel.floor, color="grey", linestyle=":", label="standard error of the long run")
     axes.set(xscale="log", yscale="log", xlabel="run time (s)", ylabel=panel.label)
+    for axis in (axes.xaxis, axes.yaxis):
+        # Few numbers, written out: powers of ten lie on each other where there is less than a decade.
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_major_formatter("{x:g}")
+        axis.set_minor_formatter(NullFormatter())
     axes.grid(visible=True, which="both", alpha=0.2)
 
 

@@ -16,7 +16,7 @@ from torchcover.report.maps.colours import (
     draw_colour_bar,
     paler_entry,
 )
-from torchcover.report.maps.overlay import SensorView, draw_ego, draw_sensors
+from torchcover.report.maps.overlay import SensorView, draw_ego, draw_places, draw_sensors
 from torchcover.report.maps.sheet import (
     HEADING_POINTS,
     fit_paper,
@@ -98,6 +98,7 @@ def draw_side_by_side(
     subtitle: str = "",
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Mapping[str, Sequence[SensorView]] | None = None,
+    directions: bool = True,
     unknown: str = NEVER_PROBED,
     opacity: Mapping[str, Tensor] | None = None,
 ) -> Figure:
@@ -111,6 +112,7 @@ def draw_side_by_side(
         subtitle: Second line, smaller.
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark, by the headings.
+        directions: Whether to draw directions and fields of view; else the places of the sensors only.
         unknown: Why a cell is, for the legend.
         opacity: As in `draw_map`, by the headings.
 
@@ -136,7 +138,8 @@ def draw_side_by_side(
         write_heading(sheet.axes, name)
         if ego_outline_m is not None:
             entries += draw_ego(sheet.axes, ego_outline_m)
-        entries += draw_sensors(sheet, (sensors or {}).get(name, ()), named=False)
+        own = (sensors or {}).get(name, ())
+        entries += draw_sensors(sheet, own, named=False) if directions else draw_places(sheet, own)
     write_title(sheets[0].axes, title, subtitle, lift_points=HEADING_POINTS)
     write_legend(lower_left(sheets), entries, sheets[0].legend_columns)
     fit_paper(sheets[0].figure)

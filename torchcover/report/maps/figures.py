@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,10 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage, check_paired
 from torchcover.report.maps.arrays import draw_map, draw_side_by_side
-from torchcover.report.maps.colours import difference_scale
+from torchcover.report.maps.colours import difference_scale, scale_of
 from torchcover.report.maps.overlay import SensorView
 from torchcover.report.maps.subjects import Subject, error_subjects_of, subjects_of
+from torchcover.report.maps.window import Window, asked_and_known, near_field
 from torchcover.report.wording import capitalised, span
 
 MAX_FILE_NAME = 48
@@ -27,6 +28,7 @@ def map_figures(
     *,
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Mapping[str, Sequence[SensorView]] | None = None,
+    vehicle: str | None = None,
     errors: bool = False,
 ) -> Iterator[Named]:
     """Draw what was measured in every height band, for one rig or for several.
@@ -34,17 +36,20 @@ def map_figures(
     Results over the visible surface are drawn as the ratio of each cell, or of a larger square where points are few;
     paler where little surface is seen in a step. The bands of a quantity share their colours, so that they can be
     compared by eye, and so do the rigs, which lie side by side. For every rig but the first there is a figure of its
-    difference to the first too; the differences of a quantity share their colours.
+    difference to the first too; the differences of a quantity share their colours. Maps show what was asked for and is
+    known; what is near the ego has figures of its own, on which nothing but the sensors' places lies over the cells.
 
     Args:
         coverages: What `CoverageMetric.compute` returned, by the name of the rig; several from the same frames.
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark, by the name of the rig.
+        vehicle: What the ego is called, for the titles.
         errors: Whether to draw the standard errors too, if there are any.
 
     Returns:
         Pairs, drawn one by one, of a name that is fit for a file and a figure: `radius_m_ground`,
-        `detection_area_0.4m_obstacle`, `radius_m_error_ground`, `difference_radius_m_ground_RIG_minus_FIRST`.
+        `detection_area_0.4m_obstacle`, `radius_m_error_ground`, `difference_radius_m_ground_RIG_minus_FIRST`,
+        `near_radius_m`.
 
     Raises:
         ValueError: Several coverages that are not paired, as in `check_paired`; while drawing, an outline of another
@@ -59,7 +64,7 @@ def map_figures(
     """
     if len(coverages) > 1:
         check_paired(coverages)
-    return _figures(coverages, _Setting(ego_outline_m, sensors or {}), errors=errors)
+    return _figures(coverages, _Setting(ego_outline_m, sensors or {}, vehicle), errors=errors)
 
 
 def band_figures(coverage: Coverage) -> Iterator[Named]:
@@ -69,10 +74,12 @@ def band_figures(coverage: Coverage) -> Iterator[Named]:
         coverage: What `CoverageMetric.compute` returned.
     """
     headings = [f"{name}, z {span(band)}" for name, band in coverage.grid.heights.items()]
-    for subject in subjects_of({"": coverage}):
+    shown = asked_and_known(coverage)
+    for whole in subjects_of({"": coverage}):
+        subject = _within(whole, shown)
         figure = draw_side_by_side(
             dict(zip(headings, subject.values[""], strict=True)),
-            coverage.grid,
+            shown.grid,
             subject.scale,
             title=capitalised(subject.quantity.title),
             subtitle=subject.conditions,
@@ -123,6 +130,13 @@ class _Setting:
 
     ego_outline_m: NDArray[np.floating] | None
     sensors: Mapping[str, Sequence[SensorView]]
+    vehicle: str | None
+
+    def told(self, subject: Subject) -> Subject:
+        """With what carried the rigs."""
+        if self.vehicle is None:
+            return subject
+        return replace(subject, conditions=f"on {self.vehicle}, {subject.conditions}")
 
 
 @dataclass(frozen=True)
@@ -144,14 +158,25 @@ class _Band:
 
 
 def _figures(coverages: Mapping[str, Coverage], setting: _Setting, *, errors: bool) -> Iterator[Named]:
-    first = next(iter(coverages.values()))
-    bands = _bands(first.grid)
+    first, ego = next(iter(coverages.values())), setting.ego_outline_m
+    bands, shown = _bands(first.grid), asked_and_known(first, ego)
+    near = None if ego is None else near_field(first.grid, ego)
     draw_rigs = _draw_one if len(coverages) == 1 else _draw_several
-    for subject in subjects_of(coverages):
-        yield from draw_rigs(subject, first.grid, bands, setting)
-        yield from _draw_differences(subject, first.grid, bands, setting)
-    for subject in error_subjects_of(coverages) if errors else ():
-        yield from draw_rigs(subject, first.grid, bands, setting)
+    for whole in map(setting.told, subjects_of(coverages)):
+        subject = _within(whole, shown)
+        yield from draw_rigs(subject, shown.grid, bands, setting)
+        yield from _draw_differences(subject, shown.grid, bands, setting)
+        if near is not None:
+            around = _within(whole, near)
+            own = scale_of(around.quantity, torch.stack(list(around.values.values())))
+            yield _draw_near(replace(around, scale=own), near.grid, bands, setting)
+    for whole in map(setting.told, error_subjects_of(coverages) if errors else ()):
+        yield from draw_rigs(_within(whole, shown), shown.grid, bands, setting)
+
+
+def _within(subject: Subject, shown: Window) -> Subject:
+    values = {rig: shown.of(each) for rig, each in subject.values.items()}
+    return replace(subject, values=values, opacity=None if subject.opacity is None else shown.of(subject.opacity))
 
 
 def _bands(grid: BevGrid) -> list[_Band]:
@@ -190,6 +215,30 @@ def _draw_several(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setti
             opacity=None if subject.opacity is None else dict.fromkeys(subject.values, subject.opacity[band.number]),
         )
         yield f"{subject.quantity.key}_{band.stem}", figure
+
+
+def _draw_near(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Named:
+    """All rigs and bands around the ego."""
+    several = len(subject.values) > 1
+    panels = {
+        f"{rig}, {band.name}, {band.z}" if several else f"{band.name}, {band.z}": (rig, band)
+        for rig in subject.values
+        for band in bands
+    }
+    opacity = {heading: band.opacity(subject) for heading, (_, band) in panels.items()}
+    figure = draw_side_by_side(
+        {heading: subject.values[rig][band.number] for heading, (rig, band) in panels.items()},
+        grid,
+        subject.scale,
+        title=f"{capitalised(subject.quantity.title)}, near the ego",
+        subtitle=subject.conditions,
+        ego_outline_m=setting.ego_outline_m,
+        sensors={heading: setting.sensors.get(rig, ()) for heading, (rig, _) in panels.items()},
+        directions=False,
+        unknown=subject.unknown,
+        opacity={heading: each for heading, each in opacity.items() if each is not None},
+    )
+    return f"near_{subject.quantity.key}", figure
 
 
 def _draw_differences(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[Named]:

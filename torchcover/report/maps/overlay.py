@@ -17,8 +17,9 @@ from numpy.typing import NDArray
 from torchcover.geometry import euler_from_rotation
 from torchcover.report.maps.sheet import Sheet
 
-# Okabe and Ito's colours, which the colour-blind can tell apart.
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+# Okabe and Ito's colours, which the colour-blind can tell apart; then all of them darker, then lighter.
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#777777")
+SHADES = ((1.0, 0.0), (0.5, 0.0), (0.5, 0.5))
 ARROW_POINTS = 20.0
 NUMBER_POINTS = 24.0
 OVERLAP_POINTS = 9.0
@@ -96,6 +97,18 @@ class SensorView:
         return inside
 
 
+def sensor_colour(at: int) -> str:
+    """The colour of a sensor by its number, from 0 on: no other of the first 21 has it.
+
+    Example:
+        >>> sensor_colour(0), sensor_colour(7), sensor_colour(14)
+        ('#0072b2', '#003959', '#80b9d9')
+    """
+    share, white = SHADES[at // len(COLOURS) % len(SHADES)]
+    red_green_blue = np.array([int(COLOURS[at % len(COLOURS)][digit : digit + 2], 16) for digit in (1, 3, 5)])
+    return "#" + "".join(f"{value:02x}" for value in np.rint(share * red_green_blue + 255 * white).astype(int).tolist())
+
+
 def draw_ego(axes: Axes, outline_m: NDArray[np.floating]) -> list[Artist]:
     """Fill the ego's outline.
 
@@ -139,8 +152,15 @@ def draw_sensors(sheet: Sheet, sensors: Sequence[SensorView], *, named: bool = T
         return [Line2D([], [], linestyle="none", marker="o", label="sensor, with its direction", **DOT), view]
     if len(sensors) > 1:
         _draw_numbers(sheet, sensors)
-    numbers = [f"{number}  " if len(sensors) > 1 else "" for number in range(1, len(sensors) + 1)]
-    return [*(_legend_entry(sheet, *pair) for pair in zip(numbers, sensors, strict=True)), view]
+    marks = [f"${number}$" if len(sensors) > 1 else "o" for number in range(1, len(sensors) + 1)]
+    return [*(_legend_entry(sheet, *pair) for pair in zip(marks, sensors, strict=True)), view]
+
+
+def draw_places(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
+    """Draw each sensor as a dot, and nothing over the cells around it; returns legend entries."""
+    for sensor in sensors:
+        sheet.axes.plot(sensor.x_m, sensor.y_m, linestyle="none", marker="o", zorder=5, **DOT)
+    return [Line2D([], [], linestyle="none", marker="o", label="sensor", **DOT)] if sensors else []
 
 
 def draw_sectors(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
@@ -155,7 +175,7 @@ def draw_sectors(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
     """
     entries: list[Artist] = []
     for at, sensor in enumerate(sensors):
-        colour = COLOURS[at % len(COLOURS)]
+        colour = sensor_colour(at)
         _draw_wedge(sheet, sensor, facecolor=(colour, 0.3), edgecolor=colour, linewidth=1.0)
         entries.append(Patch(facecolor=(colour, 0.3), edgecolor=colour, label=f"field of view: {sensor.name}"))
     return entries
@@ -207,11 +227,14 @@ def _places(sheet: Sheet, sensors: Sequence[SensorView]) -> dict[tuple[float, fl
     return places
 
 
-def _legend_entry(sheet: Sheet, number: str, sensor: SensorView) -> Artist:
+def _legend_entry(sheet: Sheet, mark: str, sensor: SensorView) -> Artist:
     (left, right), (bottom, top) = sheet.axes.get_xlim(), sheet.axes.get_ylim()
     inside = left <= sensor.x_m <= right and bottom <= sensor.y_m <= top
-    label = f"{number}{sensor.name}{'' if inside else ' (beyond the map)'}"
-    return Line2D([], [], linestyle="none", marker="o", label=label, **DOT)
+    label = f"{sensor.name}{'' if inside else ' (beyond the map)'}"
+    style = (
+        DOT if mark == "o" else {"color": "black", "markeredgewidth": 0, "markersize": 3.5 * len(mark.strip("$")) + 2.5}
+    )
+    return Line2D([], [], linestyle="none", marker=mark, label=label, **style)
 
 
 def _ahead(sheet: Sheet, sensor: SensorView, points: float) -> tuple[float, float]:

@@ -22,6 +22,8 @@ MAX_PAPER_IN = (14.0, 8.75)
 # Between maps on one paper, with room for the outer labels of two axes; below, for a heading.
 BESIDE_IN = 0.6
 BELOW_IN = 0.4
+# For a heading and the numbers of an axis.
+LABELS_IN = 0.55
 DOTS_PER_INCH = 150
 # Beyond this, cells are smaller than pixels and are averaged.
 MAX_DOTS_PER_INCH = 300
@@ -112,27 +114,25 @@ def _label(axes: Axes, *, left: bool, lowest: bool) -> None:
     axes.tick_params(labelbottom=lowest, labelleft=left)
 
 
-def stack_views(x: Bounds, heights: Sequence[Bounds], *, width_in: float) -> tuple[Figure, list[Axes]]:
-    """Empty views in metres without cells, below each other, all with the same x axis and in equal metres.
+def stack_views(views: Sequence[tuple[Bounds, Bounds]], *, width_in: float) -> tuple[Figure, list[Axes]]:
+    """Empty views in metres without cells, below each other, each in equal metres on both axes.
 
     Args:
-        x: Bounds of the axis to the right, in metres.
-        heights: Bounds of the axis upwards in each view, from the top.
+        views: Bounds of the axis to the right, and of that upwards, in metres; from the top.
         width_in: Width in inches.
 
     Returns:
         The paper, and the views from the top.
     """
-    inches_per_metre = width_in / (x[1] - x[0])
-    heights_in = [inches_per_metre * (high - low) for low, high in heights]
-    paper_in = sum(heights_in) + BELOW_IN * (len(heights) - 1)
+    heights_in = [width_in * (y[1] - y[0]) / (x[1] - x[0]) for x, y in views]
+    paper_in = sum(heights_in) + LABELS_IN * (len(heights_in) - 1)
     figure = Figure(figsize=(width_in, paper_in), dpi=DOTS_PER_INCH)
-    top_in, views = paper_in, []
-    for bounds, height_in in zip(heights, heights_in, strict=True):
+    top_in, axes = paper_in, []
+    for (x, y), height_in in zip(views, heights_in, strict=True):
         place = (0.0, (top_in - height_in) / paper_in, 1.0, height_in / paper_in)
-        views.append(figure.add_axes(place, xlim=x, ylim=bounds))
-        top_in -= height_in + BELOW_IN
-    return figure, views
+        axes.append(figure.add_axes(place, xlim=x, ylim=y))
+        top_in -= height_in + LABELS_IN
+    return figure, axes
 
 
 def write_title(axes: Axes, title: str, subtitle: str, lift_points: float = 0.0) -> None:

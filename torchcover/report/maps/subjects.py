@@ -47,14 +47,21 @@ def subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
         coverages: By the name of the rig; one, or several that are paired.
     """
     first = next(iter(coverages.values()))
-    of_cells = [quantity.key for quantity in first.quantities]
-    of_surface = [by_area(quantity).key for quantity in first.quantities]
-    others = [key for key in first.layers if key not in (*of_cells, *of_surface)]
     if first.measure == "area":
         yield from _of_surface(coverages)
-    for key in others if first.measure == "area" else (*of_cells, *others):
-        values = {name: coverage.layers[key].values for name, coverage in coverages.items()}
-        yield _subject(first.layers[key].quantity, values, scale_of, NEVER_PROBED, _conditions(first))
+    for quantity, by_surface in quantities_shown(first):
+        if not by_surface:
+            values = {name: coverage.layers[quantity.key].values for name, coverage in coverages.items()}
+            yield _subject(quantity, values, scale_of, NEVER_PROBED, _conditions(first))
+
+
+def quantities_shown(coverage: Coverage) -> list[tuple[Quantity, bool]]:
+    """The quantities of the measure, then those of other aggregations, and whether each is over the visible surface."""
+    of_surface = [by_area(quantity) for quantity in coverage.quantities]
+    of_both = {quantity.key for quantity in (*coverage.quantities, *of_surface)}
+    of_measure = of_surface if coverage.measure == "area" else coverage.quantities
+    others = [layer.quantity for key, layer in coverage.layers.items() if key not in of_both]
+    return [*((one, coverage.measure == "area") for one in of_measure), *((one, False) for one in others)]
 
 
 def error_subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:

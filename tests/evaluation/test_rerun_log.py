@@ -1,0 +1,69 @@
+"""The recording for the Rerun viewer: what is in the file, read back."""
+
+import numpy as np
+import pytest
+import rerun as rr
+import torch
+
+import torchcover
+from torchcover.data import Frame
+from torchcover.detection import Boxes
+from torchcover.evaluation import survey_target
+from torchcover.evaluation.rerun_log import MOST_POINTS, RerunLog, write_target
+from torchcover.simulation import Rig
+from torchcover.targets import Raster
+
+
+def read(path) -> dict[str, list]:
+    """Path of an entity -> its chunks."""
+    chunks: dict[str, list] = {}
+    for chunk in rr.chunk.RrdReader(path).stream():
+        chunks.setdefault(str(chunk.entity_path), []).append(chunk.to_record_batch())
+    return chunks
+
+
+def column(batches, name: str) -> list:
+    return [row for batch in batches if name in batch.schema.names for row in batch.column(name).to_pylist()]
+
+
+def test_steps_hold_clouds_coloured_by_radius_and_boxes(tmp_path):
+    log = RerunLog(tmp_path / "run.rrd")
+    car = Boxes(torch.tensor([[10.0, 2.0, 0.75]]), torch.tensor([[4.0, 2.0, 1.5]]), torch.tensor([np.pi]), ids=("a",))
+    near_and_far = torch.tensor([[0.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    for index in (3, 5):
+        log.update(Frame({"a b": torch.zeros(1, 3)}, near_and_far, index, "f", boxes=car))
+    log.update(Frame({"a b": torch.rand(3 * MOST_POINTS, 3)}, near_and_far, 6, "f"))
+    result = torchcover.evaluate("front_roof_32", steps=1, rays=1024, cell_m=1.0)
+    log.finish(result)
+    found = read(tmp_path / "run.rrd")
+    points, reference = found["/a\\ b/points"], found["/a\\ b/reference\\ by\\ radius"]
+    assert sorted(column(points, "step")) == [3, 5, 6]
+    assert sorted(len(row) for row in column(points, "Points3D:positions")) == [1, 1, MOST_POINTS]
+    seen, unseen = column(reference, "Points3D:colors")[0]
+    assert seen >> 8 == 0xFDE724  # the ends of viridis: 0 m, and 3 m or more
+    assert unseen >> 8 == 0x440154
+    assert column(found["/boxes"], "Boxes3D:half_sizes")[0] == [[2.0, 1.0, 0.75]]
+    assert np.allclose(column(found["/boxes"], "Boxes3D:quaternions")[0], [[0, 0, 1, 0]], atol=1e-6)
+    assert len(column(found["/front_roof_32/sensors/roof"], "LineStrips3D:strips")[0]) == 6
+    (corners,) = column(found["/front_roof_32/radius/ground"], "Mesh3D:vertex_positions")
+    assert len(corners) == 4 * int(result.coverage.radius[0].isfinite().sum())
+    assert "/ego" in found
+
+
+def test_a_target_is_written_with_the_line_where_it_is_first_seen(tmp_path):
+    seen = survey_target("front_roof_128", "dog", raster=Raster((2.0, 7.0), (-2.0, 2.0), 1.0))
+    write_target(seen, Rig.load("front_roof_128").sensors, tmp_path / "new" / "target.rrd")
+    found = read(tmp_path / "new" / "target.rrd")
+    (corners,) = column(found["/dog_57cm/seen"], "Mesh3D:vertex_positions")
+    assert len(corners) == 4 * int((~np.isnan(seen.seen)).sum())
+    strips = column(found["/dog_57cm/first\\ seen"], "LineStrips3D:strips")[0]
+    assert sum(map(len, strips)) <= int((~np.isnan(seen.first_seen_m()).any(axis=1)).sum())
+    assert strips
+
+
+def test_another_suffix_and_several_processes_are_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"ends in \.rrd"):
+        RerunLog(tmp_path / "run.txt")
+    log = RerunLog(tmp_path / "run.rrd")
+    with pytest.raises(ValueError, match="without torchrun"):
+        log.merge_state(log)

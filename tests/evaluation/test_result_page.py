@@ -1,0 +1,82 @@
+"""The page of a result: what is on it, and that its rigs can be read back."""
+
+import html
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+import torchcover
+from torchcover.evaluation import save_targets, survey_target
+from torchcover.evaluation.result_page import page_of, rig_document
+from torchcover.simulation import Rig
+from torchcover.targets import Raster, Requirements, check
+
+NASTY = "<script>alert(1)</script>"
+
+
+class Text(HTMLParser):
+    """All words of a page that a reader sees."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.words: list[str] = []
+        self.tags: list[str] = []
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+
+    def handle_data(self, data):
+        if not self.tags or self.tags[-1] not in ("script", "style"):
+            self.words.append(data)
+
+
+@pytest.fixture(scope="module")
+def result():
+    rig = Rig.load("front_roof_32")
+    named = rig.model_copy(update={"name": NASTY})
+    return torchcover.compare([named, rig], steps=2, rays=1024, cell_m=1.0, redundancy=True)
+
+
+@pytest.mark.usefixtures("blank_maps")
+def test_the_page_says_what_the_table_says_and_where_it_comes_from(result, tmp_path):
+    assert tmp_path / "report.html" in result.save(tmp_path)
+    text = Text((tmp_path / "report.html").read_text(encoding="utf-8"))
+    words = " ".join(text.words)
+    assert text.tags.count("script") == 3
+    assert NASTY in words
+    for row in result.table.rows[NASTY]:
+        assert row.region.name in words
+    for fact in ("courtyard", torchcover.__version__, "rays that end on the ego itself", "seed", "seconds"):
+        assert fact in words
+
+
+def test_the_page_has_what_was_asked_for(result):
+    page = page_of(result)
+    assert [line.name for line in page.outlines] == [region.name for region in result.regions]
+    quantities = dict.fromkeys(one.quantity for one in page.maps)
+    assert "sensors that see within 0.4 m" in quantities
+    assert "mean blind spot radius, without roof" in quantities
+    assert {one.rig for one in page.maps} == set(result.coverages)
+
+
+@pytest.mark.parametrize("name", ["edgar", "kitti_cameras", "place3d_pyramid", "waymo"])
+def test_the_rig_on_the_page_can_be_read_back(name, tmp_path):
+    rig = Rig.load(name)
+    text = html.unescape(html.escape(rig_document(name, rig.sensors)))
+    (tmp_path / "rig.yaml").write_text(text, encoding="utf-8")
+    again = Rig.load(tmp_path / "rig.yaml")
+    assert [sensor.content() for sensor in again.sensors] == [sensor.content() for sensor in rig.sensors]
+
+
+def test_the_page_of_a_target_names_verdicts_and_draws_where_it_is_first_seen(tmp_path):
+    seen = survey_target("front_roof_128", "dog", raster=Raster((-6.0, 6.0), (-4.0, 4.0), 1.0))
+    asked = Requirements.model_validate({"requirements": [{"within_m": 1.0, "points": 5}]})
+    files = save_targets(seen, tmp_path, check(asked, seen), Rig.load("front_roof_128").sensors)
+    assert tmp_path / "report.html" in files
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    words = " ".join(Text(page).words)
+    assert "FAIL" in words
+    assert "front_roof_128: would it see dog_57cm?" in words
+    assert len(re.findall("first seen, with 5 points", page)) == 4

@@ -1,0 +1,321 @@
+"""The page: what a browser shows of it, what is in the file, and how exact its numbers are."""
+
+import base64
+import hashlib
+import html
+import json
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover.coverage import BevGrid, Coverage, CoverageMetric
+from torchcover.coverage.quantity import RADIUS
+from torchcover.report import Line, Page, PageMap, PageRig, PageTable, SensorView, Words, maps_of, page_html, scale_of
+from torchcover.report.page.codes import CellBytes, decoded, encoded
+from torchcover.report.page.content import Array
+from torchcover.report.page.fitting import fitted
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+NASTY = "</script><script>document.title='broken'</script>"
+GRID = BevGrid(x=(-8.0, 12.0), y=(-5.0, 5.0), cell=1.0)
+EGO = np.array([[2.0, 1.0], [-2.0, 1.0], [-2.0, -1.0], [2.0, -1.0]])
+SENSOR = SensorView("<b>front</b>", np.eye(4), 90.0, (-10.0, 10.0), 8.0)
+SCALE = scale_of(RADIUS, torch.tensor([4.0]))
+TITLE = "mean blind spot radius, by area"
+
+# What a user does, and what is read then; `opened` is the page's own promise.
+SCRIPT = """
+(async () => {
+  const found = {}, page = await opened, map = document.getElementById("map");
+  const text = (id) => document.getElementById(id).textContent;
+  const point = (kind, x, y) => {
+    const [offsetX, offsetY] = page.view.toPixel(x, y), box = map.getBoundingClientRect();
+    const place = { clientX: box.left + offsetX, clientY: box.top + offsetY };
+    map.dispatchEvent(new PointerEvent(kind, { ...place, pointerId: 1 }));
+  };
+  map.setPointerCapture = () => {};
+  const choose = (id, index) => {
+    document.getElementById(id).selectedIndex = index;
+    document.getElementById(id).dispatchEvent(new Event("change"));
+  };
+  const press = (key) => map.dispatchEvent(new KeyboardEvent("keydown", { key, cancelable: true }));
+  const menu = (id) => [...document.getElementById(id).options].map((one) => one.textContent);
+  found.menus = ["quantity", "band", "rig", "view"].map(menu);
+  point("pointermove", 3.6, 2.4);
+  found.hover = text("readout");
+  found.label = map.getAttribute("aria-label");
+  found.edge = [-5.5, -4.5].map((x) => { point("pointermove", x, 2.4); return text("readout"); });
+  point("pointermove", 100.5, 100.5);
+  found.beyond = text("readout");
+  choose("band", 1);
+  point("pointermove", 3.6, 2.4);
+  found.other_band = text("readout");
+  choose("rig", 1);
+  found.other_rig = text("readout");
+  choose("quantity", 1);
+  found.kept = ["quantity", "band", "rig"].map((id) => document.getElementById(id).selectedIndex);
+  found.other_quantity = text("readout");
+  choose("rig", 2);
+  found.difference = text("readout");
+  found.drawn = page.shown(page.choice, true).values[7 * 20 + 11];
+  found.difference_legend = text("legend");
+  choose("quantity", 0); choose("band", 0); choose("rig", 0);
+  const squares = map.toDataURL();
+  document.getElementById("single").click();
+  found.single = squares !== map.toDataURL();
+  const centre = [...page.view.centre];
+  point("pointerdown", 0, 0); point("pointermove", 1, 0.5); point("pointerup", 1, 0.5);
+  found.dragged = centre.map((value, axis) => page.view.centre[axis] - value);
+  press("0");
+  const [far] = [page.view.metres, press("+")];
+  found.closer = far / page.view.metres;
+  const before = page.view.centre[0];
+  press("ArrowRight");
+  found.keyed = [page.view.centre[0] > before, text("readout")];
+  const ends = () => [...document.querySelectorAll("#bar .ticks span")].map((one) => +one.textContent);
+  choose("view", 2);
+  const [whole] = [ends(), choose("view", 1)];
+  found.ends = [whole, ends()];
+  found.gallery = [...document.querySelectorAll("#gallery figcaption")].map((one) => one.textContent);
+  document.querySelectorAll("#gallery button")[4].click();
+  found.from_gallery = map.getAttribute("aria-label");
+  found.title = document.title;
+  found.scripts = document.scripts.length;
+  found.bold = document.querySelectorAll("b").length;
+  const pre = document.createElement("pre");
+  pre.id = "found";
+  pre.textContent = JSON.stringify(found);
+  document.body.append(pre);
+})();
+"""
+
+
+def browsed(page: str, path, script: str = "") -> tuple[str, list[str]]:
+    """The page as a browser has it in the end, and what it wrote to its console."""
+    if script:
+        own = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+        page = page.replace("script-src 'sha256-", f"script-src 'sha256-{own}' 'sha256-", 1)
+        page = page.replace("</body>", f"<script>{script}</script></body>")
+    path.write_text(page, encoding="utf-8")
+    options = ["--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--window-size=1300,1000"]
+    logs = ["--enable-logging=stderr", "--virtual-time-budget=20000", "--dump-dom"]
+    profile = f"--user-data-dir={path.parent / 'profile'}"
+    command = [CHROMIUM, *options, *logs, profile, path.as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    return done.stdout, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+
+
+def page_of(coverages, **more) -> Page:
+    rigs = [PageRig(name, [SENSOR], f"name: {name}") for name in coverages]
+    table = PageTable(NASTY, ["region", "radius"], [[Words(NASTY), Words("1.0", "best")]], notes=[NASTY])
+    given = {"tables": [table], "rigs": rigs, "ego_outline_m": EGO, "facts": {NASTY: {NASTY: NASTY}}, **more}
+    outlines = [Line(NASTY, np.array([[0.0, 0.0], [5.0, 0.0], [5.0, 5.0]]))]
+    return Page(NASTY, NASTY, maps=list(maps_of(coverages)), outlines=outlines, **given)
+
+
+def over_surface(size: int, points) -> Coverage:
+    """So many points of a rig in each of 16 steps, against the same surface points: many cells have errors."""
+    metric = CoverageMetric(GRID, blocks=16, square_metres=True)
+    for index in range(16):
+        m2 = 0.1 + 0.8 * torch.rand(400, generator=torch.Generator().manual_seed(index))
+        metric.update(points(size, 100 + index), points(400, 1000 + index), weights=m2, index=index)
+    return metric.compute()
+
+
+@pytest.fixture(scope="module")
+def named(points):
+    """A rig whose name is markup, and another."""
+    return {NASTY: over_surface(100, points), "many": over_surface(400, points)}
+
+
+@pytest.fixture(scope="module")
+def seen(named, tmp_path_factory):
+    """What a browser shows of two rigs, and its console."""
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here: nobody looks at the page")
+    dom, console = browsed(page_html(page_of(named)), tmp_path_factory.mktemp("page") / "page.html", SCRIPT)
+    found = re.search(r'<pre id="found">(.*?)</pre>', dom, re.DOTALL)
+    assert found, console
+    return json.loads(html.unescape(found[1])), console
+
+
+def numbers(words: str, unit: str) -> list[tuple[float, float]]:
+    """Every number and its error in this unit."""
+    found = re.findall(rf"(−?[\d.]+) ± ([\d.]+) {unit}(?=$|[; ])", words)
+    return [(float(value.replace("−", "-")), float(error)) for value, error in found]
+
+
+def close(said: tuple[float, float], value: float, error: float) -> bool:
+    """Four digits of the value, two of the error, each of them coded."""
+    return said[0] == pytest.approx(value, rel=6e-4) and said[1] == pytest.approx(error, rel=0.06)
+
+
+def test_a_browser_has_nothing_to_complain_about(seen):
+    assert seen[1] == []
+
+
+def test_the_hover_shows_the_cell_as_it_is_in_the_file(seen, named, tmp_path):
+    found, row, column = seen[0], 7, 11  # of (3.6, 2.4)
+    cells = []
+    for name, coverage in zip(("few", "many"), named.values(), strict=True):
+        coverage.save(tmp_path / f"{name}.npz")
+        with np.load(tmp_path / f"{name}.npz") as file:
+            keys = ("radius_area_m", "radius_area_m_error", "detection_area_0.4m", "detection_area_0.4m_error")
+            cells.append([file[key][:, row, column].tolist() for key in keys])
+    (radius, error, *_), (of_many, its_error, detection, detection_error) = cells
+    m2 = named["many"].area.totals()[0][0, row, column].item()
+    assert found["hover"].startswith("x 3 to 4 m, y 2 to 3 m: ")
+    assert found["label"] == f"{TITLE}, ground, z -0.5 to 0.5 m, {NASTY}"
+    assert close(*numbers(found["hover"], "m"), radius[0], error[0])
+    assert float(re.search("in all steps: ([0-9.]+)", found["hover"])[1]) == pytest.approx(m2, rel=6e-4)
+    unknown, known = found["edge"]  # nothing was ever probed behind x = -5 m
+    assert unknown.endswith(": unknown, no visible surface found")
+    assert "unknown" not in known
+    assert found["beyond"] == "x 100 to 101 m, y 100 to 101 m: beyond the grid"
+    assert close(*numbers(found["other_band"], "m"), radius[1], error[1])
+    assert close(*numbers(found["other_rig"], "m"), of_many[1], its_error[1])
+    assert close(*numbers(found["other_quantity"], "%"), 100 * detection[1], 100 * detection_error[1])
+
+
+def test_a_difference_says_what_both_are(seen, named):
+    few, many = named.values()
+    key, at = "detection_area_0.4m", (1, 7, 11)
+    values = [100 * one.layers[key].values[at].item() for one in (few, many)]
+    errors = [100 * one.errors[key][at].item() for one in (few, many)]
+    words = seen[0]["difference"]
+    difference, *each = numbers(words, "percentage points") + numbers(words, "%")
+    assert difference[0] == pytest.approx(values[1] - values[0], rel=2e-3)
+    assert seen[0]["drawn"] == pytest.approx(values[1] - values[0], rel=2e-3)
+    assert difference[1] == pytest.approx(np.hypot(*errors), rel=0.06)
+    assert close(each[0], values[1], errors[1])
+    assert close(each[1], values[0], errors[0])
+    assert f"blue: many is better; red: {NASTY} is better" in seen[0]["difference_legend"]
+
+
+def test_menus_offer_what_there_is_and_a_choice_stays(seen):
+    quantities, bands, rigs, views = seen[0]["menus"]
+    assert quantities == [TITLE, "detection within 0.4 m, by area"]
+    assert bands == ["ground, z -0.5 to 0.5 m", "obstacle, z 0.5 to 2 m"]
+    assert rigs == [NASTY, "many", f"many minus {NASTY}"]
+    assert views == ["near the ego", NASTY, "everything known"]
+    assert seen[0]["kept"] == [1, 1, 1]
+    assert len(seen[0]["gallery"]) == 12
+    assert seen[0]["from_gallery"] == f"{TITLE}, obstacle, z 0.5 to 2 m, many"
+
+
+def test_a_map_is_moved_and_read_by_pointer_and_by_keys(seen):
+    found = seen[0]
+    assert found["single"]
+    assert np.allclose(found["dragged"], [-1.0, -0.5], atol=0.05)
+    assert found["closer"] == pytest.approx(1.4)
+    moved, words = found["keyed"]
+    assert moved
+    assert words.startswith("x ")
+
+
+def test_lengths_have_the_colours_of_the_place_that_is_looked_at(seen, named):
+    whole, region = (ends[-1] for ends in seen[0]["ends"])
+    largest = max(coverage.layers["radius_area_m"].values.nan_to_num().max().item() for coverage in named.values())
+    assert 0 < region < whole <= 1.05 * largest
+
+
+def test_names_are_text(seen):
+    found = seen[0]
+    assert found["title"] == NASTY
+    assert found["scripts"] == 4  # content, cells, the page's, this one
+    assert found["bold"] == 0
+
+
+def test_a_page_is_one_file_that_asks_for_nothing(named):
+    text = page_html(page_of(named))
+    without_names = text.replace("http-equiv", "")
+    assert re.findall(r"(?:src|href)=|https?:|url\((?!#)|@import", without_names) == []
+    assert text.count("<script") == 3
+    assert "default-src 'none'" in text
+
+
+def test_a_page_without_maps_or_sensors(tmp_path):
+    text = page_html(Page("rig", "lead", rigs=[PageRig("rig")]))
+    assert "Nobody knows its sensors" in text
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here: nobody looks at the page")
+    dom, console = browsed(text, tmp_path / "page.html")
+    assert console == []
+    assert re.search(r'<section id="maps"[^>]* hidden', dom)
+
+
+@pytest.mark.parametrize("bits", [8, 16])
+@pytest.mark.parametrize(
+    "values",
+    [np.geomspace(1e-4, 300, 999), np.linspace(0, 100, 999), np.linspace(-5, 3, 999), np.full(9, 2.0), np.zeros(3)],
+    ids=["wide", "share", "signed", "alike", "nothing"],
+)
+def test_codes_keep_what_a_reader_can_read(values, bits):
+    values = np.append(values, [0.0, np.inf])
+    codes, scale = encoded(values, bits)
+    read = decoded(codes, bits, scale)
+    assert read[-2:].tolist() == [0.0, np.inf]
+    finite = values[:-1]
+    step = (np.log(3e6) if scale["log"] else np.ptp(finite)) / (2**bits - 3)
+    allowed = step / 2 * (np.abs(finite) if scale["log"] else 1.0) * 1.1 + 1e-12
+    assert (np.abs(read[:-1] - finite) <= allowed).all()
+
+
+def test_the_same_is_kept_once():
+    cells, values = CellBytes(), np.arange(200.0).reshape(10, 20)
+    first = cells.add(values, 16)
+    alone = len(cells.text())
+    assert cells.add(values, 16) == first
+    cells.add(values.copy(), 16)
+    assert len(cells.text()) == alone
+
+
+def noisy(rigs: int) -> list[PageMap]:
+    """Every cell of the usual grid known, and none like another."""
+    random = np.random.default_rng(0)
+
+    def one(quantity: str, band: str, rig: int, weights: Array) -> PageMap:
+        values = random.lognormal(0, 1, weights.shape)
+        return PageMap(
+            quantity,
+            band,
+            f"rig {rig}",
+            (-40.0, 160.0),
+            (-40.0, 40.0),
+            0.25,
+            values,
+            SCALE,
+            errors=values * random.uniform(0.01, 0.5, values.shape),
+            weights=weights,
+            full_weight=1.0,
+            sides=np.ones(weights.shape, dtype=np.int64),
+        )
+
+    each = {band: random.gamma(2, 1, (320, 800)) for band in ("ground", "obstacle")}
+    return [one(what, band, rig, w) for what in "ab" for band, w in each.items() for rig in range(rigs)]
+
+
+@pytest.mark.parametrize("rigs", [1, 3])
+def test_no_page_of_the_usual_grid_has_five_megabytes(rigs):
+    assert len(page_html(Page("rig", "lead", maps=noisy(rigs)))) < 5e6
+
+
+def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():
+    whole = noisy(1)[0]
+    known = replace(whole, values=np.where(np.arange(800) < 700, whole.values, np.nan))
+    (same,), silence = fitted([known])
+    assert same is known
+    assert silence == []
+    (coarse,), notes = fitted([known], most_bytes=3e5)
+    assert coarse.cell_m == 0.5
+    assert coarse.values.shape == (160, 400)
+    four = np.s_[10:12, 20:22]
+    assert coarse.values[5, 10] == pytest.approx(np.average(known.values[four], weights=known.weights[four]))
+    assert np.isnan(coarse.values[:, 350:]).all()
+    assert "Some maps show 2 x 2 cells as one" in notes[-1]
+    assert notes[-1] in page_html(Page("rig", "lead", maps=[known] * 9))

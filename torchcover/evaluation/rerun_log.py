@@ -1,0 +1,226 @@
+"""A run as a recording for the Rerun viewer: what the rig saw step by step, and what was measured."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib import colormaps
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchcover.coverage.quantity import RADIUS, by_area
+from torchcover.data import Frame
+from torchcover.detection import Boxes
+from torchcover.neighbors import blind_spot_radius
+from torchcover.report import ColourScale, SensorView, scale_of
+from torchcover.simulation import Sensor
+
+if TYPE_CHECKING:
+    from torchcover.evaluation.result import Result
+    from torchcover.targets import TargetMap
+
+# A viewer holds all steps in memory.
+MOST_POINTS = 50_000
+# Colours of points, from 0 to this radius.
+FAR_M = 3.0
+# Fields of view are drawn so far: their ranges would hide everything.
+FRUSTUM_M = 4.0
+RIM_POINTS = 33
+
+
+class RerunLog:
+    """Writes frames as they pass: an observer, for `evaluate(..., observers={"rerun": log})`; then `finish`.
+
+    Args:
+        path: The file, `.rrd`.
+
+    Raises:
+        ImportError: rerun-sdk is not installed.
+        ValueError: Another suffix.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self._stream = opened(path)
+
+    def update(self, frame: Frame) -> None:
+        """Write the clouds of a frame, the reference coloured by the radius of each rig, and the boxes."""
+        import rerun as rr
+
+        self._stream.set_time("step", sequence=frame.index)
+        for rig, cloud in frame.clouds.items():
+            self._stream.log([rig, "points"], rr.Points3D(_few(cloud), colors=[70, 120, 190]))
+            radius = blind_spot_radius(frame.reference, cloud, max_radius=FAR_M)
+            colours = coloured(_few(radius), ColourScale("radius", "m", "viridis_r", 0.0, FAR_M))
+            self._stream.log([rig, "reference by radius"], rr.Points3D(_few(frame.reference), colors=colours))
+        if frame.boxes is not None:
+            self._stream.log("boxes", _boxes(frame.boxes))
+
+    def compute(self) -> None:
+        """Nothing: what it knows is in the file."""
+
+    def merge_state(self, _: "RerunLog") -> None:
+        """Refuse.
+
+        Raises:
+            ValueError: Always: several processes cannot write one file.
+        """
+        raise ValueError("rerun: several processes cannot write one file; run it without torchrun")
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: a run that goes on writes the steps that are left."""
+        return {}
+
+    def load_state_dict(self, _: Mapping[str, Any]) -> None:
+        """As `state_dict`."""
+
+    def finish(self, result: "Result") -> None:
+        """Write the rigs and the maps of the radius, and close the file."""
+        if result.ego_outline_m is not None:
+            log_outline(self._stream, "ego", result.ego_outline_m)
+        for rig, sensors in result.sensors.items():
+            log_sensors(self._stream, rig, sensors)
+        coverages = result.coverages
+        key = (by_area(RADIUS) if result.table.measure == "area" else RADIUS).key
+        for rig, coverage in coverages.items():
+            layer, grid = coverage.layers[key], coverage.grid
+            scale = scale_of(layer.quantity, layer.values)
+            for name, values in zip(grid.heights, layer.values.cpu().numpy(), strict=True):
+                log_cells(self._stream, [rig, "radius", name], values, (grid.x[0], grid.y[0]), grid.cell, scale)
+        self._stream.disconnect()
+
+
+def write_target(seen: "TargetMap", sensors: Sequence[Sensor], path: str | Path) -> None:
+    """Write what a rig sees of a target, place by place, and where it is first seen.
+
+    Args:
+        seen: From `survey_target`.
+        sensors: Those of the rig.
+        path: The file, `.rrd`.
+
+    Raises:
+        ImportError: rerun-sdk is not installed.
+        ValueError: Another suffix.
+    """
+    import rerun as rr
+
+    stream, corner = opened(path), (seen.raster.x[0], seen.raster.y[0])
+    log_outline(stream, "ego", seen.vehicle_outline_m)
+    log_sensors(stream, seen.rig, sensors)
+    scale = ColourScale("steps with enough points", "%", "viridis", 0.0, 1.0)
+    log_cells(stream, [seen.target, "seen"], seen.seen, corner, seen.raster.step_m, scale)
+    first = seen.first_seen_m()
+    parts = np.split(first, np.flatnonzero(np.isnan(first).any(axis=1)))
+    strips = [_at_height(part[~np.isnan(part).any(axis=1)], 0.05) for part in parts]
+    stream.log([seen.target, "first seen"], rr.LineStrips3D([strip for strip in strips if len(strip) > 1]), static=True)
+    stream.disconnect()
+
+
+def opened(path: str | Path) -> Any:  # noqa: ANN401  (rerun is optional, so its types are not known)
+    """A stream into a new file.
+
+    Raises:
+        ImportError: rerun-sdk is not installed.
+        ValueError: Another suffix.
+    """
+    path = Path(path)
+    if path.suffix != ".rrd":
+        raise ValueError(f"rerun: a file that ends in .rrd is needed; got {path}")
+    try:
+        import rerun as rr
+    except ImportError as error:
+        raise ImportError(f"{path}: rerun-sdk is needed: pip install 'torchcover[rerun]'") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    stream = rr.RecordingStream("torchcover")
+    stream.save(path)
+    stream.log("", rr.ViewCoordinates.FLU, static=True)
+    return stream
+
+
+def log_outline(stream: Any, name: str, outline_m: NDArray[Any]) -> None:  # noqa: ANN401
+    """A closed line on the ground."""
+    import rerun as rr
+
+    stream.log(name, rr.LineStrips3D([_at_height(np.vstack([outline_m, outline_m[:1]]), 0.0)]), static=True)
+
+
+def log_sensors(stream: Any, rig: str, sensors: Sequence[Sensor]) -> None:  # noqa: ANN401
+    """Where sensors are, and the edges of what they see."""
+    import rerun as rr
+
+    from torchcover.evaluation.sensor_drawings import sensor_views
+
+    for view in sensor_views(sensors):
+        stream.log([rig, "sensors", view.name], rr.LineStrips3D(frustum(view)), static=True)
+
+
+def frustum(view: SensorView) -> list[NDArray[np.float64]]:
+    """Lines around a field of view, in the vehicle frame: two rims, and edges from the sensor where it is no full turn.
+
+    Example:
+        >>> view = SensorView("roof", np.eye(4), 360.0, (-10.0, 10.0), 50.0)
+        >>> [line.shape for line in frustum(view)]
+        [(33, 3), (33, 3)]
+    """
+    azimuth = np.deg2rad(np.linspace(-view.horizontal_fov_deg / 2, view.horizontal_fov_deg / 2, RIM_POINTS))
+    reach_m = min(FRUSTUM_M, view.range_m)
+    rims = []
+    for elevation in np.deg2rad(view.vertical_fov_deg):
+        flat = np.cos(elevation)
+        ahead = [flat * np.cos(azimuth), flat * np.sin(azimuth), np.full(RIM_POINTS, np.sin(elevation))]
+        rims.append(view.position_m + reach_m * np.stack(ahead, axis=1) @ view.vehicle_T_sensor[:3, :3].T)
+    if view.horizontal_fov_deg >= 360:
+        return rims
+    return [*rims, *(np.stack([view.position_m, rim[end]]) for rim in rims for end in (0, -1))]
+
+
+def log_cells(
+    stream: Any,  # noqa: ANN401
+    name: Iterable[str],
+    values: NDArray[Any],
+    corner_m: tuple[float, float],
+    cell_m: float,
+    scale: ColourScale,
+) -> None:
+    """Known cells as coloured squares on the ground."""
+    import rerun as rr
+
+    row, column = np.nonzero(~np.isnan(values))
+    low = np.array(corner_m) + cell_m * np.stack([column, row], axis=1)
+    around = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+    corners = (low[:, None] + cell_m * around).reshape(-1, 2)
+    two_triangles = np.array([[0, 1, 2], [0, 2, 3]])
+    faces = (4 * np.arange(len(row))[:, None, None] + two_triangles).reshape(-1, 3)
+    colours = coloured(values[row, column], scale).repeat(4, axis=0)
+    mesh = rr.Mesh3D(vertex_positions=_at_height(corners, 0.0), triangle_indices=faces, vertex_colors=colours)
+    stream.log(list(name), mesh, static=True)
+
+
+def coloured(values: NDArray[Any], scale: ColourScale) -> NDArray[np.uint8]:
+    """(N, 3) colours of values."""
+    share = np.clip((np.minimum(values, scale.high) - scale.low) / (scale.high - scale.low), 0.0, 1.0)
+    colours: NDArray[np.uint8] = colormaps[scale.colormap](share, bytes=True)[:, :3]
+    return colours
+
+
+def _boxes(boxes: Boxes) -> Any:  # noqa: ANN401
+    import rerun as rr
+
+    half = boxes.yaw_rad.cpu().numpy() / 2
+    xyzw = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
+    return rr.Boxes3D(
+        centers=boxes.centre_m.cpu().numpy(),
+        half_sizes=boxes.size_m.cpu().numpy() / 2,
+        quaternions=xyzw,
+        labels=boxes.categories,
+    )
+
+
+def _few(values: Tensor) -> NDArray[Any]:
+    """Every so-manieth, so that there are not too many."""
+    every = -(-len(values) // MOST_POINTS) or 1
+    return values[::every].cpu().numpy()
+
+
+def _at_height(points_m: NDArray[Any], z_m: float) -> NDArray[np.float64]:
+    return np.column_stack([points_m, np.full(len(points_m), z_m)])

@@ -1,0 +1,130 @@
+"""What a page is made of: tables, maps, rigs and facts with their names and units, whoever measured them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.report.maps.colours import NEVER_PROBED, ColourScale
+from torchcover.report.maps.overlay import SensorView
+from torchcover.report.renderers.layout import Words
+
+Bounds = tuple[float, float]
+Array = NDArray[np.floating]
+Sides = NDArray[np.integer]
+
+
+@dataclass(frozen=True)
+class PageTable:
+    """A table of words.
+
+    Args:
+        title: Above it; empty for none.
+        headings: Of its columns.
+        rows: Its cells; marked ones are bold.
+        words_first: How many columns are words, on the left; numbers follow, on the right.
+        notes: Below it.
+    """
+
+    title: str
+    headings: Sequence[str]
+    rows: Sequence[Sequence[Words]]
+    words_first: int = 1
+    notes: Sequence[str] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A line over a map, in metres in the vehicle frame.
+
+    Args:
+        name: What it is, for the legend.
+        points_m: (K, 2) x, y; NaN between two parts.
+    """
+
+    name: str
+    points_m: Array
+
+
+@dataclass(frozen=True, eq=False)
+class PageMap:
+    """One quantity of one rig in one band over the cells of a raster.
+
+    Args:
+        quantity: What the values are, without the unit.
+        band: Where: a height band, or a target.
+        rig: Whose.
+        x: Bounds of the raster forward in metres.
+        y: Bounds to the left.
+        cell_m: Side of a cell.
+        values: (Y, X) in the unit of the scale; NaN is unknown.
+        scale: What the colours mean: the same for all bands and rigs.
+        unknown: Why a cell is.
+        errors: (Y, X) standard errors.
+        weights: (Y, X) what each cell weighs where several are taken together.
+        weight_name: What the weights are, with the unit.
+        full_weight: That of an opaque cell; less is paler. 0 if all are alike.
+        sides: (Y, X) how many cells wide the square is that each cell is drawn in; a power of 2.
+        difference: Colours of the difference to the first rig; None for the first, and where nothing is compared.
+        lines: What is drawn over it.
+    """
+
+    quantity: str
+    band: str
+    rig: str
+    x: Bounds
+    y: Bounds
+    cell_m: float
+    values: Array
+    scale: ColourScale
+    unknown: str = NEVER_PROBED
+    errors: Array | None = None
+    weights: Array | None = None
+    weight_name: str = ""
+    full_weight: float = 0.0
+    sides: Sides | None = None
+    difference: ColourScale | None = None
+    lines: Sequence[Line] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class PageRig:
+    """A rig as a page shows it.
+
+    Args:
+        name: What tables and maps call it.
+        sensors: Its sensors, if they are known.
+        document: It as YAML; empty if nobody knows.
+    """
+
+    name: str
+    sensors: Sequence[SensorView] = ()
+    document: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Page:
+    """All that a page shows.
+
+    Args:
+        title: Its name.
+        lead: One line below.
+        tables: The numbers.
+        maps: In the order of the menus; differences are to the first rig.
+        rigs: Drawn on the ego, and as YAML.
+        ego_outline_m: (K, 2) corners x, y of the ego in metres.
+        outlines: Regions that the maps show, by name: (K, 2) corners x, y.
+        facts: Heading -> name -> what holds, such as settings.
+        more_tables: Below the facts, such as what was left out.
+    """
+
+    title: str
+    lead: str
+    tables: Sequence[PageTable] = ()
+    maps: Sequence[PageMap] = ()
+    rigs: Sequence[PageRig] = ()
+    ego_outline_m: Array | None = None
+    outlines: Sequence[Line] = ()
+    facts: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    more_tables: Sequence[PageTable] = ()

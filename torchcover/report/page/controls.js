@@ -1,0 +1,159 @@
+// What keys, pointers and menus do.
+
+const FURTHER = 1.4;
+
+class Controls {
+  constructor(page) {
+    Object.assign(this, { page, dragged: null });
+    for (const name of ["quantity", "band", "rig"]) {
+      part(name).addEventListener("change", (event) => this.choose(name, event.target.selectedIndex));
+    }
+    part("view").addEventListener("change", () => this.look());
+    for (const name of ["single", "fields"]) {
+      part(name).addEventListener("change", (event) => { page.state[name] = event.target.checked; page.refresh(); });
+    }
+    part("menus").addEventListener("submit", (event) => event.preventDefault());
+    part("recolour").addEventListener("click", () => { page.fitColours(); page.refresh(); });
+    part("closer").addEventListener("click", () => this.zoom(FURTHER));
+    part("farther").addEventListener("click", () => this.zoom(1 / FURTHER));
+    this.listen(part("map"));
+    new ResizeObserver(() => page.draw()).observe(part("map"));
+    this.fillMenus();
+    this.fillViews();
+  }
+
+  choose(name, index) {
+    const { page } = this, old = { band: page.band.name, rig: page.choice.name };
+    page.state[name] = index;
+    const kept = (choices, wanted) => Math.max(0, choices.findIndex((one) => one.name === wanted));
+    if (name === "quantity") page.state.band = kept(page.quantity.bands, old.band);
+    if (name !== "rig") page.state.rig = kept(page.band.rigs, old.rig);
+    this.fillMenus();
+    page.fitColours();
+    page.refresh();
+  }
+
+  fillMenus() {
+    const { page } = this;
+    const lists = { quantity: page.choices, band: page.quantity.bands, rig: page.band.rigs };
+    for (const [name, choices] of Object.entries(lists)) {
+      part(name).replaceChildren(...choices.map((one) => made("option", one.name)));
+      part(name).selectedIndex = page.state[name];
+    }
+  }
+
+  fillViews() {
+    part("view").replaceChildren(...[...this.page.content.views, { name: "everything known" }].map((one) => made("option", one.name)));
+    this.look();
+  }
+
+  look() {
+    const { page } = this, { views } = page.content, { selectedIndex } = part("view");
+    const { x, y } = selectedIndex < views.length ? views[selectedIndex] : page.content.rasters[page.choice.map.raster].known;
+    page.view.fit(x, y);
+    page.fitColours();
+    page.refresh();
+  }
+
+  zoom(factor, pixel) {
+    this.page.view.zoom(factor, pixel);
+    this.page.draw();
+  }
+
+  listen(canvas) {
+    const { page } = this, pixel = (event) => [event.offsetX, event.offsetY];
+    const point = (event) => { page.probe = page.view.toMetres(...pixel(event)); page.draw(); page.read(); };
+    canvas.addEventListener("pointerdown", (event) => { this.dragged = pixel(event); canvas.setPointerCapture(event.pointerId); });
+    canvas.addEventListener("pointerup", () => { this.dragged = null; });
+    canvas.addEventListener("pointermove", (event) => {
+      if (this.dragged) {
+        const [x, y] = pixel(event);
+        page.view.move(this.dragged[0] - x, y - this.dragged[1]);
+        this.dragged = [x, y];
+      }
+      point(event);
+    });
+    canvas.addEventListener("wheel", (event) => {
+      if (document.activeElement !== canvas && !event.ctrlKey) return;
+      event.preventDefault();
+      this.zoom(FURTHER ** (-Math.sign(event.deltaY)), pixel(event));
+    }, { passive: false });
+    canvas.addEventListener("keydown", (event) => this.press(event));
+  }
+
+  press(event) {
+    const { page } = this, step = 40;
+    const moves = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] };
+    if (moves[event.key]) page.view.move(...moves[event.key]);
+    else if (event.key === "+" || event.key === "=") page.view.zoom(FURTHER);
+    else if (event.key === "-") page.view.zoom(1 / FURTHER);
+    else if (event.key === "0") { part("view").selectedIndex = page.content.views.length; this.look(); }
+    else return;
+    event.preventDefault();
+    page.probe = [...page.view.centre];
+    page.draw();
+    page.read();
+  }
+}
+
+// Every map, small: to choose one, and on paper.
+function fillGallery(page, controls) {
+  const all = page.choices.flatMap((quantity, q) => quantity.bands.flatMap((band, b) => band.rigs.map((rig, r) => ({ quantity, band, rig, at: { quantity: q, band: b, rig: r } }))));
+  part("gallery").replaceChildren(...all.map(({ quantity, band, rig, at }) => {
+    const shown = page.shown(rig, false), button = made("button", "", { type: "button" }), figure = made("figure");
+    button.append(cropped(shown, page.content.ego), made("figcaption", `${quantity.name}, ${band.name}: ${rig.name}`));
+    button.addEventListener("click", () => {
+      Object.assign(page.state, at);
+      controls.fillMenus();
+      page.refresh();
+      part("map").scrollIntoView();
+    });
+    figure.append(button, barOf(shown.scale, page.content.luts));
+    return figure;
+  }));
+}
+
+// What is known of a map, on hatching.
+function cropped(shown, ego) {
+  const { raster } = shown, { x, y } = raster.known, canvas = made("canvas");
+  const left = Math.round((x[0] - raster.x[0]) / raster.cell), top = Math.round((raster.y[1] - y[1]) / raster.cell);
+  const columns = Math.round((x[1] - x[0]) / raster.cell), rows = Math.round((y[1] - y[0]) / raster.cell);
+  const larger = Math.max(1, Math.floor(700 / columns));
+  canvas.width = larger * columns; canvas.height = larger * rows;
+  const pen = canvas.getContext("2d");
+  pen.fillStyle = hatching(pen);
+  pen.fillRect(0, 0, canvas.width, canvas.height);
+  pen.imageSmoothingEnabled = false;
+  pen.drawImage(shown.image, left, top, columns, rows, 0, 0, canvas.width, canvas.height);
+  const pixel = (low, high) => (larger * (high - low)) / raster.cell;
+  pen.beginPath();
+  for (const corner of ego || []) pen.lineTo(pixel(x[0], corner[0]), pixel(corner[1], y[1]));
+  pen.closePath();
+  pen.fillStyle = "white"; pen.fill();
+  pen.strokeStyle = "black"; pen.stroke();
+  return canvas;
+}
+
+// On paper nothing can be opened.
+function printAll(page) {
+  let closed = [];
+  window.addEventListener("beforeprint", () => {
+    closed = [...document.querySelectorAll("details:not([open])")];
+    for (const one of closed) one.open = true;
+    page.draw();
+  });
+  window.addEventListener("afterprint", () => { for (const one of closed) one.open = false; page.draw(); });
+}
+
+async function start() {
+  const content = JSON.parse(part("content").textContent);
+  if (!content.maps.length) return null;
+  const bytes = await inflated(part("cells").textContent);
+  part("maps").hidden = false;
+  const page = new MapPage(content, bytes);
+  fillGallery(page, new Controls(page));
+  printAll(page);
+  return page;
+}
+
+const opened = start();

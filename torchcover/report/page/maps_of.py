@@ -1,0 +1,100 @@
+"""The maps of a page from what was measured: the cells themselves, as in `coverage.npz`."""
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchcover.coverage import BevGrid, Coverage, Layer
+from torchcover.report.maps.colours import NEVER_PROBED, difference_scale, scale_of
+from torchcover.report.maps.subjects import NOTHING_FOUND, quantities_shown
+from torchcover.report.maps.surface import square_sides
+from torchcover.report.page.content import Array, PageMap, Sides
+from torchcover.report.wording import UNITS, span
+
+
+def maps_of(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
+    """A map for each quantity, height band and rig; at last those of redundancy, of the rigs that have them.
+
+    Args:
+        coverages: By the name of the rig; one, or several that are paired.
+    """
+    first = next(iter(coverages.values()))
+    shown = quantities_shown(first)
+    surface = _weights(first) if first.measure == "area" else None
+    steps = Weights([_known(one) for one in first.probed_steps], "steps that probed it")
+    for quantity, by_surface in shown:
+        layers = {rig: coverage.layers[quantity.key] for rig, coverage in coverages.items()}
+        errors = {
+            rig: coverage.errors[quantity.key] for rig, coverage in coverages.items() if quantity.key in coverage.errors
+        }
+        yield from _of_quantity(layers, errors, (surface if by_surface else None) or steps, first.grid)
+    of_sensors = {rig: one.redundancy.layers for rig, one in coverages.items() if one.redundancy is not None}
+    for key in dict.fromkeys(key for layers in of_sensors.values() for key in layers):
+        having = {rig: layers[key] for rig, layers in of_sensors.items() if key in layers}
+        yield from _of_quantity(having, {}, surface or steps, first.grid)
+
+
+class Weights(NamedTuple):
+    """What a cell weighs, in each band; see `PageMap`."""
+
+    values: list[Array]
+    name: str
+    full: float = 0.0
+    sides: list[Sides] | None = None
+
+
+def _of_quantity(
+    layers: Mapping[str, Layer], errors: Mapping[str, Tensor], weights: Weights, grid: BevGrid
+) -> Iterator[PageMap]:
+    quantity = next(iter(layers.values())).quantity
+    factor = UNITS[quantity.unit].factor
+    values = {rig: factor * layer.values for rig, layer in layers.items()}
+    scale = scale_of(quantity, torch.stack(list(values.values())))
+    expected, *others = values.values()
+    differences = [_difference(one, expected) for one in others]
+    against = difference_scale(quantity, torch.stack(differences)) if differences else None
+    for band, (height, z) in enumerate(grid.heights.items()):
+        for at, rig in enumerate(values):
+            yield PageMap(
+                quantity=quantity.title,
+                band=f"{height}, z {span(z)}",
+                rig=rig,
+                x=grid.x,
+                y=grid.y,
+                cell_m=grid.cell,
+                values=_array(values[rig][band]),
+                scale=scale,
+                unknown=NEVER_PROBED if weights.sides is None else NOTHING_FOUND,
+                errors=factor * _array(errors[rig][band]) if rig in errors else None,
+                weights=weights.values[band],
+                weight_name=weights.name,
+                full_weight=weights.full,
+                sides=None if weights.sides is None else weights.sides[band],
+                difference=against if at else None,
+            )
+
+
+def _difference(values: Tensor, expected: Tensor) -> Tensor:
+    """Where both are infinite there is no difference, rather than NaN, which means unknown."""
+    return (values - expected).where(values != expected, 0.0)
+
+
+def _weights(first: Coverage) -> Weights | None:
+    """Square metres; the rigs share the reference points, and so the square metres."""
+    if first.area is None:
+        return None
+    m2 = [_known(one) for one in first.area.totals()[0]]
+    sides = [one.cpu().numpy() for one in square_sides(first.points, first.grid.cell)]
+    return Weights(m2, "m² of surface seen in all steps", first.counts["steps"] * first.grid.cell**2, sides)
+
+
+def _known(counts: Tensor) -> Array:
+    array = _array(counts)
+    return np.where(array > 0, array, np.nan)
+
+
+def _array(values: Tensor) -> Array:
+    return values.detach().cpu().double().numpy()
