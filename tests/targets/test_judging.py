@@ -143,7 +143,7 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
     seen = seen_where(lambda x, y: np.abs(x) + 0.5, raster=Raster((-3.0, 3.0), (-2.0, 2.0), 1.0))
     verdicts = judged(seen, {"within_m": 1, "points": 1})
     names = [path.name for path in save_targets(seen, tmp_path, verdicts)]
-    assert names == ["targets.csv", "targets.npz", "targets.png", "summary.json"]
+    assert names == ["targets.csv", "targets.npz", "report.html", "targets.png", "summary.json"]
     with np.load(tmp_path / "targets.npz") as arrays:
         np.testing.assert_array_equal(arrays["points"], seen.points)
         np.testing.assert_array_equal(arrays["first_seen_m"], seen.first_seen_m())
