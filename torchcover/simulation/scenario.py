@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import NonNegativeFloat, PlainValidator, PositiveFloat, TypeAdapter, ValidationInfo, model_validator
 
 from torchcover.geometry import BoundingBox
-from torchcover.simulation.bodies import Body, Shape, VehicleShape, mover_mesh
+from torchcover.simulation.bodies import Body, Shape, VehicleShape, called, mover_mesh
 from torchcover.simulation.documents import Document, PathBeside, Pose, load_document
 from torchcover.simulation.kinds import TRAFFIC
 from torchcover.simulation.shapes import Mesh
@@ -17,7 +17,7 @@ from torchcover.simulation.traffic.procedural import Procedural
 from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World, steps_of
 
-# What carries the rig in procedural traffic, unless the document says otherwise.
+# What carries a rig that names no vehicle, unless the document says otherwise.
 DEFAULT_EGO = VehicleShape(type="vehicle", vehicle="suv")
 
 
@@ -36,12 +36,12 @@ class Mover(Document):
 
     Args:
         shape: Its body. Its frame follows from it: the origin lies on the ground under the centre of the bounding box,
-            x forward, z up.
+            x forward, z up. Only the ego may leave it open: see `with_ego`.
         pose: Where it rests in the world.
         trajectory: File of its trajectory instead; relative to the document.
     """
 
-    shape: Shape
+    shape: Shape | None = None
     pose: Pose | None = None
     trajectory: PathBeside | None = None
 
@@ -57,7 +57,11 @@ class Mover(Document):
             trajectory = read_trajectory(self.trajectory)
         else:
             trajectory = Trajectory.from_poses([0.0], (self.pose or Pose()).matrix()[None])
-        return Actor(name, category, mover_mesh(name, self.shape), trajectory)
+        return Actor(name, category, self.mesh(name, category), trajectory)
+
+    def mesh(self, name: str, category: str) -> Mesh:
+        """Its body in its own frame; an SUV where that was left open."""
+        return mover_mesh(name, self.shape or DEFAULT_EGO, category)
 
 
 class NamedMover(Mover):
@@ -70,6 +74,7 @@ class NamedMover(Mover):
 
     name: str
     category: str
+    shape: Shape
 
 
 class Scenario(Document):
@@ -78,7 +83,8 @@ class Scenario(Document):
     Args:
         name: What tables and maps call it.
         description: What it is.
-        ego: The vehicle that carries the rig; in procedural traffic its shape only, an SUV if not given.
+        ego: The vehicle that carries the rig; in procedural traffic its shape only. Without a shape, the rig's vehicle
+            takes its place, or an SUV.
         bodies: What never moves, in the world frame.
         actors: What moves, or may be recognised.
         boxes: File of recorded boxes that are actors too; relative to the document.
@@ -87,8 +93,8 @@ class Scenario(Document):
         traffic: A procedure of a kind in `TRAFFIC`, which makes bodies, actors, the ego's drive, and the times.
 
     Example:
-        >>> Scenario.load("courtyard").ego.shape.type
-        'vehicle'
+        >>> Scenario.load("courtyard").ego.pose.x_m
+        0.0
     """
 
     name: str
@@ -176,7 +182,17 @@ class Scenario(Document):
             FileNotFoundError: A mesh or vehicle file is missing.
             ValueError: A mesh cannot be used.
         """
-        return mover_mesh("ego", self.ego.shape if self.ego else DEFAULT_EGO)
+        return (self.ego or Mover()).mesh("ego", "ego")
+
+    @property
+    def ego_name(self) -> str:
+        """What that body is called: the name of a vehicle or of a file, or its kind of shape.
+
+        Example:
+            >>> Scenario.load("courtyard").ego_name
+            'suv'
+        """
+        return called((self.ego and self.ego.shape) or DEFAULT_EGO)
 
     def ego_box(self) -> BoundingBox:
         """The bounding box of that body.
