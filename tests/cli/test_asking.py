@@ -137,3 +137,9 @@ def test_where_nothing_was_seen_no_sensor_is_called_dispensable(evaluate):
     code, printed, _ = evaluate("--region", "sky:2,6,-2,2", "--height", "sky:50,60", "--redundancy")
     assert (code, "unknown: nothing that was asked about was seen." in " ".join(printed.split())) == (0, True)
     assert "No single point of failure" not in printed
+
+
+def test_where_nothing_is_detected_no_sensor_is_called_dispensable_either(evaluate):
+    code, printed, _ = evaluate("--region", "ahead:3,9,-3,3", "--threshold", "1e-9", "--redundancy")
+    assert (code, "Nothing of what was asked about is detected" in " ".join(printed.split())) == (0, True)
+    assert "No single point of failure" not in printed
