@@ -139,7 +139,9 @@ def test_where_nothing_was_seen_no_sensor_is_called_dispensable(evaluate):
     assert "No single point of failure" not in printed
 
 
-def test_where_nothing_is_detected_no_sensor_is_called_dispensable_either(evaluate):
-    code, printed, _ = evaluate("--region", "ahead:3,9,-3,3", "--threshold", "1e-9", "--redundancy")
+def test_where_nothing_is_detected_no_sensor_is_called_dispensable_either(torchcover, worlds):
+    scene = ("--scenario", worlds / "yard.yaml", "--out", worlds / "out", "--steps", 2, "--rays", 1024)
+    asked = ("--cell", 0.5, "--region", "ahead:2,6,-2,2", "--threshold", 1e-9, "--redundancy")
+    code, printed, _ = torchcover("evaluate", worlds / "both.yaml", *scene, *asked)
     assert (code, "Nothing of what was asked about is detected" in " ".join(printed.split())) == (0, True)
     assert "No single point of failure" not in printed
