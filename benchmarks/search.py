@@ -76,7 +76,9 @@ def cases():
         "paper's, 1024 x 1024": PaperReference(),
     }
     for name, sensor in references.items():
-        frame = SimulatedFrames("urban", rigs={rig: rig for rig in RIGS}, steps=1, reference_sensor=sensor)[0]
+        frame = SimulatedFrames(
+            "urban", rigs={rig: rig for rig in RIGS}, steps=1, reference_sensor=sensor, vehicle="suv"
+        )[0]
         for rig in RIGS:
             yield f"{rig}, {name}", frame.reference.numpy(), frame.cloud_of(rig).numpy()
     random = np.random.default_rng(0)

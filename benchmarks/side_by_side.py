@@ -25,7 +25,7 @@ RUNS = {
     "workers": ["evaluate", "nuscenes_cameras", "--scenario", "highway", "--steps", "2", "--workers", "2"],
     "recording": ["evaluate", "--frames", "recording"],
     "comparison": ["compare", "front_roof_32", "front_grille_128", "--scenario", "urban", "--steps", "9"],
-    "thresholds": ["compare", "kitti", "edgar", "--steps", "8", "--threshold", "0.4", "--threshold", "0.1"],
+    "thresholds": ["compare", "kitti", "hu2022_line", "--steps", "8", "--threshold", "0.4", "--threshold", "0.1"],
 }
 NOT_COMPARED = ("seconds", "torchcover", "left_out", "complete", "frames")
 # What the whole program starts with, in either checkout.

@@ -23,6 +23,8 @@ from torchcover.cli.app import app
 from torchcover.data import RegionsOfInterest, SimulatedFrames, collate_frames
 from torchcover.data.recordings.folder_settings import read_folder_settings
 from torchcover.simulation import Rig, Scenario
+from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.documents import load_document
 from torchcover.targets import Requirements
 
 ROOT = Path(__file__).parent.parent
@@ -143,7 +145,14 @@ def test_a_command_can_be_given(words):
 
 
 # Whatever reads a document of YAML.
-READERS = (Rig.load, Scenario.load, RegionsOfInterest.load, Requirements.load, read_folder_settings)
+READERS = (
+    Rig.load,
+    Scenario.load,
+    partial(load_document, Vehicle, "vehicles"),
+    RegionsOfInterest.load,
+    Requirements.load,
+    read_folder_settings,
+)
 
 
 @pytest.mark.parametrize("text", list(blocks("yaml")))

@@ -55,7 +55,6 @@ def test_the_exit_code_is_the_verdict(call, worlds, requirement, code, words):
         (["--require", "none.yaml"], "none.yaml: no such file"),
         (["--require", "empty.yaml"], "requirements: Field required"),
         (["--require", "wrong.yaml"], "requirements.0.pionts: Extra inputs are not permitted"),
-        (["--vehicle", "suv", "--scenario", "courtyard"], "a scenario has its own ego"),
     ],
 )
 def test_a_mistake_is_one_line_and_exit_code_2(call, worlds, monkeypatch, arguments, message):

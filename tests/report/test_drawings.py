@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from torchcover import BevGrid
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.report import ActorMark, SensorView, Standing, draw_depths, draw_four_views, draw_rig, draw_scene
-from torchcover.report.drawings.frame import REFERENCE, SENSOR, SKY
+from torchcover.report.drawings.frame import PATH, REFERENCE, SENSOR, SKY
 from torchcover.report.maps.overlay import COLOURS
 
 VERTICES = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (0.0, 1.5)])
@@ -195,6 +195,14 @@ def test_actors_are_where_they_are_in_the_colour_of_their_category():
     assert picture.at(0, 20, -5) == pytest.approx((1, 1, 1))
     entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
     assert entries[2:] == ["car (2)", "bus (1)", "ego"]
+
+
+def test_the_way_of_the_ego_is_drawn_if_it_moves():
+    picture = scene(path_m=np.array([[-10.0, -5.0], [25.0, -5.0]]))
+    assert picture.at(0, 10.0, -5.0) == pytest.approx(to_rgb(PATH), abs=0.3)
+    assert scene().at(0, 10.0, -5.0) == pytest.approx((1, 1, 1))
+    entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
+    assert "way of the ego" in entries
 
 
 def test_clouds_are_drawn_the_rig_over_the_reference():

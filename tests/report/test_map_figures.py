@@ -270,3 +270,11 @@ def test_the_difference_scale_is_symmetric_and_robust_and_turns_with_what_is_bet
 def test_what_is_not_paired_is_refused_before_anything_is_drawn(measure, points):
     with pytest.raises(ValueError, match="'a' and 'b' cannot be compared"):
         map_figures({"a": measure(points(9, 1)), "b": measure(points(9, 1), seed=7)})
+
+
+def test_titles_say_what_carried_the_rigs():
+    coverage = coverage_of(SMALL)
+    _, figure = next(map_figures({"a": coverage}, vehicle="van"))
+    assert "; on van, 1 step" in words(figure)[1]
+    _, figure = next(map_figures({"a": coverage}))
+    assert " on " not in words(figure)[1]

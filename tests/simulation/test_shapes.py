@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from torchcover.simulation import builtin_names
 from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, in_vehicle_frame
 from torchcover.simulation.documents import Pose, load_document
 from torchcover.simulation.scenario import Mover
@@ -182,10 +183,10 @@ def in_millimetres(size_m):
     return ply_of(Box(type="box", size_m=tuple(1000 * length for length in size_m)).mesh())
 
 
-@pytest.mark.parametrize("unit", [1000.0, 100.0, 1 / 0.0254])
+@pytest.mark.parametrize("unit", [1000.0, 100.0, 1 / 0.0254, 84 / 4.9])
 def test_an_ego_or_actor_in_another_unit_is_named_with_the_remedy(tmp_path, unit):
     shape = mesh_file(tmp_path, ply_of(CAR.mesh()), metres_per_unit=unit)
-    with pytest.warns(UserWarning, match=r"ego: its body is .* far too large; .*`metres_per_unit: 0\.001`"):
+    with pytest.warns(UserWarning, match=r"ego: its body is .* far too large for .*; .*`metres_per_unit: 0\.001`"):
         Mover(shape=shape).actor("ego", "ego")
 
 
@@ -197,3 +198,40 @@ def test_a_body_in_millimetres_is_named_though_scenery_may_be_large(tmp_path):
     Body(name="parked car", shape=shape.model_copy(update={"metres_per_unit": 0.001})).meshes()
     Body(name="city", shape=Box(type="box", size_m=(5000, 5000, 400))).meshes()
     Mover(shape=Box(type="box", size_m=(75, 2.6, 3.6))).actor("tram", "tram")
+
+
+@pytest.mark.parametrize("category", ["ego", "car", "vehicle.truck", "LARGE_VEHICLE"])
+@pytest.mark.parametrize(
+    ("size_m", "message"),
+    [
+        ((25.3, 2.55, 4.0), "a: its body is 25.3 x 2.55 x 4 m, far too large for a vehicle on a road"),
+        ((1.94, 4.9, 1.63), r"a: .* wider than long; .* x axis points forward .*yaw_deg: 90"),
+        ((1.94, 1.63, 4.9), r"a: .* higher than long; .* z up"),
+        ((0.049, 0.0194, 0.0163), r"a: its body is 0.049 x 0.0194 x 0.0163 m, too small .*metres_per_unit"),
+    ],
+)
+def test_a_vehicle_as_none_looks_is_named_with_the_remedy(category, size_m, message):
+    with pytest.warns(UserWarning, match=message):
+        Mover(shape=Box(type="box", size_m=size_m)).actor("a", category)
+
+
+@pytest.mark.parametrize(
+    ("category", "size_m"),
+    [
+        ("ego", (25.25, 2.55, 4.0)),
+        ("ego", (0.281, 0.306, 0.141)),  # a small robot
+        ("ego", (0.68, 0.57, 1.25)),  # one with a flag
+        ("car", (2.34, 1.48, 1.56)),
+        ("pedestrian", (0.3, 0.52, 1.75)),
+        ("motorcycle", (2.1, 0.8, 2.2)),
+        ("RAILED_VEHICLE", (42.0, 2.4, 3.6)),
+        ("barrier", (0.5, 2.5, 1.0)),
+    ],
+)
+def test_what_is_real_gives_no_warning(category, size_m):
+    Mover(shape=Box(type="box", size_m=size_m)).actor("a", category)
+
+
+@pytest.mark.parametrize("name", builtin_names("vehicles"))
+def test_no_built_in_vehicle_gives_a_warning(name):
+    Mover(shape=VehicleShape(type="vehicle", vehicle=name)).actor("ego", "ego")

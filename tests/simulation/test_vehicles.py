@@ -13,17 +13,30 @@ SIZES_M = {
     "bus": (12.0, 2.55, 3.10),
     "child": (0.209, 0.36, 1.20),
     "child_110cm": (0.1917, 0.33, 1.10),
+    "chrysler_pacifica": (5.176, 2.022, 1.777),
     "cyclist": (1.80, 0.60, 1.75),
     "dog_57cm": (0.98, 0.22, 0.69),
+    "ford_fusion": (4.869, 1.852, 1.476),
     "hatchback": (4.28, 1.79, 1.46),
     "motorcycle": (2.10, 0.80, 1.50),
     "pole_100cm": (0.075, 0.075, 1.00),
+    "renault_zoe": (4.084, 1.730, 1.562),
     "sedan": (4.77, 1.83, 1.46),
     "suv": (4.90, 1.94, 1.63),
     "truck": (16.50, 2.55, 4.00),
     "van": (5.93, 2.02, 2.64),
+    "volkswagen_multivan": (4.973, 1.941, 1.903),
+    "volkswagen_passat_estate": (4.775, 1.820, 1.516),
 }
-CARS = ("hatchback", "sedan", "suv", "van")
+# Rear axle behind the centre as in the rig of the same car, and wheelbase.
+AXLES_M = {
+    "chrysler_pacifica": (1.461, 3.089),
+    "ford_fusion": (1.339, 2.850),
+    "renault_zoe": (1.385, 2.588),
+    "volkswagen_multivan": (1.592, 3.124),
+    "volkswagen_passat_estate": (1.337, 2.709),
+}
+CARS = ("hatchback", "sedan", "suv", "van", *AXLES_M)
 WITH_WHEELS = tuple(sorted(set(SIZES_M) - {"adult", "child", "child_110cm", "dog_57cm", "pole_100cm"}))
 
 
@@ -101,6 +114,13 @@ def test_wheels_stand_on_the_ground_and_nothing_else_does(name):
             assert lowest == pytest.approx(0.0, abs=1e-12)
         else:
             assert lowest > 0.1
+
+
+@pytest.mark.parametrize("name", AXLES_M)
+def test_the_cars_of_published_rigs_have_their_axles_where_the_rigs_have_them(name):
+    (wheels,) = [part for part in load(name).parts if part.name == "wheels"]
+    front_m, rear_m = max(pose.x_m for pose in wheels.poses), min(pose.x_m for pose in wheels.poses)
+    assert (-rear_m, front_m - rear_m) == pytest.approx(AXLES_M[name], abs=1e-9)
 
 
 @pytest.mark.parametrize("name", CARS)

@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from torchcover.evaluation import free_space, save_targets, survey_target, target_picture, target_record
 from torchcover.geometry import BoundingBox
 from torchcover.report.drawings.targets import UNSEEN
+from torchcover.simulation import with_ego
 from torchcover.targets import Raster, Requirements, Target, TargetMap, check
 
 CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
@@ -142,7 +143,7 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
     seen = seen_where(lambda x, y: np.abs(x) + 0.5, raster=Raster((-3.0, 3.0), (-2.0, 2.0), 1.0))
     verdicts = judged(seen, {"within_m": 1, "points": 1})
     names = [path.name for path in save_targets(seen, tmp_path, verdicts)]
-    assert names == ["targets.csv", "targets.npz", "targets.png", "summary.json"]
+    assert names == ["targets.csv", "targets.npz", "report.html", "targets.png", "summary.json"]
     with np.load(tmp_path / "targets.npz") as arrays:
         np.testing.assert_array_equal(arrays["points"], seen.points)
         np.testing.assert_array_equal(arrays["first_seen_m"], seen.first_seen_m())
@@ -184,7 +185,7 @@ def test_names_become_bodies(tmp_path):
     assert (post.name, post.solid.box.lower_m[2]) == ("post", 0.0)  # it stands on the ground
     (tmp_path / "plate.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     assert Target.load(tmp_path / "plate.obj").solid.box.size_m == (1.0, 1.0, 1.0)
-    assert free_space(tmp_path / "plate.obj").ego_box().size_m == (1.0, 1.0, 1.0)
+    assert with_ego(free_space(), {}, tmp_path / "plate.obj").ego_box().size_m == (1.0, 1.0, 1.0)
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 3 2\n")
     with pytest.raises(ValueError, match="lower < upper"):
         Target.load(tmp_path / "flat.obj")
@@ -198,7 +199,6 @@ def test_names_become_bodies(tmp_path):
         ({"hits": 0}, "hits"),
         ({"threshold_m": -1.0}, "threshold"),
         ({"heading": "up"}, "narrow, wide or degrees"),
-        ({"scenario": "courtyard", "vehicle": "suv"}, "a scenario has its own ego"),
         ({"target": "moon"}, "'moon' is neither"),
         ({"steps": 10**9}, "use fewer steps"),
     ],

@@ -150,8 +150,7 @@ def test_a_target_that_no_random_place_sees_has_an_unknown_share():
 
 def test_the_share_is_that_of_the_surface_which_is_near_a_measured_point():
     """One row of rays at 1 m meets a wall of 2 m: what is within 0.3 m of it, of the side that faces the vehicle."""
-    wall = {"type": "box", "size_m": [0.02, 4.0, 2.0]}
-    mesh = world(ego={"shape": wall}).ego_mesh()
+    mesh = Box(type="box", size_m=(0.02, 4.0, 2.0)).mesh()
     level = lidar(mount={"z_m": 1.0}, channels=1, vertical_fov_deg=[0, 0], columns=36000)
     ego = {"shape": {"type": "box", "size_m": [4.0, 2.0, 0.5]}}
     raster = Raster((4.0, 12.0), (-4.0, 4.0), 8.0)

@@ -80,6 +80,7 @@ def evaluate(
     window: options.Window = None,
     steps: options.Steps = None,
     seed: options.Seed = 0,
+    vehicle: options.Vehicle = None,
     out: options.Out = Path("out"),
     region: options.Regions = None,
     height: options.Heights = None,
@@ -112,6 +113,7 @@ def evaluate(
             frames=opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
+            vehicle=vehicle,
             ask=asked(ask, region, height, grid),
             cell_m=cell,
             thresholds=threshold or (0.4,),
@@ -142,6 +144,7 @@ def compare(
     window: options.Window = None,
     steps: options.Steps = None,
     seed: options.Seed = 0,
+    vehicle: options.Vehicle = None,
     out: options.Out = Path("out"),
     region: options.Regions = None,
     height: options.Heights = None,
@@ -174,6 +177,7 @@ def compare(
             frames=opened(frames, recording_format, sensors, reference, window),
             steps=steps,
             seed=seed,
+            vehicle=vehicle,
             ask=asked(ask, region, height, grid),
             cell_m=cell,
             thresholds=threshold or (0.4,),
@@ -214,6 +218,7 @@ def study(
     long_run_steps: Annotated[int, typer.Option(min=8, help="Steps of that run.")] = 512,
     every: options.Every = None,
     seed: options.Seed = 0,
+    vehicle: options.Vehicle = None,
     out: options.Out = Path("out"),
     cell: Annotated[float, typer.Option(help="Side of a grid cell in metres.")] = 0.25,
     threshold: Annotated[float, typer.Option(help="Detection threshold in metres.")] = 0.4,
@@ -236,6 +241,7 @@ def study(
         long_run_steps=long_run_steps,
         every_s=every,
         seed=seed,
+        vehicle=vehicle,
         cell_m=cell,
         threshold_m=threshold,
     )
@@ -252,6 +258,7 @@ def record(
     scenario: options.ScenarioOrNone = None,
     steps: options.RecordedSteps = None,
     seed: options.Seed = 0,
+    vehicle: options.Vehicle = None,
     every: options.Every = None,
     reference: options.RecordedReference = None,
     rays: options.Rays = None,
@@ -260,7 +267,18 @@ def record(
     """Write what a simulated rig sees as a recording, for other tools and for `evaluate --frames`."""
     from torchcover.cli.record import run
 
-    run(rig, out, layout, scenario=scenario, steps=steps, seed=seed, every_s=every, reference=reference, rays=rays)
+    run(
+        rig,
+        out,
+        layout,
+        scenario=scenario,
+        steps=steps,
+        seed=seed,
+        vehicle=vehicle,
+        every_s=every,
+        reference=reference,
+        rays=rays,
+    )
 
 
 @app.command()
@@ -286,6 +304,7 @@ def show(
         str | None, typer.Option(help="For a rig: the scenario whose ego carries it and that it sees (courtyard).")
     ] = None,
     rig: Annotated[str | None, typer.Option(help="For a scenario: whose points to draw (front_roof_128).")] = None,
+    vehicle: options.Vehicle = None,
     step: Annotated[int | None, typer.Option(min=0, help="Time step of the scenario or the depth images (0).")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the simulation, likewise (0).")] = None,
     out: options.Out = Path("out"),
@@ -293,7 +312,7 @@ def show(
     """Draw a rig on its vehicle and the depth images of its cameras, or a frame of a scenario from above."""
     from torchcover.cli.show import run
 
-    run(name, scenario=scenario, rig=rig, step=step, seed=seed, out=out)
+    run(name, scenario=scenario, rig=rig, vehicle=vehicle, step=step, seed=seed, out=out)
 
 
 app.command()(targets)

@@ -60,6 +60,13 @@ Steps = Annotated[
 ]
 RecordedSteps = Annotated[int | None, typer.Option(min=1, help="Steps to simulate (64), a frame each.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the simulation.")]
+Vehicle = Annotated[
+    str | None,
+    typer.Option(
+        help="What carries the rig: a built-in vehicle, a YAML file or a mesh in metres. Not given: the scenario's own "
+        "ego, else the vehicle that the rig names, else an SUV."
+    ),
+]
 Out = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
 RecordingOut = Annotated[
     Path, typer.Option("--out", help="Folder for the recording, new or empty.", callback=check_out)

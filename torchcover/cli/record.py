@@ -8,7 +8,7 @@ import typer
 from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called, write_recording
 from torchcover.evaluation.progress import progress_of
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, spread_s
-from torchcover.simulation import Rig, Scenario
+from torchcover.simulation import Rig, Scenario, with_ego
 
 
 def run(
@@ -19,6 +19,7 @@ def run(
     scenario: str | None,
     steps: int | None,
     seed: int,
+    vehicle: str | None,
     every_s: float | None,
     reference: str | None,
     rays: int | None,
@@ -29,10 +30,11 @@ def run(
         ValueError: A folder that is not empty, a layout that cannot hold the rig, or as `SimulatedFrames`.
         FileNotFoundError: An unknown name or file.
     """
-    world = Scenario.load(scenario or DEFAULT_SCENARIO)
+    carried = Rig.load(rig)
+    world = with_ego(Scenario.load(scenario or DEFAULT_SCENARIO), {carried.name: carried}, vehicle)
     frames = SimulatedFrames(
         world,
-        Rig.load(rig),
+        carried,
         steps=steps or DEFAULT_STEPS,
         seed=seed,
         every_s=spread_s(world, every_s),

@@ -17,7 +17,16 @@ from torchcover.simulation.documents import read_mapping
 DEFAULT_RIG = "front_roof_128"
 
 
-def run(name: str, *, scenario: str | None, rig: str | None, step: int | None, seed: int | None, out: Path) -> None:
+def run(
+    name: str,
+    *,
+    scenario: str | None,
+    rig: str | None,
+    vehicle: str | None,
+    step: int | None,
+    seed: int | None,
+    out: Path,
+) -> None:
     """Print what it says of itself; draw it to `out/NAME.png`, what a rig's cameras measure to `out/NAME_depth.png`.
 
     Raises:
@@ -31,12 +40,12 @@ def run(name: str, *, scenario: str | None, rig: str | None, step: int | None, s
         if not cameras_of(shown):
             _refuse("a scenario or cameras", {"--step": step, "--seed": seed}, f"{name!r} is a rig without cameras")
         world, description = Scenario.load(scenario or DEFAULT_SCENARIO), shown.description
-        figures = rig_pictures(shown, world, step=step or 0, seed=seed or 0)
+        figures = rig_pictures(shown, world, vehicle=vehicle, step=step or 0, seed=seed or 0)
     else:
         _refuse("a rig", {"--scenario": scenario}, f"{name!r} is a scenario")
         world, seen_by = Scenario.load(name), as_called(rig or DEFAULT_RIG)
         description = world.description
-        figures = [("", scenario_picture(world, seen_by, step=step or 0, seed=seed or 0))]
+        figures = [("", scenario_picture(world, seen_by, vehicle=vehicle, step=step or 0, seed=seed or 0))]
     console = Console()
     if description:
         console.print(" ".join(description.split()), markup=False, highlight=False)

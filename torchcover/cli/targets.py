@@ -20,9 +20,7 @@ def targets(
     scenario: Annotated[
         str | None, typer.Option(help="Scenario: a built-in name or a YAML file. Not given: flat ground, nothing else.")
     ] = None,
-    vehicle: Annotated[
-        str | None, typer.Option(help="Without a scenario: what carries the rig, named as a target is (suv).")
-    ] = None,
+    vehicle: options.Vehicle = None,
     steps: Annotated[
         int | None, typer.Option(min=1, help="Steps to average (16, or 1 where nothing moves and no sensor is noisy).")
     ] = None,

@@ -91,7 +91,7 @@ class RecordedFrames(FrameDataset):
     @property
     def description(self) -> Mapping[str, object]:
         """Where the recording is."""
-        return {"scenario": None, "frames": str(self.recording.path), "seed": None}
+        return {"scenario": None, "vehicle": None, "frames": str(self.recording.path), "seed": None}
 
     @property
     def weight_kind(self) -> WeightKind | None:

@@ -18,7 +18,17 @@ from torchcover.data.regions_of_interest import RegionsOfInterest
 from torchcover.data.source import FrameDataset
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import with_hits
-from torchcover.simulation import Label, Observation, ReferenceSensor, Rig, Scenario, Sensor, Simulator, WeightKind
+from torchcover.simulation import (
+    Label,
+    Observation,
+    ReferenceSensor,
+    Rig,
+    Scenario,
+    Sensor,
+    Simulator,
+    WeightKind,
+    with_ego,
+)
 
 # What takes years.
 MAX_STEPS = 1_000_000_000
@@ -49,12 +59,14 @@ class SimulatedFrames(FrameDataset):
         boxes: Whether frames have `boxes`: one for each object within the reference's range, with how many points each
             rig has in it, and how many the reference drew on it. An object's name is its own within a run of the
             scenario.
+        vehicle: What carries the rigs: a built-in vehicle, the YAML file of one, or a mesh file. Not given: the
+            scenario's own ego, else the vehicle that the rigs name, else an SUV.
 
     Raises:
         FileNotFoundError: An unknown name or file.
-        ValueError: A document that is not valid, neither or both of `rig` and `rigs`, a number of steps below 1, a
-            negative seed, a time that is no multiple of the time step. From indexing: a sensor inside a body or
-            below the ground, an actor that overlaps the ego.
+        ValueError: A document that is not valid, neither or both of `rig` and `rigs`, rigs that name different vehicles
+            in a scenario that leaves it to them, a number of steps below 1, a negative seed, a time that is no multiple
+            of the time step. From indexing: a sensor inside a body or below the ground, an actor that overlaps the ego.
 
     Example:
         >>> frames = SimulatedFrames("courtyard", "front_roof_128", steps=2, seed=0)
@@ -73,16 +85,18 @@ class SimulatedFrames(FrameDataset):
         reference_sensor: ReferenceSensor | None = None,
         every_s: float | None = None,
         boxes: bool = False,
+        vehicle: str | Path | None = None,
     ) -> None:
         if not 1 <= steps <= MAX_STEPS:
             raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
-        world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
+        carried = _rigs(rig, rigs)
+        world = with_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), carried, vehicle)
         if reference_sensor is None:
             asked = RegionsOfInterest().around(world.ego_box().outline_m)
             reference_sensor = reference_of_objects(asked) if boxes else reference_called(asked=asked)
         self.simulator = Simulator(
             world,
-            _rigs(rig, rigs),
+            carried,
             reference_sensor,
             seed=seed,
             every_s=every_s,
@@ -127,8 +141,13 @@ class SimulatedFrames(FrameDataset):
 
     @property
     def description(self) -> Mapping[str, object]:
-        """The scenario's name and the seed."""
-        return {"scenario": self.scenario.name, "frames": None, "seed": self.seed}
+        """The names of the scenario and of the vehicle, and the seed."""
+        return {
+            "scenario": self.scenario.name,
+            "vehicle": self.scenario.ego_name,
+            "frames": None,
+            "seed": self.seed,
+        }
 
     @property
     def weight_kind(self) -> WeightKind | None:

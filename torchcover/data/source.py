@@ -36,7 +36,7 @@ class FrameSource(Protocol):
 
     @property
     def description(self) -> Mapping[str, object]:
-        """Where the frames come from, for `summary.json`: `scenario` and `seed`, or `frames`, the others None."""
+        """Where the frames come from, for `summary.json`: `scenario`, `vehicle` and `seed`, or `frames`; else None."""
         ...
 
     @property

@@ -1,6 +1,7 @@
 """Evaluate a rig, or compare several: what a notebook calls, and the command line too."""
 
 from collections.abc import Sequence
+from pathlib import Path
 
 from torchcover.coverage import Aggregation, Measure
 from torchcover.evaluation.checkpoint import AnyCheckpoint
@@ -21,6 +22,7 @@ def evaluate(
     frames: AnyFrames | None = None,
     steps: int | None = None,
     seed: int = 0,
+    vehicle: str | Path | None = None,
     ask: AnyAsk | None = None,
     cell_m: float | None = None,
     thresholds: AnyThresholds = (0.4,),
@@ -48,6 +50,8 @@ def evaluate(
         frames: A recording, or any source of frames, instead.
         steps: Steps to simulate (64; with a target error at most, 4096), or frames to use at most (all).
         seed: Seed of the simulation.
+        vehicle: What carries the rig: a built-in vehicle, the YAML file of one, or a mesh file. Not given: the
+            scenario's own ego, else the vehicle that the rig names, else an SUV.
         ask: Regions, height bands and grid: `RegionsOfInterest`, or the path of a YAML file; not given: the paper's
             regions in front, and the near field on the four sides of the vehicle.
         cell_m: Side of a grid cell in metres, whatever `ask` says; 0.25 if neither does.
@@ -104,6 +108,7 @@ def compare(
     frames: AnyFrames | None = None,
     steps: int | None = None,
     seed: int = 0,
+    vehicle: str | Path | None = None,
     ask: AnyAsk | None = None,
     cell_m: float | None = None,
     thresholds: AnyThresholds = (0.4,),
@@ -132,6 +137,7 @@ def compare(
         frames: Frames of several rigs.
         steps: Steps.
         seed: Seed.
+        vehicle: What carries all rigs; needed where they name different ones.
         ask: Regions, height bands and grid.
         cell_m: Side of a grid cell in metres.
         thresholds: Detection thresholds in metres.

@@ -36,7 +36,7 @@ class Result:
         regions: Those that numbers are given for.
         run: How the run went; None if nobody knows, for they were saved.
         rigs: What the user called each rig, by its name; None for the rig of a recording that nobody named.
-        source: Where the frames came from: `scenario`, `frames`, `seed`.
+        source: Where the frames came from: `scenario`, `vehicle`, `frames`, `seed`.
         reference_record: Where the reference comes from, as `FrameSource.reference_record` says; None if nobody knows.
         device: Where it ran; None if nobody knows.
         target_error: What was aimed at.
@@ -73,6 +73,12 @@ class Result:
         if len(self.coverages) != 1:
             raise ValueError(f"there are {len(self.coverages)} rigs ({', '.join(self.coverages)}): use coverages[name]")
         return next(iter(self.coverages.values()))
+
+    @property
+    def vehicle(self) -> str | None:
+        """What carried the rigs in a simulation."""
+        vehicle = self.source.get("vehicle")
+        return None if vehicle is None else str(vehicle)
 
     @property
     def is_comparison(self) -> bool:
@@ -121,7 +127,13 @@ class Result:
             The stem of the file name, and a figure of its own, outside pyplot.
         """
         views = {name: sensor_views(sensors) for name, sensors in self.sensors.items()}
-        return map_figures(self.coverages, ego_outline_m=self.ego_outline_m, sensors=views, errors=errors)
+        return map_figures(
+            self.coverages,
+            ego_outline_m=self.ego_outline_m,
+            sensors=views,
+            vehicle=self.vehicle,
+            errors=errors,
+        )
 
     def save(self, folder: str | Path, *, error_maps: bool = False) -> list[Path]:
         """Write the files of the command line: first the numbers, then the maps.
@@ -200,7 +212,8 @@ class Result:
             return [*on_failure, *record["notes"]]
         rays, every_s = record["rays_per_step"], record["every_s"]
         sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
-        return [*on_failure, sensor, *self._on_repetitions]
+        carried = [f"Vehicle: {self.vehicle}."] if self.vehicle else []
+        return [*on_failure, *carried, sensor, *self._on_repetitions]
 
     @property
     def cut_short(self) -> str:

@@ -67,7 +67,7 @@ def _rig(name: str, sensors: Sequence[Sensor]) -> PageRig:
 
 def _place(result: "Result") -> str:
     place = result.source.get("frames") or result.source.get("scenario")
-    return str(place) if place else "runs that were saved"
+    return f"{place}, on {result.vehicle}" if result.vehicle else str(place or "runs that were saved")
 
 
 def _corners(region: Region) -> np.ndarray[Any, np.dtype[np.float64]]:

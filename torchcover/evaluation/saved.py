@@ -42,7 +42,7 @@ def compare_saved(files: Sequence[str | Path]) -> Result:
         regions=first.regions,
         run=None,
         rigs={name: str(file) for name, file in zip(names, files, strict=True)},
-        source={"scenario": None, "frames": None, "seed": None},
+        source={"scenario": None, "vehicle": None, "frames": None, "seed": None},
         reference_record=None,
         device=None,
         inputs=[Path(file) for file in files],

@@ -23,23 +23,26 @@ def cameras_of(rig: Rig) -> list[CameraSensor]:
     return [sensor for sensor in rig.sensors if isinstance(sensor, CameraSensor)]
 
 
-def rig_pictures(rig: Rig, scenario: Scenario, *, step: int = 0, seed: int = 0) -> Iterator[tuple[str, Figure]]:
+def rig_pictures(
+    rig: Rig, scenario: Scenario, *, vehicle: str | None = None, step: int = 0, seed: int = 0
+) -> Iterator[tuple[str, Figure]]:
     """A rig on the ego of a scenario, and the depth images of its cameras, if it has any.
 
     Args:
         rig: The rig.
         scenario: Whose ego carries it, and what its cameras see.
+        vehicle: What carries it instead.
         step: Time step of the depth images.
         seed: Seed of the traffic.
 
     Returns:
         What to add to the name of the rig, ``""`` or ``"_depth"``, and the figure.
     """
-    frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference_sensor=REFERENCE)
+    frames = _frames(scenario, rig, vehicle, step, seed)
     scene, step_of_world = frames.simulator.scene_of(step)
     ego = scene.world.ego.mesh
     length, width, height = scene.ego_box.size_m
-    subtitle = f"on the ego of {scenario.name}, {length:.2f} x {width:.2f} x {height:.2f} m"
+    subtitle = f"on {frames.scenario.ego_name} in {scenario.name}, {length:.2f} x {width:.2f} x {height:.2f} m"
     yield "", draw_rig(ego.vertices_m, ego.faces, sensor_views(rig.sensors), title=rig.name, subtitle=subtitle)
     if cameras := cameras_of(rig):
         instant = scene.at(step_of_world)
@@ -47,20 +50,24 @@ def rig_pictures(rig: Rig, scenario: Scenario, *, step: int = 0, seed: int = 0) 
             camera.name: instant.range_image(camera.mount.matrix(), camera.directions(), max_range_m=camera.max_range_m)
             for camera in cameras
         }
-        when = f"{scenario.name}, step {step}, t = {step_of_world * scene.world.time_step_s:g} s, seed {seed}"
+        time_s = step_of_world * scene.world.time_step_s
+        when = f"on {frames.scenario.ego_name} in {scenario.name}, step {step}, t = {time_s:g} s, seed {seed}"
         yield "_depth", draw_depths(images, title=f"{rig.name}: distance along the ray", subtitle=when)
 
 
-def scenario_picture(scenario: Scenario, rig: Rig, *, step: int = 0, seed: int = 0) -> Figure:
+def scenario_picture(
+    scenario: Scenario, rig: Rig, *, vehicle: str | None = None, step: int = 0, seed: int = 0
+) -> Figure:
     """A frame of a scenario from above: its actors, the points of a rig, those of the reference.
 
     Args:
         scenario: The scenario.
         rig: Whose points.
+        vehicle: What carries it, instead of the scenario's ego.
         step: The frame.
         seed: Seed of the simulation.
     """
-    frames = SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, reference_sensor=REFERENCE)
+    frames = _frames(scenario, rig, vehicle, step, seed)
     frame = frames[step]
     scene, step_of_world = frames.simulator.scene_of(step)
     time_s = step_of_world * scene.world.time_step_s
@@ -73,8 +80,19 @@ def scenario_picture(scenario: Scenario, rig: Rig, *, step: int = 0, seed: int =
         sensor=frame.sensor.numpy(),
         reference=frame.reference.numpy(),
         title=f"{scenario.name}, step {step}",
-        subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name}",
+        subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name} on {frames.scenario.ego_name}",
+        path_m=_path_m(scene.world, time_s),
     )
+
+
+def _path_m(world: World, time_s: float) -> Matrix | None:
+    """(T, 2) where the ego is at all times, in the vehicle frame of one; None if it rests."""
+    ego = world.ego.trajectory
+    return transform(invert(ego.at(time_s)), ego.positions_m)[:, :2] if ego.moves else None
+
+
+def _frames(scenario: Scenario, rig: Rig, vehicle: str | None, step: int, seed: int) -> SimulatedFrames:
+    return SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, vehicle=vehicle, reference_sensor=REFERENCE)
 
 
 def _standing(world: World, time_s: float) -> Standing:

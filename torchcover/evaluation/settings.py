@@ -48,6 +48,7 @@ class Settings:
 
     steps: int | None = None
     seed: int = 0
+    vehicle: str | None = None
     ask: RegionsOfInterest | None = None
     cell_m: float | None = None
     thresholds: tuple[float, ...] = (0.4,)
@@ -83,6 +84,7 @@ class Settings:
         given["target_error"] = _target(given["target_error"])
         given["ask"] = _asked(given["ask"])
         given["device"] = str(given["device"])
+        given["vehicle"] = given["vehicle"] and str(given["vehicle"])
         return cls(**given)
 
     @property
@@ -107,8 +109,10 @@ class Settings:
         """Find out whether anything was set that a recording decides itself.
 
         Raises:
-            ValueError: The reference sensor, its rays or the time between steps was set.
+            ValueError: The vehicle, the reference sensor, its rays or the time between steps was set.
         """
+        if self.vehicle is not None:
+            raise ValueError("vehicle: for simulations; a recording has its own")
         if any(setting is not None for setting in (self.reference_sensor, self.rays, self.every_s)):
             raise ValueError("reference, rays and every are for simulations; a recording has its reference points")
 

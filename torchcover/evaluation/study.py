@@ -26,6 +26,7 @@ class Study:
 
     Args:
         plan: What it was about.
+        vehicle: What carried the rig.
         every_s: Time between two steps in seconds.
         truth: The long run.
         points: What each number of rays and of steps costs, and how far it is off.
@@ -34,6 +35,7 @@ class Study:
     """
 
     plan: StudyPlan
+    vehicle: str
     every_s: float
     truth: Truth
     points: Sequence[WorkPoint]
@@ -58,6 +60,7 @@ class Study:
             "torchcover": __version__,
             "rig": str(plan.rig),
             "scenario": str(plan.scenario),
+            "vehicle": self.vehicle,
             "seed": plan.seed,
             "every_s": self.every_s,
             "cell_m": plan.cell_m,
@@ -76,7 +79,7 @@ class Study:
 
     def draw(self) -> Figure:
         """The diagram of error against run time."""
-        title = f"{self.plan.rig} in {self.plan.scenario}: a step every {self.every_s:g} s"
+        title = f"{self.plan.rig} on {self.vehicle} in {self.plan.scenario}: a step every {self.every_s:g} s"
         panels = work_panels(self.points, self.quantities, self.truth.errors)
         return draw_work_precision(panels, title=title, legend_title="rays a step")
 
@@ -124,4 +127,5 @@ def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
         }
         for trial in done.trials
     ]
-    return Study(plan, plan.frames(plan.seed, 1).every_s, truth, points, done.start_s, stages)
+    frames = plan.frames(plan.seed, 1)
+    return Study(plan, frames.scenario.ego_name, frames.every_s, truth, points, done.start_s, stages)

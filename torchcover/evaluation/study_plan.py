@@ -8,7 +8,7 @@ import torch
 from torchcover.coverage import CoverageMetric
 from torchcover.data import Asked, RegionsOfInterest, SimulatedFrames, reference_called
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, new_metric, spread_s
-from torchcover.simulation import ReferenceSensor, Scenario
+from torchcover.simulation import ReferenceSensor, Rig, Scenario, with_ego
 
 # The long run's seed is far away from any other.
 LONG_RUN_SEED = 1_000_003
@@ -23,6 +23,7 @@ class StudyPlan:
     Args:
         rig: A built-in name or a YAML file.
         scenario: Likewise.
+        vehicle: What carries the rig, as in `evaluate`.
         rays: Numbers of rays of the reference sensor at each step.
         steps: Most steps of a run.
         runs: Runs of so many steps that errors are averaged over; shorter ones are their parts, so that there are more.
@@ -40,6 +41,7 @@ class StudyPlan:
 
     rig: str | Path
     scenario: str | Path = DEFAULT_SCENARIO
+    vehicle: str | None = None
     rays: tuple[int, ...] = (1024, 4096, 16_384)
     steps: int = 128
     runs: int = 2
@@ -72,6 +74,7 @@ class StudyPlan:
             steps=steps,
             seed=seed,
             every_s=spread_s(scenario, self.every_s),
+            vehicle=self.vehicle,
             reference_sensor=self.reference_sensor(),
         )
 
@@ -82,7 +85,8 @@ class StudyPlan:
     @property
     def asked(self) -> Asked:
         """What `evaluate` is asked about, too."""
-        return RegionsOfInterest().around(Scenario.load(self.scenario).ego_box().outline_m, self.cell_m)
+        scenario = with_ego(Scenario.load(self.scenario), {str(self.rig): Rig.load(self.rig)}, self.vehicle)
+        return RegionsOfInterest().around(scenario.ego_box().outline_m, self.cell_m)
 
     def metric(self, blocks: int) -> CoverageMetric:
         """An empty metric."""

@@ -133,7 +133,9 @@ def command_s(plan: StudyPlan) -> float:
         ValueError: It fails.
     """
     command = [sys.executable, "-m", "torchcover", "evaluate", str(plan.rig), "--scenario", str(plan.scenario)]
-    settings = {"rays": plan.rays[0], "steps": 1, "seed": plan.seed, "cell": plan.cell_m}
+    settings: dict[str, object] = {"rays": plan.rays[0], "steps": 1, "seed": plan.seed, "cell": plan.cell_m}
+    if plan.vehicle is not None:
+        settings["vehicle"] = plan.vehicle
     clock = Clock()
     with TemporaryDirectory() as folder, clock.running():
         options = [f"--{name}={value}" for name, value in settings.items()]

@@ -14,11 +14,11 @@ from torchcover.evaluation.rig_names import AnyRig, as_called
 from torchcover.evaluation.settings import spread_s
 from torchcover.evaluation.target_page import target_page
 from torchcover.report import draw_targets, page_html
-from torchcover.simulation import Scenario, Sensor
+from torchcover.simulation import Scenario, Sensor, with_ego
 from torchcover.simulation.bodies import Body
-from torchcover.simulation.scenario import DEFAULT_EGO, Mover
+from torchcover.simulation.scenario import Mover
 from torchcover.simulation.shapes import Plane
-from torchcover.targets import Heading, Raster, Target, TargetMap, Verdict, body_called, survey, write_arrays, write_csv
+from torchcover.targets import Heading, Raster, Target, TargetMap, Verdict, survey, write_arrays, write_csv
 
 # Steps of a world in which something moves, or a sensor is noisy; else they are all alike.
 DEFAULT_STEPS = 16
@@ -45,8 +45,7 @@ def survey_target(
         rig: The rig, its built-in name, or its YAML file.
         target: "child", "adult", "dog", "cyclist", "pole", a built-in vehicle, the YAML file of one, or a mesh file.
         scenario: The world: a scenario, a built-in name or a YAML file; flat ground with nothing on it if not given.
-        vehicle: On that ground, what carries the rig: a built-in vehicle, the YAML file of one, or a mesh file; an SUV
-            if not given. A scenario has its own.
+        vehicle: What carries the rig, as for `evaluate`, or a mesh file.
         raster: Where to put it; within 5 m of the vehicle in steps of 0.2 m if not given.
         steps: How many steps are averaged; 1 where all are alike, else 16.
         every_s: Time between two of them; as for `evaluate` if not given.
@@ -60,7 +59,7 @@ def survey_target(
 
     Raises:
         FileNotFoundError: An unknown name or file.
-        ValueError: A file that cannot be used, a number out of its bounds, a vehicle beside a scenario.
+        ValueError: A file that cannot be used, a number out of its bounds.
 
     Example:
         >>> seen = survey_target("front_roof_128", "dog", raster=Raster((3.0, 7.0), (-1.0, 1.0), 1.0))
@@ -68,10 +67,8 @@ def survey_target(
         ('dog_57cm', 8)
     """
     rig = as_called(rig)
-    if scenario is not None and vehicle is not None:
-        raise ValueError("vehicle: a scenario has its own ego; give one of the two")
-    world = free_space(vehicle) if scenario is None else scenario
-    world = world if isinstance(world, Scenario) else Scenario.load(world)
+    world = free_space() if scenario is None else scenario
+    world = with_ego(world if isinstance(world, Scenario) else Scenario.load(world), {rig.name: rig}, vehicle)
     alike = world.instants == 1 and not any(sensor.range_noise_m or sensor.dropout for sensor in rig.sensors)
     return survey(
         rig,
@@ -87,19 +84,15 @@ def survey_target(
     )
 
 
-def free_space(vehicle: str | Path | None = None) -> Scenario:
-    """Flat ground with nothing on it but a vehicle.
-
-    Args:
-        vehicle: A built-in one, the YAML file of one, or a mesh file; an SUV if not given.
+def free_space() -> Scenario:
+    """Flat ground with nothing on it but what carries the rig.
 
     Example:
-        >>> free_space("sedan").ego_box().size_m[0]
-        4.77
+        >>> free_space().instants
+        1
     """
     ground = Body(name="ground", shape=Plane(type="plane", size_m=(GROUND_M, GROUND_M)))
-    ego = Mover(shape=DEFAULT_EGO if vehicle is None else body_called(vehicle))
-    return Scenario(name="free space", ego=ego, bodies=(ground,))
+    return Scenario(name="free space", ego=Mover(), bodies=(ground,))
 
 
 def target_picture(seen: TargetMap) -> Figure:

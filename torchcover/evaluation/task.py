@@ -17,7 +17,7 @@ from torchcover.data import (
 from torchcover.data.suspicion import suspicions
 from torchcover.evaluation.rig_names import AnyRig, distinct_names, given_as, is_document, loaded
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings, spread_s
-from torchcover.simulation import Scenario, Sensor
+from torchcover.simulation import Scenario, Sensor, with_ego
 
 AnyScenario = Scenario | str | Path
 AnyFrames = FrameSource | str | Path
@@ -109,11 +109,13 @@ def _simulation(rigs: Sequence[AnyRig], scenario: AnyScenario, settings: Setting
     if not rigs:
         raise ValueError("which rig? Give a built-in name (see `torchcover list`) or a YAML file, or a recording")
     names = distinct_names(rigs)
-    world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
+    carried = {name: loaded(rig) for name, rig in zip(names, rigs, strict=True)}
+    loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
+    world = with_ego(loaded_world, carried, settings.vehicle)
     asked = settings.asked(world.ego_box().outline_m)
     frames = SimulatedFrames(
         world,
-        rigs={name: loaded(rig) for name, rig in zip(names, rigs, strict=True)},
+        rigs=carried,
         steps=settings.simulated_steps,
         seed=settings.seed,
         every_s=spread_s(world, settings.every_s),
@@ -122,7 +124,7 @@ def _simulation(rigs: Sequence[AnyRig], scenario: AnyScenario, settings: Setting
     frames.simulator.check_run(frames.steps)
     given = {name: given_as(rig) for name, rig in zip(names, rigs, strict=True)}
     # A path says more than the name within the file.
-    description = {**frames.description, "scenario": world.name if world is scenario else str(scenario)}
+    description = {**frames.description, "scenario": world.name if loaded_world is scenario else str(scenario)}
     return Task(frames, given, frames.sensors, description, asked, _most_steps(frames, settings))
 
 

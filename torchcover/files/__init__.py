@@ -5,6 +5,7 @@ from torchcover.files.budget import TooLargeError, check_memory
 from torchcover.files.durable import write_durably
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, npz_headers, read_npy, read_npz, write_npz
 from torchcover.files.text import decode, read_short_text
+from torchcover.files.xml_text import feed_xml, parse_xml
 from torchcover.files.yaml_text import parse_yaml
 
 __all__ = [
@@ -14,8 +15,10 @@ __all__ = [
     "TooLargeError",
     "check_memory",
     "decode",
+    "feed_xml",
     "naming",
     "npz_headers",
+    "parse_xml",
     "parse_yaml",
     "read_npy",
     "read_npz",

@@ -3,6 +3,7 @@ from .builtin import builtin_names as builtin_names
 from .camera_sensor import CameraSensor as CameraSensor
 from .documents import Document as Document
 from .documents import Pose as Pose
+from .ego import with_ego as with_ego
 from .even_reference import EvenReference as EvenReference
 from .kinds import REFERENCE_SENSORS as REFERENCE_SENSORS
 from .kinds import SENSORS as SENSORS

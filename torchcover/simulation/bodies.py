@@ -1,5 +1,6 @@
 """Bodies: shapes at places, and vehicles put together from them."""
 
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 import numpy as np
@@ -7,7 +8,8 @@ from pydantic import Field, model_validator
 
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import shapes
-from torchcover.simulation.documents import Document, Pose, load_document
+from torchcover.simulation.documents import Document, NameOrFile, Pose, is_file_name, load_document
+from torchcover.simulation.plausible import warn_of_mover, warn_of_scenery
 from torchcover.simulation.shapes import Mesh
 
 
@@ -15,11 +17,11 @@ class VehicleShape(Document):
     """A vehicle from the folder of vehicles, or from a file.
 
     Args:
-        vehicle: Name of a built-in vehicle, or path of a YAML file.
+        vehicle: Name of a built-in vehicle, or path of a YAML file; relative to the document that names it.
     """
 
     type: Literal["vehicle"]
-    vehicle: str
+    vehicle: NameOrFile
 
     def mesh(self) -> Mesh:
         """All parts in one mesh, in the vehicle frame."""
@@ -52,7 +54,7 @@ class Body(Document):
     def meshes(self) -> list[Mesh]:
         """One mesh for each pose."""
         mesh = self.shape.mesh()
-        shapes.warn_of_units(f"body {self.name!r}", mesh, moves=False)
+        warn_of_scenery(f"body {self.name!r}", mesh)
         return [mesh.moved(pose.matrix()) for pose in self.poses]
 
 
@@ -91,16 +93,42 @@ def in_vehicle_frame(mesh: Mesh) -> Mesh:
     return mesh.moved(rigid(np.eye(3), [-(x0 + x1) / 2, -(y0 + y1) / 2, -z0]))
 
 
-def mover_mesh(name: str, shape: Shape) -> Mesh:
-    """The body of the ego or of an actor in its vehicle frame; a warning if it is too large for one.
+def mover_mesh(name: str, shape: Shape, category: str = "ego") -> Mesh:
+    """The body of the ego or of an actor in its vehicle frame; a warning if it is too large, too small or turned.
 
     Args:
         name: What the warning calls it.
         shape: Its form, in its own frame.
+        category: What it is: "ego", or that of an actor.
     """
     mesh = in_vehicle_frame(shape.mesh())
-    shapes.warn_of_units(name, mesh, moves=True)
+    warn_of_mover(name, mesh, category)
     return mesh
+
+
+def called(shape: Shape) -> str:
+    """What a picture or a table calls a body: the name of a built-in vehicle, the name of a file, or the kind of shape.
+
+    Example:
+        >>> called(VehicleShape(type="vehicle", vehicle="here/my_van.yaml"))
+        'my_van.yaml'
+    """
+    if isinstance(shape, VehicleShape):
+        return Path(shape.vehicle).name
+    return shape.path.name if isinstance(shape, shapes.MeshFile) else shape.type
+
+
+def body_called(name_or_path: str | Path) -> VehicleShape | shapes.MeshFile:
+    """The shape that a name or a path means: a vehicle's, unless it is a file that is no YAML.
+
+    Example:
+        >>> body_called("suv").type, body_called("robot.stl").type
+        ('vehicle', 'mesh')
+    """
+    path = Path(name_or_path)
+    if path.suffix == "" or is_file_name(path):
+        return VehicleShape(type="vehicle", vehicle=str(name_or_path))
+    return shapes.MeshFile(type="mesh", path=path)
 
 
 def merge(meshes: list[Mesh]) -> Mesh:

@@ -208,9 +208,22 @@ PathBeside = Annotated[Path, BeforeValidator(_beside)]
 """A path in a document; a relative one is meant from the document's folder."""
 
 
+def _named(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+    return str(beside(Path(given), info)) if isinstance(given, str) and is_file_name(given) else given
+
+
+NameOrFile = Annotated[str, BeforeValidator(_named)]
+"""The name of a built-in document, or the path of a YAML file, which is meant from the folder of the document."""
+
+
+def is_file_name(path_or_name: str | Path) -> bool:
+    """Whether it is the path of a YAML file, not the name of a built-in document."""
+    return Path(path_or_name).suffix in (".yaml", ".yml")
+
+
 def _find(kind: str, path_or_name: str | Path) -> Path:
     path = Path(path_or_name)
-    if path.suffix in (".yaml", ".yml"):
+    if is_file_name(path):
         return path
     builtin = builtin_folder(kind) / f"{path_or_name}.yaml"
     if path.name != str(path_or_name) or not builtin.is_file():

@@ -1,4 +1,4 @@
-"""The kinds of sensors and of reference sensors, by the names that files and options call them."""
+"""The kinds of sensors, of reference sensors and of traffic, by the names that files and options call them."""
 
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.even_reference import EvenReference
@@ -6,10 +6,15 @@ from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.paper_reference import PaperReference
 from torchcover.simulation.reference_sensor import ReferenceSensor
 from torchcover.simulation.sensor import Sensor
+from torchcover.simulation.sumo import Sumo
 from torchcover.simulation.surface_reference import SurfaceReference
+from torchcover.simulation.traffic import Highway, Parking, Urban
+from torchcover.simulation.traffic.procedural import Procedural
 
 # By the key `type` in a rig's file.
 SENSORS: dict[str, type[Sensor]] = {"lidar": Lidar, "camera": CameraSensor}
 REFERENCE_SENSORS: dict[str, type[ReferenceSensor]] = {
     sensor.name: sensor for sensor in (EvenReference, PaperReference, SurfaceReference)
 }
+# By the key `type` of a scenario's `traffic`.
+TRAFFIC: dict[str, type[Procedural]] = {"urban": Urban, "highway": Highway, "parking": Parking, "sumo": Sumo}

@@ -5,7 +5,7 @@ from typing import Any, Literal, Self
 
 from pydantic import ValidationInfo, model_validator
 
-from torchcover.simulation.documents import Pose, beside, load_document
+from torchcover.simulation.documents import Pose, beside, is_file_name, load_document
 from torchcover.simulation.scan_pattern import ScanPattern
 
 # Two ways to write rows: a sensor that chooses one of them takes nothing of the other from its model.
@@ -84,7 +84,7 @@ class Lidar(ScanPattern):
         if not isinstance(content, dict) or not isinstance(content.get("model"), str):
             return content
         name: str | Path = content["model"]
-        if Path(name).suffix in (".yaml", ".yml"):
+        if is_file_name(name):
             name = beside(Path(name), info)
         try:
             return LidarModel.load(name).completing(content)

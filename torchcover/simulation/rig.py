@@ -5,7 +5,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationInfo, model_validator
 
-from torchcover.simulation.documents import Document, load_document
+from torchcover.simulation.documents import Document, NameOrFile, load_document
 from torchcover.simulation.kinds import SENSORS
 from torchcover.simulation.sensor import Sensor
 
@@ -24,6 +24,8 @@ class Rig(Document):
     Args:
         name: What tables and maps call it.
         description: What it is, and where its numbers come from.
+        vehicle: What carries it, a built-in vehicle or the YAML file of one, where neither the user nor the scenario
+            decides that.
         sensors: The sensors, each of a kind in `SENSORS`; their clouds are fused.
 
     Example:
@@ -33,6 +35,7 @@ class Rig(Document):
 
     name: str
     description: str = ""
+    vehicle: NameOrFile | None = None
     sensors: tuple[Annotated[Sensor, PlainValidator(_sensor)], ...] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -51,3 +54,7 @@ class Rig(Document):
             ValueError: The file is not a rig; the message names the file and the key.
         """
         return load_document(cls, "rigs", path_or_name)
+
+    def content(self) -> dict[str, Any]:
+        """Its sensors; the vehicle is in the scenario that it is simulated in, if it is the one."""
+        return {key: value for key, value in super().content().items() if key != "vehicle"}

@@ -2,24 +2,33 @@
 
 import math
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
+from pydantic import NonNegativeFloat, PlainValidator, PositiveFloat, TypeAdapter, ValidationInfo, model_validator
 
 from torchcover.geometry import BoundingBox
-from torchcover.simulation.bodies import Body, Shape, VehicleShape, mover_mesh
+from torchcover.simulation.bodies import Body, Shape, VehicleShape, called, mover_mesh
 from torchcover.simulation.documents import Document, PathBeside, Pose, load_document
+from torchcover.simulation.kinds import TRAFFIC
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.tracks import read_boxes, read_trajectory
-from torchcover.simulation.traffic import Highway, Parking, Urban
+from torchcover.simulation.traffic.procedural import Procedural
 from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World, steps_of
 
-# What carries the rig in procedural traffic, unless the document says otherwise.
+# What carries a rig that names no vehicle, unless the document says otherwise.
 DEFAULT_EGO = VehicleShape(type="vehicle", vehicle="suv")
 
-Traffic = Annotated[Urban | Highway | Parking, Field(discriminator="type")]
+
+def _traffic(content: Any, info: ValidationInfo) -> Procedural | None:  # noqa: ANN401  (whatever stood in the file)
+    """Traffic of the kind that its `type` names."""
+    if content is None:
+        return None
+    kind = content.get("type") if isinstance(content, dict) else getattr(content, "type", type(content).__name__)
+    if not isinstance(kind, str) or kind not in TRAFFIC:
+        raise ValueError(f"type: traffic is one of {', '.join(map(repr, TRAFFIC))}; got {kind!r}")
+    return TypeAdapter(TRAFFIC[kind]).validate_python(content, context=info.context)
 
 
 class Mover(Document):
@@ -27,12 +36,12 @@ class Mover(Document):
 
     Args:
         shape: Its body. Its frame follows from it: the origin lies on the ground under the centre of the bounding box,
-            x forward, z up.
+            x forward, z up. Only the ego may leave it open: see `with_ego`.
         pose: Where it rests in the world.
         trajectory: File of its trajectory instead; relative to the document.
     """
 
-    shape: Shape
+    shape: Shape | None = None
     pose: Pose | None = None
     trajectory: PathBeside | None = None
 
@@ -48,7 +57,11 @@ class Mover(Document):
             trajectory = read_trajectory(self.trajectory)
         else:
             trajectory = Trajectory.from_poses([0.0], (self.pose or Pose()).matrix()[None])
-        return Actor(name, category, mover_mesh(name, self.shape), trajectory)
+        return Actor(name, category, self.mesh(name, category), trajectory)
+
+    def mesh(self, name: str, category: str) -> Mesh:
+        """Its body in its own frame; an SUV where that was left open."""
+        return mover_mesh(name, self.shape or DEFAULT_EGO, category)
 
 
 class NamedMover(Mover):
@@ -61,6 +74,7 @@ class NamedMover(Mover):
 
     name: str
     category: str
+    shape: Shape
 
 
 class Scenario(Document):
@@ -69,17 +83,18 @@ class Scenario(Document):
     Args:
         name: What tables and maps call it.
         description: What it is.
-        ego: The vehicle that carries the rig; in procedural traffic its shape only, an SUV if not given.
+        ego: The vehicle that carries the rig; in procedural traffic its shape only. Without a shape, the rig's vehicle
+            takes its place, or an SUV.
         bodies: What never moves, in the world frame.
         actors: What moves, or may be recognised.
         boxes: File of recorded boxes that are actors too; relative to the document.
         time_step_s: Time between two frames.
         duration_s: Time of the last frame; frames beyond it start again at 0.
-        traffic: A procedure that makes bodies, actors, the ego's drive, and the times.
+        traffic: A procedure of a kind in `TRAFFIC`, which makes bodies, actors, the ego's drive, and the times.
 
     Example:
-        >>> Scenario.load("courtyard").ego.shape.type
-        'vehicle'
+        >>> Scenario.load("courtyard").ego.pose.x_m
+        0.0
     """
 
     name: str
@@ -90,7 +105,7 @@ class Scenario(Document):
     boxes: PathBeside | None = None
     time_step_s: PositiveFloat = 0.1
     duration_s: NonNegativeFloat = 0.0
-    traffic: Traffic | None = None
+    traffic: Annotated[Procedural | None, PlainValidator(_traffic)] = None
 
     @model_validator(mode="after")
     def _check_given_or_procedural(self) -> Self:
@@ -167,7 +182,17 @@ class Scenario(Document):
             FileNotFoundError: A mesh or vehicle file is missing.
             ValueError: A mesh cannot be used.
         """
-        return mover_mesh("ego", self.ego.shape if self.ego else DEFAULT_EGO)
+        return (self.ego or Mover()).mesh("ego", "ego")
+
+    @property
+    def ego_name(self) -> str:
+        """What that body is called: the name of a vehicle or of a file, or its kind of shape.
+
+        Example:
+            >>> Scenario.load("courtyard").ego_name
+            'suv'
+        """
+        return called((self.ego and self.ego.shape) or DEFAULT_EGO)
 
     def ego_box(self) -> BoundingBox:
         """The bounding box of that body.

@@ -15,9 +15,6 @@ from torchcover.simulation.documents import Document, PathBeside
 CYLINDER_SIDES = 24
 MAX_SIDES = 10_000
 ELLIPSOID_SIDES = 12  # around the z axis; half as many bands from pole to pole
-# Nothing on a road is longer; no building, and no terrain within a sensor's range, is higher.
-MAX_VEHICLE_LENGTH_M = 100.0
-TALLEST_SCENERY_M = 1000.0
 
 # What trimesh takes for each byte of a mesh's file at most: text becomes lists of words.
 _BYTES_PER_FILE_BYTE = 16
@@ -183,26 +180,6 @@ def _read_mesh(path: Path) -> Mesh:
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(f"faces have vertices {faces.min()} to {faces.max()}; there are {len(vertices)}")
     return Mesh(vertices, faces)
-
-
-def warn_of_units(owner: str, mesh: Mesh, *, moves: bool) -> None:
-    """Warn if a body is so large that its file must be in another unit than metres.
-
-    Args:
-        owner: What the warning calls the body.
-        mesh: Its form.
-        moves: Whether it is the ego or an actor, which are 100 m long at most. What never moves may be a whole city:
-            then all three extents must be above 1,000 m.
-    """
-    size_m = np.ptp(mesh.vertices_m, axis=0).tolist()
-    extent_m, most_m = (max(size_m), MAX_VEHICLE_LENGTH_M) if moves else (min(size_m), TALLEST_SCENERY_M)
-    if extent_m > most_m:
-        x, y, z = size_m
-        warnings.warn(
-            f"{owner}: its body is {x:,.0f} x {y:,.0f} x {z:,.0f} m, far too large; a file in millimetres needs "
-            "`metres_per_unit: 0.001` beside its `path`, one in centimetres 0.01, one in inches 0.0254",
-            stacklevel=2,
-        )
 
 
 def _open_edges(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> int:

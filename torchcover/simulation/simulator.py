@@ -10,6 +10,7 @@ import torch
 
 from torchcover.geometry import BoundingBox
 from torchcover.simulation.disturbance import disturb
+from torchcover.simulation.ego import with_ego
 from torchcover.simulation.instant import Instant, Scan
 from torchcover.simulation.labels import Label, labels
 from torchcover.simulation.memory import check_fits
@@ -34,14 +35,16 @@ class Simulator:
     are cast on as many threads as torch uses (`torch.set_num_threads`).
 
     Args:
-        scenario: The world. Beyond its end a given one plays again; traffic starts anew with other random numbers.
+        scenario: The world; `with_ego` gives it its ego. Beyond its end a given one plays again; traffic starts anew
+            with other random numbers.
         rigs: The sensors, by the name under which `Observation.clouds` has their points.
         reference_sensor: The reference sensor.
         seed: Seed of the traffic, of the reference sensor, and of noise and drop-out.
         every_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
 
     Raises:
-        ValueError: A negative seed, a time that is no multiple of the time step, more rays than there is memory for.
+        ValueError: Rigs that name different vehicles, a negative seed, a time that is no multiple of the time step,
+            more rays than there is memory for.
 
     Example:
         >>> from torchcover.simulation import PaperReference
@@ -63,7 +66,7 @@ class Simulator:
     ) -> None:
         if seed < 0:
             raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
-        self.scenario = scenario
+        self.scenario = scenario = with_ego(scenario, rigs)
         self.rigs = rigs
         self.reference_sensor = reference_sensor
         self.seed = seed

@@ -135,9 +135,11 @@ class Stages:
             for sensor in rig.sensors:
                 place = sensor.mount.matrix()[:3, 3]
                 if scene.encloses(place):
+                    other = f", or use its own vehicle (--vehicle {rig.vehicle})" if rig.vehicle else ""
                     raise ValueError(
                         f"rig {name!r}: sensor {sensor.name!r} at {place.round(3).tolist()} m lies inside the ego of "
-                        f"{self._scenario.name!r}, so that all its rays start blocked; move its mount"
+                        f"{self._scenario.name!r}, {self._scenario.ego_name}, so that all its rays start blocked; move "
+                        f"its mount{other}"
                     )
 
     def __getstate__(self) -> dict[str, Any]:

@@ -14,4 +14,3 @@ from .result import TargetMap as TargetMap
 from .survey import survey as survey
 from .target import TARGETS as TARGETS
 from .target import Target as Target
-from .target import body_called as body_called

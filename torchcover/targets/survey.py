@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.simulation.ego import with_ego
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
@@ -69,6 +70,7 @@ def survey(
         ((2, 4), True)
     """
     _check(steps, seed, hits, threshold_m)
+    scenario = with_ego(scenario, {rig.name: rig})
     vehicle = scenario.ego_box()
     raster = Raster.around(vehicle) if raster is None else raster
     _check_size(target, raster)

@@ -5,8 +5,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Self
 
-from torchcover.simulation.bodies import VehicleShape, mover_mesh
-from torchcover.simulation.shapes import Mesh, MeshFile
+from torchcover.simulation.bodies import body_called, mover_mesh
+from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.solids import Solid
 
 # What people say -> the built-in body that is meant, whose name has its size.
@@ -50,18 +50,5 @@ class Target:
             ValueError: The file is neither a vehicle nor a mesh, or is flat.
         """
         name = TARGETS.get(str(name_or_path), str(name_or_path))
-        mesh = mover_mesh(f"target {name!r}", body_called(name))
+        mesh = mover_mesh(f"target {name!r}", body_called(name), "target")
         return cls(Path(name).stem if Path(name).suffix else name, mesh)
-
-
-def body_called(name_or_path: str | Path) -> VehicleShape | MeshFile:
-    """The shape that a name or a path means: a vehicle's, unless it is a file that is no YAML.
-
-    Example:
-        >>> body_called("suv").type, body_called("robot.stl").type
-        ('vehicle', 'mesh')
-    """
-    path = Path(name_or_path)
-    if path.suffix in ("", ".yaml", ".yml"):
-        return VehicleShape(type="vehicle", vehicle=str(name_or_path))
-    return MeshFile(type="mesh", path=path)

@@ -7,11 +7,8 @@ import numpy as np
 import torch
 
 from torchcover.detection.boxes import Boxes
-from torchcover.files import check_memory, decode, reads
+from torchcover.files import parse_xml, reads
 from torchcover.geometry.rigid import Matrix, euler_from_rotation, rotation_from_euler, transform
-
-# A tree of elements takes about so many times the bytes of its text.
-TREE_PER_BYTE = 20
 
 
 @reads("KITTI tracklets")
@@ -28,11 +25,7 @@ def read_tracklets(path: Path, vehicle_T_velodyne: Matrix) -> dict[int, Boxes]:
     Raises:
         BadFileError: Not such a file, or numbers that are no boxes.
     """
-    check_memory(TREE_PER_BYTE * path.stat().st_size)
-    text = decode(path.read_bytes())
-    if "<!ENTITY" in text:
-        raise ValueError("an XML file without entities is needed")
-    root = ElementTree.fromstring(text)  # which resolves nothing that lies outside
+    root = parse_xml(path)
     frames: dict[int, list[tuple[list[float], str, str]]] = {}
     for number, item in enumerate(root.findall("./tracklets/item")):
         category = (item.findtext("objectType") or "").strip().lower()

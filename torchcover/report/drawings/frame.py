@@ -43,6 +43,7 @@ LOW_GREY, HIGH_GREY, GREY_HEIGHT_M = 0.92, 0.55, 3.0
 # These have the same colours in every picture; others take what follows.
 CATEGORIES = ("car", "truck", "bus", "cyclist", "motorcycle", "pedestrian")
 COLOURS = ("#d55e00", "#7a3fa0", "#e6b400", "#009e73", "#8b5a2b", "#d62598", "#a3122f", "#555555", "#000000")
+PATH = "#111111"
 IMAGE_HEIGHT_IN = 2.4
 SKY = "#dfe9f2"
 MAX_ROW_IN = 13.5
@@ -88,6 +89,7 @@ def draw_scene(
     reference: Points,
     title: str,
     subtitle: str = "",
+    path_m: Points | None = None,
 ) -> Figure:
     """Draw a frame.
 
@@ -101,6 +103,7 @@ def draw_scene(
         reference: (M, 3) points of the reference sensor.
         title: First line.
         subtitle: Second line, smaller.
+        path_m: (T, 2) the ego's way in the vehicle frame in metres; not drawn if it does not move.
 
     Returns:
         A figure of its own, outside pyplot.
@@ -113,6 +116,7 @@ def draw_scene(
         *_draw_cloud(axes, reference, REFERENCE, "reference points"),
         *_draw_cloud(axes, sensor, SENSOR, "points of the rig"),
         *_draw_actors(axes, inside),
+        *([] if path_m is None else axes.plot(*path_m.T, color=PATH, linewidth=1.2, label="way of the ego", zorder=3)),
         *draw_ego(axes, ego_outline_m),
     ]
     write_title(axes, title, subtitle)

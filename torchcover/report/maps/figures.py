@@ -28,6 +28,7 @@ def map_figures(
     *,
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Mapping[str, Sequence[SensorView]] | None = None,
+    vehicle: str | None = None,
     errors: bool = False,
 ) -> Iterator[Named]:
     """Draw what was measured in every height band, for one rig or for several.
@@ -42,6 +43,7 @@ def map_figures(
         coverages: What `CoverageMetric.compute` returned, by the name of the rig; several from the same frames.
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: What to mark, by the name of the rig.
+        vehicle: What the ego is called, for the titles.
         errors: Whether to draw the standard errors too, if there are any.
 
     Returns:
@@ -62,7 +64,7 @@ def map_figures(
     """
     if len(coverages) > 1:
         check_paired(coverages)
-    return _figures(coverages, _Setting(ego_outline_m, sensors or {}), errors=errors)
+    return _figures(coverages, _Setting(ego_outline_m, sensors or {}, vehicle), errors=errors)
 
 
 def band_figures(coverage: Coverage) -> Iterator[Named]:
@@ -128,6 +130,13 @@ class _Setting:
 
     ego_outline_m: NDArray[np.floating] | None
     sensors: Mapping[str, Sequence[SensorView]]
+    vehicle: str | None
+
+    def told(self, subject: Subject) -> Subject:
+        """With what carried the rigs."""
+        if self.vehicle is None:
+            return subject
+        return replace(subject, conditions=f"on {self.vehicle}, {subject.conditions}")
 
 
 @dataclass(frozen=True)
@@ -153,7 +162,7 @@ def _figures(coverages: Mapping[str, Coverage], setting: _Setting, *, errors: bo
     bands, shown = _bands(first.grid), asked_and_known(first, ego)
     near = None if ego is None else near_field(first.grid, ego)
     draw_rigs = _draw_one if len(coverages) == 1 else _draw_several
-    for whole in subjects_of(coverages):
+    for whole in map(setting.told, subjects_of(coverages)):
         subject = _within(whole, shown)
         yield from draw_rigs(subject, shown.grid, bands, setting)
         yield from _draw_differences(subject, shown.grid, bands, setting)
@@ -161,7 +170,7 @@ def _figures(coverages: Mapping[str, Coverage], setting: _Setting, *, errors: bo
             around = _within(whole, near)
             own = scale_of(around.quantity, torch.stack(list(around.values.values())))
             yield _draw_near(replace(around, scale=own), near.grid, bands, setting)
-    for whole in error_subjects_of(coverages) if errors else ():
+    for whole in map(setting.told, error_subjects_of(coverages) if errors else ()):
         yield from draw_rigs(_within(whole, shown), shown.grid, bands, setting)
 
 

@@ -85,10 +85,16 @@ class Fleet:
         """Somebody of a kind on a lane."""
         return Agent(kind, self.length_m(kind), lane, place_m, driver)
 
-    def park(self, kind: str, pose: tuple[float, float, float]) -> None:
-        """Note a body down in `parked`, at a pose x, y in metres and yaw in degrees."""
+    def park(
+        self,
+        kind: str,
+        pose: tuple[float, float, float],
+        height_m: float = 0.0,
+        tilt_deg: tuple[float, float] = (0.0, 0.0),
+    ) -> None:
+        """Note a body down in `parked`, at a pose x, y in metres and yaw in degrees; pitch and roll on a slope."""
         x_m, y_m, yaw_deg = pose
-        place = Trajectory.resting((x_m, y_m, 0.0), (yaw_deg, 0.0, 0.0))
+        place = Trajectory.resting((x_m, y_m, height_m), (yaw_deg, *tilt_deg))
         self.parked.append(Actor(f"parked {kind} {len(self.parked)}", CATEGORIES[kind], self.meshes[kind], place))
 
     def fill(

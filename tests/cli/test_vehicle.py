@@ -1,0 +1,63 @@
+"""`--vehicle`: what carries the rig, in numbers, files and titles."""
+
+import json
+
+import pytest
+
+from torchcover.evaluation import scene_pictures
+
+FREE = "name: free\nego: {pose: {}}\nbodies: [{name: ground, shape: {type: plane, size_m: [400, 400]}}]\n"
+
+
+@pytest.fixture
+def free(worlds):
+    """A scenario that leaves the vehicle open; `low` is on a sedan, `both` on a van."""
+    (worlds / "free.yaml").write_text(FREE)
+    for name, vehicle in (("low", "sedan"), ("both", "van")):
+        path = worlds / f"{name}.yaml"
+        path.write_text(f"vehicle: {vehicle}\n{path.read_text()}".replace("2.5", "3.1"))
+    return worlds
+
+
+def run(torchcover, free, command, *arguments):
+    settings = ("--scenario", free / "free.yaml", "--steps", 1, "--cell", 2, "--rays", 64, "--out", free / "out")
+    code, printed, error = torchcover(command, *arguments, *settings)
+    return code, printed, error
+
+
+def test_the_summary_and_the_table_say_which_vehicle_it_was(torchcover, free):
+    for options, vehicle in (([], "sedan"), (["--vehicle", "hatchback"], "hatchback")):
+        code, printed, error = run(torchcover, free, "evaluate", free / "low.yaml", *options)
+        assert (code, f"Vehicle: {vehicle}." in " ".join(printed.split())) == (0, True), error
+        assert json.loads((free / "out" / "summary.json").read_text())["vehicle"] == vehicle
+        assert f"on {vehicle}" in (free / "out" / "report.html").read_text()
+
+
+def test_rigs_of_different_vehicles_are_compared_on_one_that_is_named(torchcover, free):
+    rigs = (free / "low.yaml", free / "both.yaml")
+    code, _, error = run(torchcover, free, "compare", *rigs)
+    assert (code, error.count("\n")) == (2, 1)
+    assert "the rigs name different vehicles (low sedan, both van)" in error
+    assert "--vehicle" in error
+    assert run(torchcover, free, "compare", *rigs, "--vehicle", "sedan")[0] == 0
+    assert json.loads((free / "out" / "summary.json").read_text())["vehicle"] == "sedan"
+
+
+def test_pictures_and_recordings_are_of_the_vehicle_too(torchcover, free, monkeypatch):
+    titles = []
+    monkeypatch.setattr(scene_pictures, "draw_rig", lambda *_, **told: titles.append(told) or Blank())
+    shown = ("show", free / "low.yaml", "--scenario", free / "free.yaml", "--vehicle", "suv", "--out", free)
+    assert torchcover(*shown)[0] == 0
+    assert titles[0]["subtitle"] == "on suv in free, 4.90 x 1.94 x 1.63 m"
+    recorded = ("record", free / "low.yaml", "--scenario", free / "free.yaml", "--steps", 1, "--rays", 64)
+    assert torchcover(*recorded, "--vehicle", "suv", "--out", free / "drive")[0] == 0
+    assert '"lower_m": [-2.45' in (free / "drive" / "frames.yaml").read_text()
+    code, _, error = torchcover("evaluate", "--frames", free / "drive", "--vehicle", "suv", "--out", free / "out")
+    assert (code, "vehicle: for simulations; a recording has its own" in error) == (2, True)
+
+
+class Blank:
+    dpi = 100
+
+    def savefig(self, path, dpi):
+        path.write_bytes(b"")

@@ -1,0 +1,153 @@
+"""SUMO at work: streets and traffic that are drawn, OpenDRIVE, and what it refuses."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from torch.utils.data import DataLoader
+
+from torchcover import Rig, Scenario
+from torchcover.data import SimulatedFrames
+from torchcover.files import BadFileError
+from torchcover.simulation import PaperReference
+from torchcover.simulation.sumo import Sumo, programs
+from torchcover.simulation.sumo.network import read_network
+from torchcover.simulation.sumo.streets import Streets
+
+from .towns import street, write_net
+
+LITTLE = {"traffic_per_km": 2.0, "people_per_km": 1.0, "buses_per_km": 0.2, "cyclists_per_km": 0.5}
+XODR = """<OpenDRIVE><header revMajor="1" revMinor="4"/><road name="r" length="300" id="1" junction="-1"><planView>
+<geometry s="0" x="0" y="0" hdg="0" length="200"><line/></geometry>
+<geometry s="200" x="200" y="0" hdg="0" length="100"><arc curvature="0.01"/></geometry></planView>
+<elevationProfile><elevation s="0" a="5" b="0.04" c="0" d="0"/></elevationProfile>
+<lanes><laneSection s="0"><center><lane id="0" type="none" level="false"/></center><right>
+<lane id="-1" type="driving" level="false"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
+<lane id="-2" type="driving" level="false"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
+<lane id="-3" type="sidewalk" level="false"><width sOffset="0" a="2" b="0" c="0" d="0"/></lane>
+</right></laneSection></lanes></road></OpenDRIVE>"""
+ROUTES = """<routes><vType id="car" length="5"/>{more}<vehicle id="{name}" type="car" depart="1" departSpeed="10">
+<route edges="-1"/></vehicle></routes>"""
+
+
+def drawn(network="grid", **options):
+    return Sumo(random={"network": network, **LITTLE, **options}, duration_s=2.0, time_step_s=0.5)
+
+
+# Prints a fingerprint of all numbers of a world.
+FINGERPRINT = """
+import hashlib
+def fingerprint(world):
+    parts = [mesh.vertices_m for mesh in world.static]
+    for actor in (world.ego, *world.objects):
+        parts += [actor.trajectory.positions_m, actor.trajectory.angles_deg, actor.trajectory.times_s]
+    return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
+"""
+IN_A_PROCESS = (
+    FINGERPRINT
+    + """
+import sys
+from torchcover.simulation.sumo import Sumo
+print(fingerprint(Sumo.model_validate_json(sys.argv[1]).world(7)))
+"""
+)
+
+
+def test_a_seed_gives_one_world_in_every_process():
+    traffic = drawn()
+    here = {}
+    exec(FINGERPRINT, here)
+    environment = {**os.environ, "PYTHONHASHSEED": "12345"}
+    document = traffic.model_dump_json(exclude_unset=True)
+    there = subprocess.run(
+        [sys.executable, "-c", IN_A_PROCESS, document], env=environment, capture_output=True, text=True, check=True
+    )
+    world = traffic.world(7)
+    assert there.stdout.strip() == here["fingerprint"](world)
+    assert len(world.objects) > 20
+
+
+def test_workers_see_the_same_frames_and_each_run_is_another_town():
+    scenario = Scenario(name="town", traffic=drawn())
+    frames = SimulatedFrames(
+        scenario, Rig.load("front_grille_128"), steps=6, seed=1, reference_sensor=PaperReference(rows=8, columns=16)
+    )
+    here = [frame.reference for frame in (frames[0], frames[5])]
+    workers = DataLoader(frames, batch_size=None, sampler=[0, 5], num_workers=2)
+    for one, other in zip(here, workers, strict=True):
+        np.testing.assert_array_equal(one, other.reference)
+    towns = [frames.simulator.scene_of(index)[0].world.static[1] for index in (0, 5)]
+    assert len(towns[0].vertices_m) != len(towns[1].vertices_m)
+
+
+@pytest.mark.parametrize("network", ["rand", "grid", "spider"])
+def test_drawn_streets_go_on_everywhere_and_have_all_that_was_asked_for(network, tmp_path):
+    streets = Streets(network=network, lanes=3, hills_m=0.0)
+    town = read_network(streets.build(tmp_path, np.random.default_rng(2)))
+    assert town.flat_at_m == 0.0
+    assert {lane.use for lane in town.lanes} == {"road", "turn", "bay", "sidewalk", "crossing", "corner"}
+    follow = town.follow("passenger")
+    assert len(follow) > 10
+    assert all(follow.values())
+    # Nobody has to turn round.
+    assert all({after.strip("-") for after in found} != {edge.strip("-")} for edge, found in follow.items())
+
+
+def test_open_drive_brings_its_heights_and_sidewalks(tmp_path):
+    (tmp_path / "road.xodr").write_text(XODR)
+    (tmp_path / "r.xml").write_text(ROUTES.format(name="me", more=""))
+    made = Sumo(net=tmp_path / "road.xodr", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=8.0)
+    world = made.world(0)
+    x_m, _, z_m = world.ego.trajectory.positions_m.T
+    assert np.ptp(x_m) > 60.0
+    assert np.polyfit(x_m, z_m, 1)[0] == pytest.approx(0.04, abs=0.004)
+    assert np.abs(world.ego.trajectory.positions_m[:, 1]).max() < 1.0  # no car goes onto the sidewalk
+    np.testing.assert_allclose(world.ego.trajectory.angles_deg[:, 1].mean(), -np.rad2deg(np.arctan(0.04)), atol=0.5)
+    assert len(world.static) == 4  # ground, sidewalk, houses, trees
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<OpenDRIVE/>", "SUMO's netconvert fails: .+"),
+        ("<OpenDRIVE><road/></OpenDRIVE>", "SUMO's netconvert fails: .+"),
+        ("<net/>", "begins with <OpenDRIVE>; got <net>"),
+        ("<!DOCTYPE a [<!ENTITY e 'x'>]><OpenDRIVE>&e;</OpenDRIVE>", "without entities"),
+    ],
+)
+def test_a_road_that_netconvert_refuses_ends_with_its_message(text, message, tmp_path):
+    (tmp_path / "road.xodr").write_text(text)
+    with pytest.raises(BadFileError, match=f"road.xodr: .*{message}"):
+        Sumo(net=tmp_path / "road.xodr", random={}, duration_s=2.0).world(0)
+
+
+def test_what_sumo_says_is_passed_on_and_entities_never_get_to_it(tmp_path):
+    net = write_net(tmp_path / "a.net.xml", street())
+    routes = tmp_path / "r.xml"
+    made = Sumo(net=net, routes=(routes,), duration_s=2.0)
+    routes.write_text(ROUTES.format(name="me", more=""))
+    with pytest.raises(ValueError, match=r"SUMO's sumo fails: .+") as failed:
+        made.world(0)
+    assert "\n" not in str(failed.value)
+    routes.write_text("<!DOCTYPE a [<!ENTITY e SYSTEM 'file:///etc/passwd'>]><routes>&e;</routes>")
+    with pytest.raises(BadFileError, match=r"r\.xml: .*without entities"):
+        made.world(0)
+    with pytest.raises(FileNotFoundError, match=r"none\.xml"):
+        Sumo(net=net, routes=(tmp_path / "none.xml",), duration_s=2.0).world(0)
+
+
+def test_without_sumo_one_line_says_what_to_install(monkeypatch):
+    monkeypatch.setattr(programs, "find_spec", lambda _: None)
+    monkeypatch.setattr(programs, "which", lambda _: None)
+    with pytest.raises(ImportError, match=r"^traffic of type 'sumo' needs SUMO: pip install 'torchcover\[sumo\]'$"):
+        drawn().world(0)
+
+
+def test_a_net_without_ways_and_too_much_traffic_are_refused(tmp_path):
+    net = write_net(tmp_path / "a.net.xml", street())
+    with pytest.raises(ValueError, match="no street that cars may use and that leads on"):
+        Sumo(net=net, random={}, duration_s=2.0).world(0)
+    with pytest.raises(ValueError, match=r"traffic of about [\d,]+ vehicles and people; at most 20,000 are drawn"):
+        drawn(traffic_per_km=200.0, people_per_km=1000.0, cyclists_per_km=1000.0, buses_per_km=200.0).world(0)

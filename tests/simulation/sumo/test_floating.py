@@ -1,0 +1,93 @@
+"""Floating car data: SUMO's conventions, gaps, windows, and what is refused."""
+
+import numpy as np
+import pytest
+
+from torchcover.files import BadFileError
+from torchcover.simulation.sumo.crowd import Walker
+from torchcover.simulation.sumo.floating import Window, read_floating, record
+
+from .towns import drive, fcd, together, vehicle
+
+ALL = Window(-np.inf, 100.0)
+
+
+def recorded(steps, window=ALL):
+    return record([fcd(steps).encode()], window)
+
+
+@pytest.mark.parametrize(
+    ("angle", "yaw", "ahead"), [(90, 0, (1, 0)), (0, 90, (0, 1)), (270, 180, (-1, 0)), (180, -90, (0, -1))]
+)
+def test_places_are_those_of_the_front_and_angles_run_clockwise_from_north(angle, yaw, ahead):
+    track = recorded({0.0: [vehicle("a", 10.0, 20.0, angle, z=3.0)]}).tracks[0]
+    assert (track.yaw_deg[0] - yaw) % 360 == 0
+    body = Walker.of(track, "van", 6.0, (5.0, 2.0))
+    np.testing.assert_allclose(body.middle_m[0], np.array([10.0, 20.0]) - 3.0 * np.array(ahead), atol=1e-12)
+    assert track.places_m[0, 2] == 3.0
+
+
+def test_people_stand_where_they_are():
+    track = recorded({0.0: [vehicle("p", 1.0, 2.0, tag="person")]}).tracks[0]
+    np.testing.assert_array_equal(Walker.of(track, "adult", 0.2, (0.5, 0.5)).middle_m[0], [1.0, 2.0])
+
+
+def test_who_is_gone_in_between_or_jumps_has_several_tracks():
+    steady, gone, jumps = drive("s"), drive("g"), drive("j")
+    for time_s in (1.0, 1.2):
+        del gone[time_s]
+    jumps = {t: row if t < 2.0 else row.replace('y="0.0"', 'y="300.0"') for t, row in jumps.items()}
+    found = recorded(together(steady, gone, jumps))
+    spans = {
+        name: [(round(t.times_s[0], 6), round(t.times_s[-1], 6)) for t in found.tracks if t.name == name]
+        for name in "sgj"
+    }
+    assert spans == {"s": [(0.0, 4.0)], "g": [(0.0, 0.8), (1.4, 4.0)], "j": [(0.0, 1.8), (2.0, 4.0)]}
+    assert [track.covers(4.0) for track in found.tracks if track.name == "s"] == [True]
+
+
+def test_a_window_begins_when_it_is_due_or_the_ego_is_there_and_reads_no_further():
+    steps = together(drive("a"), {t: row for t, row in drive("ego").items() if t >= 1.0})
+    assert recorded(steps, Window(0.5, 1.0)).begin_s == 0.6
+    found = recorded(steps, Window(0.5, 1.0, "ego"))
+    assert found.begin_s == 1.0
+    assert all(len(track.times_s) == 6 for track in found.tracks)
+
+    def pieces():
+        text = fcd(steps)
+        for start in range(0, len(text), 100):
+            yield text[start : start + 100].encode()
+        raise AssertionError("asked for more than the window needs")
+
+    assert record(pieces(), Window(0.0, 1.0)).last_s == 1.0
+
+
+def test_rows_may_have_different_attributes():
+    steps = {0.0: [vehicle("a", 0, 0, z=1.0, slope=2.0), vehicle("b", 5, 0, z=2.0)], 0.2: [vehicle("b", 5, 0)]}
+    assert {track.name: track.places_m[0, 2] for track in recorded(steps).tracks} == {"a": 1.0, "b": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            fcd({0.0: [vehicle("a", 0, 0, angle=None)]}),
+            "t = 0 s: a vehicle or person without angle; id, x, y",
+        ),
+        (fcd({0.0: [], 0.2: [], 0.1: []}), r"must ascend; 0.1 s follows 0.2 s"),
+        (
+            fcd({0.0: [vehicle("a", 0, 0)], 0.2: [vehicle("a", 0, 0), vehicle("a", 9, 9)]}),
+            "'a' is there twice at t = ",
+        ),
+        (fcd({0.0: [vehicle("a", "nan", 0)]}), "1 of 1 positions are NaN or infinite"),
+        (fcd({0.0: [vehicle("a", "east", 0)]}), "east"),
+        ("<fcd-export/>", "at least one <timestep>"),
+        ("<fcd-export><timestep time='0'>", "not XML"),
+        ("<!DOCTYPE a [<!ENTITY e SYSTEM 'file:///etc/passwd'>]><a>&e;</a>", "without entities"),
+    ],
+)
+def test_what_is_no_floating_car_data_is_refused(text, message, tmp_path):
+    path = tmp_path / "fcd.xml"
+    path.write_text(text)
+    with pytest.raises(BadFileError, match=f"fcd.xml: .*{message}"):
+        read_floating(path, ALL)

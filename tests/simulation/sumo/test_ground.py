@@ -1,0 +1,116 @@
+"""The ground, the pavement and bridges."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from torchcover.simulation.sumo.ground import Plain, Slopes, ground_of, tilts_deg
+from torchcover.simulation.sumo.network import read_network
+from torchcover.simulation.sumo.pavement import Pavement, decks
+from torchcover.simulation.sumo.vicinity import Vicinity
+
+from .towns import DRIVE, WALK, edge, street, write_net
+
+WAY = np.array([[50.0, 0.0], [150.0, 0.0]])
+
+
+def vicinity(folder, *edges, way_m=WAY, origin_m=(0.0, 0.0)):
+    return Vicinity(read_network(write_net(folder / "a.net.xml", *edges)), way_m, np.array(origin_m))
+
+
+def hill():
+    """Ground of random heights."""
+    return Slopes(np.array([-10.0, 5.0]), np.random.default_rng(0).normal(size=(9, 7)), np.ones((8, 6), dtype=bool))
+
+
+def test_a_network_of_one_height_has_plain_ground_of_two_triangles(tmp_path):
+    ground = ground_of(vicinity(tmp_path, street(z=(3.0, 3.0))))
+    assert isinstance(ground, Plain)
+    assert len(ground.mesh().faces) == 2
+    assert (ground.mesh().vertices_m[:, 2] == 3.0).all()
+    assert (ground.heights_m(WAY) == 3.0).all()
+
+
+def test_a_street_that_climbs_takes_the_ground_with_it(tmp_path):
+    ground = ground_of(vicinity(tmp_path, street(z=(0.0, 20.0))))
+    along = np.column_stack([np.linspace(20.0, 380.0, 50), np.zeros(50)])
+    np.testing.assert_allclose(ground.heights_m(along), 0.05 * along[:, 0], atol=0.02)
+    pitch, roll = tilts_deg(ground, along, np.zeros(50), (5.0, 2.0)).T
+    np.testing.assert_allclose(pitch, -np.rad2deg(np.arctan(0.05)), atol=0.1)  # the nose is up
+    np.testing.assert_allclose(roll, 0.0, atol=0.1)
+    _, roll = tilts_deg(ground, along, np.full(50, -90.0), (5.0, 2.0)).T
+    np.testing.assert_allclose(roll, np.rad2deg(np.arctan(0.05)), atol=0.1)  # to the south, the left side is up
+
+
+def test_bodies_stand_on_the_triangles_that_rays_hit():
+    ground, generator = hill(), np.random.default_rng(1)
+    places_m = generator.uniform([-10.0, 5.0], [20.0, 45.0], (200, 2))
+    corners_m = ground.mesh().vertices_m[ground.mesh().faces]
+    for place_m, height_m in zip(places_m, ground.heights_m(places_m), strict=True):
+        a, b, c = corners_m[:, 0], corners_m[:, 1], corners_m[:, 2]
+        sides = [
+            (q - p)[:, 0] * (place_m[1] - p[:, 1]) - (q - p)[:, 1] * (place_m[0] - p[:, 0])
+            for p, q in ((a, b), (b, c), (c, a))
+        ]
+        first = int(np.argmax(np.min(sides, axis=0)))
+        weights = np.array([sides[1][first], sides[2][first], sides[0][first]])
+        assert (weights >= 0).all()
+        assert height_m == pytest.approx(weights @ corners_m[first, :, 2] / weights.sum())
+
+
+def test_the_ground_faces_up_and_has_no_holes():
+    mesh = trimesh.Trimesh(*hill().mesh(), process=False)
+    assert (mesh.face_normals[:, 2] > 0).all()
+    assert mesh.area_faces @ mesh.face_normals[:, 2] == pytest.approx(8 * 6 * 25.0)
+
+
+@pytest.mark.parametrize("z", [(1.0, 1.0), (0.0, 12.0)])
+def test_kerbs_are_closed_and_as_high_as_they_should_be(z, tmp_path):
+    near = vicinity(tmp_path, street(z=z))
+    ground = ground_of(near)
+    pavement = Pavement(near, ground)
+    (mesh,) = pavement.meshes()
+    body = trimesh.Trimesh(*mesh, process=False)
+    assert body.is_watertight
+    assert body.is_winding_consistent
+    assert body.volume == pytest.approx(400.0 * 2.0 * (0.15 + 0.3), rel=1e-3)
+    above_m = mesh.vertices_m[:, 2] - ground.heights_m(mesh.vertices_m[:, :2])
+    np.testing.assert_allclose(np.unique(above_m.round(9)), [-0.3, 0.15])
+    on, off = np.array([[50.0, -2.75], [399.0, -3.7]]), np.array([[50.0, -1.7], [50.0, 0.0], [50.0, -3.8]])
+    assert pavement.holds(on).all()
+    assert not pavement.holds(off).any()
+
+
+def test_nobody_drives_over_a_kerb(tmp_path):
+    crossing = edge(":j_c0", (WALK, 4.0, [(100, -5, 0), (100, 5, 0)]), function="crossing")
+    corner = edge(":j_w0", (WALK, 4.0, [(200, -9, 0), (240, -9, 0), (240, 1, 0), (200, 1, 0)]), function="walkingarea")
+    near = vicinity(tmp_path, street(), crossing, corner)
+    pavement = Pavement(near, ground_of(near))
+    xs = np.linspace(1.0, 399.0, 400)
+    assert not pavement.holds(np.column_stack([xs, np.full(400, -1.7)])).any()
+    assert not pavement.holds(np.array([[99.0, -2.75], [101.0, -3.5]])).any()
+    assert pavement.holds(np.array([[97.0, -2.75], [103.0, -2.75], [220.0, -8.0]])).all()
+    assert len(pavement.parts) == 2
+    for mesh in pavement.meshes():
+        assert trimesh.Trimesh(*mesh, process=False).is_watertight
+
+
+def test_a_bridge_has_a_deck_and_the_ground_goes_below(tmp_path):
+    over = edge("over", (DRIVE, 7.0, [(100, -150, 0), (100, -60, 6), (100, 60, 6), (100, 150, 0)]))
+    near = vicinity(tmp_path, street(), over)
+    ground = ground_of(near)
+    np.testing.assert_allclose(ground.heights_m(np.array([[80.0, 0.0], [100.0, 0.0], [120.0, 0.0]])), 0.0, atol=0.05)
+    np.testing.assert_allclose(ground.heights_m(np.array([[100.0, -55.0], [100.0, 55.0]])), 6.0, atol=0.1)
+    (deck,) = decks(near)
+    body = trimesh.Trimesh(*deck, process=False)
+    assert body.is_watertight
+    assert body.volume > 0
+    np.testing.assert_allclose(np.unique(deck.vertices_m[:, 2]), [5.2, 6.0])
+    np.testing.assert_allclose(np.ptp(deck.vertices_m[:, 0]), 7.0)
+    assert deck.vertices_m[:, 1].min() < -2.75
+    assert deck.vertices_m[:, 1].max() > 1.75
+
+
+def test_only_what_is_near_the_way_is_there(tmp_path):
+    near = vicinity(tmp_path, street(), street("far", y=400.0), street("beyond", y=270.0))
+    assert {lane.edge for lane in near.lanes} == {"east", "beyond"}

@@ -1,0 +1,88 @@
+"""Networks as SUMO writes them, good and bad."""
+
+import numpy as np
+import pytest
+
+from torchcover.files import BadFileError
+from torchcover.simulation.sumo.network import read_network
+
+from .towns import DRIVE, WALK, edge, street, write_net
+
+LINE = [(0, 0, 1), (50, 0, 2)]
+CONNECTED = '<connection from="a" to="b" fromLane="0" toLane="0"/><connection from="b" to="c" fromLane="0" toLane="0"/>'
+
+
+def test_lanes_are_for_those_who_may_use_them(tmp_path):
+    lanes = [
+        (WALK, 2, LINE), ('disallow="all" type="parking"', 2.3, LINE), ('disallow="all"', 1, LINE),
+        ('allow="rail"', 3, LINE), ('allow="bicycle"', 1.5, LINE), (DRIVE, 3.2, LINE),
+    ]  # fmt: skip
+    path = write_net(
+        tmp_path / "a.net.xml",
+        edge("a", *lanes),
+        edge(":j_c0", (WALK, 4, LINE), function="crossing"),
+        edge(":j_w0", (WALK, 2, [(0, 0), (1, 0), (0, 1)]), function="walkingarea"),
+        edge(":j_0", (DRIVE, 3, LINE), function="internal"),
+        junctions=[[(0, 0), (5, 5), (5, 0), (0, 5)]],
+    )
+    network = read_network(path)
+    uses = [lane.use for lane in network.lanes]
+    assert uses == ["sidewalk", "bay", "shoulder", "road", "road", "crossing", "corner", "turn"]
+    assert [lane.allows("bicycle") for lane in network.lanes[:5]] == [False, False, False, True, True]
+    assert [lane.allows("passenger") for lane in network.lanes[:5]] == [False, False, False, False, True]
+    np.testing.assert_array_equal(network.lanes[4].line_m, np.array(LINE, dtype=float))
+    assert len(network.junctions) == 1
+
+
+def test_ways_go_on_only_where_a_class_may_drive(tmp_path):
+    path = write_net(
+        tmp_path / "a.net.xml",
+        edge("a", (DRIVE, 3, LINE)),
+        edge("b", (DRIVE, 3, LINE)),
+        edge("c", ('allow="bus"', 3, LINE)),
+        more=CONNECTED,
+    )
+    network = read_network(path)
+    assert network.follow("passenger") == {"a": ("b",), "b": ()}
+    assert network.follow("bus") == {"a": ("b",), "b": ("c",), "c": ()}
+
+
+def test_lanes_without_length_are_left_out_and_a_file_that_changes_is_read_again(tmp_path):
+    path = write_net(tmp_path / "a.net.xml", street(), edge("short", (DRIVE, 3, [(7, 7), (7, 7)])))
+    assert {lane.edge for lane in read_network(path).lanes} == {"east"}
+    write_net(path, street(), street("another"))
+    assert {lane.edge for lane in read_network(path).lanes} == {"east", "another"}
+
+
+@pytest.mark.parametrize(
+    ("edges", "message"),
+    [
+        ([edge("a", (DRIVE, -1, LINE))], "lane 'a_0': a width above 0 and up to 100 m is needed; got -1"),
+        ([edge("a", (DRIVE, "nan", LINE))], "lane 'a_0': a width above 0"),
+        ([edge("a", (DRIVE, "wide", LINE))], "lane 'a_0': width is 'wide', not a number"),
+        ([edge("a", (DRIVE, 3, [(0, 0), ("nan", 1)]))], "lane 'a_0': its shape has NaN"),
+        ([edge("a", (DRIVE, 3, [(0, 0), (1, 1, 1, 1)]))], "a shape of places"),
+        ([edge("a", (WALK, 3, LINE))], "a street for vehicles is needed; it has 1 lanes"),
+        ([], "a street for vehicles is needed"),
+    ],
+)
+def test_what_is_no_street_is_refused_with_the_lane(edges, message, tmp_path):
+    with pytest.raises(BadFileError, match=f"a.net.xml: .*{message}"):
+        read_network(write_net(tmp_path / "a.net.xml", *edges))
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("<routes/>", "begins with <net>; got <routes>"),
+        ("<!DOCTYPE n [<!ENTITY a 'aaaa'>]><net>&a;</net>", "without entities"),
+        ("<net>", "no element found"),
+    ],
+)
+def test_what_is_no_network_is_refused(text, message, tmp_path):
+    path = tmp_path / "a.net.xml"
+    path.write_text(text)
+    with pytest.raises(BadFileError, match=f"a.net.xml: .*{message}"):
+        read_network(path)
+    with pytest.raises(FileNotFoundError, match=r"b\.net\.xml"):
+        read_network(tmp_path / "b.net.xml")

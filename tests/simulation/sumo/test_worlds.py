@@ -1,0 +1,182 @@
+"""Worlds from networks and floating car data that are given."""
+
+import numpy as np
+import pytest
+import shapely
+
+from torchcover import Scenario
+from torchcover.simulation.sumo import Sumo
+from torchcover.simulation.traffic.procedural import Procedural
+
+from .towns import drive, edge, fcd, street, together, vehicle, write_net
+
+UTM = (512_345.0, 5_405_678.0)
+
+
+def made(folder, *edges, steps=None, **options):
+    net = write_net(folder / "a.net.xml", *(edges or (street(),)))
+    (folder / "fcd.xml").write_text(fcd(steps or together(drive())))
+    options = {"duration_s": 4.0, **options}
+    return Sumo(net=net, fcd=folder / "fcd.xml", **options)
+
+
+def test_the_ego_drives_as_it_did_there(tmp_path):
+    world = made(tmp_path, ego_id="ego").world(0)
+    assert world.steps == 41
+    positions_m = world.ego.trajectory.positions_m
+    np.testing.assert_allclose(np.diff(positions_m[:, 0]), 1.0, atol=1e-9)
+    np.testing.assert_array_equal(positions_m[:, 1:], 0.0)
+    # The ground is that of the first place's whole metres: 50 m on the street, less half of a car of 5 m.
+    assert positions_m[0, 0] == 0.5
+
+
+def test_coordinates_of_utm_size_change_nothing(tmp_path):
+    here, there = tmp_path / "here", tmp_path / "there"
+    worlds = []
+    for folder, shift in ((here, (0.0, 0.0)), (there, UTM)):
+        folder.mkdir()
+        steps = together(drive(shift=shift), drive("b", y=3.0, start=70.0, shift=shift))
+        worlds.append(made(folder, street(z=(0.0, 8.0), shift=shift), steps=steps, ego_id="ego").world(3))
+    for one, other in zip(worlds[0].static, worlds[1].static, strict=True):
+        np.testing.assert_allclose(one.vertices_m, other.vertices_m, atol=1e-6)
+    for one, other in zip((worlds[0].ego, *worlds[0].actors), (worlds[1].ego, *worlds[1].actors), strict=True):
+        np.testing.assert_allclose(one.trajectory.positions_m, other.trajectory.positions_m, atol=1e-6)
+
+
+def test_who_comes_and_goes_is_there_for_that_time_and_who_is_far_never(tmp_path):
+    late = {t: row for t, row in drive("late", y=3.0).items() if 1.0 <= t <= 2.0}
+    world = made(tmp_path, steps=together(drive(), late, drive("far", y=260.0)), ego_id="ego").world(0)
+    (actor,) = world.actors
+    assert (actor.category, actor.trajectory.transient) == ("car", True)
+    there = np.isfinite(actor.trajectory.positions_at(np.array([0.8, 1.0, 2.0, 2.2]))[:, 0])
+    assert there.tolist() == [False, True, True, False]
+
+
+def test_types_have_bodies_by_class_and_length(tmp_path):
+    kinds = {"bus": 1, "truck": 2, "bicycle": 3, "motorcycle": 4, "pedestrian": 5, "passenger": 6, "rail": 7}
+    rows = [drive()] + [drive(f"{kind}", y=5.0 * k, type=kind) for kind, k in kinds.items()]
+    routes = tmp_path / "r.xml"
+    routes.write_text('<routes><vType id="passenger" length="6.2"/><vType id="truck" vClass="trailer"/></routes>')
+    world = made(tmp_path, steps=together(*rows), ego_id="ego", routes=(routes,)).world(0)
+    found = {actor.name.split()[1]: actor.name.split()[0] for actor in world.actors}
+    assert found == {
+        "bus": "bus", "truck": "truck", "bicycle": "cyclist", "motorcycle": "motorcycle", "pedestrian": "adult",
+        "passenger": "van",
+    }  # fmt: skip
+
+
+def test_whoever_is_where_the_ego_is_is_left_out_with_a_warning_unless_another_ego_is_free(tmp_path):
+    steps = together(drive(), drive("ghost", start=52.0), drive("free", start=90.0))
+    with pytest.warns(UserWarning, match=r"has 1 of 2 road users where the ego is at some time \('ghost'\)"):
+        world = made(tmp_path, steps=steps, ego_id="ego").world(0)
+    assert [actor.name.split()[1] for actor in world.actors] == ["free"]
+    for seed in range(3):
+        assert len(made(tmp_path, steps=steps).world(seed).actors) == 2
+
+
+def test_people_walk_on_the_pavement_and_step_down(tmp_path):
+    walks = {
+        t: vehicle("p", 60.0, -3.0 + 0.5 * t, 0.0, tag="person") for t in (round(0.2 * k, 1) for k in range(31))
+    }  # fmt: skip
+    world = made(tmp_path, steps=together(drive(until=6.0, y=9.0), walks), ego_id="ego", duration_s=6.0).world(0)
+    height_m = world.actors[0].trajectory.positions_m[:, 2]
+    assert height_m[0] == pytest.approx(0.15)
+    assert height_m[-1] == pytest.approx(0.0)
+    assert (np.diff(height_m) <= 1e-12).all()
+    assert np.abs(np.diff(height_m)).max() < 0.08
+
+
+def test_on_a_bridge_one_stands_on_its_deck(tmp_path):
+    over = edge("over", ("", 7.0, [(100, -150, 0), (100, -60, 6), (100, 60, 6), (100, 150, 0)]))
+    above = {t: vehicle("up", 100.0, -20 + 10 * t, 0.0, z=6.0) for t in drive()}
+    world = made(tmp_path, street(), over, steps=together(drive(start=100.0, z=0.0), above), ego_id="ego").world(0)
+    np.testing.assert_allclose(world.actors[0].trajectory.positions_m[:, 2], 6.0, atol=0.15)
+    np.testing.assert_allclose(world.ego.trajectory.positions_m[:, 2], 0.0, atol=0.1)
+
+
+@pytest.mark.parametrize("z", [(0.0, 0.0), (0.0, 12.0)])
+def test_houses_stand_beside_streets_and_apart(z, tmp_path):
+    # At right angles, so that lots of either lie on the other and on its lots.
+    north = edge("north", ("", 3.5, [(100, -200, z[1] / 4), (100, 200, z[1] / 4)]))
+    world = made(tmp_path, street(z=z), north, built_share=1.0, ego_id="ego").world(0)
+    ground, _, houses, _ = world.static
+    outlines_m = houses.vertices_m.reshape(-1, 8, 3)[:, :4, :2]
+    polygons = shapely.polygons(outlines_m)
+    assert len(polygons) > 25
+    assert all(polygon.exterior.is_ccw for polygon in polygons)
+    # The world begins 47 m along the street.
+    taken = [shapely.box(-47.0, -3.75, 353.0, 1.75), shapely.box(51.25, -200.0, 54.75, 200.0)]
+    assert min(shapely.distance(polygons, piece).min() for piece in taken) > 0.4
+    one, other = shapely.STRtree(polygons).query(polygons, predicate="intersects")
+    assert (one == other).all()
+    middles_m = outlines_m.mean(axis=1)
+    east = np.abs(middles_m[:, 0] - 53.0) > 40.0
+    assert {-1.0, 1.0} == set(np.sign(middles_m[east, 1]))  # of a one-way street, too
+    heights_m = houses.vertices_m[:, 2].reshape(-1, 8)
+    assert heights_m[:, 4:].min() - ground.vertices_m[:, 2].min() > 4.9
+
+
+def test_open_country_has_trees_only(tmp_path):
+    world = made(tmp_path, built_share=0.0, ego_id="ego").world(0)
+    assert len(world.static) == 3
+    assert world.static[2].vertices_m[:, 2].max() < 9.0
+
+
+def test_cars_are_parked_in_bays_only(tmp_path):
+    line = [(0, 4), (400, 4)]
+    bays = edge("bays", ('type="parking" disallow="all"', 2.3, line))
+    far = [edge(name, (who, 2.3, line)) for name, who in (("s", 'disallow="all"'), ("d", ""))]
+    parked = made(tmp_path, street(), bays, ego_id="ego", parked_share=1.0).world(0).parked
+    assert 40 < len(parked) < 80
+    places_m = np.array([actor.trajectory.positions_m[0] for actor in parked])
+    np.testing.assert_allclose(places_m[:, 1], 4.0)
+    assert np.diff(np.sort(places_m[:, 0])).min() > 4.0
+    assert not made(tmp_path, street(), bays, ego_id="ego", parked_share=0.0).world(0).parked
+    assert not made(tmp_path, street(), *far, ego_id="ego", parked_share=1.0).world(0).parked
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"ego_id": "nobody"}, "ego_id: no vehicle 'nobody' up to t = 4 s, where the data end"),
+        (
+            {"ego_id": "ego", "duration_s": 9.0},
+            r"ego_id: 'ego' is not there all the time from t = 0 to 9 s",
+        ),
+        ({"duration_s": 9.0}, r"no car that could be the ego .* the longest drives for 4 s \(data end at t = 4 s\)"),
+        ({"ego_type": "bus"}, "no vehicle of type 'bus' that could be the ego"),
+        ({"begin_s": 3.0}, "no car that could be the ego"),
+    ],
+)
+def test_without_an_ego_there_is_no_world(options, message, tmp_path):
+    with pytest.raises(ValueError, match=message):
+        made(tmp_path, **options).world(0)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"type": "sumo"}, "give a net and its routes, a net and its fcd, or random"),
+        ({"type": "sumo", "net": "a.net.xml"}, "give a net and its routes"),
+        ({"type": "sumo", "random": {}, "ego_id": "a"}, "random draws all traffic; leave out ego_id"),
+        ({"type": "sumo", "net": "a.net.xml", "random": {"lanes": 1}}, "random: lanes are for streets that are drawn"),
+        ({"type": "sumo", "random": {"network": "star"}}, "'rand', 'grid' or 'spider'"),
+        ({"type": "somo"}, "type: traffic is one of 'urban', 'highway', 'parking', 'sumo'; got 'somo'"),
+        ({}, "type: traffic is one of"),
+    ],
+)
+def test_documents_that_make_no_sense_are_refused(content, message):
+    with pytest.raises(ValueError, match=message):
+        Scenario.model_validate({"name": "s", "traffic": content})
+
+
+def test_files_lie_beside_the_document_and_count_as_content(tmp_path):
+    made(tmp_path)
+    document = tmp_path / "s.yaml"
+    document.write_text("name: s\ntraffic: {type: sumo, net: a.net.xml, fcd: fcd.xml, duration_s: 4.0}")
+    traffic = Scenario.load(document).traffic
+    assert isinstance(traffic, Procedural)
+    before = traffic.content()
+    assert traffic.world(0).actors == ()
+    (tmp_path / "fcd.xml").write_text(fcd(together(drive(), drive("b"))))
+    assert traffic.content() != before

@@ -1,0 +1,107 @@
+"""What carries a rig: the first that is given of `vehicle`, the scenario's own ego, the rig's vehicle, an SUV."""
+
+import numpy as np
+import pytest
+
+from torchcover.data import SimulatedFrames
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
+
+SENSOR = {"name": "top", "mount": {"z_m": 5.0}, "channels": 4, "columns": 8, "vertical_fov_deg": [-30, 0]}
+PATTERN = {"horizontal_fov_deg": 360.0, "max_range_m": 50.0}
+GROUND = {"name": "ground", "shape": {"type": "plane", "size_m": [200, 200]}}
+BOX = {"type": "box", "size_m": [6, 2.5, 3]}
+SMALL = PaperReference(rows=4, columns=4)
+CART = "name: cart\nparts: [{name: bed, shape: {type: box, size_m: [3, 1.5, 1]}, poses: [{z_m: 0.2}]}]\n"
+
+
+def rig(vehicle=None, name="r"):
+    return Rig.model_validate({"name": name, "vehicle": vehicle, "sensors": [{**SENSOR, **PATTERN}]})
+
+
+def given(**ego):
+    return Scenario.model_validate({"name": "s", "ego": ego, "bodies": [GROUND]})
+
+
+def procedural(**ego):
+    return Scenario.model_validate({"name": "s", "traffic": {"type": "parking", "duration_s": 1.0}, "ego": ego or None})
+
+
+def length_m(scenario, *rigs, vehicle=None):
+    carried = {str(k): each for k, each in enumerate(rigs)}
+    if vehicle is not None:
+        scenario = with_ego(scenario, carried, vehicle)
+    simulator = Simulator(scenario, carried, SMALL)
+    box = simulator.scenario.ego_box()
+    assert scenario.traffic is not None or simulator.scene_of(0)[0].ego_box == box
+    return box.size_m[0]
+
+
+@pytest.mark.parametrize("world", [given, procedural])
+def test_the_first_that_is_given_carries_the_rig(world):
+    assert length_m(world(), rig()) == pytest.approx(4.90)
+    assert length_m(world(), rig("sedan")) == pytest.approx(4.77)
+    assert length_m(world(shape=BOX), rig("sedan")) == pytest.approx(6.0)
+    assert length_m(world(shape=BOX), rig("sedan"), vehicle="van") == pytest.approx(5.93)
+    assert length_m(world(), rig("sedan"), vehicle="van") == pytest.approx(5.93)
+
+
+@pytest.mark.parametrize("name", ["courtyard", "urban", "highway", "parking"])
+def test_built_in_scenarios_leave_it_to_the_rig(name):
+    zoe = with_ego(Scenario.load(name), {"nuscenes": Rig.load("nuscenes")})
+    assert (zoe.ego_name, zoe.ego_box().size_m[0]) == ("renault_zoe", pytest.approx(4.084))
+    assert with_ego(Scenario.load(name), {"a": rig()}).ego_name == Scenario.load(name).ego_name == "suv"
+
+
+def test_rigs_that_name_different_vehicles_need_one_that_is_for_all():
+    two = (rig("sedan"), rig("van"))
+    with pytest.raises(ValueError, match=r"different vehicles \(0 sedan, 1 van\), .* one ego: say which by --vehicle"):
+        length_m(given(), *two)
+    assert length_m(given(), *two, vehicle="suv") == pytest.approx(4.90)
+    assert length_m(given(shape=BOX), *two) == pytest.approx(6.0)
+    # The same, and one that goes on any, are no conflict.
+    assert length_m(given(), rig("sedan"), rig("sedan"), rig()) == pytest.approx(4.77)
+
+
+def test_a_vehicles_file_lies_beside_the_document_that_names_it(tmp_path, monkeypatch):
+    (tmp_path / "own").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "own" / "cart.yaml").write_text(CART)
+    (tmp_path / "own" / "rig.yaml").write_text(
+        "name: r\nvehicle: cart.yaml\n"
+        "sensors: [{name: a, mount: {z_m: 5}, channels: 4, columns: 8, vertical_fov_deg: [-30, 0],"
+        " horizontal_fov_deg: 360, max_range_m: 50}]\n"
+    )
+    (tmp_path / "own" / "scene.yaml").write_text(
+        "name: s\nego: {shape: {type: vehicle, vehicle: cart.yaml}}\n"
+        "bodies: [{name: ground, shape: {type: plane, size_m: [9, 9]}}]\n"
+    )
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    of_rig = with_ego(given(), {"r": Rig.load("../own/rig.yaml")})
+    assert (of_rig.ego_name, of_rig.ego_box().size_m) == ("cart.yaml", (3.0, 1.5, 1.0))
+    assert Scenario.load("../own/scene.yaml").ego_box().size_m == (3.0, 1.5, 1.0)
+    # An option is meant from where the user is.
+    with pytest.raises(FileNotFoundError, match=r"vehicle: cart\.yaml: no such file"):
+        with_ego(given(), {"r": rig()}, "cart.yaml")
+    assert with_ego(given(), {"r": rig()}, "../own/cart.yaml").ego_name == "cart.yaml"
+
+
+def test_an_unknown_vehicle_is_told_with_whose_it_is_and_the_known_ones():
+    with pytest.raises(FileNotFoundError, match=r"rig 'top': vehicle: 'tank' is neither .* built-in vehicles: adult"):
+        with_ego(given(), {"top": rig("tank")})
+
+
+def test_frames_say_which_vehicle_it_was_and_are_others_on_another():
+    scenario = given()
+    frames = [SimulatedFrames(scenario, rig(), steps=1, reference_sensor=SMALL, vehicle=v) for v in (None, "van")]
+    assert [each.description["vehicle"] for each in frames] == ["suv", "van"]
+    assert frames[0].content["scenario"] != frames[1].content["scenario"]
+    np.testing.assert_allclose(np.ptp(frames[1].ego_outline_m, axis=0), [5.93, 2.02])
+    # What a rig names and what does not carry it change no frame, nor what a checkpoint is of.
+    named = SimulatedFrames(scenario, rig("sedan"), steps=1, reference_sensor=SMALL, vehicle="van")
+    assert named.content == frames[1].content
+
+
+def test_a_sensor_inside_an_ego_that_is_not_its_own_is_told_so():
+    frames = SimulatedFrames("courtyard", "nuscenes_cameras", steps=1, reference_sensor=SMALL, vehicle="suv")
+    with pytest.raises(ValueError, match=r"inside the ego of 'courtyard', suv, .*\(--vehicle renault_zoe\)"):
+        frames[0]

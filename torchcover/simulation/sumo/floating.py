@@ -1,0 +1,212 @@
+"""Floating car data: where everybody is at each time, as SUMO writes it while it runs, or into a file."""
+
+from collections.abc import Iterable, Iterator
+from contextlib import suppress
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.files import feed_xml, reads
+
+Numbers = NDArray[np.float64]
+
+ATTRIBUTES = "id,x,y,z,angle,slope,type"
+# Who is not heard of for longer than this many usual steps, or moves faster than this from one to the next, is gone in
+# between, or was moved by the simulation.
+MAX_STEPS = 1.5
+FASTEST_MPS = 90.0
+PIECE_BYTES = 1 << 18
+TIME_SLACK_S = 1e-6
+
+
+class Track(NamedTuple):
+    """One vehicle or person, for as long as it was there without a gap.
+
+    Args:
+        name: Of the simulation.
+        kind: Name of its type.
+        on_foot: Whether it is a person.
+        times_s: (K,) from the first time of the run.
+        places_m: (K, 3) the middle of its front, float64: they may be of UTM size.
+        yaw_deg: (K,) heading, counter-clockwise from x; SUMO's own angles are clockwise from north.
+        slope_deg: (K,) upwards.
+    """
+
+    name: str
+    kind: str
+    on_foot: bool
+    times_s: Numbers
+    places_m: Numbers
+    yaw_deg: Numbers
+    slope_deg: Numbers
+
+    def covers(self, duration_s: float) -> bool:
+        """Whether it is there from the first time to so much later."""
+        return bool(self.times_s[0] <= TIME_SLACK_S and self.times_s[-1] >= duration_s - TIME_SLACK_S)
+
+
+class Window(NamedTuple):
+    """What of the data is meant.
+
+    Args:
+        begin_s: Its first time, in that of the simulation.
+        duration_s: Its length.
+        from_name: It begins when this one is heard of, if that is later.
+    """
+
+    begin_s: float
+    duration_s: float
+    from_name: str | None = None
+
+
+class _Enough(Exception):  # noqa: N818  (no error: the window is over)
+    pass
+
+
+class _Collector:
+    """Keeps the rows of a window, as start tags come in."""
+
+    def __init__(self, window: Window) -> None:
+        self._window = window
+        self.begin_s, self.last_s, self._end_s = np.nan, -np.inf, np.inf
+        self._now: dict[str, list[list[str]]] = {"vehicle": [], "person": []}
+        self.number: dict[tuple[bool, str], int] = {}
+        self.kinds: list[str] = []
+        self.times_s: list[float] = []
+        self.of: list[int] = []
+        self.rows: list[Numbers] = []
+        self.counts: list[int] = []
+
+    def start(self, name: str, attributes: list[str]) -> None:
+        """A tag; see `feed_xml`."""
+        if name in self._now:
+            self._now[name].append(attributes)
+        elif name == "timestep":
+            self.end_step()
+            time_s = float(attributes[attributes.index("time") + 1])
+            if time_s <= self.last_s:
+                raise ValueError(f"the times of its steps must ascend; {time_s:g} s follows {self.last_s:g} s")
+            if time_s > self._end_s + TIME_SLACK_S:
+                raise _Enough
+            self.last_s = time_s
+
+    def end_step(self) -> None:
+        """Keep what was told of the step, if it is in the window."""
+        now = {name: rows for name, rows in self._now.items() if rows}
+        self._now = {"vehicle": [], "person": []}
+        if np.isnan(self.begin_s):
+            waits = self._window.from_name is not None and not any(
+                self._window.from_name in row for row in now.get("vehicle", ())
+            )
+            if waits or self.last_s < self._window.begin_s - TIME_SLACK_S or not np.isfinite(self.last_s):
+                return
+            self.begin_s, self._end_s = self.last_s, self.last_s + self._window.duration_s
+        self.times_s.append(self.last_s)
+        self.counts.append(sum(map(len, now.values())))
+        for name, rows in now.items():
+            columns = self._columns(rows)
+            for who, kind in zip(columns["id"], columns.get("type", ("",) * len(rows)), strict=True):
+                number = self.number.setdefault((name == "person", who), len(self.kinds))
+                if number == len(self.kinds):
+                    self.kinds.append(kind)
+                self.of.append(number)
+            zeros = ("0",) * len(rows)
+            numbers = [columns[name] for name in ("x", "y", "angle")]
+            numbers += [columns.get(name, zeros) for name in ("z", "slope")]
+            self.rows.append(np.array([list(map(float, column)) for column in numbers]).T)
+
+    def _columns(self, rows: list[list[str]]) -> dict[str, tuple[str, ...]]:
+        """The values of each attribute; all rows have the same ones."""
+        names = rows[0][::2]
+        if any(row[::2] != names for row in rows):
+            shared = sorted(set(names).intersection(*(row[::2] for row in rows)))
+            rows = [[part for name in shared for part in (name, row[2 * row[::2].index(name) + 1])] for row in rows]
+            names = shared
+        missing = [name for name in ("id", "x", "y", "angle") if name not in names]
+        if missing:
+            raise ValueError(
+                f"t = {self.last_s:g} s: a vehicle or person without {', '.join(missing)}; id, x, y and angle are "
+                f"needed of each (sumo --fcd-output.attributes {ATTRIBUTES})"
+            )
+        return dict(zip(names, list(zip(*rows, strict=True))[1::2], strict=True))
+
+
+class Recorded(NamedTuple):
+    """What there is in a window.
+
+    Args:
+        tracks: All, in the order of their first appearance; somebody who was gone in between has several.
+        begin_s: When it begins, in the time of the simulation.
+        last_s: The last time that was read.
+    """
+
+    tracks: tuple[Track, ...]
+    begin_s: float
+    last_s: float
+
+
+def record(pieces: Iterable[bytes], window: Window) -> Recorded:
+    """Read floating car data.
+
+    Args:
+        pieces: XML as SUMO writes it; no more of it is asked for than the window needs.
+        window: What is kept of it.
+
+    Raises:
+        ValueError: Not such data, or without angles.
+    """
+    collector = _Collector(window)
+    with suppress(_Enough):
+        feed_xml(pieces, collector.start)
+        collector.end_step()
+    if not np.isfinite(collector.last_s):
+        raise ValueError("floating car data of SUMO with at least one <timestep> is needed")
+    return Recorded(tuple(_tracks(collector)), collector.begin_s, collector.last_s)
+
+
+@reads("floating car data of SUMO")
+def read_floating(path: Path, window: Window) -> Recorded:
+    """Read it from a file; see `record`.
+
+    Raises:
+        FileNotFoundError: No such file.
+        BadFileError: As `record`.
+    """
+    with path.open("rb") as file:
+        return record(iter(lambda: file.read(PIECE_BYTES), b""), window)
+
+
+def _tracks(collector: _Collector) -> Iterator[Track]:
+    times_s = np.array(collector.times_s) - collector.begin_s
+    of = np.array(collector.of, dtype=np.int64)
+    step = np.repeat(np.arange(len(times_s)), collector.counts)
+    rows = np.concatenate([*collector.rows, np.empty((0, 5))])
+    if not np.isfinite(rows).all():
+        raise ValueError(f"{int((~np.isfinite(rows)).any(axis=1).sum())} of {len(rows)} positions are NaN or infinite")
+    usual_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+    order = np.argsort(of, kind="stable")
+    ends = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=len(collector.kinds)))])
+    for (on_foot, name), number in collector.number.items():
+        own = order[ends[number] : ends[number + 1]]
+        if len(own) == 0:
+            continue
+        # Bodies that are there all the time share their times.
+        own_s = times_s if len(own) == len(times_s) else times_s[step[own]]
+        taken_s, way_m = np.diff(own_s), np.linalg.norm(np.diff(rows[own, :2], axis=0), axis=1)
+        if (taken_s <= 0).any():
+            raise ValueError(f"{name!r} is there twice at t = {collector.begin_s + own_s[taken_s.argmin()]:g} s")
+        breaks = np.flatnonzero((taken_s > MAX_STEPS * usual_s + TIME_SLACK_S) | (way_m > FASTEST_MPS * taken_s)) + 1
+        for first, end in pairwise([0, *breaks.tolist(), len(own)]):
+            x_m, y_m, angle_deg, z_m, slope_deg = rows[own[first:end]].T
+            yield Track(
+                name=name,
+                kind=collector.kinds[number],
+                on_foot=on_foot,
+                times_s=own_s if end - first == len(own) else own_s[first:end],
+                places_m=np.stack([x_m, y_m, z_m], axis=1),
+                yaw_deg=90.0 - angle_deg,
+                slope_deg=slope_deg,
+            )

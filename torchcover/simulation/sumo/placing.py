@@ -1,0 +1,90 @@
+"""Bodies on the ground: heights and tilts along their tracks."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.sumo.crowd import Walker
+from torchcover.simulation.sumo.ground import Ground, Plain, tilts_deg
+from torchcover.simulation.sumo.pavement import Pavement
+from torchcover.simulation.traffic.attitude import attitude
+from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet
+from torchcover.simulation.traffic.scenery import PAVEMENT_M
+from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.world import Actor
+
+Numbers = NDArray[np.float64]
+
+# Who is so far above the ground is on a bridge.
+BRIDGE_M = 0.4
+# How long it takes to step onto a kerb.
+STEP_S = 0.4
+
+
+class Placing:
+    """Puts bodies onto the ground, the pavement, or the deck of a bridge.
+
+    Args:
+        ground: The ground.
+        pavement: Sidewalks, on which people are.
+        origin_m: (2,) what is subtracted of all places.
+    """
+
+    def __init__(self, ground: Ground, pavement: Pavement, origin_m: Numbers) -> None:
+        self._ground = ground
+        self._pavement = pavement
+        self._origin_m = origin_m
+
+    def actors(self, others: Sequence[Walker], fleet: Fleet, duration_s: float) -> tuple[Actor, ...]:
+        """The others as actors, there for as long as they were in the simulation."""
+        return tuple(
+            Actor(
+                f"{other.kind} {other.track.name} {number}",
+                CATEGORIES[other.kind],
+                fleet.meshes[other.kind],
+                Trajectory(other.track.times_s, *self._poses(other), transient=not other.track.covers(duration_s)),
+            )
+            for number, other in enumerate(others)
+        )
+
+    def ego(self, ego: Walker, times_s: Numbers, mesh: Mesh, generator: np.random.Generator) -> Actor:
+        """The ego, with a body that tilts with braking and curves, too, at evenly spaced times."""
+        own_s = ego.track.times_s
+        places_m, angles_deg = self._poses(ego)
+        yaw_deg = np.rad2deg(np.unwrap(np.deg2rad(angles_deg[:, 0])))
+        x_m, y_m, z_m, yaw, pitch, roll = (
+            np.interp(times_s, own_s, column) for column in (*places_m.T, yaw_deg, *angles_deg[:, 1:].T)
+        )
+        way_m = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x_m), np.diff(y_m)))])
+        angles = attitude(times_s, way_m, np.gradient(way_m, times_s), yaw, generator)
+        angles[:, 1:] += np.stack([pitch, roll], axis=1)
+        return Actor(EGO, "car", mesh, Trajectory(times_s, np.stack([x_m, y_m, z_m], axis=1), angles))
+
+    def _poses(self, walker: Walker) -> tuple[Numbers, Numbers]:
+        """(K, 3) places and (K, 3) angles of a body at the times of its track."""
+        middle_m, yaw_deg = walker.middle_m - self._origin_m, walker.track.yaw_deg
+        on_foot, slope_deg = walker.track.on_foot, walker.track.slope_deg
+        back_m = 0.0 if on_foot else walker.size_m[0] / 2
+        heights_m = self._ground.heights_m(middle_m)
+        on_deck_m = walker.track.places_m[:, 2] - back_m * np.sin(np.deg2rad(slope_deg))
+        up = on_deck_m > heights_m + BRIDGE_M
+        angles_deg = np.column_stack([yaw_deg, np.zeros((len(yaw_deg), 2))])
+        if on_foot:
+            raised_m = np.where(self._pavement.holds(middle_m) & ~up, PAVEMENT_M, 0.0)
+            heights_m = heights_m + _smooth(raised_m, walker.track.times_s)
+        elif not isinstance(self._ground, Plain):
+            angles_deg[:, 1:] = tilts_deg(self._ground, middle_m, yaw_deg, walker.size_m)
+            angles_deg[up, 1], angles_deg[up, 2] = -slope_deg[up], 0.0
+        return np.column_stack([middle_m, np.where(up, on_deck_m, heights_m)]), angles_deg
+
+
+def _smooth(heights_m: Numbers, times_s: Numbers) -> Numbers:
+    """Steps that take a moment; never below or above what is smoothed."""
+    if len(times_s) < 2 or not np.ptp(heights_m):
+        return heights_m
+    half = max(round(STEP_S / 2 / float(np.median(np.diff(times_s)))), 1)
+    padded = np.pad(heights_m, half, mode="edge")
+    smooth: Numbers = np.convolve(padded, np.full(2 * half + 1, 1 / (2 * half + 1)), mode="valid")
+    return smooth

@@ -1,0 +1,178 @@
+"""A town's streets, drawn: SUMO's plan of a network with lanes, bays, curves and hills of our own."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Annotated, Literal
+from xml.etree import ElementTree
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from pydantic import Field
+
+from torchcover.files import parse_xml
+from torchcover.simulation.documents import Document
+from torchcover.simulation.sumo.programs import run
+from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles
+
+Numbers = NDArray[np.float64]
+Plan = Literal["rand", "grid", "spider"]
+
+LANE_M, BICYCLE_LANE_M, BAY_M = 3.25, 1.8, 2.3
+SIDEWALK_M = (2.4, 3.4)
+# Shares of the streets that have them.
+WITH_BAYS, WITH_BICYCLE_LANES = 0.7, 0.5
+# Two streets that do not meet keep so far apart, middle to middle: the plan knows no widths.
+APART_M = 40.0
+BEND_PIECES = 10
+HILL_WAVELENGTHS_M = (250.0, 700.0)
+HILL_WAVES = 4
+
+
+class Streets(Document):
+    """Streets and traffic that are drawn from a seed.
+
+    Args:
+        network: Their plan; one of the three is drawn if not given.
+        lanes: The most of a street, each way.
+        speed_mps: What is allowed.
+        bend: How far the middle of a street may lie aside of the straight line, as a share of its length.
+        hills_m: Height of the hills, as a standard deviation; 0 is a plain.
+        traffic_per_km: Vehicles to a kilometre of lane.
+        buses_per_km: Buses among them.
+        cyclists_per_km: Likewise, beside them.
+        people_per_km: To a kilometre of sidewalk.
+    """
+
+    network: Plan | None = None
+    lanes: Annotated[int, Field(ge=1, le=3)] = 2
+    speed_mps: Annotated[float, Field(ge=5.0, le=35.0)] = 13.9
+    bend: Annotated[float, Field(ge=0.0, le=0.1)] = 0.06
+    hills_m: Annotated[float, Field(ge=0.0, le=5.0)] = 0.5
+    traffic_per_km: MostVehicles = 14.0
+    buses_per_km: MostVehicles = 0.6
+    cyclists_per_km: MostPeople = 1.5
+    people_per_km: MostPeople = 12.0
+
+    def build(self, folder: Path, generator: np.random.Generator) -> Path:
+        """Draw a network, and write it into a folder.
+
+        Raises:
+            ImportError: SUMO is not installed.
+        """
+        plan = self.network or str(generator.choice(["rand", "grid", "spider"]))
+        prefix = folder / "plan"
+        seed = str(generator.integers(1 << 31))
+        run("netgenerate", *_options(plan, generator), "--seed", seed, "--plain-output-prefix", prefix)
+        nodes = {
+            node.get("id", ""): (float(node.get("x", "")), float(node.get("y", "")))
+            for node in parse_xml(prefix.with_suffix(".nod.xml")).iter("node")
+        }
+        edges = list(parse_xml(prefix.with_suffix(".edg.xml")).iter("edge"))
+        hills = _Hills(self.hills_m, generator)
+        node_file, edge_file, network = folder / "nodes.xml", folder / "edges.xml", folder / "drawn.net.xml"
+        edge_file.write_text(self._edges(nodes, edges, hills, generator), encoding="utf-8")
+        rows = [
+            f'<node id={quoteattr(name)} x="{x:.3f}" y="{y:.3f}" z="{z:.3f}"/>'
+            for (name, (x, y)), z in zip(nodes.items(), hills.at(np.array(list(nodes.values()))), strict=True)
+        ]
+        node_file.write_text(f"<nodes>{''.join(rows)}</nodes>", encoding="utf-8")
+        run(
+            "netconvert", "--node-files", node_file, "--edge-files", edge_file, "--output-file", network,
+            "--precision", "3", "--tls.guess", "--walkingareas", "--crossings.guess", "--no-turnarounds.except-deadend",
+        )  # fmt: skip
+        return network
+
+    def _edges(
+        self,
+        nodes: dict[str, tuple[float, float]],
+        edges: list[ElementTree.Element],
+        hills: "_Hills",
+        generator: np.random.Generator,
+    ) -> str:
+        streets: dict[tuple[str, str], list[tuple[str, str, str]]] = {}
+        for edge in edges:
+            name, start, end = (edge.get(key, "") for key in ("id", "from", "to"))
+            streets.setdefault((min(start, end), max(start, end)), []).append((name, start, end))
+        ways: dict[tuple[str, str], shapely.LineString] = {}
+        for ends in streets:
+            start_m, end_m = (np.array(nodes[end]) for end in ends)
+            way = shapely.LineString(self._bent(start_m, end_m, generator))
+            if all(set(ends) & set(others) or way.distance(other) >= APART_M for others, other in ways.items()):
+                ways[ends] = way
+        rows = []
+        for ends in _without_dead_ends(list(ways)):
+            way_m, lanes = shapely.get_coordinates(ways[ends]), self._lanes(generator)
+            # Junctions are level: so are the ends of all that meet there.
+            share = np.linspace(0.0, 1.0, BEND_PIECES + 1)
+            from_m, to_m = hills.at(way_m[[0, -1]])
+            climb_m = from_m + (to_m - from_m) * share**2 * (3 - 2 * share)
+            places = [f"{x:.3f},{y:.3f},{z:.3f}" for (x, y), z in zip(way_m, climb_m, strict=True)]
+            for name, start, end in streets[ends]:
+                shape = " ".join(places if start == ends[0] else places[::-1])
+                rows.append(
+                    f"<edge id={quoteattr(name)} from={quoteattr(start)} to={quoteattr(end)} "
+                    f'numLanes="{lanes.count("<lane")}" speed="{self.speed_mps:.2f}" shape="{shape}">{lanes}</edge>'
+                )
+        return f"<edges>{''.join(rows)}</edges>"
+
+    def _bent(self, start_m: Numbers, end_m: Numbers, generator: np.random.Generator) -> Numbers:
+        """(K, 2) a way that leaves both ends straight."""
+        share = np.linspace(0.0, 1.0, BEND_PIECES + 1)[:, None]
+        along = end_m - start_m
+        aside = generator.uniform(-self.bend, self.bend) * np.sin(np.pi * share) ** 2
+        way_m: Numbers = start_m + share * along + aside * np.array([-along[1], along[0]])
+        return way_m
+
+    def _lanes(self, generator: np.random.Generator) -> str:
+        """One side of a street, from the houses inwards."""
+        lanes = [('allow="pedestrian"', generator.uniform(*SIDEWALK_M))]
+        if generator.random() < WITH_BAYS:
+            lanes.append(('type="parking" disallow="all"', BAY_M))
+        if self.cyclists_per_km > 0 and generator.random() < WITH_BICYCLE_LANES:
+            lanes.append(('allow="bicycle"', BICYCLE_LANE_M))
+        lanes += [('disallow="pedestrian"', LANE_M)] * int(generator.integers(1, self.lanes + 1))
+        return "".join(f'<lane index="{k}" {who} width="{width:.2f}"/>' for k, (who, width) in enumerate(lanes))
+
+
+class _Hills:
+    """A height for each place: a few long waves."""
+
+    def __init__(self, height_m: float, generator: np.random.Generator) -> None:
+        towards, phase = generator.uniform(0.0, 2 * np.pi, (2, HILL_WAVES))
+        waves = 2 * np.pi / generator.uniform(*HILL_WAVELENGTHS_M, HILL_WAVES)
+        self._waves_per_m = waves * np.array([np.cos(towards), np.sin(towards)])
+        self._phase = phase
+        self._height_m = height_m * np.sqrt(2 / HILL_WAVES)
+
+    def at(self, places_m: Numbers) -> Numbers:
+        """(N,) heights at (N, 2) places."""
+        heights_m: Numbers = self._height_m * np.sin(places_m @ self._waves_per_m + self._phase).sum(axis=1)
+        return heights_m
+
+
+def _without_dead_ends(streets: list[tuple[str, str]]) -> list[tuple[str, str]]:
+    """Those that go on at both ends; all, if none does."""
+    kept = streets
+    while True:
+        met = Counter(end for ends in kept for end in ends)
+        fewer = [ends for ends in kept if all(met[end] > 1 for end in ends)]
+        if len(fewer) == len(kept):
+            return kept or streets
+        kept = fewer
+
+
+def _options(plan: str, generator: np.random.Generator) -> list[str]:
+    def drawn(low: float, high: float) -> str:
+        return f"{generator.uniform(low, high):.1f}"
+
+    if plan == "rand":
+        options = ["--rand", "--rand.iterations", "45", "--rand.min-distance", "90", "--rand.max-distance", "200"]
+    elif plan == "grid":
+        options = ["--grid", "--grid.number", "5", "--grid.x-length", drawn(90, 150), "--grid.y-length", drawn(90, 150)]
+    else:
+        arms = str(generator.integers(5, 8))
+        options = ["--spider", "--spider.arm-number", arms, "--spider.circle-number", "3"]
+        options += ["--spider.space-radius", drawn(100, 140), "--spider.omit-center"]
+    return options

@@ -1,0 +1,126 @@
+"""Traffic of type `sumo`: road networks and road users of SUMO, the user's own or drawn."""
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, model_validator
+
+from torchcover.simulation.documents import PathBeside
+from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.sumo.bays import park
+from torchcover.simulation.sumo.crowd import crowd
+from torchcover.simulation.sumo.demand import EGO_TYPE, write_routes
+from torchcover.simulation.sumo.floating import Recorded, Window, read_floating, record
+from torchcover.simulation.sumo.frontage import Frontage
+from torchcover.simulation.sumo.ground import ground_of
+from torchcover.simulation.sumo.network import Network, read_network
+from torchcover.simulation.sumo.pavement import Pavement, decks
+from torchcover.simulation.sumo.placing import Placing
+from torchcover.simulation.sumo.simulating import from_opendrive, simulate
+from torchcover.simulation.sumo.streets import Streets
+from torchcover.simulation.sumo.types import types_of
+from torchcover.simulation.sumo.vicinity import Vicinity
+from torchcover.simulation.traffic.fleet import EGO, Fleet
+from torchcover.simulation.traffic.procedural import Procedural
+from torchcover.simulation.traffic.scenery import few
+from torchcover.simulation.world import Actor
+
+Numbers = NDArray[np.float64]
+
+# Traffic that is drawn sets off everywhere at once, and needs some time to get into motion and to queue at lights.
+WARM_UP_S = 40.0
+USUAL_BEGIN_S = 60.0
+
+
+class Sumo(Procedural):
+    """Traffic of SUMO, on a network of the user's own or on one that is drawn anew for each run.
+
+    Args:
+        net: A road network: `.net.xml`, or `.xodr` (OpenDRIVE).
+        routes: Files of routes for it, which SUMO drives; relative to the document.
+        fcd: Floating car data, which SUMO wrote before, instead of driving now.
+        random: Streets and traffic that are drawn; with a net, its traffic only.
+        ego_id: Which vehicle is the ego; if not given, one that is there all the time is drawn for each run.
+        ego_type: The type of which it is drawn; any car if not given.
+        begin_s: Time of the simulation at which the run begins, at the earliest: the ego has to be there. After a
+            minute if not given, or with the floating car data.
+        built_share: Share of the streets' sides that have houses.
+        parked_share: Share of the parking bays that are taken: lanes that nobody may use.
+    """
+
+    type: Literal["sumo"] = "sumo"
+    net: PathBeside | None = None
+    routes: tuple[PathBeside, ...] = ()
+    fcd: PathBeside | None = None
+    random: Streets | None = None
+    ego_id: str | None = None
+    ego_type: str | None = None
+    begin_s: Annotated[float, Field(ge=0.0)] | None = None
+    built_share: float = Field(default=0.8, ge=0.0, le=1.0)
+    parked_share: float = Field(default=0.5, ge=0.0, le=1.0)
+
+    @model_validator(mode="after")
+    def _check_sources(self) -> Self:
+        if self.random is None and (self.net is None or not (self.routes or self.fcd)):
+            raise ValueError("give a net and its routes, a net and its fcd, or random (which may have a net, too)")
+        if self.random is not None:
+            given = [key for key in ("routes", "fcd", "ego_id", "ego_type", "begin_s") if getattr(self, key)]
+            if given:
+                raise ValueError(f"random draws all traffic; leave out {', '.join(given)}, or random")
+            of_streets = sorted({"network", "lanes", "speed_mps", "bend", "hills_m"} & self.random.model_fields_set)
+            if self.net is not None and of_streets:
+                raise ValueError(f"random: {', '.join(of_streets)} are for streets that are drawn; there is a net")
+        return self
+
+    def _build(
+        self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
+    ) -> tuple[tuple[Mesh, ...], Actor, tuple[Actor, ...]]:
+        with TemporaryDirectory() as folder:
+            network_file = self._network_file(Path(folder), generator)
+            network = read_network(network_file)
+            routes = self._routes(Path(folder), network, fleet, float(times_s[-1]), generator)
+            known = types_of(routes)
+            recorded = self._recorded(network_file, routes, float(times_s[-1]), generator)
+        ego_type = EGO_TYPE if self.random is not None else self.ego_type
+        found = crowd(recorded, known, fleet, self.ego_id, ego_type, times_s, generator)
+        way_m, _ = found.ego.at(times_s)
+        origin_m = np.floor(way_m[0])
+        vicinity = Vicinity(network, way_m - origin_m, origin_m)
+        ground = ground_of(vicinity)
+        pavement = Pavement(vicinity, ground)
+        frontage = Frontage(vicinity, ground, self.built_share, generator)
+        static = (ground.mesh(), *few(pavement.meshes(), decks(vicinity)), *frontage.meshes())
+        park(vicinity, ground, fleet, self.parked_share, generator)
+        placing = Placing(ground, pavement, origin_m)
+        driver = placing.ego(found.ego, times_s, fleet.meshes[EGO], generator)
+        return static, driver, placing.actors(found.others, fleet, float(times_s[-1]))
+
+    def _network_file(self, folder: Path, generator: np.random.Generator) -> Path:
+        """The network in SUMO's own format."""
+        if self.net is None:
+            assert self.random is not None  # checked in _check_sources
+            return self.random.build(folder, generator)
+        return from_opendrive(self.net, folder) if self.net.suffix == ".xodr" else self.net
+
+    def _routes(
+        self, folder: Path, network: Network, fleet: Fleet, duration_s: float, generator: np.random.Generator
+    ) -> tuple[Path, ...]:
+        if self.random is None:
+            return self.routes
+        drawn = folder / "drawn.rou.xml"
+        sizes_m = {kind: (fleet.length_m(kind), fleet.width_m(kind)) for kind in fleet.meshes}
+        write_routes(drawn, network, self.random, sizes_m, WARM_UP_S + duration_s, generator)
+        return (drawn,)
+
+    def _recorded(
+        self, network_file: Path, routes: tuple[Path, ...], duration_s: float, generator: np.random.Generator
+    ) -> Recorded:
+        if self.fcd is not None:
+            return read_floating(self.fcd, Window(self.begin_s or -np.inf, duration_s, self.ego_id))
+        begin_s = WARM_UP_S if self.random is not None else USUAL_BEGIN_S if self.begin_s is None else self.begin_s
+        seed, drawn = int(generator.integers(1 << 31)), self.random is not None
+        pieces = simulate(network_file, routes, begin_s, seed, around=self.ego_id, drawn=drawn)
+        return record(pieces, Window(begin_s, duration_s, self.ego_id))
