@@ -23,8 +23,8 @@ from torchcover.cli.app import app
 
 ROOT = Path(__file__).parent.parent
 ROOMS = (
-    "coverage", "evaluation", "data", "simulation", "cameras", "detection", "training", "metrics", "neighbors",
-    "report", "geometry",
+    "coverage", "evaluation", "targets", "data", "simulation", "cameras", "detection", "training", "metrics",
+    "neighbors", "report", "geometry",
 )  # fmt: skip
 # Where the classes of documents are defined.
 DOCUMENTS = ("torchcover.simulation", "torchcover.data", "torchcover.evaluation", "torchcover.coverage")

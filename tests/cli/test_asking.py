@@ -137,3 +137,11 @@ def test_where_nothing_was_seen_no_sensor_is_called_dispensable(evaluate):
     code, printed, _ = evaluate("--region", "sky:2,6,-2,2", "--height", "sky:50,60", "--redundancy")
     assert (code, "unknown: nothing that was asked about was seen." in " ".join(printed.split())) == (0, True)
     assert "No single point of failure" not in printed
+
+
+def test_where_nothing_is_detected_no_sensor_is_called_dispensable_either(torchcover, worlds):
+    scene = ("--scenario", worlds / "yard.yaml", "--out", worlds / "out", "--steps", 2, "--rays", 1024)
+    asked = ("--cell", 0.5, "--region", "ahead:2,6,-2,2", "--threshold", 1e-9, "--redundancy")
+    code, printed, _ = torchcover("evaluate", worlds / "both.yaml", *scene, *asked)
+    assert (code, "Nothing of what was asked about is detected" in " ".join(printed.split())) == (0, True)
+    assert "No single point of failure" not in printed

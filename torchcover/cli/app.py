@@ -256,11 +256,11 @@ def record(
     rig: options.Rig,
     out: options.RecordingOut,
     scenario: options.ScenarioOrNone = None,
-    steps: options.Steps = None,
+    steps: options.RecordedSteps = None,
     seed: options.Seed = 0,
     vehicle: options.Vehicle = None,
     every: options.Every = None,
-    reference: options.Reference = None,
+    reference: options.RecordedReference = None,
     rays: options.Rays = None,
     layout: options.Layout = "folder",
 ) -> None:
@@ -285,7 +285,7 @@ def record(
 def rig(
     frames: options.RecordingFrames,
     recording_format: options.Format = None,
-    sensors: options.Sensors = None,
+    sensors: options.SensorsOfRig = None,
     lidar: Annotated[
         list[str] | None,
         typer.Option(help="SENSOR=MODEL: a LiDAR scans as this model (see `list`), and is not estimated."),
@@ -336,5 +336,6 @@ def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  
 
 def _fail(message: str, code: int = MISTAKE) -> None:
     line = " ".join(message.split())
-    typer.echo(f"torchcover: {line if len(line) <= MAX_LINE_CHARS else line[:MAX_LINE_CHARS] + ' ...'}", err=True)
+    if line:  # none where no command was given: the help has been printed
+        typer.echo(f"torchcover: {line if len(line) <= MAX_LINE_CHARS else line[:MAX_LINE_CHARS] + ' ...'}", err=True)
     sys.exit(code)

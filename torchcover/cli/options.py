@@ -38,7 +38,7 @@ Rigs = Annotated[
 ScenarioOrNone = Annotated[str | None, typer.Option(help="Scenario: a built-in name or a YAML file (courtyard).")]
 Frames = Annotated[
     Path | None,
-    typer.Option(help="A recording instead of a simulation, of any layout in docs/formats.md."),
+    typer.Option(help="A recording instead of a simulation, of any layout in docs/recordings.md."),
 ]
 RecordingFrames = Annotated[Path, typer.Option("--frames", help="The recording, of any layout in docs/recordings.md.")]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
@@ -48,6 +48,9 @@ Sensors = Annotated[
         help="With --frames: sensors of a rig, as in `roof,left`; once for each rig. Not given: those of the recording."
     ),
 ]
+SensorsOfRig = Annotated[
+    list[str] | None, typer.Option("--sensors", help="Its sensors, as in `roof,left`. Not given: all of the recording.")
+]
 Window = Annotated[
     float | None,
     typer.Option(help="Seconds over which `--reference accumulated` adds up what all sensors saw (2)."),
@@ -55,6 +58,7 @@ Window = Annotated[
 Steps = Annotated[
     int | None, typer.Option(min=1, help="Steps to simulate (64), or most frames of a recording to use (all).")
 ]
+RecordedSteps = Annotated[int | None, typer.Option(min=1, help="Steps to simulate (64), a frame each.")]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of the simulation.")]
 Vehicle = Annotated[
     str | None,
@@ -97,6 +101,12 @@ Reference = Annotated[
     typer.Option(
         help="Reference sensor: `surface`, points drawn evenly on what can be seen (default); `even`, rays spread over "
         "the regions and the grid; or `paper`. With --frames: `recorded`, or `accumulated` from the recording itself."
+    ),
+]
+RecordedReference = Annotated[
+    str | None,
+    typer.Option(
+        help="Reference sensor that is recorded too: `surface` (default), `even` or `paper`, as of `evaluate`."
     ),
 ]
 Rays = Annotated[

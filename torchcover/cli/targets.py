@@ -39,7 +39,9 @@ def targets(
         Path | None, typer.Option(help="YAML file of requirements: exit code 1 if one is not met.")
     ] = None,
     seed: options.Seed = 0,
-    rerun: Annotated[Path | None, typer.Option(help="Write the map to this .rrd file, for the Rerun viewer.")] = None,
+    rerun: Annotated[
+        Path | None, typer.Option(help="Write the map to this .rrd file, for the Rerun viewer (extra `rerun`).")
+    ] = None,
     out: options.Out = Path("out/targets"),
 ) -> None:
     """Put a body at every place around the vehicle: how much of it is seen, where not, and whether that is enough."""

@@ -172,7 +172,10 @@ def compare(
         return compare_saved(saved)
     task = task_of(rigs, scenario, frames, settings)
     if len(task.rigs) < 2:
-        raise ValueError(f"compare needs at least two rigs; got {task.rigs[0]!r} only (for one: `evaluate`)")
+        raise ValueError(
+            f"compare needs at least two rigs; got {task.rigs[0]!r} only (for one: `evaluate`; of a recording, each "
+            "--sensors makes a rig)"
+        )
     return measured(task, settings, observers or {}, checkpoint, ranks, progress=progress)
 
 
