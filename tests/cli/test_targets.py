@@ -42,6 +42,8 @@ def test_the_exit_code_is_the_verdict(call, worlds, requirement, code, words):
     record = json.loads((worlds / "out" / "summary.json").read_text())
     assert record["files"] == ["targets.csv", "targets.npz", "report.html", "targets.png"]
     assert [one["passed"] for one in record["requirements"]] == [code == 0]
+    assert record["not_checked"] == ["dog within 1 m: points >= 1"]
+    assert "Not checked, as it is not about adult: dog within 1 m" in (worlds / "out" / "report.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """What the commands that measure share: the recording, the checkpoint, the processes, the end."""
 
+import json
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,9 +54,17 @@ def checkpoint_in(out: Path, *, resume: bool) -> "Checkpoint":
     path = out / "checkpoint.npz"
     if resume and not path.exists():
         typer.echo(f"torchcover: {path} is not there: the run starts with its first step", err=True)
-    elif path.exists() and not resume:
+    elif path.exists() and not resume and not _complete(out):
         typer.echo(f"torchcover: {path} will be replaced; to go on from it, stop now and add --resume", err=True)
     return Checkpoint(path, resume)
+
+
+def _complete(out: Path) -> bool:
+    """Whether the run of a folder has come to its end; nothing of it is lost if another one takes its place."""
+    try:
+        return json.loads((out / "summary.json").read_text(encoding="utf-8"))["complete"] is True
+    except (OSError, ValueError, LookupError, TypeError):
+        return False
 
 
 @contextmanager

@@ -59,10 +59,12 @@ def run(
         )
         verdicts = [] if requirements is None else check(requirements, seen)
         sensors = Rig.load(rig).sensors
-        files = save_targets(seen, out, verdicts, sensors)
+        others = () if requirements is None else requirements.requirements
+        not_checked = [other.words for other in others if not other.is_about(seen.target)]
+        files = save_targets(seen, out, verdicts, sensors, not_checked=not_checked)
         if rerun is not None:
             write_target(seen, sensors, rerun)
-    _print(seen, verdicts, requirements)
+    _print(seen, verdicts, not_checked)
     Console().print(f"Wrote {', '.join(path.name for path in files)} to {out}", markup=False, soft_wrap=True)
     return 0 if all(verdict.passed for verdict in verdicts) else FAILED
 
@@ -98,7 +100,7 @@ def parsed_heading(text: str) -> Heading:
         raise ValueError(f"--heading: narrow, wide or degrees are needed; got {text!r}") from error
 
 
-def _print(seen: TargetMap, verdicts: Sequence[Verdict], requirements: Requirements | None) -> None:
+def _print(seen: TargetMap, verdicts: Sequence[Verdict], not_checked: Sequence[str]) -> None:
     console = Console()
     console.print(_sides_table(seen))
     console.print(_places_table(seen.worst(), "The places with the fewest points, 1 m apart"))
@@ -108,9 +110,8 @@ def _print(seen: TargetMap, verdicts: Sequence[Verdict], requirements: Requireme
         console.print(_sentence(verdict), markup=False, soft_wrap=True)
         if verdict.worst:
             console.print(_places_table(verdict.worst, "where not, the nearest first"))
-    for left in () if requirements is None else requirements.requirements:
-        if not left.is_about(seen.target):
-            console.print(f"not checked, as it is not about {seen.target}: {left.words}", markup=False, soft_wrap=True)
+    for words in not_checked:
+        console.print(f"not checked, as it is not about {seen.target}: {words}", markup=False, soft_wrap=True)
 
 
 def _sides_table(seen: TargetMap) -> Table:

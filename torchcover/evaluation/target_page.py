@@ -15,20 +15,27 @@ NO_ROOM = "no room for it"
 ROBUST_PERCENTILE = 98
 
 
-def target_page(seen: TargetMap, verdicts: Sequence[Verdict] = (), sensors: Sequence[Sensor] = ()) -> Page:
+def target_page(
+    seen: TargetMap,
+    verdicts: Sequence[Verdict] = (),
+    sensors: Sequence[Sensor] = (),
+    not_checked: Sequence[str] = (),
+) -> Page:
     """All that is known of a target, on one page.
 
     Args:
         seen: From `survey_target`.
         verdicts: From `torchcover.targets.check`.
         sensors: Those of the rig.
+        not_checked: Requirements that are about other targets, in words.
     """
     failed = [verdict for verdict in verdicts if not verdict.passed]
     tables = [*([_verdicts(verdicts)] if verdicts else []), _sides(seen), _places(seen.worst(), "The worst places")]
     tables += [_places(verdict.worst, f"Not met: {verdict.requirement.words}") for verdict in failed]
     return Page(
         title=f"{seen.rig}: would it see {seen.target}?",
-        lead=f"In {seen.scenario}, measured by torchcover.",
+        lead=f"In {seen.scenario}, measured by torchcover."
+        + "".join(f" Not checked, as it is not about {seen.target}: {words}." for words in not_checked),
         tables=tables,
         maps=_maps(seen),
         rigs=[PageRig(seen.rig, sensor_views(sensors), rig_document(seen.rig, sensors))],

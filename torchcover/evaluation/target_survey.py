@@ -118,7 +118,12 @@ def target_picture(seen: TargetMap) -> Figure:
 
 
 def save_targets(
-    seen: TargetMap, folder: str | Path, verdicts: Sequence[Verdict] = (), sensors: Sequence[Sensor] = ()
+    seen: TargetMap,
+    folder: str | Path,
+    verdicts: Sequence[Verdict] = (),
+    sensors: Sequence[Sensor] = (),
+    *,
+    not_checked: Sequence[str] = (),
 ) -> list[Path]:
     """Write the files of the command line: the numbers first, then the page and the picture.
 
@@ -128,17 +133,18 @@ def save_targets(
             does not exist; files of an earlier run that its `summary.json` lists are deleted.
         verdicts: From `torchcover.targets.check`, for `summary.json` and the page.
         sensors: Those of the rig, for the page.
+        not_checked: Requirements that are about other targets, in words.
 
     Returns:
         The files.
     """
-    record = target_record(seen, verdicts)
+    record = {**target_record(seen, verdicts), "not_checked": list(not_checked)}
     with ResultFiles(Path(folder)) as files:
         with held_back():  # the numbers are safe before anything ends this
             files.add("targets.csv", lambda path: write_csv(seen, path))
             files.add("targets.npz", lambda path: write_arrays(seen, path))
             files.publish(record)
-        page = target_page(seen, verdicts, sensors)
+        page = target_page(seen, verdicts, sensors, not_checked)
         files.add("report.html", lambda path: path.write_text(page_html(page), encoding="utf-8"))
         figure = target_picture(seen)
         files.add("targets.png", lambda path: figure.savefig(path, dpi=figure.dpi))
