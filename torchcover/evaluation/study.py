@@ -104,8 +104,9 @@ def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
         ValueError: A plan that makes no sense.
         FileNotFoundError: An unknown name or file.
     """
-    one_step_s = command_s(plan)  # first: it fails at once if anything is wrong
+    frames, _ = plan.frames(plan.seed, 1), plan.metric(1)  # which fail at once if anything is wrong
     truth = long_run(plan, progress=progress)
+    one_step_s = command_s(plan)
     done = tried(plan, one_step_s, progress=progress)
     points = [
         WorkPoint(
@@ -127,5 +128,4 @@ def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
         }
         for trial in done.trials
     ]
-    frames = plan.frames(plan.seed, 1)
     return Study(plan, frames.scenario.ego_name, frames.every_s, truth, points, done.start_s, stages)
