@@ -102,7 +102,7 @@ def sensor_colour(at: int) -> str:
 
     Example:
         >>> sensor_colour(0), sensor_colour(7), sensor_colour(14)
-        ('#0072b2', '#003959', '#80b9d9')
+        ('#0072b2', '#003959', '#80b8d8')
     """
     share, white = SHADES[at // len(COLOURS) % len(SHADES)]
     red_green_blue = np.array([int(COLOURS[at % len(COLOURS)][digit : digit + 2], 16) for digit in (1, 3, 5)])
