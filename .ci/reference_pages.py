@@ -27,7 +27,7 @@ ROOMS = (
     "neighbors", "report", "geometry",
 )  # fmt: skip
 # Where the classes of documents are defined.
-DOCUMENTS = ("torchcover.simulation", "torchcover.data", "torchcover.evaluation", "torchcover.coverage")
+DOCUMENTS = ("torchcover.simulation", "torchcover.data", "torchcover.targets", "torchcover.coverage")
 
 
 def on_config(config):

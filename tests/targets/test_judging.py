@@ -18,7 +18,7 @@ CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
 OUTLINE = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
 
 
-def seen_where(points, *, raster=None, state=None, share=None, hits=5):
+def seen_where(points, *, raster=None, state=None, share=None, hits=5, least=None):
     """A map with a number of points that is a function of x and y, of two sensors that share them evenly."""
     raster = raster or Raster((-6.0, 6.0), (-5.0, 5.0), 0.5)
     x, y = raster.positions_m.T
@@ -47,6 +47,8 @@ def seen_where(points, *, raster=None, state=None, share=None, hits=5):
         sensor_points=np.stack([number / 2, number / 2]),
         sensors=np.where(number / 2 >= hits, 2.0, 0.0),
         seen=(number >= hits) * 1.0,
+        least_points=number if least is None else np.where(state == 0, least, np.nan),
+        least_sensors=np.where(number / 2 >= hits, 2.0, 0.0),
         share=np.where(state == 0, 1.0, np.nan) if share is None else share,
         visible_m2=number * 0 + 1.0,
     )
@@ -87,6 +89,15 @@ def test_sides_part_the_places_at_corners_of_45_degrees():
     assert np.isnan(list(closed.unseen_to_m().values())).all()
     half = replace(seen, seen=np.where(seen.free, 0.5, np.nan))
     assert {row.seen for row in half.sides()} == {0.5}  # in every other step, however many points the others have
+
+
+def test_what_is_seen_in_some_steps_only_is_not_seen():
+    """Eighty points in one of sixteen steps are five in the mean."""
+    seen = seen_where(lambda x, y: 80 / 16, least=0)
+    assert not seen.enough.any()
+    (verdict,) = judged(seen, {"within_m": 1, "points": 5})
+    assert (verdict.passed, verdict.failed) == (False, verdict.cells)
+    assert judged(seen_where(lambda x, y: 80 / 16), {"within_m": 1, "points": 5})[0].passed
 
 
 def test_the_worst_places_have_the_fewest_points_and_keep_apart():

@@ -71,6 +71,7 @@ def test_points_are_the_mean_over_the_steps_of_a_world_that_moves(tmp_path):
             counts.append(on_target(step.clouds["r"], target, seen.x_m[column], seen.y_m[row], 0.0))
         assert seen.points[row, column] == pytest.approx(np.mean(counts))
         assert seen.seen[row, column] == pytest.approx(np.mean(np.array(counts) >= 5))
+        assert seen.least_points[row, column] == min(counts)
     # The car is at (0, 3.5), then at (2, 3.5) and (4, 3.5) as the ego sees it: each cell is taken once at most.
     assert seen.steps[8].tolist() == [3, 3, 3, 3, 3, 3, 2, 2, 2, 2, 2, 2, 3, 3]
     assert (seen.state[8] == FREE).all()
@@ -80,7 +81,7 @@ def test_a_place_does_not_depend_on_the_raster_the_chunks_or_the_threads(monkeyp
     target, sensors = Target.load("dog"), rig(lidar(dropout=0.2, range_noise_m=0.05))
     whole = survey(sensors, world(WALL), target, RASTER, steps=2, seed=3)
     part = survey(sensors, world(WALL), target, Raster((2.0, 7.0), (-2.0, 3.0), 1.0), steps=2, seed=3)
-    for name in ("sensor_points", "sensors", "seen", "share", "state", "visible_m2"):
+    for name in ("sensor_points", "sensors", "seen", "least_points", "share", "state", "visible_m2"):
         np.testing.assert_array_equal(getattr(whole, name)[..., 3:8, 9:], getattr(part, name))
     monkeypatch.setattr(counting, "CHUNK", 7)
     threads = torch.get_num_threads()

@@ -22,6 +22,8 @@ Numbers = NDArray[np.int64]
 
 # Positions that are cast at together. A constant, so that nothing depends on threads.
 CHUNK = 256
+# More than any count.
+NEVER = np.iinfo(np.int64).max
 
 
 class Sums(NamedTuple):
@@ -29,7 +31,8 @@ class Sums(NamedTuple):
 
     `points` (sensors, P), `sensors` (P,) how many had enough points, `seen` (P,) steps with enough points, `steps` (P,)
     with room, `visible` and `near` (P,) pairs of a place and a point of the surface that it sees, and those of them
-    that are within the threshold of a measured point.
+    that are within the threshold of a measured point. No sums but the fewest in any of these steps: `least_points` and
+    `least_sensors` (P,), `NEVER` where there was no room.
     """
 
     points: Numbers
@@ -38,6 +41,8 @@ class Sums(NamedTuple):
     steps: Numbers
     visible: Numbers
     near: Numbers
+    least_points: Numbers
+    least_sensors: Numbers
 
 
 class _Met(NamedTuple):
@@ -123,7 +128,17 @@ def _sums(
     threshold_m: float,
 ) -> Sums:
     count = len(vehicle_T_target)
-    sums = Sums(np.zeros((len(mounted), count), dtype=np.int64), *(np.zeros(count, dtype=np.int64) for _ in range(5)))
+    zeros, never = np.zeros(count, dtype=np.int64), np.full(count, NEVER)
+    sums = Sums(
+        points=np.zeros((len(mounted), count), dtype=np.int64),
+        sensors=zeros,
+        seen=zeros.copy(),
+        steps=zeros.copy(),
+        visible=zeros.copy(),
+        near=zeros.copy(),
+        least_points=never,
+        least_sensors=never.copy(),
+    )
     # Without noise a ray meets the target at the same place in every step.
     exact = [
         surface.near(_in_target(sensor, one, vehicle_T_target, None), threshold_m)
@@ -170,10 +185,12 @@ def _any_of_each(position: Numbers, bits: NDArray[np.uint8], count: int) -> NDAr
 
 
 def _add(sums: Sums, step: Step, points: Numbers, near: NDArray[np.uint8], hits: int) -> None:
-    free = step.free
+    free, together, sensors = step.free, points.sum(axis=0), (points >= hits).sum(axis=0)
     sums.points[:] += points * free
-    sums.sensors[:] += (points >= hits).sum(axis=0) * free
-    sums.seen[:] += (points.sum(axis=0) >= hits) & free
+    sums.sensors[:] += sensors * free
+    sums.seen[:] += (together >= hits) & free
+    sums.least_points[free] = np.minimum(sums.least_points, together)[free]
+    sums.least_sensors[free] = np.minimum(sums.least_sensors, sensors)[free]
     sums.steps[:] += free
     sums.visible[:] += np.unpackbits(step.visible, axis=2).sum(axis=(0, 2), dtype=np.int64) * free
     sums.near[:] += np.unpackbits(step.visible & near, axis=2).sum(axis=(0, 2), dtype=np.int64) * free

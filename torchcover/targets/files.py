@@ -9,9 +9,11 @@ import numpy as np
 from torchcover.files import write_npz
 from torchcover.targets.result import STATES, TargetMap
 
-COLUMNS = ("x_m", "y_m", "distance_m", "side", "state", "steps", "points", "sensors", "seen", "share", "visible_m2")
+COLUMNS = ("x_m", "y_m", "distance_m", "side", "state", "steps", "points", "sensors", "seen", "least_points",
+           "least_sensors", "share", "visible_m2")  # fmt: skip
 
-ARRAYS = ("x_m", "y_m", "state", "steps", "points", "sensor_points", "sensors", "seen", "share", "visible_m2",
+ARRAYS = ("x_m", "y_m", "state", "steps", "points", "sensor_points", "sensors", "seen", "least_points",
+          "least_sensors", "share", "visible_m2",
           "distance_m", "side", "vehicle_outline_m")  # fmt: skip
 
 
@@ -24,7 +26,8 @@ def write_csv(seen: TargetMap, path: Path) -> None:
         for row, column in np.ndindex(seen.raster.shape):
             at = row, column
             place = seen.place(row, column)
-            known = points[at], seen.sensors[at], seen.seen[at], seen.share[at], seen.visible_m2[at]
+            means = points[at], seen.sensors[at], seen.seen[at]
+            known = *means, seen.least_points[at], seen.least_sensors[at], seen.share[at], seen.visible_m2[at]
             of_sensors = seen.sensor_points[(slice(None), row, column)]
             writer.writerow([
                 f"{place.x_m:.9g}", f"{place.y_m:.9g}", f"{place.distance_m:.9g}", place.side, STATES[seen.state[at]],

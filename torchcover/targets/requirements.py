@@ -11,6 +11,8 @@ from torchcover.simulation.documents import Document, read_document
 from torchcover.targets.result import SIDES, Place, TargetMap
 from torchcover.targets.target import TARGETS
 
+# What is judged of a map, where a mean would hide a step in which nothing is seen.
+JUDGED = {"points": "least_points", "sensors": "least_sensors"}
 # Of a mean over steps, what rounding makes of it.
 ROUNDING = 1e-9
 
@@ -22,9 +24,9 @@ class Requirement(Document):
         target: What `--target` or a built-in body is called; any target if not given.
         within_m: Distance of the target's middle from the vehicle's box, seen from above.
         sides: On these sides only; on all if not given.
-        points: Least number of points on it.
-        sensors: Least number of sensors with enough points each.
-        share: Least share of its visible surface within the threshold.
+        points: Least number of points on it, in every step.
+        sensors: Least number of sensors with enough points each, in every step.
+        share: Least share of its visible surface within the threshold, over all steps.
         seen: Least share of the steps with enough points.
 
     Example:
@@ -126,7 +128,7 @@ def _judged(requirement: Requirement, seen: TargetMap, tell: int) -> Verdict:
             f"requirement {requirement.words!r}: there is no free cell, so it says nothing; take a smaller step of the "
             "raster or a larger distance"
         )
-    values = {name: getattr(seen, name) for name in requirement.least}
+    values = {name: getattr(seen, JUDGED.get(name, name)) for name in requirement.least}
     unknown = there & np.any([np.isnan(array) for array in values.values()], axis=0)
     met = [values[name] >= least - ROUNDING for name, least in requirement.least.items()]  # NaN is not
     row, column = np.nonzero(there & ~np.all(met, axis=0))

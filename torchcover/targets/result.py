@@ -67,6 +67,8 @@ class TargetMap:
         sensor_points: (S, Y, X) mean number of points of each sensor on it.
         sensors: (Y, X) mean number of sensors with enough points each.
         seen: (Y, X) share of the steps with enough points of all sensors together.
+        least_points: (Y, X) fewest points on it in any step.
+        least_sensors: (Y, X) fewest sensors with enough points each in any step.
         share: (Y, X) share of its visible surface within the threshold; NaN too where none is visible.
         visible_m2: (Y, X) its visible surface.
     """
@@ -90,6 +92,8 @@ class TargetMap:
     sensor_points: Float64
     sensors: Float64
     seen: Float64
+    least_points: Float64
+    least_sensors: Float64
     share: Float64
     visible_m2: Float64
 
@@ -117,8 +121,8 @@ class TargetMap:
 
     @property
     def enough(self) -> NDArray[np.bool_]:
-        """(Y, X) whether it is seen: the mean number of points is `hits` at least."""
-        enough: NDArray[np.bool_] = np.nan_to_num(self.points) >= self.hits
+        """(Y, X) whether it is seen: by `hits` points at least, in every step."""
+        enough: NDArray[np.bool_] = np.nan_to_num(self.least_points) >= self.hits
         return enough & self.free
 
     @property

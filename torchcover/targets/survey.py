@@ -108,7 +108,7 @@ def survey(
 
 
 def _means(sums: Sums, at: NDArray[np.intp], raster: Raster, m2_each: float) -> dict[str, NDArray[Any]]:
-    """The fields of `TargetMap` that are arrays: means over the steps in which there was room."""
+    """The arrays of `TargetMap`: over the steps in which there was room."""
 
     def spread(values: NDArray[Any], empty: float) -> NDArray[Any]:
         everywhere = np.full((*values.shape[:-1], raster.shape[0] * raster.shape[1]), empty, dtype=values.dtype)
@@ -122,6 +122,8 @@ def _means(sums: Sums, at: NDArray[np.intp], raster: Raster, m2_each: float) -> 
         "sensor_points": spread(sums.points / steps, np.nan),
         "sensors": spread(sums.sensors / steps, np.nan),
         "seen": spread(sums.seen / steps, np.nan),
+        "least_points": spread(np.where(sums.steps > 0, sums.least_points, np.nan), np.nan),
+        "least_sensors": spread(np.where(sums.steps > 0, sums.least_sensors, np.nan), np.nan),
         "share": spread(sums.near / visible, np.nan),
         "visible_m2": spread(sums.visible / steps * m2_each, np.nan),
     }
