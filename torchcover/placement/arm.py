@@ -30,14 +30,14 @@ class Arm:
         self._makes, self._cube, self._seed, self._world_of = makes, cube, seed, world_of
         self._start_scores = start.spread(len(world_of))
         self._optimiser: Optimiser = makes(cube, seed)
-        self._gains: list[Float64] = [np.zeros(self.objectives)]
-        self._errors: list[Float64] = [np.zeros(self.objectives)]
+        self._gains: list[Float64] = [np.zeros(start.scores.shape[1])]
+        self._errors: list[Float64] = [np.zeros(start.scores.shape[1])]
         self.evaluations: list[Evaluation] = [start]
 
     @property
     def objectives(self) -> int:
         """How many."""
-        return self._start_scores.shape[1]
+        return len(self._gains[0])
 
     @property
     def charge(self) -> int:
@@ -128,9 +128,7 @@ class Arm:
             return np.full(self.objectives, np.nan), np.zeros(self.objectives)
         best = self.best
         other = self._start_scores if best is None else self.evaluations[best].spread(len(self._world_of))
-        mean, error = paired(
-            evaluation.scores - other[evaluation.instants], self._world_of[evaluation.instants]
-        )
+        mean, error = paired(evaluation.scores - other[evaluation.instants], self._world_of[evaluation.instants])
         left = 1.0 - len(evaluation.instants) / len(self._world_of)
         gain: Float64 = mean + (0.0 if best is None else self._gains[best])
         return gain, np.nan_to_num(error * np.sqrt(left))
