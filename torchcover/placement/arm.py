@@ -2,10 +2,12 @@
 
 import numpy as np
 
-from torchcover.placement.evaluation import Evaluation, Float64, Numbers
+from torchcover.coverage import Measure
+from torchcover.placement.evaluation import Evaluation, Float64
 from torchcover.placement.optimisers import Cube, MakesOptimiser, Optimiser
 from torchcover.placement.pareto import chebyshev, non_dominated
-from torchcover.placement.racing import paired
+from torchcover.placement.racing import Paired, paired
+from torchcover.placement.scores import Scores
 
 
 class Arm:
@@ -19,35 +21,29 @@ class Arm:
         makes: Of the optimiser.
         cube: What is free.
         seed: Of the optimiser, and of the weights.
-        start: Evaluation 0.
-        world_of: (instants,) which world each instant is of.
+        start: Evaluation 0, scored at all instants.
+        measure: Which share counts, see `paired`.
+
+    Raises:
+        ValueError: The start has no scores.
     """
 
     def __init__(
-        self, name: str, makes: MakesOptimiser, cube: Cube, seed: int, start: Evaluation, world_of: Numbers
+        self, name: str, makes: MakesOptimiser, cube: Cube, seed: int, start: Evaluation, measure: Measure
     ) -> None:
-        self.name = name
-        self._makes, self._cube, self._seed, self._world_of = makes, cube, seed, world_of
-        self._start_scores = start.spread(len(world_of))
+        if start.scores is None:
+            raise ValueError("start: its scores are needed; it has none")
+        self.name, self.start = name, start.scores
+        self._makes, self._cube, self._seed, self._measure = makes, cube, seed, measure
         self._optimiser: Optimiser = makes(cube, seed)
-        self._gains: list[Float64] = [np.zeros(start.scores.shape[1])]
-        self._errors: list[Float64] = [np.zeros(start.scores.shape[1])]
+        nothing = np.zeros(len(self.start.objectives))
+        self._gains, self._left = [nothing], [nothing]
         self.evaluations: list[Evaluation] = [start]
-
-    @property
-    def objectives(self) -> int:
-        """How many."""
-        return len(self._gains[0])
 
     @property
     def charge(self) -> int:
         """What it has spent of a budget, without the start."""
         return sum(evaluation.charge for evaluation in self.evaluations[1:])
-
-    @property
-    def instants_spent(self) -> int:
-        """Instants that it has scored rigs at, without the start."""
-        return sum(len(evaluation.instants) for evaluation in self.evaluations[1:])
 
     @property
     def gains(self) -> Float64:
@@ -57,14 +53,14 @@ class Arm:
     @property
     def complete(self) -> list[int]:
         """Positions of the candidates that can be, and were scored at all instants."""
-        count = len(self._world_of)
-        return [at for at, one in enumerate(self.evaluations) if not one.infeasible and len(one.instants) == count]
+        count = len(self.start.instants)
+        return [at for at, one in enumerate(self.evaluations) if not one.infeasible and one.instants == count]
 
     @property
     def front(self) -> list[int]:
         """Positions of those among them that no other beats, in order; with one objective the best, and its equals."""
         complete = self.complete
-        return [at for at, on in zip(complete, non_dominated(self.gains[complete]), strict=True) if on]
+        return [at for at, on in zip(complete, non_dominated(self.gains[complete]).tolist(), strict=True) if on]
 
     @property
     def best(self) -> int | None:
@@ -76,9 +72,15 @@ class Arm:
         if not front:
             return None
         gains = self.gains[front]
-        low, high = gains.min(axis=0), gains.max(axis=0)
-        extent = np.where(high > low, high - low, 1.0)
-        return front[int(np.argmax(chebyshev((gains - low) / extent, np.full(len(low), 1 / len(low)))))]
+        low, extent = gains.min(axis=0), np.ptp(gains, axis=0)
+        scaled = (gains - low) / np.where(extent > 0, extent, 1.0)
+        return front[int(np.argmax(chebyshev(scaled, np.full(len(low), 1 / len(low)))))]
+
+    @property
+    def incumbents(self) -> list[Scores]:
+        """Scores of the front."""
+        scores = (self.evaluations[at].scores for at in self.front)
+        return [each for each in scores if each is not None]
 
     def ask(self, number: int) -> Float64 | None:
         """Where to look next, (variables,); None when there is nothing left.
@@ -86,65 +88,47 @@ class Arm:
         Args:
             number: Of the evaluation.
         """
-        return (self._optimiser if self.objectives == 1 else self._scalarised(number)).ask()
+        return (self._optimiser if len(self._gains[0]) == 1 else self._scalarised(number)).ask()
 
     def tell(self, evaluation: Evaluation) -> None:
         """What became of it."""
-        gain, error = self._gain(evaluation)
+        gain, left = self._estimated(evaluation)
         self.evaluations.append(evaluation)
         self._gains.append(gain)
-        self._errors.append(error)
-        if self.objectives == 1 and evaluation.unit is not None:
-            self._optimiser.tell(evaluation.unit, float(gain[0]), float(error[0]))
+        self._left.append(left)
+        if len(gain) == 1 and evaluation.unit is not None:
+            self._optimiser.tell(evaluation.unit, float(gain[0]), float(left[0]))
 
-    def beaten(self, instants: Numbers, scores: Float64) -> bool:
-        """Whether the first scores of a candidate show that one of the front is better in every objective.
+    def against_start(self, at: int) -> Paired | None:
+        """A candidate against the start, at the instants that it was given; None if it was not scored."""
+        scores = self.evaluations[at].scores
+        return None if scores is None else paired(scores, self.start, self._measure)
 
-        Two standard errors over worlds of the paired difference decide.
-
-        Args:
-            instants: (n,) numbers.
-            scores: (n, objectives) at them.
-        """
-        for at in self.front:
-            other = self.evaluations[at].spread(len(self._world_of))[instants]
-            mean, error = paired(scores - other, self._world_of[instants])
-            if (mean < -2 * error).all():
-                return True
-        return False
-
-    def error_of(self, at: int) -> Float64:
-        """(objectives,) standard error over worlds of a gain; NaN of one world."""
-        evaluation = self.evaluations[at]
-        difference = evaluation.scores - self._start_scores[evaluation.instants]
-        return paired(difference, self._world_of[evaluation.instants])[1]
-
-    def _gain(self, evaluation: Evaluation) -> tuple[Float64, Float64]:
-        """Over the start at all instants, and the error that those have left which it was not scored at.
+    def _estimated(self, evaluation: Evaluation) -> tuple[Float64, Float64]:
+        """Gain over the start at all instants, and the error that those have left which it was not scored at.
 
         It is paired with the best so far, which a candidate that was dropped late is more like than the start.
         """
-        if evaluation.infeasible:
-            return np.full(self.objectives, np.nan), np.zeros(self.objectives)
+        if evaluation.infeasible or evaluation.scores is None:
+            return np.full(len(self._gains[0]), np.nan), np.zeros(len(self._gains[0]))
         best = self.best
-        other = self._start_scores if best is None else self.evaluations[best].spread(len(self._world_of))
-        mean, error = paired(evaluation.scores - other[evaluation.instants], self._world_of[evaluation.instants])
-        left = 1.0 - len(evaluation.instants) / len(self._world_of)
-        gain: Float64 = mean + (0.0 if best is None else self._gains[best])
-        return gain, np.nan_to_num(error * np.sqrt(left))
+        other = self.start if best is None else self.evaluations[best].scores
+        assert other is not None  # what is on the front was scored
+        found = paired(evaluation.scores, other, self._measure)
+        left = 1.0 - evaluation.instants / len(self.start.instants)
+        gain: Float64 = found.gain + (0.0 if best is None else self._gains[best])
+        return gain, np.nan_to_num(found.error * np.sqrt(left))
 
     def _scalarised(self, number: int) -> Optimiser:
         """A new one, that was told all there is in one number."""
-        draws = np.random.default_rng([self._seed, number])
-        weights = draws.dirichlet(np.ones(self.objectives))
-        gains, errors = self.gains, np.array(self._errors)
-        known = gains[~np.isnan(gains).any(axis=1)]
-        extent = np.ptp(known, axis=0)
+        gains, left = self.gains, np.array(self._left)
+        weights = np.random.default_rng([self._seed, number]).dirichlet(np.ones(gains.shape[1]))
+        extent = np.ptp(gains[~np.isnan(gains).any(axis=1)], axis=0)
         scale = np.where(extent > 0, extent, 1.0)
         values = chebyshev(gains / scale, weights)
-        noise = np.linalg.norm(errors / scale * weights, axis=1)
+        noise = np.linalg.norm(left / scale * weights, axis=1)
         optimiser = self._makes(self._cube, self._seed)
-        for evaluation, value, error in zip(self.evaluations[1:], values[1:], noise[1:], strict=True):
-            assert evaluation.unit is not None  # only a start can be outside
-            optimiser.tell(evaluation.unit, float(value), float(error))
+        for evaluation, value, error in zip(self.evaluations, values, noise, strict=True):
+            if evaluation.number and evaluation.unit is not None:
+                optimiser.tell(evaluation.unit, float(value), float(error))
         return optimiser

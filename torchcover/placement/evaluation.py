@@ -1,6 +1,7 @@
 """A candidate of a search, and what became of it."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, Self
 
 import numpy as np
@@ -14,6 +15,8 @@ Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 START, OPTIMISER, RANDOM = "start", "optimiser", "random"
+# What of the scores differs between two rigs at the same instants.
+OWN_SCORES = ("seen_m2", "known_share")
 
 
 class Instants(Protocol):
@@ -26,8 +29,16 @@ class Instants(Protocol):
 
     def __len__(self) -> int: ...
 
-    def score(self, rig: Rig, instants: Numbers | None = None) -> Scores:
+    def score(self, rig: Rig, instants: Sequence[int] | Numbers | None = None) -> Scores:
         """What a rig scores at some instants; ValueError if it cannot be mounted."""
+        ...
+
+    def anew(self, seed: int, worlds: int) -> "Instants":
+        """Instants of other worlds; ValueError if there are none."""
+        ...
+
+    def close(self) -> None:
+        """End the processes that hold the worlds."""
         ...
 
 
@@ -59,10 +70,8 @@ class Evaluation:
         arm: "start", "optimiser" or "random".
         unit: (variables,) where it is in the unit cube; None for a start outside of the space.
         values: Of the variables.
-        instants: (n,) int64 numbers of the instants that it was scored at, in their order.
-        scores: (n, objectives) its scores there; NaN where one is unknown.
+        scores: What it scored, at the instants that it was given; None if it was not scored.
         infeasible: Why it cannot be; empty if it can.
-        self_hit_share: Share of its rays that the vehicle took; NaN where nobody knows.
         seconds: What it took.
     """
 
@@ -70,53 +79,74 @@ class Evaluation:
     arm: str
     unit: Float64 | None
     values: dict[str, Value]
-    instants: Numbers
-    scores: Float64
+    scores: Scores | None
     infeasible: str = ""
-    self_hit_share: float = float("nan")
     seconds: float = 0.0
+
+    @property
+    def instants(self) -> int:
+        """How many it was scored at."""
+        return 0 if self.scores is None else len(self.scores.instants)
 
     @property
     def charge(self) -> int:
         """What it counts in a budget: its instants, one at least, or arms would look for places that are none."""
-        return max(len(self.instants), 1)
-
-    def spread(self, count: int) -> Float64:
-        """(count, objectives) its scores by the number of the instant; NaN where it was not scored."""
-        scores = np.full((count, self.scores.shape[1]), np.nan)
-        scores[self.instants] = self.scores
-        return scores
+        return max(self.instants, 1)
 
     def record(self) -> dict[str, Any]:
-        """All of it, for JSON; every float comes back as it was."""
+        """What it has of its own, for JSON; every float comes back as it was."""
+        scores = self.scores
         return {
             "number": self.number,
             "arm": self.arm,
             "unit": None if self.unit is None else self.unit.tolist(),
             "values": self.values,
-            "instants": self.instants.tolist(),
-            "scores": [[None if np.isnan(value) else value for value in row] for row in self.scores.tolist()],
             "infeasible": self.infeasible,
-            "self_hit_share": None if np.isnan(self.self_hit_share) else self.self_hit_share,
             "seconds": self.seconds,
+            "scores": None
+            if scores is None
+            else {
+                "instants": scores.instants.tolist(),
+                "self_hit_share": scores.self_hit_share,
+                "rays": scores.rays,
+                **{name: _nulled(getattr(scores, name)) for name in OWN_SCORES},
+            },
         }
 
     @classmethod
-    def of_record(cls, record: dict[str, Any], objectives: int) -> Self:
+    def of_record(cls, record: Mapping[str, Any], like: Scores) -> Self:
         """What `record` wrote.
+
+        Args:
+            record: It.
+            like: What any rig scored at all instants: the square metres that there are to see are the same.
 
         Raises:
             ValueError, KeyError, TypeError: It did not.
         """
-        unit, hits = record["unit"], record["self_hit_share"]
+        unit, own = record["unit"], record["scores"]
+        scores = None
+        if own is not None:
+            seen_m2, known_share = (
+                np.array(own[name], dtype=np.float64).reshape(-1, like.seen_m2.shape[1]) for name in OWN_SCORES
+            )
+            scores = replace(
+                like.at(own["instants"]),
+                self_hit_share=float(own["self_hit_share"]),
+                rays=int(own["rays"]),
+                seen_m2=seen_m2,
+                known_share=known_share,
+            )
         return cls(
             number=int(record["number"]),
             arm=str(record["arm"]),
             unit=None if unit is None else np.array(unit, dtype=np.float64),
             values=dict(record["values"]),
-            instants=np.array(record["instants"], dtype=np.int64),
-            scores=np.array(record["scores"], dtype=np.float64).reshape(-1, objectives),
+            scores=scores,
             infeasible=str(record["infeasible"]),
-            self_hit_share=float("nan") if hits is None else float(hits),
             seconds=float(record["seconds"]),
         )
+
+
+def _nulled(values: Float64) -> list[list[float | None]]:
+    return [[None if np.isnan(value) else value for value in row] for row in values.tolist()]

@@ -8,6 +8,7 @@ from typing import Any, Self
 
 from torchcover.files import BadFileError, reads, write_durably
 from torchcover.placement.evaluation import Evaluation
+from torchcover.placement.scores import Scores
 
 NAME = "evaluations.jsonl"
 
@@ -28,19 +29,19 @@ class Journal:
         write_durably(path, lambda file: file.write(text.encode()))
 
     @classmethod
-    def resumed(cls, path: Path, settings: Mapping[str, Any], objectives: int) -> tuple[Self, list[Evaluation]]:
+    def resumed(cls, path: Path, settings: Mapping[str, Any], like: Scores) -> tuple[Self, list[Evaluation]]:
         """Go on in a file.
 
         Args:
             path: The file.
             settings: Those of this search, which must be those of the file.
-            objectives: How many.
+            like: What any rig scored at all instants.
 
         Raises:
             FileNotFoundError: No such file.
             BadFileError: Of another search, or not written by this class.
         """
-        evaluations, length = _read(path, settings, objectives)
+        evaluations, length = _read(path, settings, like)
         journal = cls.__new__(cls)
         journal.path = path
         os.truncate(path, length)
@@ -56,13 +57,13 @@ class Journal:
 
 
 @reads("the evaluations of a search")
-def _read(path: Path, settings: Mapping[str, Any], objectives: int) -> tuple[list[Evaluation], int]:
+def _read(path: Path, settings: Mapping[str, Any], like: Scores) -> tuple[list[Evaluation], int]:
     """The evaluations, and how many bytes hold them."""
     whole = path.read_bytes()
     whole = whole[: whole.rfind(b"\n") + 1]
     first, *lines = whole.decode().splitlines() or [""]
     _check_same(path, json.loads(first), settings)
-    evaluations = [Evaluation.of_record(json.loads(line), objectives) for line in lines]
+    evaluations = [Evaluation.of_record(json.loads(line), like) for line in lines]
     if [one.number for one in evaluations] != list(range(len(evaluations))):
         raise ValueError("an evaluation is missing")
     return evaluations, len(whole)

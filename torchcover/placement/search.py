@@ -14,13 +14,13 @@ from torchcover.placement.evaluation import (
     START,
     Candidate,
     Evaluation,
-    Float64,
     Instants,
     Numbers,
 )
 from torchcover.placement.optimisers import Cube, RandomSearch
+from torchcover.placement.optimisers.optimiser import Unit
 from torchcover.placement.plan import SearchPlan, levels_of
-from torchcover.placement.racing import batches
+from torchcover.placement.racing import paired, race, racing_order
 from torchcover.placement.scores import Scores
 from torchcover.placement.space import SearchSpace
 
@@ -51,7 +51,7 @@ class PlacementSearch:
         ... )
         >>> search = PlacementSearch(space, evaluations=2, per_world=1, rays=1024)
         >>> while (candidate := search.ask()) is not None:
-        ...     search.tell(candidate, search.instants.score(candidate.rig).area)
+        ...     search.tell(candidate, search.instants.score(candidate.rig))
         >>> [evaluation.arm for evaluation in search.evaluations]
         ['start', 'optimiser', 'random']
     """
@@ -63,7 +63,7 @@ class PlacementSearch:
         self.evaluations: list[Evaluation] = []
         self.arms: dict[str, Arm] = {}
         self._exhausted = False
-        self._makes_optimiser(Cube(levels_of(space), self._start_unit), self.plan.seed)  # fails now, if it does
+        self._makes_optimiser(self._cube(), self.plan.seed)  # fails now, if it does
 
     @cached_property
     def instants(self) -> Instants:
@@ -78,10 +78,8 @@ class PlacementSearch:
     @property
     def share_saved(self) -> float:
         """Of the instants that candidates would have been scored at without racing."""
-        looked_at = [one for one in self.evaluations[1:] if len(one.instants)]
-        if not looked_at:
-            return 0.0
-        return 1.0 - sum(len(one.instants) for one in looked_at) / (len(looked_at) * len(self.instants))
+        spent = [one.instants for one in self.evaluations[1:] if one.instants]
+        return 1.0 - sum(spent) / (len(spent) * len(self.instants)) if spent else 0.0
 
     def ask(self) -> Candidate | None:
         """The next candidate that can be mounted and keeps to the constraints; those before are noted as infeasible.
@@ -107,49 +105,26 @@ class PlacementSearch:
                 why = str(error)
             if not why:
                 return Candidate(number, arm.name, unit, values, rig)
-            self._note(Evaluation(number, arm.name, unit, values, *self._nothing, infeasible=why))
+            self._note(Evaluation(number, arm.name, unit, values, None, why))
         return None
 
-    def tell(
-        self,
-        candidate: Candidate,
-        scores: Float64,
-        instants: Numbers | None = None,
-        *,
-        self_hit_share: float = float("nan"),
-        seconds: float = 0.0,
-    ) -> None:
-        """What a candidate scored.
+    def tell(self, candidate: Candidate, scores: Scores, *, seconds: float = 0.0) -> None:
+        """What a candidate scored; with too many rays on the vehicle, it cannot be.
 
         Args:
             candidate: The last that was asked for.
-            scores: (n, objectives); NaN where one is unknown.
-            instants: (n,) numbers of the instants; all of them if not given.
-            self_hit_share: Share of its rays that the vehicle took; beyond `max_self_hits` it cannot be.
+            scores: From `instants.score`, at all instants or at some; of the start at all.
             seconds: What it took.
 
         Raises:
-            ValueError: Another candidate, scores of another shape, or an objective that nobody knows of the start.
+            ValueError: Another candidate; of the start, scores at some instants only, or an unknown objective.
         """
         self._check_turn(candidate)
-        numbers = np.arange(len(self.instants)) if instants is None else np.asarray(instants, dtype=np.int64)
-        expected = len(numbers), len(self.space.objectives)
-        if np.shape(scores) != expected:
-            raise ValueError(f"scores: {expected} are needed, instants and objectives; got {np.shape(scores)}")
-        evaluation = Evaluation(
-            candidate.number,
-            candidate.arm,
-            candidate.unit,
-            candidate.values,
-            numbers,
-            np.asarray(scores, dtype=np.float64),
-            self._why_not(candidate, self_hit_share),
-            self_hit_share,
-            seconds,
-        )
-        self._note(evaluation)
+        wrong = [] if candidate.number else list(self.space.violations(candidate.rig))
+        wrong += [why] if (why := self._too_many_self_hits(scores)) else []
+        self._note(_evaluation(candidate, scores, "; ".join(wrong), seconds))
 
-    def refuse(self, candidate: Candidate, why: str, seconds: float = 0.0) -> None:
+    def refuse(self, candidate: Candidate, why: str, *, seconds: float = 0.0) -> None:
         """Say that a candidate cannot be.
 
         Raises:
@@ -158,63 +133,44 @@ class PlacementSearch:
         self._check_turn(candidate)
         if candidate.number == 0:
             raise ValueError(f"the start, {self.space.start.name}, cannot be scored: {why}")
-        unit, values = candidate.unit, candidate.values
-        self._note(
-            Evaluation(candidate.number, candidate.arm, unit, values, *self._nothing, infeasible=why, seconds=seconds)
-        )
+        self._note(_evaluation(candidate, None, why, seconds))
 
     def evaluate(self, candidate: Candidate) -> None:
-        """Score a candidate and tell it: a few instants at a time, until it is beaten or all are done."""
-        began, scores = time.perf_counter(), None
-        for batch in batches(self.instants.world_of, self.plan.seed, candidate.number):
-            try:
-                more = self.instants.score(candidate.rig, batch)
-            except ValueError as error:
-                self.refuse(candidate, str(error), time.perf_counter() - began)
-                return
-            scores = more if scores is None else scores.joined(more)
-            if candidate.number and self._is_done(candidate, scores):
-                break
-        assert scores is not None  # there is an instant at least
-        self.tell(
-            candidate,
-            self.measured(scores),
-            scores.instants,
-            self_hit_share=scores.self_hit_share,
-            seconds=time.perf_counter() - began,
-        )
-
-    def measured(self, scores: Scores) -> Float64:
-        """(n, objectives) in the measure of the plan."""
-        return scores.area if self.plan.measure == "area" else scores.known
+        """Score a candidate and tell it: at a few instants at a time, until it is beaten or was scored at all."""
+        began = time.perf_counter()
+        draws = np.random.SeedSequence([self.plan.seed, candidate.number]).generate_state(1)
+        order = racing_order(self.instants.world_of, int(draws[0]))
+        incumbents = self.arms[candidate.arm].incumbents if candidate.number else []
+        try:
+            (raced,) = race(self._scored, [candidate], order, incumbents=incumbents, measure=self.plan.measure)
+        except ValueError as error:
+            self.refuse(candidate, str(error), seconds=time.perf_counter() - began)
+        else:
+            self.tell(candidate, raced.scores, seconds=time.perf_counter() - began)
 
     def replay(self, evaluations: Iterable[Evaluation]) -> None:
         """Go on from those of a search that was ended, all of them from the start on."""
         for evaluation in evaluations:
             self._note(evaluation)
 
-    def _is_done(self, candidate: Candidate, scores: Scores) -> bool:
-        if self._why_not(candidate, scores.self_hit_share):
-            return True
-        return self.arms[candidate.arm].beaten(scores.instants, self.measured(scores))
+    def _scored(self, candidate: Candidate, instants: Numbers) -> Scores:
+        scores = self.instants.score(candidate.rig, instants)
+        if candidate.number and (why := self._too_many_self_hits(scores)):
+            raise ValueError(why)  # no need to look at more instants
+        return scores
 
-    def _why_not(self, candidate: Candidate, self_hit_share: float) -> str:
+    def _too_many_self_hits(self, scores: Scores) -> str:
         most = self.space.constraints.max_self_hits
-        why = [] if candidate.number else list(self.space.violations(candidate.rig))
-        if most is not None and self_hit_share > most:
-            why.append(f"{self_hit_share:.1%} of its rays end on the vehicle; max_self_hits is {most:.1%}")
-        return "; ".join(why)
+        if most is None or scores.self_hit_share <= most:
+            return ""
+        return f"{scores.self_hit_share:.1%} of its rays end on the vehicle; max_self_hits is {most:.1%}"
 
     @cached_property
-    def _start_unit(self) -> Float64 | None:
+    def _start_unit(self) -> Unit | None:
         values = self.space.start_values()
         if len(values) < len(self.space.variables):
             return None
         return np.array([variable.unit(values[variable.name]) for variable in self.space.variables])
-
-    @property
-    def _nothing(self) -> tuple[Numbers, Float64]:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, len(self.space.objectives)))
 
     def _check_turn(self, candidate: Candidate) -> None:
         if candidate.number != len(self.evaluations):
@@ -228,15 +184,24 @@ class PlacementSearch:
         self.evaluations.append(evaluation)
 
     def _begin(self, start: Evaluation) -> None:
-        unknown = np.isnan(start.scores).all(axis=0).tolist()
-        for name, is_unknown in zip(self.space.objectives, unknown, strict=True):
-            if is_unknown:
+        scores = start.scores
+        if scores is None or len(scores.instants) != len(self.instants):
+            raise ValueError(f"the start is to be scored at all {len(self.instants)} instants; got {start.instants}")
+        known = paired(scores, scores, self.plan.measure).worlds.tolist()
+        for name, worlds in zip(self.space.objectives, known, strict=True):
+            if not worlds:
                 raise ValueError(
-                    f"objectives.{name}: unknown at all {len(start.instants)} instants: none shows its regions and "
+                    f"objectives.{name}: unknown at all {start.instants} instants: none shows all of its regions and "
                     "bands; take larger ones, more worlds or more rays"
                 )
         makes = {OPTIMISER: self._makes_optimiser, RANDOM: RandomSearch}
-        cube = Cube(levels_of(self.space), None if start.infeasible else start.unit)
         for name, each in makes.items():
             seed = int(np.random.SeedSequence([self.plan.seed, SEEDS[name]]).generate_state(1)[0])
-            self.arms[name] = Arm(name, each, cube, seed, start, self.instants.world_of)
+            self.arms[name] = Arm(name, each, self._cube(start.infeasible), seed, start, self.plan.measure)
+
+    def _cube(self, start_infeasible: str = "") -> Cube:
+        return Cube(levels_of(self.space), None if start_infeasible else self._start_unit)
+
+
+def _evaluation(candidate: Candidate, scores: Scores | None, infeasible: str, seconds: float) -> Evaluation:
+    return Evaluation(candidate.number, candidate.arm, candidate.unit, candidate.values, scores, infeasible, seconds)
