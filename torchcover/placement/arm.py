@@ -37,7 +37,7 @@ class Arm:
         self._makes, self._cube, self._seed, self._measure = makes, cube, seed, measure
         self._optimiser: Optimiser = makes(cube, seed)
         nothing = np.zeros(len(self.start.objectives))
-        self._gains, self._left = [nothing], [nothing]
+        self._gains, self._lefts = [nothing], [nothing]
         self.evaluations: list[Evaluation] = [start]
 
     @property
@@ -49,6 +49,11 @@ class Arm:
     def gains(self) -> Float64:
         """(evaluations, objectives) over the start; NaN for what cannot be."""
         return np.array(self._gains)
+
+    @property
+    def left(self) -> Float64:
+        """(evaluations, objectives) standard errors of the gains that instants left out have left."""
+        return np.array(self._lefts)
 
     @property
     def complete(self) -> list[int]:
@@ -95,7 +100,7 @@ class Arm:
         gain, left = self._estimated(evaluation)
         self.evaluations.append(evaluation)
         self._gains.append(gain)
-        self._left.append(left)
+        self._lefts.append(left)
         if len(gain) == 1 and evaluation.unit is not None:
             self._optimiser.tell(evaluation.unit, float(gain[0]), float(left[0]))
 
@@ -121,7 +126,7 @@ class Arm:
 
     def _scalarised(self, number: int) -> Optimiser:
         """A new one, that was told all there is in one number."""
-        gains, left = self.gains, np.array(self._left)
+        gains, left = self.gains, self.left
         weights = np.random.default_rng([self._seed, number]).dirichlet(np.ones(gains.shape[1]))
         extent = np.ptp(gains[~np.isnan(gains).any(axis=1)], axis=0)
         scale = np.where(extent > 0, extent, 1.0)

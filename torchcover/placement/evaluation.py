@@ -1,8 +1,8 @@
 """A candidate of a search, and what became of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,29 +17,6 @@ Numbers = NDArray[np.int64]
 START, OPTIMISER, RANDOM = "start", "optimiser", "random"
 # What of the scores differs between two rigs at the same instants.
 OWN_SCORES = ("seen_m2", "known_share")
-
-
-class Instants(Protocol):
-    """What rigs are scored on: `CommonInstants`, or anything else that knows worlds."""
-
-    @property
-    def world_of(self) -> Numbers:
-        """(instants,) which world each is of."""
-        ...
-
-    def __len__(self) -> int: ...
-
-    def score(self, rig: Rig, instants: Sequence[int] | Numbers | None = None) -> Scores:
-        """What a rig scores at some instants; ValueError if it cannot be mounted."""
-        ...
-
-    def anew(self, seed: int, worlds: int) -> "Instants":
-        """Instants of other worlds; ValueError if there are none."""
-        ...
-
-    def close(self) -> None:
-        """End the processes that hold the worlds."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)

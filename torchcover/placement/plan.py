@@ -9,7 +9,7 @@ from typing import Any, cast
 from torchcover import __version__
 from torchcover.coverage import Measure
 from torchcover.placement.common_instants import EVERY_S, PER_WORLD, RAYS, WORLDS, CommonInstants
-from torchcover.placement.evaluation import Instants
+from torchcover.placement.instants import Instants
 from torchcover.placement.optimisers import AUTO, OPTIMISERS, MakesOptimiser, optimiser_for
 from torchcover.placement.space import SearchSpace
 from torchcover.placement.variables import Choice

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from torchcover.evaluation import claimed
 from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.progress import progress_of
 from torchcover.files import BadFileError
@@ -58,8 +57,8 @@ def run_search(
         with progress_of(budget.expected, search.space.name, done=len(search.evaluations), shown=progress) as bar:
             budget.check()
             _spend(search, budget, journal, bar.advance)
-        picks = _tested(search, _picks(search))
-        return SearchResult(search, picks, clock() - began + earlier_s)
+        picks, untested = _tested(search, _picks(search))
+        return SearchResult(search, picks, untested, clock() - began + earlier_s)
     finally:
         if "instants" in vars(search):
             instants.close()

@@ -1,9 +1,11 @@
 """A placement search: it asks for candidates, is told their scores, and spends half of its budget on a control."""
 
+import math
 import time
 from collections.abc import Iterable
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,15 +16,18 @@ from torchcover.placement.evaluation import (
     START,
     Candidate,
     Evaluation,
-    Instants,
     Numbers,
 )
+from torchcover.placement.instants import Instants
 from torchcover.placement.optimisers import Cube, RandomSearch
 from torchcover.placement.optimisers.optimiser import Unit
 from torchcover.placement.plan import SearchPlan, levels_of
 from torchcover.placement.racing import paired, race, racing_order
 from torchcover.placement.scores import Scores
 from torchcover.placement.space import SearchSpace
+
+if TYPE_CHECKING:
+    from torchcover.placement.result import SearchResult
 
 # What is drawn by the control is nothing that the optimiser draws.
 SEEDS = {OPTIMISER: 0, RANDOM: 1}
@@ -63,6 +68,7 @@ class PlacementSearch:
         self.evaluations: list[Evaluation] = []
         self.arms: dict[str, Arm] = {}
         self._exhausted = False
+        self.until = math.inf  # by the monotonic clock: when nothing more is asked for
         self._makes_optimiser(self._cube(), self.plan.seed)  # fails now, if it does
 
     @cached_property
@@ -71,15 +77,16 @@ class PlacementSearch:
         return self.plan.instants(self.space, self.plan, self.plan.seed, self.plan.worlds)
 
     @property
-    def spent_s(self) -> float:
-        """Seconds that the evaluations took."""
-        return sum(evaluation.seconds for evaluation in self.evaluations)
-
-    @property
     def share_saved(self) -> float:
         """Of the instants that candidates would have been scored at without racing."""
         spent = [one.instants for one in self.evaluations[1:] if one.instants]
         return 1.0 - sum(spent) / (len(spent) * len(self.instants)) if spent else 0.0
+
+    def run(self, out: str | Path | None = None, *, resume: bool = False, progress: bool = False) -> "SearchResult":
+        """Spend the budget and test what was found in fresh worlds; see `run_search`."""
+        from torchcover.placement.running import run_search
+
+        return run_search(self, None if out is None else Path(out), resume=resume, progress=progress)
 
     def ask(self) -> Candidate | None:
         """The next candidate that can be mounted and keeps to the constraints; those before are noted as infeasible.
@@ -88,9 +95,12 @@ class PlacementSearch:
             It; None when the evaluations are spent, or the optimiser has nothing left to ask for.
         """
         if not self.evaluations:
+            if self.plan.budget_s is not None:
+                self.until = time.monotonic() + self.plan.budget_s
             values = self.space.start_values()
             return Candidate(0, START, self._start_unit, values, self.space.start)
-        while (number := len(self.evaluations)) <= (self.plan.evaluations or number) and not self._exhausted:
+        while self._is_budget_left():
+            number = len(self.evaluations)
             arm = min(self.arms.values(), key=lambda each: each.charge)
             unit = arm.ask(number)
             if unit is None:
@@ -171,6 +181,11 @@ class PlacementSearch:
         if len(values) < len(self.space.variables):
             return None
         return np.array([variable.unit(values[variable.name]) for variable in self.space.variables])
+
+    def _is_budget_left(self) -> bool:
+        if self._exhausted or time.monotonic() > self.until:
+            return False
+        return self.plan.evaluations is None or len(self.evaluations) <= self.plan.evaluations
 
     def _check_turn(self, candidate: Candidate) -> None:
         if candidate.number != len(self.evaluations):

@@ -1,0 +1,222 @@
+"""What a search has found, in numbers and words."""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from torchcover.coverage import Measure
+from torchcover.placement.arm import Arm
+from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
+from torchcover.placement.fresh import MEASURES, FreshGain, FreshTest
+from torchcover.placement.pareto import hypervolume
+from torchcover.placement.search import PlacementSearch
+from torchcover.simulation import Rig
+
+# Below, a gain is not told from chance.
+ENOUGH_T = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Pick:
+    """A rig that was found.
+
+    Args:
+        arm: Who found it: "optimiser" or "random".
+        role: Of several objectives, "middle" of the front, or the name of the objective that it is best in; else empty.
+        evaluation: It.
+        rig: It, as it can be evaluated.
+        test: On fresh worlds; None if it was not tested, as the start itself is not.
+    """
+
+    arm: str
+    role: str
+    evaluation: Evaluation
+    rig: Rig
+    test: FreshTest | None = None
+
+    @property
+    def is_start(self) -> bool:
+        """Whether nothing better was found."""
+        return self.evaluation.arm == START
+
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        return f"{self.arm}: {self.role}" if self.role else self.arm
+
+    def tested(self, test: FreshTest | None) -> Self:
+        """It, with its test."""
+        return replace(self, test=test)
+
+
+@dataclass(frozen=True, eq=False)
+class SearchResult:
+    """What `PlacementSearch.run` returns.
+
+    Args:
+        search: With all its evaluations.
+        picks: What was found, the optimiser's first, of several objectives the middle of its front.
+        untested: Why there is no test on fresh worlds; empty if there is one.
+        seconds: What it took, with what was spent before it was resumed.
+    """
+
+    search: PlacementSearch
+    picks: Sequence[Pick]
+    untested: str
+    seconds: float
+
+    @property
+    def best(self) -> Pick | None:
+        """The optimiser's; None if no candidate can be, nor the start."""
+        return next((pick for pick in self.picks if pick.arm == OPTIMISER), None)
+
+    @property
+    def rig(self) -> Rig:
+        """The best, or the start if nothing better was found."""
+        return self.search.space.start if self.best is None else self.best.rig
+
+    @cached_property
+    def gains(self) -> list[tuple[Pick, str, Measure, FreshGain]]:
+        """Of each pick that was tested, each objective and each measure, that of the search first."""
+        first = self.search.plan.measure
+        measures = (first, *(each for each in MEASURES if each != first))
+        return [
+            (pick, objective, measure, pick.test.gains[objective][measure])
+            for pick in self.picks
+            if pick.test is not None
+            for objective in self.search.space.objectives
+            for measure in measures
+        ]
+
+    @property
+    def hypervolumes(self) -> dict[str, float]:
+        """Of the front of each arm, above the least that any candidate of both gained in each objective."""
+        gains = {name: arm.gains[arm.complete] for name, arm in self.search.arms.items()}
+        every = np.vstack([*gains.values(), np.zeros((1, len(self.search.space.objectives)))])
+        return {name: hypervolume(values, every.min(axis=0)) for name, values in gains.items()}
+
+    @property
+    def sentence(self) -> str:
+        """The last line: what was gained on fresh worlds, and what random search got with the same budget."""
+        return " ".join(self._sentences())
+
+    def _sentences(self) -> Iterator[str]:
+        search, best = self.search, self.best
+        if best is None:
+            yield f"No rig was found: {self._refusals()}."
+        elif best.is_start:
+            yield f"Nothing better than {search.space.start.name} was found in {self._spent(OPTIMISER)}."
+        elif best.test is None:
+            yield f"Found in {self._spent(OPTIMISER)}, but not tested, so that no gain is shown: {self.untested}."
+        else:
+            yield f"{'; '.join(self._told(best))}."
+        other = next((pick for pick in self.picks if pick.arm == RANDOM), None)
+        if other is not None and not other.is_start and other.test is not None:
+            yield f"Random search with the same budget: {'; '.join(self._told(other, short=True))}."
+        elif best is not None:
+            what = "no rig" if other is None else "nothing better" if other.is_start else "a rig that was not tested"
+            yield f"Random search with the same budget found {what} in {self._spent(RANDOM)}."
+        yield f"Racing saved {search.share_saved:.0%} of the instants."
+
+    def _told(self, pick: Pick, *, short: bool = False) -> Iterator[str]:
+        assert pick.test is not None  # it was asked before
+        for objective, gains in pick.test.gains.items():
+            gain = gains[self.search.plan.measure]
+            yield f"{objective}: {told(gain)}" + ("" if short else f", optimism {100 * gain.optimism:+.2f}")
+
+    def _spent(self, arm: str) -> str:
+        one = self.search.arms[arm]
+        return f"{len(one.evaluations) - 1} candidates"
+
+    def _refusals(self) -> str:
+        refused = [one.infeasible for one in self.search.evaluations if one.infeasible]
+        return f"{len(refused)} of {len(self.search.evaluations)} candidates cannot be, the last because {refused[-1]}"
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """All but the single evaluations: what stands in `search.json`; what nobody knows is None."""
+        search, plan = self.search, self.search.plan
+        several = len(search.space.objectives) > 1
+        record = {
+            **plan.settings(search.space),
+            "evaluations": plan.evaluations,
+            "budget_s": plan.budget_s,
+            "test_seed": plan.seed_of_test,
+            "fresh_worlds": plan.fresh_worlds,
+            "seconds": round(self.seconds, 3),
+            "arms": {name: _arm_record(arm) for name, arm in search.arms.items()},
+            "share_of_instants_saved": search.share_saved,
+            "hypervolume": self.hypervolumes if several else None,
+            "found": [self._pick_record(pick) for pick in self.picks],
+            "untested": self.untested or None,
+            "sentence": self.sentence,
+        }
+        known: dict[str, Any] = _known(record)
+        return known
+
+    def _pick_record(self, pick: Pick) -> dict[str, Any]:
+        return {
+            "arm": pick.arm,
+            "role": pick.role or None,
+            "evaluation": pick.evaluation.number,
+            "values": pick.evaluation.values,
+            "cost_eur": None if pick.is_start else self.search.space.cost_eur(pick.rig),
+            "fresh_instants": None if pick.test is None else pick.test.instants,
+            "gains": None
+            if pick.test is None
+            else {
+                name: {measure: asdict(gain) for measure, gain in gains.items()}
+                for name, gains in pick.test.gains.items()
+            },
+        }
+
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write the files of the command line; see `save_search`."""
+        from torchcover.placement.result_files import save_search
+
+        return save_search(self, Path(folder))
+
+
+def told(gain: FreshGain) -> str:
+    """A gain in words, which call it one only where it is told from chance.
+
+    Example:
+        >>> told(FreshGain(0.0132, 0.0024, 5.5, 0.0001, 16, 16, 0.0148, 0.0016))
+        'gained 1.32 ± 0.24 points on 16 fresh worlds (t 5.5, better in 16)'
+        >>> told(FreshGain(0.003, 0.004, 0.75, 0.46, 16, 9, 0.0148, 0.0118))
+        'no gain is shown: +0.30 ± 0.40 points on 16 fresh worlds (t 0.8, better in 9)'
+    """
+    if math.isnan(gain.gain):
+        return "unknown in every fresh world"
+    error = "± ?" if math.isnan(gain.error) else f"± {100 * gain.error:.2f}"
+    t = "t unknown" if math.isnan(gain.t) else f"t {gain.t:.1f}"
+    rest = f"{error} points on {gain.worlds} fresh worlds ({t}, better in {gain.better})"
+    if gain.t >= ENOUGH_T:
+        return f"gained {100 * gain.gain:.2f} {rest}"
+    if gain.t <= -ENOUGH_T:
+        return f"lost {-100 * gain.gain:.2f} {rest}"
+    return f"no gain is shown: {100 * gain.gain:+.2f} {rest}"
+
+
+def _arm_record(arm: Arm) -> dict[str, Any]:
+    others = arm.evaluations[1:]
+    return {
+        "candidates": len(others),
+        "infeasible": sum(bool(one.infeasible) for one in others),
+        "scored at all instants": len(arm.complete) - (0 in arm.complete),
+        "instants": sum(one.instants for one in others),
+        "seconds": round(sum(one.seconds for one in others), 3),
+    }
+
+
+def _known(value: Any) -> Any:  # noqa: ANN401  (whatever a record holds)
+    if isinstance(value, Mapping):
+        return {key: _known(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_known(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
