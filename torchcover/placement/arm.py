@@ -71,14 +71,16 @@ class Arm:
     def best(self) -> int | None:
         """Position of the one with the largest gain; of several objectives, of the front's middle. None: there is none.
 
-        The middle has the largest Chebyshev value with equal weights, each objective in units of the front's extent.
+        The middle has the largest Chebyshev value with equal weights, each objective in units of the front's extent;
+        it is not the start, if anything else is on the front.
         """
-        front = self.front
+        front, several = self.front, len(self._gains[0]) > 1
         if not front:
             return None
         gains = self.gains[front]
         low, extent = gains.min(axis=0), np.ptp(gains, axis=0)
-        scaled = (gains - low) / np.where(extent > 0, extent, 1.0)
+        front = [at for at in front if at] or front if several else front
+        scaled = (self.gains[front] - low) / np.where(extent > 0, extent, 1.0)
         return front[int(np.argmax(chebyshev(scaled, np.full(len(low), 1 / len(low)))))]
 
     @property

@@ -115,13 +115,22 @@ class SearchResult:
             yield f"Found in {self._spent(OPTIMISER)}, but not tested, so that no gain is shown: {self.untested}."
         else:
             yield f"{'; '.join(self._told(best))}."
-        other = next((pick for pick in self.picks if pick.arm == RANDOM), None)
-        if other is not None and not other.is_start and other.test is not None:
-            yield f"Random search with the same budget: {'; '.join(self._told(other, short=True))}."
-        elif best is not None:
-            what = "no rig" if other is None else "nothing better" if other.is_start else "a rig that was not tested"
-            yield f"Random search with the same budget found {what} in {self._spent(RANDOM)}."
+        yield self._control()
         yield f"Racing saved {search.share_saved:.0%} of the instants."
+
+    def _control(self) -> str:
+        """What random search got."""
+        if len(self.search.space.objectives) > 1:
+            volumes = self.hypervolumes
+            shares = ", ".join(
+                f"{100 * volume / (max(volumes.values()) or 1):.0f} by {name}" for name, volume in volumes.items()
+            )
+            return f"Hypervolume of the fronts, with the same budget, in per cent of the larger: {shares}."
+        other = next((pick for pick in self.picks if pick.arm == RANDOM), None)
+        if other is not None and other.test is not None:
+            return f"Random search with the same budget: {'; '.join(self._told(other, short=True))}."
+        what = "no rig" if other is None else "nothing better" if other.is_start else "a rig that was not tested"
+        return f"Random search with the same budget found {what} in {self._spent(RANDOM)}."
 
     def _told(self, pick: Pick, *, short: bool = False) -> Iterator[str]:
         assert pick.test is not None  # it was asked before

@@ -3,11 +3,13 @@
 import math
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from torchcover.evaluation import claimed
 from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.progress import progress_of
 from torchcover.files import BadFileError
@@ -42,26 +44,31 @@ def run_search(
         ValueError: A budget below one evaluation of each arm; a start that cannot be scored.
         BadFileError: A journal of another search.
     """
+    if search.evaluations:
+        raise ValueError("search: one of which nothing was asked yet is needed; make another one")
+    with nullcontext() if out is None else claimed(out):
+        try:
+            return _run(search, out, resume, progress, clock)
+        finally:
+            if "instants" in vars(search):
+                search.instants.close()
+
+
+def _run(search: PlacementSearch, out: Path | None, resume: bool, progress: bool, clock: Clock) -> SearchResult:
     began = clock()
+    count = len(search.instants)
+    build_s = (clock() - began) / count
     start = search.ask()
     assert start is not None  # there always is one
-    if start.number:
-        raise ValueError("search: one of which nothing was asked yet is needed; make another one")
-    try:
-        instants = search.instants
-        build_s = clock() - began
-        search.evaluate(start)
-        journal = None if out is None else _journal(search, out, resume=resume)
-        earlier_s = sum(evaluation.seconds for evaluation in search.evaluations[1:])
-        budget = _Budget(search, clock, began - earlier_s, build_s)
-        with progress_of(budget.expected, search.space.name, done=len(search.evaluations), shown=progress) as bar:
-            budget.check()
-            _spend(search, budget, journal, bar.advance)
-        picks, untested = _tested(search, _picks(search))
-        return SearchResult(search, picks, untested, clock() - began + earlier_s)
-    finally:
-        if "instants" in vars(search):
-            instants.close()
+    search.evaluate(start)
+    journal = None if out is None else _journal(search, out, resume=resume)
+    earlier_s = sum(evaluation.seconds for evaluation in search.evaluations[1:])
+    budget = _Budget(search, clock, began - earlier_s, build_s)
+    with progress_of(budget.expected, search.space.name, done=len(search.evaluations), shown=progress) as bar:
+        budget.check()
+        _spend(search, budget, journal, bar.advance)
+    picks, untested = _tested(search, _picks(search))
+    return SearchResult(search, picks, untested, clock() - began + earlier_s)
 
 
 def _journal(search: PlacementSearch, out: Path, *, resume: bool) -> Journal:
@@ -98,16 +105,16 @@ class _Budget:
         search: It, with the start scored.
         clock: Seconds.
         began: When, by that clock; earlier, by what a search that is resumed has spent.
-        build_s: Seconds that its instants took.
+        build_s: Seconds that each of its instants took.
     """
 
     def __init__(self, search: PlacementSearch, clock: Clock, began: float, build_s: float) -> None:
         self._search, self._clock, self._began = search, clock, began
-        plan, count = search.plan, len(search.instants)
+        plan = search.plan
         one = search.evaluations[0].seconds
         rigs = 1 + 2 * (1 if len(search.space.objectives) == 1 else len(search.space.objectives) + 1)
         fresh = plan.fresh_worlds * plan.per_world * sum(each.traffic is not None for each in search.space.scenarios)
-        self.one_s, self.test_s = one, fresh * (build_s + rigs * one) / count
+        self.one_s, self.test_s = one, fresh * (build_s + rigs * one / len(search.instants))
         self.until = math.inf if plan.budget_s is None else began + plan.budget_s - self.test_s
 
     @property
@@ -164,8 +171,8 @@ def _standing(search: PlacementSearch) -> str:
     arm = search.arms[OPTIMISER]
     if arm.best is None:
         return "nothing that can be yet"
-    return "  ".join(f"{name} {100 * gain:+.2f}" for name, gain in zip(
-        search.space.objectives, arm.gains[arm.best].tolist(), strict=True))  # fmt: skip
+    gains = zip(search.space.objectives, arm.gains[arm.best].tolist(), strict=True)
+    return "  ".join(f"{name} {100 * gain:+.2f}" for name, gain in gains)
 
 
 def _picks(search: PlacementSearch) -> list[Pick]:
@@ -178,10 +185,8 @@ def _picks(search: PlacementSearch) -> list[Pick]:
         front = arm.front
         places = {"": arm.best}
         if len(search.space.objectives) > 1:
-            gains = arm.gains[front]
-            ends = {key: front[int(np.argmax(column))] for key, column in zip(
-                search.space.objectives, gains.T, strict=True)}  # fmt: skip
-            places = {"middle": arm.best, **ends}
+            columns = zip(search.space.objectives, arm.gains[front].T, strict=True)
+            places = {"middle": arm.best, **{key: front[int(np.argmax(column))] for key, column in columns}}
         for role, at in places.items():
             evaluation = arm.evaluations[at]
             rig = search.space.start

@@ -1,7 +1,7 @@
 """A search for a better rig: how it went on, what each variable does, what its objectives cost each other."""
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -110,14 +110,14 @@ def draw_fronts(
     figure, grid = _sheet(1, len(pairs), title)
     for axes, (one, other) in zip(grid[0], pairs, strict=True):
         for at, name in enumerate(candidates):
-            style = {"color": COLOURS[at], "marker": MARKERS[at], "linestyle": "none"}
+            style: dict[str, Any] = {"color": COLOURS[at], "marker": MARKERS[at], "linestyle": "none"}
             axes.plot(*candidates[name][:, [one, other]].T, markersize=3, alpha=0.4, label=name, **style)
             axes.plot(*fronts[name][:, [one, other]].T, markersize=7, label=f"{name}: beaten by none", **style)
         axes.plot(0.0, 0.0, "*", color=BEST, markersize=10, label="start")
         axes.set_xlabel(names[one], parse_math=False)
         axes.set_ylabel(names[other], parse_math=False)
         axes.grid(visible=True, alpha=0.2)
-    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=5, frameon=False)
+    figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
     return figure
 
 
