@@ -44,6 +44,13 @@ class CommonInstants:
         budget_bytes: What all worlds may take.
         workers: Processes that hold the worlds; 0 holds them in this one.
 
+    Attributes:
+        sites: The scenarios with their egos, what is asked about around these, and the settings.
+        instants: Which step of which site each instant is, and its world.
+        references: What the reference points of each instant count for.
+        unknown_worlds: Name of each objective -> how many worlds show nothing of one of its regions and bands; they
+            have no value, of any rig, and are in no difference.
+
     Raises:
         FileNotFoundError: An unknown name or file.
         ValueError: No scenario, objective or world; a region or a band that nobody knows; a run with fewer instants;
@@ -86,11 +93,11 @@ class CommonInstants:
         self.seed = seed
         self._per_world, self._every_s, self._rays = per_world, every_s, rays
         self._budget_bytes, self._workers = budget_bytes, workers
-        self._sites = [
+        self.sites = [
             Site.of(one, objectives, vehicle, rays=rays, seed=seed, every_s=every_s) for one in self.scenarios
         ]
-        self._instants = instants_of(self._sites, worlds, per_world)
-        self._questions = self._sites[0].grid.questions
+        self.instants = instants_of(self.sites, worlds, per_world)
+        self._questions = self.sites[0].grid.questions
         self._parts = {name: tuple(map(self._questions.index, one.questions)) for name, one in objectives.items()}
         self._thresholds_m = tuple(dict.fromkeys(question.threshold_m for question in self._questions))
         self._holders = self._hold(budget_bytes)
@@ -102,13 +109,13 @@ class CommonInstants:
 
     def _hold(self, budget_bytes: float) -> list[Holder]:
         """Build all worlds, here or in other processes, which take them in turn."""
-        worlds = self._instants[-1].world + 1
+        worlds = self.instants[-1].world + 1
         if self._workers == 0:
-            return [WorldsHere(self._sites, self._instants, budget_bytes)]
+            return [WorldsHere(self.sites, self.instants, budget_bytes)]
         count = min(self._workers, worlds)
-        shares = [[one for one in self._instants if one.world % count == k] for k in range(count)]
+        shares = [[one for one in self.instants if one.world % count == k] for k in range(count)]
         return [
-            WorldProcess(self._sites, share, budget_bytes * len(range(k, worlds, count)) / worlds)
+            WorldProcess(self.sites, share, budget_bytes * len(range(k, worlds, count)) / worlds)
             for k, share in enumerate(shares)
         ]
 
@@ -132,10 +139,10 @@ class CommonInstants:
     @property
     def world_of(self) -> NDArray[np.int64]:
         """(instants,) int64 which world each instant is of: worlds are independent of each other."""
-        return np.array([instant.world for instant in self._instants], dtype=np.int64)
+        return np.array([instant.world for instant in self.instants], dtype=np.int64)
 
     def __len__(self) -> int:
-        return len(self._instants)
+        return len(self.instants)
 
     def anew(self, seed: int, worlds: int) -> "CommonInstants":
         """The same questions at as many instants in each of other worlds.
@@ -217,7 +224,7 @@ class CommonInstants:
         """The rig's own vehicle counts where nothing else decides: then it must have been known from the start."""
         if rig.vehicle is None or self.vehicle is not None:
             return
-        for scenario, site in zip(self.scenarios, self._sites, strict=True):
+        for scenario, site in zip(self.scenarios, self.sites, strict=True):
             if with_ego(scenario, {rig.name: rig}).ego != site.scenario.ego:
                 raise ValueError(
                     f"rig {rig.name!r} is for the vehicle {rig.vehicle}, and these instants have "
@@ -227,7 +234,7 @@ class CommonInstants:
     def _looks(self, rig: Rig, numbers: Sequence[int]) -> dict[int, Look]:
         shares: list[list[int]] = [[] for _ in self._holders]
         for number in dict.fromkeys(numbers):
-            shares[self._instants[number].world % len(shares)].append(number)
+            shares[self.instants[number].world % len(shares)].append(number)
         asked = [(holder, share) for holder, share in zip(self._holders, shares, strict=True) if share]
         for holder, share in asked:
             holder.ask(rig, share)

@@ -13,9 +13,6 @@ from torchcover.placement.question_grid import ReferencePoints
 from torchcover.placement.sites import HeldInstant, Site
 from torchcover.simulation import Rig, Simulator
 
-# More than coordinates are rounded by.
-SLACK_M = 0.01
-
 
 class Look(NamedTuple):
     """What a rig sees at an instant: `seen` (thresholds, bytes) packed bits of the reference points, and rays."""
@@ -82,7 +79,7 @@ class HeldWorlds:
             instant = self._instants[number]
             scans = self._with(rig, instant.site).scans(instant.step)[rig.name]
             points, farthest_m = self._points[number], max(self._thresholds_m)
-            cloud = _around(points, np.concatenate([scan.points for scan in scans]), farthest_m)
+            cloud = torch.from_numpy(np.concatenate([scan.points for scan in scans]))
             distance, _ = nearest(points, cloud, max_distance=farthest_m)
             seen = np.stack([np.packbits((distance <= threshold).numpy()) for threshold in self._thresholds_m])
             looks.append(Look(seen, sum(scan.self_hits for scan in scans), sum(scan.rays for scan in scans)))
@@ -95,18 +92,6 @@ class HeldWorlds:
         if site not in self._mounted:
             self._mounted[site] = self._simulators[site].with_rigs({rig.name: rig})
         return self._mounted[site]
-
-
-def _around(points: Tensor, cloud: NDArray[np.float32], within_m: float) -> Tensor:
-    """The points of a cloud that may lie within a distance of some points: a search need not sort the others."""
-    kept = np.ones(len(cloud), dtype=bool)
-    if len(points) == 0:
-        return torch.from_numpy(cloud[:0])
-    lower_m, upper_m = points.amin(dim=0).tolist(), points.amax(dim=0).tolist()
-    for axis, (low, high) in enumerate(zip(lower_m, upper_m, strict=True)):
-        coordinate = cloud[:, axis]
-        kept &= (coordinate >= low - within_m - SLACK_M) & (coordinate <= high + within_m + SLACK_M)
-    return torch.from_numpy(cloud[kept])
 
 
 def _check_budget(bytes_of: Sequence[float], worlds: int, budget_bytes: float) -> None:

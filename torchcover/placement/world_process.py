@@ -71,8 +71,8 @@ class WorldProcess:
     def __init__(self, sites: Sequence[Site], instants: Sequence[HeldInstant], budget_bytes: float) -> None:
         self._ours, theirs = multiprocessing.Pipe()
         arguments = (self._ours, theirs, sites, instants, budget_bytes)
-        process = multiprocessing.Process(target=_serve, args=arguments, daemon=True)
-        process.start()
+        self.process = multiprocessing.Process(target=_serve, args=arguments, daemon=True)
+        self.process.start()
         theirs.close()
         # At the end of the pipe the process ends by itself.
         self._end = finalize(self, self._ours.close)
