@@ -1,6 +1,6 @@
-"""Where the sensors should go: a search over the places, models and numbers of a rig's sensors.
+"""Where sensors should go: rigs scored on common instants, compared in pairs, and tested on fresh worlds.
 
-The public names are imported when first used.
+The public names are imported when first used: who asks for help needs no ray caster.
 """
 
 import lazy_loader

@@ -1,6 +1,9 @@
+from .bits import Bits as Bits
+from .common_instants import CommonInstants as CommonInstants
 from .constraints import Constraints as Constraints
 from .free_sensor import FreeSensor as FreeSensor
 from .objective import Objective as Objective
+from .scores import Scores as Scores
 from .space import SearchSpace as SearchSpace
 from .variables import Choice as Choice
 from .variables import Number as Number
