@@ -4,17 +4,19 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from torchcover.report.drawings.body import VIEWS, Points, draw_body
-from torchcover.report.maps.overlay import sensor_colour
 from torchcover.report.maps.sheet import HEADING_POINTS, Bounds, fit_paper, stack_views, write_heading, write_title
 
 WIDTH_IN = 7.5
-AROUND_M = 0.3
+COLOURS = colormaps["turbo"]  # as many as there are regions, and no grey
+AROUND_LENGTHS = 0.06
+OPPOSITE = {"left": "right", "right": "left", "front": "rear", "rear": "front"}
 HIGHLIGHT: dict[str, Any] = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.75}
 
 
@@ -35,7 +37,7 @@ class SkinPatch(NamedTuple):
 def draw_vehicle(
     vertices_m: Points, faces: NDArray[np.int64], patches: Sequence[SkinPatch], *, title: str, subtitle: str = ""
 ) -> Figure:
-    """Draw a vehicle from five sides: each region filled where it is seen from, its outline wherever one looks from.
+    """Draw a vehicle from five sides: each region filled where it is seen from, and its outline from beside it.
 
     Args:
         vertices_m: (V, 3) corners of the vehicle's body in the vehicle frame in metres.
@@ -47,8 +49,9 @@ def draw_vehicle(
     Returns:
         A figure of its own, outside pyplot: from above, from the left, from the right, and from both ends.
     """
-    low, high = vertices_m.min(axis=0) - AROUND_M, vertices_m.max(axis=0) + AROUND_M
-    low[2], half_m = -0.1, float(max(high[0], -low[0], high[1] - low[1]))
+    around_m = AROUND_LENGTHS * float(np.ptp(vertices_m[:, 0]))
+    low, high = vertices_m.min(axis=0) - around_m, vertices_m.max(axis=0) + around_m
+    half_m = float(max(high[0], -low[0], high[1] - low[1]))  # the front and the rear have half of the paper each
     x, z = (-half_m, half_m), (float(low[2]), float(high[2]))
     views: list[tuple[Bounds, Bounds]] = [(x, (float(low[1]), float(high[1]))), (x, z), (x, z), (x, z)]
     figure, (above, left, right, ends) = stack_views(views, width_in=WIDTH_IN)
@@ -84,7 +87,9 @@ def _draw_side(
     aside = shift_m * np.array(view.right)
     draw_body(axes, vertices_m + aside, faces, view)
     for at, patch in enumerate(patches):
-        colour, flat = sensor_colour(at), view.flat(patch.places_m + aside)
+        if patch.seen_from == OPPOSITE.get(seen_from):
+            continue
+        colour, flat = COLOURS((at + 0.5) / len(patches)), view.flat(patch.places_m + aside)
         outline = np.concatenate([flat[:, 0], flat[-1], flat[::-1, -1], flat[0, ::-1]])
         axes.plot(*outline.T, color=colour, linewidth=0.7, zorder=2)
         if patch.seen_from == seen_from:
@@ -92,4 +97,5 @@ def _draw_side(
             pieces = np.stack(corners, axis=2).reshape(-1, 4, 2)
             axes.add_collection(PolyCollection(list(pieces), facecolors=colour, alpha=0.6, linewidths=0, zorder=3))
             words: dict[str, Any] = {"fontsize": 6.5, "ha": "center", "va": "center", "bbox": HIGHLIGHT, "zorder": 4}
-            axes.text(*outline.mean(axis=0), patch.name, **words)
+            x, y = outline.mean(axis=0).tolist()
+            axes.text(x, y, patch.name, **words)
