@@ -114,6 +114,7 @@ def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
     [
         (["moon"], "'moon' is neither a .yaml file nor built in; rigs: argoverse2, "),
         (["moon"], "; scenarios: courtyard, "),
+        (["moon"], "; vehicles: adult, "),
         (["none.yaml"], "none.yaml: no such file"),
         (["kitti", "--rig", "nuscenes"], "--rig: for a scenario only, and 'kitti' is a rig"),
         (
@@ -121,6 +122,7 @@ def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
             "--step, --seed: for a scenario or cameras only, and 'kitti' is a rig",
         ),
         (["courtyard", "--scenario", "urban"], "--scenario: for a rig only, and 'courtyard' is a scenario"),
+        (["suv", "--step", "1"], "--step: for rigs and scenarios only, and 'suv' is a vehicle"),
         (["courtyard", "--rig", "moon"], "built-in rigs: argoverse2,"),
         (["kitti", "--scenario", "moon"], "built-in scenarios: courtyard,"),
         (["courtyard", "--step", "-1"], "--step"),
@@ -152,7 +154,7 @@ def test_a_name_of_both_kinds_asks_for_the_file(torchcover, monkeypatch):
     monkeypatch.setattr(show, "builtin_names", lambda kind: ["twin", kind])
     code, _, error = torchcover("show", "twin")
     assert code == 2
-    assert "both a rig and a scenario: give the YAML file" in error
+    assert "both a rig and a scenario and a vehicle: give the YAML file" in error
 
 
 @pytest.mark.filterwarnings("default")

@@ -251,7 +251,7 @@ def rig(
 
 @app.command()
 def show(
-    name: Annotated[str, typer.Argument(help="Rig or scenario: a built-in name (see `list`) or a YAML file.")],
+    name: Annotated[str, typer.Argument(help="Rig, scenario or vehicle: a built-in name (see `list`) or a YAML file.")],
     scenario: Annotated[
         str | None, typer.Option(help="For a rig: the scenario whose ego carries it and that it sees (courtyard).")
     ] = None,
@@ -261,7 +261,7 @@ def show(
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the simulation, likewise (0).")] = None,
     out: options.Out = Path("out"),
 ) -> None:
-    """Draw a rig on its vehicle and the depth images of its cameras, or a frame of a scenario from above."""
+    """Draw a rig and the depth images of its cameras, a frame of a scenario, or the mount regions of a vehicle."""
     from torchcover.cli.show import run
 
     run(name, scenario=scenario, rig=rig, vehicle=vehicle, step=step, seed=seed, out=out)

@@ -1,4 +1,4 @@
-"""`torchcover show`: which of the two is meant, a rig or a scenario; its pictures."""
+"""`torchcover show`: what is meant, a rig, a scenario or a vehicle; its pictures."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -7,14 +7,17 @@ from typing import Any
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from torchcover.evaluation import cameras_of, rig_pictures, scenario_picture
+from torchcover.evaluation import cameras_of, rig_pictures, scenario_picture, vehicle_picture
 from torchcover.evaluation.rig_names import as_called
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
 from torchcover.files import BadFileError
 from torchcover.simulation import Scenario, builtin_names
-from torchcover.simulation.documents import read_mapping
+from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.documents import load_document, read_mapping
 
 DEFAULT_RIG = "front_roof_128"
+# Kinds of documents, and the key that only such a one has.
+KINDS = {"rig": "sensors", "scenario": "ego", "vehicle": "parts"}
 
 
 def run(
@@ -30,22 +33,28 @@ def run(
     """Print what it says of itself; draw it to `out/NAME.png`, what a rig's cameras measure to `out/NAME_depth.png`.
 
     Raises:
-        ValueError: The name of neither or of both, an option for the other kind, or a document that is not valid.
+        ValueError: The name of none or of several, an option for another kind, or a document that is not valid.
         FileNotFoundError: No such file.
     """
     figures: Iterable[tuple[str, Figure]]
-    if _is_rig(name):
+    kind = _kind(name)
+    if kind == "rig":
         _refuse("a scenario", {"--rig": rig}, f"{name!r} is a rig")
         shown = as_called(name)
         if not cameras_of(shown):
             _refuse("a scenario or cameras", {"--step": step, "--seed": seed}, f"{name!r} is a rig without cameras")
         world, description = Scenario.load(scenario or DEFAULT_SCENARIO), shown.description
         figures = rig_pictures(shown, world, vehicle=vehicle, step=step or 0, seed=seed or 0)
-    else:
+    elif kind == "scenario":
         _refuse("a rig", {"--scenario": scenario}, f"{name!r} is a scenario")
         world, seen_by = Scenario.load(name), as_called(rig or DEFAULT_RIG)
         description = world.description
         figures = [("", scenario_picture(world, seen_by, vehicle=vehicle, step=step or 0, seed=seed or 0))]
+    else:
+        given = {"--scenario": scenario, "--rig": rig, "--vehicle": vehicle, "--step": step, "--seed": seed}
+        _refuse("rigs and scenarios", given, f"{name!r} is a vehicle")
+        body = load_document(Vehicle, "vehicles", name)
+        description, figures = body.description, [("", vehicle_picture(body))]
     console = Console()
     if description:
         console.print(" ".join(description.split()), markup=False, highlight=False)
@@ -56,21 +65,25 @@ def run(
         console.print(f"Wrote {path}", markup=False, soft_wrap=True)
 
 
-def _is_rig(name: str) -> bool:
+def _kind(name: str) -> str:
+    """Which of `KINDS` is meant."""
     if Path(name).suffix in (".yaml", ".yml"):
-        return _has_sensors(Path(name))
-    rigs, scenarios = builtin_names("rigs"), builtin_names("scenarios")
-    if (name in rigs) == (name in scenarios):
-        which = "both a rig and a scenario: give the YAML file" if name in rigs else "neither a .yaml file nor built in"
-        raise ValueError(f"{name!r} is {which}; rigs: {', '.join(rigs)}; scenarios: {', '.join(scenarios)}")
-    return name in rigs
+        return _kind_of_file(Path(name))
+    of = {kind: builtin_names(f"{kind}s") for kind in KINDS}
+    kinds = [kind for kind, names in of.items() if name in names]
+    if len(kinds) != 1:
+        both = f"both a {' and a '.join(kinds)}: give the YAML file"
+        known = "; ".join(f"{kind}s: {', '.join(names)}" for kind, names in of.items())
+        raise ValueError(f"{name!r} is {both if kinds else 'neither a .yaml file nor built in'}; {known}")
+    return kinds[0]
 
 
-def _has_sensors(path: Path) -> bool:
+def _kind_of_file(path: Path) -> str:
     try:
-        return "sensors" in read_mapping(path)
+        keys = read_mapping(path)
     except BadFileError:
-        return False  # whatever loads it says what is wrong
+        return "scenario"  # whatever loads it says what is wrong
+    return next((kind for kind, key in KINDS.items() if key in keys), "scenario")
 
 
 def _refuse(kind: str, options: dict[str, Any], reason: str) -> None:

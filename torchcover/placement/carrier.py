@@ -3,6 +3,10 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import BoundingBox
 from torchcover.simulation import Scenario
 from torchcover.simulation.bodies import mount_regions_of
 from torchcover.simulation.mount_regions import MountRegion
@@ -21,6 +25,11 @@ class Carrier(NamedTuple):
     name: str
     skin: Skin
     regions: dict[str, MountRegion]
+
+    @property
+    def outline_m(self) -> NDArray[np.float64]:
+        """(4, 2) corners x, y of the vehicle."""
+        return BoundingBox.around(self.skin.mesh.vertices_m).outline_m
 
     @classmethod
     def of(cls, scenarios: Sequence[Scenario]) -> "Carrier":

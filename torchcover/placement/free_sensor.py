@@ -202,6 +202,8 @@ def mirrored(start: Sensor, other: Sensor | None) -> Sensor | None:
 
 def moved(pose: Pose, numbers: Mapping[str, float]) -> Pose:
     """A pose with other numbers; a rotation stays as it is written, as long as none of its angles is another."""
+    if not numbers:
+        return pose
     if pose.quaternion_wxyz is None or any(key in numbers for key in ANGLES):
         return pose_of(*(numbers_of(pose) | dict(numbers)).values())
     return Pose.model_validate(pose.model_dump() | dict(numbers))

@@ -14,12 +14,13 @@ from torchcover.placement.carrier import Carrier
 from torchcover.placement.constraints import Constraints, misplaced
 from torchcover.placement.free_sensor import FreeSensor, mirrored
 from torchcover.placement.objective import Objective
+from torchcover.placement.prices import check_prices, price_eur
+from torchcover.placement.question_grid import QuestionGrid
 from torchcover.placement.variables import Value, Variable
-from torchcover.simulation import Document, Lidar, Rig, Scenario, Sensor, builtin_names, with_ego
+from torchcover.simulation import Document, Lidar, Rig, Scenario, Sensor, with_ego
 from torchcover.simulation.documents import NameOrFile, beside, is_file_name, read_document
 
 MAX_OBJECTIVES = 3
-MOUNT = "mount"
 # How many candidates are looked at before a space is refused as one without any that can be.
 TRIES = 256
 
@@ -111,41 +112,8 @@ class SearchSpace(Document):
                 )
         if not self.variables:
             raise ValueError("free: every number is set, so that there is nothing to search; give two for a range")
-        self._check_cost()
+        check_prices(self.cost, self.constraints.max_cost_eur, self.start.sensors, self.free)
         return self
-
-    def _check_cost(self) -> None:
-        if self.constraints.max_cost_eur is None and not self.cost:
-            return
-        if not self.cost:
-            raise ValueError("constraints.max_cost_eur: nothing has a price; give them as cost")
-        models = {model for free in self.free.values() for model in free.model or ()}
-        known = {MOUNT, *models, *builtin_names("lidars"), *(sensor.name for sensor in self.start.sensors)}
-        unknown = [key for key in self.cost if key not in known]
-        if unknown:
-            raise ValueError(f"cost: {', '.join(unknown)}: neither a LiDAR model nor a sensor of {self.start.name!r}")
-        cheapest = sum(min(self._prices(sensor)) for sensor in self.start.sensors)
-        if self.constraints.max_cost_eur is not None and cheapest > self.constraints.max_cost_eur:
-            raise ValueError(
-                f"constraints.max_cost_eur: {self.constraints.max_cost_eur:g}, but the cheapest rig of the space costs "
-                f"{cheapest:g}"
-            )
-
-    def _prices(self, sensor: Sensor) -> Iterator[float]:
-        """What a sensor of the start may cost."""
-        free = self.free.get(sensor.name)
-        if free is not None and free.mirror_of is not None:
-            free = self.free[free.mirror_of]
-        if free is not None and free.present is not None:
-            yield 0.0
-        for model in (free.model if free else None) or (getattr(sensor, "model", None),):
-            yield self._price(sensor.name, model)
-
-    def _price(self, sensor: str, model: str | None) -> float:
-        key = sensor if model is None or model not in self.cost else model
-        if key not in self.cost:
-            raise ValueError(f"cost: no price of {model or sensor}, which {sensor!r} may be")
-        return self.cost[key] + self.cost.get(MOUNT, 0.0)
 
     @model_validator(mode="after")
     def _check_places(self) -> Self:
@@ -158,6 +126,7 @@ class SearchSpace(Document):
                     raise ValueError(f"free.{name}.{error}") from error
         for name in self.free:
             self._check_place(name)
+        QuestionGrid.around(carrier.outline_m, self.objectives)
         self._check_constraints()
         outside = self._outside()
         if outside:
@@ -300,4 +269,4 @@ class SearchSpace(Document):
         """
         if not self.cost:
             return None
-        return sum(self._price(sensor.name, getattr(sensor, "model", None)) for sensor in rig.sensors)
+        return sum(price_eur(self.cost, sensor.name, getattr(sensor, "model", None)) for sensor in rig.sensors)

@@ -5,6 +5,7 @@ from torchcover.report.drawings.frame import ActorMark, Standing, draw_depths, d
 from torchcover.report.drawings.rig import draw_rig
 from torchcover.report.drawings.search import Slice, draw_fronts, draw_progress, draw_slices
 from torchcover.report.drawings.targets import draw_targets
+from torchcover.report.drawings.vehicle import SkinPatch, draw_vehicle
 from torchcover.report.drawings.work_precision import WorkPanel, draw_work_precision
 from torchcover.report.maps.arrays import draw_map, draw_side_by_side
 from torchcover.report.maps.colours import ColourScale, difference_scale, error_scale, scale_of
@@ -40,6 +41,7 @@ __all__ = [
     "Remark",
     "Row",
     "SensorView",
+    "SkinPatch",
     "Slice",
     "Standing",
     "Words",
@@ -58,6 +60,7 @@ __all__ = [
     "draw_side_by_side",
     "draw_slices",
     "draw_targets",
+    "draw_vehicle",
     "draw_work_precision",
     "error_scale",
     "error_words",
