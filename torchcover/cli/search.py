@@ -28,6 +28,8 @@ def search(
     ] = "area",
     worlds: Annotated[int | None, typer.Option(min=1, help="Worlds of each scenario to search in (6).")] = None,
     fresh_worlds: Annotated[int | None, typer.Option(min=1, help="Fresh worlds of each to test in (16).")] = None,
+    per_world: Annotated[int | None, typer.Option(min=1, help="Instants of each world (3).")] = None,
+    every: Annotated[float | None, typer.Option(help="Seconds between two of them (20).")] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Rays of the reference at each instant (16384).")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the search and of its worlds.")] = 0,
     test_seed: Annotated[
@@ -44,7 +46,8 @@ def search(
 
     if budget is not None and evaluations is not None:
         raise ValueError("--budget, --evaluations: one of them; both are given")
-    given = {"worlds": worlds, "fresh_worlds": fresh_worlds, "rays": rays}
+    given = {"worlds": worlds, "fresh_worlds": fresh_worlds, "per_world": per_world, "every_s": every,
+             "rays": rays}  # fmt: skip
     run(
         space,
         out,

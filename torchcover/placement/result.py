@@ -3,7 +3,6 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,7 +11,7 @@ import numpy as np
 from torchcover.coverage import Measure
 from torchcover.placement.arm import Arm
 from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
-from torchcover.placement.fresh import MEASURES, FreshGain, FreshTest
+from torchcover.placement.fresh import FreshGain, FreshTest
 from torchcover.placement.pareto import hypervolume
 from torchcover.placement.search import PlacementSearch
 from torchcover.simulation import Rig
@@ -80,18 +79,12 @@ class SearchResult:
         """The best, or the start if nothing better was found."""
         return self.search.space.start if self.best is None else self.best.rig
 
-    @cached_property
-    def gains(self) -> list[tuple[Pick, str, Measure, FreshGain]]:
-        """Of each pick that was tested, each objective and each measure, that of the search first."""
+    def gains_of(self, pick: Pick) -> Iterator[tuple[str, Measure, FreshGain]]:
+        """What it gained on fresh worlds: objective by objective, in the measure of the search first."""
         first = self.search.plan.measure
-        measures = (first, *(each for each in MEASURES if each != first))
-        return [
-            (pick, objective, measure, pick.test.gains[objective][measure])
-            for pick in self.picks
-            if pick.test is not None
-            for objective in self.search.space.objectives
-            for measure in measures
-        ]
+        for objective, gains in pick.test.gains.items() if pick.test is not None else ():
+            for measure in sorted(gains, key=lambda each: each != first):
+                yield objective, measure, gains[measure]
 
     @property
     def hypervolumes(self) -> dict[str, float]:
@@ -133,9 +126,9 @@ class SearchResult:
         return f"Random search with the same budget found {what} in {self._spent(RANDOM)}."
 
     def _told(self, pick: Pick, *, short: bool = False) -> Iterator[str]:
-        assert pick.test is not None  # it was asked before
-        for objective, gains in pick.test.gains.items():
-            gain = gains[self.search.plan.measure]
+        for objective, measure, gain in self.gains_of(pick):
+            if measure != self.search.plan.measure:
+                continue
             yield f"{objective}: {told(gain)}" + ("" if short else f", optimism {100 * gain.optimism:+.2f}")
 
     def _spent(self, arm: str) -> str:

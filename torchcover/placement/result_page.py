@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 
 from torchcover.evaluation import sensor_views
 from torchcover.evaluation.result_page import words_of
-from torchcover.placement.result import SearchResult
+from torchcover.placement.result import ENOUGH_T, SearchResult
 from torchcover.report import Page, PagePicture, PageRig, PageTable, Words
 
 HEADINGS = ("found by", "objective", "measure", "gain in the\nsearch (points)", "gain on fresh\nworlds (points)", "t",
@@ -39,11 +39,13 @@ def search_page(result: SearchResult, pictures: Sequence[PagePicture], documents
 def gain_rows(result: SearchResult) -> list[tuple[str, ...]]:
     """Cells below `HEADINGS`; of what was not tested too."""
     rows = []
-    for pick, objective, measure, gain in result.gains:
-        numbers = f"{100 * gain.gain:+.2f} ± {100 * gain.error:.2f}", f"{gain.t:.1f}", f"{gain.better} of {gain.worlds}"
-        words = pick.name, objective, measure, f"{100 * gain.search_gain:+.2f}", *numbers, f"{100 * gain.optimism:+.2f}"
-        rows.append(tuple("-" if "nan" in word else word for word in words))
     for pick in result.picks:
+        for objective, measure, gain in result.gains_of(pick):
+            error, t = f"± {100 * gain.error:.2f}", f"{gain.t:.1f}"
+            words = f"{100 * gain.search_gain:+.2f}", f"{100 * gain.gain:+.2f} {error}", t
+            better, optimism = f"{gain.better} of {gain.worlds}", f"{100 * gain.optimism:+.2f}"
+            row = pick.name, objective, measure, *words, better, optimism
+            rows.append(tuple("-" if word == "nan" else word.replace("nan", "?") for word in row))
         if pick.test is None:
             arm = result.search.arms[pick.arm]
             gains = arm.gains[arm.evaluations.index(pick.evaluation)].tolist()
@@ -55,7 +57,10 @@ def gain_rows(result: SearchResult) -> list[tuple[str, ...]]:
 
 def _marked(result: SearchResult) -> list[tuple[Words, ...]]:
     significant = {
-        (pick.name, objective, measure) for pick, objective, measure, gain in result.gains if abs(gain.t) >= 2
+        (pick.name, objective, measure)
+        for pick in result.picks
+        for objective, measure, gain in result.gains_of(pick)
+        if abs(gain.t) >= ENOUGH_T
     }
     return [
         tuple(Words(word, "significant" if at == 4 and row[:3] in significant else "") for at, word in enumerate(row))

@@ -22,8 +22,8 @@ FAR_BELOW = -500.0
 class GaussianProcessSearch:
     """Looks where the expected improvement over the best mean so far is largest (Jones et al. 1998).
 
-    Its noise is the squared error that it is told, and a little that it learns. Where no rig can be, it expects none
-    nearby: the improvement is multiplied with the share of rigs among the places around.
+    Its noise is the squared error that it is told, and a little that it learns. A place where no rig can be counts as
+    the lowest value so far, so that little is expected nearby.
 
     Args:
         cube: What is free.
@@ -61,11 +61,12 @@ class GaussianProcessSearch:
             return self._best(turn)
 
     def model(self) -> GaussianProcess | None:
-        """What it has learnt; None before the first value."""
-        known = np.isfinite(self._values)
-        if not known.any():
+        """What it has learnt; None before the first value. Where no rig can be, the lowest value stands."""
+        values = np.array(self._values)
+        if not np.isfinite(values).any():
             return None
-        places, values, errors = (np.array(each)[known] for each in (self._places, self._values, self._errors))
+        values = np.where(np.isnan(values), np.nanmin(values), values)
+        places, errors = np.array(self._places), np.array(self._errors)
         with _one_thread():
             return GaussianProcess.fitted(self._cube.levels, *map(torch.from_numpy, (places, values, errors)))
 
@@ -94,7 +95,6 @@ class GaussianProcessSearch:
                 places = self._scattered(1, int(draws.integers(2**31)))  # all of them are known: once more, then
                 break
             worth = log_expected_improvement(*model.predict(torch.from_numpy(places)), best, model.scale)
-            worth += torch.from_numpy(np.log(self._share_of_rigs(places, model)))
             places = places[worth.argsort(descending=True, stable=True)[:KEPT].numpy()]
             if again < ROUNDS:
                 places = np.vstack([places, self._around(places, again, draws)])
@@ -113,17 +113,6 @@ class GaussianProcessSearch:
         """Those that nothing is known of, each once; their order stays."""
         tried = {tuple(place) for place in self._places}
         return np.array([place for place in dict.fromkeys(map(tuple, places)) if place not in tried])
-
-    def _share_of_rigs(self, places: Unit, model: GaussianProcess) -> Unit:
-        """Of the places around each, weighted with the kernel, and of one more that is a rig."""
-        infeasible = np.isnan(self._values)
-        if not infeasible.any():
-            return np.ones(len(places))
-        told = torch.from_numpy(np.array(self._places))
-        near = (model.covariance(torch.from_numpy(places), told) / model.log_signal.exp()).numpy()
-        near = near**4  # a narrower kernel: the border of what can be mounted is sharp
-        share: Unit = (0.1 + near[:, ~infeasible].sum(1)) / (0.1 + near.sum(1))
-        return np.maximum(share, 1e-300)
 
 
 def log_expected_improvement(mean: Tensor, deviation: Tensor, best: float, scale: float) -> Tensor:
