@@ -137,8 +137,8 @@ def test_hyperparameters_have_the_highest_posterior_nearby():
     sharp = GaussianProcess.fitted((0,), x, (20 * x[:, 0]).sin(), torch.zeros(20).double())
     smooth = GaussianProcess.fitted((0,), x, x[:, 0].square(), torch.zeros(20).double())
     assert sharp.log_lengths[0] < smooth.log_lengths[0] - 1
-    noisy = (20 * x[:, 0]).sin() + torch.from_numpy(np.random.default_rng(0).normal(0, 0.5, 20))
-    assert GaussianProcess.fitted((0,), x, noisy, torch.zeros(20).double()).log_noise > sharp.log_noise + 2
+    noisy = x[:, 0].square() + torch.from_numpy(np.random.default_rng(0).normal(0, 0.2, 20))
+    assert GaussianProcess.fitted((0,), x, noisy, torch.zeros(20).double()).log_noise > smooth.log_noise + 2
 
 
 def test_the_slope_of_the_posterior_is_that_of_its_differences():
@@ -196,7 +196,7 @@ def test_the_unit_of_the_values_does_not_matter():
 def test_the_logarithm_of_expected_improvement_has_its_digits_far_below_too():
     z = doubles([8.0, 1.0, 0.0, -0.9, -1.1, -5.0, -20.0, -499.0, -501.0])
     # log(phi(z) + z Phi(z)) with 60 digits.
-    exact = [2.0794415416798359, 0.0800262187493068, -0.9189385332046727, -2.2982829894596517, -2.6791783824760538,
+    exact = [2.0794415416798359, 0.0800262188493069, -0.9189385332046727, -2.2982829894596517, -2.6791783824760538,
              -16.7443011626609901, -206.9178385094250978]  # fmt: skip
     found = log_expected_improvement(z, torch.ones_like(z), 0.0, 1.0)
     np.testing.assert_allclose(found[:7], exact, rtol=1e-12)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from tests.placement.surfaces import Surface, plan, space
-from tests.placement.worlds import LOT
 from torchcover.placement import OPTIMISERS, PlacementSearch, SearchPlan, SearchSpace, run_search
 from torchcover.placement.journal import NAME
+from torchcover.simulation import Rig
 
 
 def searched(out=None, *, of=None, resume=False, **settings):
@@ -48,9 +48,9 @@ def ending_after(count):
 
 
 def test_both_arms_begin_at_the_start_and_spend_the_same():
-    result = searched(evaluations=30)
+    result = searched(evaluations=24)
     evaluations, arms = result.search.evaluations, result.search.arms
-    assert len(evaluations) == 31
+    assert len(evaluations) == 25
     assert evaluations[0].arm == "start"
     assert result.search.instants.closed
     assert arms["optimiser"].evaluations[0] is arms["random"].evaluations[0] is evaluations[0]
@@ -63,7 +63,7 @@ def test_both_arms_begin_at_the_start_and_spend_the_same():
 
 
 def test_the_winner_is_better_on_fresh_worlds_and_so_is_what_random_search_found():
-    result = searched(evaluations=30)
+    result = searched(evaluations=24)
     best, random = result.picks
     assert result.best is best
     assert abs(best.evaluation.values["roof.pitch_deg"] - 4) < 1.5
@@ -79,7 +79,7 @@ def test_the_winner_is_better_on_fresh_worlds_and_so_is_what_random_search_found
 
 
 def test_a_candidate_is_dropped_only_two_errors_below_its_incumbent():
-    result = searched(evaluations=30)
+    result = searched(evaluations=24)
     for arm in result.search.arms.values():
         best = arm.gains[arm.best, 0]
         for at, one in enumerate(arm.evaluations):
@@ -162,12 +162,15 @@ class Clock:
 
     def makes(self, space, plan, seed, worlds):
         clock = self
-        clock.now += self.build_s
+        clock.now += self.build_s * worlds / 6
 
         class Slow(Surface):
             def score(self, rig, instants=None):
                 clock.now += clock.instant_s * (len(self) if instants is None else len(instants))
                 return super().score(rig, instants)
+
+            def anew(self, seed, worlds):
+                return clock.makes(space, plan, seed, worlds)
 
         return Slow(seed, worlds, plan.per_world)
 
@@ -190,9 +193,7 @@ def test_a_budget_of_seconds_is_kept_with_the_test_and_asks_for_what_a_number_of
 
 
 def test_a_budget_below_one_evaluation_says_what_one_takes(monkeypatch):
-    with pytest.raises(
-        ValueError, match=r"budget: 30 s are less than one evaluation: .* 11.8 s, .* 1.8 s .* 41.1 s; give 57 s"
-    ):
+    with pytest.raises(ValueError, match=told_s):
         timed(30.0, monkeypatch)
     timed(57.0, monkeypatch)
 
@@ -237,7 +238,7 @@ def test_where_no_candidate_can_be_the_start_stays_and_the_words_say_so():
 
 
 def test_a_start_that_cannot_be_is_compared_with_but_does_not_win():
-    of = space(constraints={"max_self_hits": 0.2}, start={**tilted()})
+    of = space(constraints={"max_self_hits": 0.2}, start=tilted())
     result = searched(of=of, evaluations=12)
     start = result.search.evaluations[0]
     assert start.infeasible == "30.0% of its rays end on the vehicle; max_self_hits is 20.0%"
@@ -246,7 +247,7 @@ def test_a_start_that_cannot_be_is_compared_with_but_does_not_win():
 
 
 def tilted():
-    return {
+    content = {
         "name": "tilted",
         "sensors": [
             {
@@ -258,6 +259,7 @@ def tilted():
             }
         ],
     }
+    return Rig.model_validate(content)
 
 
 def test_too_many_rays_on_the_vehicle_end_a_race_after_its_first_instants():
@@ -272,7 +274,7 @@ def test_too_many_rays_on_the_vehicle_end_a_race_after_its_first_instants():
 def test_an_objective_that_is_unknown_on_some_worlds_is_about_the_others_and_one_on_all_is_refused():
     result = searched(evaluations=10, blind=(0, 1))
     assert np.isfinite(result.search.arms["optimiser"].gains).all()
-    with pytest.raises(ValueError, match="objectives.near: unknown at all 18 instants"):
+    with pytest.raises(ValueError, match=r"objectives\.near: unknown at all 18 instants"):
         searched(evaluations=10, blind=range(6))
 
 
@@ -286,7 +288,7 @@ def test_noise_alone_is_not_called_a_gain():
     result = searched(evaluations=20, worth=lambda rig: np.array([0.5, 0.5]), seed=4)
     assert "gained" not in result.sentence
     gain = result.best.test.gains["near"]["area"]
-    assert abs(gain.t) < 2
+    assert gain.t < 2
     assert gain.optimism > 0
 
 
@@ -353,12 +355,14 @@ def test_every_optimiser_searches():
 
 
 def test_a_real_search_does_not_depend_on_the_number_of_workers(tmp_path):
-    (tmp_path / "lot.yaml").write_text(LOT.model_dump_json(exclude_unset=True))
-    rig = {**tilted(), "name": "small"}
+    (tmp_path / "lot.yaml").write_text(
+        "name: lot\nego: {shape: {type: box, size_m: [4, 2, 1.5]}}\n"
+        "traffic: {type: parking, duration_s: 1.0, time_step_s: 0.2, crossings: 0, parked_share: 0.3}\n"
+    )
     of = SearchSpace.model_validate(
         {
             "name": "lot",
-            "start": rig,
+            "start": tilted(),
             "scenario": str(tmp_path / "lot.yaml"),
             "free": {"roof": {"pitch_deg": (0.0, 30.0)}},
             "objectives": {"near": {"region": "20m"}},
