@@ -111,7 +111,9 @@ def test_what_some_worlds_do_not_show_is_unknown_there_for_all():
         np.testing.assert_array_equal(np.isnan(scores.by_world("known"))[:, 0], [False, True, False, False, False])
         np.testing.assert_array_equal(np.isnan(scores.area)[:, 0], [False, True, False, False, False])
     assert paired(other, one).worlds.tolist() == [4, 5]
-    with pytest.raises(ValueError, match="objective 'ahead': none of 1 worlds shows any surface of all of: obstacle"):
+    with pytest.raises(
+        ValueError, match="'ahead': of 1 worlds, none shows some surface in each of: obstacle in 20m; use"
+    ):
         held([yard()], obstacles)
 
 

@@ -39,6 +39,7 @@ def test_worlds_that_do_not_know_an_objective_are_in_no_pair():
     found = paired(made_up(one, range(4)), made_up(values, range(4)), "known")
     np.testing.assert_allclose(found.gain, [0.2, 0.075])
     assert found.worlds.tolist() == [3, 4]
+    np.testing.assert_allclose(found.error, [stats.sem([0.3, 0.1, 0.2]), stats.sem([0.0, 0.1, 0.0, 0.2])])
     none = paired(made_up(one[3:], [0]), made_up(values[3:], [0]))
     assert np.isnan(none.gain[0])
     assert np.isnan(none.error).all()
@@ -50,6 +51,15 @@ def test_two_worlds_have_no_error_however_many_instants():
     found = paired(made_up(values, [0, 1] * 6), made_up(np.zeros(12), [0, 1] * 6))
     assert np.isnan(found.error[0])
     assert found.worlds[0] == 2
+
+
+def test_pairs_are_of_the_same_instants():
+    generator = np.random.default_rng(0)
+    one, other = made_up(generator.normal(size=18), WORLD), made_up(generator.normal(size=18), WORLD)
+    some = [2, 17, 9, 10, 4]
+    expected = (one.at(some).area - other.at(some).area)[:, 0]
+    of_worlds = [expected[[0]].mean(), expected[[4]].mean(), expected[[2, 3]].mean(), expected[[1]].mean()]
+    assert paired(one.at(some), other).gain[0] == pytest.approx(np.mean(of_worlds))
 
 
 def test_pairing_takes_out_what_a_world_does_to_all():
@@ -121,6 +131,19 @@ def test_several_race_at_once_and_against_each_other():
     for raced in found:
         assert (len(raced.scores.instants) == 18) == (not raced.dropped)
         assert len(raced.scores.instants) % 3 == 0
+
+
+@pytest.mark.parametrize(("errors_below", "dropped"), [(1.95, False), (2.05, True)])
+def test_two_errors_below_is_too_much(errors_below, dropped):
+    spread = np.tile([-1.0, 0.0, 1.0], 2)
+    values = 0.01 * (spread - errors_below / np.sqrt(3))
+    world = np.tile([0, 1, 2], 2)
+
+    def score(candidate, instants):
+        return made_up(values[instants], world[instants], instants)
+
+    (raced,) = race(score, ["one"], range(6), incumbents=[made_up(np.zeros(6), world)])
+    assert raced.dropped == dropped
 
 
 def test_nobody_is_dropped_before_there_is_an_error_or_for_one_of_two_objectives():

@@ -11,7 +11,8 @@ class Bits:
     """Which reference points of some instants have a point of a rig within each threshold.
 
     The distance to the nearest point of several sensors is the least of their distances, so that the bits of a rig are
-    the OR of those of its sensors: `CommonInstants.scores` of it is the score of the rig.
+    the OR of those of its sensors: `CommonInstants.scores` of it is the score of the rig. Noise and drop-out are drawn
+    anew for each place in a rig's list of sensors: there it is the score of other draws.
 
     Args:
         instants: (n,) int64 numbers of the instants.

@@ -7,6 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.evaluation.interrupt import held_back
 from torchcover.placement.bits import Bits
 from torchcover.placement.held_worlds import Look
 from torchcover.placement.objective import Objective
@@ -41,7 +42,8 @@ class CommonInstants:
         every_s: Time between them.
         seed: Seed of the traffic and of the reference.
         rays: About how many rays the reference casts at each instant.
-        budget_bytes: What all worlds may take.
+        budget_bytes: What all worlds may take, about 35 MB for one of `urban`. All are held: to build one again takes
+            five times as long as to score a rig on three instants of it.
         workers: Processes that hold the worlds; 0 holds them in this one.
 
     Attributes:
@@ -132,8 +134,8 @@ class CommonInstants:
             if unknown[:, column].all():
                 asked = ", ".join(f"{one.band} in {one.region}" for one in objective.questions)
                 raise ValueError(
-                    f"objective {name!r}: none of {len(unknown)} worlds shows any surface of all of: {asked}; use more "
-                    "worlds or instants, or larger regions"
+                    f"objective {name!r}: of {len(unknown)} worlds, none shows some surface in each of: {asked}; use "
+                    "more worlds or instants, or larger regions"
                 )
 
     @property
@@ -207,10 +209,8 @@ class CommonInstants:
             ValueError: As in `score`.
         """
         numbers = list(range(len(self))) if instants is None else [int(number) for number in instants]
-        if not numbers or (unknown := [number for number in numbers if not 0 <= number < len(self)]):
-            raise ValueError(
-                f"instants: numbers from 0 to {len(self) - 1} are needed; got {unknown if numbers else []}"
-            )
+        if not numbers or not all(0 <= number < len(self) for number in numbers):
+            raise ValueError(f"instants: numbers from 0 to {len(self) - 1} are needed; got {numbers[:20]}")
         self._check_vehicle(rig)
         looks = self._looks(rig, numbers)
         return Bits(
@@ -236,10 +236,12 @@ class CommonInstants:
         for number in dict.fromkeys(numbers):
             shares[self.instants[number].world % len(shares)].append(number)
         asked = [(holder, share) for holder, share in zip(self._holders, shares, strict=True) if share]
-        for holder, share in asked:
-            holder.ask(rig, share)
+        with held_back():  # or an answer would be left for the next question
+            for holder, share in asked:
+                holder.ask(rig, share)
+            of_holders = answers([holder for holder, _ in asked])
         looks: dict[int, Look] = {}
-        for (_, share), of_holder in zip(asked, answers([holder for holder, _ in asked]), strict=True):
+        for (_, share), of_holder in zip(asked, of_holders, strict=True):
             looks |= zip(share, of_holder, strict=True)
         return looks
 

@@ -125,7 +125,9 @@ def _serve(
     ours: Connection, theirs: Connection, sites: Sequence[Site], instants: Sequence[HeldInstant], budget_bytes: float
 ) -> None:
     ours.close()  # or the pipe would never end
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the process that asks
+    # Ctrl-C is for the process that asks, and so is what that makes of the end by a scheduler.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     torch.set_num_threads(1)
     try:
         held = HeldWorlds(sites, instants, budget_bytes)
