@@ -14,7 +14,7 @@ from torchcover.simulation import Rig, Scenario, builtin_names
 def drawn(monkeypatch):
     """What was drawn: the arguments of the last call."""
     calls: dict = {}
-    for name in ("draw_rig", "draw_scene", "draw_depths"):
+    for name in ("draw_rig", "draw_vehicle", "draw_scene", "draw_depths"):
         draw = getattr(scene_pictures, name)
         monkeypatch.setattr(
             scene_pictures,
@@ -55,6 +55,41 @@ def test_a_scenario_is_drawn_in_the_frame_of_the_ego(torchcover, worlds, drawn):
     assert (np.abs(on_actor[:, 0] - 20.0) < 2.1).all()
     assert (np.abs(on_actor[:, 1] - 5.0) < 1.1).all()
     assert len(drawn["reference"]) > 1000
+
+
+def test_a_vehicle_is_drawn_with_its_mount_regions_on_its_skin(torchcover, tmp_path, drawn):
+    (tmp_path / "cart.yaml").write_text(
+        """
+        name: cart
+        description: A box on wheels that are left out.
+        parts: [{name: body, shape: {type: box, size_m: [3.0, 1.0, 0.8]}}]
+        mount_regions:
+          lid: {seen_from: above, x_m: [-1.0, 1.0], y_m: [-0.4, 0.4]}
+          tail: {seen_from: rear, y_m: [-0.3, 0.3], z_m: [0.2, 0.6]}
+        """
+    )
+    code, printed, _ = torchcover("show", tmp_path / "cart.yaml", "--out", tmp_path)
+    assert code == 0
+    assert "A box on wheels" in printed
+    assert min(imread(tmp_path / "cart.png").shape[:2]) > 500
+    _, _, (lid, tail) = drawn["args"]
+    assert (lid.name, lid.seen_from, tail.name, tail.seen_from) == ("lid", "above", "tail", "rear")
+    for patch, lowest, highest in (
+        (lid, [-1.0, -0.4, 0.8], [1.0, 0.4, 0.8]),
+        (tail, [-1.5, -0.3, 0.2], [-1.5, 0.3, 0.6]),
+    ):
+        assert patch.places_m.min(axis=(0, 1)) == pytest.approx(lowest)
+        assert patch.places_m.max(axis=(0, 1)) == pytest.approx(highest)
+
+
+def test_a_region_beside_the_body_is_named(torchcover, tmp_path):
+    (tmp_path / "cart.yaml").write_text(
+        "name: cart\nparts: [{name: body, shape: {type: box, size_m: [3.0, 1.0, 0.8]}}]\n"
+        "mount_regions: {lid: {seen_from: above, x_m: [1.0, 2.0], y_m: [-0.4, 0.4]}}\n"
+    )
+    code, _, error = torchcover("show", tmp_path / "cart.yaml", "--out", tmp_path)
+    assert code == 2
+    assert "mount region 'lid': at x = 1.545 m" in error
 
 
 def test_the_depth_images_of_a_rig_are_those_of_its_cameras_in_the_frame(torchcover, worlds, drawn):
