@@ -153,6 +153,8 @@ def _use(function: str, kind: str, classes: frozenset[str], barred: frozenset[st
         return "turn"
     if kind.lower() == "parking":
         return "bay"
+    if kind.lower() == "median":
+        return None
     return "shoulder" if "all" in barred else "road"
 
 
