@@ -119,13 +119,15 @@ def test_houses_stand_beside_streets_and_apart(z, tmp_path):
 
 
 def test_fences_stand_where_nobody_built_and_off_the_street(tmp_path):
-    world = made(tmp_path, built_share=0.3, ego_id="ego").world(0)
+    north = edge("north", ("", 3.5, [(100, -200, 0), (100, 200, 0)]))
+    world = made(tmp_path, street(), north, built_share=0.3, ego_id="ego").world(0)
     houses, others = world.static[2:]
     # Of the pieces with eight corners the arms of lamps are flat; posts and crowns have more corners.
     fences = [piece for piece in others_of(others) if len(piece) == 8 and np.ptp(piece[:, 2]) > 1.0]
     assert len(fences) > 10
     around = shapely.STRtree([shapely.MultiPoint(piece[:, :2]).convex_hull for piece in fences])
-    street_and_houses = [shapely.box(-47.0, -3.75, 353.0, 1.75), *shapely.polygons(corners_of(houses))]
+    streets = [shapely.box(-47.0, -3.75, 353.0, 1.75), shapely.box(51.25, -200.0, 54.75, 200.0)]
+    street_and_houses = [*streets, *shapely.polygons(corners_of(houses))]
     assert len(around.query(street_and_houses, predicate="intersects")[0]) == 0
     assert {0.08} == {round(2 * hull.area / hull.length, 2) for hull in around.geometries}
 

@@ -118,7 +118,7 @@ class Frontage:
             heights_m += [self._drawn(FENCE_M)] * (len(poses) - 1)
         outlines = np.concatenate(outlines_m)
         polygons = shapely.polygons(outlines)
-        free = self._vicinity.sees(outlines.reshape(-1, 2)).reshape(-1, 4).all(axis=1)
+        free = np.all(self._vicinity.sees(outlines.reshape(-1, 2)).reshape(-1, 4), axis=1)
         for others in (self._taken, shapely.STRtree(shapely.polygons(houses_m))):
             free[others.query(polygons, predicate="intersects")[0]] = False
         on_m = self._ground.heights_m(outlines.reshape(-1, 2)).reshape(-1, 4)
