@@ -190,6 +190,17 @@ def test_cars_are_parked_in_bays_only(tmp_path):
             {"ego_id": "ego", "duration_s": 9.0},
             r"ego_id: 'ego' is not there all the time from t = 0 to 9 s",
         ),
+        (
+            {"ego_id": "ego", "steps": together({t: row for t, row in drive().items() if not 1.1 < t < 2.1})},
+            r"it leaves the network, teleports or has a gap after t = 1 s; shorten duration_s to 1",
+        ),
+        (
+            {
+                "ego_id": "ego",
+                "steps": {t: [row.replace('y="0.0"', f'y="{90.0 * (t > 2)}"')] for t, row in drive().items()},
+            },
+            r"teleports or has a gap after t = 2 s",
+        ),
         ({"duration_s": 9.0}, r"no car that could be the ego .* the longest drives for 4 s \(data end at t = 4 s\)"),
         ({"ego_type": "bus"}, "no vehicle of type 'bus' that could be the ego"),
         ({"begin_s": 3.0}, "no car that could be the ego"),
