@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.timing import compare, table
 from torchcover import Scenario
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import EvenReference
+from torchcover.simulation import PaperReference
 from torchcover.simulation.sumo import Sumo
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.programs import run
@@ -68,7 +68,7 @@ def runs():
     """Memory of this process while one run after the other is built."""
     traffic = Sumo(random={"network": "grid"}, duration_s=2.0, time_step_s=0.5)
     scenario = Scenario(name="town", traffic=traffic)
-    frames = SimulatedFrames(scenario, RIG, steps=5 * RUNS + 1, reference_sensor=EvenReference())
+    frames = SimulatedFrames(scenario, RIG, steps=5 * RUNS + 1, reference_sensor=PaperReference(rows=8, columns=16))
     rows = []
     for number in range(RUNS + 1):
         frames[5 * number]
