@@ -2,16 +2,19 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.placement.bits import Bits
-from torchcover.placement.held_worlds import HeldInstant, HeldWorlds, Look, Site
+from torchcover.placement.held_worlds import Look
 from torchcover.placement.objective import Objective
-from torchcover.placement.question_grid import QuestionGrid, ReferencePoints
+from torchcover.placement.question_grid import ReferencePoints
 from torchcover.placement.scores import Scores
-from torchcover.simulation import Rig, Scenario, Simulator, with_ego
+from torchcover.placement.sites import Site, instants_of
+from torchcover.placement.world_process import Holder, WorldProcess, WorldsHere, answers
+from torchcover.simulation import Rig, Scenario, with_ego
 
 WORLDS = 6
 PER_WORLD = 3
@@ -40,6 +43,13 @@ class CommonInstants:
         rays: About how many rays the reference casts at each instant.
         budget_bytes: What all worlds may take.
         workers: Processes that hold the worlds; 0 holds them in this one.
+
+    Attributes:
+        sites: The scenarios with their egos, what is asked about around these, and the settings.
+        instants: Which step of which site each instant is, and its world.
+        references: What the reference points of each instant count for.
+        unknown_worlds: Name of each objective -> how many worlds show nothing of one of its regions and bands; they
+            have no value, of any rig, and are in no difference.
 
     Raises:
         FileNotFoundError: An unknown name or file.
@@ -75,27 +85,103 @@ class CommonInstants:
         for name, number in (("worlds", worlds), ("per_world", per_world)):
             if number < 1:
                 raise ValueError(f"{name}: at least 1 is needed; got {number}")
-        loaded = [one if isinstance(one, Scenario) else Scenario.load(one) for one in given]
-        self.seed = seed
+        if workers < 0:
+            raise ValueError(f"workers: a number >= 0 is needed; got {workers}")
+        self.scenarios = tuple(one if isinstance(one, Scenario) else Scenario.load(one) for one in given)
         self.objectives = dict(objectives)
-        self._takes_any_ego = [vehicle is None and (one.ego is None or one.ego.shape is None) for one in loaded]
-        self.sites = [_site(one, objectives, vehicle, rays, seed, every_s) for one in loaded]
-        self._instants = _instants(self.sites, worlds, per_world)
-        questions = self.sites[0].grid.questions
-        self._parts = {name: tuple(map(questions.index, one.questions)) for name, one in objectives.items()}
-        self._thresholds_m = tuple(dict.fromkeys(question.threshold_m for question in questions))
-        self._here = HeldWorlds(self.sites, self._instants, budget_bytes)
-        self.references: tuple[ReferencePoints, ...] = tuple(
-            self._here.references[number] for number in range(len(self._instants))
+        self.vehicle = vehicle
+        self.seed = seed
+        self._per_world, self._every_s, self._rays = per_world, every_s, rays
+        self._budget_bytes, self._workers = budget_bytes, workers
+        self.sites = [
+            Site.of(one, objectives, vehicle, rays=rays, seed=seed, every_s=every_s) for one in self.scenarios
+        ]
+        self.instants = instants_of(self.sites, worlds, per_world)
+        self._questions = self.sites[0].grid.questions
+        self._parts = {name: tuple(map(self._questions.index, one.questions)) for name, one in objectives.items()}
+        self._thresholds_m = tuple(dict.fromkeys(question.threshold_m for question in self._questions))
+        self._holders = self._hold(budget_bytes)
+        held: dict[int, ReferencePoints] = {}
+        for of_holder in answers(self._holders):
+            held |= of_holder
+        self.references = tuple(held[number] for number in range(len(self)))
+        self._check_known()
+
+    def _hold(self, budget_bytes: float) -> list[Holder]:
+        """Build all worlds, here or in other processes, which take them in turn."""
+        worlds = self.instants[-1].world + 1
+        if self._workers == 0:
+            return [WorldsHere(self.sites, self.instants, budget_bytes)]
+        count = min(self._workers, worlds)
+        shares = [[one for one in self.instants if one.world % count == k] for k in range(count)]
+        return [
+            WorldProcess(self.sites, share, budget_bytes * len(range(k, worlds, count)) / worlds)
+            for k, share in enumerate(shares)
+        ]
+
+    def _check_known(self) -> None:
+        unseen = Bits(
+            np.arange(len(self), dtype=np.int64),
+            np.zeros((len(self._thresholds_m), sum(one.bytes_of_bits for one in self.references)), dtype=np.uint8),
+            np.zeros(len(self), dtype=np.int64),
+            rays=1,
         )
+        unknown = np.isnan(self.scores(unseen).by_world())
+        self.unknown_worlds = dict(zip(self.objectives, unknown.sum(axis=0).tolist(), strict=True))
+        for column, (name, objective) in enumerate(self.objectives.items()):
+            if unknown[:, column].all():
+                asked = ", ".join(f"{one.band} in {one.region}" for one in objective.questions)
+                raise ValueError(
+                    f"objective {name!r}: none of {len(unknown)} worlds shows any surface of all of: {asked}; use more "
+                    "worlds or instants, or larger regions"
+                )
 
     @property
     def world_of(self) -> NDArray[np.int64]:
         """(instants,) int64 which world each instant is of: worlds are independent of each other."""
-        return np.array([instant.world for instant in self._instants], dtype=np.int64)
+        return np.array([instant.world for instant in self.instants], dtype=np.int64)
 
     def __len__(self) -> int:
-        return len(self._instants)
+        return len(self.instants)
+
+    def anew(self, seed: int, worlds: int) -> "CommonInstants":
+        """The same questions at as many instants in each of other worlds.
+
+        Args:
+            seed: Another one, so that no world is the same.
+            worlds: Worlds of each scenario with traffic; others are the same world for any seed, and are left out.
+
+        Raises:
+            ValueError: The seed that these have; no scenario with traffic.
+        """
+        if seed == self.seed:
+            raise ValueError(f"seed: another one than that of these worlds is needed; got {seed} for both")
+        if not (fresh := [one for one in self.scenarios if one.traffic is not None]):
+            names = ", ".join(repr(one.name) for one in self.scenarios)
+            raise ValueError(f"scenarios: one with traffic is needed; {names} shows the same world for any seed")
+        return CommonInstants(
+            fresh,
+            self.objectives,
+            vehicle=self.vehicle,
+            worlds=worlds,
+            per_world=self._per_world,
+            every_s=self._every_s,
+            seed=seed,
+            rays=self._rays,
+            budget_bytes=self._budget_bytes,
+            workers=self._workers,
+        )
+
+    def close(self) -> None:
+        """End the processes that hold the worlds; without it they end with this object."""
+        for holder in self._holders:
+            holder.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
 
     def score(self, rig: Rig, instants: Sequence[int] | NDArray[np.int64] | None = None) -> Scores:
         """What a rig scores.
@@ -121,13 +207,41 @@ class CommonInstants:
             ValueError: As in `score`.
         """
         numbers = list(range(len(self))) if instants is None else [int(number) for number in instants]
-        looks: list[Look] = self._here.look(rig, numbers)
+        if not numbers or (unknown := [number for number in numbers if not 0 <= number < len(self)]):
+            raise ValueError(
+                f"instants: numbers from 0 to {len(self) - 1} are needed; got {unknown if numbers else []}"
+            )
+        self._check_vehicle(rig)
+        looks = self._looks(rig, numbers)
         return Bits(
             np.array(numbers, dtype=np.int64),
-            np.concatenate([look.seen for look in looks], axis=1),
-            np.array([look.self_hits for look in looks], dtype=np.int64),
-            looks[0].rays,
+            np.concatenate([looks[number].seen for number in numbers], axis=1),
+            np.array([looks[number].self_hits for number in numbers], dtype=np.int64),
+            looks[numbers[0]].rays,
         )
+
+    def _check_vehicle(self, rig: Rig) -> None:
+        """The rig's own vehicle counts where nothing else decides: then it must have been known from the start."""
+        if rig.vehicle is None or self.vehicle is not None:
+            return
+        for scenario, site in zip(self.scenarios, self.sites, strict=True):
+            if with_ego(scenario, {rig.name: rig}).ego != site.scenario.ego:
+                raise ValueError(
+                    f"rig {rig.name!r} is for the vehicle {rig.vehicle}, and these instants have "
+                    f"{site.scenario.ego_name}: say which by vehicle="
+                )
+
+    def _looks(self, rig: Rig, numbers: Sequence[int]) -> dict[int, Look]:
+        shares: list[list[int]] = [[] for _ in self._holders]
+        for number in dict.fromkeys(numbers):
+            shares[self.instants[number].world % len(shares)].append(number)
+        asked = [(holder, share) for holder, share in zip(self._holders, shares, strict=True) if share]
+        for holder, share in asked:
+            holder.ask(rig, share)
+        looks: dict[int, Look] = {}
+        for (_, share), of_holder in zip(asked, answers([holder for holder, _ in asked]), strict=True):
+            looks |= zip(share, of_holder, strict=True)
+        return looks
 
     def scores(self, bits: Bits) -> Scores:
         """What it is worth to see some reference points.
@@ -136,12 +250,12 @@ class CommonInstants:
             bits: From `bits`, or the OR of several.
         """
         numbers = bits.instants.tolist()
-        questions = self.sites[0].grid.questions
+        questions = self._questions
         seen_m2, visible_m2, known = np.empty((3, len(numbers), len(questions)))
         start = 0
         for row, number in enumerate(numbers):
             reference = self.references[number]
-            end = start + -(-reference.points // 8)
+            end = start + reference.bytes_of_bits
             packed, start = bits.seen[:, start:end], end
             seen = np.unpackbits(packed, axis=1, count=reference.points).astype(bool)
             cell_seen_m2 = {
@@ -164,47 +278,3 @@ class CommonInstants:
             self_hit_share=float(bits.self_hits.sum() / (len(numbers) * bits.rays)),
             rays=bits.rays,
         )
-
-
-def _site(
-    scenario: Scenario,
-    objectives: Mapping[str, Objective],
-    vehicle: str | Path | None,
-    rays: int,
-    seed: int,
-    every_s: float,
-) -> Site:
-    world = with_ego(scenario, {}, vehicle)
-    return Site(world, QuestionGrid.around(world.ego_box().outline_m, objectives), rays, seed, every_s)
-
-
-def _instants(sites: Sequence[Site], worlds: int, per_world: int) -> list[HeldInstant]:
-    """The instants of all sites, world by world."""
-    instants: list[HeldInstant] = []
-    first_world = 0
-    for number, site in enumerate(sites):
-        of_worlds = _steps(site.simulator(), site, worlds, per_world)
-        for world, indices in enumerate(of_worlds, first_world):
-            instants += [HeldInstant(len(instants) + k, number, index, world) for k, index in enumerate(indices)]
-        first_world += len(of_worlds)
-    return instants
-
-
-def _steps(simulator: Simulator, site: Site, worlds: int, per_world: int) -> list[list[int]]:
-    """Numbers of the steps of each world."""
-    if site.scenario.traffic is None:
-        # Where nothing moves every step draws another reference.
-        distinct = simulator.distinct_steps
-        return [list(range(per_world if distinct in (None, 1) else min(per_world, distinct or 0)))]
-    of_worlds: list[list[int]] = [[] for _ in range(worlds)]
-    index = 0
-    while (world := simulator.run_of(index)) < worlds:
-        if len(of_worlds[world]) < per_world:
-            of_worlds[world].append(index)
-        index += 1
-    if (fewest := min(map(len, of_worlds))) < per_world:
-        raise ValueError(
-            f"per_world: a run of {site.scenario.name!r} has {fewest} instants that are {site.every_s:g} s apart; got "
-            f"{per_world}"
-        )
-    return of_worlds

@@ -9,40 +9,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.neighbors import nearest
-from torchcover.placement.question_grid import QuestionGrid, ReferencePoints
-from torchcover.simulation import Rig, Scenario, Simulator
-
-
-class Site(NamedTuple):
-    """A scenario in which rigs are scored.
-
-    Args:
-        scenario: With its ego.
-        grid: What is asked about around that.
-        rays: About how many rays the reference casts at an instant.
-        seed: Seed of traffic and reference.
-        every_s: Time between two steps.
-    """
-
-    scenario: Scenario
-    grid: QuestionGrid
-    rays: int
-    seed: int
-    every_s: float
-
-    def simulator(self) -> Simulator:
-        """It with no rig; what was built is kept for good."""
-        reference = self.grid.reference_sensor(self.rays)
-        return Simulator(self.scenario, {}, reference, seed=self.seed, every_s=self.every_s, kept_bytes=float("inf"))
-
-
-class HeldInstant(NamedTuple):
-    """Which instant: `number` among all, `site`, `step` there, and `world` among all worlds."""
-
-    number: int
-    site: int
-    step: int
-    world: int
+from torchcover.placement.question_grid import ReferencePoints
+from torchcover.placement.sites import HeldInstant, Site
+from torchcover.simulation import Rig, Simulator
 
 
 class Look(NamedTuple):
@@ -69,6 +38,8 @@ class HeldWorlds:
     def __init__(self, sites: Sequence[Site], instants: Sequence[HeldInstant], budget_bytes: float) -> None:
         self._simulators = [site.simulator() for site in sites]
         self._instants = {instant.number: instant for instant in instants}
+        self._rig: Rig | None = None
+        self._mounted: dict[int, Simulator] = {}
         self._points: dict[int, Tensor] = {}
         self.references: dict[int, ReferencePoints] = {}
         thresholds = dict.fromkeys(question.threshold_m for question in sites[0].grid.questions)
@@ -103,18 +74,24 @@ class HeldWorlds:
         Raises:
             ValueError: The rig cannot be mounted.
         """
-        candidates: dict[int, Simulator] = {}
         looks = []
         for number in numbers:
             instant = self._instants[number]
-            if instant.site not in candidates:
-                candidates[instant.site] = self._simulators[instant.site].with_rigs({rig.name: rig})
-            scans = candidates[instant.site].scans(instant.step)[rig.name]
+            scans = self._with(rig, instant.site).scans(instant.step)[rig.name]
+            points, farthest_m = self._points[number], max(self._thresholds_m)
             cloud = torch.from_numpy(np.concatenate([scan.points for scan in scans]))
-            distance, _ = nearest(self._points[number], cloud, max_distance=max(self._thresholds_m))
+            distance, _ = nearest(points, cloud, max_distance=farthest_m)
             seen = np.stack([np.packbits((distance <= threshold).numpy()) for threshold in self._thresholds_m])
             looks.append(Look(seen, sum(scan.self_hits for scan in scans), sum(scan.rays for scan in scans)))
         return looks
+
+    def _with(self, rig: Rig, site: int) -> Simulator:
+        """A site with the rig, which is kept until another one comes: a race asks about it again and again."""
+        if rig != self._rig:
+            self._rig, self._mounted = rig, {}
+        if site not in self._mounted:
+            self._mounted[site] = self._simulators[site].with_rigs({rig.name: rig})
+        return self._mounted[site]
 
 
 def _check_budget(bytes_of: Sequence[float], worlds: int, budget_bytes: float) -> None:

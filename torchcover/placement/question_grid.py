@@ -41,6 +41,11 @@ class ReferencePoints(NamedTuple):
     cells_of: tuple[Numbers, ...]
 
     @property
+    def bytes_of_bits(self) -> int:
+        """How many bytes a bit for each point takes."""
+        return -(-self.points // 8)
+
+    @property
     def bytes(self) -> int:
         """How much memory it takes."""
         return sum(part.nbytes for part in (self.of, self.m2, self.cell, self.cell_m2, *self.cells_of))

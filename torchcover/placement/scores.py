@@ -119,5 +119,6 @@ class Scores:
 
 
 def _ratio(sums: Float64, whole: Float64) -> Float64:
-    ratio = np.full(sums.shape, np.nan)
-    return np.divide(sums, whole, out=ratio, where=whole > 0)
+    ratio: Float64 = np.full(sums.shape, np.nan)
+    np.divide(sums, whole, out=ratio, where=whole > 0)
+    return ratio
