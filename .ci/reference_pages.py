@@ -30,6 +30,12 @@ ROOMS = (
 DOCUMENTS = (
     "torchcover.simulation", "torchcover.data", "torchcover.targets", "torchcover.coverage", "torchcover.placement",
 )  # fmt: skip
+    "torchcover.simulation",
+    "torchcover.data",
+    "torchcover.targets",
+    "torchcover.coverage",
+    "torchcover.placement",
+)
 
 
 def on_config(config):

@@ -32,7 +32,11 @@ BENCHMARKS = (
     "scaling",
     "mutated_files",
     "targets",
+<<<<<<< HEAD
+    "towns",
+=======
     "pairing",
+>>>>>>> instants
 )
 
 

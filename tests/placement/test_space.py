@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchcover.files import BadFileError
+from torchcover.files import BadFileError, as_yaml
 from torchcover.placement import SearchSpace
 from torchcover.simulation import Lidar, Pose, Rig
 
@@ -29,10 +29,12 @@ def lidar(name, **mount):
     return Lidar(name=name, mount=Pose(**mount), **LIDAR)
 
 
+RIGHT = lidar("right", x_m=-0.5, y_m=-0.5, z_m=1.8)
+HIGH = {"mount": {"z_m": 1.9}}
 PAIR = Rig(
     name="pair",
     vehicle="suv",
-    sensors=(lidar("left", x_m=-0.5, y_m=0.5, z_m=1.8), lidar("right", x_m=-0.5, y_m=-0.5, z_m=1.8)),
+    sensors=(lidar("left", x_m=-0.5, y_m=0.5, z_m=1.8), RIGHT),
 )
 
 
@@ -53,7 +55,7 @@ def place(sensor):
 @pytest.mark.parametrize("path", SPACES, ids=lambda path: path.stem)
 def test_rigs_of_the_examples_come_back_from_their_files(path, tmp_path):
     searched = SearchSpace.load(path)
-    for values in drawn(searched, 3):
+    for values in drawn(searched, 2):
         rig = searched.rig(values, "found")
         rig.save(tmp_path / "found.yaml")
         assert Rig.load(tmp_path / "found.yaml") == rig
@@ -78,7 +80,7 @@ def test_the_start_is_the_rig_of_its_own_values():
     free = {"left": {"x_m": (-1.0, 0.0), "z_above_body_m": (0.1, 0.3), "yaw_deg": (-90.0, 90.0)}}
     searched = space({**free, "right": {"mirror_of": "left"}}, constraints={"symmetric": True})
     values = searched.start_values()
-    assert list(values) == [variable.name for variable in searched.variables] or len(values) == 3
+    assert values.keys() == {variable.name for variable in searched.variables}
     assert searched.rig(values, "same").sensors == PAIR.sensors
     assert searched.violations(PAIR) == ()
 
@@ -94,7 +96,7 @@ def test_a_sensor_with_a_quaternion_keeps_it_until_an_angle_is_free():
 
 def test_a_pair_is_symmetric_whatever_its_values():
     free = {"x_m": (-1.0, 0.0), "y_m": (0.3, 0.6), "yaw_deg": (-180.0, 180.0), "roll_deg": (-30.0, 30.0)}
-    free |= {"pitch_deg": (-30.0, 30.0), "model": ("velodyne_vlp16", "ouster_os0_128"), "present": (True, False)}
+    free |= {"pitch_deg": (-30.0, 30.0), "model": ("velodyne_vlp16", "velodyne_vlp32c"), "present": (True, False)}
     third = Rig(name="third", vehicle="suv", sensors=(*PAIR.sensors, lidar("middle", x_m=-1.4, z_m=2.0)))
     searched = space({"left": free, "right": {"mirror_of": "left"}}, third, constraints={"symmetric": True})
     counts = set()
@@ -140,26 +142,30 @@ def test_a_place_on_a_region_is_as_far_from_the_skin_as_its_height():
 
 
 def test_a_model_brings_its_whole_pattern():
-    start = PAIR.model_copy(update={"sensors": (Lidar.model_validate({"name": "left", "model": "velodyne_vlp16"}),)})
-    start = space({"left": {"z_m": (1.8, 2.0)}}, start).rig({"left.z_m": 1.9}, "higher")
-    searched = space({"left": {"model": ("velodyne_vlp16", "ouster_os0_128")}}, start)
-    for model in ("velodyne_vlp16", "ouster_os0_128"):
+    keys = {"name": "left", "model": "velodyne_vlp16"}
+    start = PAIR.model_copy(update={"sensors": (Lidar.model_validate(keys | HIGH),)})
+    searched = space({"left": {"model": ("velodyne_vlp16", "velodyne_vlp32c")}}, start)
+    for model in ("velodyne_vlp16", "velodyne_vlp32c"):
         sensor = searched.rig({"left.model": model}, "found").sensors[0]
         assert sensor == Lidar.model_validate({"name": "left", "mount": start.sensors[0].mount, "model": model})
     assert searched.start_values() == {"left.model": "velodyne_vlp16"}
 
 
 def test_a_rig_costs_its_models_and_its_mounts():
-    cost = {"velodyne_vlp16": 3000.0, "ouster_os0_128": 9000.0, "right": 500.0, "mount": 100.0}
-    searched = space({"left": {"model": ("velodyne_vlp16", "ouster_os0_128"), "present": (True, False)}}, cost=cost)
+    cost = {"velodyne_vlp16": 3000.0, "velodyne_vlp32c": 9000.0, "right": 500.0, "mount": 100.0}
+    free = {"model": ("velodyne_vlp16", "velodyne_vlp32c"), "present": (True, False)}
+    with pytest.raises(ValueError, match="no price of 'left', for the sensor 'left'"):
+        space({"left": free}, cost=cost)
+    start = Rig(name="start", sensors=(Lidar.model_validate({"name": "left", "model": "velodyne_vlp16"} | HIGH), RIGHT))
+    searched = space({"left": free}, start, cost=cost)
     prices = {
         (model, there): searched.cost_eur(searched.rig({"left.model": model, "left.present": there}, "found"))
-        for model in ("velodyne_vlp16", "ouster_os0_128")
+        for model in ("velodyne_vlp16", "velodyne_vlp32c")
         for there in (True, False)
     }
     assert prices["velodyne_vlp16", True] == 3000.0 + 500.0 + 200.0
-    assert prices["ouster_os0_128", True] == 9000.0 + 500.0 + 200.0
-    assert prices["ouster_os0_128", False] == 500.0 + 100.0
+    assert prices["velodyne_vlp32c", True] == 9000.0 + 500.0 + 200.0
+    assert prices["velodyne_vlp32c", False] == 500.0 + 100.0
     assert space({"left": {"x_m": (-1.0, 0.0)}}).cost_eur(PAIR) is None
 
 
@@ -228,7 +234,7 @@ MISTAKES = [
     ({"free": {"roof": {"present": [True, True]}}}, "free.roof: present: [true, false] is the choice"),
     (
         {"free": {"roof": {"mirror_of": "left"}}},
-        "free.roof.mirror_of: a free sensor is needed, one of none; got 'left'",
+        "free.roof.mirror_of: a free sensor is needed, one of none",
     ),
     ({"free": {"roof": {"mirror_of": "roof"}}}, "free.roof.mirror_of: a free sensor is needed"),
     ({"free": {"roof": {"mirror_of": "left", "x_m": [0, 1]}}}, "mirror_of: the mirror image has nothing of its own"),
@@ -257,19 +263,12 @@ def test_a_space_that_cannot_be_searched_is_refused_at_the_door(changed, message
     keys = {"name": "here", "start": "front_roof_32", "scenario": "courtyard", "objectives": NEAR}
     keys["free"] = {"roof": {"pitch_deg": [-5, 5]}}
     path = tmp_path / "space.yaml"
-    path.write_text(written(keys | changed), encoding="utf-8")
+    path.write_text(as_yaml(keys | changed), encoding="utf-8")
     with pytest.raises(BadFileError) as refused:
         SearchSpace.load(path)
     assert str(refused.value).startswith(f"{path}: ")
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)
-
-
-def written(value):
-    """JSON with YAML's word for NaN."""
-    import json
-
-    return json.dumps(value).replace("NaN", ".nan")
 
 
 @pytest.mark.parametrize(("key", "missing"), [("scenario", "nowhere"), ("vehicle", "spaceship")])

@@ -13,6 +13,7 @@ def test_a_number_comes_back_from_its_share_to_the_last_bit(low, high):
         value = number.at(u)
         assert low <= value <= high
         assert number.at(number.unit(value)) == value
+        assert float(f"{value:.6f}") == value or value in (low, high)
         assert number.unit(value) == pytest.approx(u, abs=1e-6 / (high - low))
     assert (number.at(0.0), number.at(1.0)) == pytest.approx((low, high), abs=1e-6)
 
@@ -23,6 +24,7 @@ def test_options_have_equal_parts_of_the_way_and_come_back_from_their_middle(opt
     drawn = [choice.at(u) for u in (np.arange(3000) + 0.5) / 3000]
     assert [drawn.count(option) for option in options] == [3000 / len(options)] * len(options)
     assert choice.at(1.0) == options[-1]
+    assert [choice.unit(option) for option in options] == [(k + 0.5) / len(options) for k in range(len(options))]
     for u in (0.0, 0.3, 0.7, 1.0):
         assert choice.at(choice.unit(choice.at(u))) == choice.at(u)
 

@@ -44,7 +44,7 @@ def test_places_lie_on_the_skin_and_heights_are_distances_from_it(name):
 @pytest.mark.parametrize("name", VEHICLES)
 def test_a_region_is_one_patch_that_looks_to_its_side(name):
     """No place beside another lies on another part, nor on a wall that only seems to be seen from there."""
-    vehicle, shares = load_document(Vehicle, "vehicles", name), np.linspace(0.0, 1.0, 9)
+    vehicle, shares = load_document(Vehicle, "vehicles", name), np.linspace(0.0, 1.0, 6)
     skin = Skin(vehicle.mesh())
     for region in vehicle.mount_regions.values():
         axis, sign = SEEN_FROM[region.seen_from]

@@ -17,7 +17,7 @@ from torchcover.placement.objective import Objective
 from torchcover.placement.prices import check_prices, price_eur
 from torchcover.placement.question_grid import QuestionGrid
 from torchcover.placement.variables import Value, Variable
-from torchcover.simulation import Document, Lidar, Rig, Scenario, Sensor, with_ego
+from torchcover.simulation import Document, Lidar, LidarModel, Rig, Scenario, Sensor, with_ego
 from torchcover.simulation.documents import NameOrFile, beside, is_file_name, read_document
 
 MAX_OBJECTIVES = 3
@@ -104,6 +104,11 @@ class SearchSpace(Document):
                 raise ValueError(f"free.{name}: {self.start.name!r} has no such sensor; it has {', '.join(sensors)}")
             if free.model is not None and not isinstance(sensors[name], Lidar):
                 raise ValueError(f"free.{name}.model: only a LiDAR has a model to choose")
+            for model in free.model or ():
+                try:
+                    LidarModel.load(model)
+                except FileNotFoundError as error:
+                    raise ValueError(f"free.{name}.model: {error}") from error
             if free.mirror_of is not None and (free.mirror_of not in self.free or self.free[free.mirror_of].mirror_of):
                 others = [other for other, one in self.free.items() if one.mirror_of is None]
                 raise ValueError(

@@ -41,6 +41,7 @@ class Skin:
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
+        self._corners_m: Vector = mesh.vertices_m[mesh.faces]
 
     def __reduce__(self) -> tuple[type["Skin"], tuple[Mesh]]:
         return Skin, (self.mesh,)
@@ -62,7 +63,7 @@ class Skin:
         """
         axis, sign = SEEN_FROM[side]
         others = [other for other in range(3) if other != axis]
-        corners = self.mesh.vertices_m[self.mesh.faces]
+        corners = self._corners_m
         flat = corners[:, :, others] - np.asarray(across_m)
         following, last = np.roll(flat, -1, axis=1), np.roll(flat, -2, axis=1)
         # Twice the signed areas of the three triangles between the line and an edge, each opposite to a corner.
