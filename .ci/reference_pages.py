@@ -30,12 +30,6 @@ ROOMS = (
 DOCUMENTS = (
     "torchcover.simulation", "torchcover.data", "torchcover.targets", "torchcover.coverage", "torchcover.placement",
 )  # fmt: skip
-    "torchcover.simulation",
-    "torchcover.data",
-    "torchcover.targets",
-    "torchcover.coverage",
-    "torchcover.placement",
-)
 
 
 def on_config(config):
