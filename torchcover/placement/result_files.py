@@ -6,10 +6,8 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import yaml
 
 from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.result_files import ResultFiles
@@ -20,7 +18,6 @@ from torchcover.placement.result_pictures import search_pictures
 from torchcover.placement.scores import Scores
 from torchcover.report import PagePicture, file_stems, page_html
 from torchcover.simulation import Rig
-from torchcover.simulation.documents import is_file_name
 
 
 def save_search(result: SearchResult, folder: Path) -> list[Path]:
@@ -40,7 +37,7 @@ def save_search(result: SearchResult, folder: Path) -> list[Path]:
     with ResultFiles(folder) as files:
         with held_back():  # what was found is safe before anything ends this
             for name, rig in _rigs(result).items():
-                files.add(name, partial(_write_text, rig_yaml(rig)))
+                files.add(name, rig.save)
             files.add("evaluations.csv", partial(_write_rows, list(evaluation_rows(result))))
             files.add("pareto.csv", partial(_write_rows, list(pareto_rows(result))))
             files.add("search.json", partial(_write_text, json.dumps(record, indent=2, allow_nan=False) + "\n"))
@@ -52,24 +49,10 @@ def save_search(result: SearchResult, folder: Path) -> list[Path]:
             pictures[f"{stem}.png"] = PagePicture(title, png.getvalue())
         for name, picture in pictures.items():
             files.add(name, partial(_write_bytes, picture.png))
-        page = search_page(result, list(pictures.values()), {pick.name: rig_yaml(pick.rig) for pick in result.picks})
+        page = search_page(result, list(pictures.values()))
         files.add("report.html", partial(_write_text, page_html(page)))
         files.publish(summary)
     return files.paths
-
-
-def rig_yaml(rig: Rig) -> str:
-    """A rig as YAML that `Rig.load` reads from any folder.
-
-    Example:
-        >>> rig_yaml(Rig.load("front_roof_32")).splitlines()[0]
-        'name: front_roof_32'
-    """
-    content = _absolute(rig.model_dump(exclude_unset=True))
-    if rig.vehicle is not None:
-        content["vehicle"] = str(Path(rig.vehicle).absolute()) if is_file_name(rig.vehicle) else rig.vehicle
-    text: str = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-    return text
 
 
 def evaluation_rows(result: SearchResult) -> Iterator[Sequence[object]]:
@@ -134,14 +117,6 @@ def _rigs(result: SearchResult) -> dict[str, Rig]:
     ends = picks[1:]
     stems = file_stems([pick.role for pick in ends])
     return {"best.yaml": result.rig} | {f"best_{stem}.yaml": pick.rig for stem, pick in zip(stems, ends, strict=True)}
-
-
-def _absolute(value: Any) -> Any:  # noqa: ANN401  (whatever a document holds)
-    if isinstance(value, dict):
-        return {key: _absolute(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [_absolute(each) for each in value]
-    return str(value.absolute()) if isinstance(value, Path) else value
 
 
 def _cell(value: object) -> object:

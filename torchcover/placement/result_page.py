@@ -1,9 +1,9 @@
 """The page of a search, and its table."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 from torchcover.evaluation import sensor_views
-from torchcover.evaluation.result_page import words_of
+from torchcover.evaluation.result_page import rig_document, words_of
 from torchcover.placement.result import ENOUGH_T, SearchResult
 from torchcover.report import Page, PagePicture, PageRig, PageTable, Words
 
@@ -13,17 +13,19 @@ OF_THE_RUN = ("seconds", "torchcover", "space_sha256")
 ELSEWHERE = ("arms", "found", "sentence", "hypervolume", "share_of_instants_saved", "untested")
 
 
-def search_page(result: SearchResult, pictures: Sequence[PagePicture], documents: Mapping[str, str]) -> Page:
+def search_page(result: SearchResult, pictures: Sequence[PagePicture]) -> Page:
     """All that is known of a search, on one page.
 
     Args:
         result: What was found.
         pictures: Of it.
-        documents: Name of what was found -> it as YAML.
     """
     search, record = result.search, result.record
-    rigs = [PageRig(f"start: {search.space.start.name}", sensor_views(search.space.start.sensors))]
-    rigs += [PageRig(pick.name, sensor_views(pick.rig.sensors), documents[pick.name]) for pick in result.picks]
+    named = {"start": search.space.start, **{pick.name: pick.rig for pick in result.picks}}
+    rigs = [
+        PageRig(f"{name}: {rig.name}", sensor_views(rig.sensors), rig_document(rig.name, rig.sensors))
+        for name, rig in named.items()
+    ]
     settings = {name: value for name, value in record.items() if name not in (*OF_THE_RUN, *ELSEWHERE)}
     return Page(
         title=f"{search.space.name}: where should the sensors go?",
