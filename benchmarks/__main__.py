@@ -34,6 +34,7 @@ BENCHMARKS = (
     "targets",
     "towns",
     "pairing",
+    "placement",
 )
 
 
