@@ -50,6 +50,9 @@ class CommonInstants:
         sites: The scenarios with their egos, what is asked about around these, and the settings.
         instants: Which step of which site each instant is, and its world.
         references: What the reference points of each instant count for.
+        questions: All that the objectives ask: bands in regions, each with a threshold.
+        parts: For each objective, by name, the numbers of its questions.
+        thresholds_m: The thresholds, in the order of the rows of bits.
         unknown_worlds: Name of each objective -> how many worlds show nothing of one of its regions and bands; they
             have no value, of any rig, and are in no difference.
 
@@ -99,9 +102,9 @@ class CommonInstants:
             Site.of(one, objectives, vehicle, rays=rays, seed=seed, every_s=every_s) for one in self.scenarios
         ]
         self.instants = instants_of(self.sites, worlds, per_world)
-        self._questions = self.sites[0].grid.questions
-        self._parts = {name: tuple(map(self._questions.index, one.questions)) for name, one in objectives.items()}
-        self._thresholds_m = tuple(dict.fromkeys(question.threshold_m for question in self._questions))
+        self.questions = self.sites[0].grid.questions
+        self.parts = {name: tuple(map(self.questions.index, one.questions)) for name, one in objectives.items()}
+        self.thresholds_m = tuple(dict.fromkeys(question.threshold_m for question in self.questions))
         self._holders = self._hold(budget_bytes)
         held: dict[int, ReferencePoints] = {}
         for of_holder in answers(self._holders):
@@ -124,7 +127,7 @@ class CommonInstants:
     def _check_known(self) -> None:
         unseen = Bits(
             np.arange(len(self), dtype=np.int64),
-            np.zeros((len(self._thresholds_m), sum(one.bytes_of_bits for one in self.references)), dtype=np.uint8),
+            np.zeros((len(self.thresholds_m), sum(one.bytes_of_bits for one in self.references)), dtype=np.uint8),
             np.zeros(len(self), dtype=np.int64),
             rays=1,
         )
@@ -252,7 +255,7 @@ class CommonInstants:
             bits: From `bits`, or the OR of several.
         """
         numbers = bits.instants.tolist()
-        questions = self._questions
+        questions = self.questions
         seen_m2, visible_m2, known = np.empty((3, len(numbers), len(questions)))
         start = 0
         for row, number in enumerate(numbers):
@@ -264,7 +267,7 @@ class CommonInstants:
                 threshold: np.bincount(
                     reference.cell, reference.m2 * hit[reference.of], minlength=len(reference.cell_m2)
                 )
-                for threshold, hit in zip(self._thresholds_m, seen, strict=True)
+                for threshold, hit in zip(self.thresholds_m, seen, strict=True)
             }
             for column, (question, cells) in enumerate(zip(questions, reference.cells_of, strict=True)):
                 of_cells, cell_m2 = cell_seen_m2[question.threshold_m][cells], reference.cell_m2[cells]
@@ -273,7 +276,7 @@ class CommonInstants:
         return Scores(
             instants=bits.instants,
             world=self.world_of[numbers],
-            parts=self._parts,
+            parts=self.parts,
             seen_m2=seen_m2,
             visible_m2=visible_m2,
             known_share=known,

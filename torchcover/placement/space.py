@@ -5,40 +5,25 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, NonNegativeFloat, PlainValidator, ValidationInfo, model_validator
+from pydantic import Field, NonNegativeFloat, model_validator
 
 from torchcover.placement.carrier import Carrier
 from torchcover.placement.constraints import Constraints, misplaced
 from torchcover.placement.free_sensor import FreeSensor, mirrored
+from torchcover.placement.named import NamedRig, Names
 from torchcover.placement.objective import Objective
 from torchcover.placement.prices import check_prices, price_eur
 from torchcover.placement.question_grid import QuestionGrid
 from torchcover.placement.variables import Value, Variable
 from torchcover.simulation import Document, Lidar, LidarModel, Rig, Scenario, Sensor, with_ego
-from torchcover.simulation.documents import NameOrFile, beside, is_file_name, read_document
+from torchcover.simulation.documents import NameOrFile, read_document
 
 MAX_OBJECTIVES = 3
 # How many candidates are looked at before a space is refused as one without any that can be.
 TRIES = 256
-
-
-def _rig(given: Any, info: ValidationInfo) -> Rig:  # noqa: ANN401  (whatever stood in the file)
-    """A rig, or one by its name or its file."""
-    if isinstance(given, Rig):
-        return given
-    if not isinstance(given, str):
-        raise ValueError(f"the name of a rig, or the path of its file, is needed; got {type(given).__name__}")
-    try:
-        return Rig.load(beside(Path(given), info) if is_file_name(given) else given)
-    except FileNotFoundError as error:
-        raise ValueError(str(error)) from error
-
-
-def _listed(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
-    return (given,) if isinstance(given, str) else given
 
 
 class SearchSpace(Document):
@@ -78,8 +63,8 @@ class SearchSpace(Document):
 
     name: str
     description: str = ""
-    start: Annotated[Rig, PlainValidator(_rig)]
-    scenario: Annotated[tuple[NameOrFile, ...], BeforeValidator(_listed)] = Field(min_length=1)
+    start: NamedRig
+    scenario: Names
     vehicle: NameOrFile | None = None
     free: dict[str, FreeSensor] = Field(min_length=1)
     constraints: Constraints = Constraints()

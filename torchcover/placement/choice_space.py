@@ -1,0 +1,183 @@
+"""A choice: candidates at given places, how many of them may be taken, and what a good choice is."""
+
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
+
+from torchcover.placement.candidate_group import MOST_CANDIDATES, CandidateGroup
+from torchcover.placement.carrier import Carrier
+from torchcover.placement.constraints import APART_M
+from torchcover.placement.named import NamedRig, Names
+from torchcover.placement.objective import Objective
+from torchcover.placement.prices import MOUNT
+from torchcover.placement.question_grid import QuestionGrid
+from torchcover.placement.subsets import Limits
+from torchcover.simulation import Document, Rig, Scenario, Sensor, with_ego
+from torchcover.simulation.documents import NameOrFile, read_document
+
+
+class ChoiceLimits(Document):
+    """What a choice must keep to.
+
+    Args:
+        at_most: Sensors that are chosen; all candidates if not given.
+        max_cost_eur: What they may cost; see `cost` of the choice.
+        min_distance_m: Between any two sensors.
+    """
+
+    at_most: PositiveInt | None = None
+    max_cost_eur: NonNegativeFloat | None = None
+    min_distance_m: NonNegativeFloat = APART_M
+
+    @model_validator(mode="after")
+    def _check_any(self) -> Self:
+        if self.at_most is None and self.max_cost_eur is None:
+            raise ValueError("at_most, max_cost_eur: one of the two is needed, or all candidates would be chosen")
+        return self
+
+
+class ChoiceSpace(Document):
+    """Which and how many: some of many candidates, which are given.
+
+    Args:
+        name: What files and pages call it.
+        description: What it is.
+        always: Sensors that are there in any case: a rig, by name or file.
+        scenario: One or several, by name or file: they count alike.
+        vehicle: What carries the sensors, by name or file; if not given, that of `always`, or the scenario's own.
+        candidates: Groups by name, each a sensor and its places.
+        choose: How many, for how much, how far apart.
+        cost: Prices in euros, by group, and of `mount`, which each sensor needs.
+        now: Names of the candidates that are there today, as `GROUP_PLACE`: the choice is compared with them; if not
+            given, with a choice that is drawn, the middle one of many.
+        objective: What is made as large as it gets.
+
+    Raises:
+        ValueError: Nothing in it can be chosen, for a reason that the message tells.
+
+    Example:
+        >>> corners = {"front": {"x_m": 1.5, "z_m": 1.9}, "rear": {"x_m": -1.5, "z_m": 1.9, "yaw_deg": 180.0}}
+        >>> choice = ChoiceSpace(
+        ...     name="ends",
+        ...     scenario="courtyard",
+        ...     candidates={"end": {"sensor": {"type": "lidar", "model": "velodyne_vlp16"}, "places": corners}},
+        ...     choose={"at_most": 1},
+        ...     objective={"band": "ground", "region": "front_3m"},
+        ... )
+        >>> [sensor.name for sensor in choice.sensors]
+        ['end_front', 'end_rear']
+    """
+
+    name: str
+    description: str = ""
+    always: NamedRig | None = None
+    scenario: Names
+    vehicle: NameOrFile | None = None
+    candidates: dict[Annotated[str, Field(min_length=1)], CandidateGroup] = Field(min_length=1)
+    choose: ChoiceLimits
+    cost: dict[str, NonNegativeFloat] = Field(default_factory=dict)
+    now: tuple[str, ...] | None = Field(default=None, min_length=1)
+    objective: Objective
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a choice from a YAML file.
+
+        Raises:
+            FileNotFoundError: No such file, or of one that it names.
+            BadFileError: Not YAML, or no choice that makes sense; the message names the file and the key.
+        """
+        return read_document(cls, Path(path))
+
+    @model_validator(mode="after")
+    def _check_candidates(self) -> Self:
+        names = [sensor.name for sensor in (*(self.always.sensors if self.always else ()), *self.sensors)]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"candidates: two sensors are called {twice[0]}; names are those of group and place")
+        if len(self.sensors) > MOST_CANDIDATES:
+            raise ValueError(f"candidates: at most {MOST_CANDIDATES:,} are looked at; got {len(self.sensors):,}")
+        self._check_prices()
+        if unknown := [name for name in self.now or () if name not in names]:
+            raise ValueError(f"now: {', '.join(unknown)}: no candidate; they are {', '.join(names[:20])}")
+        QuestionGrid.around(self._carrier.outline_m, {"objective": self.objective})
+        return self
+
+    def _check_prices(self) -> None:
+        known = {MOUNT, *self.candidates}
+        if unknown := [key for key in self.cost if key not in known]:
+            raise ValueError(f"cost: {', '.join(unknown)}: no group of candidates, and not {MOUNT!r}")
+        if self.choose.max_cost_eur is None:
+            return
+        if missing := [group for group in self.candidates if group not in self.cost]:
+            raise ValueError(f"cost: no price of {', '.join(missing)}, and choose.max_cost_eur needs it")
+        cheapest = min(self.prices)
+        if cheapest > self.choose.max_cost_eur:
+            raise ValueError(
+                f"choose.max_cost_eur: {self.choose.max_cost_eur:g}, but the cheapest candidate costs {cheapest:g}"
+            )
+
+    @cached_property
+    def scenarios(self) -> tuple[Scenario, ...]:
+        """The scenarios, each with what carries the sensors as its ego."""
+        rigs = {self.always.name: self.always} if self.always else {}
+        return tuple(with_ego(Scenario.load(each), rigs, self.vehicle) for each in self.scenario)
+
+    @cached_property
+    def _carrier(self) -> Carrier:
+        return Carrier.of(self.scenarios)
+
+    @cached_property
+    def sensors(self) -> tuple[Sensor, ...]:
+        """The candidates, group by group."""
+        groups = self.candidates.items()
+        return tuple(sensor for name, group in groups for sensor in group.sensors(name, self._carrier))
+
+    @cached_property
+    def prices(self) -> tuple[float, ...]:
+        """What each candidate costs, with its mount; nothing where there are no prices."""
+        return tuple(
+            self.cost.get(name, 0.0) + (self.cost.get(MOUNT, 0.0) if self.cost else 0.0)
+            for name, group in self.candidates.items()
+            for _ in group.sensors(name, self._carrier)
+        )
+
+    def limits(self, kept: list[int]) -> Limits:
+        """What a subset of some candidates must keep to.
+
+        Args:
+            kept: Numbers of the candidates that can be mounted.
+        """
+        places_m = np.array([self.sensors[one].mount.matrix()[:3, 3] for one in kept]).reshape(-1, 3)
+        apart_m = np.linalg.norm(places_m[:, None] - places_m[None], axis=2)
+        most_to_pay = self.choose.max_cost_eur
+        return Limits(
+            most=min(self.choose.at_most or len(kept), len(kept)),
+            prices=[self.prices[one] for one in kept] if self.cost else (),
+            most_to_pay=np.inf if most_to_pay is None else most_to_pay,
+            apart=apart_m >= self.choose.min_distance_m,
+        )
+
+    def too_close(self, one: Sensor) -> bool:
+        """Whether a candidate would be where a sensor is that is always there."""
+        place_m = one.mount.matrix()[:3, 3]
+        others: list[NDArray[np.float64]] = [
+            other.mount.matrix()[:3, 3] for other in (self.always.sensors if self.always else ())
+        ]
+        return any(np.linalg.norm(place_m - other) < self.choose.min_distance_m for other in others)
+
+    def rig(self, chosen: tuple[Sensor, ...], name: str) -> Rig:
+        """The rig of what is always there and of some candidates.
+
+        Raises:
+            ValueError: That is no sensor at all.
+        """
+        return Rig(
+            name=name,
+            description=f"Chosen by a placement search in {self.name!r}, of {len(self.sensors)} candidates.",
+            vehicle=self.vehicle or (self.always.vehicle if self.always else None),
+            sensors=(*(self.always.sensors if self.always else ()), *chosen),
+        )
