@@ -21,15 +21,14 @@ from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
 from torchcover.data.recordings import kitti_files
-from torchcover.data.recordings.argoverse2 import read_feather
 from torchcover.data.recordings.carla_files import read_carla_sensors
 from torchcover.data.recordings.folder_settings import read_folder_settings
 from torchcover.data.recordings.folder_tables import PoseTable
 from torchcover.data.recordings.folder_tables import read_boxes as read_labels
-from torchcover.data.recordings.json_tables import read_table
 from torchcover.data.recordings.ros2 import Ros2
 from torchcover.data.recordings.tracklets import read_tracklets
 from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
+from torchcover.files import read_feather, read_json_table
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.shapes import MeshFile
 from torchcover.simulation.tracks import read_boxes, read_trajectory
@@ -227,7 +226,7 @@ def recording_files(folder):
         (kitti / "oxts" / "data" / "0000000000.txt", kitti_files.read_oxts),
         (kitti / "velodyne_points" / "timestamps.txt", kitti_files.read_timestamps),
         (kitti / "tracklet_labels.xml", boxes),
-        (nuscenes / "v1.0-mini" / "sample_data.json", read_table),
+        (nuscenes / "v1.0-mini" / "sample_data.json", read_json_table),
         (argoverse2 / "annotations.feather", cuboids),
     ):
         yield Kind(path.name, path.read_bytes(), read)

@@ -9,7 +9,7 @@ from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.sumo import Sumo
 from torchcover.simulation.surface_reference import SurfaceReference
 from torchcover.simulation.traffic import Highway, Parking, Urban
-from torchcover.simulation.traffic.procedural import Procedural
+from torchcover.simulation.traffic.kind import Traffic
 
 # By the key `type` in a rig's file.
 SENSORS: dict[str, type[Sensor]] = {"lidar": Lidar, "camera": CameraSensor}
@@ -17,4 +17,4 @@ REFERENCE_SENSORS: dict[str, type[ReferenceSensor]] = {
     sensor.name: sensor for sensor in (EvenReference, PaperReference, SurfaceReference)
 }
 # By the key `type` of a scenario's `traffic`.
-TRAFFIC: dict[str, type[Procedural]] = {"urban": Urban, "highway": Highway, "parking": Parking, "sumo": Sumo}
+TRAFFIC: dict[str, type[Traffic]] = {"urban": Urban, "highway": Highway, "parking": Parking, "sumo": Sumo}

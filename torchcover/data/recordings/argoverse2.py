@@ -1,7 +1,7 @@
 """A log of Argoverse 2's sensor data set (Wilson et al., NeurIPS 2021): both LiDARs, poses and cuboids."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,7 +14,7 @@ from torchcover.data.recordings.calibrated import SensorCalibrations
 from torchcover.data.recordings.recording import Scan, check_times
 from torchcover.data.recordings.tracks import Seen, Tracks
 from torchcover.detection.boxes import Boxes
-from torchcover.files import check_memory, naming, reads
+from torchcover.files import naming, read_feather
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 
@@ -169,35 +169,6 @@ def _camera(row: Mapping[str, Any], vehicle_T_camera: Matrix) -> Calibration:
         vehicle_T_camera=vehicle_T_camera,
         name=str(row["sensor_name"]),
     )
-
-
-@reads("a feather table")
-def read_feather(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Read columns of a feather table.
-
-    Args:
-        path: The file.
-        names: The columns.
-
-    Raises:
-        BadFileError: No such table, a column that is missing or has holes, or no rows.
-        ImportError: pyarrow is not installed.
-    """
-    try:
-        from pyarrow import feather
-    except ImportError as error:
-        raise ImportError(f"{path}: Argoverse 2 needs pyarrow: pip install 'torchcover[av2]'") from error
-    check_memory(4 * path.stat().st_size)
-    table = feather.read_table(path, columns=None)
-    missing = [name for name in names if name not in table.column_names]
-    if missing:
-        raise ValueError(f"the columns {', '.join(names)} are needed; {', '.join(missing)} are missing")
-    if table.num_rows == 0:
-        raise ValueError("a table without rows")
-    holes = [name for name in names if table.column(name).null_count]
-    if holes:
-        raise ValueError(f"the columns {', '.join(holes)} have holes")
-    return {name: table.column(name).to_numpy() for name in names}
 
 
 def _time_ns(path: Path) -> int:
