@@ -4,6 +4,7 @@ from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.even_reference import EvenReference
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.paper_reference import PaperReference
+from torchcover.simulation.recorded.traffic import RecordedTraffic
 from torchcover.simulation.reference_sensor import ReferenceSensor
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.sumo import Sumo
@@ -17,4 +18,10 @@ REFERENCE_SENSORS: dict[str, type[ReferenceSensor]] = {
     sensor.name: sensor for sensor in (EvenReference, PaperReference, SurfaceReference)
 }
 # By the key `type` of a scenario's `traffic`.
-TRAFFIC: dict[str, type[Traffic]] = {"urban": Urban, "highway": Highway, "parking": Parking, "sumo": Sumo}
+TRAFFIC: dict[str, type[Traffic]] = {
+    "urban": Urban,
+    "highway": Highway,
+    "parking": Parking,
+    "sumo": Sumo,
+    "tracks": RecordedTraffic,
+}
