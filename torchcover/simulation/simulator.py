@@ -21,6 +21,7 @@ from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.stage import Stage, Stages
+from torchcover.simulation.standing import warn_of_floating
 from torchcover.simulation.surroundings import Surroundings
 
 # What a step takes at its largest: 73 to 246 were measured, for a LiDAR, a camera and the reference sensors.
@@ -142,13 +143,18 @@ class Simulator:
 
         Raises:
             ValueError: A sensor that is where none can be at the first step, an actor that overlaps the ego at any.
+
+        Warns:
+            UserWarning: Those that move do not stand on the ground.
         """
         if self.scenario.repeats:
             stage, _ = self._stage(0)
             world_steps = stage.scene.world.steps
             indices = np.arange(min(steps, world_steps), dtype=np.int64)  # then they repeat themselves
-            stage.scene.check_apart(np.unique(indices * self._every_steps % world_steps))
+            seen = np.unique(indices * self._every_steps % world_steps)
+            stage.scene.check_apart(seen)
             stage.check_mounts(stage.scene.at(0))
+            warn_of_floating(self.scenario.name, stage.scene, seen)
 
     def labels(self, index: int) -> list[Label]:
         """The objects within the reference sensor's range at one step; names are an object's own within a run."""

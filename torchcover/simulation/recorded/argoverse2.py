@@ -98,5 +98,4 @@ def poses_of(columns: Mapping[str, NDArray[Any]]) -> list[Matrix]:
 
 
 def _seconds(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> Matrix:
-    seconds: Matrix = (columns["timestamp_ns"].astype(np.int64) - origin_ns) * 1e-9
-    return seconds
+    return np.asarray((columns["timestamp_ns"].astype(np.int64) - origin_ns) * 1e-9, dtype=np.float64)
