@@ -19,12 +19,10 @@ from torchcover.detection.boxes import Boxes
 from torchcover.files import naming, read_json_table
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
+from torchcover.simulation.recorded.nuscenes import vehicle_T_ego
 
 CHANNEL = "LIDAR_TOP"
-# The ego frame lies under the rear axle, on the ground; the centre of a Renault Zoe's box is 1.385 m before it, as in
-# the rig `nuscenes`, where the source is. Nothing but the car and what is mounted on it can be in its outline of
-# 4.08 x 1.73 m up to a little above the LiDAR.
-vehicle_T_ego = rigid(np.eye(3), [-1.385, 0.0, 0.0])
+# Nothing but the car and what is mounted on it can be in its outline of 4.08 x 1.73 m up to a little above the LiDAR.
 BODY = BoundingBox((-2.042, -0.865, 0.05), (2.042, 0.865, 2.04))
 
 
