@@ -82,18 +82,19 @@ def _track(obstacle: Element, step_s: float) -> Track:
 
 def _shape(obstacle: Element, name: str) -> tuple[tuple[float, float, float], tuple[float, float]]:
     """Length and width, no height; and the middle, as seen from the obstacle's place."""
+    owner = f"id {name}"
     rectangle, circle, polygon = (obstacle.find(f"shape/{tag}") for tag in ("rectangle", "circle", "polygon"))
     if rectangle is not None:
-        low = -np.array([_number(rectangle, "length", name), _number(rectangle, "width", name)]) / 2
+        low = -np.array([_number(rectangle, "length", owner), _number(rectangle, "width", owner)]) / 2
         high = -low
     elif circle is not None:
-        high = np.full(2, _number(circle, "radius", name))
+        high = np.full(2, _number(circle, "radius", owner))
         low = -high
     elif polygon is not None:
-        corners = [(_number(point, "x", name), _number(point, "y", name)) for point in polygon.iter("point")]
+        corners = [(_number(point, "x", owner), _number(point, "y", owner)) for point in polygon.iter("point")]
         low, high = np.min(corners, axis=0), np.max(corners, axis=0)
     else:
-        raise ValueError(f"id {name}: no rectangle, circle or polygon as its shape, so no size")
+        raise ValueError(f"{owner}: no rectangle, circle or polygon as its shape, so no size")
     middle_m: Matrix = (low + high) / 2
     length, width = checked_size(name, high - low)
     return (length, width, math.nan), (float(middle_m[0]), float(middle_m[1]))

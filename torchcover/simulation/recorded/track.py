@@ -82,6 +82,7 @@ def track_of(
     Raises:
         ValueError: No size, times that do not ascend, numbers that are none; the message names the id.
     """
+    checked_size(name, sizes_m.min(axis=0))
     length, width, height = checked_size(name, np.median(sizes_m, axis=0))
     places_m = world_T_box[:, :3, 3] - sizes_m[:, 2:] / 2 * world_T_box[:, :3, 2]
     angles_deg = euler_from_rotation(world_T_box[:, :3, :3])
