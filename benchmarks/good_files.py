@@ -17,6 +17,8 @@ from PIL import Image
 from tests.cli.hostile import CAMERA, RIG, TOWN, YARD
 from tests.data.drives import Drive
 from tests.data.layouts import LAYOUTS
+from tests.simulation.recorded.drives import OTHERS, write_argoverse2, write_commonroad, write_csv, write_nuscenes
+from tests.simulation.sumo.towns import drive, fcd, street, together, write_net
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
@@ -30,7 +32,11 @@ from torchcover.data.recordings.tracklets import read_tracklets
 from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
 from torchcover.files import read_feather, read_json_table
 from torchcover.simulation import Rig, Scenario
+from torchcover.simulation.recorded.formats import format_of
 from torchcover.simulation.shapes import MeshFile
+from torchcover.simulation.sumo.floating import Window, read_floating
+from torchcover.simulation.sumo.network import read_network
+from torchcover.simulation.sumo.types import read_types
 from torchcover.simulation.tracks import read_boxes, read_trajectory
 
 
@@ -207,6 +213,32 @@ def scene_files():
     yield Kind("town.yaml", TOWN.encode(), Scenario.load)
 
 
+def track_files(folder):
+    """Recorded tracks, and files of SUMO."""
+    log = write_argoverse2(Path(folder) / "log", OTHERS[:3])
+    tables = write_nuscenes(Path(folder) / "tables", OTHERS[:3])
+    table = write_csv(Path(folder) / "table", OTHERS[:2])
+    for path in (*sorted(log.glob("*.feather")), *sorted(tables.glob("*.json"))):
+        others = ((other.name, other.read_bytes()) for other in path.parent.iterdir() if other != path)
+        yield Kind(path.name, path.read_bytes(), in_folder, tuple(others))
+    commonroad = write_commonroad(Path(folder) / "commonroad.xml", OTHERS[:2])
+    for path in (commonroad, table / "boxes.csv"):
+        yield Kind(f"tracks_{path.name}", path.read_bytes(), lambda path: format_of(path).read(path, None))
+    yield Kind("town.net.xml", write_net(Path(folder) / "a.net.xml", street()).read_bytes(), read_network)
+    driven = fcd(together(drive(until=2.0), drive("b", start=90.0, until=2.0))).encode()
+    yield Kind("fcd.xml", driven, lambda path: read_floating(path, Window(0.0, 1.0)))
+    yield Kind("town.rou.xml", ROUTES, read_types)
+
+
+def in_folder(path):
+    """Read the tracks that a file belongs to."""
+    return format_of(path.parent).read(path.parent, None)
+
+
+ROUTES = b"""<routes><vType id="taxi" vClass="taxi" length="4.6"/><vType id="bike" vClass="bicycle"/>
+<vehicle id="a" type="taxi" depart="0"><route edges="east west"/></vehicle></routes>"""
+
+
 def recording_files(folder):
     """What recordings are made of beside clouds, as a drive leaves it."""
     drive, places = Drive(steps=3), {}
@@ -317,6 +349,7 @@ def kinds(folder):
         Kind("labels.csv", LABELS, read_labels),
         Kind("coverage.npz", coverage(folder), Coverage.load),
         *scene_files(),
+        *track_files(folder),
         *recording_files(folder),
         Kind("checkpoint.npz", checkpoint(folder), lambda path: read_state(path, read_header(path), "one")),
     )

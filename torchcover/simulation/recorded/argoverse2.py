@@ -45,7 +45,7 @@ MAX_CLOCK_GAP_S = 0.1
 
 def files(path: Path) -> list[Path] | None:
     """The files of a log; None if it is none."""
-    found = [path / name for name in ANNOTATIONS if (path / name).is_file()]
+    found = [path / name for name in ANNOTATIONS if (path / name).exists()]
     return [found[0], path / POSES] if found else None
 
 

@@ -37,11 +37,11 @@ def files(path: Path) -> list[Path] | None:
     if not path.is_dir():
         return None
     folders = [path, *sorted(path.glob("v1.0-*"))]
-    found = [folder for folder in folders if (folder / "sample_annotation.json").is_file()]
+    found = [folder for folder in folders if (folder / "sample_annotation.json").exists()]
     if len(found) != 1:
         return None
     scenes = found[0] / "scene.json"
-    return [*(found[0] / f"{name}.json" for name in TABLES), *([scenes] if scenes.is_file() else [])]
+    return [*(found[0] / f"{name}.json" for name in TABLES), *([scenes] if scenes.exists() else [])]
 
 
 def read(path: Path, scene: str | None) -> Recording:
