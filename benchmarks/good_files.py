@@ -18,7 +18,7 @@ from tests.cli.hostile import CAMERA, RIG, TOWN, YARD
 from tests.data.drives import Drive
 from tests.data.layouts import LAYOUTS
 from tests.simulation.recorded.drives import OTHERS, write_argoverse2, write_commonroad, write_csv, write_nuscenes
-from tests.simulation.sumo.towns import drive, fcd, street, together, write_net
+from tests.simulation.sumo.towns import XODR, drive, fcd, street, together, write_net
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
@@ -36,6 +36,7 @@ from torchcover.simulation.recorded.formats import format_of
 from torchcover.simulation.shapes import MeshFile
 from torchcover.simulation.sumo.floating import Window, read_floating
 from torchcover.simulation.sumo.network import read_network
+from torchcover.simulation.sumo.simulating import from_opendrive
 from torchcover.simulation.sumo.types import read_types
 from torchcover.simulation.tracks import read_boxes, read_trajectory
 
@@ -228,6 +229,7 @@ def track_files(folder):
     driven = fcd(together(drive(until=2.0), drive("b", start=90.0, until=2.0))).encode()
     yield Kind("fcd.xml", driven, lambda path: read_floating(path, Window(0.0, 1.0)))
     yield Kind("town.rou.xml", ROUTES, read_types)
+    yield Kind("road.xodr", XODR.encode(), lambda path: from_opendrive(path, Path(folder)))
 
 
 def in_folder(path):
