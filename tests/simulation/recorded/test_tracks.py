@@ -1,5 +1,7 @@
 """Recorded tracks as scenarios: where everybody is, on what ground, and what repeats."""
 
+import pickle
+
 import numpy as np
 import pytest
 
@@ -118,6 +120,14 @@ def test_nothing_is_drawn(written):
     for mine, its in zip((one.ego, *one.actors), (other.ego, *other.actors), strict=True):
         assert (mine.name, mine.category) == (its.name, its.category)
         np.testing.assert_array_equal(mine.trajectory.positions_m, its.trajectory.positions_m)
+
+
+def test_a_step_is_the_same_in_another_process(written):
+    drive, *_ = opened(written, "argoverse2")
+    simulator = Simulator(drive, {"rig": RIG}, FEW)
+    seen, there = simulator.step(7), pickle.loads(pickle.dumps(simulator)).step(7)
+    np.testing.assert_array_equal(seen.clouds["rig"], there.clouds["rig"])
+    np.testing.assert_array_equal(seen.reference, there.reference)
 
 
 def heights_of(mesh, places_m):
@@ -248,6 +258,19 @@ def test_who_was_not_seen_for_too_long_was_not_there(tmp_path):
     np.testing.assert_array_equal(there[1], [0, 0, 0, 0, 0, 1, 1])
     world = scenario(folder / "boxes.csv", max_gap_s=2.0, **keys).world()
     assert np.isfinite(of(world, "a1").trajectory.positions_at(times_s)).all()
+
+
+def test_who_is_seen_at_an_instant_is_there_whatever_is_subtracted_of_the_times(written):
+    for begin_s in (0.2, 0.6, 1.4):
+        drive, *_ = opened(written, "table")
+        world = Scenario.model_validate(
+            {"name": "part", "traffic": drive.traffic.model_copy(update={"begin_s": begin_s}).model_dump()}
+        ).world()
+        last = round((2.8 - begin_s) / 0.1)
+        times_s = 0.1 * np.array([last, last + 1], dtype=np.float64)
+        np.testing.assert_array_equal(
+            np.isfinite(of(world, "a8").trajectory.positions_at(times_s)[:, 0]), [True, False], err_msg=str(begin_s)
+        )
 
 
 def test_who_is_where_the_ego_is_is_left_out_and_named(tmp_path):
