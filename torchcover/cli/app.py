@@ -258,12 +258,15 @@ def show(
     vehicle: options.Vehicle = None,
     step: Annotated[int | None, typer.Option(min=0, help="Time step of the scenario or the depth images (0).")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the simulation, likewise (0).")] = None,
+    film: Annotated[
+        Path | None, typer.Option(help="For a scenario: 10 s of it from that step on, as a .gif or .mp4 (ffmpeg) file.")
+    ] = None,
     out: options.Out = Path("out"),
 ) -> None:
     """Draw a rig on its vehicle and the depth images of its cameras, or a frame of a scenario from above."""
     from torchcover.cli.show import run
 
-    run(name, scenario=scenario, rig=rig, vehicle=vehicle, step=step, seed=seed, out=out)
+    run(name, scenario=scenario, rig=rig, vehicle=vehicle, step=step, seed=seed, film=film, out=out)
 
 
 app.command()(targets)
