@@ -42,6 +42,8 @@ class Simulator:
         reference_sensor: The reference sensor.
         seed: Seed of the traffic, of the reference sensor, and of noise and drop-out.
         every_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
+        kept_bytes: What the worlds that are kept, in case they are needed again, may take; a small share of the
+            machine's memory if not given.
 
     Raises:
         ValueError: Rigs that name different vehicles, a negative seed, a time that is no multiple of the time step,
@@ -64,6 +66,7 @@ class Simulator:
         *,
         seed: int = 0,
         every_s: float | None = None,
+        kept_bytes: float | None = None,
     ) -> None:
         if seed < 0:
             raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
@@ -72,7 +75,7 @@ class Simulator:
         self.reference_sensor = reference_sensor
         self.seed = seed
         self._every_steps = 1 if every_s is None else scenario.steps_in(every_s)
-        self._stages = Stages(scenario, rigs, seed)
+        self._stages = Stages(scenario, rigs, seed, kept_bytes)
         self._check_size()
 
     @property
@@ -105,6 +108,41 @@ class Simulator:
         other._check_size()
         return other
 
+    def with_rigs(self, rigs: Mapping[str, Rig]) -> Self:
+        """The same instants as other rigs see them, on the same ego; the geometry is built once for both.
+
+        Args:
+            rigs: The sensors, by the name under which `scans` has what they see. What vehicle they name says nothing.
+        """
+        other = copy.copy(self)
+        other.rigs = rigs
+        other._stages = self._stages.with_rigs(rigs)
+        other._check_size()
+        return other
+
+    def scans(self, index: int) -> Mapping[str, Sequence[Scan]]:
+        """What the sensors see at one step, as in `step`, bit for bit; the reference is not cast.
+
+        Args:
+            index: Number of the step, from 0.
+
+        Returns:
+            Name of each rig -> what each of its sensors saw.
+
+        Raises:
+            FileNotFoundError: A mesh, vehicle or trajectory file is missing.
+            ValueError: As for `step`.
+
+        Example:
+            >>> from torchcover.simulation import PaperReference
+            >>> empty = Simulator(Scenario.load("courtyard"), {}, PaperReference(rows=16, columns=16))
+            >>> [roof] = empty.with_rigs({"candidate": Rig.load("front_roof_128")}).scans(0)["candidate"]
+            >>> roof.rays, roof.points.dtype
+            (230400, dtype('float32'))
+        """
+        stage, instant = self._placed(index)
+        return self._scans(stage, instant, index)
+
     def step(self, index: int) -> Observation:
         """What is seen at one step.
 
@@ -116,10 +154,8 @@ class Simulator:
             ValueError: A negative index, a sensor inside a body or below the ground, an actor that overlaps the ego, an
                 ego below the ground.
         """
-        stage, step = self._stage(index)
-        instant = stage.scene.at(step, within_m=self._reach_m(stage.scene.ego_box))
-        stage.check_mounts(instant)
-        scans = {name: self._scan_rig(sensors, instant, index) for name, sensors in stage.mounted.items()}
+        stage, instant = self._placed(index)
+        scans = self._scans(stage, instant, index)
         reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
         return Observation(
@@ -188,6 +224,13 @@ class Simulator:
         run, step = self.scenario.locate(index * self._every_steps)
         return self._stages.of_run(run), step
 
+    def _placed(self, index: int) -> tuple[Stage, Instant]:
+        """The stage of a step, and all of it at its time, with no sensor where none can be."""
+        stage, step = self._stage(index)
+        instant = stage.scene.at(step, within_m=self._reach_m(stage.scene.ego_box))
+        stage.check_mounts(instant)
+        return stage, instant
+
     def _reach_m(self, ego: BoundingBox) -> float:
         """How far from the origin of the vehicle frame a sensor can see: its range starts where it is mounted."""
         farthest_m = np.abs(ego.corners_m).max(axis=0) + self.reference_sensor.shell_m
@@ -197,6 +240,9 @@ class Simulator:
             for sensor in rig.sensors
         ]
         return max([float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches])
+
+    def _scans(self, stage: Stage, instant: Instant, index: int) -> dict[str, list[Scan]]:
+        return {name: self._scan_rig(sensors, instant, index) for name, sensors in stage.mounted.items()}
 
     def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[Scan]:
         scans = []
