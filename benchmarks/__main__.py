@@ -32,11 +32,8 @@ BENCHMARKS = (
     "scaling",
     "mutated_files",
     "targets",
-<<<<<<< HEAD
     "towns",
-=======
     "pairing",
->>>>>>> instants
 )
 
 
