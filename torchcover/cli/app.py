@@ -260,7 +260,7 @@ def rig(
 
 @app.command()
 def show(
-    name: Annotated[str, typer.Argument(help="Rig or scenario: a built-in name (see `list`) or a YAML file.")],
+    name: Annotated[str, typer.Argument(help="Rig, scenario or vehicle: a built-in name (see `list`) or a YAML file.")],
     scenario: Annotated[
         str | None, typer.Option(help="For a rig: the scenario whose ego carries it and that it sees (courtyard).")
     ] = None,
@@ -273,7 +273,7 @@ def show(
     ] = None,
     out: options.Out = Path("out"),
 ) -> None:
-    """Draw a rig on its vehicle and the depth images of its cameras, or a frame of a scenario from above."""
+    """Draw a rig and the depth images of its cameras, a frame of a scenario, or the mount regions of a vehicle."""
     from torchcover.cli.show import run
 
     run(name, scenario=scenario, rig=rig, vehicle=vehicle, step=step, seed=seed, film=film, out=out)

@@ -1,4 +1,4 @@
-"""`torchcover show`: which of the two is meant, a rig or a scenario; its pictures."""
+"""`torchcover show`: what is meant, a rig, a scenario or a vehicle; its pictures."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -8,15 +8,18 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.progress import track
 
-from torchcover.evaluation import cameras_of, rig_pictures, scenario_pictures
+from torchcover.evaluation import cameras_of, rig_pictures, scenario_pictures, vehicle_picture
 from torchcover.evaluation.rig_names import as_called
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
 from torchcover.files import BadFileError
 from torchcover.report import check_film, write_film
 from torchcover.simulation import Scenario, builtin_names
-from torchcover.simulation.documents import read_mapping
+from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.documents import load_document, read_mapping
 
 DEFAULT_RIG = "front_roof_128"
+# Kinds of documents, and the key that only such a one has.
+KINDS = {"rig": "sensors", "scenario": "ego", "vehicle": "parts"}
 # A film shows this much, at this pace; both may be a little off, for steps are whole.
 FILM_S, PER_S = 10.0, 5.0
 
@@ -37,11 +40,18 @@ def run(
     A film shows what follows in a scenario instead.
 
     Raises:
-        ValueError: The name of neither or of both, an option for the other kind, or a document that is not valid.
+        ValueError: The name of none or of several, an option for another kind, or a document that is not valid.
         FileNotFoundError: No such file.
     """
-    console = Console()
-    if _is_rig(name):
+    console, kind = Console(), _kind(name)
+    if kind == "vehicle":
+        given = {"--scenario": scenario, "--rig": rig, "--vehicle": vehicle, "--step": step, "--seed": seed}
+        _refuse("rigs and scenarios", given | {"--film": film}, f"{name!r} is a vehicle")
+        body = load_document(Vehicle, "vehicles", name)
+        _say(console, body.description)
+        _write(console, out / Path(name).stem, [("", vehicle_picture(body))])
+        return
+    if kind == "rig":
         _refuse("a scenario", {"--rig": rig, "--film": film}, f"{name!r} is a rig")
         shown = as_called(name)
         if not cameras_of(shown):
@@ -86,21 +96,25 @@ def _steps_of_film(world: Scenario, first: int) -> range:
     return range(first, first + max(round(FILM_S / world.step_s), every) + 1, every)
 
 
-def _is_rig(name: str) -> bool:
+def _kind(name: str) -> str:
+    """Which of `KINDS` is meant."""
     if Path(name).suffix in (".yaml", ".yml"):
-        return _has_sensors(Path(name))
-    rigs, scenarios = builtin_names("rigs"), builtin_names("scenarios")
-    if (name in rigs) == (name in scenarios):
-        which = "both a rig and a scenario: give the YAML file" if name in rigs else "neither a .yaml file nor built in"
-        raise ValueError(f"{name!r} is {which}; rigs: {', '.join(rigs)}; scenarios: {', '.join(scenarios)}")
-    return name in rigs
+        return _kind_of_file(Path(name))
+    of = {kind: builtin_names(f"{kind}s") for kind in KINDS}
+    kinds = [kind for kind, names in of.items() if name in names]
+    if len(kinds) != 1:
+        both = f"both a {' and a '.join(kinds)}: give the YAML file"
+        known = "; ".join(f"{kind}s: {', '.join(names)}" for kind, names in of.items())
+        raise ValueError(f"{name!r} is {both if kinds else 'neither a .yaml file nor built in'}; {known}")
+    return kinds[0]
 
 
-def _has_sensors(path: Path) -> bool:
+def _kind_of_file(path: Path) -> str:
     try:
-        return "sensors" in read_mapping(path)
+        keys = read_mapping(path)
     except BadFileError:
-        return False  # whatever loads it says what is wrong
+        return "scenario"  # whatever loads it says what is wrong
+    return next((kind for kind, key in KINDS.items() if key in keys), "scenario")
 
 
 def _refuse(kind: str, options: dict[str, Any], reason: str) -> None:

@@ -9,10 +9,14 @@ from torchcover.data import GRID_X_M, GRID_Y_M, SimulatedFrames
 from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
-from torchcover.report import ActorMark, Standing, draw_depths, draw_rig, draw_scene
+from torchcover.report import ActorMark, SkinPatch, Standing, draw_depths, draw_rig, draw_scene, draw_vehicle
 from torchcover.simulation import CameraSensor, PaperReference, Rig, Scenario
+from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.mount_regions import MountRegion
+from torchcover.simulation.skin import Skin
 from torchcover.simulation.world import Actor, World
 
+PATCH_PLACES = 12  # along each side of a mount region
 FLAT = 0.9  # the least cosine between a face's normal and z
 # A picture needs fewer points than a measurement.
 REFERENCE = PaperReference(rows=256, columns=512)
@@ -84,6 +88,31 @@ def scenario_pictures(
             subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name} on {frames.scenario.ego_name}",
             path_m=_path_m(scene.world, time_s),
         )
+
+
+def vehicle_picture(vehicle: Vehicle) -> Figure:
+    """A vehicle from all sides, with its mount regions.
+
+    Args:
+        vehicle: The vehicle.
+
+    Raises:
+        ValueError: Nothing of the vehicle is seen in a part of a region.
+    """
+    mesh = vehicle.mesh()
+    skin, size_m = Skin(mesh), BoundingBox.around(mesh.vertices_m).size_m
+    patches = [_patch(name, region, skin) for name, region in vehicle.mount_regions.items()]
+    subtitle = f"{' x '.join(f'{extent:.2f}' for extent in size_m)} m; {len(patches) or 'no'} mount regions"
+    return draw_vehicle(mesh.vertices_m, mesh.faces, patches, title=vehicle.name, subtitle=subtitle)
+
+
+def _patch(name: str, region: MountRegion, skin: Skin) -> SkinPatch:
+    shares = np.linspace(0.0, 1.0, PATCH_PLACES).tolist()
+    try:
+        places_m = [[region.on(skin, u, v).place_m for v in shares] for u in shares]
+    except ValueError as error:
+        raise ValueError(f"mount region {name!r}: {error}") from error
+    return SkinPatch(name, region.seen_from, np.array(places_m))
 
 
 def _path_m(world: World, time_s: float) -> Matrix | None:

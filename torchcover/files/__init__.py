@@ -8,13 +8,14 @@ from torchcover.files.json_tables import read_json_table
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, npz_headers, read_npy, read_npz, write_npz
 from torchcover.files.text import decode, read_short_text
 from torchcover.files.xml_text import feed_xml, parse_xml
-from torchcover.files.yaml_text import parse_yaml
+from torchcover.files.yaml_text import as_yaml, parse_yaml
 
 __all__ = [
     "DEFLATE_MAX_RATIO",
     "BadFileError",
     "NpyHeader",
     "TooLargeError",
+    "as_yaml",
     "check_memory",
     "decode",
     "feed_xml",

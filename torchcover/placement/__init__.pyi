@@ -1,5 +1,7 @@
 from .bits import Bits as Bits
 from .common_instants import CommonInstants as CommonInstants
+from .constraints import Constraints as Constraints
+from .free_sensor import FreeSensor as FreeSensor
 from .fresh import FreshGain as FreshGain
 from .fresh import FreshTest as FreshTest
 from .fresh import fresh_test as fresh_test
@@ -11,3 +13,7 @@ from .racing import paired as paired
 from .racing import race as race
 from .racing import racing_order as racing_order
 from .scores import Scores as Scores
+from .space import SearchSpace as SearchSpace
+from .variables import Choice as Choice
+from .variables import Number as Number
+from .variables import Variable as Variable

@@ -5,6 +5,7 @@ from torchcover.report.drawings.four_views import draw_four_views
 from torchcover.report.drawings.frame import ActorMark, Standing, draw_depths, draw_scene
 from torchcover.report.drawings.rig import draw_rig
 from torchcover.report.drawings.targets import draw_targets
+from torchcover.report.drawings.vehicle import SkinPatch, draw_vehicle
 from torchcover.report.drawings.work_precision import WorkPanel, draw_work_precision
 from torchcover.report.maps.arrays import draw_map, draw_side_by_side
 from torchcover.report.maps.colours import ColourScale, difference_scale, error_scale, scale_of
@@ -39,6 +40,7 @@ __all__ = [
     "Remark",
     "Row",
     "SensorView",
+    "SkinPatch",
     "Standing",
     "Words",
     "WorkPanel",
@@ -54,6 +56,7 @@ __all__ = [
     "draw_scene",
     "draw_side_by_side",
     "draw_targets",
+    "draw_vehicle",
     "draw_work_precision",
     "error_scale",
     "error_words",
