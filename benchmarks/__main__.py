@@ -32,9 +32,9 @@ BENCHMARKS = (
     "scaling",
     "mutated_files",
     "targets",
-    "towns",
     "pairing",
     "placement",
+    "towns",
 )
 
 

@@ -11,13 +11,13 @@ from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
 from torchcover.placement.candidate_group import MOST_CANDIDATES, CandidateGroup
 from torchcover.placement.carrier import Carrier
 from torchcover.placement.constraints import APART_M
-from torchcover.placement.named import NamedRig, Names
+from torchcover.placement.named import NamedRig, NamedVehicle, Names
 from torchcover.placement.objective import Objective
 from torchcover.placement.prices import MOUNT
 from torchcover.placement.question_grid import QuestionGrid
 from torchcover.placement.subsets import Limits
 from torchcover.simulation import Document, Rig, Scenario, Sensor, with_ego
-from torchcover.simulation.documents import NameOrFile, read_document
+from torchcover.simulation.documents import read_document
 
 
 class ChoiceLimits(Document):
@@ -76,7 +76,7 @@ class ChoiceSpace(Document):
     description: str = ""
     always: NamedRig | None = None
     scenario: Names
-    vehicle: NameOrFile | None = None
+    vehicle: NamedVehicle | None = None
     candidates: dict[Annotated[str, Field(min_length=1)], CandidateGroup] = Field(min_length=1)
     choose: ChoiceLimits
     cost: dict[str, NonNegativeFloat] = Field(default_factory=dict)

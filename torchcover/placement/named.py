@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, PlainValidator, ValidationInfo
+from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, ValidationInfo
 
 from torchcover.simulation import Rig
 from torchcover.simulation.documents import NameOrFile, beside, is_file_name
@@ -21,6 +21,12 @@ def _rig(given: Any, info: ValidationInfo) -> Rig:  # noqa: ANN401  (whatever st
         raise ValueError(str(error)) from error
 
 
+def _vehicle(given: str) -> str:
+    if Path(given).suffix and not is_file_name(given):
+        raise ValueError(f"the name of a vehicle, or the path of its YAML file, is needed; got {given!r}")
+    return given
+
+
 def _listed(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
     return (given,) if isinstance(given, str) else given
 
@@ -29,3 +35,5 @@ def _listed(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
 NamedRig = Annotated[Rig, PlainValidator(_rig)]
 # One name or file, or several.
 Names = Annotated[tuple[NameOrFile, ...], BeforeValidator(_listed), Field(min_length=1)]
+# A vehicle's.
+NamedVehicle = Annotated[NameOrFile, AfterValidator(_vehicle)]

@@ -65,7 +65,7 @@ class SearchSpace(Document):
     description: str = ""
     start: NamedRig
     scenario: Names
-    vehicle: NameOrFile | None = None
+    vehicle: NamedVehicle | None = None
     free: dict[str, FreeSensor] = Field(min_length=1)
     constraints: Constraints = Constraints()
     cost: dict[NameOrFile, NonNegativeFloat] = Field(default_factory=dict)
@@ -76,7 +76,7 @@ class SearchSpace(Document):
         """Read a space from a YAML file.
 
         Raises:
-            FileNotFoundError: No such file, or of one that it names.
+            FileNotFoundError: No such file.
             BadFileError: Not YAML, or no space in which a search makes sense; the message names the file and the key.
         """
         return read_document(cls, Path(path))
@@ -107,7 +107,10 @@ class SearchSpace(Document):
 
     @model_validator(mode="after")
     def _check_places(self) -> Self:
-        carrier = self._carrier
+        try:
+            carrier = self._carrier
+        except FileNotFoundError as error:
+            raise ValueError(str(error)) from error
         for name, free in self.free.items():
             for region in (free.region,) if isinstance(free.region, str) else free.region or ():
                 try:
