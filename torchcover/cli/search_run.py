@@ -7,19 +7,28 @@ import typer
 from rich.console import Console
 
 from torchcover.evaluation import claimed
-from torchcover.placement import PlacementSearch, SearchPlan, SearchSpace
+from torchcover.placement import ChoiceSpace, CommonInstants, PlacementSearch, SearchPlan, SearchSpace, choose
+from torchcover.placement.choice_files import HEADINGS as CHOSEN_HEADINGS
+from torchcover.placement.choice_files import chosen_rows, save_choice
+from torchcover.placement.choosing import OBJECTIVE
 from torchcover.placement.journal import NAME
 from torchcover.placement.result_page import HEADINGS, gain_rows
 from torchcover.report import narrowest_width, text_table
+from torchcover.simulation.documents import read_mapping
+
+CHOICE_KEY = "candidates"
 
 
 def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noqa: ANN401  (those of `SearchPlan`)
-    """Search, write and print what was found.
+    """Search, write and print what was found: better values of what is free, or a choice of candidates.
 
     Raises:
         ValueError: A space, an option or a budget that cannot be used.
         FileNotFoundError: An unknown name or file.
     """
+    if CHOICE_KEY in read_mapping(path):
+        _choose(ChoiceSpace.load(path), out, resume=resume, **settings)
+        return
     search = PlacementSearch(SearchSpace.load(path), SearchPlan(**settings))
     if resume and not (out / NAME).exists():
         typer.echo(f"torchcover: {out / NAME} is not there: the search starts with its first candidate", err=True)
@@ -31,3 +40,30 @@ def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noq
     Console(width=max(console.width, narrowest_width([table]))).print(table)
     console.print(f"Wrote {', '.join(file.name for file in files)} to {out}", markup=False, soft_wrap=True)
     console.print(result.sentence, markup=False, soft_wrap=True)
+
+
+def _choose(space: ChoiceSpace, out: Path, *, resume: bool, **settings: Any) -> None:  # noqa: ANN401
+    if resume or settings["evaluations"] is not None or settings["optimiser"] != "auto":
+        raise ValueError("--resume, --evaluations, --optimiser: candidates are all looked at; leave them out")
+    plan = SearchPlan(**settings)
+    with claimed(out):
+        instants = CommonInstants(
+            space.scenarios,
+            {OBJECTIVE: space.objective},
+            worlds=plan.worlds,
+            per_world=plan.per_world,
+            every_s=plan.every_s,
+            seed=plan.seed,
+            rays=plan.rays,
+            workers=plan.workers,
+        )
+        with instants:
+            found = choose(
+                space, instants, test_seed=plan.seed_of_test, fresh_worlds=plan.fresh_worlds, measure=plan.measure
+            )
+        files = save_choice(found, out)
+    table = text_table(CHOSEN_HEADINGS, [chosen_rows(found)], title=f"{space.name}: {len(found.sensors)} candidates")
+    console = Console()
+    Console(width=max(console.width, narrowest_width([table]))).print(table)
+    console.print(f"Wrote {', '.join(file.name for file in files)} to {out}", markup=False, soft_wrap=True)
+    console.print(found.sentence, markup=False, soft_wrap=True)

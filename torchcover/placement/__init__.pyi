@@ -1,4 +1,10 @@
 from .bits import Bits as Bits
+from .candidate_group import CandidateGroup as CandidateGroup
+from .candidate_group import MountGrid as MountGrid
+from .choice_space import ChoiceLimits as ChoiceLimits
+from .choice_space import ChoiceSpace as ChoiceSpace
+from .choosing import SensorChoice as SensorChoice
+from .choosing import choose as choose
 from .common_instants import CommonInstants as CommonInstants
 from .constraints import Constraints as Constraints
 from .evaluation import Candidate as Candidate
@@ -26,6 +32,12 @@ from .running import run_search as run_search
 from .scores import Scores as Scores
 from .search import PlacementSearch as PlacementSearch
 from .space import SearchSpace as SearchSpace
+from .subsets import Candidates as Candidates
+from .subsets import Limits as Limits
+from .subsets import Subset as Subset
+from .subsets import exact as exact
+from .subsets import greedy as greedy
 from .variables import Choice as Choice
 from .variables import Number as Number
 from .variables import Variable as Variable
+from .worth import Worth as Worth

@@ -22,7 +22,7 @@ DRAWN = 1000
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
+class SensorChoice:
     """What was chosen, and how good that is.
 
     Args:
@@ -135,7 +135,7 @@ def choose(
     test_seed: int,
     fresh_worlds: int,
     measure: Measure = "area",
-) -> Choice:
+) -> SensorChoice:
     """Find the best choice of candidates, and compare it with today's in worlds that it was not chosen by.
 
     Each candidate is scanned once at each instant; what a choice sees is the OR of what its sensors see.
@@ -163,7 +163,7 @@ def choose(
         if lost := [name for name in space.now if name not in places]:
             raise ValueError(f"now: {lost[0]} cannot be there: {refused[lost[0]]}")
         now = tuple(places[name] for name in space.now)
-    found = Choice(
+    found = SensorChoice(
         space,
         measure,
         sensors,
@@ -202,7 +202,7 @@ def _mounted(space: ChoiceSpace, instants: CommonInstants) -> tuple[tuple[Sensor
     return tuple(sensors), bits, refused
 
 
-def _tested(found: Choice, instants: CommonInstants, test_seed: int, worlds: int) -> Choice:
+def _tested(found: SensorChoice, instants: CommonInstants, test_seed: int, worlds: int) -> SensorChoice:
     if set(found.best.chosen) == set(found.now):
         return replace(found, untested="it is what is there today")
     now = found.rig_of(found.now, f"{found.space.name}_now")

@@ -2,7 +2,7 @@
 
 import csv
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -38,9 +38,9 @@ def save_search(result: SearchResult, folder: Path) -> list[Path]:
         with held_back():  # what was found is safe before anything ends this
             for name, rig in _rigs(result).items():
                 files.add(name, rig.save)
-            files.add("evaluations.csv", partial(_write_rows, list(evaluation_rows(result))))
-            files.add("pareto.csv", partial(_write_rows, list(pareto_rows(result))))
-            files.add("search.json", partial(_write_text, json.dumps(record, indent=2, allow_nan=False) + "\n"))
+            files.add("evaluations.csv", partial(write_rows, list(evaluation_rows(result))))
+            files.add("pareto.csv", partial(write_rows, list(pareto_rows(result))))
+            files.add("search.json", partial(write_text, json.dumps(record, indent=2, allow_nan=False) + "\n"))
             files.publish(summary)
         pictures = {}
         for stem, title, figure in search_pictures(result):
@@ -48,9 +48,9 @@ def save_search(result: SearchResult, folder: Path) -> list[Path]:
             figure.savefig(png, dpi=figure.dpi)
             pictures[f"{stem}.png"] = PagePicture(title, png.getvalue())
         for name, picture in pictures.items():
-            files.add(name, partial(_write_bytes, picture.png))
+            files.add(name, partial(write_bytes, picture.png))
         page = search_page(result, list(pictures.values()))
-        files.add("report.html", partial(_write_text, page_html(page)))
+        files.add("report.html", partial(write_text, page_html(page)))
         files.publish(summary)
     return files.paths
 
@@ -72,7 +72,7 @@ def evaluation_rows(result: SearchResult) -> Iterator[Sequence[object]]:
         state, why = _state(result, one)
         hits = None if one.scores is None else one.scores.self_hit_share
         values = [one.values.get(name) for name in variables]
-        cells = map(_cell, [*values, *each, one.instants, hits, _cost(result, one), round(one.seconds, 3)])
+        cells = map(cell, [*values, *each, one.instants, hits, _cost(result, one), round(one.seconds, 3)])
         yield [one.number, one.arm, state, *cells, why]
 
 
@@ -85,7 +85,7 @@ def pareto_rows(result: SearchResult) -> Iterator[Sequence[object]]:
         for at in arm.front:
             one = arm.evaluations[at]
             values = [one.values.get(variable) for variable in variables]
-            yield [name, one.number, *map(_cell, [*arm.gains[at].tolist(), _cost(result, one), *values])]
+            yield [name, one.number, *map(cell, [*arm.gains[at].tolist(), _cost(result, one), *values])]
 
 
 def _means(result: SearchResult, scores: Scores) -> list[float]:
@@ -119,20 +119,24 @@ def _rigs(result: SearchResult) -> dict[str, Rig]:
     return {"best.yaml": result.rig} | {f"best_{stem}.yaml": pick.rig for stem, pick in zip(stems, ends, strict=True)}
 
 
-def _cell(value: object) -> object:
+def cell(value: object) -> object:
+    """What stands in a table; nothing for what nobody knows."""
     if value is None or value != value:
         return ""
     return f"{value:.9g}" if isinstance(value, float) else value
 
 
-def _write_rows(rows: Sequence[Sequence[object]], path: Path) -> None:
+def write_rows(rows: Sequence[Iterable[object]], path: Path) -> None:
+    """Write a table as CSV."""
     with path.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
 
 
-def _write_text(text: str, path: Path) -> None:
+def write_text(text: str, path: Path) -> None:
+    """Write a text."""
     path.write_text(text, encoding="utf-8")
 
 
-def _write_bytes(data: bytes, path: Path) -> None:
+def write_bytes(data: bytes, path: Path) -> None:
+    """Write what is encoded already."""
     path.write_bytes(data)

@@ -13,7 +13,7 @@ from pydantic import Field, NonNegativeFloat, model_validator
 from torchcover.placement.carrier import Carrier
 from torchcover.placement.constraints import Constraints, misplaced
 from torchcover.placement.free_sensor import FreeSensor, mirrored
-from torchcover.placement.named import NamedRig, Names
+from torchcover.placement.named import NamedRig, NamedVehicle, Names
 from torchcover.placement.objective import Objective
 from torchcover.placement.prices import check_prices, price_eur
 from torchcover.placement.question_grid import QuestionGrid

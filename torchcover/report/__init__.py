@@ -1,5 +1,6 @@
 """What a run shows: a table and its renderers, maps, drawings, a page. Imports matplotlib and rich: import it late."""
 
+from torchcover.report.drawings.choice import ChoiceSize, draw_choice
 from torchcover.report.drawings.film import check_film, write_film
 from torchcover.report.drawings.four_views import draw_four_views
 from torchcover.report.drawings.frame import ActorMark, Standing, draw_depths, draw_scene
@@ -30,6 +31,7 @@ __all__ = [
     "RENDERERS",
     "UNITS",
     "ActorMark",
+    "ChoiceSize",
     "ColourScale",
     "CoverageTable",
     "Line",
@@ -52,6 +54,7 @@ __all__ = [
     "check_film",
     "difference_heading",
     "difference_scale",
+    "draw_choice",
     "draw_depths",
     "draw_four_views",
     "draw_fronts",
