@@ -235,7 +235,7 @@ def test_where_no_candidate_can_be_the_start_stays_and_the_words_say_so():
     assert [one.infeasible for one in result.search.evaluations] == ["", *["inside the wall"] * 8]
     assert [one.arm for one in result.search.evaluations[1:]] == ["optimiser", "random"] * 4
     assert result.best.is_start
-    assert "Nothing better than front_roof_32" in result.sentence
+    assert result.sentence == "None of 8 candidates can be, the last for this reason: inside the wall."
 
 
 def test_a_start_that_cannot_be_is_compared_with_but_does_not_win():

@@ -100,8 +100,13 @@ class SearchResult:
 
     def _sentences(self) -> Iterator[str]:
         search, best = self.search, self.best
+        others = search.evaluations[1:]
+        refused = [one.infeasible for one in others if one.infeasible]
+        if others and len(refused) == len(others):
+            yield f"None of {len(others)} candidates can be, the last for this reason: {refused[-1]}."
+            return
         if best is None:
-            yield f"No rig was found: {self._refusals()}."
+            yield f"No candidate of the optimiser can be in {self._spent(OPTIMISER)}."
         elif best.is_start:
             yield f"Nothing better than {search.space.start.name} was found in {self._spent(OPTIMISER)}."
         elif best.test is None:
@@ -134,10 +139,6 @@ class SearchResult:
     def _spent(self, arm: str) -> str:
         one = self.search.arms[arm]
         return f"{len(one.evaluations) - 1} candidates"
-
-    def _refusals(self) -> str:
-        refused = [one.infeasible for one in self.search.evaluations if one.infeasible]
-        return f"{len(refused)} of {len(self.search.evaluations)} candidates cannot be, the last because {refused[-1]}"
 
     @property
     def record(self) -> dict[str, Any]:
