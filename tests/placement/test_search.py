@@ -93,7 +93,7 @@ def test_a_candidate_is_dropped_only_two_errors_below_its_incumbent():
 
 def test_random_search_draws_the_same_beside_any_optimiser():
     draws = []
-    for optimiser in ("gp", "cmaes"):
+    for optimiser in ("random", "cmaes"):
         search = searched(evaluations=16, optimiser=optimiser).search
         draws.append([one.values for one in search.evaluations if one.arm == "random"])
     shortest = min(map(len, draws))
@@ -185,10 +185,10 @@ def timed(budget_s, monkeypatch):
 
 def test_a_budget_of_seconds_is_kept_with_the_test_and_asks_for_what_a_number_of_evaluations_would(monkeypatch):
     # 10 s for 18 instants, 1.8 s a candidate; 48 fresh instants and three rigs there and here: 46.5 s.
-    result, clock = timed(100.0, monkeypatch)
-    assert 80 < clock.now < 100
+    result, clock = timed(80.0, monkeypatch)
+    assert 65 < clock.now < 80
     count = len(result.search.evaluations) - 1
-    assert count > 20
+    assert count > 10
     assert told(result.search) == told(searched(evaluations=count).search)
 
 
