@@ -129,6 +129,14 @@ def test_a_search_that_was_ended_goes_on_to_the_same_candidates(tmp_path, optimi
     assert strip[0] == strip[1]
 
 
+def test_a_budget_that_is_too_small_takes_nothing_away(tmp_path):
+    searched(tmp_path, evaluations=3)
+    before = (tmp_path / NAME).read_bytes()
+    with pytest.raises(ValueError, match="less than one evaluation"):
+        searched(tmp_path, budget_s=1e-6)
+    assert (tmp_path / NAME).read_bytes() == before
+
+
 def test_a_longer_search_goes_on_from_a_shorter_one(tmp_path):
     shorter = searched(tmp_path, evaluations=5)
     longer = searched(tmp_path, evaluations=12, resume=True)
