@@ -1,5 +1,6 @@
 """Mount regions: their places lie on the skin of the vehicle, and a sensor on them faces outwards, level."""
 
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,13 @@ VEHICLES = [*(name for name in builtin_names("vehicles") if name not in SMALL), 
 BOX = Skin(Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh())
 
 
+@cache
+def loaded(name):
+    """A vehicle and its skin."""
+    vehicle = load_document(Vehicle, "vehicles", name)
+    return vehicle, Skin(vehicle.mesh())
+
+
 def distance_m(mesh, place_m):
     """How far a place is from the nearest triangle of a mesh."""
     triangles = mesh.vertices_m[mesh.faces]
@@ -29,8 +37,7 @@ def distance_m(mesh, place_m):
 
 @pytest.mark.parametrize("name", VEHICLES)
 def test_places_lie_on_the_skin_and_heights_are_distances_from_it(name):
-    vehicle = load_document(Vehicle, "vehicles", name)
-    skin, generator = Skin(vehicle.mesh()), np.random.default_rng(0)
+    (vehicle, skin), generator = loaded(name), np.random.default_rng(0)
     assert vehicle.mount_regions
     for region in vehicle.mount_regions.values():
         u, v = generator.random(2)
@@ -44,8 +51,7 @@ def test_places_lie_on_the_skin_and_heights_are_distances_from_it(name):
 @pytest.mark.parametrize("name", VEHICLES)
 def test_a_region_is_one_patch_that_looks_to_its_side(name):
     """No place beside another lies on another part, nor on a wall that only seems to be seen from there."""
-    vehicle, shares = load_document(Vehicle, "vehicles", name), np.linspace(0.0, 1.0, 6)
-    skin = Skin(vehicle.mesh())
+    (vehicle, skin), shares = loaded(name), np.linspace(0.0, 1.0, 5)
     for region in vehicle.mount_regions.values():
         axis, sign = SEEN_FROM[region.seen_from]
         points = [[region.on(skin, u, v) for v in shares] for u in shares]
@@ -58,8 +64,8 @@ def test_a_region_is_one_patch_that_looks_to_its_side(name):
 
 @pytest.mark.parametrize("name", ["suv", "truck"])
 def test_rays_of_the_caster_end_at_the_same_places(name):
-    vehicle = load_document(Vehicle, "vehicles", name)
-    skin, caster = Skin(vehicle.mesh()), RayCaster([vehicle.mesh()])
+    vehicle, skin = loaded(name)
+    caster = RayCaster([skin.mesh])
     for region in vehicle.mount_regions.values():
         axis, sign = SEEN_FROM[region.seen_from]
         place_m = region.on(skin, 0.3, 0.7).place_m
@@ -71,8 +77,8 @@ def test_rays_of_the_caster_end_at_the_same_places(name):
 
 @pytest.mark.parametrize("name", VEHICLES)
 def test_left_and_right_are_mirror_images(name):
-    vehicle = load_document(Vehicle, "vehicles", name)
-    skin, regions = Skin(vehicle.mesh()), vehicle.mount_regions
+    vehicle, skin = loaded(name)
+    regions = vehicle.mount_regions
     pairs = [(regions[key], regions[key.replace("left", "right")]) for key in regions if "left" in key]
     assert pairs
     for left, right in pairs:

@@ -8,7 +8,15 @@ from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, NonNegativeFloat, PlainValidator, ValidationInfo, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    NonNegativeFloat,
+    PlainValidator,
+    ValidationInfo,
+    model_validator,
+)
 
 from torchcover.placement.carrier import Carrier
 from torchcover.placement.constraints import Constraints, misplaced
@@ -35,6 +43,12 @@ def _rig(given: Any, info: ValidationInfo) -> Rig:  # noqa: ANN401  (whatever st
         return Rig.load(beside(Path(given), info) if is_file_name(given) else given)
     except FileNotFoundError as error:
         raise ValueError(str(error)) from error
+
+
+def _vehicle(given: str) -> str:
+    if Path(given).suffix and not is_file_name(given):
+        raise ValueError(f"the name of a vehicle, or the path of its YAML file, is needed; got {given!r}")
+    return given
 
 
 def _listed(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
@@ -80,7 +94,7 @@ class SearchSpace(Document):
     description: str = ""
     start: Annotated[Rig, PlainValidator(_rig)]
     scenario: Annotated[tuple[NameOrFile, ...], BeforeValidator(_listed)] = Field(min_length=1)
-    vehicle: NameOrFile | None = None
+    vehicle: Annotated[NameOrFile, AfterValidator(_vehicle)] | None = None
     free: dict[str, FreeSensor] = Field(min_length=1)
     constraints: Constraints = Constraints()
     cost: dict[NameOrFile, NonNegativeFloat] = Field(default_factory=dict)
@@ -91,7 +105,7 @@ class SearchSpace(Document):
         """Read a space from a YAML file.
 
         Raises:
-            FileNotFoundError: No such file, or of one that it names.
+            FileNotFoundError: No such file.
             BadFileError: Not YAML, or no space in which a search makes sense; the message names the file and the key.
         """
         return read_document(cls, Path(path))
@@ -122,7 +136,10 @@ class SearchSpace(Document):
 
     @model_validator(mode="after")
     def _check_places(self) -> Self:
-        carrier = self._carrier
+        try:
+            carrier = self._carrier
+        except FileNotFoundError as error:
+            raise ValueError(str(error)) from error
         for name, free in self.free.items():
             for region in (free.region,) if isinstance(free.region, str) else free.region or ():
                 try:

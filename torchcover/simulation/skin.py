@@ -81,7 +81,7 @@ class Skin:
         first, second, third = corners[met[nearest]]
         normal = np.cross(second - first, third - first)
         # Outwards is where the line came from, whichever way the face's corners turn.
-        return SkinPoint(place_m, normal / np.linalg.norm(normal) * np.sign(sign * normal[axis]))
+        return SkinPoint(place_m, normal / np.linalg.norm(normal) * np.sign(sign * normal[axis]) + 0.0)
 
     def encloses(self, place_m: Vector) -> bool:
         """Whether a (3,) place lies inside the body, so that no ray gets out."""
