@@ -89,6 +89,7 @@ def test_a_candidate_is_dropped_only_two_errors_below_its_incumbent():
                 assert arm.left[at, 0] > 0
             else:
                 assert arm.left[at, 0] == 0
+                assert arm.gains[at, 0] == pytest.approx(arm.against_start(at).gain[0], abs=1e-12)
 
 
 def test_random_search_draws_the_same_beside_any_optimiser():
@@ -99,6 +100,9 @@ def test_random_search_draws_the_same_beside_any_optimiser():
     shortest = min(map(len, draws))
     assert shortest > 3
     assert draws[0][:shortest] == draws[1][:shortest]
+    # And what it draws is not what the optimiser draws, where that is random search too.
+    search = searched(evaluations=6, optimiser="random").search
+    assert len({one.values["roof.x_m"] for one in search.evaluations}) == 7
 
 
 @pytest.mark.parametrize(
