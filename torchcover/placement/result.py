@@ -16,8 +16,8 @@ from torchcover.placement.pareto import hypervolume
 from torchcover.placement.search import PlacementSearch
 from torchcover.simulation import Rig
 
-# Below, a gain is not told from chance.
-ENOUGH_T = 2.0
+# Otherwise, a gain is not told from chance; of few worlds, a large t is none yet.
+ENOUGH_T, ENOUGH_P = 2.0, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,6 +185,11 @@ class SearchResult:
         return save_search(self, Path(folder))
 
 
+def is_shown(gain: FreshGain) -> bool:
+    """Whether a gain or a loss is told from chance: at least two standard errors, of enough worlds."""
+    return abs(gain.t) >= ENOUGH_T and gain.p < ENOUGH_P
+
+
 def told(gain: FreshGain) -> str:
     """A gain in words, which call it one only where it is told from chance.
 
@@ -199,9 +204,9 @@ def told(gain: FreshGain) -> str:
     error = "± ?" if math.isnan(gain.error) else f"± {100 * gain.error:.2f}"
     t = "t unknown" if math.isnan(gain.t) else f"t {gain.t:.1f}"
     rest = f"{error} points on {gain.worlds} fresh worlds ({t}, better in {gain.better})"
-    if gain.t >= ENOUGH_T:
+    if is_shown(gain) and gain.t > 0:
         return f"gained {100 * gain.gain:.2f} {rest}"
-    if gain.t <= -ENOUGH_T:
+    if is_shown(gain):
         return f"lost {-100 * gain.gain:.2f} {rest}"
     return f"no gain is shown: {100 * gain.gain:+.2f} {rest}"
 
