@@ -28,8 +28,12 @@ ROOMS = (
 )  # fmt: skip
 # Where the classes of documents are defined.
 DOCUMENTS = (
-    "torchcover.simulation", "torchcover.data", "torchcover.targets", "torchcover.coverage", "torchcover.placement",
-)  # fmt: skip
+    "torchcover.simulation",
+    "torchcover.data",
+    "torchcover.targets",
+    "torchcover.coverage",
+    "torchcover.placement",
+)
 
 
 def on_config(config):

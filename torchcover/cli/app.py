@@ -45,21 +45,31 @@ def main() -> None:
             warnings.filterwarnings("ignore", "The run was cut short", RuntimeWarning)  # the last line says it
             code = typer.main.get_command(app).main(standalone_mode=False)
         sys.stdout.flush()
-    except USAGE_ERROR as error:
-        _fail(error.format_message())  # type: ignore[attr-defined]  # the typed name is private
-    except (ValueError, TypeError, OSError) as error:
-        _fail(str(error))
-    except MemoryError as error:
-        _fail(f"there is not enough memory ({error or 'for what was asked'}); ask for less, or use a larger machine")
-    except RuntimeError as error:
-        if type(error).__name__ != "OutOfMemoryError":  # of torch, which most mistakes are told without
+    except Exception as error:
+        message = _mistake(error)
+        if message is None:
             raise
-        _fail(f"there is not enough memory ({str(error).splitlines()[0]}); ask for less, or use --device cpu")
-    except (OverflowError, RecursionError) as error:
-        _fail(f"a number is too large, or a file nested too deeply ({error})")
+        _fail(message)
     if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
         _fail(*("terminated", TERMINATED) if terminated else ("interrupted", INTERRUPTED))
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _mistake(error: Exception) -> str | None:
+    """What a user did wrong, or lacks; None if it is a mistake of ours."""
+    if isinstance(error, USAGE_ERROR):
+        return str(error.format_message())  # type: ignore[attr-defined]  # the typed name is private
+    if isinstance(error, ValueError | TypeError | OSError):
+        return str(error)
+    if isinstance(error, ImportError) and "pip install" in str(error):
+        return str(error)  # of an extra
+    if isinstance(error, MemoryError):
+        return f"there is not enough memory ({error or 'for what was asked'}); ask for less, or use a larger machine"
+    if type(error).__name__ == "OutOfMemoryError":  # of torch, which most mistakes are told without
+        return f"there is not enough memory ({str(error).splitlines()[0]}); ask for less, or use --device cpu"
+    if isinstance(error, OverflowError | RecursionError):
+        return f"a number is too large, or a file nested too deeply ({error})"
+    return None
 
 
 @app.callback(invoke_without_command=True)

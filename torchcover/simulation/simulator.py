@@ -21,6 +21,7 @@ from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.stage import Stage, Stages
+from torchcover.simulation.standing import warn_of_floating
 from torchcover.simulation.surroundings import Surroundings
 
 # What a step takes at its largest: 73 to 246 were measured, for a LiDAR, a camera and the reference sensors.
@@ -35,8 +36,8 @@ class Simulator:
     are cast on as many threads as torch uses (`torch.set_num_threads`).
 
     Args:
-        scenario: The world; `with_ego` gives it its ego. Beyond its end a given one plays again; traffic starts anew
-            with other random numbers.
+        scenario: The world; `with_ego` gives it its ego. Beyond its end the same plays again, or another one; see
+            `Scenario.repeats`.
         rigs: The sensors, by the name under which `Observation.clouds` has their points.
         reference_sensor: The reference sensor.
         seed: Seed of the traffic, of the reference sensor, and of noise and drop-out.
@@ -91,14 +92,14 @@ class Simulator:
     def place_in_time(self, index: int) -> int:
         """The number by which standard errors tell a step from others; steps that share it are alike.
 
-        In traffic that is the number of the run: its steps share a city. In a given world it is the instant, be it seen
-        for the first time or again. Where there is a single instant only the reference sensor's draw differs, and every
-        step has a number of its own.
+        Where each run has a world of its own, that is the number of the run: its steps share a city. In a scenario that
+        repeats it is the instant, be it seen for the first time or again. Where there is a single instant only the
+        reference sensor's draw differs, and every step has a number of its own.
         """
         if self.scenario.instants == 1:
             return index
         run, step = self.scenario.locate(index * self._every_steps)
-        return step if self.scenario.traffic is None else run
+        return step if self.scenario.repeats else run
 
     def with_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
         """The same instants as another reference sensor sees them; the geometry is built once for both."""
@@ -171,20 +172,25 @@ class Simulator:
         )
 
     def check_run(self, steps: int) -> None:
-        """Refuse before its first step what a run through a given world would end with; traffic is made as it comes.
+        """Refuse before its first step what a run through a world that repeats would end with; others come as they are.
 
         Args:
             steps: How many steps the run has.
 
         Raises:
             ValueError: A sensor that is where none can be at the first step, an actor that overlaps the ego at any.
+
+        Warns:
+            UserWarning: Those that move do not stand on the ground.
         """
-        if self.scenario.traffic is None:
+        if self.scenario.repeats:
             stage, _ = self._stage(0)
             world_steps = stage.scene.world.steps
             indices = np.arange(min(steps, world_steps), dtype=np.int64)  # then they repeat themselves
-            stage.scene.check_apart(np.unique(indices * self._every_steps % world_steps))
+            seen = np.unique(indices * self._every_steps % world_steps)
+            stage.scene.check_apart(seen)
             stage.check_mounts(stage.scene.at(0))
+            warn_of_floating(self.scenario.name, stage.scene, seen)
 
     def labels(self, index: int) -> list[Label]:
         """The objects within the reference sensor's range at one step; names are an object's own within a run."""
@@ -200,7 +206,7 @@ class Simulator:
         return stage.scene, step
 
     def run_of(self, index: int) -> int:
-        """Which run through the scenario a step belongs to: in traffic, each is a world of its own."""
+        """Which run through the scenario a step belongs to: each is a world of its own, unless it repeats."""
         return self.scenario.locate(index * self._every_steps)[0]
 
     def _check_size(self) -> None:

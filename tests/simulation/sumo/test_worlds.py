@@ -219,7 +219,7 @@ def test_without_an_ego_there_is_no_world(options, message, tmp_path):
         ({"type": "sumo", "random": {}, "ego_id": "a"}, "random draws all traffic; leave out ego_id"),
         ({"type": "sumo", "net": "a.net.xml", "random": {"lanes": 1}}, "random: lanes are for streets that are drawn"),
         ({"type": "sumo", "random": {"network": "star"}}, "'rand', 'grid' or 'spider'"),
-        ({"type": "somo"}, "type: traffic is one of 'urban', 'highway', 'parking', 'sumo'; got 'somo'"),
+        ({"type": "somo"}, "type: traffic is one of 'urban', 'highway', 'parking', 'sumo', 'tracks'; got 'somo'"),
         ({}, "type: traffic is one of"),
     ],
 )

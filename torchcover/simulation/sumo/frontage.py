@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from torchcover.simulation.height_field import Ground
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sumo.ground import Ground
 from torchcover.simulation.sumo.network import Lane
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.roads import Line

@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from torchcover.simulation.height_field import CELL_M, Ground, Plain
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sumo.ground import CELL_M, Ground, Plain
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.scenery import PAVEMENT_M
 
