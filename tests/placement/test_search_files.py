@@ -8,6 +8,7 @@ import pytest
 
 from tests.placement.surfaces import plan, space
 from torchcover.placement import FreshGain, PlacementSearch
+from torchcover.placement.fresh import student_p
 from torchcover.placement.result import told
 from torchcover.simulation import Rig
 
@@ -110,14 +111,16 @@ def test_where_nothing_can_be_there_are_files_all_the_same(tmp_path):
     assert json.loads((tmp_path / "search.json").read_text())["found"][0]["gains"] is None
 
 
-def gain(mean, error, t, worlds=16, better=9):
-    return FreshGain(mean, error, t, 0.5, worlds, better, 0.0, 0.0)
+def gain(mean, error, t, worlds=16):
+    return FreshGain(mean, error, t, student_p(t, worlds - 1), worlds, 9, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
     ("found", "words"),
     [
         (gain(-0.02, 0.004, -5.0), "lost 2.00 ± 0.40 points on 16 fresh worlds (t -5.0, better in 9)"),
+        (gain(0.03, 0.01, 3.0), "gained 3.00 ± 1.00 points on 16 fresh worlds (t 3.0, better in 9)"),
+        (gain(0.03, 0.01, 3.0, 3), "no gain is shown: +3.00 ± 1.00 points on 3 fresh worlds (t 3.0, better in 9)"),
         (gain(0.0199, 0.01, 1.99), "no gain is shown: +1.99 ± 1.00 points on 16 fresh worlds (t 2.0, better in 9)"),
         (gain(0.02, np.nan, np.nan), "no gain is shown: +2.00 ± ? points on 16 fresh worlds (t unknown, better in 9)"),
         (gain(np.nan, np.nan, np.nan), "unknown in every fresh world"),

@@ -7,6 +7,7 @@ import typer
 from rich.console import Console
 
 from torchcover.evaluation import claimed
+from torchcover.evaluation.result_files import SUMMARY
 from torchcover.placement import ChoiceSpace, CommonInstants, PlacementSearch, SearchPlan, SearchSpace, choose
 from torchcover.placement.choice_files import HEADINGS as CHOSEN_HEADINGS
 from torchcover.placement.choice_files import chosen_rows, save_choice
@@ -32,6 +33,8 @@ def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noq
     search = PlacementSearch(SearchSpace.load(path), SearchPlan(**settings))
     if resume and not (out / NAME).exists():
         typer.echo(f"torchcover: {out / NAME} is not there: the search starts with its first candidate", err=True)
+    elif not resume and (out / NAME).exists() and not (out / SUMMARY).exists():
+        typer.echo(f"torchcover: {out / NAME} will be replaced; to go on from it, stop now and add --resume", err=True)
     with claimed(out):
         result = search.run(out, resume=resume, progress=True)
         files = result.save(out)

@@ -16,8 +16,8 @@ from torchcover.placement.pareto import hypervolume
 from torchcover.placement.search import PlacementSearch
 from torchcover.simulation import Rig
 
-# Below, a gain is not told from chance.
-ENOUGH_T = 2.0
+# Otherwise, a gain is not told from chance; of few worlds, a large t is none yet.
+ENOUGH_T, ENOUGH_P = 2.0, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,8 +100,13 @@ class SearchResult:
 
     def _sentences(self) -> Iterator[str]:
         search, best = self.search, self.best
+        others = search.evaluations[1:]
+        refused = [one.infeasible for one in others if one.infeasible]
+        if others and len(refused) == len(others):
+            yield f"None of {len(others)} candidates can be, the last for this reason: {refused[-1]}."
+            return
         if best is None:
-            yield f"No rig was found: {self._refusals()}."
+            yield f"No candidate of the optimiser can be in {self._spent(OPTIMISER)}."
         elif best.is_start:
             yield f"Nothing better than {search.space.start.name} was found in {self._spent(OPTIMISER)}."
         elif best.test is None:
@@ -134,10 +139,6 @@ class SearchResult:
     def _spent(self, arm: str) -> str:
         one = self.search.arms[arm]
         return f"{len(one.evaluations) - 1} candidates"
-
-    def _refusals(self) -> str:
-        refused = [one.infeasible for one in self.search.evaluations if one.infeasible]
-        return f"{len(refused)} of {len(self.search.evaluations)} candidates cannot be, the last because {refused[-1]}"
 
     @property
     def record(self) -> dict[str, Any]:
@@ -184,6 +185,11 @@ class SearchResult:
         return save_search(self, Path(folder))
 
 
+def is_shown(gain: FreshGain) -> bool:
+    """Whether a gain or a loss is told from chance: at least two standard errors, of enough worlds."""
+    return abs(gain.t) >= ENOUGH_T and gain.p < ENOUGH_P
+
+
 def told(gain: FreshGain) -> str:
     """A gain in words, which call it one only where it is told from chance.
 
@@ -198,9 +204,9 @@ def told(gain: FreshGain) -> str:
     error = "± ?" if math.isnan(gain.error) else f"± {100 * gain.error:.2f}"
     t = "t unknown" if math.isnan(gain.t) else f"t {gain.t:.1f}"
     rest = f"{error} points on {gain.worlds} fresh worlds ({t}, better in {gain.better})"
-    if gain.t >= ENOUGH_T:
+    if is_shown(gain) and gain.t > 0:
         return f"gained {100 * gain.gain:.2f} {rest}"
-    if gain.t <= -ENOUGH_T:
+    if is_shown(gain):
         return f"lost {-100 * gain.gain:.2f} {rest}"
     return f"no gain is shown: {100 * gain.gain:+.2f} {rest}"
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 from torchcover.evaluation import sensor_views
 from torchcover.evaluation.result_page import rig_document, words_of
-from torchcover.placement.result import ENOUGH_T, SearchResult
+from torchcover.placement.result import SearchResult, is_shown
 from torchcover.report import Page, PagePicture, PageRig, PageTable, Words
 
 HEADINGS = ("found by", "objective", "measure", "gain in the\nsearch (points)", "gain on fresh\nworlds (points)", "t",
@@ -62,7 +62,7 @@ def _marked(result: SearchResult) -> list[tuple[Words, ...]]:
         (pick.name, objective, measure)
         for pick in result.picks
         for objective, measure, gain in result.gains_of(pick)
-        if abs(gain.t) >= ENOUGH_T
+        if is_shown(gain)
     }
     return [
         tuple(Words(word, "significant" if at == 4 and row[:3] in significant else "") for at, word in enumerate(row))

@@ -61,25 +61,26 @@ def _run(search: PlacementSearch, out: Path | None, resume: bool, progress: bool
     start = search.ask()
     assert start is not None  # there always is one
     search.evaluate(start)
-    journal = None if out is None else _journal(search, out, resume=resume)
+    journal = None if out is None or not resume else _resumed(search, out / NAME)
     earlier_s = sum(evaluation.seconds for evaluation in search.evaluations[1:])
     budget = _Budget(search, clock, began - earlier_s, build_s)
+    budget.check()
+    if out is not None and journal is None:  # an earlier one is lost only now
+        journal = Journal(out / NAME, search.plan.settings(search.space))
+        journal.add(search.evaluations[0])
     with progress_of(budget.expected, search.space.name, done=len(search.evaluations), shown=progress) as bar:
-        budget.check()
         _spend(search, budget, journal, bar.advance)
     picks, untested = _tested(search, _picks(search))
     return SearchResult(search, picks, untested, clock() - began + earlier_s)
 
 
-def _journal(search: PlacementSearch, out: Path, *, resume: bool) -> Journal:
-    settings, path = search.plan.settings(search.space), out / NAME
+def _resumed(search: PlacementSearch, path: Path) -> Journal | None:
+    """The journal that is there, with the search where it ended; None if there is none."""
+    if not path.exists():
+        return None
     start = search.evaluations[0]
-    if not resume or not path.exists():
-        journal = Journal(path, settings)
-        journal.add(start)
-        return journal
     assert start.scores is not None  # it was scored just now
-    journal, evaluations = Journal.resumed(path, settings, start.scores)
+    journal, evaluations = Journal.resumed(path, search.plan.settings(search.space), start.scores)
     if not evaluations:
         journal.add(start)
     elif _differs(start, evaluations[0]):
