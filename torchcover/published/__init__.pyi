@@ -7,6 +7,7 @@ from .object_coverage import ObjectCoverage as ObjectCoverage
 from .perception_entropy import PerceptionEntropy as PerceptionEntropy
 from .point_density import PointDensity as PointDensity
 from .registry import PUBLISHED as PUBLISHED
+from .registry import metric_names as metric_names
 from .setup import Published as Published
 from .setup import Setup as Setup
 from .sights import Sights as Sights

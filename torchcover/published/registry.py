@@ -1,6 +1,6 @@
 """The metrics of others, by the names that `torchcover compare --metrics` takes."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from torchcover.published.false_visible import FalseVisible
 from torchcover.published.k_cover import KCover
@@ -45,3 +45,18 @@ PUBLISHED: Mapping[str, Published] = {
         _false_visible, frozenset({"sensors"}), "blind cells that the field of view promised (Börger 2022)"
     ),
 }
+
+
+def metric_names(given: str | Iterable[str]) -> tuple[str, ...]:
+    """The metrics that a user asks for; "all" is all of them.
+
+    Raises:
+        ValueError: No such metric.
+    """
+    names = [name.strip() for name in given.split(",")] if isinstance(given, str) else list(given)
+    if names == ["all"]:
+        return tuple(PUBLISHED)
+    for name in names:
+        if name not in PUBLISHED:
+            raise ValueError(f"metrics: all, or some of {', '.join(PUBLISHED)}, separated by commas; got {name!r}")
+    return tuple(dict.fromkeys(names))
