@@ -23,9 +23,7 @@ def _k_cover(setup: Setup) -> KCover:
 
 
 def _point_density(setup: Setup) -> PointDensity:
-    bands = setup.grid.heights.values()
-    height_m = min(low for low, _ in bands), max(high for _, high in bands)
-    return PointDensity(setup.regions, height_m, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
+    return PointDensity(setup.grid, setup.regions, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
 
 
 def _false_visible(setup: Setup) -> FalseVisible:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchmetrics.utilities.distributed import gather_all_tensors
 
 from torchcover.coverage.blocks import MIN_BLOCKS, pair_up
-from torchcover.coverage.errors import ROUND_OFF, jackknife_error, ratio_errors
+from torchcover.coverage.errors import ROUND_OFF, jackknife_error
 from torchcover.data import Frame
 from torchcover.published.frame_metric import FrameMetric
 from torchcover.published.number import PublishedNumber
@@ -34,9 +34,10 @@ class Ratio:
 class WorldRatios(FrameMetric):
     """Ratios S / A of sums over frames, kept in blocks of contiguous worlds (`Frame.place_in_time`).
 
-    A metric gives its `ratios`, and in `_of_frame` what a frame adds to each: a_j, s_j, and how many these are. The
-    error of a share is that of `torchcover.coverage.errors.ratio_errors`, which is never 0; others have the block
-    jackknife's. Blocks double as in `CoverageMetric`, so that the state has a fixed size and parts merge exactly.
+    A metric gives its `ratios`, and in `_of_frame` what a frame adds to each: a_j, s_j, and how many these are. Errors
+    are the block jackknife's, as those of regions in `Coverage`; a ratio that fewer than 8 blocks know has none, nor
+    has one of which all blocks say the same. Blocks double as in `CoverageMetric`, so that the state has a fixed size
+    and parts merge exactly.
 
     Args:
         ratios: What they are.
@@ -108,9 +109,7 @@ class WorldRatios(FrameMetric):
         used = self.block_steps > 0
         base, sums, steps = self.base[used], self.sums[used], self.block_steps[used]
         whole, whole_base, whole_sums = self._value(base.sum(0), sums.sum(0)), base.sum(0), sums.sum(0)
-        jackknife = jackknife_error(self._value(whole_base - base, whole_sums - sums), whole, steps)
-        share = torch.tensor([ratio.unit == "share" for ratio in self.ratios], device=whole.device)
-        error = ratio_errors(base, sums, "share").where(share, jackknife)
+        error = jackknife_error(self._value(whole_base - base, whole_sums - sums), whole, steps)
         # Blocks that all say the same do not prove that others would.
         return error.where(((base > 0).sum(dim=0) >= MIN_BLOCKS) & (error > ROUND_OFF), math.nan)
 
