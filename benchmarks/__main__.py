@@ -33,6 +33,8 @@ BENCHMARKS = (
     "mutated_files",
     "targets",
     "published",
+    "pairing",
+    "towns",
 )
 
 
