@@ -1,8 +1,8 @@
 """Which voxels of a regular grid rays cross: exact, for many rays at once.
 
 A ray enters every voxel on its way, but the first, through a plane between two voxels of one of the three axes. So the
-planes that it crosses are counted off, axis by axis, and where it crosses one, the other two coordinates say which voxel
-it enters: what Amanatides and Woo (1987) find by stepping, without the steps waiting for each other.
+planes that it crosses are counted off, axis by axis, and where it crosses one, the other two coordinates say which
+voxel it enters: what Amanatides and Woo (1987) find by stepping, without the steps waiting for each other.
 """
 
 import math
@@ -71,7 +71,7 @@ class VoxelGrid:
     def centres_m(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """(X,), (Y,) and (Z,) coordinates of the voxels' centres."""
         bounds = zip(self.region.lower_m, self.region.upper_m, self.shape, strict=True)
-        x, y, z = (low + (np.arange(count) + 0.5) * ((high - low) / count) for low, high, count in bounds)
+        x, y, z = (_centres(low, high, count) for low, high, count in bounds)
         return x, y, z
 
     def in_voxels(self, points_m: ArrayLike) -> NDArray[np.float64]:
@@ -87,7 +87,7 @@ class VoxelGrid:
             array([ 0,  3, -1])
         """
         at = np.floor(self.in_voxels(points_m))
-        inside = ((at >= 0) & (at < self.shape)).all(axis=1)
+        inside = np.asarray(((at >= 0) & (at < self.shape)).all(axis=1))
         number = np.where(inside[:, None], at, 0).astype(np.int64) @ self._strides.astype(np.int64)
         return np.where(inside, number, -1)
 
@@ -110,9 +110,9 @@ def crossed_voxels(
 ) -> NDArray[np.bool_]:
     """Which voxels are crossed by any of a bundle of rays.
 
-    A voxel is crossed if a piece of a ray, and not just a point of it, lies in it: a ray through a corner or an edge does
-    not cross the voxels that it touches there. One that runs along a face is in the voxel on the upper side of it. A
-    piece that is shorter than 1e-9 voxels may or may not count.
+    A voxel is crossed if a piece of a ray, and not just a point of it, lies in it: a ray through a corner or an edge
+    does not cross the voxels that it touches there. One that runs along a face is in the voxel on the upper side of it.
+    A piece that is shorter than 1e-9 voxels may or may not count.
 
     Args:
         grid: The voxels.
@@ -137,101 +137,113 @@ def crossed_voxels(
                [1, 0, 0, 0],
                [1, 0, 0, 0]])
     """
-    directions = np.asarray(directions, dtype=np.float64)
-    origins_m, ends = np.asarray(origins_m, dtype=np.float64), np.asarray(ends, dtype=np.float64)
-    _check(origins_m, directions, ends)
-    is_ray = ~np.isnan(directions).any(axis=1)
-    directions, count = directions[is_ray], len(directions)
-    origins_m = np.broadcast_to(origins_m, (count, 3))[is_ray]
-    ends = np.broadcast_to(ends, (count,))[is_ray]
+    way = np.asarray(directions, dtype=np.float64)
+    start, end = np.asarray(origins_m, dtype=np.float64), np.asarray(ends, dtype=np.float64)
+    _check(start, way, end)
+    is_ray = ~np.isnan(way).any(axis=1)
+    start, end = np.broadcast_to(start, way.shape)[is_ray], np.broadcast_to(end, len(way))[is_ray]
+    way = way[is_ray]
     if crossed is None:
         crossed = np.zeros(grid.shape, dtype=bool)
     elif crossed.shape != grid.shape or crossed.dtype != bool or not crossed.flags.c_contiguous:
         raise ValueError(f"crossed: a contiguous bool array of shape {grid.shape} is needed; got {crossed.shape}")
-    for start in range(0, len(directions), RAYS_AT_ONCE):
-        some = slice(start, start + RAYS_AT_ONCE)
-        _walk(grid, origins_m[some], directions[some], ends[some], crossed.reshape(-1))
+    for first in range(0, len(way), RAYS_AT_ONCE):
+        some = slice(first, first + RAYS_AT_ONCE)
+        rays = _upwards(grid, start[some], way[some], end[some])
+        crossed.reshape(-1)[rays.numbers(rays.first)] = True
+        for axis in range(3):
+            _cross_planes(rays, axis, crossed.reshape(-1))
     return crossed
 
 
-def _walk(
-    grid: VoxelGrid,
-    origins_m: NDArray[np.float64],
-    directions: NDArray[np.float64],
-    ends: NDArray[np.float64],
-    crossed: NDArray[np.bool_],
-) -> None:
-    shape = np.array(grid.shape, dtype=np.float64)[:, None]
-    # (3, n) from here on, in voxels.
-    place, way = grid.in_voxels(origins_m).T, (directions * grid._voxels_per_m).T
+@dataclass(frozen=True, eq=False)
+class _Upwards:
+    """Rays within the region, in voxels, each seen in mirrors in which it moves upwards on every axis.
+
+    Args:
+        place: (3, n) where they start.
+        way: (3, n) where they go, nowhere below 0.
+        first: (3, n) voxel that each is in first.
+        last: (3, n) and last.
+        strides: (3, n) how a voxel's number grows along the mirrored axes.
+        number: (n,) number of the voxel at 0, 0, 0, in the mirrors.
+    """
+
+    place: NDArray[np.float64]
+    way: NDArray[np.float64]
+    first: NDArray[np.float64]
+    last: NDArray[np.float64]
+    strides: NDArray[np.float64]
+    number: NDArray[np.float64]
+
+    def numbers(self, voxel: NDArray[np.float64]) -> NDArray[np.int64]:
+        """(n,) numbers of the voxels (3, n), one of each ray."""
+        numbers: NDArray[np.float64] = self.number + (voxel * self.strides).sum(axis=0)
+        return numbers.astype(np.int64)
+
+
+def _upwards(
+    grid: VoxelGrid, start_m: NDArray[np.float64], way: NDArray[np.float64], end: NDArray[np.float64]
+) -> _Upwards:
+    """The rays that have a piece in the region."""
+    shape, strides = np.array(grid.shape, dtype=np.float64)[:, None], grid._strides[:, None]
+    place, way = grid.in_voxels(start_m).T, (way * grid._voxels_per_m).T
     # On an axis along which it moves less than a touch on its way through the region, a ray does not move.
     reach = np.maximum(np.abs(place), np.abs(shape - place)).max(axis=0)
     still = np.abs(way) * reach <= TOUCH * np.abs(way).max(axis=0)
-    # Seen in a mirror, every ray goes upwards on every other axis.
     mirrored = (way < 0) & ~still
     place, way = np.where(mirrored, shape - place, place), np.where(still, 0.0, np.abs(way))
-    strides = grid._strides[:, None]
-    first_number = np.where(mirrored, (shape - 1) * strides, 0.0).sum(axis=0)
+    number = np.where(mirrored, (shape - 1) * strides, 0.0).sum(axis=0)
     strides = np.where(mirrored, -strides, strides)
 
     # There, it is inside for ever or never.
     inside = (place + TOUCH >= 0) & (place + TOUCH < shape)
     moving = np.where(still, 1.0, way)
-    enters = np.where(still, np.where(inside, -np.inf, np.inf), -place / moving)
-    leaves = np.where(still, np.where(inside, np.inf, -np.inf), (shape - place) / moving)
-    start, stop = np.maximum(enters.max(axis=0), 0.0), np.minimum(leaves.min(axis=0), ends)
-    length = (stop - start) * way.max(axis=0)
-    kept = np.flatnonzero(length > TOUCH)
-    place, way, strides, start, stop = place[:, kept], way[:, kept], strides[:, kept], start[kept], stop[kept]
-    first_number = first_number[kept]
-
-    first = np.clip(np.floor(place + start * way + TOUCH), 0, shape - 1)
+    enters = np.where(still, np.where(inside, -np.inf, np.inf), -place / moving).max(axis=0)
+    leaves = np.where(still, np.where(inside, np.inf, -np.inf), (shape - place) / moving).min(axis=0)
+    begin, stop = np.maximum(enters, 0.0), np.minimum(leaves, end)
+    kept = (stop - begin) * way.max(axis=0) > TOUCH
+    place, way, begin, stop = place[:, kept], way[:, kept], begin[kept], stop[kept]
+    first = np.clip(np.floor(place + begin * way + TOUCH), 0, shape - 1)
     last = np.clip(np.ceil(place + stop * way - TOUCH) - 1, first, shape - 1)
-    crossed[(first_number + (first * strides).sum(axis=0)).astype(np.int64)] = True
-    for axis in range(3):
-        others = [other for other in range(3) if other != axis]
-        _cross_planes(axis, others, place, way, strides, first, last, first_number, crossed)
+    return _Upwards(place, way, first, last, strides[:, kept], number[kept])
 
 
-def _cross_planes(
-    axis: int,
-    others: list[int],
-    place: NDArray[np.float64],
-    way: NDArray[np.float64],
-    strides: NDArray[np.float64],
-    first: NDArray[np.float64],
-    last: NDArray[np.float64],
-    first_number: NDArray[np.float64],
-    crossed: NDArray[np.bool_],
-) -> None:
+def _cross_planes(rays: _Upwards, axis: int, crossed: NDArray[np.bool_]) -> None:
     """Mark the voxels that rays enter through planes across one axis: first the first plane of every ray, and so on."""
-    planes = (last[axis] - first[axis]).astype(np.int64)
+    planes = (rays.last[axis] - rays.first[axis]).astype(np.int64)
     # Those with many planes to the front: the rays that are still on their way are the first ones.
-    order = np.argsort(-planes, kind="stable")
-    order = order[: np.count_nonzero(planes)]
-    if len(order) == 0:
-        return
+    order = np.argsort(-planes, kind="stable")[: np.count_nonzero(planes)]
     planes = planes[order]
-    on_way = len(order) - np.searchsorted(planes[::-1], np.arange(planes[0]), side="right")
-    slope = way[:, order] / way[axis, order]
-    # Where the first plane is crossed, half a touch ahead so that what ends at a plane is beyond it.
-    crossing = place[:, order] + (first[axis, order] + 1 - place[axis, order]) * slope + TOUCH
-    number = first_number[order] + (first[axis, order] + 1) * strides[axis, order]
-    stride, most = strides[:, order], last[:, order] + 0.5
-    step = stride[axis].copy()
-    at, other = np.empty(len(order)), np.empty(len(order))
-    for plane, rays in enumerate(on_way.tolist()):
-        now, beside = at[:rays], other[:rays]
-        np.multiply(step[:rays], plane, out=now)
-        now += number[:rays]
-        for coordinate in others:
-            np.multiply(slope[coordinate, :rays], plane, out=beside)
-            beside += crossing[coordinate, :rays]
-            np.minimum(beside, most[coordinate, :rays], out=beside)
-            np.floor(beside, out=beside)
-            beside *= stride[coordinate, :rays]
-            now += beside
+    most = planes.max(initial=0)
+    on_way = len(order) - np.searchsorted(planes[::-1], np.arange(most), side="right")
+    place, way, first, last, strides = (
+        each[:, order] for each in (rays.place, rays.way, rays.first, rays.last, rays.strides)
+    )
+    slope = way / way[axis]
+    # Where the first plane is crossed, a touch ahead: what reaches a plane of another axis there is beyond it.
+    beside = place + (first[axis] + 1 - place[axis]) * slope + TOUCH
+    last = last + 0.5
+    number = rays.number[order] + (first[axis] + 1) * strides[axis]
+    others = [other for other in range(3) if other != axis]
+    numbers, coordinate = np.empty(len(order)), np.empty(len(order))
+    for plane, count in enumerate(on_way.tolist()):
+        now, at = numbers[:count], coordinate[:count]
+        np.multiply(strides[axis, :count], plane, out=now)
+        now += number[:count]
+        for other in others:
+            np.multiply(slope[other, :count], plane, out=at)
+            at += beside[other, :count]
+            np.minimum(at, last[other, :count], out=at)
+            np.floor(at, out=at)
+            at *= strides[other, :count]
+            now += at
         crossed[now.astype(np.int64)] = True
+
+
+def _centres(low: float, high: float, count: int) -> NDArray[np.float64]:
+    odd = 2 * np.arange(count, dtype=np.float64) + 1
+    return (low * (2 * count - odd) + high * odd) / (2 * count)
 
 
 def _check(origins_m: NDArray[np.float64], directions: NDArray[np.float64], ends: NDArray[np.float64]) -> None:
