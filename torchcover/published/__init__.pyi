@@ -1,5 +1,11 @@
+from .false_visible import FalseVisible as FalseVisible
+from .field_of_view import field_of_view as field_of_view
 from .frame_metric import FrameMetric as FrameMetric
+from .k_cover import KCover as KCover
 from .number import PublishedNumber as PublishedNumber
+from .object_coverage import ObjectCoverage as ObjectCoverage
+from .perception_entropy import PerceptionEntropy as PerceptionEntropy
+from .point_density import PointDensity as PointDensity
 from .registry import PUBLISHED as PUBLISHED
 from .setup import Published as Published
 from .setup import Setup as Setup
