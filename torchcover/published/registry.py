@@ -1,12 +1,15 @@
 """The metrics of others, by the names that `torchcover compare --metrics` takes."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
+from torchcover.published.boards import Lob
 from torchcover.published.false_visible import FalseVisible
 from torchcover.published.k_cover import KCover
+from torchcover.published.m_sog import MSog
 from torchcover.published.object_coverage import ObjectCoverage
 from torchcover.published.perception_entropy import PerceptionEntropy
 from torchcover.published.point_density import PointDensity
+from torchcover.published.s_mig import SMig
 from torchcover.published.setup import Published, Setup
 
 
@@ -23,13 +26,27 @@ def _k_cover(setup: Setup) -> KCover:
 
 
 def _point_density(setup: Setup) -> PointDensity:
-    bands = setup.grid.heights.values()
-    height_m = min(low for low, _ in bands), max(high for _, high in bands)
-    return PointDensity(setup.regions, height_m, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
+    return PointDensity(setup.grid, setup.regions, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
 
 
 def _false_visible(setup: Setup) -> FalseVisible:
     return FalseVisible(setup.sensors, setup.ego, setup.grid, setup.threshold_m, **setup.of_frames)
+
+
+def _s_mig(setup: Setup) -> SMig:
+    return SMig(setup.sensors, **setup.of_frames)
+
+
+def _s_mig_occluded(setup: Setup) -> SMig:
+    return SMig(setup.sensors, occlusion=True, **setup.of_frames)
+
+
+def _m_sog(setup: Setup) -> MSog:
+    return MSog(setup.sensors, **setup.of_frames)
+
+
+def _lob(setup: Setup) -> Lob:
+    return Lob(setup.sensors, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
 
 
 PUBLISHED: Mapping[str, Published] = {
@@ -44,4 +61,29 @@ PUBLISHED: Mapping[str, Published] = {
     "false_visible": Published(
         _false_visible, frozenset({"sensors"}), "blind cells that the field of view promised (Börger 2022)"
     ),
+    "s_mig": Published(
+        _s_mig, frozenset({"boxes", "sensors"}), "minus the entropy of objects along the rays, in nats (Hu 2022)"
+    ),
+    "s_mig_occluded": Published(
+        _s_mig_occluded, frozenset({"boxes", "sensors", "sensor_points"}), "the same, up to what the rays hit"
+    ),
+    "m_sog": Published(
+        _m_sog, frozenset({"boxes", "sensors"}), "minus the mean entropy of labels along the rays (Place3D 2024)"
+    ),
+    "lob": Published(_lob, frozenset({"sensors"}), "cells of boards at 10 to 50 m that rays hit (Kim and Park 2020)"),
 }
+
+
+def metric_names(given: str | Iterable[str]) -> tuple[str, ...]:
+    """The metrics that a user asks for; "all" is all of them.
+
+    Raises:
+        ValueError: No such metric.
+    """
+    names = [name.strip() for name in given.split(",")] if isinstance(given, str) else list(given)
+    if names == ["all"]:
+        return tuple(PUBLISHED)
+    for name in names:
+        if name not in PUBLISHED:
+            raise ValueError(f"metrics: all, or some of {', '.join(PUBLISHED)}, separated by commas; got {name!r}")
+    return tuple(dict.fromkeys(names))
