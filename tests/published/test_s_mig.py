@@ -188,7 +188,9 @@ def test_finer_voxels_make_it_larger_about_as_their_number_grows():
 
 
 def test_the_published_rig_crosses_as_many_voxels_as_were_counted_before():
-    number = value(s_mig(place3d("center"), [frame(0, boxes(AHEAD))], voxel_m=1.0, region=SMig(place3d("line")).grid.region))
+    number = value(
+        s_mig(place3d("center"), [frame(0, boxes(AHEAD))], voxel_m=1.0, region=SMig(place3d("line")).grid.region)
+    )
     assert number.parameters["voxels_crossed"] == 9564
     assert number.parameters["rays"] == 16_000
 
