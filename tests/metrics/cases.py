@@ -163,7 +163,7 @@ def detection_step(seed: int) -> Step:
 
 def frame_step(index: int) -> Step:
     generator = torch.Generator().manual_seed(index)
-    count = index // 2 % 5
+    count = index // 3 % 5
     rows = torch.rand(count, 7, generator=generator) * torch.tensor([50.0, 8, 0.5, 3, 2, 1, 3])
     rows += torch.tensor([3.0, -4, 0.5, 1, 1, 1, 0])
     # A few points anywhere, and on objects.
@@ -220,7 +220,7 @@ def of_frames(kind: Callable[..., Metric], usual: Step, changes: Mapping[str, St
     )
     return Case(
         lambda **changed: kind(**{**usual, **changed}),
-        [frame_step(index) for index in range(0, 20, 2)],  # blocks are paired up
+        [frame_step(index) for index in range(0, 24, 3)],  # blocks are paired up
         {"frame": nothing},
         {**changes, "rig": {"rig": "rig"}},
     )
