@@ -1,8 +1,11 @@
 """`torchcover show`: it finds what is meant, and draws it where it is."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from PIL import Image
 
 from torchcover.cli import show
 from torchcover.evaluation import scene_pictures, sensor_views
@@ -186,3 +189,37 @@ def test_a_rig_has_the_name_of_its_file_in_every_command(worlds):
 def test_it_prints_where_the_numbers_of_a_rig_come_from(torchcover, tmp_path):
     code, printed, _ = torchcover("show", "nuscenes", "--out", tmp_path)
     assert (code, " ".join(printed.split())[:60]) == (0, Rig.load("nuscenes").description[:60])
+
+
+def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
+    monkeypatch.setattr(show, "FILM_S", 0.6)
+    code, printed, _ = torchcover(
+        "show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--film", worlds / "new" / "a.gif", "--step", 1
+    )
+    assert (code, "a.gif" in printed) == (0, True)
+    with Image.open(worlds / "new" / "a.gif") as film:
+        seen = []
+        for number in range(film.n_frames):
+            film.seek(number)
+            seen.append(np.asarray(film.convert("RGB")))
+        pace_s = film.info["duration"] / 1000
+    steps = show._steps_of_film(Scenario.load(worlds / "yard.yaml"), 1)
+    assert len(seen) == len(steps) >= 2
+    assert pace_s == pytest.approx(steps.step * Scenario.load(worlds / "yard.yaml").step_s)
+    assert all((one != other).any() for one, other in pairwise(seen))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("yard.yaml", "--film", "a.avi"), "a film is a .gif or .mp4 file; got 'a.avi'"),
+        (("low.yaml", "--film", "a.gif"), "--film: for a scenario only"),
+        (("yard.yaml", "--film", "a.mp4"), "the program ffmpeg is needed for .mp4 and is not there; write a .gif"),
+    ],
+)
+def test_a_film_that_cannot_be_written_is_refused_at_once(options, message, torchcover, worlds, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    name, *others = options
+    code, _, told = torchcover("show", worlds / name, *others)
+    assert code == 2
+    assert message in told

@@ -1,6 +1,6 @@
-"""Pictures before any measurement: a rig on its vehicle, what its cameras see, a frame of a scenario from above."""
+"""Pictures before any measurement: a rig on its vehicle, what its cameras see, frames of a scenario from above."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -55,34 +55,35 @@ def rig_pictures(
         yield "_depth", draw_depths(images, title=f"{rig.name}: distance along the ray", subtitle=when)
 
 
-def scenario_picture(
-    scenario: Scenario, rig: Rig, *, vehicle: str | None = None, step: int = 0, seed: int = 0
-) -> Figure:
-    """A frame of a scenario from above: its actors, the points of a rig, those of the reference.
+def scenario_pictures(
+    scenario: Scenario, rig: Rig, steps: Sequence[int], *, vehicle: str | None = None, seed: int = 0
+) -> Iterator[Figure]:
+    """Frames of a scenario from above: its actors, the points of a rig, those of the reference.
 
     Args:
         scenario: The scenario.
         rig: Whose points.
+        steps: The frames.
         vehicle: What carries it, instead of the scenario's ego.
-        step: The frame.
         seed: Seed of the simulation.
     """
-    frames = _frames(scenario, rig, vehicle, step, seed)
-    frame = frames[step]
-    scene, step_of_world = frames.simulator.scene_of(step)
-    time_s = step_of_world * scene.world.time_step_s
-    return draw_scene(
-        GRID_X_M,
-        GRID_Y_M,
-        standing=_standing(scene.world, time_s),
-        ego_outline_m=scene.ego_box.outline_m,
-        actors=_actor_marks(scene.world, time_s),
-        sensor=frame.sensor.numpy(),
-        reference=frame.reference.numpy(),
-        title=f"{scenario.name}, step {step}",
-        subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name} on {frames.scenario.ego_name}",
-        path_m=_path_m(scene.world, time_s),
-    )
+    frames = _frames(scenario, rig, vehicle, max(steps), seed)
+    for step in steps:
+        frame = frames[step]
+        scene, step_of_world = frames.simulator.scene_of(step)
+        time_s = step_of_world * scene.world.time_step_s
+        yield draw_scene(
+            GRID_X_M,
+            GRID_Y_M,
+            standing=_standing(scene.world, time_s),
+            ego_outline_m=scene.ego_box.outline_m,
+            actors=_actor_marks(scene.world, time_s),
+            sensor=frame.sensor.numpy(),
+            reference=frame.reference.numpy(),
+            title=f"{scenario.name}, step {step}",
+            subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name} on {frames.scenario.ego_name}",
+            path_m=_path_m(scene.world, time_s),
+        )
 
 
 def _path_m(world: World, time_s: float) -> Matrix | None:

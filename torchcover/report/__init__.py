@@ -1,5 +1,6 @@
 """What a run shows: a table and its renderers, maps, drawings, a page. Imports matplotlib and rich: import it late."""
 
+from torchcover.report.drawings.film import check_film, write_film
 from torchcover.report.drawings.four_views import draw_four_views
 from torchcover.report.drawings.frame import ActorMark, Standing, draw_depths, draw_scene
 from torchcover.report.drawings.rig import draw_rig
@@ -43,6 +44,7 @@ __all__ = [
     "WorkPanel",
     "as_markdown",
     "band_figures",
+    "check_film",
     "difference_heading",
     "difference_scale",
     "draw_depths",
@@ -71,4 +73,5 @@ __all__ = [
     "table_dict",
     "text_table",
     "write_figures",
+    "write_film",
 ]

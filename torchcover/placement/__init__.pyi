@@ -1,0 +1,13 @@
+from .bits import Bits as Bits
+from .common_instants import CommonInstants as CommonInstants
+from .fresh import FreshGain as FreshGain
+from .fresh import FreshTest as FreshTest
+from .fresh import fresh_test as fresh_test
+from .objective import Objective as Objective
+from .question_grid import ReferencePoints as ReferencePoints
+from .racing import Paired as Paired
+from .racing import Raced as Raced
+from .racing import paired as paired
+from .racing import race as race
+from .racing import racing_order as racing_order
+from .scores import Scores as Scores
