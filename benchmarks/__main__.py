@@ -33,6 +33,7 @@ BENCHMARKS = (
     "mutated_files",
     "targets",
     "published",
+    "voxels",
     "pairing",
     "towns",
 )

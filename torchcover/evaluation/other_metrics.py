@@ -14,7 +14,7 @@ from torchcover.coverage.estimate import area_in_blocks
 from torchcover.data import BadFrameError, Frame, SimulatedFrames
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
-from torchcover.published import PUBLISHED, FrameMetric, PublishedNumber, Setup, Sights, WorldRatios
+from torchcover.published import PUBLISHED, FrameMetric, PublishedNumber, Setup, Sights
 from torchcover.published.comparison import OWN, MetricComparison, Series
 from torchcover.published.ranks import Array
 from torchcover.published.setup import Need
@@ -152,7 +152,7 @@ def drawn_worlds(coverage: Coverage, seed: int) -> Tensor | None:
 def _series(name: str, of_rigs: Sequence[FrameMetric], weights: Tensor | None) -> list[Series]:
     """The numbers of a metric, by their names; rigs may have different ones."""
     numbers = [{number.name: number for number in metric.compute()} for metric in of_rigs]
-    draws = [_draws(metric, weights) for metric in of_rigs]
+    draws = [_draws(metric, list(own), weights) for metric, own in zip(of_rigs, numbers, strict=True)]
     found = []
     for number in dict.fromkeys(each for own in numbers for each in own):
         together = [drawn[number] for drawn in draws if number in drawn]
@@ -161,11 +161,9 @@ def _series(name: str, of_rigs: Sequence[FrameMetric], weights: Tensor | None) -
     return found
 
 
-def _draws(metric: FrameMetric, weights: Tensor | None) -> dict[str, Array]:
-    if weights is None or not isinstance(metric, WorldRatios):
-        return {}
-    drawn = metric.resampled(weights).cpu().numpy()
-    return {ratio.name: drawn[:, at] for at, ratio in enumerate(metric.ratios)}
+def _draws(metric: FrameMetric, names: Sequence[str], weights: Tensor | None) -> dict[str, Array]:
+    drawn = None if weights is None else metric.resampled(weights)
+    return {} if drawn is None else dict(zip(names, drawn.cpu().numpy().T, strict=True))
 
 
 def _own(coverages: Sequence[Coverage], region: Region, height: str, which: int, weights: Tensor | None) -> Series:
