@@ -1,0 +1,53 @@
+"""Which places beside a street are its own."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.simulation.traffic.alignment import Alignment, squared_distances
+
+Numbers = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+SAMPLE_EVERY_M = 6.0
+# The nearest sample is that much farther than the nearest place, at most, for what lies 10 m or more aside.
+ROUNDING_M = 0.5
+STEP_M = 5.0
+
+
+class Territory:
+    """The places that are nearest to the stretch of the street that they were measured from.
+
+    No two stretches share any of it: what is built within cannot lie on another street, nor on what belongs to it.
+
+    Args:
+        street: The street.
+        span_m: First and last station that matter.
+    """
+
+    def __init__(self, street: Alignment, span_m: tuple[float, float]) -> None:
+        self._street = street
+        self._samples_m = np.arange(*span_m, SAMPLE_EVERY_M)
+        self._places_m = street.poses(self._samples_m, 0.0)[:, :2]
+
+    def owns(self, stations_m: Numbers, left_m: Numbers) -> Flags:
+        """(N,) whether places beside the street are their own stretch's."""
+        if self._street.is_straight:
+            return np.ones(len(stations_m), dtype=bool)
+        places_m = self._street.poses(stations_m, left_m)[:, :2]
+        nearest = squared_distances(places_m, self._places_m).min(axis=1)
+        return np.asarray(nearest > np.maximum(np.abs(left_m) - ROUNDING_M, 0.0) ** 2)
+
+    def nearest(self, places_m: Numbers) -> Numbers:
+        """(N,) stations of the nearest samples."""
+        return np.asarray(self._samples_m[squared_distances(places_m, self._places_m).argmin(axis=1)])
+
+    def reaches_m(self, stations_m: Numbers, side: int, near_m: float, far_m: float) -> Numbers:
+        """(N,) how far from the middle it goes without a gap, on the left (1) or on the right (-1), near to far."""
+        if self._street.is_straight:
+            return np.full(len(stations_m), far_m)
+        steps = np.append(np.arange(near_m, far_m, STEP_M), far_m)
+        station, left = np.meshgrid(stations_m, steps, indexing="ij")
+        owned = self.owns(station.ravel(), side * left.ravel()).reshape(station.shape)
+        owned[:, 0] = True
+        last = np.where(owned.all(axis=1), len(steps) - 1, np.argmin(owned, axis=1) - 1)
+        return np.asarray(steps[last])
