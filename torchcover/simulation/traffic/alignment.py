@@ -140,7 +140,11 @@ class Beside:
         steps_m, stations_m = np.diff(self._knots_m), np.diff(street.stations_m)
         long = stations_m > 0
         self._stations_per_m = np.append(np.divide(stations_m, steps_m, out=np.ones_like(steps_m), where=long), 1.0)
-        self._cubics = _cubics(street.poses(street.stations_m, left_m), np.where(long, steps_m, np.inf))
+        self._steps_m = np.where(long, steps_m, np.inf)
+
+    @cached_property
+    def _cubics(self) -> Numbers:
+        return _cubics(self.street.poses(self.street.stations_m, self.left_m), self._steps_m)
 
     @property
     def length_m(self) -> float:
@@ -158,14 +162,26 @@ class Beside:
 
     def poses(self, place_m: ArrayLike) -> Numbers:
         """(..., 3) x and y in metres, and yaw in degrees, after ways along the line; to a hundredth of a millimetre."""
-        knot, beyond_m = self._knot(np.asarray(place_m, dtype=np.float64))
+        place_m = np.asarray(place_m, dtype=np.float64)
+        if self.street.is_straight:
+            return self._poses_on_a_straight(place_m)
+        knot, beyond_m = self._knot(place_m)
         beyond_m = beyond_m[..., None]
-        poses = self._cubics[3].take(knot, axis=0)
+        poses: Numbers = self._cubics[3].take(knot, axis=0)
         for power in (2, 1, 0):
             poses *= beyond_m
             poses += self._cubics[power].take(knot, axis=0)
         if self.way < 0:
             poses[..., 2] += 180.0
+        return poses
+
+    def _poses_on_a_straight(self, place_m: Numbers) -> Numbers:
+        x, y, yaw_deg = self.street.poses(0.0, self.left_m)
+        along_m, yaw = self.way * (place_m - self._reach_m), np.deg2rad(yaw_deg)
+        poses = np.empty((*place_m.shape, 3))
+        poses[..., 0] = x + np.cos(yaw) * along_m
+        poses[..., 1] = y + np.sin(yaw) * along_m
+        poses[..., 2] = yaw_deg if self.way > 0 else yaw_deg + 180.0
         return poses
 
     def _knot(self, place_m: Numbers) -> tuple[Knots, Numbers]:

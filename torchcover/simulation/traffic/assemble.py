@@ -99,8 +99,9 @@ def actors(
     """
     near: list[Actor] = []
     for group in found:
-        away_m = group.positions_m[..., :2] - ego.trajectory.positions_m[:, None, :2]
-        distance = np.fmin.reduce(np.linalg.norm(away_m, axis=2), axis=0)
+        # On the level, and one axis after the other: hills come later, and this is done for very many.
+        x_m, y_m = ((group.positions_m[..., k] - ego.trajectory.positions_m[:, None, k]) ** 2 for k in (0, 1))
+        distance = np.sqrt(np.fmin.reduce(x_m + y_m, axis=0))
         numbers = np.flatnonzero((distance < HORIZON_M) & (np.array(group.kinds) != EGO))
         # One body after the other: each has its own piece of both.
         positions_m = np.ascontiguousarray(group.positions_m[:, numbers].swapaxes(0, 1))
@@ -110,7 +111,7 @@ def actors(
             wheels = np.array([CATEGORIES[group.kinds[number]] != "pedestrian" for number in numbers], dtype=bool)
             angles_deg[wheels, :, 1:] = hills.tilts_deg(positions_m[wheels, :, :2], angles_deg[wheels, :, 0])
             positions_m[..., 2] += hills.heights_m(positions_m[..., :2])
-        there = np.isfinite(positions_m[..., 0])
+        there = ~np.isnan(positions_m[..., 0])
         always = there.all(axis=1)
         for row, number in enumerate(numbers):
             kind, some = group.kinds[number], slice(None) if always[row] else there[row]

@@ -1,14 +1,17 @@
 """Gentle slopes: one height for each place, streets and all else."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic.alignment import squared_distances
 
 Numbers = NDArray[np.float64]
 
 WAVELENGTHS_M = (250.0, 700.0)
-WAVES = 4
+WAVES = 3
 # Between the corners of its squares the ground is nowhere farther from the hills than a centimetre or two.
 SQUARE_M = 10.0
 
@@ -39,23 +42,33 @@ class Hills:
         return float(self._wave_m * np.linalg.norm(self._waves_per_m, axis=0).sum())
 
     def heights_m(self, places_m: Numbers) -> Numbers:
-        """(...) at (..., 2) places."""
+        """(...) at (..., 2) places, rounded to some micrometres."""
         if self.are_flat:
             return np.zeros(places_m.shape[:-1])
-        heights: Numbers = self._wave_m * np.sin(places_m @ self._waves_per_m + self._phase).sum(axis=-1)
-        return heights
+        return self._wave_m * sum(np.sin(phase) for phase in self._phases(places_m)).astype(np.float64)
 
     def tilts_deg(self, places_m: Numbers, yaw_deg: Numbers) -> Numbers:
         """(..., 2) pitch and roll of who stands at (..., 2) places, with (...) headings."""
+        tilts = np.zeros(places_m.shape)
         if self.are_flat:
-            return np.zeros(places_m.shape)
-        slope = self._wave_m * np.cos(places_m @ self._waves_per_m + self._phase) @ self._waves_per_m.T
-        yaw = np.deg2rad(yaw_deg)
+            return tilts
+        yaw = np.deg2rad(yaw_deg).astype(np.float32)
         cos, sin = np.cos(yaw), np.sin(yaw)
-        ahead, left = slope[..., 0] * cos + slope[..., 1] * sin, slope[..., 1] * cos - slope[..., 0] * sin
-        # Up at the front is a negative pitch; up at the left lowers the right side.
-        tilts: Numbers = np.rad2deg(np.arctan(np.stack([-ahead, left], axis=-1)))
+        for phase, (x_per_m, y_per_m) in zip(self._phases(places_m), self._waves_per_m.T.astype(np.float32), strict=True):
+            slope = np.cos(phase)
+            # Up at the front is a negative pitch; up at the left lowers the right side.
+            tilts[..., 0] -= slope * (x_per_m * cos + y_per_m * sin)
+            tilts[..., 1] += slope * (y_per_m * cos - x_per_m * sin)
+        tilts *= self._wave_m
+        # The arc tangent of what is small.
+        tilts *= np.rad2deg(1.0) * (1.0 - tilts * tilts / 3)
         return tilts
+
+    def _phases(self, places_m: Numbers) -> Iterator[NDArray[np.float32]]:
+        """(...) of each wave. They are reduced in float64: sines and cosines of float32 take a fraction of the time."""
+        x_m, y_m = places_m[..., 0], places_m[..., 1]
+        for x_per_m, y_per_m, phase in zip(*self._waves_per_m, self._phase, strict=True):
+            yield (x_per_m * x_m + y_per_m * y_m + phase).astype(np.float32)
 
     def mesh(self, way_m: Numbers, within_m: float) -> Mesh:
         """The ground near a way, (N, 2) places, as one sheet of squares."""
@@ -63,13 +76,13 @@ class Hills:
         columns, rows = (np.ceil((way_m.max(axis=0) + within_m) / SQUARE_M) - lower).astype(np.int64).tolist()
         row, column = np.indices((rows, columns)).reshape(2, -1)
         middles_m = SQUARE_M * (lower + 0.5 + np.stack([column, row], axis=1))
-        near = np.zeros(len(middles_m), dtype=bool)
-        for place_m in way_m:
-            near |= ((middles_m - place_m) ** 2).sum(axis=1) < within_m**2
+        near = squared_distances(middles_m, way_m).min(axis=1) < within_m**2
         here = (row * (columns + 1) + column)[near]
         right, above = here + 1, here + columns + 1
         across = above + 1
         faces = np.concatenate([np.stack([here, right, across], axis=1), np.stack([here, across, above], axis=1)])
-        used, faces = np.unique(faces, return_inverse=True)
+        wanted = np.zeros((rows + 1) * (columns + 1), dtype=bool)
+        wanted[faces] = True
+        used, number = np.flatnonzero(wanted), np.cumsum(wanted) - 1
         places_m = SQUARE_M * (lower + np.stack([used % (columns + 1), used // (columns + 1)], axis=1))
-        return Mesh(np.column_stack([places_m, self.heights_m(places_m)]), faces.reshape(-1, 3))
+        return Mesh(np.column_stack([places_m, self.heights_m(places_m)]), number[faces])

@@ -143,19 +143,14 @@ class Streets:
             streets.append(Alignment(knots[of_turn] - station, self.main.curvatures_per_m[of_turn], start))
         return streets
 
-    @cached_property
-    def territory(self) -> Territory:
-        """What belongs to which stretch of the main street."""
-        return Territory(self.main, (-self.reach_m, self.reach_m))
-
-    def cross_ends_m(self, index: int) -> tuple[float, float]:
-        """Stations of a cross street between which no other stretch of the main street is nearer."""
-        ends = []
-        for side in (-1, 1):
-            station = self.junctions_m[index : index + 1]
-            (reach,) = self.territory.reaches_m(station, side, self.kerb_m, SIGHT_M)
-            ends.append(side * (np.inf if reach >= SIGHT_M else float(reach)))
-        return ends[0], ends[1]
+    def cross_ends_m(self, territory: Territory) -> Numbers:
+        """(J, 2) stations between which no other stretch of the main street is nearer to a cross street."""
+        near = territory.covers(self.junctions_m)
+        ends_m = np.tile([-2 * self.reach_m, 2 * self.reach_m], (len(self.junctions_m), 1))
+        for column, side in enumerate((-1, 1)):
+            reach_m = territory.reaches_m(self.junctions_m[near], side, self.kerb_m, SIGHT_M)
+            ends_m[near, column] = side * np.where(reach_m < SIGHT_M, reach_m, 2 * self.reach_m)
+        return ends_m
 
     def traffic_lanes(self) -> list[Lane]:
         """The lanes for motor traffic of the main street: eastbound from the median outwards, then westbound."""

@@ -8,10 +8,10 @@ from torchcover.simulation.traffic.alignment import Alignment, squared_distances
 Numbers = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-SAMPLE_EVERY_M = 6.0
+SAMPLE_EVERY_M = 8.0
 # The nearest sample is that much farther than the nearest place, at most, for what lies 10 m or more aside.
-ROUNDING_M = 0.5
-STEP_M = 5.0
+ROUNDING_M = 0.8
+HALVINGS = 6
 
 
 class Territory:
@@ -26,8 +26,17 @@ class Territory:
 
     def __init__(self, street: Alignment, span_m: tuple[float, float]) -> None:
         self._street = street
+        self._span_m = span_m
         self._samples_m = np.arange(*span_m, SAMPLE_EVERY_M)
         self._places_m = street.poses(self._samples_m, 0.0)[:, :2]
+
+    def stations_m(self, every_m: float) -> Numbers:
+        """(N,) stations of its street, at even distances."""
+        return np.arange(*self._span_m, every_m)
+
+    def covers(self, stations_m: Numbers) -> Flags:
+        """(N,) whether stations are among those that matter."""
+        return (stations_m > self._span_m[0]) & (stations_m < self._span_m[1])
 
     def owns(self, stations_m: Numbers, left_m: Numbers) -> Flags:
         """(N,) whether places beside the street are their own stretch's."""
@@ -42,12 +51,13 @@ class Territory:
         return np.asarray(self._samples_m[squared_distances(places_m, self._places_m).argmin(axis=1)])
 
     def reaches_m(self, stations_m: Numbers, side: int, near_m: float, far_m: float) -> Numbers:
-        """(N,) how far from the middle it goes without a gap, on the left (1) or on the right (-1), near to far."""
+        """(N,) how far from the middle it goes, on the left (1) or on the right (-1), from near to far."""
+        least, most = np.full(len(stations_m), near_m), np.full(len(stations_m), far_m)
         if self._street.is_straight:
-            return np.full(len(stations_m), far_m)
-        steps = np.append(np.arange(near_m, far_m, STEP_M), far_m)
-        station, left = np.meshgrid(stations_m, steps, indexing="ij")
-        owned = self.owns(station.ravel(), side * left.ravel()).reshape(station.shape)
-        owned[:, 0] = True
-        last = np.where(owned.all(axis=1), len(steps) - 1, np.argmin(owned, axis=1) - 1)
-        return np.asarray(steps[last])
+            return most
+        least[self.owns(stations_m, side * most)] = far_m
+        for _ in range(HALVINGS):
+            middle = (least + most) / 2
+            owned = self.owns(stations_m, side * middle)
+            least, most = np.where(owned, np.maximum(least, middle), least), np.where(owned, most, middle)
+        return least

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.alignment import Beside
 from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, come_near, ego_actor, paths
 from torchcover.simulation.traffic.city import City
 from torchcover.simulation.traffic.crossing import Footpath, step_height, walk
@@ -25,6 +24,7 @@ from torchcover.simulation.traffic.streets import (
     Streets,
     plan,
 )
+from torchcover.simulation.traffic.territory import Territory
 from torchcover.simulation.world import Actor
 
 Numbers = NDArray[np.float64]
@@ -32,6 +32,8 @@ Numbers = NDArray[np.float64]
 WARM_UP_S = 20.0
 # What is built up or has traffic, behind and ahead of all places the ego gets to.
 BEHIND_M, AHEAD_M = 120.0, 260.0
+# Stretches of the street that lie farther along it than this do not come near.
+ASIDE_M = 500.0
 # Widths of the main street, and the share of cities with parking bays along it.
 LANE_M, BAY_M, SIDEWALK_M, WITH_BAYS = (3.25, 3.75), 2.3, (3.2, 5.0), 0.8
 # The ego starts this far behind the vehicle it follows, which is a little slower.
@@ -98,12 +100,13 @@ class Urban(Procedural):
                 break
         near = come_near(lanes, agents, flow.place_m)
         place_m, agents = flow.place_m[:, near], [agents[number] for number in near]
-        moving = _in_place(paths(lanes, agents, place_m), lanes, agents, place_m, streets, fleet)
-        driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator, hills)
         first_m, last_m = lanes[agents[0].lane].line.stations(place_m[[0, -1], 0])
         seen = (float(first_m) - BEHIND_M, float(last_m) + AHEAD_M)
+        territory = Territory(streets.main, (seen[0] - ASIDE_M, seen[1] + ASIDE_M))
+        moving = _in_place(paths(lanes, agents, place_m), lanes, agents, place_m, streets, territory, fleet)
+        driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator, hills)
         crossing = _crossers(streets, flow, times_s, seen, fleet, generator)
-        city = City(streets, hills, fleet, self.parked_share, self.built_share, generator, shapes)
+        city = City(streets, territory, hills, fleet, self.parked_share, self.built_share, generator, shapes)
         static = city.static(seen)
         return static, driver, actors(times_s, [moving, crossing], driver, fleet, hills)
 
@@ -172,25 +175,37 @@ def _usually_follows(agents: list[Agent], flow: Flow) -> bool:
 
 
 def _in_place(
-    found: Paths, lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers, streets: Streets, fleet: Fleet
+    found: Paths,
+    lanes: Sequence[Lane],
+    agents: Sequence[Agent],
+    place_m: Numbers,
+    streets: Streets,
+    territory: Territory,
+    fleet: Fleet,
 ) -> Paths:
     """Lift those who walk along the main street onto the pavement, and let them step down at the cross streets.
 
     And let nobody be where their cross street ends.
     """
-    ends_m = {id(street): streets.cross_ends_m(index) for index, street in enumerate(streets.crossing)}
-    for index, agent in enumerate(agents):
-        line = lanes[agent.lane].line
-        assert isinstance(line, Beside)  # all lanes of a city are
-        stations_m = line.stations(place_m[:, index])
-        if agent.kind in ("adult", "child"):
+    junction = {id(street): index for index, street in enumerate(streets.crossing)}
+    ends_m = streets.cross_ends_m(territory)
+    radius_m = np.array([fleet.length_m(agent.kind) / 2 for agent in agents])
+    lane_of = np.array([agent.lane for agent in agents])
+    for lane in np.unique(lane_of):
+        line, on_lane = lanes[lane].line, np.flatnonzero(lane_of == lane)
+        places_m = place_m[:, on_lane]
+        if line.street is not streets.main:
+            first_m, last_m = np.sort(line.places_at(ends_m[junction[id(line.street)]]))
+            step, agent = np.nonzero((places_m < first_m) | (places_m > last_m))
+            found.positions_m[step, on_lane[agent]] = np.nan
+        elif agents[on_lane[0]].kind in ("adult", "child"):
             # On the inside of a turn the pavement goes on.
             stop = streets.course.turns != np.sign(line.left_m)
-            beyond_kerb = streets.cross_kerbs_m[stop] - np.abs(stations_m[:, None] - streets.junctions_m[stop])
-            found.positions_m[:, index, 2] = step_height(beyond_kerb.max(axis=1), fleet.length_m(agent.kind) / 2)
-        elif line.street is not streets.main:
-            first_m, last_m = ends_m[id(line.street)]
-            found.positions_m[(stations_m < first_m) | (stations_m > last_m), index] = np.nan
+            middles_m, halves_m = streets.junctions_m[stop][:: line.way], streets.cross_kerbs_m[stop][:: line.way]
+            first_m, last_m = np.sort(line.places_at(middles_m + np.array([[-1.0], [1.0]]) * halves_m), axis=0)
+            next_one = np.minimum(np.searchsorted(last_m, np.ascontiguousarray(places_m.T)).T, len(last_m) - 1)
+            beyond_kerb_m = np.minimum(places_m - first_m[next_one], last_m[next_one] - places_m)
+            found.positions_m[:, on_lane, 2] = step_height(beyond_kerb_m, radius_m[on_lane])
     return found
 
 
