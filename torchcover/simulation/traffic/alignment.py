@@ -61,7 +61,7 @@ class Alignment:
 
     def curvatures(self, stations_m: ArrayLike) -> Numbers:
         """(...) curvatures in 1/m."""
-        return np.asarray(np.interp(stations_m, self.stations_m, self.curvatures_per_m))
+        return np.asarray(np.interp(np.asarray(stations_m, dtype=np.float64), self.stations_m, self.curvatures_per_m))
 
     def poses(self, stations_m: ArrayLike, left_m: ArrayLike) -> Numbers:
         """(..., 3) x and y in metres and yaw in degrees of places beside the line."""
@@ -76,9 +76,9 @@ class Alignment:
         return poses
 
     def lengths_m(self, stations_m: ArrayLike, left_m: ArrayLike) -> Numbers:
-        """(...) ways from station 0 along the line that keeps to the left by so much; exact, as long as it is a line."""
+        """(...) ways from station 0 along the line that keeps to the left by so much; exact."""
         turned = self.headings(stations_m) - self.headings(0.0)
-        return np.asarray(stations_m - left_m * turned, dtype=np.float64)
+        return np.asarray(stations_m, dtype=np.float64) - np.asarray(left_m, dtype=np.float64) * turned
 
     def project(self, places_m: Numbers, span_m: tuple[float, float]) -> Numbers:
         """(N, 2) station and distance to the left of the nearest place on a stretch of the line, of (N, 2) places."""
@@ -109,7 +109,8 @@ class Alignment:
         """(..., 2) from knots to places beyond them."""
         first, middle, last = (self._heading(knot, share * beyond_m) for share in GAUSS_PLACES)
         mean = [(5 * turn(first) + 8 * turn(middle) + 5 * turn(last)) / 18 for turn in (np.cos, np.sin)]
-        return np.stack(mean, axis=-1) * beyond_m[..., None]
+        ways_m: Numbers = np.stack(mean, axis=-1) * beyond_m[..., None]
+        return ways_m
 
 
 def squared_distances(places_m: Numbers, others_m: Numbers) -> Numbers:
@@ -158,7 +159,8 @@ class Beside:
     def stations(self, place_m: ArrayLike) -> Numbers:
         """(...) stations of the street after ways along the line."""
         knot, beyond_m = self._knot(np.asarray(place_m, dtype=np.float64))
-        return self.street.stations_m[knot] + beyond_m * self._stations_per_m[knot]
+        stations_m: Numbers = self.street.stations_m[knot] + beyond_m * self._stations_per_m[knot]
+        return stations_m
 
     def poses(self, place_m: ArrayLike) -> Numbers:
         """(..., 3) x and y in metres, and yaw in degrees, after ways along the line; to a hundredth of a millimetre."""
@@ -206,4 +208,6 @@ def _cubics(poses: Numbers, steps_m: Numbers) -> Numbers:
     linear, square[:, 2], cube[:, 2] = linear.copy(), 0.0, 0.0
     linear[:, 2] = mean[:, 2]
     none = np.zeros((1, 3))
-    return np.stack([poses, *(np.concatenate([part, last]) for part, last in ((linear, slopes[-1:]), (square, none), (cube, none)))])
+    return np.stack(
+        [poses, *(np.concatenate([part, last]) for part, last in ((linear, slopes[-1:]), (square, none), (cube, none)))]
+    )

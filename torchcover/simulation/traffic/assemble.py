@@ -80,8 +80,9 @@ def ego_actor(
     angles = attitude(times_s, way, speed, found.yaw_deg[:, index], generator)
     positions_m = found.positions_m[:, index].copy()
     if hills is not None:
-        angles[:, 1:] += hills.tilts_deg(positions_m[:, :2], found.yaw_deg[:, index])
-        positions_m[:, 2] += hills.heights_m(positions_m[:, :2])
+        stances = hills.stances(positions_m[:, :2], found.yaw_deg[:, index])
+        positions_m[:, 2] += stances[:, 0]
+        angles[:, 1:] += stances[:, 1:]
     return Actor(EGO, "car", mesh, Trajectory(times_s, positions_m, angles))
 
 
@@ -108,11 +109,13 @@ def actors(
         angles_deg = np.zeros_like(positions_m)
         angles_deg[..., 0] = group.yaw_deg[:, numbers].T
         if hills is not None:
-            wheels = np.array([CATEGORIES[group.kinds[number]] != "pedestrian" for number in numbers], dtype=bool)
-            angles_deg[wheels, :, 1:] = hills.tilts_deg(positions_m[wheels, :, :2], angles_deg[wheels, :, 0])
-            positions_m[..., 2] += hills.heights_m(positions_m[..., :2])
+            on_foot = np.array([CATEGORIES[group.kinds[number]] == "pedestrian" for number in numbers], dtype=bool)
+            positions_m[on_foot, :, 2] += hills.heights_m(positions_m[on_foot, :, :2])
+            stances = hills.stances(positions_m[~on_foot, :, :2], angles_deg[~on_foot, :, 0])
+            positions_m[~on_foot, :, 2] += stances[..., 0]
+            angles_deg[~on_foot, :, 1:] = stances[..., 1:]
         there = ~np.isnan(positions_m[..., 0])
-        always = there.all(axis=1)
+        always = np.array([all_along.all() for all_along in there], dtype=bool)
         for row, number in enumerate(numbers):
             kind, some = group.kinds[number], slice(None) if always[row] else there[row]
             trajectory = Trajectory(times_s[some], positions_m[row, some], angles_deg[row, some], not always[row])

@@ -134,7 +134,9 @@ class City:
         site = Site(street, Territory(street, span_m), self._hills, deep_m, self._territory, turn_m)
         # As far as it is opposite of the turn, and not of another one.
         x = np.arange(*span_m, 5.0)
-        foreign = ~(site.owns(x, np.full(len(x), side * kerb_m)) & site.owns(x, np.full(len(x), side * (deep_m - 10.0))))
+        foreign = ~(
+            site.owns(x, np.full(len(x), side * kerb_m)) & site.owns(x, np.full(len(x), side * (deep_m - 10.0)))
+        )
         foreign &= np.abs(x) > half_m
         before, behind = x[foreign & (x < 0.0)], x[foreign & (x > 0.0)]
         x_m = max([span_m[0], *before.tolist()]) + 5.0, min([span_m[1], *behind.tolist()]) - 5.0
@@ -255,10 +257,9 @@ class City:
         kinds, x_m, y_m, yaw_deg = zip(*cars, strict=True)
         poses = site.street.poses(x_m, np.array(y_m))
         poses[:, 2] += yaw_deg
-        heights_m = self._hills.heights_m(poses[:, :2]).tolist()
-        tilts_deg = self._hills.tilts_deg(poses[:, :2], poses[:, 2]).tolist()
-        for kind, (x, y, yaw), height_m, (pitch, roll) in zip(kinds, poses.tolist(), heights_m, tilts_deg, strict=True):
-            self._fleet.park(kind, (x, y, yaw), height_m, (pitch, roll))
+        stances = self._hills.stances(poses[:, :2], poses[:, 2])
+        for kind, (x, y, yaw), (height_m, *tilt_deg) in zip(kinds, poses.tolist(), stances.tolist(), strict=True):
+            self._fleet.park(kind, (x, y, yaw), height_m, (tilt_deg[0], tilt_deg[1]))
 
     def _is_free(self, front: Frontage, x_m: Bounds) -> bool:
         """Whether something may stand from one station to another."""

@@ -229,7 +229,7 @@ class _Limits:
         entry += self._first
         np.minimum(entry, self._last, out=entry)
         np.maximum(entry, self._first, out=entry)
-        return np.minimum(self._table.take(entry), desired_mps)
+        return np.asarray(np.minimum(self._table.take(entry), desired_mps))
 
 
 def check_crowd(agents: float, steps: int) -> None:

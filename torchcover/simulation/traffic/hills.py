@@ -34,7 +34,7 @@ class Hills:
     @property
     def are_flat(self) -> bool:
         """Whether there are none."""
-        return self._wave_m == 0.0
+        return bool(self._wave_m == 0.0)
 
     @property
     def steepest(self) -> float:
@@ -45,24 +45,29 @@ class Hills:
         """(...) at (..., 2) places, rounded to some micrometres."""
         if self.are_flat:
             return np.zeros(places_m.shape[:-1])
-        return self._wave_m * sum(np.sin(phase) for phase in self._phases(places_m)).astype(np.float64)
+        waves = sum((np.sin(phase) for phase in self._phases(places_m)), start=np.float32(0.0))
+        return np.asarray(self._wave_m * np.asarray(waves, dtype=np.float64))
 
-    def tilts_deg(self, places_m: Numbers, yaw_deg: Numbers) -> Numbers:
-        """(..., 2) pitch and roll of who stands at (..., 2) places, with (...) headings."""
-        tilts = np.zeros(places_m.shape)
+    def stances(self, places_m: Numbers, yaw_deg: Numbers) -> Numbers:
+        """(..., 3) height in metres, and pitch and roll in degrees, of who stands at (..., 2) places with headings."""
         if self.are_flat:
-            return tilts
+            return np.zeros((*places_m.shape[:-1], 3))
+        stances = np.zeros((3, *places_m.shape[:-1]), dtype=np.float32)
+        height, pitch, roll = stances
         yaw = np.deg2rad(yaw_deg).astype(np.float32)
         cos, sin = np.cos(yaw), np.sin(yaw)
-        for phase, (x_per_m, y_per_m) in zip(self._phases(places_m), self._waves_per_m.T.astype(np.float32), strict=True):
+        for phase, (x_per_m, y_per_m) in zip(
+            self._phases(places_m), self._waves_per_m.T.astype(np.float32), strict=True
+        ):
+            height += np.sin(phase)
             slope = np.cos(phase)
             # Up at the front is a negative pitch; up at the left lowers the right side.
-            tilts[..., 0] -= slope * (x_per_m * cos + y_per_m * sin)
-            tilts[..., 1] += slope * (y_per_m * cos - x_per_m * sin)
-        tilts *= self._wave_m
+            pitch -= slope * (x_per_m * cos + y_per_m * sin)
+            roll += slope * (y_per_m * cos - x_per_m * sin)
+        stances *= np.float32(self._wave_m)
         # The arc tangent of what is small.
-        tilts *= np.rad2deg(1.0) * (1.0 - tilts * tilts / 3)
-        return tilts
+        stances[1:] *= np.float32(np.rad2deg(1.0)) * (1 - stances[1:] ** 2 / 3)
+        return np.moveaxis(stances, 0, -1).astype(np.float64)
 
     def _phases(self, places_m: Numbers) -> Iterator[NDArray[np.float32]]:
         """(...) of each wave. They are reduced in float64: sines and cosines of float32 take a fraction of the time."""

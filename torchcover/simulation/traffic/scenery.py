@@ -80,10 +80,15 @@ def slab(corners_m: Numbers, z_m: tuple[float, float]) -> Mesh:
     rows, columns, _ = corners_m.shape
     number = np.arange(rows * columns).reshape(rows, columns)
     here, ahead, aside, across = number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]
-    over = np.concatenate([np.stack(three, axis=-1).reshape(-1, 3) for three in ((here, ahead, across), (here, across, aside))])
+    over = np.concatenate(
+        [np.stack(three, axis=-1).reshape(-1, 3) for three in ((here, ahead, across), (here, across, aside))]
+    )
     around = np.concatenate([number[:-1, 0], number[-1, :-1], number[:0:-1, -1], number[0, :0:-1]])
     following, up = np.roll(around, -1), rows * columns
-    sides = [np.stack([around, following, following + up], axis=1), np.stack([around, following + up, around + up], axis=1)]
+    sides = [
+        np.stack([around, following, following + up], axis=1),
+        np.stack([around, following + up, around + up], axis=1),
+    ]
     places_m = np.tile(corners_m.reshape(-1, 2), (2, 1))
     return Mesh(
         np.column_stack([places_m, np.repeat(z_m, rows * columns)]), np.concatenate([over[:, ::-1], over + up, *sides])

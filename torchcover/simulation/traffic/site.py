@@ -17,6 +17,7 @@ Bounds = tuple[float, float]
 
 # What bends is cut into such pieces, and on hills across the street, too.
 PIECE_M, ACROSS_M = 6.0, 12.0
+SURVEY_EVERY_M = 8.0
 # There is so much room between blocks where two stretches of street are near; houses keep within their block.
 BETWEEN_BLOCKS_M = 4.0
 NARROWEST_M = 0.5
@@ -31,8 +32,9 @@ class Site:
         street: The street.
         territory: What belongs to it.
         hills: The ground.
-        beyond: Where else it may not be built, if it is not the main street: a station of that, and how far from there.
         deep_m: How far from its middle it is built at most.
+        main: What belongs to the main street, if this is another one.
+        turn_m: Only what is nearest to the main street between these stations may be built, then.
     """
 
     def __init__(
@@ -65,11 +67,13 @@ class Site:
         """Those bodies that stand on it altogether, and not near its end."""
         if self.street.is_straight or not pieces:
             return list(pieces)
-        lower, upper = (np.array([reduce(piece.vertices_m[:, :2], 0) for piece in pieces]) for reduce in (np.min, np.max))
+        lower, upper = (
+            np.array([reduce(piece.vertices_m[:, :2], 0) for piece in pieces]) for reduce in (np.min, np.max)
+        )
         x_m = np.stack([lower[:, 0], lower[:, 0], upper[:, 0], upper[:, 0]], axis=1).ravel()
         y_m = np.stack([lower[:, 1], upper[:, 1], lower[:, 1], upper[:, 1]], axis=1).ravel()
-        owned = self.owns(x_m, y_m + 2 * BETWEEN_BLOCKS_M * np.sign(y_m)).reshape(-1, 4).all(axis=1)
-        return [piece for piece, own in zip(pieces, owned, strict=True) if own]
+        owned: NDArray[np.bool_] = self.owns(x_m, y_m + 2 * BETWEEN_BLOCKS_M * np.sign(y_m)).reshape(-1, 4)
+        return [piece for piece, own in zip(pieces, owned, strict=True) if own.all()]
 
     def block(self, x_m: Bounds, side: int, kerb_m: float, depth_m: float) -> Mesh:
         """Pavement from a kerb on, on the left (1) or the right (-1), as far as the site goes there."""
@@ -102,6 +106,6 @@ class Site:
     def _reach_m(self, x_m: Numbers, side: int, kerb_m: float) -> Numbers:
         """(N,) how far from the middle it goes there."""
         if side not in self._reaches_m:
-            stations_m = self._territory.stations_m(PIECE_M)
+            stations_m = self._territory.stations_m(SURVEY_EVERY_M)
             self._reaches_m[side] = stations_m, self._territory.reaches_m(stations_m, side, kerb_m, self._deep_m)
         return np.asarray(np.interp(x_m, *self._reaches_m[side]))

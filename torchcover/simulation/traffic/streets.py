@@ -119,7 +119,7 @@ class Streets:
     @property
     def has_lights(self) -> NDArray[np.bool_]:
         """(J,) whether somebody crosses the main street there: not where it turns, and others give way."""
-        return self.course.turns == 0
+        return np.asarray(self.course.turns == 0)
 
     @cached_property
     def crossing(self) -> list[Alignment]:

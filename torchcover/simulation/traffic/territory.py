@@ -11,7 +11,8 @@ Flags = NDArray[np.bool_]
 SAMPLE_EVERY_M = 8.0
 # The nearest sample is that much farther than the nearest place, at most, for what lies 10 m or more aside.
 ROUNDING_M = 0.8
-HALVINGS = 6
+# Halvings of what is a hundred metres.
+HALVINGS = 5
 
 
 class Territory:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic.alignment import Beside
 from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, come_near, ego_actor, paths
 from torchcover.simulation.traffic.city import City
 from torchcover.simulation.traffic.crossing import Footpath, step_height, walk
@@ -33,7 +34,7 @@ WARM_UP_S = 20.0
 # What is built up or has traffic, behind and ahead of all places the ego gets to.
 BEHIND_M, AHEAD_M = 120.0, 260.0
 # Stretches of the street that lie farther along it than this do not come near.
-ASIDE_M = 500.0
+ASIDE_M = 320.0
 # Widths of the main street, and the share of cities with parking bays along it.
 LANE_M, BAY_M, SIDEWALK_M, WITH_BAYS = (3.25, 3.75), 2.3, (3.2, 5.0), 0.8
 # The ego starts this far behind the vehicle it follows, which is a little slower.
@@ -100,7 +101,9 @@ class Urban(Procedural):
                 break
         near = come_near(lanes, agents, flow.place_m)
         place_m, agents = flow.place_m[:, near], [agents[number] for number in near]
-        first_m, last_m = lanes[agents[0].lane].line.stations(place_m[[0, -1], 0])
+        own_lane = lanes[agents[0].lane].line
+        assert isinstance(own_lane, Beside)  # as all lanes of a city are
+        first_m, last_m = own_lane.stations(place_m[[0, -1], 0])
         seen = (float(first_m) - BEHIND_M, float(last_m) + AHEAD_M)
         territory = Territory(streets.main, (seen[0] - ASIDE_M, seen[1] + ASIDE_M))
         moving = _in_place(paths(lanes, agents, place_m), lanes, agents, place_m, streets, territory, fleet)
@@ -194,6 +197,7 @@ def _in_place(
     for lane in np.unique(lane_of):
         line, on_lane = lanes[lane].line, np.flatnonzero(lane_of == lane)
         places_m = place_m[:, on_lane]
+        assert isinstance(line, Beside)
         if line.street is not streets.main:
             first_m, last_m = np.sort(line.places_at(ends_m[junction[id(line.street)]]))
             step, agent = np.nonzero((places_m < first_m) | (places_m > last_m))
@@ -230,7 +234,7 @@ def _crossers(
                 x = streets.junctions_m[index] + side * (streets.cross_kerbs_m[index] + offset)
                 kind = fleet.draw_kind({"adult": 5.0, "child": 1.0})
                 ends = streets.main.poses(x, np.array([-wait_m, wait_m]))[:, :2]
-                path = Footpath(*ends, WAITING_BEHIND_KERB_M)
+                path = Footpath(ends[0], ends[1], WAITING_BEHIND_KERB_M)
                 position, yaw = walk(path, may_go[:, index], walks, times_s, fleet.length_m(kind) / 2, generator)
                 positions.append(position)
                 yaws.append(yaw)
