@@ -115,9 +115,10 @@ class Alignment:
 
 def squared_distances(places_m: Numbers, others_m: Numbers) -> Numbers:
     """(N, M) squared distances between (N, 2) and (M, 2) places."""
-    squares = (places_m**2).sum(axis=1)[:, None] + (others_m**2).sum(axis=1)
+    squares: Numbers = (places_m**2).sum(axis=1)[:, None] + (others_m**2).sum(axis=1)
     squares -= 2 * places_m @ others_m.T
-    return np.maximum(squares, 0.0, out=squares)
+    np.maximum(squares, 0.0, out=squares)
+    return squares
 
 
 class Beside:

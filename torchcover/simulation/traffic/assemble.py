@@ -118,6 +118,8 @@ def actors(
         always = np.array([all_along.all() for all_along in there], dtype=bool)
         for row, number in enumerate(numbers):
             kind, some = group.kinds[number], slice(None) if always[row] else there[row]
+            if np.count_nonzero(there[row]) < 2:
+                continue
             trajectory = Trajectory(times_s[some], positions_m[row, some], angles_deg[row, some], not always[row])
             near.append(Actor(f"{kind} {len(near)}", CATEGORIES[kind], fleet.meshes[kind], trajectory))
     return tuple(near)

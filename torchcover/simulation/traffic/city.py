@@ -228,8 +228,8 @@ class City:
         """Trees in the open."""
         pieces: list[Mesh] = []
         behind_m = front.kerb_m + self._section.sidewalk_m
-        x = front.x_m[0]
-        while x < front.x_m[1]:
+        x = front.x_m[0] + self._section.sidewalk_m
+        while x < front.x_m[1] - self._section.sidewalk_m:
             foot = x, front.side * (behind_m + self._uniform(*VERGE_TREES_M))
             pieces += tree(foot, 0.0, self._uniform(1.0, 3.0), self._uniform(5.0, 11.0), self._uniform(1.0, 2.0))
             x += self._uniform(*VERGE_TREE_EVERY_M)

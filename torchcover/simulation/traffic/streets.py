@@ -34,7 +34,9 @@ GREEN_WAVE_MPS = 11.0
 WAVE_DISORDER_S = 9.0
 
 # What is farther away along a cross street than this is not seen from the main street.
-SIGHT_M = 400.0
+SIGHT_M = 270.0
+# Half of the longest vehicle, and a little more.
+LONGEST_HALF_M = 9.0
 
 # Across a curve, and before it.
 COMFORTABLE_MPS2, BRAKING_MPS2 = 2.0, 1.2
@@ -143,13 +145,14 @@ class Streets:
             streets.append(Alignment(knots[of_turn] - station, self.main.curvatures_per_m[of_turn], start))
         return streets
 
-    def cross_ends_m(self, territory: Territory) -> Numbers:
-        """(J, 2) stations between which no other stretch of the main street is nearer to a cross street."""
-        near = territory.covers(self.junctions_m)
-        ends_m = np.tile([-2 * self.reach_m, 2 * self.reach_m], (len(self.junctions_m), 1))
+    def cross_ends_m(self) -> Numbers:
+        """(J, 2) stations between which a cross street, in all its width, is far from all others of its kind."""
+        whole = Territory(self.main, (-self.reach_m, self.reach_m))
+        edges_m = self.junctions_m + np.array([[-1.0], [1.0]]) * (self.cross_kerbs_m + 1.0)
+        ends_m = np.empty((len(self.junctions_m), 2))
         for column, side in enumerate((-1, 1)):
-            reach_m = territory.reaches_m(self.junctions_m[near], side, self.kerb_m, SIGHT_M)
-            ends_m[near, column] = side * np.where(reach_m < SIGHT_M, reach_m, 2 * self.reach_m)
+            reach_m = whole.reaches_m(edges_m.ravel(), side, self.kerb_m, SIGHT_M).reshape(2, -1).min(axis=0)
+            ends_m[:, column] = side * (2 * self.reach_m if self.main.is_straight else reach_m - LONGEST_HALF_M)
         return ends_m
 
     def traffic_lanes(self) -> list[Lane]:

@@ -9,8 +9,6 @@ Numbers = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 SAMPLE_EVERY_M = 8.0
-# The nearest sample is that much farther than the nearest place, at most, for what lies 10 m or more aside.
-ROUNDING_M = 0.8
 # Halvings of what is a hundred metres.
 HALVINGS = 5
 
@@ -43,9 +41,8 @@ class Territory:
         """(N,) whether places beside the street are their own stretch's."""
         if self._street.is_straight:
             return np.ones(len(stations_m), dtype=bool)
-        places_m = self._street.poses(stations_m, left_m)[:, :2]
-        nearest = squared_distances(places_m, self._places_m).min(axis=1)
-        return np.asarray(nearest > np.maximum(np.abs(left_m) - ROUNDING_M, 0.0) ** 2)
+        nearest = self.nearest(self._street.poses(stations_m, left_m)[:, :2])
+        return np.asarray(np.abs(nearest - stations_m) <= SAMPLE_EVERY_M)
 
     def nearest(self, places_m: Numbers) -> Numbers:
         """(N,) stations of the nearest samples."""

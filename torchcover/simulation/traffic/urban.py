@@ -106,7 +106,7 @@ class Urban(Procedural):
         first_m, last_m = own_lane.stations(place_m[[0, -1], 0])
         seen = (float(first_m) - BEHIND_M, float(last_m) + AHEAD_M)
         territory = Territory(streets.main, (seen[0] - ASIDE_M, seen[1] + ASIDE_M))
-        moving = _in_place(paths(lanes, agents, place_m), lanes, agents, place_m, streets, territory, fleet)
+        moving = _in_place(paths(lanes, agents, place_m), lanes, agents, place_m, streets, fleet)
         driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator, hills)
         crossing = _crossers(streets, flow, times_s, seen, fleet, generator)
         city = City(streets, territory, hills, fleet, self.parked_share, self.built_share, generator, shapes)
@@ -183,7 +183,6 @@ def _in_place(
     agents: Sequence[Agent],
     place_m: Numbers,
     streets: Streets,
-    territory: Territory,
     fleet: Fleet,
 ) -> Paths:
     """Lift those who walk along the main street onto the pavement, and let them step down at the cross streets.
@@ -191,7 +190,7 @@ def _in_place(
     And let nobody be where their cross street ends.
     """
     junction = {id(street): index for index, street in enumerate(streets.crossing)}
-    ends_m = streets.cross_ends_m(territory)
+    ends_m = streets.cross_ends_m()
     radius_m = np.array([fleet.length_m(agent.kind) / 2 for agent in agents])
     lane_of = np.array([agent.lane for agent in agents])
     for lane in np.unique(lane_of):
