@@ -32,6 +32,7 @@ BENCHMARKS = (
     "scaling",
     "mutated_files",
     "targets",
+    "cities",
 )
 
 

@@ -70,7 +70,10 @@ def test_the_ego_stays_on_the_road_and_tilts_a_little(kind, world):
     assert 0.1 < np.abs(pitch).max() < 2.0
     assert 0.1 < np.abs(roll).max() < 1.5
     # Not of who stands, maybe for long, on one bump.
-    assert abs(pitch[np.gradient(ego.positions_m[:, 0]) ** 2 + np.gradient(ego.positions_m[:, 1]) ** 2 > 0.01].mean()) < 0.1
+    assert (
+        abs(pitch[np.gradient(ego.positions_m[:, 0]) ** 2 + np.gradient(ego.positions_m[:, 1]) ** 2 > 0.01].mean())
+        < 0.1
+    )
     assert np.abs(np.diff(ego.angles_deg[:, 1:], axis=0)).max() < 0.4
 
 
