@@ -120,18 +120,19 @@ def paper(name, options):
 def measured(scenario, rigs, reference, steps, seed, *, area):
     """For each rig {(region, height): (detection, radius)}."""
     frames = SimulatedFrames(
-        scenario, {rig: rig for rig in rigs}, steps=steps, seed=seed, every_s=EVERY_S, reference_sensor=reference
+        scenario, rigs={rig: rig for rig in rigs}, steps=steps, seed=seed, every_s=EVERY_S, reference_sensor=reference
     )
     metrics = {rig: CoverageMetric(GRID, max_radius=GRID.diagonal_m, square_metres=area) for rig in rigs}
     observers = {rig: CoverageObserver(metric, rig) for rig, metric in metrics.items()}
     observe(frames, observers.values())
-    return {
-        rig: {
-            (row.region, row.height): (row.numbers["detection_0.4m"].value, row.numbers["radius_m"].value)
-            for row in observer.compute().summary(REGIONS)
-        }
-        for rig, observer in observers.items()
-    }
+    found = {}
+    for rig, observer in observers.items():
+        coverage = observer.compute()
+        for region in REGIONS:
+            for height in GRID.heights:
+                radius_m, detection = coverage.estimate(region, height).value.tolist()[:2]
+                found.setdefault(rig, {})[region.name, height] = detection, radius_m
+    return found
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, box, few, ground, post, tree
 from torchcover.simulation.traffic.site import Bounds, Site
 from torchcover.simulation.traffic.streets import GUTTER_M, Streets
-from torchcover.simulation.traffic.territory import Territory
+from torchcover.simulation.traffic.territory import SAMPLE_EVERY_M, Territory
 
 Numbers = NDArray[np.float64]
 
@@ -130,13 +130,15 @@ class City:
         kerb_m = float(self._streets.cross_lanes_each_way[index]) * self._section.lane_m + GUTTER_M
         side, middle_m = int(self._streets.course.turns[index]), float(self._streets.junctions_m[index])
         span_m = (-half_m - CORNER_M, half_m + CORNER_M)
-        deep_m, turn_m = kerb_m + CORNER_DEPTH_M + 10.0, (middle_m - half_m, middle_m + half_m)
+        deep_m, turn_m = (
+            kerb_m + CORNER_DEPTH_M + 10.0,
+            (middle_m - half_m - SAMPLE_EVERY_M, middle_m + half_m + SAMPLE_EVERY_M),
+        )
         site = Site(street, Territory(street, span_m), self._hills, deep_m, self._territory, turn_m)
         # As far as it is opposite of the turn, and not of another one.
         x = np.arange(*span_m, 5.0)
-        foreign = ~(
-            site.owns(x, np.full(len(x), side * kerb_m)) & site.owns(x, np.full(len(x), side * (deep_m - 10.0)))
-        )
+        foreign = ~site.is_opposite(x, np.full(len(x), side * kerb_m))
+        foreign |= ~site.is_opposite(x, np.full(len(x), side * (kerb_m + CORNER_DEPTH_M)))
         foreign &= np.abs(x) > half_m
         before, behind = x[foreign & (x < 0.0)], x[foreign & (x > 0.0)]
         x_m = max([span_m[0], *before.tolist()]) + 5.0, min([span_m[1], *behind.tolist()]) - 5.0

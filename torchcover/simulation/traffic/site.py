@@ -57,11 +57,14 @@ class Site:
 
     def owns(self, x_m: Numbers, y_m: Numbers) -> NDArray[np.bool_]:
         """(N,) whether places belong to it."""
-        owned = self._territory.owns(x_m, y_m)
-        if self._main is not None:
-            station = self._main.nearest(self.street.poses(x_m, y_m)[:, :2])
-            owned &= (station >= self._turn_m[0]) & (station <= self._turn_m[1])
-        return owned
+        return self._territory.owns(x_m, y_m) & self.is_opposite(x_m, y_m)
+
+    def is_opposite(self, x_m: Numbers, y_m: Numbers) -> NDArray[np.bool_]:
+        """(N,) whether places are opposite of the turn; all are, if it is the main street's."""
+        if self._main is None:
+            return np.ones(len(x_m), dtype=bool)
+        station = self._main.nearest(self.street.poses(x_m, y_m)[:, :2])
+        return np.asarray((station >= self._turn_m[0]) & (station <= self._turn_m[1]))
 
     def owned(self, pieces: Sequence[Mesh]) -> list[Mesh]:
         """Those bodies that stand on it altogether, and not near its end."""
