@@ -40,8 +40,8 @@ TABLES = Path(__file__).parents[1] / "examples" / "paper" / "tables.csv"
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cities", type=int, default=12)
-    parser.add_argument("--rays", type=int, default=16_384, help="points on surfaces, for the variety")
-    parser.add_argument("--paper-steps", type=int, default=24)
+    parser.add_argument("--rays", type=int, default=8192, help="points on surfaces, for the variety")
+    parser.add_argument("--paper-steps", type=int, default=12)
     options = parser.parse_args([] if __name__ != "__main__" else None)
     table(("code", "files", "lines"), [lines(name) for name in FILES])
     print(flush=True)
