@@ -36,6 +36,7 @@ BENCHMARKS = (
     "voxels",
     "pairing",
     "towns",
+    "cities",
 )
 
 
