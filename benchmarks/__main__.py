@@ -32,9 +32,12 @@ BENCHMARKS = (
     "scaling",
     "mutated_files",
     "targets",
+    "published",
+    "voxels",
     "pairing",
     "placement",
     "towns",
+    "cities",
 )
 
 

@@ -9,7 +9,8 @@ from pydantic import Field, PlainValidator, PositiveFloat, ValidationInfo, model
 
 from torchcover.placement.carrier import Carrier
 from torchcover.placement.free_sensor import HEIGHT_M, pose_of
-from torchcover.simulation import Document, Pose, Rig, Sensor
+from torchcover.simulation import Document, Pose, Sensor
+from torchcover.simulation.rig import read_sensor
 
 MOST_CANDIDATES = 2000
 
@@ -18,9 +19,7 @@ def _sensor(given: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whate
     """A sensor as a rig has it, without a name and a mount."""
     if isinstance(given, dict) and (own := [key for key in ("name", "mount") if key in given]):
         raise ValueError(f"{' and '.join(own)}: the places make them; leave them out")
-    content = {"name": "sensor", **given} if isinstance(given, dict) else given
-    rig = Rig.model_validate({"name": "one", "sensors": [content]}, context=info.context)
-    return rig.sensors[0]
+    return read_sensor({"name": "sensor", **given} if isinstance(given, dict) else given, info)
 
 
 class MountGrid(Document):

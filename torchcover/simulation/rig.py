@@ -12,7 +12,7 @@ from torchcover.simulation.lidar import Lidar, LidarModel
 from torchcover.simulation.sensor import Sensor
 
 
-def _sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whatever stood in the file, or a sensor)
+def read_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whatever stood in the file, or a sensor)
     """A sensor of the kind that its `type` names."""
     kind = content.get("type", "lidar") if isinstance(content, dict) else getattr(content, "type", type(content))
     if not isinstance(kind, str) or kind not in SENSORS:
@@ -38,7 +38,7 @@ class Rig(Document):
     name: str
     description: str = ""
     vehicle: NameOrFile | None = None
-    sensors: tuple[Annotated[Sensor, PlainValidator(_sensor)], ...] = Field(min_length=1)
+    sensors: tuple[Annotated[Sensor, PlainValidator(read_sensor)], ...] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _check_names(self) -> Self:

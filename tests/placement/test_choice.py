@@ -1,0 +1,144 @@
+"""A choice of candidates: what bits are worth is what rigs score, and what cannot be chosen is refused."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import yaml
+
+from tests.placement.worlds import EGO, FLOOR, LOT, WALL, held, lidar, rig
+from torchcover import Rig
+from torchcover.placement import ChoiceSpace, Worth, choose
+from torchcover.placement.choice_files import save_choice
+from torchcover.placement.choosing import OBJECTIVE
+
+SENSOR = {"type": "lidar", "channels": 16, "vertical_fov_deg": [-40, 2], "columns": 91, "horizontal_fov_deg": 180,
+          "max_range_m": 60}  # fmt: skip
+PLACES = {
+    "front": {"x_m": 1.5, "z_m": 1.9},
+    "rear": {"x_m": -1.5, "z_m": 1.9, "yaw_deg": 180},
+    "left": {"y_m": 0.8, "z_m": 1.9, "yaw_deg": 90},
+    "inside": {"z_m": 0.7},
+}
+SPACE = {
+    "name": "ends",
+    "scenario": "lot.yaml",
+    "candidates": {"wide": {"sensor": SENSOR, "places": PLACES}},
+    "choose": {"at_most": 2},
+    "objective": {"band": "ground", "region": ["front_3m", "rear_3m"]},
+}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("choice")
+    traffic = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings": 0, "parked_share": 0.3}
+    (path / "lot.yaml").write_text(yaml.safe_dump({"name": "lot", "ego": EGO, "traffic": traffic}))
+    return path
+
+
+def loaded(folder, **changes):
+    path = folder / "space.yaml"
+    path.write_text(yaml.safe_dump({**SPACE, **changes}))
+    return ChoiceSpace.load(path)
+
+
+@pytest.mark.parametrize("measure", ["area", "known"])
+def test_what_points_are_worth_is_the_mean_over_worlds_of_what_rigs_score(instants, measure):
+    rigs = [rig(lidar(mount={"z_m": z, "pitch_deg": pitch})) for z, pitch in ((1.7, 0.0), (2.4, 20.0))]
+    for name in instants.objectives:
+        worth = Worth.of_objective(instants, name, measure)
+        column = list(instants.objectives).index(name)
+        assert worth.total == pytest.approx(1.0, rel=1e-12)
+        for each in rigs:
+            bits = instants.bits(each)
+            expected = np.nanmean(instants.scores(bits).by_world(measure)[:, column])
+            assert worth.of(bits.seen) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("measure", ["area", "known"])
+def test_worlds_that_know_nothing_of_a_part_count_for_nothing(measure):
+    yard = {"name": "yard", "ego": EGO, "bodies": [FLOOR]}
+    walled = {"name": "walled", "ego": EGO, "bodies": [FLOOR, WALL]}
+    scenarios = [type(LOT).model_validate(one) for one in (yard, walled)]
+    from torchcover.placement import Objective
+
+    with held(scenarios, {"wall": Objective(region="20m", band="obstacle")}, per_world=1, every_s=0.1) as two:
+        worth = Worth.of_objective(two, "wall", measure)
+        bits = two.bits(rig())
+        (empty,), (known,) = two.scores(bits).by_world(measure)
+    assert np.isnan(empty)
+    assert worth.of(bits.seen) == pytest.approx(known, rel=1e-9)
+
+
+def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
+    space = loaded(folder, now=["wide_left"])
+    with held(space.scenarios, {OBJECTIVE: space.objective}, worlds=2) as instants:
+        found = choose(space, instants, test_seed=5, fresh_worlds=3)
+        pairs = [("front", "rear"), ("front", "left"), ("rear", "left")]
+        named = {sensor.name: sensor for sensor in space.sensors}
+        scores = {
+            pair: instants.score(space.rig(tuple(named[f"wide_{one}"] for one in pair), "pair")).by_world().mean()
+            for pair in pairs
+        }
+    best = max(scores, key=lambda pair: scores[pair])
+    assert set(found.names(found.best.chosen)) == {f"wide_{one}" for one in best}
+    assert found.best.value == pytest.approx(scores[best], rel=1e-9)
+    assert found.best.proven
+    assert list(found.refused) == ["wide_inside"]
+    assert found.gain.worlds == 3
+    assert found.gain.search_gain == pytest.approx(found.best.value - found.candidates.value(found.now), rel=1e-6)
+    written = {path.name for path in save_choice(found, folder / "out")}
+    assert written == {
+        "best.yaml", "candidates.csv", "sizes.csv", "search.json", "sizes.png", "report.html", "summary.json",
+    }  # fmt: skip
+    assert Rig.load(folder / "out" / "best.yaml").sensors == found.rig.sensors
+    rows = list(csv.DictReader((folder / "out" / "candidates.csv").read_text().splitlines()))
+    assert [row["name"] for row in rows if row["chosen"] == "True"] == sorted(found.names(found.best.chosen))
+    assert "inside" in rows[-1]["why_not"]
+    assert json.loads((folder / "out" / "search.json").read_text())["best"]["proven"] is True
+
+
+def test_places_all_over_a_region_lie_on_its_skin(tmp_path):
+    grid = {"region": ["roof", "hood"], "spacing_m": 0.6, "height_m": 0.2, "yaw_deg": [0, 90]}
+    candidates = {"wide": {"sensor": SENSOR, "grid": grid}}
+    space = loaded(tmp_path, scenario="courtyard", vehicle="suv", candidates=candidates)
+    names = [sensor.name for sensor in space.sensors]
+    assert len(set(names)) == len(names) > 10
+    assert all(name.startswith(("wide_roof_", "wide_hood_")) for name in names)
+    assert {round(sensor.mount.yaw_deg) for sensor in space.sensors} == {0, 90}
+    body = space.scenarios[0].ego_mesh()
+    top_m = body.vertices_m[:, 2].max()
+    assert all(0.9 < sensor.mount.z_m <= top_m + 0.2 + 1e-6 for sensor in space.sensors)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"choose": {}}, "at_most, max_cost_eur: one of the two is needed"),
+        ({"choose": {"max_cost_eur": 500}}, "cost: no price of wide"),
+        ({"choose": {"max_cost_eur": 500}, "cost": {"wide": 600}}, "500, but the cheapest candidate costs 600"),
+        ({"cost": {"narrow": 1}}, "cost: narrow: no group of candidates"),
+        ({"now": ["wide_top"]}, "now: wide_top: no candidate"),
+        ({"candidates": {"wide": {"sensor": SENSOR}}}, "places, grid: at least one of the two is needed"),
+        ({"candidates": {"wide": {"sensor": {**SENSOR, "name": "x"}, "places": PLACES}}}, "name: the places make them"),
+        ({"candidates": {"wide": {"sensor": SENSOR, "grid": {"region": ["wing"], "spacing_m": 1}}}}, "no 'wing'"),
+        ({"objective": {"band": "sky", "region": "20m"}}, "sky"),
+        ({"objective": {"region": "behind"}}, "behind"),
+        ({"candidates": {}}, "candidates"),
+    ],
+)
+def test_what_cannot_be_chosen_is_refused_in_one_line(folder, changes, message):
+    with pytest.raises(ValueError, match=message) as error:
+        loaded(folder, **changes)
+    assert "space.yaml" in str(error.value)
+
+
+def test_candidates_that_are_all_inside_are_refused(folder):
+    space = loaded(folder, candidates={"wide": {"sensor": SENSOR, "places": {"a": {"z_m": 0.7}}}})
+    with (
+        held(space.scenarios, {OBJECTIVE: space.objective}, worlds=1) as instants,
+        pytest.raises(ValueError, match=r"none of 1 can be there; of wide_a: .* inside the ego"),
+    ):
+        choose(space, instants, test_seed=5, fresh_worlds=1)
