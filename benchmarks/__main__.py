@@ -35,6 +35,9 @@ BENCHMARKS = (
     "towns",
     "pairing",
     "placement",
+    "published",
+    "voxels",
+    "cities",
 )
 
 

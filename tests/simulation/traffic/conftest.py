@@ -9,7 +9,18 @@ from torchcover.simulation import shapes
 from torchcover.simulation.traffic import Highway, Parking, Urban
 from torchcover.simulation.traffic.fleet import load_bodies
 
-KINDS = {"urban": Urban(), "narrow": Urban(lanes=2), "highway": Highway(), "parking": Parking()}
+# Hills lift and tilt, and change no place: what overlaps is found out on a plain.
+PLAIN = {"hills_m": 0.0}
+STRAIGHT = {**PLAIN, "bend_deg": 0.0, "turn_share": 0.0}
+KINDS = {
+    "urban": Urban(**PLAIN),
+    "narrow": Urban(lanes=2, **PLAIN),
+    "winding": Urban(lanes=4, bend_deg=35.0, turn_share=0.6, built_share=1.0, **PLAIN),
+    "straight": Urban(built_share=1.0, **STRAIGHT),
+    "hilly": Urban(hills_m=2.0),
+    "highway": Highway(),
+    "parking": Parking(),
+}
 
 
 @cache

@@ -10,6 +10,7 @@ from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.attitude import attitude
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet
 from torchcover.simulation.traffic.flow import Agent, Flow, Lane
+from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor
 
@@ -66,33 +67,59 @@ def come_near(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) 
 
 
 def ego_actor(
-    times_s: Numbers, found: Paths, flow: Flow, index: int, mesh: Mesh, generator: np.random.Generator
+    times_s: Numbers,
+    found: Paths,
+    flow: Flow,
+    index: int,
+    mesh: Mesh,
+    generator: np.random.Generator,
+    hills: Hills | None = None,
 ) -> Actor:
-    """The ego, one of those who follow lanes, with a body that tilts."""
+    """The ego, one of those who follow lanes, with a body that tilts; on a plain if there are no hills."""
     way, speed = flow.place_m[:, index], flow.speed_mps[:, index]
     angles = attitude(times_s, way, speed, found.yaw_deg[:, index], generator)
-    return Actor(EGO, "car", mesh, Trajectory(times_s, found.positions_m[:, index].copy(), angles))
+    positions_m = found.positions_m[:, index].copy()
+    if hills is not None:
+        stances = hills.stances(positions_m[:, :2], found.yaw_deg[:, index])
+        positions_m[:, 2] += stances[:, 0]
+        angles[:, 1:] += stances[:, 1:]
+    return Actor(EGO, "car", mesh, Trajectory(times_s, positions_m, angles))
 
 
-def actors(times_s: Numbers, found: Sequence[Paths], ego: Actor, fleet: Fleet) -> tuple[Actor, ...]:
+def actors(
+    times_s: Numbers, found: Sequence[Paths], ego: Actor, fleet: Fleet, hills: Hills | None = None
+) -> tuple[Actor, ...]:
     """All who ever come near the ego; the ego itself is left out.
 
     Args:
         times_s: (T,) times.
-        found: Who there is, in groups.
+        found: Who there is, in groups; NaN where somebody is not there.
         ego: The ego.
         fleet: Their bodies.
+        hills: What they stand on; on a plain if there are none.
     """
     near: list[Actor] = []
     for group in found:
-        distance = np.linalg.norm(group.positions_m - ego.trajectory.positions_m[:, None], axis=2).min(axis=0)
+        # On the level, and one axis after the other: hills come later, and this is done for very many.
+        x_m, y_m = ((group.positions_m[..., k] - ego.trajectory.positions_m[:, None, k]) ** 2 for k in (0, 1))
+        distance = np.sqrt(np.fmin.reduce(x_m + y_m, axis=0))
         numbers = np.flatnonzero((distance < HORIZON_M) & (np.array(group.kinds) != EGO))
         # One body after the other: each has its own piece of both.
         positions_m = np.ascontiguousarray(group.positions_m[:, numbers].swapaxes(0, 1))
         angles_deg = np.zeros_like(positions_m)
         angles_deg[..., 0] = group.yaw_deg[:, numbers].T
-        for number, position_m, angle_deg in zip(numbers, positions_m, angles_deg, strict=True):
-            kind = group.kinds[number]
-            trajectory = Trajectory(times_s, position_m, angle_deg)
+        if hills is not None:
+            on_foot = np.array([CATEGORIES[group.kinds[number]] == "pedestrian" for number in numbers], dtype=bool)
+            positions_m[on_foot, :, 2] += hills.heights_m(positions_m[on_foot, :, :2])
+            stances = hills.stances(positions_m[~on_foot, :, :2], angles_deg[~on_foot, :, 0])
+            positions_m[~on_foot, :, 2] += stances[..., 0]
+            angles_deg[~on_foot, :, 1:] = stances[..., 1:]
+        there = ~np.isnan(positions_m[..., 0])
+        always = np.array([all_along.all() for all_along in there], dtype=bool)
+        for row, number in enumerate(numbers):
+            kind, some = group.kinds[number], slice(None) if always[row] else there[row]
+            if np.count_nonzero(there[row]) < 2:
+                continue
+            trajectory = Trajectory(times_s[some], positions_m[row, some], angles_deg[row, some], not always[row])
             near.append(Actor(f"{kind} {len(near)}", CATEGORIES[kind], fleet.meshes[kind], trajectory))
     return tuple(near)

@@ -80,7 +80,7 @@ def walk(
     return path.poses(share, back, body_radius_m)
 
 
-def step_height(beyond_kerb_m: Numbers, body_radius_m: float) -> Numbers:
+def step_height(beyond_kerb_m: Numbers, body_radius_m: float | Numbers) -> Numbers:
     """Height of the feet of somebody whose middle is so far beyond the kerb, on the carriageway's side."""
     stepping = (beyond_kerb_m - body_radius_m) / PAVEMENT_M
     return PAVEMENT_M * (1.0 - np.clip(stepping, 0.0, 1.0))

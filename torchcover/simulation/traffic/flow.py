@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.simulation.memory import check_fits
+from torchcover.simulation.traffic.alignment import Beside
 from torchcover.simulation.traffic.gates import Gate, Gates
-from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, tightness
+from torchcover.simulation.traffic.idm import Driver, Quantity, acceleration_in, advance, tightness
 from torchcover.simulation.traffic.roads import Line
 from torchcover.simulation.traffic.signals import Signals
 
@@ -28,16 +29,25 @@ STOP_BEFORE_LINE_M = 0.5
 # A vehicle ahead that is slower than this share of one's own desired speed is a queue, not a flow.
 QUEUE_SPEED = 0.15
 
+LIMIT_EVERY_M = 2.0
+
 # Place and speed, pose and yaw, and their copies.
 BYTES_PER_STATE = 128
 
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """A line that is followed in one direction, with the junctions on it in their order."""
+    """A line that is followed in one direction.
 
-    line: Line
+    Args:
+        line: The line.
+        gates: The junctions on it, in their order.
+        limits_mps: (K,) how fast its curves may be driven, at 0 m, `LIMIT_EVERY_M`, ...; any speed if not given.
+    """
+
+    line: Line | Beside
     gates: tuple[Gate, ...] = ()
+    limits_mps: Numbers | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +101,7 @@ class Simulation:
         self._queue_mps = QUEUE_SPEED * self._driver.desired_speed_mps
         self._signals = signals
         self._gates = Gates.from_lanes([lane.gates for lane in lanes])
+        self._limits = _Limits(lanes, lane)
         # The number of the gate that each agent is in, or else of the next one ahead, and where that is.
         self._gate = np.empty(len(agents), dtype=np.int64)
         self._enter_m, self._exit_m, self._clear_m = np.empty((3, len(agents)))
@@ -133,7 +144,7 @@ class Simulation:
         stop_m -= STOP_BEFORE_LINE_M
         tight = tightness(driver, speed_mps, gap_m, speed_mps - leader_mps)
         np.maximum(tight, tightness(driver, speed_mps, stop_m, speed_mps), out=tight)
-        wanted = acceleration_in(driver, speed_mps, tight)
+        wanted = acceleration_in(driver, speed_mps, tight, self._limits.at(self.place_m, driver.desired_speed_mps))
         way, self.speed_mps = advance(speed_mps, wanted, np.minimum(gap_m, line_m), step_s)
         self.place_m += way
         (passed,) = (self.place_m - self._half_m > self._exit_m).nonzero()
@@ -193,7 +204,32 @@ class Simulation:
         )
         to_leader = np.maximum(self._gap_m(self._leader_m()) - self._driver.standstill_gap_m, 0.0)
         bearable = to_leader / self._driver.headway_s
-        return np.asarray(np.minimum(0.95 * self._driver.desired_speed_mps, np.minimum(stoppable, bearable)))
+        desired_mps = self._limits.at(self.place_m, self._driver.desired_speed_mps)
+        return np.asarray(np.minimum(0.95 * desired_mps, np.minimum(stoppable, bearable)))
+
+
+class _Limits:
+    """What N agents may drive, on the lanes with these numbers, (N,)."""
+
+    def __init__(self, lanes: Sequence[Lane], lane: NDArray[np.int64]) -> None:
+        # The first is of all lanes without limits.
+        tables = [np.array([np.inf]), *(each.limits_mps for each in lanes if each.limits_mps is not None)]
+        number = np.cumsum([each.limits_mps is not None for each in lanes])
+        of_lane = np.where([each.limits_mps is not None for each in lanes], number, 0)
+        first = np.cumsum([0, *(len(table) for table in tables)])
+        self._none = len(tables) == 1
+        self._table = np.concatenate(tables)
+        self._first, self._last = first[of_lane][lane], first[of_lane + 1][lane] - 1
+
+    def at(self, place_m: Numbers, desired_mps: Quantity) -> Quantity:
+        """(N,) what they want to drive at (N,) places, if that is allowed there."""
+        if self._none:
+            return desired_mps
+        entry = (place_m / LIMIT_EVERY_M).astype(np.int64)
+        entry += self._first
+        np.minimum(entry, self._last, out=entry)
+        np.maximum(entry, self._first, out=entry)
+        return np.asarray(np.minimum(self._table.take(entry), desired_mps))
 
 
 def check_crowd(agents: float, steps: int) -> None:

@@ -55,7 +55,8 @@ def acceleration(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps
     Returns:
         (N,) m/s², at least -9.
     """
-    return acceleration_in(driver, speed_mps, tightness(driver, speed_mps, gap_m, closing_mps))
+    tight = tightness(driver, speed_mps, gap_m, closing_mps)
+    return acceleration_in(driver, speed_mps, tight, driver.desired_speed_mps)
 
 
 def tightness(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: Numbers) -> Numbers:
@@ -70,9 +71,12 @@ def tightness(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: N
     return gaps
 
 
-def acceleration_in(driver: Driver, speed_mps: Numbers, tightness: Numbers) -> Numbers:
-    """Acceleration of N drivers; of several things ahead the one with the largest tightness counts."""
-    wanted = speed_mps / driver.desired_speed_mps
+def acceleration_in(driver: Driver, speed_mps: Numbers, tightness: Numbers, desired_mps: Quantity) -> Numbers:
+    """Acceleration of N drivers; of several things ahead the one with the largest tightness counts.
+
+    `desired_mps` is what they want to drive here: less than elsewhere in a curve.
+    """
+    wanted = speed_mps / desired_mps
     wanted **= FREE_ROAD_EXPONENT
     np.subtract(1.0, wanted, out=wanted)
     wanted -= tightness**2

@@ -69,6 +69,32 @@ def block(x_m: tuple[float, float], y_m: tuple[float, float], z_m: tuple[float, 
     return prism([outline, outline], z_m)
 
 
+def slab(corners_m: Numbers, z_m: tuple[float, float]) -> Mesh:
+    """A closed body between two heights over a net.
+
+    Args:
+        corners_m: (rows, columns, 2) corners of the net, which may bend; seen from above, columns are to the left of
+            rows.
+        z_m: Its lower and its upper side.
+    """
+    rows, columns, _ = corners_m.shape
+    number = np.arange(rows * columns).reshape(rows, columns)
+    here, ahead, aside, across = number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]
+    over = np.concatenate(
+        [np.stack(three, axis=-1).reshape(-1, 3) for three in ((here, ahead, across), (here, across, aside))]
+    )
+    around = np.concatenate([number[:-1, 0], number[-1, :-1], number[:0:-1, -1], number[0, :0:-1]])
+    following, up = np.roll(around, -1), rows * columns
+    sides = [
+        np.stack([around, following, following + up], axis=1),
+        np.stack([around, following + up, around + up], axis=1),
+    ]
+    places_m = np.tile(corners_m.reshape(-1, 2), (2, 1))
+    return Mesh(
+        np.column_stack([places_m, np.repeat(z_m, rows * columns)]), np.concatenate([over[:, ::-1], over + up, *sides])
+    )
+
+
 def box(centre_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: float = 0.0) -> Mesh:
     """A box about a point (x, y), turned."""
     length, width, height = np.asarray(size_m, dtype=np.float64)

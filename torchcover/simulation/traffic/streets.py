@@ -1,22 +1,22 @@
-"""The plan of a city: a main street along x, and streets that cross it at lights."""
+"""The plan of a city: a main street, and streets that cross it at lights."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.simulation.traffic.flow import Lane
+from torchcover.simulation.traffic.alignment import Alignment, Beside
+from torchcover.simulation.traffic.course import Course, course
+from torchcover.simulation.traffic.flow import LIMIT_EVERY_M, Lane
 from torchcover.simulation.traffic.gates import Gate
-from torchcover.simulation.traffic.roads import Line
 from torchcover.simulation.traffic.signals import CROSS, MAIN, Signals
+from torchcover.simulation.traffic.territory import Territory
 
 Numbers = NDArray[np.float64]
 
-LANE_M = 3.25
 BICYCLE_LANE_M = 1.8
-PARKING_BAY_M = 2.3
 GUTTER_M = 0.5
-SIDEWALK_M = 3.2
 MIN_BLOCK_M, MAX_BLOCK_M = 80.0, 130.0
 
 # Along the way of whoever drives: stop line, crossing, carriageway of the other street, crossing.
@@ -33,53 +33,136 @@ WALKED_METRES_PER_GREEN_SECOND = 1.2
 GREEN_WAVE_MPS = 11.0
 WAVE_DISORDER_S = 9.0
 
+# What is farther away along a cross street than this is not seen from the main street.
+SIGHT_M = 270.0
+# Half of the longest vehicle, and a little more.
+LONGEST_HALF_M = 9.0
+
+# Across a curve, and before it.
+COMFORTABLE_MPS2, BRAKING_MPS2 = 2.0, 1.2
+# Two buses of 12 x 2.55 m, and a little air, pass each other in a turn.
+BUS_HALF_M, BUS_M = 6.0, 2.65
+
+
+@dataclass(frozen=True)
+class Section:
+    """The main street from its middle to the houses; all streets have lanes of one width.
+
+    Args:
+        lanes_each_way: For motor traffic.
+        lane_m: Their width.
+        bay_m: Width of the parking bays; 0 if there are none.
+        sidewalk_m: Width of the sidewalk.
+    """
+
+    lanes_each_way: int
+    lane_m: float = 3.25
+    bay_m: float = 2.3
+    sidewalk_m: float = 3.2
+
+    @property
+    def bicycle_lane_m(self) -> float:
+        """From the middle of the street to that of its bicycle lane."""
+        return self.lanes_each_way * self.lane_m + BICYCLE_LANE_M / 2
+
+    @property
+    def bays_m(self) -> float:
+        """From the middle of the street to that of its parking bays."""
+        return self.lanes_each_way * self.lane_m + BICYCLE_LANE_M + self.bay_m / 2
+
+    @property
+    def kerb_m(self) -> float:
+        """From the middle of the street to its kerb."""
+        return self.bays_m + self.bay_m / 2
+
+    @property
+    def turn_radius_m(self) -> float:
+        """The smallest radius of the middle of a turn in which a bus keeps off the bus on the lane outside its own."""
+        inner, outer = BUS_M / 2, self.lane_m - BUS_M / 2
+        innermost_m = (BUS_HALF_M**2 + inner**2 - outer**2) / (2 * (outer - inner))
+        return innermost_m + (self.lanes_each_way - 0.5) * self.lane_m
+
 
 @dataclass(frozen=True, eq=False)
 class Streets:
     """Where the streets are.
 
     Args:
-        lanes_each_way: Of the main street.
-        junctions_m: (J,) x of the middle of each cross street.
+        section: Of the main street.
+        junctions_m: (J,) stations of the main street at which others cross it.
         cross_lanes_each_way: (J,) 1 or 2.
         signals: Their lights.
         reach_m: How far from the origin lanes begin and end: beyond what is driven in the run.
+        course: Of the main street.
     """
 
-    lanes_each_way: int
+    section: Section
     junctions_m: Numbers
     cross_lanes_each_way: NDArray[np.int64]
     signals: Signals
     reach_m: float
+    course: Course
 
     @property
-    def bicycle_lane_m(self) -> float:
-        """From the middle of the main street to that of its bicycle lane."""
-        return self.lanes_each_way * LANE_M + BICYCLE_LANE_M / 2
-
-    @property
-    def bay_m(self) -> float:
-        """From the middle of the main street to that of its parking bays."""
-        return self.lanes_each_way * LANE_M + BICYCLE_LANE_M + PARKING_BAY_M / 2
+    def main(self) -> Alignment:
+        """The main street."""
+        return self.course.street
 
     @property
     def kerb_m(self) -> float:
         """From the middle of the main street to its kerb."""
-        return self.bay_m + PARKING_BAY_M / 2
+        return self.section.kerb_m
 
     @property
     def cross_kerbs_m(self) -> Numbers:
-        """(J,) from the middle of each cross street to its kerb."""
-        return np.asarray(self.cross_lanes_each_way * LANE_M + GUTTER_M)
+        """(J,) from the middle of each cross street to its kerb; of a junction with a turn to its end."""
+        return self.course.halves_m
+
+    @property
+    def has_lights(self) -> NDArray[np.bool_]:
+        """(J,) whether somebody crosses the main street there: not where it turns, and others give way."""
+        return np.asarray(self.course.turns == 0)
+
+    @cached_property
+    def crossing(self) -> list[Alignment]:
+        """J streets that cross the main street, at right angles; where it turns, the two that meet it go on straight.
+
+        They have station 0 on the junction, to which a straight one comes from the right of the main street.
+        """
+        streets = []
+        for station, turn, half in zip(self.junctions_m, self.course.turns, self.course.halves_m, strict=True):
+            if turn == 0:
+                x, y, yaw_deg = self.main.poses(station, 0.0)
+                streets.append(Alignment([0.0], [0.0], (x, y, np.deg2rad(yaw_deg + 90.0))))
+                continue
+            # The same turn, opposite of where the main street would go on to and come from.
+            (x, y, yaw_deg), (end_x, end_y, end_yaw_deg) = self.main.poses([station - half, station + half], 0.0)
+            yaw, angle = np.deg2rad([yaw_deg, end_yaw_deg - yaw_deg])
+            to_corner = np.hypot(end_x - x, end_y - y) / 2 / np.cos(angle / 2)
+            start = x + 2 * to_corner * np.cos(yaw), y + 2 * to_corner * np.sin(yaw), yaw + np.pi
+            knots = self.main.stations_m
+            of_turn = (knots >= station - half - 1e-6) & (knots <= station + half + 1e-6)
+            streets.append(Alignment(knots[of_turn] - station, self.main.curvatures_per_m[of_turn], start))
+        return streets
+
+    def cross_ends_m(self) -> Numbers:
+        """(J, 2) stations between which a cross street, in all its width, is far from all others of its kind."""
+        whole = Territory(self.main, (-self.reach_m, self.reach_m))
+        edges_m = self.junctions_m + np.array([[-1.0], [1.0]]) * (self.cross_kerbs_m + 1.0)
+        ends_m = np.empty((len(self.junctions_m), 2))
+        for column, side in enumerate((-1, 1)):
+            reach_m = whole.reaches_m(edges_m.ravel(), side, self.kerb_m, SIGHT_M).reshape(2, -1).min(axis=0)
+            ends_m[:, column] = side * (2 * self.reach_m if self.main.is_straight else reach_m - LONGEST_HALF_M)
+        return ends_m
 
     def traffic_lanes(self) -> list[Lane]:
         """The lanes for motor traffic of the main street: eastbound from the median outwards, then westbound."""
-        offsets = [(lane + 0.5) * LANE_M for lane in range(self.lanes_each_way)]
+        offsets = [(lane + 0.5) * self.section.lane_m for lane in range(self.section.lanes_each_way)]
         return [self._main_lane(offset, way, STOP_LINE_M) for way in (1, -1) for offset in offsets]
 
     def bicycle_lanes(self) -> list[Lane]:
         """One eastbound, one westbound."""
-        return [self._main_lane(self.bicycle_lane_m, way, STOP_LINE_M) for way in (1, -1)]
+        return [self._main_lane(self.section.bicycle_lane_m, way, STOP_LINE_M) for way in (1, -1)]
 
     def sidewalks(self) -> list[Lane]:
         """Tracks of the people who walk along the main street: each way on both sides."""
@@ -89,13 +172,13 @@ class Streets:
     def cross_lanes(self) -> list[Lane]:
         """The lanes of all cross streets: northbound ones on the east side, southbound ones on the west side."""
         lanes = []
-        for index, (x, lanes_each_way) in enumerate(zip(self.junctions_m, self.cross_lanes_each_way, strict=True)):
+        for index in np.flatnonzero(self.has_lights).tolist():
             middle, half = self.reach_m, self.kerb_m
             gate = Gate(middle - half - STOP_LINE_M, middle + half + CROSSING_ENDS_M, index, CROSS)
             for way in (1, -1):
-                for lane in range(lanes_each_way):
-                    start = (x + way * (lane + 0.5) * LANE_M, -way * self.reach_m)
-                    lanes.append(Lane(Line.straight(start, way * 90.0, 2 * self.reach_m), (gate,)))
+                for lane in range(self.cross_lanes_each_way[index]):
+                    left_m = -way * (lane + 0.5) * self.section.lane_m
+                    lanes.append(Lane(Beside(self.crossing[index], left_m, way, self.reach_m), (gate,)))
         return lanes
 
     def _main_lane(self, right_m: float, way: int, stop_line_m: float) -> Lane:
@@ -103,28 +186,50 @@ class Streets:
 
         Whoever stops right at the kerb of the cross street (`stop_line_m` of 0) walks.
         """
-        order = np.argsort(way * self.junctions_m)
+        line = Beside(self.main, -way * right_m, way, self.reach_m)
         walks = stop_line_m == 0.0
+        before = WAITING_BEHIND_KERB_M if walks else stop_line_m
+        behind = WAITING_BEHIND_KERB_M if walks else CROSSING_ENDS_M
         gates = []
-        for index in order:
-            middle, half = way * self.junctions_m[index] + self.reach_m, self.cross_kerbs_m[index]
-            enter = middle - half - (stop_line_m or WAITING_BEHIND_KERB_M)
-            leave = middle + half + (WAITING_BEHIND_KERB_M if walks else CROSSING_ENDS_M)
-            needed = (leave - enter) / WALKED_METRES_PER_GREEN_SECOND if walks else 0.0
-            gates.append(Gate(float(enter), float(leave), int(index), MAIN, float(needed)))
-        yaw_deg = 0.0 if way == 1 else 180.0
-        line = Line.straight((-way * self.reach_m, -way * right_m), yaw_deg, 2 * self.reach_m)
-        return Lane(line, tuple(gates))
+        for index in np.argsort(way * self.junctions_m):
+            if self.has_lights[index]:
+                middle, half = float(line.places_at(self.junctions_m[index])), self.cross_kerbs_m[index]
+                enter, leave = middle - half - before, middle + half + behind
+                needed = (leave - enter) / WALKED_METRES_PER_GREEN_SECOND if walks else 0.0
+                gates.append(Gate(float(enter), float(leave), int(index), MAIN, float(needed)))
+        return Lane(line, tuple(gates), None if walks or self.main.is_straight else _limits_mps(line))
 
 
-def plan(lanes_each_way: int, span_m: tuple[float, float], reach_m: float, generator: np.random.Generator) -> Streets:
+def _limits_mps(line: Beside) -> Numbers:
+    """(K,) how fast a lane may be driven, at each `LIMIT_EVERY_M`: in curves, and before them."""
+    places = np.arange(0.0, line.length_m, LIMIT_EVERY_M)
+    curvature = line.street.curvatures(line.stations(places))
+    curvature = np.abs(curvature / (1.0 - curvature * line.left_m))
+    square = COMFORTABLE_MPS2 / np.maximum(curvature, 1e-6)
+    # Whoever brakes gently from here is slow enough wherever it is needed ahead.
+    braked = 2 * BRAKING_MPS2 * places
+    return np.asarray(np.sqrt(np.minimum.accumulate((square + braked)[::-1])[::-1] - braked))
+
+
+def plan(
+    section: Section,
+    bend_deg: float,
+    turn_share: float,
+    span_m: tuple[float, float],
+    reach_m: float,
+    generator: np.random.Generator,
+    shapes: np.random.Generator,
+) -> Streets:
     """Draw the cross streets and their lights. The origin lies halfway between two junctions.
 
     Args:
-        lanes_each_way: Of the main street.
-        span_m: x from the first to the last cross street, about; it holds the origin.
+        section: Of the main street.
+        bend_deg: How much the main street may bend between two junctions.
+        turn_share: Share of the junctions at which it turns.
+        span_m: From the first to the last cross street, about, along the main street; it holds the origin.
         reach_m: How far from the origin lanes begin and end.
-        generator: Draws blocks, widths and lights.
+        generator: Draws blocks and lights.
+        shapes: Draws the course of the main street.
     """
     middle = generator.uniform(MIN_BLOCK_M, MAX_BLOCK_M) / 2
     east, west = [middle], [-middle]
@@ -137,4 +242,6 @@ def plan(lanes_each_way: int, span_m: tuple[float, float], reach_m: float, gener
     cross_lanes = 1 + (np.arange(len(junctions)) + generator.integers(2)) % 2
     disorder = generator.uniform(-WAVE_DISORDER_S, WAVE_DISORDER_S, size=len(junctions))
     signals = Signals(disorder - junctions / GREEN_WAVE_MPS + generator.uniform(0.0, 60.0))
-    return Streets(lanes_each_way, junctions, cross_lanes, signals, reach_m)
+    halves = np.asarray(cross_lanes * section.lane_m + GUTTER_M)
+    drawn = course(junctions, halves, bend_deg, turn_share, section.turn_radius_m, reach_m, shapes)
+    return Streets(section, junctions, cross_lanes, signals, reach_m, drawn)

@@ -1,5 +1,6 @@
-"""A city: the ego follows a main street with lights, behind other vehicles and past parked cars and people."""
+"""A city: the ego follows a main street that bends and turns, behind others and past parked cars and people."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -7,20 +8,24 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic.alignment import Beside
 from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, come_near, ego_actor, paths
 from torchcover.simulation.traffic.city import City
 from torchcover.simulation.traffic.crossing import Footpath, step_height, walk
 from torchcover.simulation.traffic.fleet import CYCLING, EGO, WALKING, Fleet
 from torchcover.simulation.traffic.flow import Agent, Flow, Lane, Simulation, check_crowd
+from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles, Procedural
 from torchcover.simulation.traffic.signals import CROSS, MAIN
 from torchcover.simulation.traffic.streets import (
     FOOTPATHS_M,
     WAITING_BEHIND_KERB_M,
+    Section,
     Streets,
     plan,
 )
+from torchcover.simulation.traffic.territory import Territory
 from torchcover.simulation.world import Actor
 
 Numbers = NDArray[np.float64]
@@ -28,6 +33,10 @@ Numbers = NDArray[np.float64]
 WARM_UP_S = 20.0
 # What is built up or has traffic, behind and ahead of all places the ego gets to.
 BEHIND_M, AHEAD_M = 120.0, 260.0
+# Stretches of the street that lie farther along it than this do not come near.
+ASIDE_M = 320.0
+# Widths of the main street, and the share of cities with parking bays along it.
+LANE_M, BAY_M, SIDEWALK_M, WITH_BAYS = (3.25, 3.75), 2.3, (3.2, 5.0), 0.8
 # The ego starts this far behind the vehicle it follows, which is a little slower.
 LEADER_AHEAD_M = 20.0
 LEADER_SPEED = 0.82
@@ -51,42 +60,64 @@ class Urban(Procedural):
     """Traffic in a city.
 
     Args:
-        lanes: Of the ego's street, both directions together; the streets that cross it have two or four.
+        lanes: Of the ego's street, both directions together; two or four are drawn for each run if not given. The
+            streets that cross it have two or four.
         speed_mps: What drivers want to drive, about.
         traffic_per_km: Vehicles to a kilometre of lane.
         cyclists_per_km: To a kilometre of bicycle lane.
         people_per_km: On foot, to a kilometre of sidewalk in each direction.
         parked_share: Share of the parking bays that are taken.
+        built_share: Share of the blocks' sides that have houses; 0 is open country.
+        bend_deg: How much the ego's street may bend between two junctions; 0 is straight.
+        turn_share: Share of the junctions at which the ego's street turns.
+        hills_m: Height of the hills, as a standard deviation; 0 is a plain.
     """
 
     type: Literal["urban"] = "urban"
-    lanes: Literal[2, 4] = 4
+    lanes: Literal[2, 4] | None = None
     speed_mps: float = Field(default=13.9, ge=5.0, le=20.0)
     traffic_per_km: MostVehicles = 20.0
     cyclists_per_km: MostPeople = 6.0
     people_per_km: MostPeople = 25.0
     parked_share: float = Field(default=0.45, ge=0.0, le=1.0)
+    built_share: float = Field(default=0.8, ge=0.0, le=1.0)
+    bend_deg: float = Field(default=25.0, ge=0.0, le=35.0)
+    turn_share: float = Field(default=0.25, ge=0.0, le=1.0)
+    hills_m: float = Field(default=1.0, ge=0.0, le=2.0)
 
     def _build(
         self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
     ) -> tuple[tuple[Mesh, ...], Actor, tuple[Actor, ...]]:
+        # What the streets are like is drawn apart from what happens in them.
+        (shapes,) = generator.spawn(1)
+        hills, section = Hills(self.hills_m, shapes), self._section(shapes)
         longest_way = 1.25 * self.speed_mps * (self.duration_s + WARM_UP_S)
+        span_m, reach_m = (-BEHIND_M, longest_way + AHEAD_M), longest_way + 2 * AHEAD_M
         for _ in range(DRAWS):
-            streets = plan(self.lanes // 2, (-BEHIND_M, longest_way + AHEAD_M), longest_way + 2 * AHEAD_M, generator)
+            streets = plan(section, self.bend_deg, self.turn_share, span_m, reach_m, generator, shapes)
             lanes, agents = self._traffic(streets, fleet, generator)
             flow = Simulation(lanes, agents, streets.signals).run(times_s, WARM_UP_S)
             if _usually_follows(agents, flow):
                 break
         near = come_near(lanes, agents, flow.place_m)
-        moving = paths(lanes, [agents[number] for number in near], flow.place_m[:, near])
-        moving = _on_the_pavement(moving, streets, fleet)
-        driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator)
-        way = driver.trajectory.positions_m[:, 0]
-        seen = (float(way[0]) - BEHIND_M, float(way[-1]) + AHEAD_M)
+        place_m, agents = flow.place_m[:, near], [agents[number] for number in near]
+        own_lane = lanes[agents[0].lane].line
+        assert isinstance(own_lane, Beside)  # as all lanes of a city are
+        first_m, last_m = own_lane.stations(place_m[[0, -1], 0])
+        seen = (float(first_m) - BEHIND_M, float(last_m) + AHEAD_M)
+        territory = Territory(streets.main, (seen[0] - ASIDE_M, seen[1] + ASIDE_M))
+        moving = _in_place(paths(lanes, agents, place_m), lanes, agents, place_m, streets, fleet)
+        driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator, hills)
         crossing = _crossers(streets, flow, times_s, seen, fleet, generator)
-        static = City(streets, fleet, self.parked_share, generator).static(seen)
-        others = actors(times_s, [moving, crossing], driver, fleet)
-        return static, driver, others
+        city = City(streets, territory, hills, fleet, self.parked_share, self.built_share, generator, shapes)
+        static = city.static(seen)
+        return static, driver, actors(times_s, [moving, crossing], driver, fleet, hills)
+
+    def _section(self, shapes: np.random.Generator) -> Section:
+        """The main street, as wide as is drawn."""
+        lanes = self.lanes or int(shapes.choice([2, 4]))
+        bay_m = BAY_M if shapes.random() < WITH_BAYS else 0.0
+        return Section(lanes // 2, float(shapes.uniform(*LANE_M)), bay_m, float(shapes.uniform(*SIDEWALK_M)))
 
     def _traffic(
         self, streets: Streets, fleet: Fleet, generator: np.random.Generator
@@ -99,8 +130,10 @@ class Urban(Procedural):
             kind: (weight, Driver(self.speed_mps * pace, headway_s=headway, acceleration_mps2=starting))
             for kind, (weight, pace, headway, starting) in DRIVING.items()
         }
+        # Trucks of 16.5 m do not get round a corner in one lane.
+        turning = driving if not streets.course.turns.any() else {k: v for k, v in driving.items() if k != "truck"}
         per_lane = [
-            *[(self.traffic_per_km, driving)] * len(main),
+            *[(self.traffic_per_km, turning)] * len(main),
             *[(self.cyclists_per_km, {"cyclist": (1.0, CYCLING)})] * len(bicycles),
             *[(self.people_per_km, {"adult": (5.0, WALKING), "child": (1.0, WALKING)})] * len(sidewalks),
             *[(self.traffic_per_km / 2, driving)] * len(cross),
@@ -114,7 +147,7 @@ class Urban(Procedural):
         return lanes, _who_matter(lanes, agents, self.duration_s + self.time_step_s + WARM_UP_S)
 
     def _ego_and_leader(self, streets: Streets, fleet: Fleet, generator: np.random.Generator) -> list[Agent]:
-        lane, middle = int(generator.integers(streets.lanes_each_way)), streets.reach_m
+        lane, middle = int(generator.integers(streets.section.lanes_each_way)), streets.reach_m
         kind = fleet.draw_kind({"suv": 1.0, "sedan": 2.0, "hatchback": 2.0, "van": 1.0})
         return [
             fleet.agent(EGO, lane, middle - LEADER_AHEAD_M / 2, Driver(self.speed_mps, headway_s=1.1)),
@@ -144,13 +177,38 @@ def _usually_follows(agents: list[Agent], flow: Flow) -> bool:
     return bool(close.mean() >= FOLLOWS_SHARE)
 
 
-def _on_the_pavement(found: Paths, streets: Streets, fleet: Fleet) -> Paths:
-    """Lift those who walk along the main street onto the pavement, and let them step down at the cross streets."""
-    for index, kind in enumerate(found.kinds):
-        if kind in ("adult", "child"):
-            x = found.positions_m[:, index, 0]
-            beyond_kerb = (streets.cross_kerbs_m - np.abs(x[:, None] - streets.junctions_m)).max(axis=1)
-            found.positions_m[:, index, 2] = step_height(beyond_kerb, fleet.length_m(kind) / 2)
+def _in_place(
+    found: Paths,
+    lanes: Sequence[Lane],
+    agents: Sequence[Agent],
+    place_m: Numbers,
+    streets: Streets,
+    fleet: Fleet,
+) -> Paths:
+    """Lift those who walk along the main street onto the pavement, and let them step down at the cross streets.
+
+    And let nobody be where their cross street ends.
+    """
+    junction = {id(street): index for index, street in enumerate(streets.crossing)}
+    ends_m = streets.cross_ends_m()
+    radius_m = np.array([fleet.length_m(agent.kind) / 2 for agent in agents])
+    lane_of = np.array([agent.lane for agent in agents])
+    for lane in np.unique(lane_of):
+        line, on_lane = lanes[lane].line, np.flatnonzero(lane_of == lane)
+        places_m = place_m[:, on_lane]
+        assert isinstance(line, Beside)
+        if line.street is not streets.main:
+            first_m, last_m = np.sort(line.places_at(ends_m[junction[id(line.street)]]))
+            step, agent = np.nonzero((places_m < first_m) | (places_m > last_m))
+            found.positions_m[step, on_lane[agent]] = np.nan
+        elif agents[on_lane[0]].kind in ("adult", "child"):
+            # On the inside of a turn the pavement goes on.
+            stop = streets.course.turns != np.sign(line.left_m)
+            middles_m, halves_m = streets.junctions_m[stop][:: line.way], streets.cross_kerbs_m[stop][:: line.way]
+            first_m, last_m = np.sort(line.places_at(middles_m + np.array([[-1.0], [1.0]]) * halves_m), axis=0)
+            next_one = np.minimum(np.searchsorted(last_m, np.ascontiguousarray(places_m.T)).T, len(last_m) - 1)
+            beyond_kerb_m = np.minimum(places_m - first_m[next_one], last_m[next_one] - places_m)
+            found.positions_m[:, on_lane, 2] = step_height(beyond_kerb_m, radius_m[on_lane])
     return found
 
 
@@ -162,18 +220,20 @@ def _crossers(
     fleet: Fleet,
     generator: np.random.Generator,
 ) -> Paths:
-    """People who go to and fro across the main street, on both crossings of each junction in sight."""
+    """People who go to and fro across the main street, on both crossings of each junction with lights in sight."""
     positions, yaws, kinds = [], [], []
     wait_m = streets.kerb_m + WAITING_BEHIND_KERB_M
     walks = 2 * wait_m / float(WALKING.desired_speed_mps)
     green = streets.signals.green_left_s(times_s)[..., CROSS]
     may_go = (green + streets.signals.amber_s > walks) & ~flow.occupied[:, :, MAIN]
-    for index in np.flatnonzero((streets.junctions_m > seen_m[0]) & (streets.junctions_m < seen_m[1])):
+    seen = (streets.junctions_m > seen_m[0]) & (streets.junctions_m < seen_m[1])
+    for index in np.flatnonzero(seen & streets.has_lights):
         for side in (1, -1):
             for offset in FOOTPATHS_M:
                 x = streets.junctions_m[index] + side * (streets.cross_kerbs_m[index] + offset)
                 kind = fleet.draw_kind({"adult": 5.0, "child": 1.0})
-                path = Footpath(np.array([x, -wait_m]), np.array([x, wait_m]), WAITING_BEHIND_KERB_M)
+                ends = streets.main.poses(x, np.array([-wait_m, wait_m]))[:, :2]
+                path = Footpath(ends[0], ends[1], WAITING_BEHIND_KERB_M)
                 position, yaw = walk(path, may_go[:, index], walks, times_s, fleet.length_m(kind) / 2, generator)
                 positions.append(position)
                 yaws.append(yaw)

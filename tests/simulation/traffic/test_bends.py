@@ -1,0 +1,231 @@
+"""Streets that bend, turn and slope: the laws of alignments, and of what is built and driven along them."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from torchcover.simulation.raycaster import RayCaster
+from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic import Urban
+from torchcover.simulation.traffic.alignment import Alignment, Beside
+from torchcover.simulation.traffic.course import APART_M, NEIGHBOURS_M, SMALLEST_RADIUS_M, course
+from torchcover.simulation.traffic.flow import LIMIT_EVERY_M
+from torchcover.simulation.traffic.hills import SQUARE_M, Hills
+from torchcover.simulation.traffic.scenery import slab
+from torchcover.simulation.traffic.streets import BRAKING_MPS2, COMFORTABLE_MPS2, Section, plan
+from torchcover.simulation.traffic.territory import Territory
+
+RADIUS_M, REACH_M = 20.0, 1500.0
+STATIONS_M = np.arange(-300.0, 1200.0, 0.37)
+
+
+def drawn(seed, bend_deg=30.0, turn_share=0.5):
+    generator = np.random.default_rng(seed)
+    junctions = np.cumsum(generator.uniform(80, 130, 14)) - 250.0
+    return course(junctions, np.full(14, 5.0), bend_deg, turn_share, RADIUS_M, REACH_M, generator)
+
+
+@pytest.fixture(scope="module", params=[0, 1, 2])
+def street(request):
+    return drawn(request.param).street
+
+
+def test_a_straight_alignment_changes_nothing():
+    x, y = STATIONS_M, np.linspace(-50.0, 50.0, len(STATIONS_M))
+    poses = Alignment([0.0], [0.0]).poses(x, y)
+    np.testing.assert_array_equal(poses, np.stack([x, y, np.zeros_like(x)], axis=1))
+
+
+def test_a_circle_is_a_circle():
+    # Between its short ends: the centre lies to the left, a radius away.
+    arc = Alignment([0.0, 1e-3, 60.0, 60.001], [0.0, 1 / RADIUS_M, 1 / RADIUS_M, 0.0])
+    places = arc.poses(np.linspace(0.1, 59.0, 50), 3.0)[:, :2]
+    np.testing.assert_allclose(np.linalg.norm(places - [5e-4, RADIUS_M], axis=1), RADIUS_M - 3.0, atol=1e-6)
+
+
+def test_it_is_as_long_as_its_stations_and_heads_where_it_goes(street):
+    # Gauss's rule is right where Simpson's, with a tenth of a knot, is.
+    step = 1e-3
+    before, after = (street.poses(STATIONS_M + shift, 0.0) for shift in (-step, step))
+    moved = (after - before)[:, :2] / (2 * step)
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 1.0, atol=1e-8)
+    heading = street.headings(STATIONS_M)
+    np.testing.assert_allclose(moved, np.stack([np.cos(heading), np.sin(heading)], axis=1), atol=1e-6)
+    curvature = (street.headings(STATIONS_M + step) - street.headings(STATIONS_M - step)) / (2 * step)
+    np.testing.assert_allclose(curvature, street.curvatures(STATIONS_M), atol=1e-5)
+    assert np.allclose(street.poses(0.0, 0.0), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("left_m", [-12.0, 0.0, 9.0])
+def test_projecting_is_the_inverse(street, left_m):
+    places = street.poses(STATIONS_M, left_m)[:, :2]
+    found = street.project(places, (-400.0, 1300.0))
+    np.testing.assert_allclose(found[:, 0], STATIONS_M, atol=1e-6)
+    np.testing.assert_allclose(found[:, 1], left_m, atol=1e-6)
+
+
+@pytest.mark.parametrize("way", [1, -1])
+@pytest.mark.parametrize("left_m", [-12.0, 9.0])
+def test_beside_it_one_goes_as_far_as_one_gets(street, left_m, way):
+    line = Beside(street, left_m, way, REACH_M)
+    places = np.arange(REACH_M - 700.0, REACH_M + 700.0, 0.05)
+    poses = line.poses(places)
+    steps = np.diff(poses[:, :2], axis=0)
+    np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 0.05, rtol=2e-4)
+    turned = np.deg2rad((poses[:-1, 2] + poses[1:, 2]) / 2)
+    ahead = steps[:, 0] * np.cos(turned) + steps[:, 1] * np.sin(turned)
+    assert ahead.min() > 0.0499
+    np.testing.assert_allclose(line.places_at(line.stations(places)), places, atol=0.02)
+    there = street.poses(line.stations(places), left_m)[:, :2]
+    np.testing.assert_allclose(poses[:, :2], there, atol=0.02)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_courses_keep_within_bounds_and_away_from_themselves(seed):
+    found = drawn(seed)
+    assert found.turns.any()
+    assert not found.turns[[0, -1]].any()
+    assert (np.abs(np.cumsum(found.turns)) <= 1).all()
+    curvature = np.abs(found.street.curvatures(STATIONS_M))
+    assert curvature.max() <= 1 / RADIUS_M + 1e-9
+    junctions = np.cumsum(np.random.default_rng(seed).uniform(80, 130, 14)) - 250.0
+    in_turn = (np.abs(STATIONS_M[:, None] - junctions[found.turns != 0]) < found.halves_m[found.turns != 0]).any(axis=1)
+    assert curvature[~in_turn].max() <= 1 / SMALLEST_RADIUS_M + 1e-9
+    # Junctions that are passed straight on lie on straights, with their crossings.
+    for middle, half in zip(junctions[found.turns == 0], found.halves_m[found.turns == 0], strict=True):
+        assert not found.street.curvatures(middle + np.linspace(-half - 7.0, half + 7.0, 9)).any()
+    places = found.street.poses(np.arange(-REACH_M, REACH_M, 20.0), 0.0)[:, :2]
+    away = np.linalg.norm(places[:, None] - places, axis=2)
+    far = np.abs(np.subtract.outer(np.arange(len(places)), np.arange(len(places)))) * 20.0 > NEIGHBOURS_M
+    assert away[far].min() >= APART_M
+
+
+def test_without_bends_and_turns_a_course_is_straight():
+    assert drawn(0, bend_deg=0.0, turn_share=0.0).street.is_straight
+
+
+def test_territories_are_apart(street):
+    # Places that two stretches would both call theirs do not exist: whoever is nearest has them.
+    territory = Territory(street, (-400.0, 1300.0))
+    station, left = np.meshgrid(np.arange(-200.0, 1100.0, 9.0), [-80.0, -40.0, 40.0, 80.0])
+    station, left = station.ravel(), left.ravel()
+    owned = territory.owns(station, left)
+    assert owned.any()
+    assert not owned.all()
+    places = street.poses(station, left)[:, :2]
+    fine = street.poses(np.arange(-400.0, 1300.0, 0.5), 0.0)[:, :2]
+    nearest = np.array([np.linalg.norm(fine - place, axis=1).min() for place in places])
+    assert (nearest[owned] > np.abs(left[owned]) - 1.5).all()
+    assert (nearest[~owned] < np.abs(left[~owned])).all()
+
+
+def test_cars_may_drive_as_fast_as_is_comfortable_and_brake_gently_for_it():
+    section = Section(2, 3.4)
+    generator, shapes = np.random.default_rng(3), np.random.default_rng(4)
+    streets = plan(section, 25.0, 0.5, (-120.0, 900.0), 1400.0, generator, shapes)
+    assert streets.course.turns.any()
+    lane = streets.traffic_lanes()[0]
+    places = LIMIT_EVERY_M * np.arange(len(lane.limits_mps))
+    yaw = np.unwrap(np.deg2rad(lane.line.poses(places)[:, 2]))
+    across = np.abs(np.gradient(yaw, places)) * lane.limits_mps**2
+    in_curves = lane.line.street.curvatures(lane.line.stations(places)) != 0.0
+    assert across[in_curves & (lane.limits_mps < 15.0)].max() < 1.1 * COMFORTABLE_MPS2
+    assert lane.limits_mps.min() < 8.0
+    braking = -np.diff(lane.limits_mps**2) / (2 * LIMIT_EVERY_M)
+    assert braking.max() < 1.001 * BRAKING_MPS2
+    # A bus keeps off the bus beside it.
+    inner = section.turn_radius_m - (section.lanes_each_way - 0.5) * section.lane_m
+    corner = np.hypot(inner + 2.55 / 2, 6.0)
+    assert corner < inner + section.lane_m - 2.55 / 2
+
+
+def test_hills_are_what_their_slopes_say_and_their_mesh_is_near():
+    hills = Hills(1.5, np.random.default_rng(1))
+    places = np.random.default_rng(2).uniform(-200, 200, (500, 2))
+    yaw_deg = np.linspace(0, 360, 500)
+    height, pitch, roll = hills.stances(places, yaw_deg).T
+    np.testing.assert_allclose(height, hills.heights_m(places), atol=1e-5)
+    yaw = np.deg2rad(yaw_deg)
+    ahead = 0.5 * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    left = 0.5 * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
+    for way, angle in ((ahead, -pitch), (left, roll)):
+        rise = hills.heights_m(places + way) - hills.heights_m(places - way)
+        np.testing.assert_allclose(np.rad2deg(np.arctan(rise)), angle, atol=0.02)
+        assert np.abs(rise).max() <= hills.steepest
+    way_m = np.stack([np.linspace(-200, 200, 11), np.zeros(11)], axis=1)
+    mesh = hills.mesh(way_m, 250.0)
+    down = np.tile(np.array([[0.0], [0.0], [-1.0]], dtype=np.float32), 500)
+    starts = np.column_stack([places, np.full(500, 50.0)]).astype(np.float32)
+    hits = RayCaster([mesh]).cast_from_each(starts, down, np.full(500, 100.0, dtype=np.float32))
+    np.testing.assert_allclose(50.0 - hits.range_m, height, atol=0.03)
+    assert SQUARE_M == 10.0
+
+
+def test_a_slab_over_a_bent_net_is_closed_and_looks_outwards():
+    x, y = np.meshgrid(np.linspace(0, 30, 7), np.linspace(0, 8, 3), indexing="ij")
+    net = Alignment([0.0, 5.0, 25.0, 30.0], [0.0, 0.04, 0.04, 0.0]).poses(x, y)[..., :2]
+    mesh = slab(net, (0.0, 0.15))
+    solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
+    assert solid.is_volume
+    assert solid.volume == pytest.approx(0.15 * (30 * 8 - 0.04 * 25 * 8**2 / 2), rel=0.01)
+
+
+def test_what_is_built_in_the_hills_is_closed_and_stands_on_the_ground(world):
+    w = world("hilly", 0)
+    for mesh in w.static[1:]:
+        assert trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False).is_volume
+    ground = RayCaster(w.static[:1])
+
+    def height(places):
+        starts = np.column_stack([places, np.full(len(places), 90.0)]).astype(np.float32)
+        down = np.tile(np.array([[0.0], [0.0], [-1.0]], dtype=np.float32), len(places))
+        hits = ground.cast_from_each(starts, down, np.full(len(places), 200.0, dtype=np.float32))
+        assert (hits.body >= 0).all()
+        return 90.0 - hits.range_m
+
+    for actor in (w.ego, *w.actors, *w.parked):
+        positions = actor.trajectory.positions_m[::20]
+        near = np.linalg.norm(positions[:, :2] - w.ego.trajectory.positions_m[0, :2], axis=1) < 200.0
+        above = positions[near, 2] - height(positions[near, :2])
+        assert (above > -0.05).all()
+        assert (above < (0.2 if actor.category == "pedestrian" else 0.05)).all()
+        # Its wheels stand on it, too.
+        if actor.category in ("car", "bus"):
+            angles = np.deg2rad(actor.trajectory.angles_deg[::20][near])
+            front = positions[near] + 1.4 * np.column_stack(
+                [np.cos(angles[:, 0]), np.sin(angles[:, 0]), -np.sin(angles[:, 1])]
+            )
+            assert np.abs(front[:, 2] - height(front[:, :2])).max(initial=0.0) < (0.12 if actor is w.ego else 0.06)
+
+
+def test_a_city_without_bends_is_straight_and_nobody_comes_from_nowhere(world):
+    w = world("straight", 0)
+    assert np.ptp(w.ego.trajectory.positions_m[:, 1:]) == -w.ego.trajectory.positions_m[0, 1]
+    assert not any(actor.trajectory.transient for actor in w.actors)
+
+
+def test_the_ego_turns_at_junctions(world):
+    assert max(np.ptp(world("winding", seed).ego.trajectory.angles_deg[:, 0]) for seed in (0, 1)) > 60.0
+    assert np.ptp(world("straight", 0).ego.trajectory.angles_deg[:, 0]) == 0.0
+
+
+def test_open_country_has_no_houses():
+    w = Urban(duration_s=2.0, built_share=0.0, hills_m=0.0).world(1)
+    assert len(w.static) == 3
+    assert max(mesh.vertices_m[:, 2].max() for mesh in w.static) < 12.0
+
+
+def test_rays_always_hit_the_hills(world):
+    w = world("hilly", 0)
+    generator = np.random.default_rng(0)
+    for time_s in (0.0, w.duration_s):
+        pose = w.ego.trajectory.at(time_s)
+        yaw = np.arctan2(pose[1, 0], pose[0, 0])
+        ahead, left = generator.uniform(-60.0, 160.0, 20_000), generator.uniform(-40.0, 40.0, 20_000)
+        offset = np.stack([np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left])
+        to_ground = np.concatenate([offset, np.full((1, 20_000), -100.0)])
+        directions = (to_ground / np.linalg.norm(to_ground, axis=0)).astype(np.float32)
+        static = [Mesh(mesh.vertices_m - pose[:3, 3], mesh.faces) for mesh in w.static]
+        limit = np.full(20_000, 1000.0, dtype=np.float32)
+        assert (RayCaster(static).cast(np.array([0.0, 0.0, 100.0]), directions, limit).body >= 0).all()
+        assert (RayCaster(static[:1]).cast(np.array([0.0, 0.0, 100.0]), directions, limit).body == 0).all()

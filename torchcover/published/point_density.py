@@ -1,0 +1,72 @@
+"""How many points a rig has, how dense they are, and how evenly they lie."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcover.coverage import BevGrid, Region, check_regions
+from torchcover.data import Frame
+from torchcover.neighbors import check_cloud
+from torchcover.published.sights import rig_of
+from torchcover.published.world_ratios import Ratio, WorldRatios
+
+
+class PointDensity(WorldRatios):
+    """Points of the rig in a frame; over the grid and in regions those for each square metre, and their uniformity.
+
+    The density is over the ground as drawn, be it visible or not. The uniformity is (sum n)^2 / (C sum n^2) over the
+    points n in C square cells: 1 if all cells have as many, 1 / C if one has all. Density and uniformity are what Cai
+    et al. (2023) look at; their own formula of uniformity could not be read.
+
+    Args:
+        grid: Where points count: its extent, its height bands, and the cells of the uniformity.
+        regions: Those that have numbers of their own.
+        rig: Whose clouds; those of the only rig if not given.
+        kwargs: For `torchmetrics.Metric`.
+
+    Raises:
+        ValueError: Regions that the grid does not hold.
+
+    Example:
+        >>> metric = PointDensity(BevGrid(x=(0.0, 4.0), y=(0.0, 1.0), cell=1.0), ())
+        >>> cloud = torch.tensor([[0.5, 0.5, 0.0], [1.5, 0.5, 0.0], [9.0, 0.0, 0.0]])
+        >>> metric.update(Frame({"rig": cloud}, torch.zeros(0, 3), 0, "a"))
+        >>> [(one.name, one.value) for one in metric.compute()]
+        [('points', 3.0), ('point_density', 0.5), ('point_uniformity_1m', 0.5)]
+    """
+
+    def __init__(
+        self,
+        grid: BevGrid,
+        regions: Sequence[Region],
+        *,
+        rig: str | None = None,
+        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+    ) -> None:
+        check_regions(regions, grid)
+        names = ["", *(f":{region.name}" for region in regions)]
+        ratios = [
+            Ratio("points", "points", True, "frames"),
+            *(Ratio(f"point_density{name}", "points/m2", True, "frames") for name in names),
+            *(Ratio(f"point_uniformity_{grid.cell:g}m{name}", "share", True, "frames") for name in names),
+        ]
+        super().__init__(ratios, {"grid": grid, "regions": tuple(regions)}, rig, **kwargs)
+        self.grid = grid
+        everywhere = torch.ones(grid.shape[1:], dtype=torch.bool)
+        self._members = torch.stack([everywhere, *(region.mask(grid) for region in regions)]).flatten(1).double()
+
+    def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        cloud = frame.cloud_of(rig_of(frame, self.rig))
+        check_cloud(cloud, "sensor")
+        flat = self._members.shape[1]
+        each = torch.bincount(self.grid.bins(cloud).cell % flat, minlength=flat).double().cpu()
+        cells = self._members.sum(dim=1)
+        points, squares = (self._members @ torch.stack([each, each.square()], dim=1)).T
+        somewhere = (points > 0).double()
+        uniformity = points.square() / (cells * squares).where(points > 0, 1.0)
+        one, all_points = cells.new_ones(1), cells.new_tensor([len(cloud)])
+        base = torch.cat([one, cells * self.grid.cell**2, somewhere])
+        counts = torch.cat([one, torch.ones_like(cells), somewhere]).long()
+        return base, torch.cat([all_points, points, uniformity]), counts
