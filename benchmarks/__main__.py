@@ -32,10 +32,11 @@ BENCHMARKS = (
     "scaling",
     "mutated_files",
     "targets",
+    "towns",
+    "pairing",
+    "placement",
     "published",
     "voxels",
-    "pairing",
-    "towns",
     "cities",
 )
 

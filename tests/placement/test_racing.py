@@ -168,7 +168,7 @@ def test_nobody_is_dropped_before_there_is_an_error_or_for_one_of_two_objectives
 
 def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(instants):
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
-    found = fresh_test(high, low, instants, test_seed=1, worlds=3)
+    found = fresh_test({"higher": high}, low, instants, test_seed=1, worlds=3)["higher"]
     assert (found.search_seed, found.test_seed, found.instants) == (0, 1, 6)
     fresh = held(seed=1, worlds=3)
     for measure in ("area", "known"):

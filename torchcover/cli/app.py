@@ -11,6 +11,7 @@ import typer
 from torchcover.cli import options
 from torchcover.cli.asking import asked
 from torchcover.cli.running import checkpoint_in, finish, logged, opened, sharing, watching
+from torchcover.cli.search import search
 from torchcover.cli.study import study
 from torchcover.cli.targets import targets
 from torchcover.evaluation.interrupt import terminable
@@ -284,6 +285,7 @@ def show(
 
 
 app.command()(targets)
+app.command()(search)
 
 
 @app.command("list")

@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 
 from torchcover.coverage import Measure
-from torchcover.placement.common_instants import CommonInstants
+from torchcover.placement.instants import Instants
 from torchcover.placement.racing import Paired, paired
 from torchcover.simulation import Rig
 
@@ -55,33 +56,42 @@ class FreshTest:
     gains: Mapping[str, Mapping[Measure, FreshGain]]
 
 
-def fresh_test(winner: Rig, start: Rig, searched: CommonInstants, *, test_seed: int, worlds: int = WORLDS) -> FreshTest:
-    """Score both rigs in worlds of another seed, instant by instant against the same reference.
+def fresh_test(
+    winners: Mapping[str, Rig], start: Rig, searched: Instants, *, test_seed: int, worlds: int = WORLDS
+) -> dict[str, FreshTest]:
+    """Score rigs in worlds of another seed, instant by instant against the same reference.
 
     Args:
-        winner: What the search has found.
+        winners: What the search has found, by name; all are tested in the same worlds.
         start: What it started from.
         searched: The instants of the search.
         test_seed: Seed of the fresh worlds; another one than that of the search, so that no world is in both.
         worlds: Fresh worlds of each scenario with traffic; a scenario without is the same world for any seed, and is
             left out.
 
+    Returns:
+        The tests, by the names of the winners.
+
     Raises:
         ValueError: The seed of the search; no scenario with traffic; a rig that cannot be mounted in a fresh world.
     """
-    with searched.anew(test_seed, worlds) as fresh:
-        by_test = fresh.score(winner), fresh.score(start)
-    by_search = searched.score(winner), searched.score(start)
-    pairs = {measure: (paired(*by_test, measure), paired(*by_search, measure)) for measure in MEASURES}
-    return FreshTest(
-        search_seed=searched.seed,
-        test_seed=test_seed,
-        instants=len(by_test[0].instants),
-        gains={
-            name: {measure: _gain(*pair, column) for measure, pair in pairs.items()}
-            for column, name in enumerate(by_test[0].objectives)
-        },
-    )
+    with closing(searched.anew(test_seed, worlds)) as fresh:
+        start_by_test = fresh.score(start)
+        by_test = {name: fresh.score(winner) for name, winner in winners.items()}
+    start_by_search = searched.score(start)
+    tests = {}
+    for name, winner in winners.items():
+        scores, by_search = by_test[name], searched.score(winner)
+        pairs = {
+            measure: (paired(scores, start_by_test, measure), paired(by_search, start_by_search, measure))
+            for measure in MEASURES
+        }
+        gains = {
+            objective: {measure: _gain(*pair, column) for measure, pair in pairs.items()}
+            for column, objective in enumerate(scores.objectives)
+        }
+        tests[name] = FreshTest(searched.seed, test_seed, len(scores.instants), gains)
+    return tests
 
 
 def _gain(test: Paired, search: Paired, column: int) -> FreshGain:

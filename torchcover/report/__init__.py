@@ -4,6 +4,7 @@ from torchcover.report.drawings.film import check_film, write_film
 from torchcover.report.drawings.four_views import draw_four_views
 from torchcover.report.drawings.frame import ActorMark, Standing, draw_depths, draw_scene
 from torchcover.report.drawings.rig import draw_rig
+from torchcover.report.drawings.search import Slice, draw_fronts, draw_progress, draw_slices
 from torchcover.report.drawings.targets import draw_targets
 from torchcover.report.drawings.vehicle import SkinPatch, draw_vehicle
 from torchcover.report.drawings.work_precision import WorkPanel, draw_work_precision
@@ -11,7 +12,7 @@ from torchcover.report.maps.arrays import draw_map, draw_side_by_side
 from torchcover.report.maps.colours import ColourScale, difference_scale, error_scale, scale_of
 from torchcover.report.maps.figures import band_figures, file_stems, map_figures, write_figures
 from torchcover.report.maps.overlay import SensorView
-from torchcover.report.page.content import Line, Page, PageMap, PageRig, PageTable
+from torchcover.report.page.content import Line, Page, PageMap, PagePicture, PageRig, PageTable
 from torchcover.report.page.maps_of import maps_of
 from torchcover.report.page.writing import page_html
 from torchcover.report.remarks import Remark, marks_on, notes_on, remarks_on
@@ -34,6 +35,7 @@ __all__ = [
     "Line",
     "Page",
     "PageMap",
+    "PagePicture",
     "PageRig",
     "PageTable",
     "Part",
@@ -41,6 +43,7 @@ __all__ = [
     "Row",
     "SensorView",
     "SkinPatch",
+    "Slice",
     "Standing",
     "Words",
     "WorkPanel",
@@ -51,10 +54,13 @@ __all__ = [
     "difference_scale",
     "draw_depths",
     "draw_four_views",
+    "draw_fronts",
     "draw_map",
+    "draw_progress",
     "draw_rig",
     "draw_scene",
     "draw_side_by_side",
+    "draw_slices",
     "draw_targets",
     "draw_vehicle",
     "draw_work_precision",

@@ -104,6 +104,19 @@ class PageRig:
 
 
 @dataclass(frozen=True, eq=False)
+class PagePicture:
+    """A diagram.
+
+    Args:
+        title: What it shows, for those too who do not see it.
+        png: The file.
+    """
+
+    title: str
+    png: bytes
+
+
+@dataclass(frozen=True, eq=False)
 class Page:
     """All that a page shows.
 
@@ -111,6 +124,7 @@ class Page:
         title: Its name.
         lead: One line below.
         tables: The numbers.
+        pictures: Below the numbers.
         maps: In the order of the menus; differences are to the first rig.
         rigs: Drawn on the ego, and as YAML.
         ego_outline_m: (K, 2) corners x, y of the ego in metres.
@@ -122,6 +136,7 @@ class Page:
     title: str
     lead: str
     tables: Sequence[PageTable] = ()
+    pictures: Sequence[PagePicture] = ()
     maps: Sequence[PageMap] = ()
     rigs: Sequence[PageRig] = ()
     ego_outline_m: Array | None = None

@@ -11,7 +11,7 @@ from importlib.resources import files
 from string import Template
 
 from torchcover.report.page.codes import CellBytes
-from torchcover.report.page.content import Array, Page, PageRig, PageTable
+from torchcover.report.page.content import Array, Page, PagePicture, PageRig, PageTable
 from torchcover.report.page.fitting import fitted
 from torchcover.report.page.map_content import map_content
 from torchcover.report.page.rig_drawing import rig_drawing, sensor_table
@@ -36,6 +36,7 @@ def page_html(page: Page) -> str:
         style=_file("page.css"),
         script_hash=script_hash(script),
         tables="\n".join(map(table_html, page.tables)),
+        pictures="\n".join(map(_picture, page.pictures)),
         map_notes=_notes(notes),
         rigs_heading="Rigs" if len(page.rigs) > 1 else "Rig",
         rigs="\n".join(_rig(rig, page.ego_outline_m, at) for at, rig in enumerate(page.rigs)),
@@ -77,6 +78,12 @@ def table_html(table: PageTable) -> str:
     rows = "\n".join(f"<tr>{''.join(map(_cell, row, kinds))}</tr>" for row in table.rows)
     body = f"{caption}<thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody>"
     return f'<div class="wide"><table>{body}</table></div>{_notes(table.notes)}'
+
+
+def _picture(picture: PagePicture) -> str:
+    title, data = escape(picture.title), base64.b64encode(picture.png).decode()
+    image = f'<img src="data:image/png;base64,{data}" alt="{title}">'
+    return f'<figure class="picture">{image}<figcaption>{title}</figcaption></figure>'
 
 
 def _notes(notes: Sequence[str]) -> str:

@@ -1,0 +1,66 @@
+"""The command `search`."""
+
+from functools import partial
+
+import pytest
+
+from tests.placement.surfaces import Surface
+from torchcover.cli import search_run
+from torchcover.cli.search import parsed_budget
+from torchcover.placement import SearchPlan
+
+SPACE = """
+name: roof
+start: front_roof_32
+scenario: urban
+free: {roof: {x_m: [-0.6, 0.8], z_m: 1.8, pitch_deg: [-10, 15]}}
+objectives: {near: {region: 20m}}
+"""
+
+
+@pytest.fixture
+def space(tmp_path, monkeypatch):
+    """A file; instants are surfaces."""
+    makes = lambda space, plan, seed, worlds: Surface(seed, worlds, plan.per_world)  # noqa: E731
+    monkeypatch.setattr(search_run, "SearchPlan", partial(SearchPlan, instants=makes))
+    (tmp_path / "space.yaml").write_text(SPACE)
+    return tmp_path / "space.yaml"
+
+
+def test_a_search_ends_with_what_was_gained_and_what_random_search_got(torchcover, space, tmp_path):
+    out = tmp_path / "found"
+    code, printed, _ = torchcover("search", space, "--evaluations", 12, "--out", out, "--seed", 3)
+    assert code == 0
+    last = printed.splitlines()[-1]
+    assert last.startswith("near: ")
+    assert "Random search with the same budget" in last
+    assert last.endswith("of the instants.")
+    assert "optimiser" in printed
+    assert (out / "best.yaml").exists()
+    code, again, _ = torchcover("search", space, "--evaluations", 12, "--out", out, "--seed", 3, "--resume")
+    assert again.splitlines()[-1] == last
+    code, _, said = torchcover("search", space, "--evaluations", 12, "--out", out, "--resume")
+    assert code == 2
+    assert "of another search: seed 3, not 0" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--budget", "30"), "--budget: a time is needed, as in 90s, 30min or 2h; got '30'"),
+        (("--budget", "1h", "--evaluations", "3"), "one of them; both are given"),
+        (("--optimiser", "luck"), "one of auto, gp, cmaes, random, enumerate is needed; got 'luck'"),
+        (("--test-seed", "0"), "the worlds would not be fresh"),
+        (("--budget", "0s"), "more than 0 s is needed; got 0"),
+        (("--budget", "0.00001s"), "are less than one evaluation"),
+    ],
+)
+def test_a_mistake_is_one_line(torchcover, space, tmp_path, options, message):
+    code, _, said = torchcover("search", space, "--out", tmp_path / "found", *options)
+    assert code == 2
+    assert message in said
+    assert not (tmp_path / "found" / "summary.json").exists()
+
+
+def test_times():
+    assert [parsed_budget(text) for text in ("10s", "30min", "2h", "0.5 h")] == [10, 1800, 7200, 1800]

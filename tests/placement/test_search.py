@@ -1,0 +1,391 @@
+"""A search: two arms with one budget, the same candidates whatever ends it, and words for all that goes wrong."""
+
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from tests.placement.surfaces import Surface, plan, space
+from torchcover.placement import OPTIMISERS, PlacementSearch, SearchPlan, SearchSpace, run_search
+from torchcover.placement.journal import NAME
+from torchcover.simulation import Rig
+
+
+def searched(out=None, *, of=None, resume=False, **settings):
+    search = PlacementSearch(space() if of is None else of, plan(**settings))
+    return search.run(out, resume=resume)
+
+
+def told(search):
+    """What was asked for and what came of it."""
+    return [
+        (one.number, one.arm, one.values, one.infeasible, [] if one.scores is None else one.scores.seen_m2.tolist())
+        for one in search.evaluations
+    ]
+
+
+class Ended(Exception):  # noqa: N818
+    """What ends a process at any moment."""
+
+
+class EndsAfter(Surface):
+    """Ends when it is asked for the score of so many instants."""
+
+    def score(self, rig, instants=None):
+        if len(self.scored) > self.most:
+            raise Ended
+        return super().score(rig, instants)
+
+
+def ending_after(count):
+    def makes(space, plan, seed, worlds):
+        surface = EndsAfter(seed, worlds, plan.per_world)
+        surface.most = count
+        return surface
+
+    return makes
+
+
+def test_both_arms_begin_at_the_start_and_spend_the_same():
+    result = searched(evaluations=24)
+    evaluations, arms = result.search.evaluations, result.search.arms
+    assert len(evaluations) == 25
+    assert evaluations[0].arm == "start"
+    assert result.search.instants.closed
+    assert arms["optimiser"].evaluations[0] is arms["random"].evaluations[0] is evaluations[0]
+    spent = {"optimiser": 0, "random": 0}
+    for one in evaluations[1:]:
+        assert one.arm == min(spent, key=spent.get)
+        spent[one.arm] += one.instants
+    assert abs(spent["optimiser"] - spent["random"]) <= 18
+    assert 0.3 < result.search.share_saved < 0.9
+
+
+def test_the_winner_is_better_on_fresh_worlds_and_so_is_what_random_search_found():
+    result = searched(evaluations=24)
+    best, random = result.picks
+    assert result.best is best
+    assert abs(best.evaluation.values["roof.pitch_deg"] - 4) < 1.5
+    for pick in (best, random):
+        gain = pick.test.gains["near"]["area"]
+        assert gain.t > 4
+        assert gain.worlds == 16
+        assert gain.optimism == gain.search_gain - gain.gain
+        assert pick.test.test_seed == 1
+    assert best.test.gains["near"]["area"].gain > random.test.gains["near"]["area"].gain
+    assert result.sentence.startswith("near: gained ")
+    assert "Random search with the same budget: near: gained" in result.sentence
+
+
+def test_a_candidate_is_dropped_only_two_errors_below_its_incumbent():
+    result = searched(evaluations=24)
+    for arm in result.search.arms.values():
+        best = arm.gains[arm.best, 0]
+        for at, one in enumerate(arm.evaluations):
+            assert one.instants in (3, 6, 9, 12, 15, 18)
+            if one.instants < 18:
+                assert arm.gains[at, 0] < best
+                assert arm.left[at, 0] > 0
+            else:
+                assert arm.left[at, 0] == 0
+                assert arm.gains[at, 0] == pytest.approx(arm.against_start(at).gain[0], abs=1e-12)
+
+
+def test_random_search_draws_the_same_beside_any_optimiser():
+    draws = []
+    for optimiser in ("random", "cmaes"):
+        search = searched(evaluations=16, optimiser=optimiser).search
+        draws.append([one.values for one in search.evaluations if one.arm == "random"])
+    shortest = min(map(len, draws))
+    assert shortest > 3
+    assert draws[0][:shortest] == draws[1][:shortest]
+    # And what it draws is not what the optimiser draws, where that is random search too.
+    search = searched(evaluations=6, optimiser="random").search
+    assert len({one.values["roof.x_m"] for one in search.evaluations}) == 7
+
+
+@pytest.mark.parametrize(
+    ("optimiser", "objectives"), [("gp", ("near",)), ("cmaes", ("near",)), ("gp", ("near", "far"))]
+)
+def test_a_search_that_was_ended_goes_on_to_the_same_candidates(tmp_path, optimiser, objectives):
+    of = space(objectives=objectives)
+    settings = {"evaluations": 14, "optimiser": optimiser}
+    whole = searched(tmp_path / "whole", of=of, **settings)
+    out = tmp_path / "ended"
+    lengths = []
+    for most in (0, 40, 90):
+        if objectives == ("near",):
+            with pytest.raises(Ended):
+                searched(out, of=of, resume=True, instants=ending_after(most), **settings)
+        else:
+            searched(out, of=of, resume=True, **{**settings, "evaluations": 1 + most // 20})
+        lengths.append((out / NAME).read_text().count("\n") if out.exists() else 0)
+    assert lengths == sorted(lengths)
+    assert lengths[-1] > 2
+    with (out / NAME).open("ab") as file:
+        file.write(b'{"number": 3, "arm"')  # a line that a killed process was writing
+    resumed = searched(out, of=of, resume=True, **settings)
+    assert told(resumed.search) == told(whole.search)
+    assert [pick.evaluation.number for pick in resumed.picks] == [pick.evaluation.number for pick in whole.picks]
+    strip = [[{**json.loads(line), "seconds": 0} for line in (folder / NAME).read_text().splitlines()[1:]]
+             for folder in (out, tmp_path / "whole")]  # fmt: skip
+    assert strip[0] == strip[1]
+
+
+def test_a_budget_that_is_too_small_takes_nothing_away(tmp_path):
+    searched(tmp_path, evaluations=3)
+    before = (tmp_path / NAME).read_bytes()
+    with pytest.raises(ValueError, match="less than one evaluation"):
+        searched(tmp_path, budget_s=1e-6)
+    assert (tmp_path / NAME).read_bytes() == before
+
+
+def test_a_longer_search_goes_on_from_a_shorter_one(tmp_path):
+    shorter = searched(tmp_path, evaluations=5)
+    longer = searched(tmp_path, evaluations=12, resume=True)
+    assert told(longer.search)[:6] == told(shorter.search)
+    assert told(longer.search) == told(searched(evaluations=12).search)
+
+
+def test_evaluations_of_another_search_are_refused(tmp_path):
+    searched(tmp_path, evaluations=2)
+    with pytest.raises(ValueError, match="of another search: optimiser 'gp', not 'random'; seed 0, not 3"):
+        searched(tmp_path, evaluations=2, seed=3, optimiser="random", resume=True)
+    lines = (tmp_path / NAME).read_text().splitlines(keepends=True)
+    (tmp_path / NAME).write_text("".join([lines[0], *lines[2:]]))
+    with pytest.raises(ValueError, match="an evaluation is missing"):
+        searched(tmp_path, evaluations=2, resume=True)
+    changed = json.loads(lines[1])
+    changed["scores"]["seen_m2"][0][0] += 1e-3
+    (tmp_path / NAME).write_text("".join([lines[0], json.dumps(changed) + "\n"]))
+    with pytest.raises(ValueError, match="the start scores something else than it did"):
+        searched(tmp_path, evaluations=2, resume=True)
+
+
+class Clock:
+    """Seconds that pass when something is scored or built."""
+
+    def __init__(self, build_s=10.0, instant_s=0.1):
+        self.now, self.build_s, self.instant_s = 0.0, build_s, instant_s
+
+    def __call__(self):
+        return self.now
+
+    def makes(self, space, plan, seed, worlds):
+        clock = self
+        clock.now += self.build_s * worlds / 6
+
+        class Slow(Surface):
+            def score(self, rig, instants=None):
+                clock.now += clock.instant_s * (len(self) if instants is None else len(instants))
+                return super().score(rig, instants)
+
+            def anew(self, seed, worlds):
+                return clock.makes(space, plan, seed, worlds)
+
+        return Slow(seed, worlds, plan.per_world)
+
+
+def timed(budget_s, monkeypatch):
+    clock = Clock()
+    monkeypatch.setattr("torchcover.placement.search.time.perf_counter", clock)
+    monkeypatch.setattr("torchcover.placement.search.time.monotonic", clock)
+    search = PlacementSearch(space(), plan(budget_s=budget_s, instants=clock.makes))
+    return run_search(search, clock=clock), clock
+
+
+def test_a_budget_of_seconds_is_kept_with_the_test_and_asks_for_what_a_number_of_evaluations_would(monkeypatch):
+    # 10 s for 18 instants, 1.8 s a candidate; 48 fresh instants and three rigs there and here: 46.5 s.
+    result, clock = timed(80.0, monkeypatch)
+    assert 65 < clock.now < 80
+    count = len(result.search.evaluations) - 1
+    assert count > 10
+    assert told(result.search) == told(searched(evaluations=count).search)
+
+
+def test_a_budget_below_one_evaluation_says_what_one_takes(monkeypatch):
+    told_s = r"budget: 30 s are less than one evaluation: .* 11\.8 s, .* 1\.8 s .* 46\.5 s; give 62 s"
+    with pytest.raises(ValueError, match=told_s):
+        timed(30.0, monkeypatch)
+    timed(62.0, monkeypatch)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"budget_s": 3.0, "evaluations": 3}, "seconds or a number of evaluations is needed; got both"),
+        ({"evaluations": 0}, "evaluations: 1 or more is needed; got 0"),
+        ({"budget_s": 0.0}, "more than 0 s is needed"),
+        ({"test_seed": 0}, "would not be fresh with the seed of the search; both are 0"),
+        ({"optimiser": "luck"}, "one of auto, gp, cmaes, random, enumerate is needed; got 'luck'"),
+        ({"measure": "mean"}, "one of area, known is needed"),
+    ],
+)
+def test_a_plan_that_makes_no_sense(settings, message):
+    with pytest.raises(ValueError, match=message):
+        plan(**settings)
+    with pytest.raises(ValueError, match="got neither"):
+        SearchPlan()
+
+
+def test_one_candidate_only():
+    result = searched(evaluations=1)
+    assert [one.arm for one in result.search.evaluations] == ["start", "optimiser"]
+    assert "Nothing better than front_roof_32 was found in 1 candidates." in result.sentence
+    assert "found nothing better in 0 candidates" in result.sentence
+    assert result.rig == result.search.space.start
+
+
+def test_where_no_candidate_can_be_the_start_stays_and_the_words_say_so():
+    def nowhere(rig):
+        if rig.name != "front_roof_32":
+            raise ValueError("inside the wall")
+        return np.array([0.5, 0.5])
+
+    result = searched(evaluations=8, worth=nowhere)
+    assert [one.infeasible for one in result.search.evaluations] == ["", *["inside the wall"] * 8]
+    assert [one.arm for one in result.search.evaluations[1:]] == ["optimiser", "random"] * 4
+    assert result.best.is_start
+    assert result.sentence == "None of 8 candidates can be, the last for this reason: inside the wall."
+
+
+def test_a_start_that_cannot_be_is_compared_with_but_does_not_win():
+    with pytest.warns(UserWarning, match="'tilted' is none of the space"):
+        of = space(constraints={"max_self_hits": 0.2}, start=tilted())
+    result = searched(of=of, evaluations=12)
+    start = result.search.evaluations[0]
+    assert start.infeasible == "30.0% of its rays end on the vehicle; max_self_hits is 20.0%"
+    assert not result.best.is_start
+    assert result.best.evaluation.values["roof.pitch_deg"] <= 20
+
+
+def tilted():
+    content = {
+        "name": "tilted",
+        "sensors": [
+            {
+                "name": "roof",
+                "mount": {"x_m": 0.4, "z_m": 1.8, "pitch_deg": 30.0},
+                "channels": 4,
+                "vertical_fov_deg": [-20, 0],
+                "columns": 30,
+                "horizontal_fov_deg": 360.0,
+                "max_range_m": 60.0,
+            }
+        ],
+    }
+    return Rig.model_validate(content)
+
+
+def test_too_many_rays_on_the_vehicle_end_a_race_after_its_first_instants():
+    of = space(constraints={"max_self_hits": 0.05})
+    search = searched(of=of, evaluations=20).search
+    refused = [one for one in search.evaluations if one.infeasible]
+    assert refused
+    assert all(one.values["roof.pitch_deg"] > 5 and one.scores is None for one in refused)
+    assert "of its rays end on the vehicle; max_self_hits is 5.0%" in refused[0].infeasible
+
+
+def test_an_objective_that_is_unknown_on_some_worlds_is_about_the_others_and_one_on_all_is_refused():
+    result = searched(evaluations=10, blind=(0, 1))
+    assert np.isfinite(result.search.arms["optimiser"].gains).all()
+    with pytest.raises(ValueError, match=r"objectives\.near: unknown at all 18 instants"):
+        searched(evaluations=10, blind=range(6))
+
+
+def test_one_world_has_no_error_drops_nothing_and_claims_nothing():
+    result = searched(evaluations=6, worlds=1, fresh_worlds=1)
+    assert all(one.instants == 3 for one in result.search.evaluations)
+    assert "no gain is shown" in result.sentence or "Nothing better" in result.sentence
+
+
+def test_noise_alone_is_not_called_a_gain():
+    result = searched(evaluations=20, worth=lambda rig: np.array([0.5, 0.5]), seed=4)
+    assert "gained" not in result.sentence
+    gain = result.best.test.gains["near"]["area"]
+    assert gain.t < 2
+    assert gain.optimism > 0
+
+
+def test_of_several_objectives_the_ends_of_the_front_and_its_middle_are_tested():
+    result = searched(of=space(objectives=("near", "far")), evaluations=30)
+    picks = [pick for pick in result.picks if pick.arm == "optimiser"]
+    assert [pick.role for pick in picks] == ["middle", "near", "far"]
+    arm = result.search.arms["optimiser"]
+    gains = {pick.role: arm.gains[arm.evaluations.index(pick.evaluation)] for pick in picks}
+    assert gains["near"][0] == arm.gains[arm.complete, 0].max()
+    assert gains["far"][1] == arm.gains[arm.complete, 1].max()
+    pitches = [arm.evaluations[at].values["roof.pitch_deg"] for at in arm.front]
+    assert min(pitches) < 0 < max(pitches)
+    assert "Hypervolume of the fronts" in result.sentence
+    with pytest.raises(ValueError, match="optimiser cmaes: it follows one objective"):
+        PlacementSearch(space(objectives=("near", "far")), plan(optimiser="cmaes"))
+
+
+def test_an_optimiser_of_ones_own_plugs_in():
+    class Halving:
+        def __init__(self, cube, seed):
+            self.low, self.high = np.zeros(len(cube.levels)), np.ones(len(cube.levels))
+
+        def ask(self):
+            return (self.low + self.high) / 2
+
+        def tell(self, unit, value, error):
+            self.high = (self.low + self.high) / 2
+
+    search = searched(evaluations=8, optimiser=Halving).search
+    asked = [one.unit[0] for one in search.evaluations if one.arm == "optimiser"]
+    assert all(later == earlier / 2 for earlier, later in pairwise(asked))
+    assert search.optimiser_name == "Halving"
+
+
+def test_asking_and_telling_is_what_a_run_does():
+    run = searched(evaluations=9).search
+    search = PlacementSearch(space(), plan(evaluations=9))
+    while (candidate := search.ask()) is not None:
+        search.evaluate(candidate)
+    assert told(search) == told(run)
+    search = PlacementSearch(space(), plan(evaluations=2))
+    start = search.ask()
+    with pytest.raises(ValueError, match="the start, front_roof_32, cannot be scored: no"):
+        search.refuse(start, "no")
+    with pytest.raises(ValueError, match="scored at all 18 instants; got 2"):
+        search.tell(start, search.instants.score(start.rig, [0, 1]))
+    search.tell(start, search.instants.score(start.rig))
+    with pytest.raises(ValueError, match="candidate 1 is to be told next; got candidate 0"):
+        search.tell(start, search.instants.score(start.rig))
+
+
+def test_choices_are_enumerated_and_the_search_ends_when_all_were_tried():
+    of = space(free={"roof": {"model": ("hesai_pandar64", "ouster_os1_64", "ouster_os1_128")}})
+    result = searched(of=of, evaluations=50)
+    tried = [one.values["roof.model"] for one in result.search.evaluations if one.arm == "optimiser"]
+    assert sorted(tried) == ["hesai_pandar64", "ouster_os1_128", "ouster_os1_64"]
+    assert len(result.search.evaluations) < 12
+
+
+def test_every_optimiser_searches():
+    for name in OPTIMISERS.keys() - {"enumerate"}:
+        assert len(searched(evaluations=4, optimiser=name).search.evaluations) == 5
+
+
+def test_a_real_search_does_not_depend_on_the_number_of_workers(tmp_path):
+    (tmp_path / "lot.yaml").write_text(
+        "name: lot\nego: {shape: {type: box, size_m: [4, 2, 1.5]}}\n"
+        "traffic: {type: parking, duration_s: 1.0, time_step_s: 0.2, crossings: 0, parked_share: 0.3}\n"
+    )
+    of = SearchSpace.model_validate(
+        {
+            "name": "lot",
+            "start": tilted(),
+            "scenario": str(tmp_path / "lot.yaml"),
+            "free": {"roof": {"pitch_deg": (0.0, 30.0)}},
+            "objectives": {"near": {"region": "20m"}},
+        }
+    )
+    small = {"worlds": 3, "fresh_worlds": 3, "per_world": 2, "every_s": 0.4, "rays": 512}
+    results = [PlacementSearch(of, evaluations=3, workers=workers, **small).run() for workers in (0, 1)]
+    assert told(results[0].search) == told(results[1].search)
+    assert results[0].sentence == results[1].sentence
+    assert results[0].search.evaluations[0].scores.seen_m2.sum() > 0

@@ -1,0 +1,134 @@
+"""What a search writes: a rig that can be evaluated, tables that agree, a page and pictures."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from tests.placement.surfaces import plan, space
+from torchcover.placement import FreshGain, PlacementSearch
+from torchcover.placement.fresh import student_p
+from torchcover.placement.result import told
+from torchcover.simulation import Rig
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("one")
+    result = PlacementSearch(space(), plan(evaluations=16)).run(folder)
+    return result, folder, result.save(folder)
+
+
+def rows(path):
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_rig_is_the_best_and_can_be_loaded(one):
+    result, folder, _ = one
+    rig = Rig.load(folder / "best.yaml")
+    assert rig == result.rig
+    assert rig.sensors[0].mount.pitch_deg == result.best.evaluation.values["roof.pitch_deg"]
+    assert rig.name == "roof_best"
+
+
+def test_the_summary_comes_last_and_lists_all_files(one):
+    result, folder, files = one
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["complete"] is True
+    assert summary["sentence"] == result.sentence
+    assert files[-1].name == "summary.json"
+    assert set(summary["files"]) == {path.name for path in files[:-1]}
+    assert set(summary["files"]) >= {"best.yaml", "evaluations.csv", "pareto.csv", "search.json", "report.html"}
+    assert {path.name for path in folder.iterdir()} == {path.name for path in files} | {"evaluations.jsonl"}
+
+
+def test_there_is_a_row_for_every_evaluation_and_its_gain_is_the_difference_of_means(one):
+    result, folder, _ = one
+    table = rows(folder / "evaluations.csv")
+    assert [int(row["number"]) for row in table] == list(range(17))
+    start = float(table[0]["near_mean"])
+    for row, evaluation in zip(table, result.search.evaluations, strict=True):
+        assert int(row["instants"]) == evaluation.instants
+        assert row["arm"] == evaluation.arm
+        if row["state"] == "complete":
+            assert float(row["near_gain"]) == pytest.approx(float(row["near_mean"]) - start, abs=1e-8)
+            assert row["why"] == ""
+        else:
+            assert row["state"] == "dropped"
+            assert row["why"] == "two standard errors below the best so far"
+            assert int(row["instants"]) < 18
+    best = max((row for row in table if row["state"] == "complete" and row["arm"] != "random"),
+               key=lambda row: float(row["near_gain"]))  # fmt: skip
+    assert int(best["number"]) == result.best.evaluation.number
+
+
+def test_the_record_has_seeds_gains_and_what_was_saved(one):
+    result, folder, _ = one
+    record = json.loads((folder / "search.json").read_text())
+    assert (record["seed"], record["test_seed"], record["optimiser"]) == (0, 1, "gp")
+    assert record["share_of_instants_saved"] == result.search.share_saved
+    gain = record["found"][0]["gains"]["near"]["area"]
+    assert gain["optimism"] == pytest.approx(gain["search_gain"] - gain["gain"])
+    assert record["arms"]["random"]["instants"] == sum(
+        each.instants for each in result.search.evaluations if each.arm == "random"
+    )
+
+
+def test_the_page_shows_the_gains_the_rigs_and_the_pictures(one):
+    result, folder, _ = one
+    page = (folder / "report.html").read_text()
+    assert result.sentence in page
+    assert page.count("data:image/png;base64,") == 2
+    assert "start: front_roof_32" in page
+    assert "optimiser: roof_best" in page
+    assert f"{result.best.evaluation.values['roof.pitch_deg']:.3f}" in page
+
+
+def test_of_several_objectives_there_are_rigs_of_the_ends_and_a_front(tmp_path):
+    result = PlacementSearch(space(objectives=("near", "far")), plan(evaluations=16)).run()
+    names = {path.name for path in result.save(tmp_path)}
+    assert names >= {"best.yaml", "best_near.yaml", "best_far.yaml", "pareto.png", "objective_1.png", "objective_2.png"}
+    front = rows(tmp_path / "pareto.csv")
+    arm = result.search.arms["optimiser"]
+    assert [int(row["number"]) for row in front if row["arm"] == "optimiser"] == [
+        arm.evaluations[at].number for at in arm.front
+    ]
+    assert json.loads((tmp_path / "search.json").read_text())["hypervolume"]["random"] > 0
+
+
+def test_where_nothing_can_be_there_are_files_all_the_same(tmp_path):
+    def nowhere(rig):
+        if rig.name != "front_roof_32":
+            raise ValueError("inside the wall")
+        return np.array([0.5, 0.5])
+
+    result = PlacementSearch(space(), plan(evaluations=3, worth=nowhere)).run()
+    result.save(tmp_path)
+    assert Rig.load(tmp_path / "best.yaml") == Rig.load("front_roof_32")
+    assert [row["why"] for row in rows(tmp_path / "evaluations.csv")[1:]] == ["inside the wall"] * 3
+    assert json.loads((tmp_path / "search.json").read_text())["found"][0]["gains"] is None
+
+
+def gain(mean, error, t, worlds=16):
+    return FreshGain(mean, error, t, student_p(t, worlds - 1), worlds, 9, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        (gain(-0.02, 0.004, -5.0), "lost 2.00 ± 0.40 points on 16 fresh worlds (t -5.0, better in 9)"),
+        (gain(0.03, 0.01, 3.0), "gained 3.00 ± 1.00 points on 16 fresh worlds (t 3.0, better in 9)"),
+        (gain(0.03, 0.01, 3.0, 3), "no gain is shown: +3.00 ± 1.00 points on 3 fresh worlds (t 3.0, better in 9)"),
+        (
+            gain(0.0198, 0.01, 1.98, 999),
+            "no gain is shown: +1.98 ± 1.00 points on 999 fresh worlds (t 2.0, better in 9)",
+        ),
+        (gain(0.0199, 0.01, 1.99), "no gain is shown: +1.99 ± 1.00 points on 16 fresh worlds (t 2.0, better in 9)"),
+        (gain(0.02, np.nan, np.nan), "no gain is shown: +2.00 ± ? points on 16 fresh worlds (t unknown, better in 9)"),
+        (gain(np.nan, np.nan, np.nan), "unknown in every fresh world"),
+    ],
+)
+def test_nothing_is_called_a_gain_below_a_t_of_two(found, words):
+    assert told(found) == words

@@ -1,0 +1,153 @@
+"""Expected improvement on a Gaussian process: for a few free numbers, and values that cost seconds."""
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchcover.placement.optimisers.gp_model import GaussianProcess
+from torchcover.placement.optimisers.optimiser import Cube, Unit
+
+# Places that are looked at before the first model, at least; one more for every variable.
+FIRST = 3
+# Of more values, the model has the highest and the last: it costs their third power.
+HIGHEST, LAST = 200, 600
+SCATTERED, KEPT, AROUND, ROUNDS = 1024, 8, 64, 6
+FIRST_WIDTH, OTHER_OPTION = 0.1, 0.2
+# Below, φ(z) + z Φ(z) is φ(z) / z² to five digits, and a difference of the two has none left.
+FAR_BELOW = -500.0
+
+
+class GaussianProcessSearch:
+    """Looks where the expected improvement over the best mean so far is largest (Jones et al. 1998).
+
+    Its noise is the squared error that it is told, and a little that it learns. A place where no rig can be counts as
+    the lowest value so far, so that little is expected nearby.
+
+    Args:
+        cube: What is free.
+        seed: Of the first places and of where improvement is looked for.
+
+    Example:
+        >>> search = GaussianProcessSearch(Cube(levels=(0,), start=np.array([0.0])), seed=0)
+        >>> for _ in range(12):
+        ...     search.tell(unit := search.ask(), -float((unit[0] - 0.3) ** 2) + 0.09, 0.0)
+        >>> bool(abs(search.ask()[0] - 0.3) < 0.1)
+        True
+    """
+
+    def __init__(self, cube: Cube, seed: int) -> None:
+        self._cube, self._seed = cube, seed
+        self._places: list[Unit] = []
+        self._values: list[float] = []
+        self._errors: list[float] = []
+        if cube.start is not None:
+            self._note(cube.snapped(cube.start), 0.0, 0.0)
+        self._before = len(self._places)
+
+    def tell(self, unit: Unit, value: float, error: float) -> None:
+        """A value more for the model."""
+        self._note(unit, value, error)
+
+    def ask(self) -> Unit:
+        """The place of the largest expected improvement; scattered places first."""
+        turn, width = len(self._places) - self._before, len(self._cube.levels)
+        known = np.isfinite(self._values)
+        if turn < FIRST + width or not known.any():
+            scattered: Unit = self._scattered(turn + 1, self._seed)[-1]
+            return scattered
+        with _one_thread(), torch.no_grad():
+            return self._best(turn)
+
+    def model(self) -> GaussianProcess | None:
+        """What it has learnt; None before the first value. Where no rig can be, the lowest value stands."""
+        values = np.array(self._values)
+        if not np.isfinite(values).any():
+            return None
+        values = np.where(np.isnan(values), np.nanmin(values), values)
+        kept = np.union1d(np.argsort(-values, kind="stable")[:HIGHEST], np.arange(len(values))[-LAST:])
+        each = (torch.from_numpy(np.array(told)[kept]) for told in (self._places, values, self._errors))
+        with _one_thread():
+            return GaussianProcess.fitted(self._cube.levels, *each)
+
+    def _note(self, unit: Unit, value: float, error: float) -> None:
+        self._places.append(np.asarray(unit, dtype=np.float64))
+        self._values.append(float(value))
+        self._errors.append(float(error) if math.isfinite(error) else 0.0)
+
+    def _scattered(self, count: int, seed: int) -> Unit:
+        sobol = torch.quasirandom.SobolEngine(  # type: ignore[no-untyped-call]
+            len(self._cube.levels), scramble=True, seed=seed
+        )
+        return self._cube.snapped(sobol.draw(count, dtype=torch.float64).numpy())
+
+    def _best(self, turn: int) -> Unit:
+        model = self.model()
+        assert model is not None  # there are values
+        means, _ = model.predict(model.places)
+        best = float(means.max())
+        draws = np.random.default_rng([self._seed, turn])
+        tops = model.places[means.argsort(descending=True)[:KEPT]].numpy()
+        places = np.vstack([self._scattered(SCATTERED, int(draws.integers(2**31))), self._around(tops, 0, draws)])
+        for again in range(ROUNDS + 1):
+            places = self._untried(places)
+            if not len(places):
+                places = self._scattered(1, int(draws.integers(2**31)))  # all of them are known: once more, then
+                break
+            worth = log_expected_improvement(*model.predict(torch.from_numpy(places)), best, model.scale)
+            places = places[worth.argsort(descending=True, stable=True)[:KEPT].numpy()]
+            if again < ROUNDS:
+                places = np.vstack([places, self._around(places, again, draws)])
+        chosen: Unit = places[0]
+        return chosen
+
+    def _around(self, places: Unit, narrower: int, draws: np.random.Generator) -> Unit:
+        """Places near others; some with another option."""
+        near = np.repeat(places, AROUND, axis=0)
+        moved = near + draws.normal(0.0, FIRST_WIDTH * 0.4**narrower, near.shape)
+        other = draws.random(near.shape)
+        is_choice, changes = np.array(self._cube.levels) > 0, draws.random(near.shape) < OTHER_OPTION
+        return self._cube.snapped(np.where(is_choice, np.where(changes, other, near), moved))
+
+    def _untried(self, places: Unit) -> Unit:
+        """Those that nothing is known of, each once; their order stays."""
+        tried = {tuple(place) for place in self._places}
+        return np.array([place for place in dict.fromkeys(map(tuple, places)) if place not in tried])
+
+
+def log_expected_improvement(mean: Tensor, deviation: Tensor, best: float, scale: float) -> Tensor:
+    """The logarithm of E[max(f - best, 0)] / scale for normally distributed f, without underflow (Ament et al. 2023).
+
+    Args:
+        mean: (m,).
+        deviation: (m,), 0 or more.
+        best: What is to be beaten.
+        scale: Of the values; deviations below a trillionth of it count as that.
+
+    Example:
+        >>> float(log_expected_improvement(torch.zeros(1), torch.ones(1), 0.0, 1.0).exp() * math.sqrt(2 * math.pi))
+        1.0
+    """
+    deviation = (deviation / scale).clamp_min(1e-12)
+    z = (mean - best) / scale / deviation
+    above = z.clamp_min(-1.0)
+    usual = (torch.exp(-0.5 * above.square()) / math.sqrt(2 * math.pi) + above * torch.special.ndtr(above)).log()
+    below = z.clamp(FAR_BELOW, 0.0)
+    rest = torch.log1p(below * math.sqrt(math.pi / 2) * torch.special.erfcx(-below / math.sqrt(2)))
+    rest = torch.where(z < FAR_BELOW, -2.0 * z.clamp_max(FAR_BELOW).neg().log(), rest)
+    tail = rest - 0.5 * z.square() - 0.5 * math.log(2 * math.pi)
+    return deviation.log() + torch.where(z > -1.0, usual, tail)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Matrices are small, and sums of several threads would depend on their number."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

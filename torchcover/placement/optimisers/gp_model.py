@@ -1,0 +1,175 @@
+"""A Gaussian process with a Matérn 5/2 kernel: what a page of torch is enough for."""
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from torch import Tensor
+
+# Hyperparameters are learnt from so many values, which costs their third power at every step.
+MOST_LEARNT_FROM = 150
+STEPS, LONGEST_STEP, SHORTEST_STEP, ENOUGH = 40, 2.0, 1e-3, 1e-3
+# Of the variance of the values: with less, duplicates make the kernel matrix singular.
+LEAST_NOISE = 1e-8
+# Where marginal likelihoods are flat, lengths near half of a range, a signal as large as the values, little noise.
+PRIOR_LENGTH, PRIOR_NOISE = math.log(0.5), math.log(1e-4)
+PRIOR_WIDTH, PRIOR_NOISE_WIDTH = 1.0, 2.0
+RESTARTS = ((0.0, 0.0), (-1.2, 4.0))
+
+
+@dataclass(frozen=True, eq=False)
+class GaussianProcess:
+    """What is known of a function after some values of it.
+
+    Args:
+        levels: As of `Cube`: the options of a choice are all as far from each other.
+        places: (n, variables) float64, where it was measured.
+        shift: Added to what is computed.
+        scale: What it is multiplied with first.
+        log_lengths: (variables,) of the kernel.
+        log_signal: Variance of the function.
+        log_noise: Variance that every value has beside its own.
+        cholesky: (n, n) factor of the kernel matrix with the noise.
+        weights: (n,) the matrix' inverse times the values.
+    """
+
+    levels: tuple[int, ...]
+    places: Tensor
+    shift: float
+    scale: float
+    log_lengths: Tensor
+    log_signal: Tensor
+    log_noise: Tensor
+    cholesky: Tensor
+    weights: Tensor
+
+    @classmethod
+    def fitted(cls, levels: tuple[int, ...], places: Tensor, values: Tensor, errors: Tensor) -> Self:
+        """Learn the hyperparameters: the maximum of the marginal likelihood with a weak prior, from several starts.
+
+        Rasmussen and Williams 2006, Gaussian Processes for Machine Learning, algorithm 2.1 and section 5.4.
+
+        Args:
+            levels: As of `Cube`.
+            places: (n, variables) float64, n of 1 or more; duplicates may be among them.
+            values: (n,) float64, finite.
+            errors: (n,) float64, the standard error of each; 0 for an exact one.
+
+        Example:
+            >>> x = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None]
+            >>> model = GaussianProcess.fitted((0,), x, (6 * x[:, 0]).sin(), torch.zeros(9, dtype=torch.float64))
+            >>> mean, deviation = model.predict(torch.tensor([[0.3]], dtype=torch.float64))
+            >>> bool((mean - math.sin(1.8)).abs() < 0.01)
+            True
+        """
+        shift = float(values.mean())
+        spread = float((values - shift).square().mean().sqrt())
+        scale = spread if spread > 1e-12 * float(values.abs().max()) else 1.0  # else rounding is all there is
+        standard, noise = (values - shift) / scale, (errors / scale).square()
+        if scale != spread:
+            standard = torch.zeros_like(standard)
+        some = torch.linspace(0, len(values) - 1, min(len(values), MOST_LEARNT_FROM)).round().long()
+        apart = _squared_apart(levels, places[some], places[some])
+        learnt = _learnt(apart, standard[some], noise[some])
+        kernel = _kernel(_squared_apart(levels, places, places), *learnt[:2])
+        cholesky = _factor(kernel + torch.diag(noise + learnt[2].exp() + LEAST_NOISE))
+        weights = torch.cholesky_solve(standard[:, None], cholesky)[:, 0]
+        return cls(levels, places, shift, scale, *learnt, cholesky, weights)
+
+    def predict(self, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and standard deviation of the function, without the noise of a value, at (m, variables) places."""
+        across = self.covariance(places, self.places)
+        explained = torch.linalg.solve_triangular(self.cholesky, across.T, upper=False)
+        variance = (self.log_signal.exp() - explained.square().sum(0)).clamp_min(0.0)
+        return self.shift + self.scale * (across @ self.weights), self.scale * variance.sqrt()
+
+    def covariance(self, first: Tensor, second: Tensor) -> Tensor:
+        """(n, m) of the function, in its standard units, between (n, variables) and (m, variables) places."""
+        return _kernel(_squared_apart(self.levels, first, second), self.log_lengths, self.log_signal)
+
+
+def _squared_apart(levels: tuple[int, ...], first: Tensor, second: Tensor) -> Tensor:
+    """(variables, n, m) squared distances along each variable; 1 between two options."""
+    squared = (first.T[:, :, None] - second.T[:, None, :]).square()
+    is_choice = torch.tensor(levels)[:, None, None] > 0
+    return torch.where(is_choice, (squared > 0).to(squared.dtype), squared)
+
+
+def _kernel(apart: Tensor, log_lengths: Tensor, log_signal: Tensor) -> Tensor:
+    """Matérn 5/2, with a length for each variable."""
+    squared = torch.einsum("vnm,v->nm", apart, torch.exp(-2.0 * log_lengths))
+    far = (5.0 * squared).sqrt()
+    return log_signal.exp() * (1.0 + far + far.square() / 3.0) * torch.exp(-far)
+
+
+def _factor(matrix: Tensor) -> Tensor:
+    """The Cholesky factor, with as much more noise as it takes."""
+    for exponent in range(-8, 1):
+        cholesky, failed = torch.linalg.cholesky_ex(matrix)
+        if not failed:
+            factor: Tensor = cholesky
+            return factor
+        matrix = matrix + 10.0**exponent * torch.diag(matrix.diagonal())
+    raise ArithmeticError("the kernel matrix of the places has no Cholesky factor: a place or an error is not finite")
+
+
+def _learnt(apart: Tensor, standard: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Logarithms of lengths, signal and noise with the highest posterior density among the restarts."""
+    count = len(apart)
+    length = PRIOR_LENGTH + 0.5 * math.log(count)  # distances grow with the number of variables
+    usual = torch.tensor([length] * count + [0.0, PRIOR_NOISE], dtype=standard.dtype)
+    ends = []
+    for longer, noisier in RESTARTS:
+        first = usual + torch.tensor([longer] * count + [0.0, noisier], dtype=standard.dtype)
+        ends.append(_descended(first, usual, apart, standard, noise))
+    best = min(ends, key=lambda end: end[1])[0]
+    return best[:count], best[count], best[count + 1]
+
+
+def _descended(values: Tensor, usual: Tensor, apart: Tensor, standard: Tensor, noise: Tensor) -> tuple[Tensor, float]:
+    """The nearest minimum of the negative log posterior, by BFGS (Nocedal and Wright 2006, algorithm 6.1)."""
+    loss, slope = _loss_and_slope(values, usual, apart, standard, noise)
+    inverse = torch.eye(len(values), dtype=values.dtype)
+    for _ in range(STEPS):
+        direction = -inverse @ slope
+        direction = direction * min(1.0, LONGEST_STEP / max(float(direction.norm()), 1e-300))
+        step, expected = 1.0, float(slope @ direction)
+        while step > SHORTEST_STEP:
+            new_loss, new_slope = _loss_and_slope(values + step * direction, usual, apart, standard, noise)
+            if new_loss <= loss + 1e-4 * step * expected:
+                break
+            step *= 0.4
+        else:
+            break
+        moved, bent = step * direction, new_slope - slope
+        values, gained, loss, slope = values + moved, loss - new_loss, new_loss, new_slope
+        if gained < ENOUGH:
+            break
+        curvature = float(moved @ bent)
+        if curvature > 1e-10:
+            left = torch.eye(len(values), dtype=values.dtype) - torch.outer(moved, bent) / curvature
+            inverse = left @ inverse @ left.T + torch.outer(moved, moved) / curvature
+    return values, loss
+
+
+def _loss_and_slope(
+    values: Tensor, usual: Tensor, apart: Tensor, standard: Tensor, noise: Tensor
+) -> tuple[float, Tensor]:
+    """The negative log posterior density of the hyperparameters, and its gradient (equation 5.9)."""
+    count = len(apart)
+    closer = apart * torch.exp(-2.0 * values[:count])[:, None, None]
+    far = (5.0 * closer.sum(0)).sqrt()
+    decay = values[count].exp() * torch.exp(-far)
+    kernel = decay * (1.0 + far + far.square() / 3.0)
+    own = values[count + 1].exp()
+    cholesky = _factor(kernel + torch.diag(noise + own + LEAST_NOISE))
+    weights = torch.cholesky_solve(standard[:, None], cholesky)[:, 0]
+    widths = torch.tensor([PRIOR_WIDTH] * (count + 1) + [PRIOR_NOISE_WIDTH], dtype=values.dtype)
+    off = (values - usual) / widths
+    loss = 0.5 * (weights @ standard + off.square().sum()) + cholesky.diagonal().log().sum()
+    unexplained = torch.cholesky_inverse(cholesky) - torch.outer(weights, weights)
+    by_length = torch.einsum("nm,vnm->v", unexplained * decay * (1.0 + far) * (5.0 / 3.0), closer)
+    by_signal, by_noise = (unexplained * kernel).sum(), own * unexplained.diagonal().sum()
+    slope = 0.5 * torch.cat([by_length, by_signal[None], by_noise[None]])
+    return float(loss), slope + off / widths

@@ -1,0 +1,74 @@
+"""Several objectives: which candidates no other beats, and how much they beat together. Higher is better."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Values = NDArray[np.float64]
+# Of the sum beside the smallest: without it, weakly dominated candidates would be worth as much (Knowles 2006).
+AUGMENTATION = 0.05
+
+
+def non_dominated(values: Values) -> NDArray[np.bool_]:
+    """Which candidates no other is as good as everywhere and better than somewhere; equal ones stay together.
+
+    Args:
+        values: (candidates, objectives); a row with NaN is not among them.
+
+    Example:
+        >>> non_dominated(np.array([[1.0, 0.0], [0.0, 1.0], [0.5, 0.5], [0.4, 0.5]]))
+        array([ True,  True,  True, False])
+    """
+    known = np.logical_not(np.isnan(values).any(axis=1))
+    as_good = np.all(values[:, None] >= values[None], axis=2)
+    better = np.any(values[:, None] > values[None], axis=2)
+    beaten: NDArray[np.bool_] = (known[:, None] & as_good & better).any(axis=0)
+    return known & ~beaten
+
+
+def hypervolume(values: Values, reference: Values) -> float:
+    """Volume of what lies between the candidates and a point that they are measured from.
+
+    By slices along the last objective, whose number is that of the candidates: exact, and quick for two or three.
+
+    Args:
+        values: (candidates, objectives); what is not above the reference in all of them adds nothing.
+        reference: (objectives,).
+
+    Example:
+        >>> hypervolume(np.array([[2.0, 1.0], [1.0, 2.0]]), np.zeros(2))
+        3.0
+    """
+    above = values[(values > reference).all(axis=1)]
+    if not len(above):
+        return 0.0
+    if values.shape[1] == 1:
+        return float((above - reference).max())
+    above = above[np.argsort(-above[:, -1], kind="stable")]
+    heights = np.append(above[:, -1], reference[-1])
+    slices = heights[:-1] - heights[1:]
+    return float(
+        sum(
+            height * hypervolume(above[: count + 1, :-1], reference[:-1])
+            for count, height in enumerate(slices)
+            if height > 0
+        )
+    )
+
+
+def chebyshev(values: Values, weights: Values) -> Values:
+    """One number of several objectives: the least weighted one, and a little of their sum.
+
+    Args:
+        values: (candidates, objectives), in units that can be compared.
+        weights: (objectives,), positive; they add up to 1.
+
+    Returns:
+        (candidates,). Higher is better; whatever has the highest is dominated by none.
+
+    Example:
+        >>> chebyshev(np.array([[1.0, 0.0], [0.4, 0.4]]), np.array([0.5, 0.5]))
+        array([0.025, 0.22 ])
+    """
+    weighted = values * weights
+    least: Values = weighted.min(axis=1) + AUGMENTATION * weighted.sum(axis=1)
+    return least

@@ -1,0 +1,132 @@
+"""What a placement search is asked to do, without the space."""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+from torchcover import __version__
+from torchcover.coverage import Measure
+from torchcover.placement.common_instants import EVERY_S, PER_WORLD, RAYS, WORLDS, CommonInstants
+from torchcover.placement.instants import Instants
+from torchcover.placement.optimisers import AUTO, OPTIMISERS, MakesOptimiser, optimiser_for
+from torchcover.placement.space import SearchSpace
+from torchcover.placement.variables import Choice
+
+FRESH_WORLDS = 16
+MEASURES: tuple[Measure, ...] = ("area", "known")
+
+MakesInstants = Callable[[SearchSpace, "SearchPlan", int, int], Instants]
+
+
+def common_instants(space: SearchSpace, plan: "SearchPlan", seed: int, worlds: int) -> Instants:
+    """Instants of the worlds of a seed."""
+    return CommonInstants(
+        space.scenarios,
+        space.objectives,
+        worlds=worlds,
+        per_world=plan.per_world,
+        every_s=plan.every_s,
+        seed=seed,
+        rays=plan.rays,
+        workers=plan.workers,
+    )
+
+
+@dataclass(frozen=True)
+class SearchPlan:
+    """Budget, worlds and seeds of a placement search.
+
+    Args:
+        evaluations: Candidates to look at beside the start, those of the control included; or
+        budget_s: seconds for all of it, the instants and the test on fresh worlds included. One of the two is needed.
+        optimiser: "auto", a name in `OPTIMISERS`, or whatever makes an `Optimiser` from a `Cube` and a seed.
+        seed: Of the worlds that candidates are scored in, and of all that is drawn.
+        test_seed: Of the fresh worlds; not given, the next.
+        measure: What a score is: "area", the share of the visible surface, or "known", the mean of the known cells.
+        worlds: Worlds of each scenario to search in.
+        fresh_worlds: Worlds of each to test in.
+        per_world: Instants of each world.
+        every_s: Time between them.
+        rays: About how many rays the reference casts at each.
+        workers: Processes that score; 0 scores in this one. Results do not depend on it.
+        instants: What makes instants.
+
+    Raises:
+        ValueError: Values that make no sense.
+    """
+
+    evaluations: int | None = None
+    budget_s: float | None = None
+    optimiser: str | MakesOptimiser = AUTO
+    seed: int = 0
+    test_seed: int | None = None
+    measure: Measure = "area"
+    worlds: int = WORLDS
+    fresh_worlds: int = FRESH_WORLDS
+    per_world: int = PER_WORLD
+    every_s: float = EVERY_S
+    rays: int = RAYS
+    workers: int = 0
+    instants: MakesInstants = common_instants
+
+    def __post_init__(self) -> None:
+        if (self.evaluations is None) == (self.budget_s is None):
+            given = "neither" if self.evaluations is None else "both"
+            raise ValueError(f"budget: seconds or a number of evaluations is needed; got {given}")
+        if self.evaluations is not None and self.evaluations < 1:
+            raise ValueError(f"evaluations: 1 or more is needed; got {self.evaluations}")
+        if self.budget_s is not None and not self.budget_s > 0:
+            raise ValueError(f"budget: more than 0 s is needed; got {self.budget_s:g}")
+        if self.test_seed == self.seed:
+            raise ValueError(
+                f"test_seed: the worlds would not be fresh with the seed of the search; both are {self.seed}"
+            )
+        if self.measure not in MEASURES:
+            raise ValueError(f"measure: one of {', '.join(MEASURES)} is needed; got {self.measure!r}")
+        if isinstance(self.optimiser, str) and self.optimiser not in (AUTO, *OPTIMISERS):
+            raise ValueError(f"optimiser: one of {', '.join((AUTO, *OPTIMISERS))} is needed; got {self.optimiser!r}")
+
+    @property
+    def seed_of_test(self) -> int:
+        """Of the fresh worlds."""
+        return self.seed + 1 if self.test_seed is None else self.test_seed
+
+    def optimiser_in(self, space: SearchSpace) -> tuple[str, MakesOptimiser]:
+        """The optimiser and its name.
+
+        Raises:
+            ValueError: It cannot search several objectives.
+        """
+        if not isinstance(self.optimiser, str):
+            return getattr(self.optimiser, "__name__", str(self.optimiser)), self.optimiser
+        name = self.optimiser
+        if name == AUTO:
+            name = optimiser_for(levels_of(space), len(space.objectives))
+        if name == "cmaes" and len(space.objectives) > 1:
+            raise ValueError("optimiser cmaes: it follows one objective; for several use gp or random")
+        return name, OPTIMISERS[name]
+
+    def settings(self, space: SearchSpace) -> dict[str, Any]:
+        """All that decides which candidates are asked for, for JSON."""
+        content = {"space": space.content(), "scenarios": [scenario.content() for scenario in space.scenarios]}
+        text = json.dumps(content, sort_keys=True, default=str)
+        return {
+            "torchcover": __version__,
+            "space": space.name,
+            "space_sha256": hashlib.sha256(text.encode()).hexdigest(),
+            "optimiser": self.optimiser_in(space)[0],
+            "measure": self.measure,
+            "seed": self.seed,
+            "worlds": self.worlds,
+            "per_world": self.per_world,
+            "every_s": self.every_s,
+            "rays": self.rays,
+        }
+
+
+def levels_of(space: SearchSpace) -> tuple[int, ...]:
+    """As of `Cube`."""
+    variables = cast("Sequence[object]", space.variables)
+    return tuple(len(each.options) if isinstance(each, Choice) else 0 for each in variables)
