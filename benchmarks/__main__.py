@@ -32,11 +32,11 @@ BENCHMARKS = (
     "scaling",
     "mutated_files",
     "targets",
-    "published",
-    "voxels",
+    "towns",
     "pairing",
     "placement",
-    "towns",
+    "published",
+    "voxels",
     "cities",
 )
 

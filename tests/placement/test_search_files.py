@@ -121,6 +121,10 @@ def gain(mean, error, t, worlds=16):
         (gain(-0.02, 0.004, -5.0), "lost 2.00 ± 0.40 points on 16 fresh worlds (t -5.0, better in 9)"),
         (gain(0.03, 0.01, 3.0), "gained 3.00 ± 1.00 points on 16 fresh worlds (t 3.0, better in 9)"),
         (gain(0.03, 0.01, 3.0, 3), "no gain is shown: +3.00 ± 1.00 points on 3 fresh worlds (t 3.0, better in 9)"),
+        (
+            gain(0.0198, 0.01, 1.98, 999),
+            "no gain is shown: +1.98 ± 1.00 points on 999 fresh worlds (t 2.0, better in 9)",
+        ),
         (gain(0.0199, 0.01, 1.99), "no gain is shown: +1.99 ± 1.00 points on 16 fresh worlds (t 2.0, better in 9)"),
         (gain(0.02, np.nan, np.nan), "no gain is shown: +2.00 ± ? points on 16 fresh worlds (t unknown, better in 9)"),
         (gain(np.nan, np.nan, np.nan), "unknown in every fresh world"),
