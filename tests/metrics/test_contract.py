@@ -7,6 +7,7 @@ import pickle
 import pkgutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import matplotlib.pyplot as plt
@@ -15,9 +16,12 @@ import torch
 from torchmetrics import Metric, MetricCollection
 from torchmetrics.aggregation import SumMetric
 
-import torchcover
+import torchcover.coverage
+import torchcover.detection
+import torchcover.published
 from torchcover.coverage import AGGREGATIONS
 from torchcover.metrics import MergeableMetric
+from torchcover.published import FrameMetric, WorldRatios
 
 from .cases import ALL, CASES, flat, in_lists
 
@@ -41,12 +45,21 @@ def assert_states(metric, expected):
         assert torch.equal(found[name], value), name
 
 
+def with_arrays(step):
+    """The step, or the frame in it, with one tensor after the other as an array of NumPy: by its name."""
+    if "frame" in step:
+        frame = step["frame"]
+        return {name: {"frame": replace(frame, **{name: getattr(frame, name).numpy()})} for name in ("reference",)}
+    tensors = {name: value for name, value in step.items() if isinstance(value, torch.Tensor)}
+    return {name: {**step, name: tensor.numpy()} for name, tensor in tensors.items()}
+
+
 def assert_same(result, expected):
     """Equal up to the order in which numbers were added up."""
     found, expected = flat(result), flat(expected)
     assert found.keys() == expected.keys()
     for path, value in expected.items():
-        if isinstance(value, torch.Tensor):
+        if isinstance(value, torch.Tensor | float):
             torch.testing.assert_close(found[path], value, rtol=1e-12, atol=0, equal_nan=True, msg=path)
         else:
             assert found[path] == value, path
@@ -56,10 +69,12 @@ def assert_same(result, expected):
 
 
 def test_every_metric_and_every_aggregation_of_the_package_is_asked():
-    for room in (torchcover.coverage, torchcover.detection):
+    for room in (torchcover.coverage, torchcover.detection, torchcover.published):
         for module in pkgutil.iter_modules(room.__path__, f"{room.__name__}."):
             importlib.import_module(module.name)
-    own = {kind for kind in MergeableMetric.__subclasses__() if kind.__module__.startswith("torchcover.")}
+    bases = {MergeableMetric, FrameMetric, WorldRatios}
+    kinds = {kind for base in bases for kind in base.__subclasses__()} - bases
+    own = {kind for kind in kinds if kind.__module__.startswith("torchcover.")}
     assert {type(case.make()) for case in CASES.values()} == own
     assert {type(aggregation) for aggregation in ALL} == set(AGGREGATIONS)
 
@@ -94,10 +109,9 @@ def test_the_inputs_are_as_they_were(case):
 def test_an_array_of_numpy_is_refused_by_its_name_and_nothing_is_added(case, in_a_list):
     metric = case.over(case.steps[:1])
     before, step = states(metric), case.steps[1]
-    tensors = [name for name, value in step.items() if isinstance(value, torch.Tensor)]
-    assert tensors
-    for name in tensors:
-        given = {**step, name: step[name].numpy()}
+    given_as_arrays = with_arrays(step)
+    assert given_as_arrays
+    for name, given in given_as_arrays.items():
         with pytest.raises(TypeError, match=rf"^{name}.* got a NumPy array of float.*; torch.from_numpy\(array\)"):
             metric.update(**(in_lists([given]) if in_a_list else given))
     assert_states(metric, before)

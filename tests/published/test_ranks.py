@@ -1,0 +1,90 @@
+"""Orders of rigs, against SciPy and by hand."""
+
+import math
+from itertools import permutations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from torchcover.published.ranks import kendall_tau_b, midranks, orders, permutation_p, spearman
+
+STATISTICS = pytest.mark.parametrize(
+    ("own", "of_scipy"), [(kendall_tau_b, stats.kendalltau), (spearman, stats.spearmanr)], ids=["tau", "spearman"]
+)
+
+
+@STATISTICS
+@pytest.mark.parametrize("levels", [2, 4, 1000])
+@pytest.mark.parametrize("count", [3, 4, 9])
+def test_it_is_scipys_with_and_without_ties(own, of_scipy, levels, count):
+    generator = np.random.default_rng([levels, count])
+    series = generator.integers(0, levels, (2, 20, count)).astype(float)
+    together = own(*series)
+    for row, one, other in zip(together, *series, strict=True):
+        constant = len(set(one)) == 1 or len(set(other)) == 1
+        expected = math.nan if constant else of_scipy(one, other).statistic
+        assert row == pytest.approx(expected, abs=1e-12, nan_ok=True)
+        assert own(one, other) == pytest.approx(row, abs=1e-15, nan_ok=True)
+
+
+@STATISTICS
+def test_what_is_unknown_in_one_of_them_is_left_out_of_both(own, of_scipy):
+    one, other = [1.0, math.nan, 3.0, 2.0, 7.0, 5.0], [2.0, 9.0, 1.0, math.nan, 8.0, 8.0]
+    known = of_scipy([1.0, 3.0, 7.0, 5.0], [2.0, 1.0, 8.0, 8.0]).statistic
+    assert own(one, other) == pytest.approx(known, abs=1e-12)
+
+
+@STATISTICS
+@pytest.mark.parametrize(
+    "series",
+    [([], []), ([1, 2], [1, 2]), ([1, 2, math.nan], [1, 2, 3]), ([1, 1, 1], [1, 2, 3]), ([math.nan] * 4, range(4))],
+)
+def test_two_rigs_have_no_relation_and_equal_ones_have_none(own, of_scipy, series):
+    assert math.isnan(own(np.array(series[0], dtype=float), np.array(series[1], dtype=float)))
+
+
+@STATISTICS
+def test_any_monotone_scale_gives_the_same_and_a_sign_turns_it(own, of_scipy):
+    one, other = np.random.default_rng(1).normal(size=(2, 7))
+    assert own(np.exp(3 * one), other**3) == pytest.approx(own(one, other), abs=1e-15)
+    assert own(-one, other) == pytest.approx(-own(one, other), abs=1e-15)
+    assert own(one, one) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_infinite_values_are_the_largest_not_unknown():
+    assert kendall_tau_b([1.0, 2.0, math.inf], [1.0, 2.0, 3.0]) == pytest.approx(1.0)
+    assert midranks([math.inf, 1.0, math.inf]).tolist() == [2.5, 1.0, 2.5]
+
+
+def test_midranks_are_scipys():
+    values = np.random.default_rng(2).integers(0, 4, (5, 8)).astype(float)
+    np.testing.assert_array_equal(midranks(values), stats.rankdata(values, axis=1))
+
+
+def test_the_p_of_one_series_is_that_of_all_orders():
+    one, other = [1, 2, 3, 4, 5], [2, 1, 4, 3, 5]
+    found = abs(stats.spearmanr(one, other).statistic)
+    expected = np.mean([abs(stats.spearmanr(one, order).statistic) >= found - 1e-9 for order in permutations(other)])
+    assert permutation_p(one, other) == pytest.approx(expected, abs=1e-15)
+
+
+def test_of_many_the_best_is_good_by_chance():
+    generator = np.random.default_rng(3)
+    target, many = np.arange(6.0), generator.normal(size=(40, 6))
+    best = min(permutation_p(one, target) for one in many)
+    assert permutation_p(many, target) > 4 * best
+    assert permutation_p(many[:1], target) == permutation_p(many[0], target)
+
+
+def test_of_more_than_eight_orders_are_drawn_the_same_each_time_and_p_is_never_0():
+    same = np.arange(12.0)
+    assert permutation_p(same, same) == pytest.approx(1 / 40321)
+    assert (orders(12, seed=5) == orders(12, seed=5)).all()
+    assert not (orders(12, seed=5) == orders(12, seed=6)).all()
+    assert (np.sort(orders(9)[:50], axis=1) == np.arange(9)).all()
+
+
+def test_what_is_unknown_has_no_p():
+    assert math.isnan(permutation_p([1, 1, 1], [1, 2, 3]))
+    assert math.isnan(permutation_p([1, math.nan, 2], [1, 2, 3]))

@@ -1,0 +1,128 @@
+"""Metrics that are ratios of sums over frames, with errors from blocks of worlds."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchmetrics.utilities.distributed import gather_all_tensors
+
+from torchcover.coverage.blocks import MIN_BLOCKS, pair_up
+from torchcover.coverage.errors import ROUND_OFF, jackknife_error, ratio_errors
+from torchcover.data import Frame
+from torchcover.published.frame_metric import FrameMetric
+from torchcover.published.number import PublishedNumber
+
+# As many as `evaluate` keeps of the coverage, so that both can be drawn again together.
+BLOCKS = 16
+IN_BLOCKS = ("base", "sums", "block_steps")
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """What one ratio of a metric is; see `PublishedNumber`."""
+
+    name: str
+    unit: str
+    higher_is_better: bool
+    count_of: str
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+
+class WorldRatios(FrameMetric):
+    """Ratios S / A of sums over frames, kept in blocks of contiguous worlds (`Frame.place_in_time`).
+
+    A metric gives its `ratios`, and in `_of_frame` what a frame adds to each: a_j, s_j, and how many these are. The
+    error of a share is that of `torchcover.coverage.errors.ratio_errors`, which is never 0; others have the block
+    jackknife's. Blocks double as in `CoverageMetric`, so that the state has a fixed size and parts merge exactly.
+
+    Args:
+        ratios: What they are.
+        meaning: What the sums depend on.
+        rig: Whose clouds; those of the only rig if not given.
+        kwargs: For `torchmetrics.Metric`.
+    """
+
+    base: Tensor
+    sums: Tensor
+    counts: Tensor
+    block_steps: Tensor
+    block_length: Tensor
+
+    def __init__(
+        self,
+        ratios: Sequence[Ratio],
+        meaning: Mapping[str, object],
+        rig: str | None = None,
+        **kwargs: Any,  # noqa: ANN401
+    ) -> None:
+        super().__init__(meaning, rig, **kwargs)
+        self.ratios = tuple(ratios)
+        self.add_sum("base", (BLOCKS, len(self.ratios)))
+        self.add_sum("sums", (BLOCKS, len(self.ratios)))
+        self.add_sum("counts", (len(self.ratios),), torch.int64)
+        self.add_sum("block_steps", (BLOCKS,), torch.int64)
+        self.add_state("block_length", torch.tensor(1), dist_reduce_fx="max", persistent=True)
+
+    def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        """(V,) what a frame adds to what is divided by, to the sums, and to the int64 counts of each ratio."""
+        raise NotImplementedError
+
+    def _add_frame(self, frame: Frame) -> None:
+        base, sums, counts = self._of_frame(frame)  # before anything is added
+        while frame.place_in_time >= BLOCKS * int(self.block_length):
+            pair_up(self.metric_state, IN_BLOCKS)
+        block = frame.place_in_time // int(self.block_length)
+        self.base[block] += base.to(self.base)
+        self.sums[block] += sums.to(self.sums)
+        self.counts += counts.to(self.counts)
+        self.block_steps[block] += 1
+
+    def compute(self) -> tuple[PublishedNumber, ...]:
+        """The ratios so far."""
+        value, error = self._value(self.base.sum(dim=0), self.sums.sum(dim=0)), self._errors()
+        return tuple(
+            PublishedNumber(
+                ratio.name, one, ratio.unit, ratio.higher_is_better, ratio.parameters, count, ratio.count_of, own_error
+            )
+            for ratio, one, count, own_error in zip(
+                self.ratios, value.tolist(), self.counts.tolist(), error.tolist(), strict=True
+            )
+        )
+
+    def resampled(self, weights: Tensor) -> Tensor:
+        """(R, V) the ratios if each block of worlds had come as often as it is weighted.
+
+        Args:
+            weights: (R, 16) how often.
+        """
+        weights = weights.to(self.base)
+        return self._value(weights @ self.base, weights @ self.sums)
+
+    def _value(self, base: Tensor, sums: Tensor) -> Tensor:
+        return (sums / base).where(base > 0, math.nan)
+
+    def _errors(self) -> Tensor:
+        used = self.block_steps > 0
+        base, sums, steps = self.base[used], self.sums[used], self.block_steps[used]
+        whole, whole_base, whole_sums = self._value(base.sum(0), sums.sum(0)), base.sum(0), sums.sum(0)
+        jackknife = jackknife_error(self._value(whole_base - base, whole_sums - sums), whole, steps)
+        share = torch.tensor([ratio.unit == "share" for ratio in self.ratios], device=whole.device)
+        error = ratio_errors(base, sums, "share").where(share, jackknife)
+        # Blocks that all say the same do not prove that others would.
+        return error.where(((base > 0).sum(dim=0) >= MIN_BLOCKS) & (error > ROUND_OFF), math.nan)
+
+    def _align_with(self, incoming: dict[str, Any]) -> None:
+        # Blocks of the same length only can be added up.
+        longest = max(int(self.block_length), int(incoming["block_length"]))
+        states: tuple[dict[str, Any], ...] = (self.metric_state, incoming)
+        for state in states:
+            while int(state["block_length"]) < longest:
+                pair_up(state, IN_BLOCKS)
+
+    def _align_ranks(self, dist_sync_fn: Callable[..., Any] = gather_all_tensors, process_group: Any = None) -> None:  # noqa: ANN401
+        lengths = dist_sync_fn(self.block_length, group=process_group or self.process_group)
+        while int(self.block_length) < max(map(int, lengths)):
+            pair_up(self.metric_state, IN_BLOCKS)
