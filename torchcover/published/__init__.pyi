@@ -1,6 +1,14 @@
+from .agreement import Agreement as Agreement
+from .agreement import Candidate as Candidate
+from .agreement import Ranked as Ranked
+from .agreement import Relation as Relation
+from .agreement import agreement_of as agreement_of
 from .frame_metric import FrameMetric as FrameMetric
 from .number import PublishedNumber as PublishedNumber
 from .registry import PUBLISHED as PUBLISHED
+from .results import Judged as Judged
+from .results import published_results as published_results
+from .results import read_results as read_results
 from .setup import Published as Published
 from .setup import Setup as Setup
 from .sights import Sights as Sights
