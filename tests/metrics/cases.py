@@ -10,7 +10,10 @@ from torchmetrics import Metric
 
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.coverage import Maximum, PooledMean, Quantiles, StepQuantiles
+from torchcover.data import Frame
 from torchcover.detection import Boxes, RecallByVisibility
+from torchcover.published import FalseVisible, KCover, ObjectCoverage, PerceptionEntropy, PointDensity
+from torchcover.simulation import Rig
 
 Step = Mapping[str, Any]
 
@@ -145,6 +148,55 @@ def detection_step(seed: int) -> Step:
     }
 
 
+# Published by others, over frames.
+
+
+def frame_step(index: int) -> Step:
+    generator = torch.Generator().manual_seed(index)
+    count = index // 2 % 5
+    rows = torch.rand(count, 7, generator=generator) * torch.tensor([50.0, 8, 0.5, 3, 2, 1, 3])
+    rows += torch.tensor([3.0, -4, 0.5, 1, 1, 1, 0])
+    # A few points anywhere, and on objects.
+    reference, cloud = torch.rand(2, 60, 3, generator=generator) * torch.tensor([8.0, 4.0, 2.0])
+    near = rows[:, :3].repeat(8, 1) + 0.4 * torch.randn(8 * count, 3, generator=generator)
+    categories = tuple("car" if number % 2 else "pedestrian" for number in range(count))
+    frame = Frame(
+        {"rig": torch.cat([cloud, near[::2]])},
+        torch.cat([reference, near]),
+        index=index,
+        name=f"frame {index}",
+        reference_weights=torch.rand(60 + 8 * count, generator=generator) + 0.1,
+        weight_kind="m2",
+        boxes=Boxes.from_rows(rows, categories=categories),
+        sensor_points={"rig": {"front": 25, "rear": 35 + 4 * count}},
+    )
+    return {"frame": frame}
+
+
+PLACES = {"grid": BevGrid(x=(0.0, 8.0), y=(0.0, 4.0), cell=0.5), "regions": (Region("near", (0.0, 4.0), (0.0, 4.0)),)}
+OTHER_GRID = {"grid": BevGrid(x=(0.0, 10.0), y=(0.0, 4.0), cell=0.5)}
+SENSORS = Rig.load("front_roof_32").sensors
+
+
+def of_frames(kind: Callable[..., Metric], usual: Step, changes: Mapping[str, Step]) -> Case:
+    nothing = Frame(
+        {"rig": torch.zeros(0, 3)},
+        torch.zeros(0, 3),
+        0,
+        "nothing",
+        reference_weights=torch.zeros(0),
+        weight_kind="m2",
+        boxes=Boxes.from_rows(torch.zeros(0, 7)),
+        sensor_points={"rig": {"front": 0, "rear": 0}},
+    )
+    return Case(
+        lambda **changed: kind(**{**usual, **changed}),
+        [frame_step(index) for index in range(0, 20, 2)],  # blocks are paired up
+        {"frame": nothing},
+        {**changes, "rig": {"rig": "rig"}},
+    )
+
+
 CASES = {
     "coverage": coverage(12, {}),
     "coverage, everything": coverage(
@@ -175,6 +227,47 @@ CASES = {
             "visibility_borders": {"visibility_borders": (0.1, 0.4, 0.6, 0.8)},
             "distance_borders": {"distance_borders": (10.0, 20.0)},
             "score_thresholds": {"score_thresholds": (0.0, 0.9)},
+        },
+    ),
+    "object coverage": of_frames(
+        ObjectCoverage,
+        {"categories": ("car", "pedestrian"), "range_borders_m": (20.0,)},
+        {
+            "threshold_m": {"threshold_m": 0.2},
+            "hits": {"hits": (2,)},
+            "categories": {"categories": ("pedestrian", "car")},
+            "range_borders_m": {"range_borders_m": (30.0,)},
+        },
+    ),
+    "perception entropy": of_frames(PerceptionEntropy, {}, {"categories": {"categories": ("car",)}}),
+    "k-cover": of_frames(
+        KCover,
+        PLACES,
+        {
+            "grid": OTHER_GRID,
+            "regions": {"regions": ()},
+            "threshold_m": {"threshold_m": 0.2},
+            "at_least": {"at_least": (1, 2)},
+            "square_metres": {"square_metres": False},
+        },
+    ),
+    "point density": of_frames(
+        PointDensity,
+        {"regions": PLACES["regions"], "height_m": (-0.5, 2.0)},
+        {
+            "regions": {"regions": (Region("near", (0.0, 2.0), (0.0, 4.0)),)},
+            "height_m": {"height_m": (0.5, 2.0)},
+            "cell_m": {"cell_m": 0.5},
+        },
+    ),
+    "false visible": of_frames(
+        FalseVisible,
+        {"sensors": SENSORS, "ego": None, "grid": PLACES["grid"]},
+        {
+            "grid": OTHER_GRID,
+            "threshold_m": {"threshold_m": 0.2},
+            "cell_m": {"cell_m": 0.5},
+            "predicted": {"sensors": (SENSORS[0].model_copy(update={"max_range_m": 5.0}),)},
         },
     ),
 }

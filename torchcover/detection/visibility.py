@@ -1,6 +1,5 @@
 """How much of each object the rig could see."""
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -106,22 +105,35 @@ def box_visibility(
     box, point = points_in_boxes(reference, boxes)
     # Only the reference may be cropped to the boxes.
     radius = blind_spot_radius(reference[point], sensor).double()
-    weight = torch.ones_like(radius) if reference_weights is None else reference_weights.to(radius)[point]
-
-    def sum_by_box(values: Tensor) -> Tensor:
-        return torch.zeros(len(boxes), dtype=torch.float64, device=reference.device).index_add_(0, box, values)
-
-    count = torch.bincount(box, minlength=len(boxes))
-    total = sum_by_box(weight).where(count > 0, math.nan)
+    weights = None if reference_weights is None else reference_weights[point]
     return BoxVisibility(
         # A GPU adds weights up in any order, so that even all of them may come to a trifle over the total.
-        share=(sum_by_box(weight * (radius <= threshold)) / total).clamp(max=1.0),
-        mean_radius_m=sum_by_box(weight * radius) / total,
-        reference_points=count,
+        share=mean_by_box((radius <= threshold).double(), box, len(boxes), weights).clamp(max=1.0),
+        mean_radius_m=mean_by_box(radius, box, len(boxes), weights),
+        reference_points=torch.bincount(box, minlength=len(boxes)),
         drawn_points=boxes.drawn_points,
         sensor_points=torch.bincount(points_in_boxes(sensor, boxes).box, minlength=len(boxes)),
         threshold_m=float(threshold),
     )
+
+
+def mean_by_box(values: Tensor, box: Tensor, boxes: int, weights: Tensor | None) -> Tensor:
+    """(K,) weighted mean over the points in each of K boxes; NaN for a box without any.
+
+    Args:
+        values: (P,) float64, one for each point in a box.
+        box: (P,) int64 number of the box.
+        boxes: K.
+        weights: (P,) positive weights; None if all weigh the same.
+
+    Example:
+        >>> mean_by_box(torch.tensor([1.0, 0.0]).double(), torch.tensor([1, 1]), 2, torch.tensor([1.0, 3.0]))
+        tensor([   nan, 0.2500], dtype=torch.float64)
+    """
+    weight = torch.ones_like(values) if weights is None else weights.to(values)
+    total, whole = values.new_zeros(2, boxes).unbind()
+    total.index_add_(0, box, values * weight)
+    return total / whole.index_add_(0, box, weight)  # 0 / 0 is NaN
 
 
 def _check(sensor: Tensor, reference: Tensor, threshold: float, weights: Tensor | None) -> None:

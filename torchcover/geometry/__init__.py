@@ -1,4 +1,4 @@
-"""Rigid transforms and boxes. Knows no other part of the house."""
+"""Rigid transforms, boxes, and rays through voxels. Knows no other part of the house."""
 
 from torchcover.geometry.bounding_box import BoundingBox, overlap
 from torchcover.geometry.rigid import (
@@ -12,10 +12,13 @@ from torchcover.geometry.rigid import (
     transform,
 )
 from torchcover.geometry.tensors import transform_tensor
+from torchcover.geometry.voxel_walk import VoxelGrid, crossed_voxels
 
 __all__ = [
     "BoundingBox",
+    "VoxelGrid",
     "check_rigid",
+    "crossed_voxels",
     "euler_from_rotation",
     "invert",
     "overlap",

@@ -2,5 +2,6 @@
 
 from torchcover.metrics.mergeable import MergeableMetric
 from torchcover.metrics.plotting import figure_of
+from torchcover.metrics.table import with_rows
 
-__all__ = ["MergeableMetric", "figure_of"]
+__all__ = ["MergeableMetric", "figure_of", "with_rows"]

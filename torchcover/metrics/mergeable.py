@@ -10,9 +10,11 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities.distributed import gather_all_tensors
 
+from torchcover.metrics.table import filled, joined
+
 
 class MergeableMetric(Metric):
-    """Base of the metrics: fixed-size sums over steps, and the parameters that say what they are sums of.
+    """Base of the metrics: sums over steps, and the parameters that say what they are sums of.
 
     * Two metrics over different steps merge exactly: `merge_state`, or over ranks when `compute` is called.
     * Sums that mean different things are never added: a fingerprint of class and parameters is part of the state. It
@@ -23,6 +25,7 @@ class MergeableMetric(Metric):
     * Under `torch.inference_mode` everything works as outside of it, and steps may be added outside afterwards.
 
     A metric passes its parameters to `__init__`, adds its states with `add_sum` and `add_maximum`, and counts `steps`.
+    Their size is fixed; only a table (`add_table`) grows.
 
     Args:
         meaning: What the sums depend on, by the name of the parameter; compared by `==` and `repr`.
@@ -57,6 +60,7 @@ class MergeableMetric(Metric):
     def __init__(self, meaning: Mapping[str, object], **kwargs: Any) -> None:  # noqa: ANN401  (whatever torchmetrics takes)
         super().__init__(**kwargs)
         self.meaning = dict(meaning)
+        self._tables: tuple[str, ...] = ()
         self.add_state("fingerprint", self._fingerprint(), dist_reduce_fx="max", persistent=True)
         self.add_sum("steps", (), torch.int64)
 
@@ -85,6 +89,12 @@ class MergeableMetric(Metric):
         """Add a float64 state that starts at minus infinity and keeps the largest."""
         lowest = torch.tensor(-math.inf, dtype=torch.float64).expand(shape)
         self.add_state(name, lowest, dist_reduce_fx="max", persistent=True)
+
+    def add_table(self, name: str, columns: int) -> None:
+        """Add a float64 state of finite rows, none at first; to be added to with `torchcover.metrics.with_rows`."""
+        self._tables = (*self._tables, name)
+        none = torch.empty((0, columns), dtype=torch.float64)
+        self.add_state(name, none, dist_reduce_fx=joined, persistent=True)
 
     @torch.inference_mode(False)  # here and below: a tensor made under it could not be added to outside of it
     def reset(self) -> None:
@@ -119,6 +129,11 @@ class MergeableMetric(Metric):
     def _reduce_states(self, incoming_state: dict[str, Any]) -> None:
         # A copy already, here and in torchmetrics' `forward`.
         self._align_with(incoming_state)
+        for name in self._tables:
+            mine, other = getattr(self, name), incoming_state[name]
+            length = max(len(mine), len(other))
+            setattr(self, name, filled(mine, length))
+            incoming_state[name] = filled(other, length)
         super()._reduce_states(incoming_state)
 
     def _align_with(self, incoming: dict[str, Any]) -> None:
@@ -134,6 +149,10 @@ class MergeableMetric(Metric):
                     "the same; make it with the same arguments on every rank"
                 )
         self._align_ranks(dist_sync_fn, process_group)
+        for name in self._tables:
+            table = getattr(self, name)
+            lengths = dist_sync_fn(self.steps.new_tensor(len(table)), group=process_group or self.process_group)
+            setattr(self, name, filled(table, max(map(int, lengths))))
         super()._sync_dist(dist_sync_fn, process_group)
 
     def _align_ranks(self, dist_sync_fn: Callable[..., Any], process_group: Any) -> None:  # noqa: ANN401
@@ -166,9 +185,12 @@ class MergeableMetric(Metric):
         copies = {}
         for name in self._defaults:
             mine, other = getattr(self, name), states.get(name)
-            if other is None or other.shape != mine.shape:
+            needed = tuple(mine.shape)
+            if name in self._tables and other is not None:
+                needed = (*other.shape[:1], *needed[1:])
+            if other is None or tuple(other.shape) != needed:
                 arrived = "none" if other is None else tuple(other.shape)
-                raise ValueError(f"state {name!r} of shape {tuple(mine.shape)} is needed; got {arrived}")
+                raise ValueError(f"state {name!r} of shape {needed} is needed; got {arrived}")
             copies[name] = other.to(device=mine.device, dtype=mine.dtype, copy=True)
         return copies
 

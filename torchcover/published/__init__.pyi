@@ -3,8 +3,14 @@ from .agreement import Candidate as Candidate
 from .agreement import Ranked as Ranked
 from .agreement import Relation as Relation
 from .agreement import agreement_of as agreement_of
+from .false_visible import FalseVisible as FalseVisible
+from .field_of_view import field_of_view as field_of_view
 from .frame_metric import FrameMetric as FrameMetric
+from .k_cover import KCover as KCover
 from .number import PublishedNumber as PublishedNumber
+from .object_coverage import ObjectCoverage as ObjectCoverage
+from .perception_entropy import PerceptionEntropy as PerceptionEntropy
+from .point_density import PointDensity as PointDensity
 from .registry import PUBLISHED as PUBLISHED
 from .results import Judged as Judged
 from .results import published_results as published_results

@@ -7,6 +7,7 @@ import torch
 
 from torchcover.data import Frame
 from torchcover.metrics import MergeableMetric, figure_of
+from torchcover.neighbors import check_tensor
 from torchcover.published.number import PublishedNumber
 
 if TYPE_CHECKING:
@@ -40,6 +41,9 @@ class FrameMetric(MergeableMetric):
         frames = [frame] if isinstance(frame, Frame) else frame
         if not isinstance(frames, Sequence) or not all(isinstance(each, Frame) for each in frames):
             raise TypeError(f"frame: a Frame, or a list of them, is needed; got {type(frame).__name__}")
+        for each in frames:
+            for name, cloud in {"reference": each.reference, **each.clouds}.items():
+                check_tensor(cloud, name, floating=True)
         for each in frames:
             self._add_frame(each)
             self.steps += 1

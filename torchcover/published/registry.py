@@ -2,6 +2,46 @@
 
 from collections.abc import Mapping
 
-from torchcover.published.setup import Published
+from torchcover.published.false_visible import FalseVisible
+from torchcover.published.k_cover import KCover
+from torchcover.published.object_coverage import ObjectCoverage
+from torchcover.published.perception_entropy import PerceptionEntropy
+from torchcover.published.point_density import PointDensity
+from torchcover.published.setup import Published, Setup
 
-PUBLISHED: Mapping[str, Published] = {}
+
+def _object_coverage(setup: Setup) -> ObjectCoverage:
+    return ObjectCoverage(setup.threshold_m, **setup.of_frames)
+
+
+def _perception_entropy(setup: Setup) -> PerceptionEntropy:
+    return PerceptionEntropy(setup.sensors, **setup.of_frames)
+
+
+def _k_cover(setup: Setup) -> KCover:
+    return KCover(setup.grid, setup.regions, setup.threshold_m, square_metres=setup.square_metres, **setup.of_frames)
+
+
+def _point_density(setup: Setup) -> PointDensity:
+    bands = setup.grid.heights.values()
+    height_m = min(low for low, _ in bands), max(high for _, high in bands)
+    return PointDensity(setup.regions, height_m, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
+
+
+def _false_visible(setup: Setup) -> FalseVisible:
+    return FalseVisible(setup.sensors, setup.ego, setup.grid, setup.threshold_m, **setup.of_frames)
+
+
+PUBLISHED: Mapping[str, Published] = {
+    "object_coverage": Published(
+        _object_coverage, frozenset({"boxes"}), "share of an object within the threshold; objects with 1, 5, 10 points"
+    ),
+    "perception_entropy": Published(
+        _perception_entropy, frozenset({"boxes"}), "nats of a detector's error, from points on objects (Ma 2021)"
+    ),
+    "k_cover": Published(_k_cover, frozenset({"sensor_points"}), "share of the surface seen by 1, 2, 3 sensors"),
+    "point_density": Published(_point_density, frozenset(), "points, for each square metre, and how evenly"),
+    "false_visible": Published(
+        _false_visible, frozenset({"sensors"}), "blind cells that the field of view promised (Börger 2022)"
+    ),
+}

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from torchcover.coverage import BevGrid, Region, forward_regions
 from torchcover.published.frame_metric import FrameMetric
@@ -27,6 +27,7 @@ class Setup:
         ego: The body that carries it, in the vehicle frame; None if nobody knows it.
         grid: Cells and height bands of the run.
         regions: Those that numbers are given for.
+        square_metres: Whether the weights of reference points are square metres.
         threshold_m: Distance within which a point counts as seen.
         sights: What metrics of the same run share, so that each frame is searched once.
         sync_on_compute: As in `torchmetrics.Metric`.
@@ -37,9 +38,15 @@ class Setup:
     ego: Mesh | None = None
     grid: BevGrid = GRID
     regions: Sequence[Region] = field(default_factory=forward_regions)
+    square_metres: bool = True
     threshold_m: float = 0.4
     sights: Sights = field(default_factory=Sights)
     sync_on_compute: bool = True
+
+    @property
+    def of_frames(self) -> dict[str, Any]:
+        """The arguments that metrics of what frames show have in common."""
+        return {"rig": self.rig, "sights": self.sights, "sync_on_compute": self.sync_on_compute}
 
 
 @dataclass(frozen=True)

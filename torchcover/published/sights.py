@@ -1,13 +1,123 @@
 """What several metrics ask of the same frame and rig, found once."""
 
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor
+
+from torchcover.coverage import BevGrid
+from torchcover.coverage.grid import Bins
 from torchcover.data import Frame
+from torchcover.detection import Boxes, points_in_boxes
+from torchcover.detection.inside import Inside
+from torchcover.neighbors import check_cloud, nearest
+
+Found = TypeVar("Found")
+
+NO_BOXES = (
+    "{}: the frame has no boxes, and the metric is about objects: SimulatedFrames(..., boxes=True) makes them, a "
+    "recording has them if its format does; else use dataclasses.replace(frame, boxes=...)"
+)
 
 
 class Sights:
-    """Remembers what was found in the last frame. Several metrics of a run share one; a copy starts anew."""
+    """Remembers what was found in the last frame. Metrics of a run, of all its rigs, share one; a copy starts anew.
+
+    Example:
+        >>> frame = Frame({"rig": torch.zeros(1, 3)}, torch.tensor([[0.3, 0.0, 0.0], [3.0, 0.0, 0.0]]), 0, "a")
+        >>> Sights().distance(frame, "rig", 0.4)
+        tensor([0.3000,    inf])
+    """
 
     def __init__(self) -> None:
         self._frame: Frame | None = None
+        self._found: dict[tuple[Any, ...], Any] = {}
+        # Whether anybody wants to know of single sensors: then nobody searches for the rig as a whole.
+        self.by_sensor = False
 
-    def __reduce__(self) -> tuple[type["Sights"], tuple[()]]:
-        return Sights, ()
+    def __reduce__(self) -> tuple[type["Sights"], tuple[()], dict[str, bool]]:
+        return Sights, (), {"by_sensor": self.by_sensor}
+
+    def distance(self, frame: Frame, rig: str, within_m: float) -> Tensor:
+        """(M,) metres from each reference point to the nearest point of the rig; infinite where none is within reach.
+
+        Args:
+            frame: The frame.
+            rig: Name of the rig.
+            within_m: The reach.
+        """
+        if self.by_sensor:
+            return self.of_sensors(frame, rig, within_m).amin(dim=0)
+        return self._once(frame, ("rig", rig, within_m), lambda: _search(frame, frame.cloud_of(rig), within_m))
+
+    def of_sensors(self, frame: Frame, rig: str, within_m: float) -> Tensor:
+        """(S, M) the same for each sensor of the rig.
+
+        Raises:
+            ValueError: Nobody knows which points are of which sensor.
+        """
+        return self._once(
+            frame,
+            ("sensors", rig, within_m),
+            lambda: torch.stack(
+                [_search(frame, cloud, within_m) for cloud in frame.clouds_by_sensor(rig).values()],
+            ),
+        )
+
+    def boxes(self, frame: Frame) -> Boxes:
+        """The objects of the frame.
+
+        Raises:
+            ValueError: Nobody looked for them; the message says how to get them.
+        """
+        if frame.boxes is None:
+            raise ValueError(NO_BOXES.format(f"frame {frame.name!r}"))
+        return frame.boxes
+
+    def reference_in_boxes(self, frame: Frame) -> Inside:
+        """Which reference points lie in which objects."""
+        return self._once(frame, ("boxes",), lambda: points_in_boxes(frame.reference, self.boxes(frame)))
+
+    def hits(self, frame: Frame, rig: str) -> Tensor:
+        """(K,) int64 how many points of the rig lie in each object."""
+        boxes = self.boxes(frame)
+        if rig in boxes.hits:
+            return boxes.hits[rig]
+        return self._once(frame, ("hits", rig), lambda: count_in_boxes(frame.cloud_of(rig), boxes))
+
+    def bins(self, frame: Frame, grid: BevGrid) -> Bins:
+        """In which cells of a grid the reference points are."""
+        return self._once(frame, ("bins", grid), lambda: grid.bins(frame.reference))
+
+    def _once(self, frame: Frame, what: tuple[Any, ...], find: Callable[[], Found]) -> Found:
+        if frame is not self._frame:
+            self._frame, self._found = frame, {}
+        if what not in self._found:
+            self._found[what] = find()
+        found: Found = self._found[what]
+        return found
+
+
+def rig_of(frame: Frame, rig: str | None) -> str:
+    """The name of the rig; of the only one if none is given.
+
+    Raises:
+        ValueError: There is no such rig, or there are several.
+    """
+    if rig is None:
+        _ = frame.sensor  # the only one
+        return next(iter(frame.clouds))
+    frame.cloud_of(rig)
+    return rig
+
+
+def count_in_boxes(cloud: Tensor, boxes: Boxes) -> Tensor:
+    """(K,) int64 how many points lie in each of K boxes."""
+    return torch.bincount(points_in_boxes(cloud, boxes).box, minlength=len(boxes))
+
+
+def _search(frame: Frame, cloud: Tensor, within_m: float) -> Tensor:
+    check_cloud(frame.reference, "reference")
+    check_cloud(cloud, "sensor")
+    return nearest(frame.reference, cloud, max_distance=within_m).distance

@@ -1,23 +1,18 @@
 """Metrics that are ratios of sums over frames, with errors from blocks of worlds."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import torch
 from torch import Tensor
-from torchmetrics.utilities.distributed import gather_all_tensors
 
-from torchcover.coverage.blocks import MIN_BLOCKS, pair_up
+from torchcover.coverage.blocks import MIN_BLOCKS
 from torchcover.coverage.errors import ROUND_OFF, jackknife_error, ratio_errors
 from torchcover.data import Frame
-from torchcover.published.frame_metric import FrameMetric
 from torchcover.published.number import PublishedNumber
-
-# As many as `evaluate` keeps of the coverage, so that both can be drawn again together.
-BLOCKS = 16
-IN_BLOCKS = ("base", "sums", "block_steps")
+from torchcover.published.world_blocks import WorldBlocks
 
 
 @dataclass(frozen=True)
@@ -31,12 +26,12 @@ class Ratio:
     parameters: Mapping[str, Any] = field(default_factory=dict)
 
 
-class WorldRatios(FrameMetric):
+class WorldRatios(WorldBlocks):
     """Ratios S / A of sums over frames, kept in blocks of contiguous worlds (`Frame.place_in_time`).
 
     A metric gives its `ratios`, and in `_of_frame` what a frame adds to each: a_j, s_j, and how many these are. The
     error of a share is that of `torchcover.coverage.errors.ratio_errors`, which is never 0; others have the block
-    jackknife's. Blocks double as in `CoverageMetric`, so that the state has a fixed size and parts merge exactly.
+    jackknife's.
 
     Args:
         ratios: What they are.
@@ -48,8 +43,6 @@ class WorldRatios(FrameMetric):
     base: Tensor
     sums: Tensor
     counts: Tensor
-    block_steps: Tensor
-    block_length: Tensor
 
     def __init__(
         self,
@@ -60,11 +53,9 @@ class WorldRatios(FrameMetric):
     ) -> None:
         super().__init__(meaning, rig, **kwargs)
         self.ratios = tuple(ratios)
-        self.add_sum("base", (BLOCKS, len(self.ratios)))
-        self.add_sum("sums", (BLOCKS, len(self.ratios)))
+        self.add_block_sum("base", (len(self.ratios),))
+        self.add_block_sum("sums", (len(self.ratios),))
         self.add_sum("counts", (len(self.ratios),), torch.int64)
-        self.add_sum("block_steps", (BLOCKS,), torch.int64)
-        self.add_state("block_length", torch.tensor(1), dist_reduce_fx="max", persistent=True)
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         """(V,) what a frame adds to what is divided by, to the sums, and to the int64 counts of each ratio."""
@@ -72,13 +63,10 @@ class WorldRatios(FrameMetric):
 
     def _add_frame(self, frame: Frame) -> None:
         base, sums, counts = self._of_frame(frame)  # before anything is added
-        while frame.place_in_time >= BLOCKS * int(self.block_length):
-            pair_up(self.metric_state, IN_BLOCKS)
-        block = frame.place_in_time // int(self.block_length)
+        block = self._block_of(frame)
         self.base[block] += base.to(self.base)
         self.sums[block] += sums.to(self.sums)
         self.counts += counts.to(self.counts)
-        self.block_steps[block] += 1
 
     def compute(self) -> tuple[PublishedNumber, ...]:
         """The ratios so far."""
@@ -113,16 +101,3 @@ class WorldRatios(FrameMetric):
         error = ratio_errors(base, sums, "share").where(share, jackknife)
         # Blocks that all say the same do not prove that others would.
         return error.where(((base > 0).sum(dim=0) >= MIN_BLOCKS) & (error > ROUND_OFF), math.nan)
-
-    def _align_with(self, incoming: dict[str, Any]) -> None:
-        # Blocks of the same length only can be added up.
-        longest = max(int(self.block_length), int(incoming["block_length"]))
-        states: tuple[dict[str, Any], ...] = (self.metric_state, incoming)
-        for state in states:
-            while int(state["block_length"]) < longest:
-                pair_up(state, IN_BLOCKS)
-
-    def _align_ranks(self, dist_sync_fn: Callable[..., Any] = gather_all_tensors, process_group: Any = None) -> None:  # noqa: ANN401
-        lengths = dist_sync_fn(self.block_length, group=process_group or self.process_group)
-        while int(self.block_length) < max(map(int, lengths)):
-            pair_up(self.metric_state, IN_BLOCKS)

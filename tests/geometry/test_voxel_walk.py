@@ -1,0 +1,183 @@
+"""Voxels on the way of rays: against a slow exact twin, closed forms, and what must not matter."""
+
+from fractions import Fraction
+from itertools import product
+
+import numpy as np
+import pytest
+
+from torchcover.geometry import BoundingBox, VoxelGrid, crossed_voxels
+
+# Sides that are exact in binary, and are not equal in number.
+GRID = VoxelGrid(BoundingBox((-1.0, -0.5, -0.5), (1.0, 1.0, 0.5)), 0.5)
+TINY = Fraction(1, 10**6)
+
+
+def piece(grid, place, origin, direction, end):
+    """Length in voxels, along the axis on which it is longest, of what a ray has of a voxel; in fractions."""
+    side, start, stop = Fraction(grid.voxel_m), Fraction(0), None if end == np.inf else Fraction(end)
+    for axis in range(3):
+        low = Fraction(grid.region.lower_m[axis]) + place[axis] * side
+        o, d = Fraction(origin[axis]), Fraction(direction[axis])
+        if d == 0:
+            if not low <= o < low + side:
+                return Fraction(0)
+            continue
+        enters, leaves = sorted([(low - o) / d, (low + side - o) / d])
+        start, stop = max(start, enters), leaves if stop is None else min(stop, leaves)
+    return max(stop - start, Fraction(0)) * max(abs(Fraction(d)) for d in direction) / side
+
+
+def slowly(grid, origins, directions, ends):
+    least, most = np.zeros(grid.shape, dtype=bool), np.zeros(grid.shape, dtype=bool)
+    for origin, direction, end in zip(origins.tolist(), directions.tolist(), ends.tolist(), strict=True):
+        for place in product(*map(range, grid.shape)):
+            length = piece(grid, place, origin, direction, end)
+            least[place] |= length > TINY
+            most[place] |= length > 0
+    return least, most
+
+
+def nasty_rays():
+    """Along axes, edges, faces and diagonals, through corners, from faces, from outside, past the region."""
+    directions = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=3) if any(way)])
+    origins = np.array([[0.0, 0.0, 0.0], [0.25, 0.25, 0.25], [0.5, 0.25, 0.1], [-1.0, -0.5, -0.5], [1.0, 1.0, 0.5]])
+    outside = np.array([[-4.0, -3.5, -3.0], [2.0, 0.0, 0.0], [-1.0, 3.0, 0.25], [0.25, 0.3, 2.5]])
+    return tuple(np.array(each, dtype=float) for each in zip(*product([*origins, *outside], directions), strict=True))
+
+
+def test_nasty_rays_cross_what_the_twin_in_fractions_says():
+    origins, directions = nasty_rays()
+    ends = np.where(np.arange(len(origins)) % 3 == 0, 0.75, np.inf)
+    for ray in range(len(origins)):
+        one = slice(ray, ray + 1)
+        least, most = slowly(GRID, origins[one], directions[one], ends[one])
+        assert (least == most).all()
+        assert np.array_equal(crossed_voxels(GRID, origins[one], directions[one], ends[one]), least), ray
+
+
+def test_any_rays_cross_what_the_twin_in_fractions_says():
+    generator = np.random.default_rng(5)
+    origins = generator.uniform(-2.5, 2.5, (200, 3))
+    directions = generator.normal(size=(200, 3)) * 10 ** generator.uniform(-3, 1, (200, 3))
+    ends = np.where(generator.random(200) < 0.5, np.inf, generator.uniform(0, 2, 200))
+    for ray in range(200):
+        one = slice(ray, ray + 1)
+        least, most = slowly(GRID, origins[one], directions[one], ends[one])
+        found = crossed_voxels(GRID, origins[one], directions[one], ends[one])
+        assert (least <= found).all(), ray
+        assert (found <= most).all(), ray
+
+
+MIDDLE = VoxelGrid(BoundingBox((-5.0, -5.0, -2.0), (5.0, 5.0, 2.0)), 0.5)
+
+
+@pytest.mark.parametrize("voxel_m", [0.5, 0.1, 0.2])
+def test_a_ray_crosses_as_many_voxels_as_it_is_long_however_often_it_is_cast(voxel_m):
+    grid = VoxelGrid(MIDDLE.region, voxel_m)
+    for turn in range(8):
+        direction = np.array([[np.cos(turn * np.pi / 4), np.sin(turn * np.pi / 4), 0.0]])
+        once = crossed_voxels(grid, np.zeros(3), direction)
+        assert once.sum() == round(5.0 / voxel_m)  # at 45 degrees through the corners, too
+        assert np.array_equal(once, crossed_voxels(grid, np.zeros(3), np.repeat(direction, 2, axis=0)))
+
+
+def test_directions_that_are_all_but_parallel_run_in_the_upper_voxel_of_a_face():
+    for tiny in (0.0, 1e-17, -1e-17, 1e-13, -1e-13):
+        found = np.argwhere(crossed_voxels(MIDDLE, [0.0, 0.0, 0.25], [[1.0, tiny, tiny]]))
+        assert found[:, 1:].tolist() == [[10, 4]] * 10
+    # From far away it would leave the region's side.
+    assert crossed_voxels(MIDDLE, [-1e6, 0.25, 0.25], [[1.0, 1e-5, 0.0]]).sum() == 0
+
+
+def some_rays(count=300):
+    generator = np.random.default_rng(8)
+    return generator.uniform(-4, 4, (count, 3)), generator.normal(size=(count, 3)), generator.uniform(0, 9, count)
+
+
+def test_order_and_division_and_length_of_directions_do_not_matter(monkeypatch):
+    origins, directions, ends = some_rays()
+    whole = crossed_voxels(MIDDLE, origins, directions, ends)
+    order = np.random.default_rng(1).permutation(len(origins))
+    assert np.array_equal(whole, crossed_voxels(MIDDLE, origins[order], directions[order], ends[order]))
+    assert np.array_equal(whole, crossed_voxels(MIDDLE, origins, directions * 4, ends / 4))
+    parts = crossed_voxels(MIDDLE, origins[:100], directions[:100], ends[:100])
+    assert parts is crossed_voxels(MIDDLE, origins[100:], directions[100:], ends[100:], crossed=parts)
+    assert np.array_equal(whole, parts)
+    monkeypatch.setattr("torchcover.geometry.voxel_walk.RAYS_AT_ONCE", 7)
+    assert np.array_equal(whole, crossed_voxels(MIDDLE, origins, directions, ends))
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_in_a_mirror_the_mirrored_voxels_are_crossed(axis):
+    origins, directions, ends = some_rays()
+    corners = np.round(origins)  # rays through corners are no exception
+    for places, ways in ((origins, directions), (corners, np.sign(directions))):
+        mirror = np.where(np.arange(3) == axis, -1.0, 1.0)
+        found = crossed_voxels(MIDDLE, places, ways, ends)
+        assert np.array_equal(np.flip(found, axis), crossed_voxels(MIDDLE, places * mirror, ways * mirror, ends))
+
+
+def test_a_ray_and_the_way_back_cross_the_same():
+    origins, directions, ends = some_rays()
+    there = crossed_voxels(MIDDLE, origins, directions, ends)
+    back = crossed_voxels(MIDDLE, origins + directions * ends[:, None], -directions, ends)
+    assert np.array_equal(there, back)
+
+
+def test_a_flat_region_of_one_voxel_is_one():
+    grid = VoxelGrid(BoundingBox((0.0, 0.0, 0.0), (2.0, 2.0, 2.0)), 2.0)
+    assert crossed_voxels(grid, [1.0, 1.0, 1.0], [[1.0, 0.0, 0.0]]).tolist() == [[[True]]]
+    assert not crossed_voxels(grid, [2.0, 1.0, 1.0], [[1.0, 0.0, 0.0]]).any()
+    assert not crossed_voxels(grid, [1.0, 1.0, 1.0], np.empty((0, 3))).any()
+
+
+def test_directions_of_nan_are_no_rays():
+    some = np.array([[1.0, 0.0, 0.0], [np.nan, np.nan, np.nan], [0.0, 1.0, 0.0]])
+    expected = crossed_voxels(MIDDLE, np.zeros(3), some[[0, 2]], [3.0, 2.0])
+    assert np.array_equal(crossed_voxels(MIDDLE, np.zeros(3), some, [3.0, 1.0, 2.0]), expected)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (([0, 0], [[1, 0, 0]], 1), r"origins_m: shape \(3,\) or \(1, 3\) is needed; got \(2,\)"),
+        (([0, 0, np.nan], [[1, 0, 0]], 1), "origins_m: finite"),
+        (([0, 0, 0], [1, 0, 0], 1), r"directions: shape \(N, 3\) is needed; got \(3,\)"),
+        (([0, 0, 0], [[0, 0, 0]], 1), "directions: finite vectors that are not 0"),
+        (([0, 0, 0], [[np.inf, 0, 0]], 1), "directions: finite vectors that are not 0"),
+        (([0, 0, 0], [[1, 0, 0]], [1, 2]), r"ends: one number or shape \(1,\)"),
+        (([0, 0, 0], [[1, 0, 0]], -1), "ends: lengths >= 0"),
+        (([0, 0, 0], [[1, 0, 0]], np.nan), "ends: lengths >= 0"),
+    ],
+)
+def test_rays_that_are_none_are_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        crossed_voxels(MIDDLE, *given)
+
+
+def test_an_array_of_another_grid_is_not_added_to():
+    with pytest.raises(ValueError, match=r"crossed: a contiguous bool array of shape \(20, 20, 8\)"):
+        crossed_voxels(MIDDLE, [0, 0, 0], [[1, 0, 0]], crossed=np.zeros((20, 20, 9), dtype=bool))
+
+
+@pytest.mark.parametrize(
+    ("voxel_m", "message"),
+    [
+        (0.3, r"extent along x of 10 m is not a multiple of the voxel of 0.3 m \(33.33333333 voxels\); one of 0.30"),
+        (21.0, r"extent along x of 10 m is not a multiple of the voxel of 21 m"),
+        (0.0, "voxel_m: a positive length"),
+        (np.nan, "voxel_m: a positive length"),
+    ],
+)
+def test_a_side_that_does_not_divide_the_region_is_refused_and_one_that_does_named(voxel_m, message):
+    with pytest.raises(ValueError, match=message):
+        VoxelGrid(MIDDLE.region, voxel_m)
+
+
+def test_every_centre_is_in_its_own_voxel_and_borders_are_half_open():
+    x, y, z = GRID.centres_m()
+    centres = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
+    assert GRID.number_of(centres).tolist() == list(range(GRID.voxels))
+    assert GRID.number_of([GRID.region.lower_m, GRID.region.upper_m]).tolist() == [0, -1]
+    assert GRID.number_of(np.full((1, 3), np.nan)).tolist() == [-1]

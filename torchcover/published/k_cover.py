@@ -1,0 +1,93 @@
+"""k-cover: how much is seen by k sensors or more."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcover.coverage import BevGrid, Region
+from torchcover.data import Frame
+from torchcover.published.places import Places
+from torchcover.published.sights import Sights, rig_of
+from torchcover.published.world_ratios import Ratio, WorldRatios
+
+AT_LEAST = (1, 2, 3)
+
+
+class KCover(WorldRatios):
+    """Share of the visible square metres within the threshold of k sensors of the rig or more.
+
+    The binary cover with redundancy of the art gallery line (Vijay et al. 2021): of surface that the random reference
+    sees instead of a list of cells, so that k = 1 is the detection by area.
+
+    Args:
+        grid: Cells and height bands.
+        regions: Those that have numbers of their own.
+        threshold_m: Distance within which a point counts as seen.
+        at_least: Numbers of sensors, k; more than the rig has are covered nowhere.
+        square_metres: Whether the weights of reference points are square metres; else the share is one of points.
+        rig: Whose clouds; those of the only rig if not given.
+        sights: What metrics of a run share.
+        kwargs: For `torchmetrics.Metric`.
+
+    Raises:
+        ValueError: k below 1, a threshold that is negative, regions that the grid does not hold. From `update`: nobody
+            knows which points are of which sensor; no square metres where they are wanted.
+
+    Example:
+        >>> grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0)
+        >>> frame = Frame({"rig": torch.zeros(2, 3)}, torch.tensor([[0.3, 0.0, 0.0]]), 0, "a",
+        ...               sensor_points={"rig": {"left": 1, "right": 1, "rear": 0}})
+        >>> metric = KCover(grid, (), square_metres=False)
+        >>> metric.update(frame)
+        >>> [one.value for one in metric.compute()]
+        [1.0, 1.0, 0.0]
+    """
+
+    def __init__(
+        self,
+        grid: BevGrid,
+        regions: Sequence[Region],
+        threshold_m: float = 0.4,
+        at_least: Sequence[int] = AT_LEAST,
+        *,
+        square_metres: bool = True,
+        rig: str | None = None,
+        sights: Sights | None = None,
+        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+    ) -> None:
+        if not 0 <= threshold_m < float("inf"):
+            raise ValueError(f"threshold_m: a finite distance >= 0 in metres is needed; got {threshold_m}")
+        if not at_least or any(least < 1 for least in at_least) or len(set(at_least)) < len(at_least):
+            raise ValueError(f"at_least: different numbers of sensors from 1 on are needed; got {tuple(at_least)}")
+        places = Places(grid, regions)
+        counted = "reference points, by square metres" if square_metres else "reference points"
+        ratios = [
+            Ratio(f"k_cover_{k}_{threshold_m:g}m{place}", "share", True, counted, {"k": k, "threshold_m": threshold_m})
+            for k in at_least
+            for place in places.names
+        ]
+        meaning = {"threshold_m": float(threshold_m), "at_least": tuple(at_least), "square_metres": square_metres}
+        super().__init__(ratios, {**meaning, **places.meaning}, rig, **kwargs)
+        self.places = places
+        self.threshold_m = float(threshold_m)
+        self.at_least = tuple(at_least)
+        self.square_metres = square_metres
+        self.sights = Sights() if sights is None else sights
+        self.sights.by_sensor = True
+
+    def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        frame.check_weights(square_metres=self.square_metres)
+        within = self.sights.of_sensors(frame, rig_of(frame, self.rig), self.threshold_m) <= self.threshold_m
+        inside, of, cell = self.sights.bins(frame, self.places.grid)
+        point = inside[of]
+        sensors = within.sum(dim=0)[point]
+        weight = torch.ones_like(point, dtype=torch.float64)
+        if self.square_metres:
+            assert frame.reference_weights is not None  # by check_weights
+            weight = frame.reference_weights[point].double()
+        seen = [weight * (sensors >= k) for k in self.at_least]
+        sums = self.places.sums(cell, torch.stack([torch.ones_like(weight), weight, *seen]))
+        count, base = (row.repeat(len(seen)) for row in sums[:2])
+        return base, sums[2:].flatten(), count.long()

@@ -1,0 +1,158 @@
+"""M-SOG: the mean entropy of a semantic occupancy grid along the rays of a rig (Place3D, Li et al. 2024)."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcover.coverage.blocks import MIN_BLOCKS
+from torchcover.coverage.errors import ROUND_OFF, jackknife_error
+from torchcover.data import Frame
+from torchcover.detection import points_in_boxes
+from torchcover.geometry import BoundingBox
+from torchcover.neighbors import check_cloud
+from torchcover.published.number import PublishedNumber
+from torchcover.published.region_voxels import REGION, check_sensors, checked_grid, crossed_by, ray_count
+from torchcover.published.world_blocks import BLOCKS, WorldBlocks
+from torchcover.simulation import Sensor
+
+# Numbers that are kept of each voxel and block: frames in which it is labelled as the category, and as anything else.
+LABELS = 2
+VOXELS_AT_ONCE = 1 << 16
+# The region with as many labels as there are is 10,000 times smaller in print than any mean entropy can be.
+RANKS_ONLY = (
+    "only for ranks among rigs at the same voxels: the published values are of another scale, and the published size of "
+    "a voxel is unknown"
+)
+
+
+class MSog(WorldBlocks):
+    """Mean entropy in nats of what the voxels on the way of a rig's rays hold, as a loss: M-SOG (Place3D, 2024).
+
+        H(v)  = - sum over c of p_c(v) ln p_c(v)         c: the category, anything else, empty
+        M-SOG = - mean over the distinct voxels v on the way of any ray of H(v)
+
+    where p_c is the share of frames in which the voxel has the label c. Higher is better. This is the paper's variant
+    for detection. A frame's label of a voxel comes from the reference points in it: the category if at least half of
+    them are in its boxes (`points_in_boxes`), else anything else; empty if there is none, whether the reference saw that
+    it is empty or did not see it.
+
+    Nothing hides anything from the rays, which go to the wall of the region or the end of the sensor's range; and a
+    voxel that is crossed once counts as much as one that is crossed often. At 1 m nearly every voxel is crossed by any
+    rig: the size of a voxel is part of the name. The error is the jackknife's over 16 blocks of worlds.
+
+    Args:
+        sensors: Those of the rig, with mounts and rays.
+        voxel_m: Side of a voxel; the paper does not print its own.
+        region: What the voxels fill, 60 x 40 x 4 m as of S-MIG if not given.
+        category: Of the boxes that have a label of their own.
+        rig: Whose clouds; those of the only rig if not given.
+        kwargs: For `torchmetrics.Metric`.
+
+    Raises:
+        ValueError: No sensor, voxels that do not divide the region or do not fit into the memory. From `update`: a frame
+            without boxes.
+
+    Example:
+        >>> from torchcover.detection import Boxes
+        >>> from torchcover.simulation import Rig
+        >>> car = Boxes.from_rows(torch.tensor([[10.0, 0.0, 0.8, 4.0, 2.0, 1.6, 0.0]]), categories=("car",))
+        >>> metric = MSog(Rig.load("hu2022_center").sensors)
+        >>> seen = torch.tensor([[8.1, 0.1, 0.6]])  # its rear, in one of two frames
+        >>> for index, points in enumerate((seen, seen[:0])):
+        ...     metric.update(Frame({"rig": torch.zeros(0, 3)}, points, index, str(index), boxes=car))
+        >>> number = metric.compute()[0]
+        >>> number.name, round(number.value * number.count / math.log(2), 9)
+        ('m_sog_0.5m_car', -1.0)
+    """
+
+    labelled: Tensor
+
+    def __init__(
+        self,
+        sensors: Sequence[Sensor],
+        voxel_m: float = 0.5,
+        region: BoundingBox = REGION,
+        category: str = "car",
+        *,
+        rig: str | None = None,
+        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+    ) -> None:
+        check_sensors(sensors)
+        grid = checked_grid(region, voxel_m, BLOCKS * LABELS * 8)
+        meaning = {"sensors": tuple(sensors), "voxel_m": float(voxel_m), "region": region, "category": category}
+        super().__init__(meaning, rig, **kwargs)
+        self.sensors = tuple(sensors)
+        self.grid = grid
+        self.category = category
+        self.add_block_sum("labelled", (LABELS, grid.voxels), torch.int64)
+
+    def _add_frame(self, frame: Frame) -> None:
+        check_cloud(frame.reference, "reference")
+        if frame.boxes is None:
+            raise ValueError(
+                f"frame {frame.name!r} has no boxes, from which points have their labels; SimulatedFrames(..., "
+                "boxes=True) makes them"
+            )
+        of_category = torch.zeros(len(frame.reference), dtype=torch.bool)
+        of_category[points_in_boxes(frame.reference, frame.boxes.of_category(self.category)).point.cpu()] = True
+        voxel = torch.from_numpy(self.grid.number_of(frame.reference.cpu().numpy()))
+        inside = voxel >= 0
+        occupied, which, points = voxel[inside].unique(return_inverse=True, return_counts=True)
+        votes = torch.zeros(len(occupied), dtype=torch.int64).index_add_(0, which, of_category[inside].long())
+        chosen = 2 * votes >= points
+        block = self._block_of(frame)
+        for label, voxels in enumerate((occupied[chosen], occupied[~chosen])):
+            self.labelled[block, label, voxels.to(self.labelled.device)] += 1
+
+    def compute(self) -> tuple[PublishedNumber, ...]:
+        """The number; NaN if the category was never seen, or no ray crosses the region."""
+        used = self.block_steps.cpu() > 0
+        values = self._values(torch.cat([torch.ones(1, BLOCKS), (1.0 - torch.eye(BLOCKS))[used]]).double())
+        error = jackknife_error(values[1:], values[0], self.block_steps.cpu()[used])
+        usable = float(error) > ROUND_OFF and int(used.sum()) >= MIN_BLOCKS
+        crossed = int(crossed_by(self.sensors, self.grid).sum())
+        return (
+            PublishedNumber(
+                name=f"m_sog_{self.grid.voxel_m:g}m_{self.category}",
+                value=float(values[0]),
+                unit="nats",
+                higher_is_better=True,
+                parameters={
+                    "voxel_m": self.grid.voxel_m,
+                    "region_m": (self.grid.region.lower_m, self.grid.region.upper_m),
+                    "category": self.category,
+                    "rays": ray_count(self.sensors),
+                    "crossed_share": crossed / self.grid.voxels,
+                },
+                count=0 if values[0].isnan() else crossed,
+                count_of="voxels",
+                standard_error=float(error) if usable else math.nan,
+                warning=RANKS_ONLY,
+            ),
+        )
+
+    def resampled(self, weights: Tensor) -> Tensor:
+        """(R, 1) the number if each block of worlds had come as often as it is weighted.
+
+        Args:
+            weights: (R, 16) how often.
+        """
+        return self._values(weights.double().cpu())[:, None].to(weights.device)
+
+    def _values(self, weights: Tensor) -> Tensor:
+        """(R,) the number for each of (R, 16) weights of the blocks."""
+        crossed = torch.from_numpy(crossed_by(self.sensors, self.grid).reshape(-1).nonzero()[0])
+        unknown = torch.full((len(weights),), math.nan, dtype=torch.float64)
+        if len(crossed) == 0 or not self.labelled[:, 0].any():
+            return unknown
+        steps = weights @ self.block_steps.cpu().double()
+        total = torch.zeros(len(weights), dtype=torch.float64)
+        for some in crossed.split(VOXELS_AT_ONCE):
+            labelled = self.labelled[:, :, some.to(self.labelled.device)].cpu().double()
+            share = torch.tensordot(weights, labelled, dims=1) / steps[:, None, None]
+            empty = (1.0 - share.sum(dim=1)).clamp(min=0.0)
+            total += torch.special.entr(share).sum(dim=(1, 2)) + torch.special.entr(empty).sum(dim=1)
+        return torch.where(steps > 0, -total / len(crossed), unknown)

@@ -1,0 +1,124 @@
+"""Perception entropy: how uncertain a detector is about an object with so many points on it."""
+
+import math
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchcover.data import Frame
+from torchcover.published.object_strata import CATEGORIES, ObjectStrata
+from torchcover.published.sights import Sights, count_in_boxes, rig_of
+from torchcover.published.world_ratios import Ratio, WorldRatios
+from torchcover.simulation import CameraSensor, Sensor
+
+# Of average precision a ln m + b over m points or pixels on the object, as GO4ROBO has them.
+CONSTANTS: Mapping[str, tuple[float, float]] = MappingProxyType({"lidar": (0.152, 0.659), "camera": (0.055, 0.155)})
+PRECISIONS = (0.001, 0.999)
+
+
+def standard_deviation(measurements: Tensor, kind: str) -> Tensor:
+    """The sigma of an object with so many measurements of one kind of sensor: 1 / AP - 1, AP = a ln m + b.
+
+    AP is kept within [0.001, 0.999], as GO4ROBO does; with the constants of LiDARs it is 0.999 from 10 points on.
+
+    Args:
+        measurements: (K,) points or pixels on each object, m; none are as bad as can be.
+        kind: "lidar" or "camera".
+
+    Example:
+        >>> standard_deviation(torch.tensor([0, 1, 100]), "lidar")
+        tensor([9.9900e+02, 5.1745e-01, 1.0010e-03], dtype=torch.float64)
+    """
+    a, b = CONSTANTS[kind]
+    precision = (a * measurements.double().log() + b).clamp(*PRECISIONS)
+    return 1 / precision - 1
+
+
+def late_fusion(sigmas: Sequence[Tensor]) -> Tensor:
+    """The sigma of several kinds of sensors together: (sum of sigma_i^-2)^-1/2."""
+    return torch.stack(list(sigmas)).pow(-2).sum(dim=0).pow(-0.5)
+
+
+def entropy(sigma: Tensor, *, bounded: bool = False) -> Tensor:
+    """Nats of a Gaussian in the plane: 2 ln sigma + 1 + ln 2 pi; bounded: 2 ln(sigma + 1) + ln 2 pi.
+
+    Example:
+        >>> of_lidar = standard_deviation(torch.tensor(5), "lidar")
+        >>> of_camera = standard_deviation(torch.tensor(1000), "camera")
+        >>> round(float(entropy(late_fusion([of_lidar, of_camera]))), 6)
+        -1.653611
+    """
+    if bounded:
+        return 2 * (sigma + 1).log() + math.log(2 * math.pi)
+    return 2 * sigma.log() + 1 + math.log(2 * math.pi)
+
+
+class PerceptionEntropy(WorldRatios):
+    """Mean over objects of their perception entropy (Ma et al. 2021, as GO4ROBO has it); lower is better.
+
+    Points of LiDARs on an object are added up, those of cameras too, and the two kinds are fused late. The plain form
+    is unbounded in the quality of a detector and dominated by whether an object has 10 points; the bounded one, of
+    GO4ROBO's differentiable path, is never below ln 2 pi.
+
+    Args:
+        sensors: The rig's sensors; if not given, or without a camera, all points are taken for those of LiDARs.
+        categories: Those that have numbers of their own.
+        rig: Whose clouds; those of the only rig if not given.
+        sights: What metrics of a run share.
+        kwargs: For `torchmetrics.Metric`.
+
+    Raises:
+        ValueError: From `update`: a frame without boxes; of a rig with cameras, if nobody knows which points are of
+            which sensor.
+
+    Example:
+        >>> from torchcover.detection import Boxes
+        >>> boxes = Boxes.from_rows(torch.tensor([[10.0, 0, 1, 4, 2, 2, 0]]), hits={"rig": torch.tensor([5])})
+        >>> metric = PerceptionEntropy()
+        >>> metric.update(Frame({"rig": torch.zeros(0, 3)}, torch.zeros(0, 3), 0, "a", boxes=boxes))
+        >>> round(metric.compute()[0].value, 6)
+        -1.638678
+    """
+
+    def __init__(
+        self,
+        sensors: Sequence[Sensor] = (),
+        categories: Sequence[str] = CATEGORIES,
+        *,
+        rig: str | None = None,
+        sights: Sights | None = None,
+        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+    ) -> None:
+        cameras = frozenset(sensor.name for sensor in sensors if isinstance(sensor, CameraSensor))
+        strata = ObjectStrata(categories, ())
+        names = [name for name in strata.names if not name.endswith("m+")]
+        ratios = [
+            Ratio(form + name, "nats", False, "objects", {"constants": dict(CONSTANTS), "cameras": sorted(cameras)})
+            for form in ("perception_entropy", "perception_entropy_bounded")
+            for name in names
+        ]
+        super().__init__(ratios, {"categories": strata.categories, "cameras": tuple(sorted(cameras))}, rig, **kwargs)
+        self.strata = strata
+        self.cameras = cameras
+        self.sights = Sights() if sights is None else sights
+
+    def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+        sigma = self._sigma(frame, rig_of(frame, self.rig))
+        members = self.strata.members(self.sights.boxes(frame))[:-1].to(sigma.device)
+        values = torch.stack([entropy(sigma), entropy(sigma, bounded=True)])
+        count = members.sum(dim=1).repeat(2)
+        return count, (values @ members.T).flatten(), count.long()
+
+    def _sigma(self, frame: Frame, rig: str) -> Tensor:
+        hits = self.sights.hits(frame, rig)
+        if not self.cameras:
+            return standard_deviation(hits, "lidar")
+        of_cameras = [cloud for name, cloud in frame.clouds_by_sensor(rig).items() if name in self.cameras]
+        pixels = count_in_boxes(torch.cat(of_cameras), self.sights.boxes(frame)).to(hits)
+        kinds = [standard_deviation(pixels, "camera")]
+        if len(of_cameras) < len(frame.clouds_by_sensor(rig)):
+            kinds.append(standard_deviation(hits - pixels, "lidar"))
+        return late_fusion(kinds)

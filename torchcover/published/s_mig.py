@@ -1,0 +1,214 @@
+"""S-MIG: the entropy of an occupancy grid along the rays of a rig (Hu et al. 2022), and its negative."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchcover.coverage.blocks import MIN_BLOCKS
+from torchcover.coverage.errors import ROUND_OFF, jackknife_error
+from torchcover.data import Frame
+from torchcover.geometry import BoundingBox
+from torchcover.metrics import with_rows
+from torchcover.neighbors import check_cloud
+from torchcover.published.frame_metric import FrameMetric
+from torchcover.published.number import PublishedNumber
+from torchcover.published.occupancy import COLUMNS, Occupancy, occupancy_of, occupancy_rows
+from torchcover.published.region_voxels import (
+    REGION,
+    check_sensors,
+    checked_grid,
+    crossed_by,
+    crossed_on_the_way,
+    ray_count,
+)
+from torchcover.published.world_blocks import BLOCKS
+from torchcover.simulation import Sensor
+
+CATEGORIES = ("car", "pedestrian", "cyclist")
+# While it is computed: what is crossed, inside in a frame, inside in a block. With occlusion the state: how often.
+BYTES_A_VOXEL, BYTES_A_VOXEL_OCCLUDED = 6, 14
+
+
+class SMig(FrameMetric):
+    """Entropy in nats of what is in the voxels that the rays of a rig cross, as a loss: S-MIG (Hu et al. 2022).
+
+        p(v)  = share of frames in which voxel v is in a box of the category
+        S-MIG = - sum over the distinct voxels v on the way of any ray of  -p ln p - (1 - p) ln(1 - p)
+
+    with independent voxels. Higher is better, say its authors; yet it falls as more voxels are crossed, and a rig
+    without rays has the highest value, 0. Its negative, which is beside it in `parameters["entropy_captured_nats"]`, is
+    what roadside placement maximises (EGVS, Jiang 2025, as far as its text could be read). Compare rigs of the same
+    number of rays (`unequal_rays`).
+
+    A voxel is in a box if its centre is; of a box that leaves the region, the part within counts. Rays go through
+    everything, to the wall of the region or the end of the sensor's range. With `occlusion` they end at the points that
+    the rig measured, and the number is the mean over frames of the entropy on their way; rays that gave no point are
+    left out, for a frame does not know them.
+
+    The error is the jackknife's over 16 blocks of worlds, as they change p; with occlusion there is none: that would
+    need the voxels crossed in each block.
+
+    Args:
+        sensors: Those of the rig, with mounts and rays.
+        voxel_m: Side of a voxel; the published one is 0.05.
+        region: What the voxels fill, the published 60 x 40 x 4 m if not given.
+        categories: Each has its own occupancy and number. The number of all is their sum.
+        occlusion: Whether rays end at what they hit.
+        rig: Whose clouds; those of the only rig if not given.
+        kwargs: For `torchmetrics.Metric`.
+
+    Raises:
+        ValueError: No sensor, no category or one twice, voxels that do not divide the region or do not fit into the
+            memory. From `update`: a frame without boxes; with occlusion, points of which nobody knows the sensor.
+
+    Example:
+        >>> from torchcover.detection import Boxes
+        >>> from torchcover.simulation import Rig
+        >>> car = Boxes.from_rows(torch.tensor([[10.0, 0.0, 0.8, 4.0, 2.0, 1.6, 0.0]]), categories=("car",))
+        >>> metric = SMig(Rig.load("hu2022_center").sensors)
+        >>> for index, boxes in enumerate((car, car.of_category())):  # a car that is there in half of the frames
+        ...     metric.update(Frame({"rig": torch.zeros(0, 3)}, torch.zeros(0, 3), index, str(index), boxes=boxes))
+        >>> number = metric.compute()[1]
+        >>> number.name, round(number.value / math.log(2))
+        ('s_mig_0.2m:car', -1600)
+    """
+
+    boxes: Tensor
+    crossings: Tensor
+
+    def __init__(
+        self,
+        sensors: Sequence[Sensor],
+        voxel_m: float = 0.2,
+        region: BoundingBox = REGION,
+        categories: Sequence[str] = CATEGORIES,
+        *,
+        occlusion: bool = False,
+        rig: str | None = None,
+        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+    ) -> None:
+        check_sensors(sensors)
+        if not categories or len(set(categories)) < len(categories):
+            raise ValueError(f"categories: one or more different ones are needed; got {tuple(categories)}")
+        grid = checked_grid(region, voxel_m, BYTES_A_VOXEL_OCCLUDED if occlusion else BYTES_A_VOXEL)
+        meaning = {
+            "sensors": tuple(sensors),
+            "voxel_m": float(voxel_m),
+            "region": region,
+            "categories": tuple(categories),
+            "occlusion": occlusion,
+        }
+        super().__init__(meaning, rig, **kwargs)
+        self.sensors = tuple(sensors)
+        self.grid = grid
+        self.categories = tuple(categories)
+        self.occlusion = occlusion
+        self.add_table("boxes", COLUMNS)
+        self.add_sum("crossings", (self.grid.voxels if occlusion else 0,), torch.int64)
+
+    def _add_frame(self, frame: Frame) -> None:
+        check_cloud(frame.reference, "reference")
+        rows = occupancy_rows(frame, self.categories, self.grid.region)
+        if self.occlusion:
+            crossed = crossed_on_the_way(self.sensors, frame, self.rig, self.grid)
+            self.crossings += torch.from_numpy(crossed.reshape(-1)).to(self.crossings)
+        self.boxes = with_rows(self.boxes, rows)
+
+    def compute(self) -> tuple[PublishedNumber, ...]:
+        """All categories together, then each."""
+        of_each, crossed = self._occupancies()
+        used = np.flatnonzero(of_each[0].steps)
+        whole = self._values(of_each, np.ones((1, BLOCKS)))[0]
+        left_out = self._values(of_each, (1.0 - np.eye(BLOCKS))[used])
+        error = jackknife_error(
+            torch.from_numpy(left_out), torch.from_numpy(whole), torch.from_numpy(of_each[0].steps[used])
+        )
+        usable = not self.occlusion and len(used) >= MIN_BLOCKS
+        error = error.where((error > ROUND_OFF) & usable, math.nan)
+        boxes = [one.boxes for one in of_each]
+        names = ["", *(f":{category}" for category in self.categories)]
+        rays = ray_count(self.sensors)
+        return tuple(
+            PublishedNumber(
+                name=f"s_mig{'_occluded' if self.occlusion else ''}_{self.grid.voxel_m:g}m{name}",
+                value=value,
+                unit="nats",
+                higher_is_better=True,
+                parameters={
+                    "voxel_m": self.grid.voxel_m,
+                    "region_m": (self.grid.region.lower_m, self.grid.region.upper_m),
+                    "rays": rays,
+                    "voxels_crossed": crossed,
+                    "entropy_captured_nats": -value,
+                },
+                count=count,
+                count_of="boxes",
+                standard_error=own_error,
+                warning=f"falls as coverage grows, 0 without any ray: only among rigs of {rays:,} rays, too",
+            )
+            for name, value, count, own_error in zip(
+                names, whole.tolist(), [sum(boxes), *boxes], error.tolist(), strict=True
+            )
+        )
+
+    def resampled(self, weights: Tensor) -> Tensor:
+        """(R, V) the numbers if each block of worlds had come as often as it is weighted.
+
+        Args:
+            weights: (R, 16) how often.
+        """
+        values = self._values(self._occupancies()[0], weights.double().cpu().numpy())
+        return torch.from_numpy(values).to(weights.device)
+
+    def _occupancies(self) -> tuple[list[Occupancy], int]:
+        """The occupancy by each category in the voxels that are crossed, and how many these are."""
+        if self.occlusion:
+            crossed = (self.crossings > 0).cpu().numpy().reshape(self.grid.shape)
+        else:
+            crossed = crossed_by(self.sensors, self.grid)
+        table = self.boxes.cpu().numpy()
+        each = [occupancy_of(table, number, self.grid, BLOCKS, crossed) for number in range(len(self.categories))]
+        return each, int(crossed.sum())
+
+    def _values(self, of_each: Sequence[Occupancy], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(R, 1 + C) the numbers: their sum, and each; NaN where there was no box."""
+        values = np.full((len(weights), 1 + len(of_each)), np.nan)
+        for column, one in enumerate(of_each, 1):
+            if one.boxes:
+                values[:, column] = -one.entropy_nats(weights, self._share_of_frames(one))
+        known = [column for column, one in enumerate(of_each, 1) if one.boxes]
+        if known:
+            values[:, 0] = values[:, known].sum(axis=1)
+        return values
+
+    def _share_of_frames(self, one: Occupancy) -> NDArray[np.float64] | None:
+        if not self.occlusion:
+            return None
+        times: NDArray[np.float64] = self.crossings.cpu().numpy()[one.voxels] / int(self.steps)
+        return times
+
+
+def unequal_rays(numbers: Mapping[str, PublishedNumber]) -> str | None:
+    """What is to be said of rigs whose numbers are compared: that one has more rays than another, or nothing.
+
+    Args:
+        numbers: Name of the rig -> its number, of one `SMig` each.
+
+    Example:
+        >>> one = PublishedNumber("s_mig_0.2m", -3.0, "nats", True, {"rays": 16000}, 1, "boxes")
+        >>> two = PublishedNumber("s_mig_0.2m", -2.0, "nats", True, {"rays": 8000}, 1, "boxes")
+        >>> unequal_rays({"one": one, "two": two})
+        's_mig_0.2m: the rigs have different numbers of rays (one 16,000, two 8,000), and fewer rays score higher'
+        >>> unequal_rays({"one": one, "same": one})
+    """
+    rays = {rig: number.parameters["rays"] for rig, number in numbers.items()}
+    if len(set(rays.values())) < 2:
+        return None
+    name = next(iter(numbers.values())).name
+    each = ", ".join(f"{rig} {count:,}" for rig, count in rays.items())
+    return f"{name}: the rigs have different numbers of rays ({each}), and fewer rays score higher"
