@@ -13,7 +13,7 @@ from torchcover.coverage import Maximum, PooledMean, Quantiles, StepQuantiles
 from torchcover.data import Frame
 from torchcover.detection import Boxes, RecallByVisibility
 from torchcover.published import FalseVisible, KCover, ObjectCoverage, PerceptionEntropy, PointDensity
-from torchcover.simulation import Rig
+from torchcover.simulation import Lidar, Pose
 
 Step = Mapping[str, Any]
 
@@ -175,7 +175,17 @@ def frame_step(index: int) -> Step:
 
 PLACES = {"grid": BevGrid(x=(0.0, 8.0), y=(0.0, 4.0), cell=0.5), "regions": (Region("near", (0.0, 4.0), (0.0, 4.0)),)}
 OTHER_GRID = {"grid": BevGrid(x=(0.0, 10.0), y=(0.0, 4.0), cell=0.5)}
-SENSORS = Rig.load("front_roof_32").sensors
+SENSORS = (
+    Lidar(
+        name="front",
+        mount=Pose(z_m=1.0),
+        channels=2,
+        vertical_fov_deg=(-20, 0),
+        columns=8,
+        horizontal_fov_deg=90,
+        max_range_m=20,
+    ),
+)
 
 
 def of_frames(kind: Callable[..., Metric], usual: Step, changes: Mapping[str, Step]) -> Case:
@@ -239,7 +249,9 @@ CASES = {
             "range_borders_m": {"range_borders_m": (30.0,)},
         },
     ),
-    "perception entropy": of_frames(PerceptionEntropy, {}, {"categories": {"categories": ("car",)}}),
+    "perception entropy": of_frames(
+        PerceptionEntropy, {}, {"categories": {"categories": ("car",)}, "range_borders_m": {"range_borders_m": (9.0,)}}
+    ),
     "k-cover": of_frames(
         KCover,
         PLACES,
@@ -253,10 +265,10 @@ CASES = {
     ),
     "point density": of_frames(
         PointDensity,
-        {"regions": PLACES["regions"], "height_m": (-0.5, 2.0)},
+        PLACES,
         {
+            "grid": OTHER_GRID,
             "regions": {"regions": (Region("near", (0.0, 2.0), (0.0, 4.0)),)},
-            "height_m": {"height_m": (0.5, 2.0)},
             "cell_m": {"cell_m": 0.5},
         },
     ),

@@ -143,6 +143,13 @@ Redundancy = Annotated[
     bool,
     typer.Option("--redundancy", help="Say by how many sensors places are seen, and what is lost when each one fails."),
 ]
+Metrics = Annotated[
+    str | None,
+    typer.Option(
+        help="Coverage metrics that others published, on the same frames: `all`, or names as in `k_cover,s_mig` "
+        "(docs/metrics.md)."
+    ),
+]
 ErrorMaps = Annotated[bool, typer.Option("--error-maps", help="Draw maps of the standard errors too.")]
 Rerun = Annotated[
     Path | None,

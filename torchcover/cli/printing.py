@@ -18,6 +18,7 @@ from torchcover.evaluation import (
     study_table,
     verdict,
 )
+from torchcover.published.tables import text_tables
 from torchcover.report import UNITS, error_words, narrowest_width, print_table, text_table
 
 
@@ -25,6 +26,11 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
     """The tables, what the run left out if that is asked for, and where the files are."""
     console = Console()
     print_table(result.table, console)
+    if result.metrics:
+        tables = text_tables(result.metrics)
+        wide = Console(width=max(console.width, narrowest_width(tables)))
+        for table in tables:
+            wide.print(table)
     if explain and result.left_out:
         console.print(_explanation(result.left_out))
     for line in result.run.skipped if result.run else ():
@@ -33,8 +39,9 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
         console.print(line, markup=False, soft_wrap=True)
     maps = sum(path.suffix == ".png" for path in files)
     coverages = f"{len(result.coverages)} coverage files" if result.is_comparison else "coverage.npz"
+    metrics = "metrics.csv, metrics_tau.csv, " if result.metrics else ""
     console.print(
-        f"Wrote report.html, summary.json, summary.csv, {coverages} and {maps} maps to {out}",
+        f"Wrote report.html, summary.json, summary.csv, {metrics}{coverages} and {maps} maps to {out}",
         markup=False,
         soft_wrap=True,
     )

@@ -10,7 +10,7 @@ from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.rig_names import AnyRig, given_as
 from torchcover.evaluation.saved import compare_saved, saved_among
-from torchcover.evaluation.settings import AnyAsk, AnyDevice, AnyThresholds, Settings
+from torchcover.evaluation.settings import AnyAsk, AnyDevice, AnyMetrics, AnyThresholds, Settings
 from torchcover.evaluation.target_error import AnyTargetError
 from torchcover.evaluation.task import AnyFrames, AnyScenario, task_of
 
@@ -33,6 +33,7 @@ def evaluate(
     every_s: float | None = None,
     target_error: AnyTargetError | None = None,
     redundancy: bool = False,
+    metrics: AnyMetrics = (),
     device: AnyDevice = "cpu",
     workers: int = 0,
     skip_bad_frames: bool = False,
@@ -67,6 +68,8 @@ def evaluate(
             "0.1%", or ["0.1%", "0.02m"].
         redundancy: Whether to find out by how many sensors places are seen, and what is lost when each sensor fails:
             `Result.table.redundancy` and `Coverage.redundancy`.
+        metrics: Metrics that others published, by their names in `torchcover.published.PUBLISHED`, or "all" of them:
+            `Result.metrics`.
         device: Where the search and the sums run: "cpu", "cuda", ...
         workers: Processes that make frames; 0 makes them in this one.
         skip_bad_frames: Skip and note frames that cannot be read, instead of ending with the first.
@@ -119,6 +122,7 @@ def compare(
     every_s: float | None = None,
     target_error: AnyTargetError | None = None,
     redundancy: bool = False,
+    metrics: AnyMetrics = (),
     device: AnyDevice = "cpu",
     workers: int = 0,
     skip_bad_frames: bool = False,
@@ -148,6 +152,7 @@ def compare(
         every_s: Time between two steps in seconds.
         target_error: End once every number, and every difference, is this good.
         redundancy: Whether to find out what is lost when each sensor of each rig fails.
+        metrics: Metrics that others published; the result has how alike their orders of the rigs are, too.
         device: Where the search and the sums run.
         workers: Processes that make frames.
         skip_bad_frames: Whether to skip bad frames.

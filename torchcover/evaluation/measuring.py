@@ -11,6 +11,7 @@ from torchcover.data import BadFrameError
 from torchcover.evaluation.checkpoint import AnyCheckpoint, Checkpoint, Journal
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.omissions import left_out
+from torchcover.evaluation.other_metrics import compared, metrics_of
 from torchcover.evaluation.pipeline import Run, observe
 from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
@@ -49,8 +50,12 @@ def measured(
     frames = task.frames
     sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
     check_drawable(sensors)
+    metrics = metrics_of(task, settings)
     with ranks.aborting() if ranks else nullcontext():
-        coverage, others, run = _observed(task, settings, others, checkpoint, ranks, progress=progress)
+        coverage, seen, run = _observed(
+            task, settings, {**others, **metrics.observers}, checkpoint, ranks, progress=progress
+        )
+    metrics = metrics.after(seen)
     coverages = {name: observer.compute() for name, observer in coverage.items()}
     if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
@@ -66,7 +71,8 @@ def measured(
         awaited=task.asked.awaited,
         sensors=task.sensors,
         ego_outline_m=frames.ego_outline_m,
-        observed={name: observer.compute() for name, observer in others.items()},
+        observed={name: seen[name].compute() for name in others},
+        metrics=compared(metrics, coverages, task.asked.awaited, settings.seed),
         left_out=left_out(
             run.counts,
             list(coverages.values()),

@@ -20,6 +20,8 @@ from torchcover.evaluation.result_page import page_of
 from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.evaluation.target_error import TargetError
 from torchcover.evaluation.target_outcome import outcome
+from torchcover.published.comparison import MetricComparison
+from torchcover.published.tables import numbers_csv, record, tau_csv
 from torchcover.report import RENDERERS, CoverageTable, file_stems, map_figures, page_html, table_dict
 from torchcover.simulation import Sensor
 
@@ -44,6 +46,7 @@ class Result:
         sensors: The sensors of the rigs that they are known of, for the maps.
         ego_outline_m: (K, 2) corners x, y of the ego in metres, for the maps.
         observed: What the user's own observers computed, by their names.
+        metrics: What metrics of others say of the rigs; None if none was asked for.
         left_out: What the run left out because the scene did not need it.
         inputs: Coverage files that it was made from.
     """
@@ -60,6 +63,7 @@ class Result:
     sensors: Mapping[str, Sequence[Sensor]] = field(default_factory=dict)
     ego_outline_m: NDArray[Any] | None = None
     observed: Mapping[str, Any] = field(default_factory=dict)
+    metrics: MetricComparison | None = None
     left_out: Sequence[Omission] = ()
     inputs: Sequence[Path] = ()
 
@@ -115,6 +119,7 @@ class Result:
             "target_error": self._outcome[0],
             "measure": self._first.measure,
             **table_dict(self.table),
+            **({} if self.metrics is None else {"metrics": record(self.metrics)}),
         }
 
     def maps(self, *, errors: bool = False) -> Iterator[tuple[str, Figure]]:
@@ -142,8 +147,9 @@ class Result:
 
         Args:
             folder: Where to write: `coverage.npz`, or `coverage/RIG.npz` for several; `summary.csv`, `report.html`,
-                `maps/STEM.png`, `summary.json`. Made if it does not exist. Files of an earlier run that this one does
-                not write are deleted: those that its `summary.json` lists.
+                `maps/STEM.png`, `summary.json`; with metrics of others `metrics.csv` and `metrics_tau.csv`. Made if it
+                does not exist. Files of an earlier run that this one does not write are deleted: those that its
+                `summary.json` lists.
             error_maps: Whether to draw maps of the standard errors too.
 
         Returns:
@@ -159,13 +165,16 @@ class Result:
             with held_back():  # the numbers are safe before anything ends this, and before the maps are drawn
                 for name, coverage in self._coverage_files.items():
                     files.add(name, coverage.save)
-                files.add("summary.csv", lambda path: path.write_text(RENDERERS["csv"](self.table), encoding="utf-8"))
-                record = self.record
-                files.publish(record)
-            files.add("report.html", lambda path: path.write_text(page_html(page_of(self)), encoding="utf-8"))
+                files.add("summary.csv", partial(_write, RENDERERS["csv"](self.table)))
+                if self.metrics is not None:
+                    files.add("metrics.csv", partial(_write, numbers_csv(self.metrics)))
+                    files.add("metrics_tau.csv", partial(_write, tau_csv(self.metrics)))
+                summary = self.record
+                files.publish(summary)
+            files.add("report.html", partial(_write, page_html(page_of(self))))
             for stem, figure in self.maps(errors=error_maps):
                 files.add(f"maps/{stem}.png", partial(_draw, figure))
-            files.publish(record)
+            files.publish(summary)
         return files.paths
 
     @property
@@ -249,6 +258,10 @@ class Result:
         cut_short = ", cut short" if self.run is not None and not self.run.complete else ""
         about = f"Result of {', '.join(self.coverages)}: {self._first.counts['steps']} steps{cut_short}"
         return f"{about}\n{RENDERERS['text'](self.table)}"
+
+
+def _write(text: str, path: Path) -> None:
+    path.write_text(text, encoding="utf-8")
 
 
 def _draw(figure: Figure, path: Path) -> None:

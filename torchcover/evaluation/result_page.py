@@ -12,6 +12,7 @@ from pydantic import BaseModel
 from torchcover.coverage import Region
 from torchcover.evaluation.omissions import Omission
 from torchcover.evaluation.sensor_drawings import sensor_views
+from torchcover.published.tables import page_tables as metric_tables
 from torchcover.report import BOLD_MARKS, PLACE_HEADINGS, Line, Page, PageRig, PageTable, Words, maps_of, parts_of
 from torchcover.report.remarks import marks_on, notes_on
 from torchcover.report.table import CoverageTable
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 # What decides about the numbers, beside this package.
 PACKAGES = ("torch", "numpy", "embreex", "trimesh", "pykdtree", "kornia")
 OF_THE_RUN = ("torchcover", "seconds", "complete", "device", "skipped_frames")
-ELSEWHERE = ("rows", "counts", "frame_counts", "left_out", "rig", "rigs")
+ELSEWHERE = ("rows", "metrics", "counts", "frame_counts", "left_out", "rig", "rigs")
 
 
 def page_of(result: "Result") -> Page:
@@ -32,7 +33,7 @@ def page_of(result: "Result") -> Page:
     return Page(
         title=" against ".join(rigs) if len(rigs) == 2 else ", ".join(rigs),
         lead=f"Blind spots and coverage in {_place(result)}, measured by torchcover.",
-        tables=page_tables(result.table),
+        tables=[*page_tables(result.table), *(metric_tables(result.metrics) if result.metrics else [])],
         maps=list(maps_of(result.coverages)),
         rigs=[_rig(name, result.sensors.get(name, ())) for name in rigs],
         ego_outline_m=result.ego_outline_m,

@@ -34,6 +34,7 @@ BYTES_PER_WORKER = 300e6
 TOO_MANY_CELLS = "use larger cells, or a smaller grid"
 
 AnyAsk = RegionsOfInterest | str | Path
+AnyMetrics = str | Iterable[str]
 AnyThresholds = float | Iterable[float]
 AnyDevice = str | torch.device
 
@@ -59,6 +60,7 @@ class Settings:
     every_s: float | None = None
     target_error: TargetError | None = None
     redundancy: bool = False
+    metrics: tuple[str, ...] = ()
     device: str = "cpu"
     workers: int = 0
     skip_bad_frames: bool = False
@@ -83,6 +85,7 @@ class Settings:
         given["aggregations"] = _aggregations(given["aggregations"])
         given["target_error"] = _target(given["target_error"])
         given["ask"] = _asked(given["ask"])
+        given["metrics"] = _metrics(given["metrics"])
         given["device"] = str(given["device"])
         given["vehicle"] = given["vehicle"] and str(given["vehicle"])
         return cls(**given)
@@ -93,6 +96,15 @@ class Settings:
         if self.steps is not None:
             return self.steps
         return DEFAULT_STEPS if self.target_error is None else MAX_STEPS
+
+    @property
+    def needs_boxes(self) -> bool:
+        """Whether a metric is about objects, so that frames are to have them."""
+        if not self.metrics:
+            return False
+        from torchcover.published import PUBLISHED
+
+        return any("boxes" in PUBLISHED[name].needs for name in self.metrics)
 
     def asked(self, ego_outline_m: NDArray[np.float64] | None) -> Asked:
         """Regions, height bands and grid for one vehicle.
@@ -233,6 +245,14 @@ def _aggregations(given: Any) -> tuple[Aggregation, ...]:  # noqa: ANN401
     if not isinstance(given, Sequence):  # what is in it the metric checks
         raise TypeError(f"aggregations: a sequence of objects such as [Maximum()] is needed; got {given!r}")
     return tuple(given)
+
+
+def _metrics(given: AnyMetrics) -> tuple[str, ...]:
+    if not given:
+        return ()
+    from torchcover.published import metric_names  # not needed by most runs
+
+    return metric_names(given)
 
 
 def _asked(given: AnyAsk | None) -> RegionsOfInterest | None:

@@ -120,6 +120,7 @@ def _simulation(rigs: Sequence[AnyRig], scenario: AnyScenario, settings: Setting
         seed=settings.seed,
         every_s=spread_s(world, settings.every_s),
         reference_sensor=reference_called(settings.reference_sensor, settings.rays, asked),
+        boxes=settings.needs_boxes,
     )
     frames.simulator.check_run(frames.steps)
     given = {name: given_as(rig) for name, rig in zip(names, rigs, strict=True)}

@@ -12,6 +12,7 @@ from .object_coverage import ObjectCoverage as ObjectCoverage
 from .perception_entropy import PerceptionEntropy as PerceptionEntropy
 from .point_density import PointDensity as PointDensity
 from .registry import PUBLISHED as PUBLISHED
+from .registry import metric_names as metric_names
 from .results import Judged as Judged
 from .results import published_results as published_results
 from .results import read_results as read_results

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchcover.coverage import BevGrid
 from torchcover.data import Frame
 from torchcover.published.field_of_view import field_of_view
+from torchcover.published.places import coarse_grid
 from torchcover.published.sights import Sights, rig_of
 from torchcover.published.world_ratios import Ratio, WorldRatios
 from torchcover.simulation import Sensor
@@ -65,7 +66,7 @@ class FalseVisible(WorldRatios):
             )
         if not 0 <= threshold_m < float("inf"):
             raise ValueError(f"threshold_m: a finite distance >= 0 in metres is needed; got {threshold_m}")
-        coarse = BevGrid(grid.x, grid.y, cell_m, grid.heights)
+        coarse = coarse_grid(grid, cell_m)
         predicted = field_of_view(sensors, coarse, ego)
         given = {"threshold_m": float(threshold_m), "cell_m": float(cell_m)}
         ratios = [

@@ -26,7 +26,7 @@ class ObjectCoverage(WorldRatios):
         threshold_m: Distance within which a point counts as seen.
         hits: Numbers of points, n.
         categories: Those that have numbers of their own.
-        range_borders_m: Borders between bins of range.
+        range_borders_m: Borders between bins of range; farther objects do not count.
         rig: Whose clouds; those of the only rig if not given.
         sights: What metrics of a run share.
         kwargs: For `torchmetrics.Metric`.
@@ -63,8 +63,9 @@ class ObjectCoverage(WorldRatios):
         strata = ObjectStrata(categories, range_borders_m)
         names = [f"object_coverage_{threshold_m:g}m", *(f"objects_hit_{least}" for least in hits)]
         given: list[dict[str, Any]] = [{"threshold_m": threshold_m}, *({"hits": least} for least in hits)]
+        within = {"range_m": strata.range_borders_m[-1]}
         ratios = [
-            Ratio(name + stratum, "share", True, "objects", parameters)
+            Ratio(name + stratum, "share", True, "objects", {**parameters, **within})
             for name, parameters in zip(names, given, strict=True)
             for stratum in strata.names
         ]

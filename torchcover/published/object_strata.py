@@ -13,18 +13,20 @@ RANGE_BORDERS_M = (20.0, 40.0, 80.0)
 
 
 class ObjectStrata:
-    """All objects, those of each category, and those in each bin of range: [lo, hi) of the centre's, over ground.
+    """All objects up to the last border, those of each category, and those in each bin of range, [lo, hi).
+
+    An object's range is the distance of its centre from the vehicle's origin, over ground.
 
     Args:
         categories: Names; objects of others are among all of them only.
-        range_borders_m: Ascending, positive; the last bin is open.
+        range_borders_m: Ascending, positive; what is farther than the last does not count.
 
     Raises:
-        ValueError: A category that is named twice, borders out of order.
+        ValueError: A category that is named twice, borders out of order or none.
 
     Example:
         >>> ObjectStrata(("car",), (20.0, 40.0)).names
-        ('', ':car', ':0-20m', ':20-40m', ':40m+')
+        ('', ':car', ':0-20m', ':20-40m')
     """
 
     def __init__(self, categories: Sequence[str], range_borders_m: Sequence[float]) -> None:
@@ -32,7 +34,7 @@ class ObjectStrata:
         self.range_borders_m = tuple(float(border) for border in range_borders_m)
         if len(set(self.categories)) < len(self.categories):
             raise ValueError(f"categories: each may be given once; got {', '.join(self.categories)}")
-        if not all(low < high for low, high in pairwise((0.0, *self.range_borders_m))):
+        if not self.range_borders_m or not all(low < high for low, high in pairwise((0.0, *self.range_borders_m))):
             raise ValueError(f"range_borders_m: ascending numbers > 0 are needed; got {self.range_borders_m}")
 
     @property
@@ -43,9 +45,8 @@ class ObjectStrata:
     @property
     def names(self) -> tuple[str, ...]:
         """What is appended to the name of a number; nothing for all objects."""
-        lows = [f"{low:g}" for low in (0.0, *self.range_borders_m)]
-        bins = [f":{low}-{high}m" for low, high in pairwise(lows)]
-        return ("", *(f":{category}" for category in self.categories), *bins, f":{lows[-1]}m+")
+        bins = [f":{low:g}-{high:g}m" for low, high in pairwise((0.0, *self.range_borders_m))]
+        return ("", *(f":{category}" for category in self.categories), *bins)
 
     def members(self, boxes: Boxes) -> Tensor:
         """(strata, K) float64: 1 where an object is one of them."""
@@ -54,6 +55,6 @@ class ObjectStrata:
         category = torch.tensor(of_category, dtype=torch.float64, device=device).view(len(self.categories), len(boxes))
         range_m = torch.linalg.vector_norm(boxes.centre_m[:, :2].double(), dim=1)
         borders = torch.tensor(self.range_borders_m, dtype=torch.float64, device=device)
-        which = torch.bucketize(range_m, borders, right=True)
-        bins = torch.nn.functional.one_hot(which, len(borders) + 1).T.double()
-        return torch.cat([torch.ones_like(range_m)[None], category, bins])
+        bins = torch.nn.functional.one_hot(torch.bucketize(range_m, borders, right=True), len(borders) + 1).T.double()
+        near = 1.0 - bins[-1]
+        return torch.cat([near[None], category * near, bins[:-1]])

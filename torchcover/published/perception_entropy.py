@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.data import Frame
-from torchcover.published.object_strata import CATEGORIES, ObjectStrata
+from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
 from torchcover.published.sights import Sights, count_in_boxes, rig_of
 from torchcover.published.world_ratios import Ratio, WorldRatios
 from torchcover.simulation import CameraSensor, Sensor
@@ -66,6 +66,7 @@ class PerceptionEntropy(WorldRatios):
     Args:
         sensors: The rig's sensors; if not given, or without a camera, all points are taken for those of LiDARs.
         categories: Those that have numbers of their own.
+        range_borders_m: Borders between bins of range; farther objects do not count.
         rig: Whose clouds; those of the only rig if not given.
         sights: What metrics of a run share.
         kwargs: For `torchmetrics.Metric`.
@@ -87,27 +88,28 @@ class PerceptionEntropy(WorldRatios):
         self,
         sensors: Sequence[Sensor] = (),
         categories: Sequence[str] = CATEGORIES,
+        range_borders_m: Sequence[float] = RANGE_BORDERS_M,
         *,
         rig: str | None = None,
         sights: Sights | None = None,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         cameras = frozenset(sensor.name for sensor in sensors if isinstance(sensor, CameraSensor))
-        strata = ObjectStrata(categories, ())
-        names = [name for name in strata.names if not name.endswith("m+")]
+        strata = ObjectStrata(categories, range_borders_m)
+        given = {"range_m": strata.range_borders_m[-1], "constants": dict(CONSTANTS), "cameras": sorted(cameras)}
         ratios = [
-            Ratio(form + name, "nats", False, "objects", {"constants": dict(CONSTANTS), "cameras": sorted(cameras)})
+            Ratio(form + name, "nats", False, "objects", given)
             for form in ("perception_entropy", "perception_entropy_bounded")
-            for name in names
+            for name in strata.names
         ]
-        super().__init__(ratios, {"categories": strata.categories, "cameras": tuple(sorted(cameras))}, rig, **kwargs)
+        super().__init__(ratios, {**strata.meaning, "cameras": tuple(sorted(cameras))}, rig, **kwargs)
         self.strata = strata
         self.cameras = cameras
         self.sights = Sights() if sights is None else sights
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         sigma = self._sigma(frame, rig_of(frame, self.rig))
-        members = self.strata.members(self.sights.boxes(frame))[:-1].to(sigma.device)
+        members = self.strata.members(self.sights.boxes(frame)).to(sigma.device)
         values = torch.stack([entropy(sigma), entropy(sigma, bounded=True)])
         count = members.sum(dim=1).repeat(2)
         return count, (values @ members.T).flatten(), count.long()

@@ -1,11 +1,23 @@
 """Regions in height bands, and all of the grid: what numbers about places are given for."""
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from torchcover.coverage import BevGrid, Region, check_regions
+
+
+def coarse_grid(grid: BevGrid, cell_m: float) -> BevGrid:
+    """A grid of other cells, as large as the given one, or by a part of a cell larger.
+
+    Example:
+        >>> coarse_grid(BevGrid(x=(-0.5, 2.0), y=(0.0, 1.0), cell=0.25), 1.0).x
+        (-1.0, 2.0)
+    """
+    x, y = ((math.floor(low / cell_m) * cell_m, math.ceil(high / cell_m) * cell_m) for low, high in (grid.x, grid.y))
+    return BevGrid(x, y, cell_m, grid.heights)
 
 
 class Places:

@@ -1,6 +1,5 @@
 """How many points a rig has, how dense they are, and how evenly they lie."""
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -10,84 +9,85 @@ from torch import Tensor
 from torchcover.coverage import BevGrid, Region, check_regions
 from torchcover.data import Frame
 from torchcover.neighbors import check_cloud
+from torchcover.published.places import coarse_grid
 from torchcover.published.sights import rig_of
 from torchcover.published.world_ratios import Ratio, WorldRatios
 
 
 class PointDensity(WorldRatios):
-    """Points of the rig in a frame; in each region its points for each square metre of ground, and their uniformity.
+    """Points of the rig in a frame; over the grid and in regions those for each square metre, and their uniformity.
 
-    The density is over the region as drawn, be it visible or not. The uniformity is (sum n)^2 / (C sum n^2) over the
-    points n in the C square cells of the region: 1 if all cells have as many, 1 / C if one has all. Density and
-    uniformity are what Cai et al. (2023) optimise; their own formula of uniformity could not be read.
+    The density is over the ground as drawn, be it visible or not. The uniformity is (sum n)^2 / (C sum n^2) over the
+    points n in C square cells: 1 if all cells have as many, 1 / C if one has all. Density and uniformity are what Cai
+    et al. (2023) look at; their own formula of uniformity could not be read.
 
     Args:
-        regions: Those that have numbers.
-        height_m: Lower and upper bound of z of the points that count.
-        cell_m: Side of the cells.
+        grid: Where points count: its extent and its height bands.
+        regions: Those that have numbers of their own; one without the centre of a cell has no uniformity.
+        cell_m: Side of the cells of the uniformity.
         rig: Whose clouds; those of the only rig if not given.
         kwargs: For `torchmetrics.Metric`.
 
     Raises:
-        ValueError: Two regions of one name, or one without a cell centre; bounds of z that are no interval.
+        ValueError: Regions that the grid does not hold.
 
     Example:
-        >>> metric = PointDensity([Region("near", (0.0, 4.0), (0.0, 1.0))], (-0.5, 2.0))
+        >>> metric = PointDensity(BevGrid(x=(0.0, 4.0), y=(0.0, 1.0), cell=1.0), ())
         >>> cloud = torch.tensor([[0.5, 0.5, 0.0], [1.5, 0.5, 0.0], [9.0, 0.0, 0.0]])
         >>> metric.update(Frame({"rig": cloud}, torch.zeros(0, 3), 0, "a"))
         >>> [(one.name, one.value) for one in metric.compute()]
-        [('points', 3.0), ('point_density_near', 0.5), ('point_uniformity_1m_near', 0.5)]
+        [('points', 3.0), ('point_density', 0.5), ('point_uniformity_1m', 0.5)]
     """
 
     def __init__(
         self,
+        grid: BevGrid,
         regions: Sequence[Region],
-        height_m: tuple[float, float],
         cell_m: float = 1.0,
         *,
         rig: str | None = None,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
-        grid = _grid_around(regions, height_m, cell_m)
         check_regions(regions, grid)
-        given = {"height_m": tuple(map(float, height_m)), "cell_m": float(cell_m)}
-        named = [
-            ("point_density", "points/m2", "frames"),
-            (f"point_uniformity_{cell_m:g}m", "share", "frames with points there"),
-        ]
+        coarse = coarse_grid(grid, cell_m)
+        areas = [_everywhere(grid), *(region.mask(grid).flatten() for region in regions)]
+        masks = {"": _everywhere(coarse)} | {f":{region.name}": region.mask(coarse).flatten() for region in regions}
+        masks = {name: mask for name, mask in masks.items() if mask.any()}
+        names = ["", *(f":{region.name}" for region in regions)]
+        given = {"cell_m": float(cell_m)}
         ratios = [
             Ratio("points", "points", True, "frames"),
-            *(
-                Ratio(f"{name}_{region.name}", unit, True, over, given)
-                for name, unit, over in named
-                for region in regions
-            ),
+            *(Ratio(f"point_density{name}", "points/m2", True, "frames") for name in names),
+            *(Ratio(f"point_uniformity_{cell_m:g}m{name}", "share", True, "frames", given) for name in masks),
         ]
-        super().__init__(ratios, {"regions": tuple(regions), **given}, rig, **kwargs)
+        super().__init__(ratios, {"grid": grid, "regions": tuple(regions), **given}, rig, **kwargs)
         self.grid = grid
-        self.regions = tuple(regions)
-        self._cells = [region.mask(grid).flatten() for region in regions]
+        self.coarse = coarse
+        self._areas = areas
+        self._masks = tuple(masks.values())
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         cloud = frame.cloud_of(rig_of(frame, self.rig))
         check_cloud(cloud, "sensor")
-        cells = torch.bincount(self.grid.bins(cloud).cell, minlength=self.grid.cells).double()
         rows = [(1.0, float(len(cloud)), 1.0)]
-        inside = [cells[mask.to(cells.device)] for mask in self._cells]
-        rows += [(len(own) * self.grid.cell**2, float(own.sum()), 1.0) for own in inside]
-        for own in inside:
-            squares = float(own.square().sum())
-            rows.append((1.0, float(own.sum()) ** 2 / (len(own) * squares), 1.0) if squares else (0.0, 0.0, 0.0))
+        inside, of, cell = self.grid.bins(cloud)
+        fine, area_m2 = _counted(cell, self.grid), self.grid.cell**2
+        rows += [(int(mask.sum()) * area_m2, float(fine[mask].sum()), 1.0) for mask in self._areas]
+        own = _counted(self.coarse.bins(cloud[inside[of]]).cell, self.coarse)
+        for mask in self._masks:
+            each = own[mask]
+            squares = float(each.square().sum())
+            even = (1.0, float(each.sum()) ** 2 / (len(each) * squares), 1.0) if squares else (0.0, 0.0, 0.0)
+            rows.append(even)
         base, sums, counts = torch.tensor(rows, dtype=torch.float64).T
         return base, sums, counts.long()
 
 
-def _grid_around(regions: Sequence[Region], height_m: tuple[float, float], cell_m: float) -> BevGrid:
-    """Whole cells around all regions, in one band."""
+def _everywhere(grid: BevGrid) -> Tensor:
+    return torch.ones(grid.shape[1] * grid.shape[2], dtype=torch.bool)
 
-    def around(bounds: Sequence[tuple[float, float]]) -> tuple[float, float]:
-        low = math.floor(min([low for low, _ in bounds], default=0.0) / cell_m)
-        return low * cell_m, max(low + 1, math.ceil(max([high for _, high in bounds], default=0.0) / cell_m)) * cell_m
 
-    x, y = around([region.x for region in regions]), around([region.y for region in regions])
-    return BevGrid(x, y, cell_m, {"all": height_m})
+def _counted(cell: Tensor, grid: BevGrid) -> Tensor:
+    """(Y * X) float64 points in each cell, all bands together, on the CPU."""
+    flat = grid.shape[1] * grid.shape[2]
+    return torch.bincount(cell % flat, minlength=flat).double().cpu()

@@ -1,6 +1,6 @@
 """The metrics of others, by the names that `torchcover compare --metrics` takes."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from torchcover.published.false_visible import FalseVisible
 from torchcover.published.k_cover import KCover
@@ -23,9 +23,7 @@ def _k_cover(setup: Setup) -> KCover:
 
 
 def _point_density(setup: Setup) -> PointDensity:
-    bands = setup.grid.heights.values()
-    height_m = min(low for low, _ in bands), max(high for _, high in bands)
-    return PointDensity(setup.regions, height_m, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
+    return PointDensity(setup.grid, setup.regions, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
 
 
 def _false_visible(setup: Setup) -> FalseVisible:
@@ -45,3 +43,18 @@ PUBLISHED: Mapping[str, Published] = {
         _false_visible, frozenset({"sensors"}), "blind cells that the field of view promised (Börger 2022)"
     ),
 }
+
+
+def metric_names(given: str | Iterable[str]) -> tuple[str, ...]:
+    """The metrics that a user asks for; "all" is all of them.
+
+    Raises:
+        ValueError: No such metric.
+    """
+    names = [name.strip() for name in given.split(",")] if isinstance(given, str) else list(given)
+    if names == ["all"]:
+        return tuple(PUBLISHED)
+    for name in names:
+        if name not in PUBLISHED:
+            raise ValueError(f"metrics: all, or some of {', '.join(PUBLISHED)}, separated by commas; got {name!r}")
+    return tuple(dict.fromkeys(names))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.blocks import MIN_BLOCKS
-from torchcover.coverage.errors import ROUND_OFF, jackknife_error, ratio_errors
+from torchcover.coverage.errors import ROUND_OFF, jackknife_error
 from torchcover.data import Frame
 from torchcover.published.number import PublishedNumber
 from torchcover.published.world_blocks import WorldBlocks
@@ -29,9 +29,9 @@ class Ratio:
 class WorldRatios(WorldBlocks):
     """Ratios S / A of sums over frames, kept in blocks of contiguous worlds (`Frame.place_in_time`).
 
-    A metric gives its `ratios`, and in `_of_frame` what a frame adds to each: a_j, s_j, and how many these are. The
-    error of a share is that of `torchcover.coverage.errors.ratio_errors`, which is never 0; others have the block
-    jackknife's.
+    A metric gives its `ratios`, and in `_of_frame` what a frame adds to each: a_j, s_j, and how many these are. Errors
+    are the block jackknife's, as those of regions in `Coverage`; a ratio that fewer than 8 blocks know has none, nor
+    has one of which all blocks say the same.
 
     Args:
         ratios: What they are.
@@ -96,8 +96,6 @@ class WorldRatios(WorldBlocks):
         used = self.block_steps > 0
         base, sums, steps = self.base[used], self.sums[used], self.block_steps[used]
         whole, whole_base, whole_sums = self._value(base.sum(0), sums.sum(0)), base.sum(0), sums.sum(0)
-        jackknife = jackknife_error(self._value(whole_base - base, whole_sums - sums), whole, steps)
-        share = torch.tensor([ratio.unit == "share" for ratio in self.ratios], device=whole.device)
-        error = ratio_errors(base, sums, "share").where(share, jackknife)
+        error = jackknife_error(self._value(whole_base - base, whole_sums - sums), whole, steps)
         # Blocks that all say the same do not prove that others would.
         return error.where(((base > 0).sum(dim=0) >= MIN_BLOCKS) & (error > ROUND_OFF), math.nan)

@@ -1,0 +1,124 @@
+"""A comparison of metrics in words: for a terminal, a page, JSON and CSV."""
+
+import csv
+import io
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.table import Table
+
+from torchcover.published.comparison import MetricComparison, Series, Tau
+from torchcover.published.number import PublishedNumber
+from torchcover.report import PageTable, Words, text_table
+
+TITLE, TAU_TITLE = "Metrics of others (rank)", "Kendall's tau-b with torchcover's numbers, 95 % over worlds"
+# Digits of a number without an error.
+DIGITS = 4
+
+
+def number_words(number: PublishedNumber | None, rank: float | None = None) -> str:
+    """A number to the two digits of its error, and its rank; NaN is a dash.
+
+    Example:
+        >>> number_words(PublishedNumber("a", 0.12345, "share", True, {}, 9, "objects", 0.0123), 1.0)
+        '0.123 ± 0.012 (1)'
+        >>> number_words(None)
+        '–'
+    """
+    if number is None or not number.known:
+        return "–"
+    error = number.standard_error
+    if error > 0 and math.isfinite(error):
+        decimals = max(0, 1 - math.floor(math.log10(error)))
+        words = f"{number.value:,.{decimals}f} ± {error:,.{decimals}f}"
+    else:
+        words = f"{number.value:,.{DIGITS}g}"
+    return words if rank is None or math.isnan(rank) else f"{words} ({rank:g})"
+
+
+def page_tables(comparison: MetricComparison) -> list[PageTable]:
+    """All numbers, those of parts too; and the taus, if there are any."""
+    several = len(comparison.rigs) > 1
+    headings = ["metric", "unit", "better", *comparison.rigs]
+    rows = [[Words(word) for word in _row(one, several)] for one in comparison.series]
+    tables = [PageTable(TITLE if several else "Metrics of others", headings, rows, 3, comparison.notes)]
+    if taus := _tau_rows(comparison):
+        tau_rows = [[Words(word) for word in row] for row in taus]
+        tables.append(PageTable(TAU_TITLE, ["metric", *(own.name for own in _shown(comparison))], tau_rows))
+    return tables
+
+
+def text_tables(comparison: MetricComparison) -> list[Table]:
+    """The main numbers, and the taus, for `rich.console.Console.print`."""
+    several = len(comparison.rigs) > 1
+    headings = ["metric", "unit", "better", *comparison.rigs]
+    by_metric: dict[str, list[list[str]]] = {}
+    for one in comparison.main:
+        by_metric.setdefault(one.metric, []).append(_row(one, several))
+    title = TITLE if several else "Metrics of others"
+    tables = [text_table(headings, by_metric.values(), title=title, caption="\n".join(comparison.notes))]
+    if taus := _tau_rows(comparison):
+        tables.append(text_table(["metric", *(own.name for own in _shown(comparison))], [taus], title=TAU_TITLE))
+    return tables
+
+
+def record(comparison: MetricComparison) -> dict[str, Any]:
+    """As `summary.json` has it: what is unknown is None."""
+    return {
+        "numbers": [_plain(row) for row in comparison.rows()],
+        "tau": [_plain(tau._asdict()) for tau in comparison.taus()],
+        "notes": comparison.notes,
+    }
+
+
+def numbers_csv(comparison: MetricComparison) -> str:
+    """A line for each rig and number; an unknown one is an empty field, parameters are JSON."""
+    rows = [{**row, "parameters": json.dumps(row["parameters"], sort_keys=True)} for row in comparison.rows()]
+    return _csv(rows, ["rig", "metric", *PublishedNumber._fields, "rank"])
+
+
+def tau_csv(comparison: MetricComparison) -> str:
+    """A line for each pair of numbers."""
+    return _csv([tau._asdict() for tau in comparison.taus()], Tau._fields)
+
+
+def _row(one: Series, several: bool) -> list[str]:
+    number = one.any_number
+    better = "more" if number.higher_is_better else "less"
+    ranks = one.ranks.tolist() if several else [None] * len(one.numbers)
+    return [one.name, number.unit, better, *map(number_words, one.numbers, ranks)]
+
+
+def _shown(comparison: MetricComparison) -> list[Series]:
+    """Numbers of torchcover that the table has room for: the detections."""
+    return [own for own in comparison.own if own.any_number.higher_is_better]
+
+
+def _tau_rows(comparison: MetricComparison) -> list[list[str]]:
+    found = {(tau.first, tau.second): tau for tau in comparison.taus()}
+    if not found:
+        return []
+    return [
+        [one.name, *(_tau_words(found[one.name, own.name]) for own in _shown(comparison))] for one in comparison.main
+    ]
+
+
+def _tau_words(tau: Tau) -> str:
+    if math.isnan(tau.tau):
+        return "–"
+    interval = "" if math.isnan(tau.low) else f" [{tau.low:+.2f}, {tau.high:+.2f}]"
+    return f"{tau.tau:+.2f}{interval}"
+
+
+def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in row.items()}
+
+
+def _csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: "" if value is None else value for name, value in _plain(row).items()} for row in rows)
+    return text.getvalue()
