@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torchcover.data import Frame
 from torchcover.neighbors import check_cloud
@@ -43,7 +45,8 @@ class Lob(FrameMetric):
 
     Example:
         >>> from torchcover.simulation import Rig
-        >>> near, *_, far = Lob(Rig.load("hu2022_center").sensors).compute()  # doctest: +SKIP
+        >>> Lob(Rig.load("hu2022_center").sensors).cells_hit(10.0).shape
+        (10, 314)
     """
 
     def __init__(
@@ -114,6 +117,11 @@ class Lob(FrameMetric):
             )
         return tuple(numbers)
 
+    def resampled(self, weights: Tensor) -> Tensor:
+        """(R, V) the numbers, which are the same whatever the weights (R, 16) of worlds."""
+        values = torch.tensor([number.value for number in self.compute()], dtype=torch.float64, device=weights.device)
+        return values.repeat(len(weights), 1)
+
     def cells_hit(self, distance_m: float) -> NDArray[np.bool_]:
         """(rows, columns) whether any ray hits a cell of the board: from below, and counter-clockwise from behind."""
         around_m = 2 * math.pi * distance_m if self.width_m is None else self.width_m
@@ -142,7 +150,7 @@ class Lob(FrameMetric):
     def _ranges_m(
         self, origin_m: NDArray[np.float64], way: NDArray[np.float64], distance_m: float
     ) -> NDArray[np.float64]:
-        """(N,) how far it is along each ray to the board, whose sensors are on the inside; infinite if it never hits."""
+        """(N,) how far it is along each ray to the board from its inner side; infinite if it never hits."""
         with np.errstate(divide="ignore", invalid="ignore"):
             if self.width_m is not None:
                 range_m = np.where(way[0] > 0, (distance_m - origin_m[0]) / way[0], np.inf)

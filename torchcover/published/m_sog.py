@@ -4,27 +4,27 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.coverage.blocks import MIN_BLOCKS
 from torchcover.coverage.errors import ROUND_OFF, jackknife_error
 from torchcover.data import Frame
-from torchcover.detection import points_in_boxes
 from torchcover.geometry import BoundingBox
 from torchcover.neighbors import check_cloud
 from torchcover.published.number import PublishedNumber
 from torchcover.published.region_voxels import REGION, check_sensors, checked_grid, crossed_by, ray_count
+from torchcover.published.sights import Sights
 from torchcover.published.world_blocks import BLOCKS, WorldBlocks
 from torchcover.simulation import Sensor
 
 # Numbers that are kept of each voxel and block: frames in which it is labelled as the category, and as anything else.
 LABELS = 2
-VOXELS_AT_ONCE = 1 << 16
-# The region with as many labels as there are is 10,000 times smaller in print than any mean entropy can be.
+# Numbers that are worked out together: voxels, of each draw.
+AT_ONCE = 1 << 20
 RANKS_ONLY = (
-    "only for ranks among rigs at the same voxels: the published values are of another scale, and the published size of "
-    "a voxel is unknown"
+    "only for ranks of rigs at voxels of one size: printed values are a million times smaller than a mean entropy, and "
+    "the size is not printed"
 )
 
 
@@ -36,8 +36,8 @@ class MSog(WorldBlocks):
 
     where p_c is the share of frames in which the voxel has the label c. Higher is better. This is the paper's variant
     for detection. A frame's label of a voxel comes from the reference points in it: the category if at least half of
-    them are in its boxes (`points_in_boxes`), else anything else; empty if there is none, whether the reference saw that
-    it is empty or did not see it.
+    them are in its boxes (`points_in_boxes`), else anything else; empty if there is none, whether the reference saw
+    that it is empty or did not see it.
 
     Nothing hides anything from the rays, which go to the wall of the region or the end of the sensor's range; and a
     voxel that is crossed once counts as much as one that is crossed often. At 1 m nearly every voxel is crossed by any
@@ -49,11 +49,12 @@ class MSog(WorldBlocks):
         region: What the voxels fill, 60 x 40 x 4 m as of S-MIG if not given.
         category: Of the boxes that have a label of their own.
         rig: Whose clouds; those of the only rig if not given.
+        sights: What metrics of a run share.
         kwargs: For `torchmetrics.Metric`.
 
     Raises:
-        ValueError: No sensor, voxels that do not divide the region or do not fit into the memory. From `update`: a frame
-            without boxes.
+        ValueError: No sensor, voxels that do not divide the region or do not fit into the memory. From `update`: a
+            frame without boxes.
 
     Example:
         >>> from torchcover.detection import Boxes
@@ -65,7 +66,7 @@ class MSog(WorldBlocks):
         ...     metric.update(Frame({"rig": torch.zeros(0, 3)}, points, index, str(index), boxes=car))
         >>> number = metric.compute()[0]
         >>> number.name, round(number.value * number.count / math.log(2), 9)
-        ('m_sog_0.5m_car', -1.0)
+        ('m_sog_car_0.5m', -1.0)
     """
 
     labelled: Tensor
@@ -78,6 +79,7 @@ class MSog(WorldBlocks):
         category: str = "car",
         *,
         rig: str | None = None,
+        sights: Sights | None = None,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         check_sensors(sensors)
@@ -87,36 +89,37 @@ class MSog(WorldBlocks):
         self.sensors = tuple(sensors)
         self.grid = grid
         self.category = category
+        self.sights = Sights() if sights is None else sights
         self.add_block_sum("labelled", (LABELS, grid.voxels), torch.int64)
 
     def _add_frame(self, frame: Frame) -> None:
         check_cloud(frame.reference, "reference")
-        if frame.boxes is None:
-            raise ValueError(
-                f"frame {frame.name!r} has no boxes, from which points have their labels; SimulatedFrames(..., "
-                "boxes=True) makes them"
-            )
-        of_category = torch.zeros(len(frame.reference), dtype=torch.bool)
-        of_category[points_in_boxes(frame.reference, frame.boxes.of_category(self.category)).point.cpu()] = True
-        voxel = torch.from_numpy(self.grid.number_of(frame.reference.cpu().numpy()))
-        inside = voxel >= 0
-        occupied, which, points = voxel[inside].unique(return_inverse=True, return_counts=True)
-        votes = torch.zeros(len(occupied), dtype=torch.int64).index_add_(0, which, of_category[inside].long())
-        chosen = 2 * votes >= points
+        labels = self.sights.once(frame, ("labels", self.category, self.grid), lambda: self._labels(frame))
         block = self._block_of(frame)
-        for label, voxels in enumerate((occupied[chosen], occupied[~chosen])):
+        for label, voxels in enumerate(labels):
             self.labelled[block, label, voxels.to(self.labelled.device)] += 1
+
+    def _labels(self, frame: Frame) -> tuple[Tensor, Tensor]:
+        """The voxels that have the label of the category in a frame, and those that hold anything else."""
+        boxes = self.sights.boxes(frame)
+        of_category = torch.tensor([each == self.category for each in boxes.categories], dtype=torch.bool)
+        inside = self.sights.reference_in_boxes(frame)
+        votes = np.zeros(len(frame.reference), dtype=bool)
+        votes[inside.point.cpu()[of_category[inside.box.cpu()]].numpy()] = True
+        voxel = self.grid.number_of(frame.reference.cpu().numpy())
+        occupied, which, points = np.unique(voxel[voxel >= 0], return_inverse=True, return_counts=True)
+        chosen = 2 * np.bincount(which, weights=votes[voxel >= 0], minlength=len(occupied)) >= points
+        return torch.from_numpy(occupied[chosen]), torch.from_numpy(occupied[~chosen])
 
     def compute(self) -> tuple[PublishedNumber, ...]:
         """The number; NaN if the category was never seen, or no ray crosses the region."""
         used = self.block_steps.cpu() > 0
         values = self._values(torch.cat([torch.ones(1, BLOCKS), (1.0 - torch.eye(BLOCKS))[used]]).double())
         error = jackknife_error(values[1:], values[0], self.block_steps.cpu()[used])
-        usable = float(error) > ROUND_OFF and int(used.sum()) >= MIN_BLOCKS
         crossed = int(crossed_by(self.sensors, self.grid).sum())
         return (
             PublishedNumber(
-                name=f"m_sog_{self.grid.voxel_m:g}m_{self.category}",
+                name=f"m_sog_{self.category}_{self.grid.voxel_m:g}m",
                 value=float(values[0]),
                 unit="nats",
                 higher_is_better=True,
@@ -129,7 +132,7 @@ class MSog(WorldBlocks):
                 },
                 count=0 if values[0].isnan() else crossed,
                 count_of="voxels",
-                standard_error=float(error) if usable else math.nan,
+                standard_error=float(error) if error > ROUND_OFF else math.nan,
                 warning=RANKS_ONLY,
             ),
         )
@@ -149,8 +152,9 @@ class MSog(WorldBlocks):
         if len(crossed) == 0 or not self.labelled[:, 0].any():
             return unknown
         steps = weights @ self.block_steps.cpu().double()
-        total = torch.zeros(len(weights), dtype=torch.float64)
-        for some in crossed.split(VOXELS_AT_ONCE):
+        total, part = torch.zeros(len(weights), dtype=torch.float64), max(AT_ONCE // len(weights), 1)
+        for start in range(0, len(crossed), part):
+            some = crossed[start : start + part]
             labelled = self.labelled[:, :, some.to(self.labelled.device)].cpu().double()
             share = torch.tensordot(weights, labelled, dims=1) / steps[:, None, None]
             empty = (1.0 - share.sum(dim=1)).clamp(min=0.0)

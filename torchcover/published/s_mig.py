@@ -1,5 +1,6 @@
 """S-MIG: the entropy of an occupancy grid along the rays of a rig (Hu et al. 2022), and its negative."""
 
+import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -9,7 +10,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.coverage.blocks import MIN_BLOCKS
 from torchcover.coverage.errors import ROUND_OFF, jackknife_error
 from torchcover.data import Frame
 from torchcover.geometry import BoundingBox
@@ -26,12 +26,13 @@ from torchcover.published.region_voxels import (
     crossed_on_the_way,
     ray_count,
 )
+from torchcover.published.sights import Sights
 from torchcover.published.world_blocks import BLOCKS
 from torchcover.simulation import Sensor
 
 CATEGORIES = ("car", "pedestrian", "cyclist")
-# While it is computed: what is crossed, inside in a frame, inside in a block. With occlusion the state: how often.
-BYTES_A_VOXEL, BYTES_A_VOXEL_OCCLUDED = 6, 14
+# While it is computed: how often it is crossed, in a box of a frame, of a block. With occlusion the state, too.
+BYTES_A_VOXEL, BYTES_A_VOXEL_OCCLUDED = 6, 21
 
 
 class SMig(FrameMetric):
@@ -60,6 +61,7 @@ class SMig(FrameMetric):
         categories: Each has its own occupancy and number. The number of all is their sum.
         occlusion: Whether rays end at what they hit.
         rig: Whose clouds; those of the only rig if not given.
+        sights: What metrics of a run share.
         kwargs: For `torchmetrics.Metric`.
 
     Raises:
@@ -90,6 +92,7 @@ class SMig(FrameMetric):
         *,
         occlusion: bool = False,
         rig: str | None = None,
+        sights: Sights | None = None,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         check_sensors(sensors)
@@ -108,12 +111,18 @@ class SMig(FrameMetric):
         self.grid = grid
         self.categories = tuple(categories)
         self.occlusion = occlusion
+        self.sights = Sights() if sights is None else sights
         self.add_table("boxes", COLUMNS)
         self.add_sum("crossings", (self.grid.voxels if occlusion else 0,), torch.int64)
 
     def _add_frame(self, frame: Frame) -> None:
         check_cloud(frame.reference, "reference")
-        rows = occupancy_rows(frame, self.categories, self.grid.region)
+        boxes = self.sights.boxes(frame)
+        rows = self.sights.once(
+            frame,
+            ("occupancy", self.categories, self.grid.region),
+            lambda: occupancy_rows(boxes, frame.place_in_time, self.categories, self.grid.region),
+        )
         if self.occlusion:
             crossed = crossed_on_the_way(self.sensors, frame, self.rig, self.grid)
             self.crossings += torch.from_numpy(crossed.reshape(-1)).to(self.crossings)
@@ -121,15 +130,12 @@ class SMig(FrameMetric):
 
     def compute(self) -> tuple[PublishedNumber, ...]:
         """All categories together, then each."""
-        of_each, crossed = self._occupancies()
+        of_each, times = self._occupancies(), self._crossings()
         used = np.flatnonzero(of_each[0].steps)
-        whole = self._values(of_each, np.ones((1, BLOCKS)))[0]
-        left_out = self._values(of_each, (1.0 - np.eye(BLOCKS))[used])
-        error = jackknife_error(
-            torch.from_numpy(left_out), torch.from_numpy(whole), torch.from_numpy(of_each[0].steps[used])
-        )
-        usable = not self.occlusion and len(used) >= MIN_BLOCKS
-        error = error.where((error > ROUND_OFF) & usable, math.nan)
+        weights = np.concatenate([np.ones((1, BLOCKS)), (1.0 - np.eye(BLOCKS))[used]])
+        values = torch.from_numpy(self._values(of_each, times, weights))
+        error = jackknife_error(values[1:], values[0], torch.from_numpy(of_each[0].steps[used]))
+        error = error.where((error > ROUND_OFF) & (not self.occlusion), math.nan)
         boxes = [one.boxes for one in of_each]
         names = ["", *(f":{category}" for category in self.categories)]
         rays = ray_count(self.sensors)
@@ -143,7 +149,7 @@ class SMig(FrameMetric):
                     "voxel_m": self.grid.voxel_m,
                     "region_m": (self.grid.region.lower_m, self.grid.region.upper_m),
                     "rays": rays,
-                    "voxels_crossed": crossed,
+                    "voxels_crossed": int((times > 0).sum()),
                     "entropy_captured_nats": -value,
                 },
                 count=count,
@@ -152,7 +158,7 @@ class SMig(FrameMetric):
                 warning=f"falls as coverage grows, 0 without any ray: only among rigs of {rays:,} rays, too",
             )
             for name, value, count, own_error in zip(
-                names, whole.tolist(), [sum(boxes), *boxes], error.tolist(), strict=True
+                names, values[0].tolist(), [sum(boxes), *boxes], error.tolist(), strict=True
             )
         )
 
@@ -162,35 +168,35 @@ class SMig(FrameMetric):
         Args:
             weights: (R, 16) how often.
         """
-        values = self._values(self._occupancies()[0], weights.double().cpu().numpy())
+        values = self._values(self._occupancies(), self._crossings(), weights.double().cpu().numpy())
         return torch.from_numpy(values).to(weights.device)
 
-    def _occupancies(self) -> tuple[list[Occupancy], int]:
-        """The occupancy by each category in the voxels that are crossed, and how many these are."""
+    def _crossings(self) -> NDArray[np.float64 | np.bool_]:
+        """(voxels,) how often each voxel is crossed in a frame, on average."""
         if self.occlusion:
-            crossed = (self.crossings > 0).cpu().numpy().reshape(self.grid.shape)
-        else:
-            crossed = crossed_by(self.sensors, self.grid)
-        table = self.boxes.cpu().numpy()
-        each = [occupancy_of(table, number, self.grid, BLOCKS, crossed) for number in range(len(self.categories))]
-        return each, int(crossed.sum())
+            return self.crossings.cpu().numpy() / max(int(self.steps), 1)
+        return crossed_by(self.sensors, self.grid).reshape(-1)
 
-    def _values(self, of_each: Sequence[Occupancy], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _occupancies(self) -> list[Occupancy]:
+        """That of each category; rigs that saw the same frames share them."""
+        table = self.boxes.cpu().numpy()
+        what = ("occupancy", hashlib.sha256(table.tobytes()).digest(), self.grid, self.categories)
+        return self.sights.after_all(
+            what, lambda: [occupancy_of(table, number, self.grid, BLOCKS) for number in range(len(self.categories))]
+        )
+
+    def _values(
+        self, of_each: Sequence[Occupancy], times: NDArray[np.float64 | np.bool_], weights: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
         """(R, 1 + C) the numbers: their sum, and each; NaN where there was no box."""
         values = np.full((len(weights), 1 + len(of_each)), np.nan)
         for column, one in enumerate(of_each, 1):
             if one.boxes:
-                values[:, column] = -one.entropy_nats(weights, self._share_of_frames(one))
+                values[:, column] = -one.entropy_nats(times, weights)
         known = [column for column, one in enumerate(of_each, 1) if one.boxes]
         if known:
             values[:, 0] = values[:, known].sum(axis=1)
         return values
-
-    def _share_of_frames(self, one: Occupancy) -> NDArray[np.float64] | None:
-        if not self.occlusion:
-            return None
-        times: NDArray[np.float64] = self.crossings.cpu().numpy()[one.voxels] / int(self.steps)
-        return times
 
 
 def unequal_rays(numbers: Mapping[str, PublishedNumber]) -> str | None:

@@ -33,6 +33,7 @@ class Sights:
     def __init__(self) -> None:
         self._frame: Frame | None = None
         self._found: dict[tuple[Any, ...], Any] = {}
+        self._of_all: tuple[tuple[Any, ...], Any] | None = None
         # Whether anybody wants to know of single sensors: then nobody searches for the rig as a whole.
         self.by_sensor = False
 
@@ -49,7 +50,7 @@ class Sights:
         """
         if self.by_sensor:
             return self.of_sensors(frame, rig, within_m).amin(dim=0)
-        return self._once(frame, ("rig", rig, within_m), lambda: _search(frame, frame.cloud_of(rig), within_m))
+        return self.once(frame, ("rig", rig, within_m), lambda: _search(frame, frame.cloud_of(rig), within_m))
 
     def of_sensors(self, frame: Frame, rig: str, within_m: float) -> Tensor:
         """(S, M) the same for each sensor of the rig.
@@ -57,7 +58,7 @@ class Sights:
         Raises:
             ValueError: Nobody knows which points are of which sensor.
         """
-        return self._once(
+        return self.once(
             frame,
             ("sensors", rig, within_m),
             lambda: torch.stack(
@@ -77,25 +78,33 @@ class Sights:
 
     def reference_in_boxes(self, frame: Frame) -> Inside:
         """Which reference points lie in which objects."""
-        return self._once(frame, ("boxes",), lambda: points_in_boxes(frame.reference, self.boxes(frame)))
+        return self.once(frame, ("boxes",), lambda: points_in_boxes(frame.reference, self.boxes(frame)))
 
     def hits(self, frame: Frame, rig: str) -> Tensor:
         """(K,) int64 how many points of the rig lie in each object."""
         boxes = self.boxes(frame)
         if rig in boxes.hits:
             return boxes.hits[rig]
-        return self._once(frame, ("hits", rig), lambda: count_in_boxes(frame.cloud_of(rig), boxes))
+        return self.once(frame, ("hits", rig), lambda: count_in_boxes(frame.cloud_of(rig), boxes))
 
     def bins(self, frame: Frame, grid: BevGrid) -> Bins:
         """In which cells of a grid the reference points are."""
-        return self._once(frame, ("bins", grid), lambda: grid.bins(frame.reference))
+        return self.once(frame, ("bins", grid), lambda: grid.bins(frame.reference))
 
-    def _once(self, frame: Frame, what: tuple[Any, ...], find: Callable[[], Found]) -> Found:
+    def once(self, frame: Frame, what: tuple[Any, ...], find: Callable[[], Found]) -> Found:
+        """Whatever is to be found in a frame; looked for if nobody has asked for it."""
         if frame is not self._frame:
             self._frame, self._found = frame, {}
         if what not in self._found:
             self._found[what] = find()
         found: Found = self._found[what]
+        return found
+
+    def after_all(self, what: tuple[Any, ...], find: Callable[[], Found]) -> Found:
+        """Whatever is to be found from what all frames left; remembered until something else is asked for."""
+        if self._of_all is None or self._of_all[0] != what:
+            self._of_all = what, find()
+        found: Found = self._of_all[1]
         return found
 
 
