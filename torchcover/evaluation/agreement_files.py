@@ -45,7 +45,6 @@ def record(study: AgreementStudy) -> dict[str, object]:
     return {
         "scenario": study.scenario,
         "steps": study.scores.steps,
-        "worlds": study.scores.worlds,
         "seed": study.seed,
         "notes": list(study.notes),
         "truths": [
@@ -109,7 +108,7 @@ def relation(one: Relation) -> str:
 def _measured(study: AgreementStudy) -> str:
     scores = study.scores
     return (
-        f"Measured in {scores.steps} steps of {scores.worlds} worlds of {study.scenario}, seed {study.seed}. "
+        f"Measured in {scores.steps} steps of {study.scenario}, seed {study.seed}. "
         "Spearman's correlation and Kendall's tau-b with the mean of the networks, 95 % intervals from drawing worlds "
         "and networks anew (where marked *, networks only), p of a correlation as strong, of either sign, by chance. "
         "More is better, as a metric's authors say it."

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torchcover.coverage.estimate import area_in_blocks
 from torchcover.data import BadFrameError, Frame, SimulatedFrames
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
-from torchcover.published import PUBLISHED, FrameMetric, PublishedNumber, Setup, Sights, WorldRatios
+from torchcover.published import PUBLISHED, FrameMetric, PublishedNumber, Setup, Sights
 from torchcover.published.comparison import OWN, MetricComparison, Series
 from torchcover.published.ranks import Array
 from torchcover.published.setup import Need
@@ -29,6 +29,15 @@ WHY: Mapping[Need, str] = {
     "m2": "it needs the square metres of reference points, which the surface reference of a simulation gives",
     "tags": "it needs classes of the reference points, which the frames do not have",
 }
+
+
+@runtime_checkable
+class Resampled(Protocol):
+    """A metric that knows what it would have said of other worlds."""
+
+    def resampled(self, weights: Tensor) -> Tensor:
+        """(R, V) its numbers if each block of worlds had come as often as (R, 16) weights say."""
+        ...
 
 
 class OtherMetrics(NamedTuple):
@@ -162,10 +171,10 @@ def _series(name: str, of_rigs: Sequence[FrameMetric], weights: Tensor | None) -
 
 
 def _draws(metric: FrameMetric, weights: Tensor | None) -> dict[str, Array]:
-    if weights is None or not isinstance(metric, WorldRatios):
+    if weights is None or not isinstance(metric, Resampled):
         return {}
     drawn = metric.resampled(weights).cpu().numpy()
-    return {ratio.name: drawn[:, at] for at, ratio in enumerate(metric.ratios)}
+    return {number.name: drawn[:, at] for at, number in enumerate(metric.compute())}
 
 
 def _own(coverages: Sequence[Coverage], region: Region, height: str, which: int, weights: Tensor | None) -> Series:

@@ -90,7 +90,7 @@ class Agreement:
 
 
 def agreement_of(
-    candidates: Sequence[Candidate], judged: Judged, *, draws: int = 1000, seed: int = 0, placements: bool = False
+    candidates: Sequence[Candidate], judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
 ) -> Agreement:
     """Rank placements by metrics, and compare with the mean of the judges.
 
