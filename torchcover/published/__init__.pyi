@@ -3,6 +3,7 @@ from .agreement import Candidate as Candidate
 from .agreement import Ranked as Ranked
 from .agreement import Relation as Relation
 from .agreement import agreement_of as agreement_of
+from .agreement import lead as lead
 from .false_visible import FalseVisible as FalseVisible
 from .field_of_view import field_of_view as field_of_view
 from .frame_metric import FrameMetric as FrameMetric

@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.published.ranks import Array, Statistic, kendall_tau_b, permutation_p, spearman, strongest_by_chance
+from torchcover.published.ranks import Array, kendall_tau_b, permutation_p, spearman, strongest_by_chance
 from torchcover.published.results import Judged
 
 # coverage: torchcover's own numbers; published: those of others; baseline: what takes no simulation to know, or little.
@@ -117,10 +117,7 @@ def agreement_of(
     for one in candidates:
         if one.values.shape != (count,) or (one.draws is not None and one.draws[:draws].shape != (draws, count)):
             raise ValueError(f"{one.name}: a value of each of {count} placements is needed, and {draws} draws or none")
-    generator = np.random.default_rng(seed)
-    chosen = generator.integers(len(judged.judges), size=(draws, len(judged.judges)))
-    truths = judged.values[chosen].mean(axis=1)
-    columns = generator.integers(count, size=(draws, count)) if placements else np.tile(np.arange(count), (draws, 1))
+    truths, columns = _drawn(judged, draws, seed, placements=placements)
     ranked = tuple(_ranked(one, judged.mean, truths, columns) for one in candidates)
     strength = np.array([abs(row.spearman.value) for row in ranked])
     if np.isnan(strength).all():
@@ -135,16 +132,57 @@ def agreement_of(
     )
 
 
-def _ranked(one: Candidate, truth: Array, truths: Array, columns: NDArray[np.int64]) -> Ranked:
+def lead(
+    one: Candidate, other: Candidate, judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
+) -> Relation:
+    """By how much Spearman's correlation of a metric is above that of another one, with its interval.
+
+    Both are held against the same draws, so that what they share cancels out.
+
+    Args:
+        one: The metric.
+        other: What it is to beat.
+        judged: As in `agreement_of`, and so are all that follow.
+        draws: How often.
+        seed: Of the draws.
+        placements: Whether to draw placements, too.
+
+    Example:
+        >>> judged = Judged("AP", tuple("abcd"), ("net",), np.array([[1.0, 2, 3, 4]]))
+        >>> good, bad = (Candidate("", "published", np.array(values)) for values in ([1.0, 2, 3, 4], [4.0, 3, 2, 1]))
+        >>> lead(good, bad, judged)
+        Relation(value=2.0, low=2.0, high=2.0)
+    """
+    truths, columns = _drawn(judged, draws, seed, placements=placements)
+    found = [spearman(each.values, judged.mean) for each in (one, other)]
+    drawn = [spearman(*_along(each, truths, columns)) for each in (one, other)]
+    return _with_ends(float(found[0] - found[1]), drawn[0] - drawn[1])
+
+
+def _drawn(judged: Judged, draws: int, seed: int, *, placements: bool) -> tuple[Array, NDArray[np.int64]]:
+    """(R, n) the mean of judges that are drawn anew, and which placements are drawn."""
+    generator, count = np.random.default_rng(seed), len(judged.placements)
+    chosen = generator.integers(len(judged.judges), size=(draws, len(judged.judges)))
+    columns = generator.integers(count, size=(draws, count)) if placements else np.tile(np.arange(count), (draws, 1))
+    return judged.values[chosen].mean(axis=1), columns
+
+
+def _along(one: Candidate, truths: Array, columns: NDArray[np.int64]) -> tuple[Array, Array]:
+    """(R, n) what a metric and the judges say in each draw."""
     drawn = np.broadcast_to(one.values, truths.shape) if one.draws is None else one.draws[: len(truths)]
-    drawn, truths = (np.take_along_axis(each, columns, axis=1) for each in (drawn, truths))
-    rho, tau = (_relation(statistic, (one.values, truth), (drawn, truths)) for statistic in (spearman, kendall_tau_b))
+    return np.take_along_axis(drawn, columns, axis=1), np.take_along_axis(truths, columns, axis=1)
+
+
+def _ranked(one: Candidate, truth: Array, truths: Array, columns: NDArray[np.int64]) -> Ranked:
+    drawn = _along(one, truths, columns)
+    rho, tau = (
+        _with_ends(float(statistic(one.values, truth)), statistic(*drawn)) for statistic in (spearman, kendall_tau_b)
+    )
     return Ranked(one.name, one.kind, rho, tau, permutation_p(one.values, truth), one.draws is not None)
 
 
-def _relation(statistic: Statistic, found: tuple[Array, Array], drawn: tuple[Array, Array]) -> Relation:
-    value, others = float(statistic(*found)), statistic(*drawn)
-    known = others[~np.isnan(others)]
+def _with_ends(value: float, drawn: Array) -> Relation:
+    known = drawn[~np.isnan(drawn)]
     if math.isnan(value) or not known.size:
         return Relation(value, math.nan, math.nan)
     low, high = np.quantile(known, LEVELS).tolist()
