@@ -32,6 +32,8 @@ BENCHMARKS = (
     "scaling",
     "mutated_files",
     "targets",
+    "published",
+    "voxels",
 )
 
 

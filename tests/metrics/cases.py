@@ -12,7 +12,17 @@ from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.coverage import Maximum, PooledMean, Quantiles, StepQuantiles
 from torchcover.data import Frame
 from torchcover.detection import Boxes, RecallByVisibility
-from torchcover.published import FalseVisible, KCover, ObjectCoverage, PerceptionEntropy, PointDensity
+from torchcover.geometry import BoundingBox
+from torchcover.published import (
+    FalseVisible,
+    KCover,
+    Lob,
+    MSog,
+    ObjectCoverage,
+    PerceptionEntropy,
+    PointDensity,
+    SMig,
+)
 from torchcover.simulation import Lidar, Pose
 
 Step = Mapping[str, Any]
@@ -153,7 +163,7 @@ def detection_step(seed: int) -> Step:
 
 def frame_step(index: int) -> Step:
     generator = torch.Generator().manual_seed(index)
-    count = index // 2 % 5
+    count = index // 3 % 5
     rows = torch.rand(count, 7, generator=generator) * torch.tensor([50.0, 8, 0.5, 3, 2, 1, 3])
     rows += torch.tensor([3.0, -4, 0.5, 1, 1, 1, 0])
     # A few points anywhere, and on objects.
@@ -188,6 +198,15 @@ SENSORS = (
 )
 
 
+BOTH = (*SENSORS, SENSORS[0].model_copy(update={"name": "rear", "mount": Pose(z_m=1.0, x_m=0.5)}))
+VOXELS = {"sensors": BOTH, "voxel_m": 0.5, "region": BoundingBox((0.0, -4.0, 0.0), (16.0, 4.0, 2.0))}
+OF_VOXELS = {
+    "sensors": {"sensors": (BOTH[0].model_copy(update={"max_range_m": 5.0}), BOTH[1])},
+    "voxel_m": {"voxel_m": 1.0},
+    "region": {"region": BoundingBox((0.0, -4.0, 0.0), (12.0, 4.0, 2.0))},
+}
+
+
 def of_frames(kind: Callable[..., Metric], usual: Step, changes: Mapping[str, Step]) -> Case:
     nothing = Frame(
         {"rig": torch.zeros(0, 3)},
@@ -201,7 +220,7 @@ def of_frames(kind: Callable[..., Metric], usual: Step, changes: Mapping[str, St
     )
     return Case(
         lambda **changed: kind(**{**usual, **changed}),
-        [frame_step(index) for index in range(0, 20, 2)],  # blocks are paired up
+        [frame_step(index) for index in range(0, 24, 3)],  # blocks are paired up
         {"frame": nothing},
         {**changes, "rig": {"rig": "rig"}},
     )
@@ -280,6 +299,22 @@ CASES = {
             "threshold_m": {"threshold_m": 0.2},
             "cell_m": {"cell_m": 0.5},
             "predicted": {"sensors": (SENSORS[0].model_copy(update={"max_range_m": 5.0}),)},
+        },
+    ),
+    "s-mig": of_frames(
+        SMig, VOXELS, {**OF_VOXELS, "categories": {"categories": ("car",)}, "occlusion": {"occlusion": True}}
+    ),
+    "s-mig, occluded": of_frames(SMig, {**VOXELS, "occlusion": True}, OF_VOXELS),
+    "m-sog": of_frames(MSog, VOXELS, {**OF_VOXELS, "category": {"category": "pedestrian"}}),
+    "lob": of_frames(
+        Lob,
+        {"sensors": BOTH, "distances_m": (8.0, 5.0)},
+        {
+            "sensors": {"sensors": BOTH[:1]},
+            "distances_m": {"distances_m": (5.0, 8.0)},
+            "height_m": {"height_m": (0.0, 1.0)},
+            "cell_m": {"cell_m": 0.5},
+            "width_m": {"width_m": 4.0},
         },
     ),
 }

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -29,15 +29,6 @@ WHY: Mapping[Need, str] = {
     "m2": "it needs the square metres of reference points, which the surface reference of a simulation gives",
     "tags": "it needs classes of the reference points, which the frames do not have",
 }
-
-
-@runtime_checkable
-class Resampled(Protocol):
-    """A metric that knows what it would have said of other worlds."""
-
-    def resampled(self, weights: Tensor) -> Tensor:
-        """(R, V) its numbers if each block of worlds had come as often as (R, 16) weights say."""
-        ...
 
 
 class OtherMetrics(NamedTuple):
@@ -161,7 +152,7 @@ def drawn_worlds(coverage: Coverage, seed: int) -> Tensor | None:
 def _series(name: str, of_rigs: Sequence[FrameMetric], weights: Tensor | None) -> list[Series]:
     """The numbers of a metric, by their names; rigs may have different ones."""
     numbers = [{number.name: number for number in metric.compute()} for metric in of_rigs]
-    draws = [_draws(metric, weights) for metric in of_rigs]
+    draws = [_draws(metric, list(own), weights) for metric, own in zip(of_rigs, numbers, strict=True)]
     found = []
     for number in dict.fromkeys(each for own in numbers for each in own):
         together = [drawn[number] for drawn in draws if number in drawn]
@@ -170,11 +161,9 @@ def _series(name: str, of_rigs: Sequence[FrameMetric], weights: Tensor | None) -
     return found
 
 
-def _draws(metric: FrameMetric, weights: Tensor | None) -> dict[str, Array]:
-    if weights is None or not isinstance(metric, Resampled):
-        return {}
-    drawn = metric.resampled(weights).cpu().numpy()
-    return {number.name: drawn[:, at] for at, number in enumerate(metric.compute())}
+def _draws(metric: FrameMetric, names: Sequence[str], weights: Tensor | None) -> dict[str, Array]:
+    drawn = None if weights is None else metric.resampled(weights)
+    return {} if drawn is None else dict(zip(names, drawn.cpu().numpy().T, strict=True))
 
 
 def _own(coverages: Sequence[Coverage], region: Region, height: str, which: int, weights: Tensor | None) -> Series:

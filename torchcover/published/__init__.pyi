@@ -4,10 +4,12 @@ from .agreement import Ranked as Ranked
 from .agreement import Relation as Relation
 from .agreement import agreement_of as agreement_of
 from .agreement import lead as lead
+from .boards import Lob as Lob
 from .false_visible import FalseVisible as FalseVisible
 from .field_of_view import field_of_view as field_of_view
 from .frame_metric import FrameMetric as FrameMetric
 from .k_cover import KCover as KCover
+from .m_sog import MSog as MSog
 from .number import PublishedNumber as PublishedNumber
 from .object_coverage import ObjectCoverage as ObjectCoverage
 from .perception_entropy import PerceptionEntropy as PerceptionEntropy
@@ -17,8 +19,11 @@ from .registry import metric_names as metric_names
 from .results import Judged as Judged
 from .results import published_results as published_results
 from .results import read_results as read_results
+from .s_mig import SMig as SMig
+from .s_mig import unequal_rays as unequal_rays
 from .setup import Published as Published
 from .setup import Setup as Setup
 from .sights import Sights as Sights
+from .world_blocks import WorldBlocks as WorldBlocks
 from .world_ratios import Ratio as Ratio
 from .world_ratios import WorldRatios as WorldRatios

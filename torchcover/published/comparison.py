@@ -10,6 +10,7 @@ import numpy as np
 
 from torchcover.published.number import PublishedNumber
 from torchcover.published.ranks import LEAST, Array, kendall_tau_b, midranks
+from torchcover.published.s_mig import unequal_rays
 
 # The metric that numbers of torchcover itself are of.
 OWN = "torchcover"
@@ -110,8 +111,13 @@ class MetricComparison:
         """What a reader is to know."""
         few = [] if len(self.rigs) >= LEAST else [f"{TOO_FEW.format(len(self.rigs))}."]
         warned = {number.warning for one in self.series for number in one.numbers if number and number.warning}
+        rays = [note for one in self.main if one.metric.startswith("s_mig") and (note := self._unequal_rays(one))]
         missing = [f"Without {name}: {why}" for name, why in (self.left_out or {}).items()]
-        return [NOT_VALIDATED, *few, *sorted(warned), *missing]
+        return [NOT_VALIDATED, *few, *sorted(warned), *rays, *missing]
+
+    def _unequal_rays(self, one: Series) -> str | None:
+        known = {rig: number for rig, number in zip(self.rigs, one.numbers, strict=True) if number is not None}
+        return unequal_rays(known)
 
 
 def tau_of(first: Series, second: Series) -> Tau:

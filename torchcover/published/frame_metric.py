@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
 from torchcover.data import Frame
 from torchcover.metrics import MergeableMetric, figure_of
@@ -54,6 +55,17 @@ class FrameMetric(MergeableMetric):
     def compute(self) -> tuple[PublishedNumber, ...]:
         """What the frames so far say."""
         raise NotImplementedError
+
+    def resampled(self, weights: Tensor) -> Tensor | None:
+        """(R, V) the V numbers of `compute` if each block of worlds had come as often as it is weighted.
+
+        Args:
+            weights: (R, 16) how often.
+
+        Returns:
+            None if nobody knows, as here.
+        """
+        return None
 
     def plot(self, val: Sequence[PublishedNumber] | None = None, ax: "Axes | None" = None) -> "tuple[Figure, Axes]":
         """Draw the numbers and their standard errors, one below the other; what is unknown has its name only.

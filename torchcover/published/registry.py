@@ -2,11 +2,14 @@
 
 from collections.abc import Iterable, Mapping
 
+from torchcover.published.boards import Lob
 from torchcover.published.false_visible import FalseVisible
 from torchcover.published.k_cover import KCover
+from torchcover.published.m_sog import MSog
 from torchcover.published.object_coverage import ObjectCoverage
 from torchcover.published.perception_entropy import PerceptionEntropy
 from torchcover.published.point_density import PointDensity
+from torchcover.published.s_mig import SMig
 from torchcover.published.setup import Published, Setup
 
 
@@ -30,6 +33,22 @@ def _false_visible(setup: Setup) -> FalseVisible:
     return FalseVisible(setup.sensors, setup.ego, setup.grid, setup.threshold_m, **setup.of_frames)
 
 
+def _s_mig(setup: Setup) -> SMig:
+    return SMig(setup.sensors, **setup.of_frames)
+
+
+def _s_mig_occluded(setup: Setup) -> SMig:
+    return SMig(setup.sensors, occlusion=True, **setup.of_frames)
+
+
+def _m_sog(setup: Setup) -> MSog:
+    return MSog(setup.sensors, **setup.of_frames)
+
+
+def _lob(setup: Setup) -> Lob:
+    return Lob(setup.sensors, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
+
+
 PUBLISHED: Mapping[str, Published] = {
     "object_coverage": Published(
         _object_coverage, frozenset({"boxes"}), "share of an object within the threshold; objects with 1, 5, 10 points"
@@ -42,6 +61,16 @@ PUBLISHED: Mapping[str, Published] = {
     "false_visible": Published(
         _false_visible, frozenset({"sensors"}), "blind cells that the field of view promised (Börger 2022)"
     ),
+    "s_mig": Published(
+        _s_mig, frozenset({"boxes", "sensors"}), "minus the entropy of objects along the rays, in nats (Hu 2022)"
+    ),
+    "s_mig_occluded": Published(
+        _s_mig_occluded, frozenset({"boxes", "sensors", "sensor_points"}), "the same, up to what the rays hit"
+    ),
+    "m_sog": Published(
+        _m_sog, frozenset({"boxes", "sensors"}), "minus the mean entropy of labels along the rays (Place3D 2024)"
+    ),
+    "lob": Published(_lob, frozenset({"sensors"}), "cells of boards at 10 to 50 m that rays hit (Kim and Park 2020)"),
 }
 
 

@@ -31,6 +31,7 @@ from torchcover.published.world_blocks import BLOCKS
 from torchcover.simulation import Sensor
 
 CATEGORIES = ("car", "pedestrian", "cyclist")
+FALLS = "S-MIG falls as more is covered, and is 0 without any ray: compare it among rigs with as many rays only"
 # While it is computed: how often it is crossed, in a box of a frame, of a block. With occlusion the state, too.
 BYTES_A_VOXEL, BYTES_A_VOXEL_OCCLUDED = 6, 21
 
@@ -113,7 +114,8 @@ class SMig(FrameMetric):
         self.occlusion = occlusion
         self.sights = Sights() if sights is None else sights
         self.add_table("boxes", COLUMNS)
-        self.add_sum("crossings", (self.grid.voxels if occlusion else 0,), torch.int64)
+        if occlusion:
+            self.add_sum("crossings", (grid.voxels,), torch.int64)
 
     def _add_frame(self, frame: Frame) -> None:
         check_cloud(frame.reference, "reference")
@@ -155,19 +157,17 @@ class SMig(FrameMetric):
                 count=count,
                 count_of="boxes",
                 standard_error=own_error,
-                warning=f"falls as coverage grows, 0 without any ray: only among rigs of {rays:,} rays, too",
+                warning=FALLS,
             )
             for name, value, count, own_error in zip(
                 names, values[0].tolist(), [sum(boxes), *boxes], error.tolist(), strict=True
             )
         )
 
-    def resampled(self, weights: Tensor) -> Tensor:
-        """(R, V) the numbers if each block of worlds had come as often as it is weighted.
-
-        Args:
-            weights: (R, 16) how often.
-        """
+    def resampled(self, weights: Tensor) -> Tensor | None:
+        """As `FrameMetric.resampled`; None with occlusion, for nobody knows what was crossed in each block."""
+        if self.occlusion:
+            return None
         values = self._values(self._occupancies(), self._crossings(), weights.double().cpu().numpy())
         return torch.from_numpy(values).to(weights.device)
 
@@ -200,16 +200,15 @@ class SMig(FrameMetric):
 
 
 def unequal_rays(numbers: Mapping[str, PublishedNumber]) -> str | None:
-    """What is to be said of rigs whose numbers are compared: that one has more rays than another, or nothing.
+    """What is to be said of the numbers of several rigs: that one has more rays than another; None if none has.
 
     Args:
         numbers: Name of the rig -> its number, of one `SMig` each.
 
     Example:
-        >>> one = PublishedNumber("s_mig_0.2m", -3.0, "nats", True, {"rays": 16000}, 1, "boxes")
-        >>> two = PublishedNumber("s_mig_0.2m", -2.0, "nats", True, {"rays": 8000}, 1, "boxes")
+        >>> one, two = (PublishedNumber("s_mig_0.2m", -3.0, "nats", True, {"rays": n}, 1, "boxes") for n in (4000, 90))
         >>> unequal_rays({"one": one, "two": two})
-        's_mig_0.2m: the rigs have different numbers of rays (one 16,000, two 8,000), and fewer rays score higher'
+        's_mig_0.2m: the rigs have different numbers of rays (one 4,000, two 90), and fewer rays score higher'
         >>> unequal_rays({"one": one, "same": one})
     """
     rays = {rig: number.parameters["rays"] for rig, number in numbers.items()}

@@ -1,0 +1,222 @@
+"""S-MIG: closed forms, a slow twin, what it rewards, and what it cannot know."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover.detection import Boxes
+from torchcover.geometry import BoundingBox, VoxelGrid
+from torchcover.published import SMig
+from torchcover.published.occupancy import binary_entropy, occupancy_of, occupancy_rows
+
+from .voxel_frames import beam, boxes, frame, place3d
+
+REGION = BoundingBox((-10.0, -10.0, 0.0), (10.0, 10.0, 4.0))
+AHEAD = (5.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0)  # x from 3 to 7
+NONE = boxes()
+
+
+def s_mig(sensors, frames, **options):
+    metric = SMig(sensors, **{"voxel_m": 0.5, "region": REGION, **options})
+    metric.update(frames)
+    return metric
+
+
+def value(metric, name=":car"):
+    return next(number for number in metric.compute() if number.name.endswith(name))
+
+
+def test_entropy_of_known_probabilities():
+    assert binary_entropy(np.array([0.5, 0.1, 0.0, 1.0])) == pytest.approx([0.693147, 0.325083, 0, 0], abs=5e-7)
+
+
+def test_what_is_always_there_says_nothing_and_half_of_the_time_a_bit_a_voxel():
+    ahead = beam(z_m=1.0)
+    always, half = [frame(0, boxes(AHEAD)), frame(1, boxes(AHEAD))], [frame(0, boxes(AHEAD)), frame(1, NONE)]
+    assert value(s_mig([ahead], always)).value == 0.0
+    number = value(s_mig([ahead], half))
+    assert number.value == pytest.approx(-8 * math.log(2), rel=1e-12)  # 4 m in voxels of 0.5 m
+    assert (number.count, number.count_of, number.unit, number.higher_is_better) == (1, "boxes", "nats", True)
+    assert number.parameters["voxels_crossed"] == 20
+    assert number.parameters["entropy_captured_nats"] == -number.value
+    # The same ray again, or from four sensors, is no other voxel.
+    again = [ahead.model_copy(update={"name": name}) for name in "abcd"]
+    assert value(s_mig(again, half)).value == number.value
+
+
+def test_a_rig_without_rays_in_the_region_has_the_highest_value_of_all():
+    half = [frame(0, boxes(AHEAD)), frame(1, NONE)]
+    above = value(s_mig([beam(z_m=5.0)], half))
+    assert above.value == 0.0 > value(s_mig([beam(z_m=1.0)], half)).value
+    assert (above.parameters["voxels_crossed"], above.parameters["rays"]) == (0, 1)
+    assert "is 0 without any ray" in above.warning
+
+
+def test_rays_end_with_the_range_of_their_sensor():
+    half = [frame(0, boxes(AHEAD)), frame(1, NONE)]
+    assert value(s_mig([beam(z_m=1.0, range_m=4.0)], half)).value == pytest.approx(-2 * math.log(2))
+
+
+def test_categories_have_numbers_of_their_own_and_those_that_never_come_have_none():
+    person = (8.0, 0.0, 1.0, 1.0, 1.0, 2.0, 0.0)
+    both = Boxes.from_rows(torch.tensor([AHEAD, person]), categories=("car", "pedestrian"))
+    every, car, pedestrian, cyclist = s_mig([beam(z_m=1.0)], [frame(0, both), frame(1, NONE)]).compute()
+    assert [every.name, car.name] == ["s_mig_0.5m", "s_mig_0.5m:car"]
+    assert (car.value, pedestrian.value) == pytest.approx((-8 * math.log(2), -2 * math.log(2)))
+    assert every.value == pytest.approx(car.value + pedestrian.value)
+    assert (every.count, car.count, pedestrian.count) == (2, 1, 1)
+    assert math.isnan(cyclist.value)
+    assert cyclist.count == 0
+    outside = boxes((50.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0))
+    nowhere = s_mig([beam(z_m=1.0)], [frame(0, outside)]).compute()
+    assert all(math.isnan(number.value) and number.count == 0 for number in nowhere)
+
+
+def random_boxes(generator, count):
+    rows = generator.uniform((-12, -12, 0, 0.5, 0.5, 0.5, -3), (12, 12, 2, 6, 3, 3, 3), (count, 7))
+    return boxes(*rows.astype(np.float32).tolist())
+
+
+def slowly(objects, grid):
+    """(X, Y, Z) whether each centre is in any box."""
+    x, y, z = np.meshgrid(*grid.centres_m(), indexing="ij")
+    inside = np.zeros(grid.shape, dtype=bool)
+    for row in objects.rows.double().numpy():
+        dx, dy, dz = x - row[0], y - row[1], z - row[2]
+        ahead, left = dx * np.cos(row[6]) + dy * np.sin(row[6]), dy * np.cos(row[6]) - dx * np.sin(row[6])
+        inside |= (abs(ahead) < row[3] / 2) & (abs(left) < row[4] / 2) & (abs(dz) < row[5] / 2)
+    return inside
+
+
+def test_occupancy_and_its_blocks_are_those_of_a_slow_twin():
+    generator, grid = np.random.default_rng(3), VoxelGrid(REGION, 0.5)
+    frames = [frame(index, random_boxes(generator, index % 6), place=index // 2) for index in range(40)]
+    frames.append(frames[5])  # the same frame again
+    metric = s_mig([beam()], frames)
+    found = occupancy_of(metric.boxes.numpy(), 0, grid, 16)
+    counts = np.zeros((16, *grid.shape), dtype=int)
+    for one in frames:
+        counts[one.place_in_time // 2] += slowly(one.boxes, grid)  # 20 places: two in a block
+    assert np.array_equal(found.voxels, np.flatnonzero(counts.sum(axis=0)))
+    assert np.array_equal(found.counts[found.pattern].T, counts.reshape(16, -1)[:, found.voxels])
+    assert found.steps.tolist() == [4, 5, *[4] * 8, *[0] * 6]
+    assert found.probability == pytest.approx(counts.sum(axis=0).ravel()[found.voxels] / 41)
+
+
+def test_boxes_that_overlap_count_once_and_beside_each_other_share_no_voxel():
+    grid = VoxelGrid(REGION, 0.5)
+
+    def occupied(*rows):
+        table = occupancy_rows(boxes(*rows), 0, ("car",), REGION).numpy()
+        found = occupancy_of(table, 0, grid, 16)
+        assert found.counts.max() == 1
+        return len(found.voxels)
+
+    shifted = (6.0, *AHEAD[1:])
+    assert occupied(AHEAD) == 8 * 4 * 4
+    assert occupied(AHEAD, AHEAD) == 8 * 4 * 4
+    assert occupied(AHEAD, shifted) == 10 * 4 * 4
+    # Sides on centres: each belongs to one of two neighbours, whatever float32 makes of them.
+    level = (0.25, 0.25, 0.35, 1.0, 1.0, 1.2, 0.0)
+    assert occupied(level) == 2 * 2 * 2
+    assert occupied(level, (1.25, *level[1:])) == 4 * 2 * 2
+
+
+def test_a_box_that_leaves_the_region_counts_as_far_as_it_is_within():
+    over = (10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0)  # x from 8 to 12
+    number = value(s_mig([beam(z_m=1.0)], [frame(0, boxes(over)), frame(1, NONE)]))
+    assert number.value == pytest.approx(-4 * math.log(2))
+
+
+def test_errors_over_worlds_are_the_jackknife_by_hand_and_none_below_eight():
+    generator = np.random.default_rng(1)
+    sensors = [beam(z_m=1.0, columns=40), beam("low", z_m=0.3, columns=40)]
+    frames = [frame(index, random_boxes(generator, 4)) for index in range(16)]
+    whole = s_mig(sensors, frames)
+    left_out = [value(s_mig(sensors, frames[:drop] + frames[drop + 1 :])).value for drop in range(16)]
+    expected = math.sqrt(15 / 16 * sum((one - np.mean(left_out)) ** 2 for one in left_out))
+    assert value(whole).standard_error == pytest.approx(expected, rel=1e-9)
+    weights = 1.0 - torch.eye(16)
+    assert whole.resampled(weights)[:, 1].tolist() == pytest.approx(left_out)
+    assert whole.resampled(torch.zeros(1, 16)).isnan().all()
+    assert math.isnan(value(s_mig(sensors, frames[:7])).standard_error)
+
+
+def test_with_occlusion_rays_end_at_what_was_measured_and_without_points_nowhere():
+    before = torch.tensor([[5.0, 0.0, 1.25]])
+    clouds = {"beam": before}
+    frames = [frame(0, boxes(AHEAD), clouds=clouds), frame(1, NONE)]
+    number = value(s_mig([beam(z_m=1.25)], frames, occlusion=True))
+    # From 3 to 5 m, in one of two frames.
+    assert number.name == "s_mig_occluded_0.5m:car"
+    assert number.value == pytest.approx(-4 * math.log(2) / 2)
+    assert math.isnan(number.standard_error)
+    assert s_mig([beam(z_m=1.25)], frames, occlusion=True).resampled(torch.ones(1, 16)) is None
+
+
+def test_with_occlusion_it_is_the_mean_over_frames_of_the_entropy_on_their_way():
+    generator = np.random.default_rng(2)
+    sensors = [beam("a", z_m=1.0), beam("b", z_m=2.0, x_m=-1.0)]
+    frames = [
+        frame(
+            index,
+            random_boxes(generator, 3),
+            clouds={
+                name: torch.from_numpy(generator.uniform(-9, 9, (50, 3)) * (1, 1, 0.2) + (0, 0, 2)).float()
+                for name in "ab"
+            },
+        )
+        for index in range(4)
+    ]
+    together = value(s_mig(sensors, frames, occlusion=True)).value
+    each = [replace(one, clouds={"rig": one.clouds["rig"][:0]}, sensor_points={"rig": {}}) for one in frames]
+    alone = [
+        value(s_mig(sensors, [*each[:index], frames[index], *each[index + 1 :]], occlusion=True)).value
+        for index in range(4)
+    ]
+    assert together == pytest.approx(sum(alone))
+
+
+def test_finer_voxels_make_it_larger_about_as_their_number_grows():
+    half = [frame(0, boxes(AHEAD)), frame(1, NONE)]
+    coarse, fine = (value(s_mig([beam(z_m=1.0)], half, voxel_m=voxel_m)) for voxel_m in (0.5, 0.1))
+    assert fine.value == pytest.approx(5 * coarse.value)
+    assert fine.name == "s_mig_0.1m:car"
+
+
+def test_the_published_rig_crosses_as_many_voxels_as_were_counted_before():
+    number = value(
+        s_mig(place3d("center"), [frame(0, boxes(AHEAD))], voxel_m=1.0, region=SMig(place3d("line")).grid.region)
+    )
+    assert number.parameters["voxels_crossed"] == 9564
+    assert number.parameters["rays"] == 16_000
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"sensors": ()}, "sensors: the sensors of the rig, with their mounts and rays, are needed; got none"),
+        ({"categories": ()}, "categories: one or more different ones"),
+        ({"categories": ("car", "car")}, "categories: one or more different ones"),
+        ({"voxel_m": 0.3}, "is not a multiple of the voxel"),
+        ({"voxel_m": 30.0}, "is not a multiple of the voxel"),
+        ({"voxel_m": 0.0005}, r"voxels of 0.0005 m in 20 x 20 x 4 m: .* GB .*; take larger voxels"),
+    ],
+)
+def test_parameters_that_cannot_be_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        SMig(**{"sensors": [beam()], "voxel_m": 0.5, "region": REGION, **options})
+
+
+def test_frames_that_cannot_say_it_are_refused_and_add_nothing():
+    metric = s_mig([beam()], [frame(0, NONE)], occlusion=True)
+    without = frame(1, None)
+    nobody = replace(frame(1, NONE), sensor_points=None)
+    other = frame(1, NONE, clouds={"rear": torch.ones(1, 3)})
+    for given, message in ((without, "has no boxes"), (nobody, "nobody knows which points"), (other, "sensor 'rear'")):
+        with pytest.raises(ValueError, match=message):
+            metric.update(given)
+    assert (int(metric.steps), len(metric.boxes), int(metric.crossings.sum())) == (1, 1, 0)
