@@ -22,7 +22,7 @@ RIGS = {
 }  # fmt: skip
 # Those that walk through voxels are apart.
 FRAME_METRICS = ("object_coverage", "perception_entropy", "k_cover", "point_density", "false_visible")
-STEPS = 8
+STEPS = 4
 # The sums of eight rigs over cells of 0.25 m take 3 GB.
 CELL_M = 0.5
 

@@ -288,7 +288,6 @@ CASES = {
         {
             "grid": OTHER_GRID,
             "regions": {"regions": (Region("near", (0.0, 2.0), (0.0, 4.0)),)},
-            "cell_m": {"cell_m": 0.5},
         },
     ),
     "false visible": of_frames(

@@ -12,6 +12,9 @@ from torchcover.neighbors import check_tensor
 
 # A body's points lie on its box as often as in it; rounding of coordinates may put them on either side.
 SKIN_M = 0.01
+# Points are first looked for in cells of this size; of more cells nobody makes a map.
+CELL_M = 1.0
+MAX_CELLS = 1_000_000
 
 
 class Inside(NamedTuple):
@@ -49,20 +52,41 @@ def points_in_boxes(points: Tensor, boxes: Boxes, *, skin_m: float = SKIN_M) -> 
         none = torch.empty(0, dtype=torch.int64, device=points.device)
         return Inside(none, none)
     points = points.detach().to(torch.promote_types(points.dtype, torch.float32))
-    # Sorted by x, the points that a box can hold are next to each other.
-    x_m, order = points[:, 0].contiguous().sort()
-    y_m = points[order, 1]
     reach_m = torch.linalg.vector_norm(boxes.size_m[:, :2].double(), dim=1) / 2 + 2 * skin_m + SKIN_M
-    first = torch.searchsorted(x_m, (boxes.centre_m[:, 0].double() - reach_m).to(x_m.dtype)).tolist()
-    end = torch.searchsorted(x_m, (boxes.centre_m[:, 0].double() + reach_m).to(x_m.dtype)).tolist()
-    near = []
-    for start, stop, centre_y_m, reach in zip(first, end, boxes.centre_m[:, 1].tolist(), reach_m.tolist(), strict=True):
-        near.append(order[start:stop][(y_m[start:stop] - centre_y_m).abs() < reach])
-    point = torch.cat(near)
-    counts = torch.tensor([len(some) for some in near], device=point.device)
-    box = torch.arange(len(boxes), device=point.device).repeat_interleave(counts)
+    near = _near_any(points, boxes, reach_m)
+    # Sorted by x, the points that a box can hold are next to each other.
+    x_m, order = points[near, 0].sort()
+    first = torch.searchsorted(x_m, (boxes.centre_m[:, 0].double() - reach_m).to(x_m.dtype))
+    end = torch.searchsorted(x_m, (boxes.centre_m[:, 0].double() + reach_m).to(x_m.dtype))
+    counts = (end - first).clamp(min=0)
+    box = torch.arange(len(boxes), device=points.device).repeat_interleave(counts)
+    place = torch.arange(len(box), device=points.device) - (counts.cumsum(0) - counts - first)[box]
+    point = near[order[place]]
+    beside = (points[point, 1] - boxes.centre_m[box, 1]).abs() < reach_m[box]
+    box, point = box[beside], point[beside]
     inside = _is_inside(points[point], boxes.rows[box], skin_m)
     return Inside(box[inside], point[inside])
+
+
+def _near_any(points: Tensor, boxes: Boxes, reach_m: Tensor) -> Tensor:
+    """(n,) numbers of the points that share a cell, seen from above, with what any box can reach: most are far away."""
+    centre_m = boxes.centre_m[:, :2].double()
+    lower_m, upper_m = centre_m - reach_m[:, None], centre_m + reach_m[:, None]
+    corner_m = lower_m.amin(dim=0)
+    first, last = (((bound - corner_m) / CELL_M).floor().long() for bound in (lower_m, upper_m))
+    rows, columns = (last.amax(dim=0) + 3).tolist()  # with a border for all that is beyond
+    if rows * columns > MAX_CELLS:
+        return torch.arange(len(points), device=points.device)
+    offset = torch.arange(int((last - first).amax()) + 1, device=points.device)
+    row, column = (first[:, axis, None] + offset for axis in range(2))
+    reached = (row <= last[:, 0, None])[:, :, None] & (column <= last[:, 1, None])[:, None]
+    marked = torch.zeros(rows * columns, dtype=torch.bool, device=points.device)
+    marked[((row + 1)[:, :, None] * columns + (column + 1)[:, None])[reached]] = True
+    x, y = (
+        ((points[:, axis].double() - corner_m[axis]) / CELL_M + 1).clamp_(0, most - 1).nan_to_num_(0.0).long()
+        for axis, most in enumerate((rows, columns))
+    )
+    return marked.index_select(0, x * columns + y).nonzero().squeeze(1)
 
 
 def _is_inside(points: Tensor, rows: Tensor, skin_m: float) -> Tensor:

@@ -2,7 +2,7 @@
 
 import logging
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from importlib import import_module
 
@@ -73,6 +73,27 @@ def choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
         ) from error
 
 
+def backend_of_several(query: Tensor, clouds: Sequence[Tensor]) -> str:
+    """The backend for the same queries in several clouds, one after the other: what pays for all of them together.
+
+    Args:
+        query: (N, 3) coordinates.
+        clouds: (M, 3) coordinates each, of the same type and device.
+
+    Returns:
+        What `nearest` takes as `backend`.
+    """
+    together = len(query) * len(clouds) + sum(map(len, clouds))
+    return "packets" if query.device.type == "cpu" and _packets_pay(query, together) else "auto"
+
+
+def _packets_pay(query: Tensor, together: int) -> bool:
+    # Packets are for float32, and where there are few queries, most of the time goes into sorting the points.
+    if query.dtype == torch.float64 or together < PACKETS_PAY:
+        return False
+    return _works("packets", query.device, "the KD-tree searches")
+
+
 def _search_of(backend: str) -> Search:
     search: Search = import_module(BACKENDS[backend]).search
     return search
@@ -81,14 +102,7 @@ def _search_of(backend: str) -> Search:
 def _on_the_cpu(query: Tensor, points: Tensor) -> Search:
     if len(query) <= MAX_QUERIES_COMPARED and len(points) >= MANY_POINTS:
         return _search_of("cdist")
-    # Packets are for float32, and where there are few queries, most of the time goes into sorting the points.
-    if (
-        query.dtype != torch.float64
-        and len(query) + len(points) >= PACKETS_PAY
-        and _works("packets", query.device, "the KD-tree searches")
-    ):
-        return _search_of("packets")
-    return _search_of("kdtree")
+    return _search_of("packets" if _packets_pay(query, len(query) + len(points)) else "kdtree")
 
 
 def _on_a_device(query: Tensor, points: Tensor) -> Search:

@@ -8,9 +8,13 @@ from torchcover.published.k_cover import KCover
 from torchcover.published.m_sog import MSog
 from torchcover.published.object_coverage import ObjectCoverage
 from torchcover.published.perception_entropy import PerceptionEntropy
+from torchcover.published.places import coarse_grid
 from torchcover.published.point_density import PointDensity
 from torchcover.published.s_mig import SMig
 from torchcover.published.setup import Published, Setup
+
+# Of smaller cells most are empty whatever the rig.
+UNIFORMITY_CELL_M = 1.0
 
 
 def _object_coverage(setup: Setup) -> ObjectCoverage:
@@ -26,7 +30,11 @@ def _k_cover(setup: Setup) -> KCover:
 
 
 def _point_density(setup: Setup) -> PointDensity:
-    return PointDensity(setup.grid, setup.regions, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
+    # A region that is smaller than a cell of 1 m needs the cells of the run.
+    coarse = coarse_grid(setup.grid, UNIFORMITY_CELL_M)
+    fits = all(region.mask(coarse).any() for region in setup.regions)
+    grid = coarse if fits else setup.grid
+    return PointDensity(grid, setup.regions, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
 
 
 def _false_visible(setup: Setup) -> FalseVisible:

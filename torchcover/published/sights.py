@@ -12,6 +12,7 @@ from torchcover.data import Frame
 from torchcover.detection import Boxes, points_in_boxes
 from torchcover.detection.inside import Inside
 from torchcover.neighbors import check_cloud, nearest
+from torchcover.neighbors.choice import backend_of_several
 
 Found = TypeVar("Found")
 
@@ -58,13 +59,13 @@ class Sights:
         Raises:
             ValueError: Nobody knows which points are of which sensor.
         """
-        return self.once(
-            frame,
-            ("sensors", rig, within_m),
-            lambda: torch.stack(
-                [_search(frame, cloud, within_m) for cloud in frame.clouds_by_sensor(rig).values()],
-            ),
-        )
+
+        def search() -> Tensor:
+            clouds = list(frame.clouds_by_sensor(rig).values())
+            backend = backend_of_several(frame.reference, clouds)
+            return torch.stack([_search(frame, cloud, within_m, backend) for cloud in clouds])
+
+        return self.once(frame, ("sensors", rig, within_m), search)
 
     def boxes(self, frame: Frame) -> Boxes:
         """The objects of the frame.
@@ -126,7 +127,7 @@ def count_in_boxes(cloud: Tensor, boxes: Boxes) -> Tensor:
     return torch.bincount(points_in_boxes(cloud, boxes).box, minlength=len(boxes))
 
 
-def _search(frame: Frame, cloud: Tensor, within_m: float) -> Tensor:
+def _search(frame: Frame, cloud: Tensor, within_m: float, backend: str = "auto") -> Tensor:
     check_cloud(frame.reference, "reference")
     check_cloud(cloud, "sensor")
-    return nearest(frame.reference, cloud, max_distance=within_m).distance
+    return nearest(frame.reference, cloud, max_distance=within_m, backend=backend).distance

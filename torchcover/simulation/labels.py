@@ -41,18 +41,19 @@ def labels(world: World, step: int, within_m: float) -> list[Label]:
     time_s = step * world.time_step_s
     world_T_vehicle = world.ego.trajectory.at(time_s)
     vehicle_T_world = invert(world_T_vehicle)
-    found = []
+    found, box_of = [], dict[int, BoundingBox]()  # actors of one kind share a mesh
     for number, actor in enumerate(world.objects):
         position_m = actor.trajectory.positions_at(np.array([time_s]))[0]
         # Not near, too, if absent: NaN.
         if np.hypot(*(position_m - world_T_vehicle[:3, 3])[:2]) <= within_m:
-            found.append(_label(number, actor, vehicle_T_world, time_s))
+            if id(actor.mesh) not in box_of:
+                box_of[id(actor.mesh)] = BoundingBox.around(actor.mesh.vertices_m)
+            found.append(_label(number, actor, box_of[id(actor.mesh)], vehicle_T_world, time_s))
     return found
 
 
-def _label(number: int, actor: Actor, vehicle_T_world: Matrix, time_s: float) -> Label:
+def _label(number: int, actor: Actor, box: BoundingBox, vehicle_T_world: Matrix, time_s: float) -> Label:
     vehicle_T_actor = vehicle_T_world @ actor.trajectory.at(time_s)
-    box = BoundingBox.around(actor.mesh.vertices_m)
     middle_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
     return Label(
         number,

@@ -101,6 +101,8 @@ class Trajectory:
         """(T, 3) positions at (T,) times; NaN where the body is not there."""
         if np.array_equal(times_s, self.times_s[: len(times_s)]):
             return self.positions_m[: len(times_s)]
+        if len(self.times_s) == 1 and not self.transient:
+            return np.repeat(self.positions_m, len(times_s), axis=0)
         outside = np.nan if self.transient else None
         tracks = [np.interp(times_s, self.times_s, axis, outside, outside) for axis in self.positions_m.T]
         return np.stack(tracks, axis=1)

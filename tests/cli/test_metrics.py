@@ -1,0 +1,122 @@
+"""`--metrics`: metrics of others beside the coverage."""
+
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from torchcover import Coverage
+from torchcover.evaluation import compare
+
+
+def run(torchcover, worlds, *rigs, command="compare", options=(), out="out", steps=2):
+    arguments = ["--scenario", worlds / "yard.yaml", "--steps", steps, "--cell", 4, "--threshold", 2, "--rays", 4096]
+    paths = [worlds / f"{rig}.yaml" for rig in rigs]
+    folder = worlds / out
+    return *torchcover(command, *paths, *arguments, "--out", folder, *options), folder
+
+
+def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
+    code, printed, error, out = run(torchcover, worlds, "low", "both", "other/low", options=["--metrics", "all"])
+    assert (code, error.count("warning")) == (0, 0)
+    assert "None of these metrics is validated" in printed
+    summary = json.loads((out / "summary.json").read_text())
+    numbers = {(row["rig"], row["name"]): row for row in summary["metrics"]["numbers"]}
+    assert numbers["both", "points"]["rank"] == 1.0
+    assert numbers["both", "k_cover_1_2m"]["value"] >= numbers["low", "k_cover_1_2m"]["value"]
+    assert numbers["low", "object_coverage_2m:bus"]["value"] is None
+    with (out / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(summary["metrics"]["numbers"])
+    assert {row["rig"] for row in rows} == {"low", "both", "low_2"}
+    with (out / "metrics_tau.csv").open() as file:
+        taus = list(csv.DictReader(file))
+    assert len(taus) == len(summary["metrics"]["tau"]) > 50
+    assert all(tau["low"] == "" for tau in taus)  # two instants are too few to draw again
+    assert {"metrics.csv", "metrics_tau.csv"} <= set(summary["files"])
+    page = (out / "report.html").read_text()
+    assert "Metrics of others" in page
+    assert "tau-b" in page
+
+
+def test_two_rigs_have_no_tau_and_are_told_why(torchcover, worlds):
+    _, printed, _, out = run(torchcover, worlds, "low", "both", options=["--metrics", "point_density"])
+    assert "needs three rigs or more" in " ".join(printed.split())
+    assert json.loads((out / "summary.json").read_text())["metrics"]["tau"] == []
+
+
+def test_one_rig_has_its_numbers_and_its_coverage_is_what_it_is_without(torchcover, worlds):
+    code, printed, _, out = run(torchcover, worlds, "both", command="evaluate", options=["--metrics", "k_cover"])
+    assert code == 0
+    assert "k_cover_2_2m" in printed
+    *_, plain = run(torchcover, worlds, "both", command="evaluate", out="plain")
+    with_metrics, without = (Coverage.load(folder / "coverage.npz") for folder in (out, plain))
+    np.testing.assert_array_equal(with_metrics.radius, without.radius)
+    np.testing.assert_array_equal(with_metrics.points, without.points)
+
+
+def test_a_name_that_is_none_is_told_with_those_that_are(torchcover, worlds):
+    code, _, error, _ = run(torchcover, worlds, "low", "both", options=["--metrics", "nosuch"])
+    assert code == 2
+    assert error.count("\n") == 1
+    assert "k_cover" in error
+    assert "'nosuch'" in error
+
+
+def test_a_run_goes_on_from_its_checkpoint_with_its_metrics(torchcover, worlds):
+    options = ["--metrics", "all"]
+    run(torchcover, worlds, "low", "both", options=options, steps=1)
+    code, *_, out = run(torchcover, worlds, "low", "both", options=[*options, "--resume"], steps=3)
+    *_, whole = run(torchcover, worlds, "low", "both", options=options, steps=3, out="whole")
+    assert code == 0
+    assert (out / "metrics.csv").read_text() == (whole / "metrics.csv").read_text()
+
+
+def test_a_recording_without_boxes_has_the_metrics_that_need_none(torchcover, worlds):
+    torchcover(
+        "record", worlds / "both.yaml", "--out", worlds / "drive", "--scenario", worlds / "yard.yaml", "--steps", 2
+    )
+    shutil.rmtree(worlds / "drive" / "boxes")
+    code, printed, error = torchcover(
+        "evaluate", "--frames", worlds / "drive", "--metrics", "all", "--cell", 4, "--out", worlds / "of_drive"
+    )
+    assert code == 0, error
+    assert "point_density" in printed
+    assert "Without false_visible" in " ".join(printed.split())
+
+
+def test_taus_have_intervals_over_worlds_that_are_drawn_the_same_again(worlds):
+    def taus():
+        result = compare(
+            [worlds / f"{rig}.yaml" for rig in ("low", "both", "other/low")],
+            worlds / "yard.yaml",
+            steps=9,
+            cell_m=4.0,
+            thresholds=2.0,
+            rays=2048,
+            metrics="k_cover",
+        )
+        return [tau for tau in result.metrics.taus() if tau.first == "k_cover_1_2m"]
+
+    first = taus()
+    known = [tau for tau in first if not np.isnan(tau.low)]
+    assert known
+    for tau in known:
+        assert -1 <= tau.low <= tau.high <= 1
+    assert repr(taus()) == repr(first)
+
+
+@pytest.mark.parametrize("metrics", ["", ()])
+def test_nothing_is_asked_for_with_nothing(worlds, metrics):
+    result = compare(
+        [worlds / "low.yaml", worlds / "both.yaml"],
+        worlds / "yard.yaml",
+        steps=1,
+        cell_m=4.0,
+        rays=1024,
+        metrics=metrics,
+    )
+    assert result.metrics is None
+    assert "metrics" not in result.record

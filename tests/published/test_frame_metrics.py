@@ -1,0 +1,349 @@
+"""Metrics of others over frames: closed forms, slow twins, what does not matter, and bad frames."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from tests.metrics.cases import CASES
+from torchcover import BevGrid, Region
+from torchcover.published import (
+    PUBLISHED,
+    FalseVisible,
+    KCover,
+    ObjectCoverage,
+    PerceptionEntropy,
+    PointDensity,
+    Setup,
+    Sights,
+    field_of_view,
+    metric_names,
+)
+from torchcover.published.perception_entropy import entropy, late_fusion, standard_deviation
+from torchcover.simulation import CameraSensor, Lidar, Pose
+from torchcover.simulation.shapes import Box
+
+from .frames import frame_of, values
+
+OF_FRAMES = ("object coverage", "perception entropy", "k-cover", "point density", "false visible")
+EVERY = pytest.mark.parametrize("case", [CASES[name] for name in OF_FRAMES], ids=OF_FRAMES)
+GRID = BevGrid(x=(0.0, 8.0), y=(0.0, 4.0), cell=1.0, heights={"low": (-0.5, 0.5), "high": (0.5, 2.0)})
+CAR = [10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]
+
+
+# Closed forms.
+
+
+@pytest.mark.parametrize(
+    ("points", "nats"),
+    [(0, 16.651387), (1, 1.520195), (5, -1.638678), (9, -7.065483), (10, -10.975632), (100, -10.975632)],
+)
+def test_the_entropy_of_points_of_a_lidar(points, nats):
+    assert float(entropy(standard_deviation(torch.tensor(points), "lidar"))) == pytest.approx(nats, abs=1e-6)
+    box = replace(frame_of([], boxes=[CAR]).boxes, hits={"rig": torch.tensor([points])})
+    metric = PerceptionEntropy()
+    metric.update(replace(frame_of([]), boxes=box))
+    assert values(metric)["perception_entropy"] == pytest.approx(nats, abs=1e-6)
+
+
+@pytest.mark.parametrize(("pixels", "nats"), [(1, 6.229700), (1000, 2.558009), (100_000, 0.209528)])
+def test_the_entropy_of_pixels_of_a_camera(pixels, nats):
+    assert float(entropy(standard_deviation(torch.tensor(pixels), "camera"))) == pytest.approx(nats, abs=1e-6)
+
+
+def test_late_fusion_is_sharper_than_the_sharpest():
+    sigmas = standard_deviation(torch.tensor(5), "lidar"), standard_deviation(torch.tensor(1000), "camera")
+    assert float(late_fusion(sigmas)) == pytest.approx(0.105849, abs=1e-6)
+    assert float(entropy(late_fusion(sigmas))) == pytest.approx(-1.653611, abs=1e-6)
+    assert late_fusion(sigmas) < min(sigmas)
+
+
+def test_the_bounded_form_never_leaves_its_bound_and_has_the_same_order():
+    sigma = standard_deviation(torch.arange(0, 50), "lidar")
+    plain, bounded = entropy(sigma), entropy(sigma, bounded=True)
+    assert (bounded > math.log(2 * math.pi)).all()
+    assert ((plain.diff() < 0) == (bounded.diff() < 0)).all()
+
+
+def test_points_of_cameras_and_of_lidars_of_a_rig_are_told_apart():
+    camera = CameraSensor(name="eye", width=8, height=8, fov_deg=90, max_range_m=50)
+    lidar = Lidar(name="roof", channels=2, vertical_fov_deg=(-9, 0), columns=8, horizontal_fov_deg=90, max_range_m=50)
+    inside = [[10.0, 0.0, 1.0]] * 8
+    frame = frame_of(inside, boxes=[CAR], sensors={"eye": 3, "roof": 5})
+    metric = PerceptionEntropy((camera, lidar))
+    metric.update(frame)
+    kinds = standard_deviation(torch.tensor(3), "camera"), standard_deviation(torch.tensor(5), "lidar")
+    assert values(metric)["perception_entropy"] == pytest.approx(float(entropy(late_fusion(kinds))), abs=1e-12)
+    alone = PerceptionEntropy((camera,))
+    alone.update(frame_of(inside, boxes=[CAR], sensors={"eye": 8}))
+    only = standard_deviation(torch.tensor(8), "camera")
+    assert values(alone)["perception_entropy"] == pytest.approx(float(entropy(only)), abs=1e-12)
+
+
+def test_the_share_of_an_object_weighs_square_metres():
+    reference = [[8.0, 0.0, 0.5], [8.0, 0.0, 1.5], [30.0, 0.0, 0.0]]
+    metric = ObjectCoverage(categories=("car", "bus"))
+    metric.update(frame_of([[8.0, 0.0, 0.6]], reference, [CAR], ["car"], weights=[1.0, 3.0, 50.0]))
+    found = values(metric)
+    assert (
+        found["object_coverage_0.4m"]
+        == found["object_coverage_0.4m:car"]
+        == found["object_coverage_0.4m:0-20m"]
+        == 0.25
+    )
+    assert math.isnan(found["object_coverage_0.4m:bus"])
+    assert {number.count for number in metric.compute() if not number.known} == {0}
+
+
+def test_an_object_that_nobody_can_see_counts_for_hits_only_and_a_far_one_for_nothing():
+    hidden, far = [20.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0], [90.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]
+    metric = ObjectCoverage()
+    metric.update(frame_of([[8.0, 0.0, 0.5]], [[8.0, 0.0, 0.5], [88.0, 0.0, 0.5]], [CAR, hidden, far]))
+    numbers = {number.name: number for number in metric.compute()}
+    assert (numbers["object_coverage_0.4m"].value, numbers["object_coverage_0.4m"].count) == (1.0, 1)
+    assert (numbers["objects_hit_1"].value, numbers["objects_hit_1"].count) == (0.5, 2)
+
+
+def test_uniformity_is_one_of_even_points_and_one_over_the_cells_of_a_heap():
+    even = [[x + 0.5, y + 0.5, 0.0] for x in range(8) for y in range(4)]
+    for cloud, uniformity in ((even, 1.0), ([[0.5, 0.5, 0.0]] * 7, 1 / 32)):
+        metric = PointDensity(GRID, [Region("near", (0.0, 2.0), (0.0, 4.0))])
+        metric.update(frame_of(cloud))
+        found = values(metric)
+        assert found["point_uniformity_1m"] == pytest.approx(uniformity, abs=1e-15)
+        assert found["point_density"] == pytest.approx(len(cloud) / 32)
+        assert found["points"] == len(cloud)
+
+
+def test_a_cloud_without_points_has_density_0_and_no_uniformity():
+    metric = PointDensity(GRID, ())
+    metric.update(frame_of([]))
+    found = values(metric)
+    assert (found["points"], found["point_density"]) == (0.0, 0.0)
+    assert math.isnan(found["point_uniformity_1m"])
+
+
+# The field of view, and what is false in it.
+
+
+def lidar(**changes):
+    usual = {"name": "a", "mount": Pose(x_m=0.0, z_m=1.0), "channels": 1, "vertical_fov_deg": (-45, -45), "columns": 1}
+    return Lidar(**{**usual, "horizontal_fov_deg": 0.001, "max_range_m": 50, **changes})
+
+
+def test_a_ray_crosses_the_cells_down_to_the_ground():
+    grid = BevGrid(x=(-1.0, 5.0), y=(-1.0, 1.0), cell=0.25, heights={"low": (-0.1, 0.5), "high": (0.5, 2.0)})
+    seen = field_of_view([lidar(mount=Pose(x_m=0.05, y_m=0.1, z_m=1.0))], grid)
+    low, high = (set((grid.x_centres_m[band.nonzero()[:, 1]]).tolist()) for band in seen)
+    assert low == {0.625, 0.875, 1.125}  # below 0.5 m from x = 0.55 on, and on the ground at 1.05
+    assert high == {0.125, 0.375, 0.625}
+    assert {int(row) for row in seen.nonzero()[:, 1]} == {4}
+
+
+def test_what_points_at_the_vehicle_sees_nothing_and_range_ends_a_ray():
+    grid = BevGrid(x=(0.0, 8.0), y=(-1.0, 1.0), cell=0.5)
+    bonnet = Box(type="box", size_m=(1.0, 2.0, 0.8)).mesh()
+    assert not field_of_view([lidar(mount=Pose(x_m=0.0, z_m=1.0))], grid, bonnet).any()
+    flat = lidar(vertical_fov_deg=(0.0, 0.0), max_range_m=3.2)
+    assert field_of_view([flat], grid)[1].any(dim=0).nonzero().squeeze(1).tolist() == list(range(7))
+    blind = lidar(vertical_fov_deg=(0.0, 0.0), max_range_m=3.2, min_range_m=2.0)
+    assert field_of_view([blind], grid)[1].any(dim=0).nonzero().squeeze(1).tolist() == [4, 5, 6]
+
+
+def test_false_visible_is_a_share_of_what_is_not_seen():
+    sensors = [lidar(vertical_fov_deg=(0.0, 0.0), mount=Pose(x_m=0.0, y_m=0.5, z_m=1.0), max_range_m=5.0)]
+    grid = BevGrid(x=(0.0, 8.0), y=(0.0, 1.0), cell=1.0, heights={"high": (0.5, 2.0)})
+    metric = FalseVisible(sensors, None, grid)
+    # Seen: 0. Not seen: 1 to 3 and 7, the first three of which the ray crosses. Nobody asked about the others.
+    reference = [[x + 0.5, 0.5, 1.0] for x in (0, 1, 2, 3, 7)] + [[0.5, 0.9, 1.9]]
+    metric.update(frame_of([[0.5, 0.5, 1.1]], reference))
+    (number,) = metric.compute()
+    assert (number.value, number.count) == (0.75, 4)
+
+
+def test_a_rig_that_sees_all_has_no_false_visible_number():
+    metric = FalseVisible([lidar()], None, GRID)
+    metric.update(frame_of([[0.5, 0.5, 0.0]], [[0.5, 0.5, 0.0]]))
+    assert [number.known for number in metric.compute()] == [False, False]
+
+
+# Slow twins.
+
+
+def test_k_cover_is_what_a_loop_over_points_and_sensors_finds():
+    generator = np.random.default_rng(0)
+    cloud, reference = (
+        generator.uniform((0, 0, 0), (8, 4, 2), (60, 3)),
+        generator.uniform((0, 0, 0), (8, 4, 1.9), (80, 3)),
+    )
+    weights = generator.uniform(0.1, 2.0, 80)
+    sensors = {"a": 20, "b": 15, "c": 25}
+    near = Region("near", (0.0, 4.0), (0.0, 2.0))
+    metric = KCover(GRID, [near], 0.9)
+    metric.update(frame_of(cloud.tolist(), reference.tolist(), weights=weights.tolist(), sensors=sensors))
+    found = values(metric)
+    parts = np.split(cloud.astype(np.float32), np.cumsum(list(sensors.values()))[:-1])
+    for k in (1, 2, 3):
+        for name, chosen in (
+            ("", lambda q: True),
+            (":near_low", lambda q: q[0] < 4 and q[1] < 2 and q[2] < 0.5),
+            (":near_high", lambda q: q[0] < 4 and q[1] < 2 and q[2] >= 0.5),
+        ):
+            above = below = 0.0
+            for q, weight in zip(reference.astype(np.float32), weights, strict=True):
+                if chosen(q):
+                    seeing = sum((np.linalg.norm(part - q, axis=1) <= 0.9).any() for part in parts)
+                    above, below = above + weight * (seeing >= k), below + weight
+            assert found[f"k_cover_{k}_0.9m{name}"] == pytest.approx(above / below, rel=1e-6)
+
+
+def test_k_cover_falls_with_k_and_one_sensor_covers_nothing_twice():
+    case = CASES["k-cover"]
+    found = values(case.over(case.steps))
+    assert found["k_cover_1_0.4m"] >= found["k_cover_2_0.4m"] >= found["k_cover_3_0.4m"] == 0.0
+
+
+def test_errors_are_those_of_a_mean_over_worlds():
+    metric = PointDensity(GRID, ())
+    counts = [3, 8, 1, 4, 4, 9, 2, 6, 5, 7]
+    for index, count in enumerate(counts):
+        metric.update(frame_of([[0.5, 0.5, 0.0]] * count, index=index))
+    number = metric.compute()[0]
+    assert number.value == pytest.approx(np.mean(counts))
+    assert number.standard_error == pytest.approx(np.std(counts, ddof=1) / len(counts) ** 0.5)
+
+
+def test_frames_of_one_world_are_no_more_worlds():
+    metric = PointDensity(GRID, ())
+    for index in range(40):
+        metric.update(frame_of([[0.5, 0.5, 0.0]] * (index % 5), index=index, instant=index // 6))
+    assert all(math.isnan(number.standard_error) for number in metric.compute())  # 7 of them
+
+
+def test_what_a_draw_of_worlds_gives_is_what_the_metric_gives_over_them():
+    case = CASES["object coverage"]
+    metric = case.over(case.steps)
+    at = {step["frame"].place_in_time // int(metric.block_length): step for step in case.steps}
+    weights = torch.zeros(1, 16)
+    for block, times in ((0, 2), (3, 1)):
+        weights[0, block] = times
+    drawn = case.over([at[0], at[0], at[3]])
+    torch.testing.assert_close(
+        metric.resampled(weights)[0], torch.tensor([one.value for one in drawn.compute()]).double(), equal_nan=True
+    )
+
+
+# What does not matter, and what is unknown.
+
+
+@EVERY
+def test_the_order_of_points_boxes_and_frames_does_not_matter(case):
+    def shuffled(step):
+        frame = step["frame"]
+        generator = torch.Generator().manual_seed(7)
+        order = torch.randperm(len(frame.reference), generator=generator)
+        parts = torch.split(frame.sensor, list(frame.sensor_points["rig"].values()))
+        cloud = torch.cat([part[torch.randperm(len(part), generator=generator)] for part in parts])
+        return {
+            "frame": replace(
+                frame,
+                clouds={"rig": cloud},
+                reference=frame.reference[order],
+                reference_weights=frame.reference_weights[order],
+                boxes=frame.boxes.select(torch.randperm(len(frame.boxes), generator=generator)),
+            )
+        }
+
+    first, second = case.over(case.steps), case.over([shuffled(step) for step in case.steps[::-1]])
+    for one, other in zip(first.compute(), second.compute(), strict=True):
+        assert one.value == pytest.approx(other.value, rel=1e-12, nan_ok=True), one.name
+        assert one.count == other.count
+
+
+@EVERY
+def test_metrics_that_share_a_search_find_what_each_finds_alone(case):
+    sights = Sights()
+    together = {name: CASES[name].make() for name in OF_FRAMES}
+    for metric in together.values():
+        metric.sights = sights
+    sights.by_sensor = True
+    for step in case.steps:
+        for metric in together.values():
+            metric.update(**step)
+    for name in OF_FRAMES:
+        alone = CASES[name].over(case.steps)
+        for one, other in zip(together[name].compute(), alone.compute(), strict=True):
+            assert one.value == pytest.approx(other.value, abs=0, nan_ok=True)
+
+
+@EVERY
+def test_an_unknown_number_is_nan_with_a_count_of_0_and_nothing_else_is(case):
+    for metric in (case.over([case.bland]), case.over(case.steps[:1]), case.over(case.steps)):
+        for number in metric.compute():
+            assert math.isnan(number.value) == (number.count == 0), number.name
+            assert math.isnan(number.standard_error) or number.standard_error > 0
+
+
+@pytest.mark.parametrize("name", ["object coverage", "perception entropy"])
+def test_frames_without_boxes_are_refused_with_the_way_to_them(name):
+    metric = CASES[name].make()
+    with pytest.raises(ValueError, match=r"no boxes.*SimulatedFrames\(\.\.\., boxes=True\)"):
+        metric.update(replace(CASES[name].steps[0]["frame"], boxes=None))
+    assert metric.steps == 0
+
+
+def test_square_metres_that_are_missing_are_refused():
+    frame = replace(CASES["k-cover"].steps[0]["frame"], reference_weights=None, weight_kind=None)
+    with pytest.raises(ValueError, match="square metres"):
+        CASES["k-cover"].make().update(frame)
+    CASES["k-cover"].make(square_metres=False).update(frame)
+    CASES["object coverage"].make().update(frame)
+
+
+def test_sensors_that_nobody_can_tell_apart_are_refused():
+    with pytest.raises(ValueError, match="sensor_points"):
+        CASES["k-cover"].make().update(replace(CASES["k-cover"].steps[0]["frame"], sensor_points=None))
+
+
+def test_a_rig_of_which_nobody_knows_the_sensors_has_no_field_of_view():
+    with pytest.raises(ValueError, match="YAML file"):
+        FalseVisible((), None, GRID)
+
+
+def test_another_rig_is_refused():
+    with pytest.raises(ValueError, match="no rig 'other'"):
+        ObjectCoverage(rig="other").update(CASES["k-cover"].steps[0]["frame"])
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: ObjectCoverage(-1.0),
+        lambda: ObjectCoverage(math.nan),
+        lambda: ObjectCoverage(hits=(0,)),
+        lambda: ObjectCoverage(categories=("car", "car")),
+        lambda: ObjectCoverage(range_borders_m=(20.0, 10.0)),
+        lambda: KCover(GRID, (), at_least=(0,)),
+        lambda: KCover(GRID, [Region("far", (0.0, 99.0), (0.0, 1.0))]),
+        lambda: FalseVisible([lidar()], None, GRID, math.inf),
+    ],
+)
+def test_parameters_that_make_no_sense_are_refused(make):
+    with pytest.raises(ValueError, match=r"needed|once|beyond"):
+        make()
+
+
+def test_names_of_metrics():
+    assert metric_names("all") == tuple(PUBLISHED)
+    assert metric_names("k_cover, point_density,k_cover") == ("k_cover", "point_density")
+    with pytest.raises(ValueError, match="got 'nosuch'"):
+        metric_names(["nosuch"])
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_every_metric_is_made_from_a_setup(name):
+    metric = PUBLISHED[name].make(Setup(rig="rig", sensors=(lidar(),), grid=GRID, regions=()))
+    assert metric.rig == "rig"
+    assert PUBLISHED[name].words
