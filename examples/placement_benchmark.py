@@ -36,7 +36,7 @@ from torchcover import Region
 from torchcover.data import Augmentation, SimulatedFrames
 from torchcover.detection import RecallByVisibility
 from torchcover.evaluation import relation, score_placements
-from torchcover.published import Judged, agreement_of, lead
+from torchcover.published import Judged, agreement_of, lead, metric_names
 from torchcover.published.ranks import LEAST
 from torchcover.simulation import PaperReference, Rig
 
@@ -175,7 +175,7 @@ def check_same(options, path):
         path.write_text(json.dumps(settings, indent=1), encoding="utf-8")
     earlier = json.loads(path.read_text(encoding="utf-8"))
     # A training depends on none of these.
-    free = ("placements", "seeds", "steps")
+    free = ("placements", "seeds", "steps", "metrics")
     if other := [name for name in settings if earlier.get(name) != settings[name] and name not in free]:
         told = ", ".join(f"{name} {earlier.get(name)} (now {settings[name]})" for name in other)
         raise SystemExit(f"{path.parent} holds trainings with {told}; choose another --out")
@@ -239,6 +239,7 @@ def main():
     parser.add_argument("--validate", type=int, default=96, help="held-out frames, 4 from a drive")
     parser.add_argument("--epochs", type=int, default=10)
     parser.add_argument("--steps", type=int, default=96, help="steps that the metrics are measured in")
+    parser.add_argument("--metrics", default="all", help="metrics of others, as in `k_cover,point_density`")
     parser.add_argument("--seed", type=int, default=0, help="of the placements and of the traffic")
     parser.add_argument("--reduced", action="store_true", help=f"no more than a trial: {REDUCED}")
     parser.add_argument("--out", type=Path, default=Path("out/placement_benchmark"))
@@ -255,6 +256,7 @@ def main():
         rigs,
         "urban",
         region=Region("seen by the detector", X_M, Y_M),
+        metrics=metric_names(options.metrics),
         steps=options.steps,
         seed=options.seed + 2,
         every_s=WORLD_S,

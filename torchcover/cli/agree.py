@@ -23,6 +23,7 @@ def agree(
     """Rank published placements by metrics, and by the detectors that were trained on them; say what that is worth."""
     from torchcover.cli.printing import print_agreement
     from torchcover.evaluation import agree, claimed, rank_count, save_agreement
+    from torchcover.published import metric_names
 
     if rank_count() > 1:
         raise ValueError("agree: ranks do not share it; run it without torchrun, with --workers")
@@ -30,7 +31,7 @@ def agree(
         study = agree(
             paper,
             scenario,
-            metrics=None if metrics == "all" else metrics.split(","),
+            metrics=metric_names(metrics),
             steps=steps,
             seed=seed,
             every_s=every,

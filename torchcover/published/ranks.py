@@ -140,11 +140,22 @@ def strongest_by_chance(first: ArrayLike, second: ArrayLike, statistic: Statisti
         >>> float(strongest_by_chance([1, 2, 3], [1, 2, 3]).mean())             # of six orders two have 1, four 0.5
         0.666...
     """
-    shuffled = np.asarray(second, dtype=np.float64)[orders(np.size(second), seed)]
-    best = np.zeros(len(shuffled))
+    target, numbers = np.asarray(second, dtype=np.float64), orders(np.size(second), seed)
+    best = np.zeros(len(numbers))
     for one in np.atleast_2d(np.asarray(first, dtype=np.float64)):
-        best = np.fmax(best, np.abs(statistic(one, shuffled)))
+        if statistic is spearman and not np.isnan(one + target).any():
+            found = _spearman_of_orders(one, target, numbers)
+        else:
+            found = statistic(one, target[numbers])
+        best = np.fmax(best, np.abs(found))
     return best
+
+
+def _spearman_of_orders(one: Array, target: Array, numbers: NDArray[np.int64]) -> Array:
+    """(P,) what `spearman` gives for each order of the second, where all is known: ranks move with what they are of."""
+    own, other = (ranks - ranks.mean() for ranks in (midranks(one), midranks(target)))
+    spread = np.sqrt((own**2).sum() * (other**2).sum())
+    return _ratio(other[numbers] @ own, np.full(len(numbers), spread), np.broadcast_to(one, numbers.shape))
 
 
 def _signs(one: Array, other: Array) -> Array:
