@@ -1,4 +1,4 @@
-"""Which metric ranks sensor placements as a detector does: `python examples/placement_benchmark.py`.
+"""Which metric ranks sensor placements as a detector does: `python -m examples.placement_benchmark`.
 
 Two LiDARs go to random places on the SUV, always with the same rays. The small detector of `examples/train_detector.py`
 is trained on the frames of each placement, several times from different seeds, and its average precision on held-out
