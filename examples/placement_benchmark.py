@@ -185,7 +185,7 @@ def page(judged, scores, options):
     """What came of it, in Markdown."""
     text = (
         f"{len(judged.placements)} placements of {LIDARS} LiDARs ({LIDAR['channels']} rows, {LIDAR['columns']} columns "
-        f"each), {options.seeds} trainings of each on {options.train} frames in {options.epochs} epochs, average "
+        f"each), {options.seeds} training{'s' * (options.seeds > 1)} of each on {options.train} frames in {options.epochs} epochs, average "
         f"precision of cars on {options.validate} held-out frames; metrics in {options.steps} other steps. Spearman's "
         "correlation and Kendall's tau-b with the mean of the trainings, 95 % intervals from drawing placements, "
         "trainings and worlds anew (where marked *, not worlds); p of a correlation as strong, of either sign, by "
@@ -210,8 +210,9 @@ def ranks(judged, candidates):
     """The table of some placements, and what it is worth."""
     found = agreement_of(candidates, judged, placements=True)
     (height,) = (one for one in candidates if one.name == "mean mounting height")
+    ceiling = f"{judged.ceiling:.2f}" if len(judged.judges) > 1 else "an unknown amount, for there is one of each,"
     text = (
-        f"The trainings agree with each other by {judged.ceiling:.2f} on {len(judged.placements)} placements, whose "
+        f"The trainings agree with each other by {ceiling} on {len(judged.placements)} placements, whose "
         f"average precision is {judged.mean.min():.3f} to {judged.mean.max():.3f}. Of {found.looked_at} metrics the "
         f"best is `{found.best}`, p = {found.best_p:.2g} as the best of so many; one of twenty times chance alone "
         f"gives the best more than {found.by_chance:.2f}.\n\n"
