@@ -183,13 +183,14 @@ def check_same(options, path):
 
 def page(judged, scores, options):
     """What came of it, in Markdown."""
+    each = f"{options.seeds} training{'s' * (options.seeds > 1)} of each"
     text = (
         f"{len(judged.placements)} placements of {LIDARS} LiDARs ({LIDAR['channels']} rows, {LIDAR['columns']} columns "
-        f"each), {options.seeds} training{'s' * (options.seeds > 1)} of each on {options.train} frames in {options.epochs} epochs, average "
-        f"precision of cars on {options.validate} held-out frames; metrics in {options.steps} other steps. Spearman's "
-        "correlation and Kendall's tau-b with the mean of the trainings, 95 % intervals from drawing placements, "
-        "trainings and worlds anew (where marked *, not worlds); p of a correlation as strong, of either sign, by "
-        "chance; the lead is what Spearman's correlation has more than that of the mean mounting height.\n\n"
+        f"each), {each} on {options.train} frames in {options.epochs} epochs, average precision of cars on "
+        f"{options.validate} held-out frames; metrics in {options.steps} other steps. Spearman's correlation and "
+        "Kendall's tau-b with the mean of the trainings, 95 % intervals from drawing placements, trainings and worlds "
+        "anew (where marked *, not worlds); p of a correlation as strong, of either sign, by chance; the lead is what "
+        "Spearman's correlation has more than that of the mean mounting height.\n\n"
     )
     on_the_roof = [name for name in judged.placements if name.startswith("roof")]
     for words, names in (("All placements", judged.placements), ("Placements on the roof", on_the_roof)):
