@@ -23,11 +23,17 @@ from torchcover.cli.app import app
 
 ROOT = Path(__file__).parent.parent
 ROOMS = (
-    "coverage", "evaluation", "targets", "data", "simulation", "cameras", "detection", "training", "metrics",
-    "neighbors", "report", "geometry",
+    "coverage", "evaluation", "placement", "targets", "data", "simulation", "cameras", "detection", "training",
+    "metrics", "neighbors", "report", "geometry",
 )  # fmt: skip
 # Where the classes of documents are defined.
-DOCUMENTS = ("torchcover.simulation", "torchcover.data", "torchcover.targets", "torchcover.coverage")
+DOCUMENTS = (
+    "torchcover.simulation",
+    "torchcover.data",
+    "torchcover.targets",
+    "torchcover.coverage",
+    "torchcover.placement",
+)
 
 
 def on_config(config):

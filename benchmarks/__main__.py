@@ -34,6 +34,8 @@ BENCHMARKS = (
     "targets",
     "published",
     "voxels",
+    "pairing",
+    "towns",
 )
 
 

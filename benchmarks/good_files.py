@@ -17,21 +17,27 @@ from PIL import Image
 from tests.cli.hostile import CAMERA, RIG, TOWN, YARD
 from tests.data.drives import Drive
 from tests.data.layouts import LAYOUTS
+from tests.simulation.recorded.drives import OTHERS, write_argoverse2, write_commonroad, write_csv, write_nuscenes
+from tests.simulation.sumo.towns import XODR, drive, fcd, street, together, write_net
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
 from torchcover.data.recordings import kitti_files
-from torchcover.data.recordings.argoverse2 import read_feather
 from torchcover.data.recordings.carla_files import read_carla_sensors
 from torchcover.data.recordings.folder_settings import read_folder_settings
 from torchcover.data.recordings.folder_tables import PoseTable
 from torchcover.data.recordings.folder_tables import read_boxes as read_labels
-from torchcover.data.recordings.json_tables import read_table
 from torchcover.data.recordings.ros2 import Ros2
 from torchcover.data.recordings.tracklets import read_tracklets
 from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
+from torchcover.files import read_feather, read_json_table
 from torchcover.simulation import Rig, Scenario
+from torchcover.simulation.recorded.formats import format_of
 from torchcover.simulation.shapes import MeshFile
+from torchcover.simulation.sumo.floating import Window, read_floating
+from torchcover.simulation.sumo.network import read_network
+from torchcover.simulation.sumo.simulating import from_opendrive
+from torchcover.simulation.sumo.types import read_types
 from torchcover.simulation.tracks import read_boxes, read_trajectory
 
 
@@ -208,6 +214,33 @@ def scene_files():
     yield Kind("town.yaml", TOWN.encode(), Scenario.load)
 
 
+def track_files(folder):
+    """Recorded tracks, and files of SUMO."""
+    log = write_argoverse2(Path(folder) / "log", OTHERS[:3])
+    tables = write_nuscenes(Path(folder) / "tables", OTHERS[:3])
+    table = write_csv(Path(folder) / "table", OTHERS[:2])
+    for path in (*sorted(log.glob("*.feather")), *sorted(tables.glob("*.json"))):
+        others = ((other.name, other.read_bytes()) for other in path.parent.iterdir() if other != path)
+        yield Kind(path.name, path.read_bytes(), in_folder, tuple(others))
+    commonroad = write_commonroad(Path(folder) / "commonroad.xml", OTHERS[:2])
+    for path in (commonroad, table / "boxes.csv"):
+        yield Kind(f"tracks_{path.name}", path.read_bytes(), lambda path: format_of(path).read(path, None))
+    yield Kind("town.net.xml", write_net(Path(folder) / "a.net.xml", street()).read_bytes(), read_network)
+    driven = fcd(together(drive(until=2.0), drive("b", start=90.0, until=2.0))).encode()
+    yield Kind("fcd.xml", driven, lambda path: read_floating(path, Window(0.0, 1.0)))
+    yield Kind("town.rou.xml", ROUTES, read_types)
+    yield Kind("road.xodr", XODR.encode(), lambda path: from_opendrive(path, Path(folder)))
+
+
+def in_folder(path):
+    """Read the tracks that a file belongs to."""
+    return format_of(path.parent).read(path.parent, None)
+
+
+ROUTES = b"""<routes><vType id="taxi" vClass="taxi" length="4.6"/><vType id="bike" vClass="bicycle"/>
+<vehicle id="a" type="taxi" depart="0"><route edges="east west"/></vehicle></routes>"""
+
+
 def recording_files(folder):
     """What recordings are made of beside clouds, as a drive leaves it."""
     drive, places = Drive(steps=3), {}
@@ -227,7 +260,7 @@ def recording_files(folder):
         (kitti / "oxts" / "data" / "0000000000.txt", kitti_files.read_oxts),
         (kitti / "velodyne_points" / "timestamps.txt", kitti_files.read_timestamps),
         (kitti / "tracklet_labels.xml", boxes),
-        (nuscenes / "v1.0-mini" / "sample_data.json", read_table),
+        (nuscenes / "v1.0-mini" / "sample_data.json", read_json_table),
         (argoverse2 / "annotations.feather", cuboids),
     ):
         yield Kind(path.name, path.read_bytes(), read)
@@ -318,6 +351,7 @@ def kinds(folder):
         Kind("labels.csv", LABELS, read_labels),
         Kind("coverage.npz", coverage(folder), Coverage.load),
         *scene_files(),
+        *track_files(folder),
         *recording_files(folder),
         Kind("checkpoint.npz", checkpoint(folder), lambda path: read_state(path, read_header(path), "one")),
     )

@@ -1,4 +1,4 @@
-"""Metrics of rays through voxels: processor time of the walk, of S-MIG, of the occupancy, and voxels that are crossed."""
+"""Metrics of rays through voxels: processor time of the walk, of S-MIG and of the occupancy; voxels crossed."""
 
 import time
 
@@ -67,17 +67,8 @@ def main():
                 [voxel_m, name, int(crossed.sum()), round(share, 1), walk, whole, occupancy, float(values[0, 0])]
             )
     print(f"16,000 rays, 60 x 40 x 4 m; {FRAMES} frames of {CARS} cars anywhere; seconds of one processor.\n")
-    header = [
-        "voxel m",
-        "rig",
-        "crossed",
-        "% of all",
-        "walk s",
-        "S-MIG with errors s",
-        "occupancy once s",
-        "S-MIG nats",
-    ]
-    table(header, rows)
+    columns = "voxel m, rig, crossed, % of all, walk s, S-MIG with errors s, occupancy once s, S-MIG nats"
+    table(columns.split(", "), rows)
 
 
 if __name__ == "__main__":

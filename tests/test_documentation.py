@@ -22,6 +22,7 @@ from torchcover import BevGrid
 from torchcover.cli.app import app
 from torchcover.data import RegionsOfInterest, SimulatedFrames, collate_frames
 from torchcover.data.recordings.folder_settings import read_folder_settings
+from torchcover.placement import SearchSpace
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.documents import load_document
@@ -151,6 +152,7 @@ READERS = (
     partial(load_document, Vehicle, "vehicles"),
     RegionsOfInterest.load,
     Requirements.load,
+    SearchSpace.load,
     read_folder_settings,
 )
 

@@ -67,7 +67,7 @@ def test_the_public_names_are_those_of_the_contract():
         "BevGrid", "Camera", "Coverage", "CoverageMetric", "Region", "RegionsOfInterest", "Rig", "Scenario",
         "blind_spot_radius", "cameras",
         "compare", "coverage", "data", "detection", "evaluate", "evaluation", "forward_regions", "geometry", "metrics",
-        "nearest", "neighbors", "report", "simulation", "survey_target", "targets", "training",
+        "nearest", "neighbors", "placement", "report", "simulation", "survey_target", "targets", "training",
     }  # fmt: skip
     assert torchcover.__all__ == sorted(torchcover.__all__)
 

@@ -6,6 +6,7 @@ from . import evaluation as evaluation
 from . import geometry as geometry
 from . import metrics as metrics
 from . import neighbors as neighbors
+from . import placement as placement
 from . import report as report
 from . import simulation as simulation
 from . import targets as targets

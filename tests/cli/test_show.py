@@ -1,8 +1,11 @@
 """`torchcover show`: it finds what is meant, and draws it where it is."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from PIL import Image
 
 from torchcover.cli import show
 from torchcover.evaluation import scene_pictures, sensor_views
@@ -14,7 +17,7 @@ from torchcover.simulation import Rig, Scenario, builtin_names
 def drawn(monkeypatch):
     """What was drawn: the arguments of the last call."""
     calls: dict = {}
-    for name in ("draw_rig", "draw_scene", "draw_depths"):
+    for name in ("draw_rig", "draw_vehicle", "draw_scene", "draw_depths"):
         draw = getattr(scene_pictures, name)
         monkeypatch.setattr(
             scene_pictures,
@@ -55,6 +58,41 @@ def test_a_scenario_is_drawn_in_the_frame_of_the_ego(torchcover, worlds, drawn):
     assert (np.abs(on_actor[:, 0] - 20.0) < 2.1).all()
     assert (np.abs(on_actor[:, 1] - 5.0) < 1.1).all()
     assert len(drawn["reference"]) > 1000
+
+
+def test_a_vehicle_is_drawn_with_its_mount_regions_on_its_skin(torchcover, tmp_path, drawn):
+    (tmp_path / "cart.yaml").write_text(
+        """
+        name: cart
+        description: A box on wheels that are left out.
+        parts: [{name: body, shape: {type: box, size_m: [3.0, 1.0, 0.8]}}]
+        mount_regions:
+          lid: {seen_from: above, x_m: [-1.0, 1.0], y_m: [-0.4, 0.4]}
+          tail: {seen_from: rear, y_m: [-0.3, 0.3], z_m: [0.2, 0.6]}
+        """
+    )
+    code, printed, _ = torchcover("show", tmp_path / "cart.yaml", "--out", tmp_path)
+    assert code == 0
+    assert "A box on wheels" in printed
+    assert min(imread(tmp_path / "cart.png").shape[:2]) > 500
+    _, _, (lid, tail) = drawn["args"]
+    assert (lid.name, lid.seen_from, tail.name, tail.seen_from) == ("lid", "above", "tail", "rear")
+    for patch, lowest, highest in (
+        (lid, [-1.0, -0.4, 0.8], [1.0, 0.4, 0.8]),
+        (tail, [-1.5, -0.3, 0.2], [-1.5, 0.3, 0.6]),
+    ):
+        assert patch.places_m.min(axis=(0, 1)) == pytest.approx(lowest)
+        assert patch.places_m.max(axis=(0, 1)) == pytest.approx(highest)
+
+
+def test_a_region_beside_the_body_is_named(torchcover, tmp_path):
+    (tmp_path / "cart.yaml").write_text(
+        "name: cart\nparts: [{name: body, shape: {type: box, size_m: [3.0, 1.0, 0.8]}}]\n"
+        "mount_regions: {lid: {seen_from: above, x_m: [1.0, 2.0], y_m: [-0.4, 0.4]}}\n"
+    )
+    code, _, error = torchcover("show", tmp_path / "cart.yaml", "--out", tmp_path)
+    assert code == 2
+    assert "mount region 'lid': at x = 1.545 m" in error
 
 
 def test_the_depth_images_of_a_rig_are_those_of_its_cameras_in_the_frame(torchcover, worlds, drawn):
@@ -114,6 +152,7 @@ def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
     [
         (["moon"], "'moon' is neither a .yaml file nor built in; rigs: argoverse2, "),
         (["moon"], "; scenarios: courtyard, "),
+        (["moon"], "; vehicles: adult, "),
         (["none.yaml"], "none.yaml: no such file"),
         (["kitti", "--rig", "nuscenes"], "--rig: for a scenario only, and 'kitti' is a rig"),
         (
@@ -121,6 +160,7 @@ def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
             "--step, --seed: for a scenario or cameras only, and 'kitti' is a rig",
         ),
         (["courtyard", "--scenario", "urban"], "--scenario: for a rig only, and 'courtyard' is a scenario"),
+        (["suv", "--step", "1"], "--step: for rigs and scenarios only, and 'suv' is a vehicle"),
         (["courtyard", "--rig", "moon"], "built-in rigs: argoverse2,"),
         (["kitti", "--scenario", "moon"], "built-in scenarios: courtyard,"),
         (["courtyard", "--step", "-1"], "--step"),
@@ -152,7 +192,7 @@ def test_a_name_of_both_kinds_asks_for_the_file(torchcover, monkeypatch):
     monkeypatch.setattr(show, "builtin_names", lambda kind: ["twin", kind])
     code, _, error = torchcover("show", "twin")
     assert code == 2
-    assert "both a rig and a scenario: give the YAML file" in error
+    assert "both a rig and a scenario and a vehicle: give the YAML file" in error
 
 
 @pytest.mark.filterwarnings("default")
@@ -186,3 +226,37 @@ def test_a_rig_has_the_name_of_its_file_in_every_command(worlds):
 def test_it_prints_where_the_numbers_of_a_rig_come_from(torchcover, tmp_path):
     code, printed, _ = torchcover("show", "nuscenes", "--out", tmp_path)
     assert (code, " ".join(printed.split())[:60]) == (0, Rig.load("nuscenes").description[:60])
+
+
+def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
+    monkeypatch.setattr(show, "FILM_S", 0.6)
+    code, printed, _ = torchcover(
+        "show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--film", worlds / "new" / "a.gif", "--step", 1
+    )
+    assert (code, "a.gif" in printed) == (0, True)
+    with Image.open(worlds / "new" / "a.gif") as film:
+        seen = []
+        for number in range(film.n_frames):
+            film.seek(number)
+            seen.append(np.asarray(film.convert("RGB")))
+        pace_s = film.info["duration"] / 1000
+    steps = show._steps_of_film(Scenario.load(worlds / "yard.yaml"), 1)
+    assert len(seen) == len(steps) >= 2
+    assert pace_s == pytest.approx(steps.step * Scenario.load(worlds / "yard.yaml").step_s)
+    assert all((one != other).any() for one, other in pairwise(seen))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("yard.yaml", "--film", "a.avi"), "a film is a .gif or .mp4 file; got 'a.avi'"),
+        (("low.yaml", "--film", "a.gif"), "--film: for a scenario only"),
+        (("yard.yaml", "--film", "a.mp4"), "the program ffmpeg is needed for .mp4 and is not there; write a .gif"),
+    ],
+)
+def test_a_film_that_cannot_be_written_is_refused_at_once(options, message, torchcover, worlds, monkeypatch):
+    monkeypatch.setenv("PATH", "")
+    name, *others = options
+    code, _, told = torchcover("show", worlds / name, *others)
+    assert code == 2
+    assert message in told

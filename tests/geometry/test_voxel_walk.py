@@ -90,6 +90,13 @@ def test_directions_that_are_all_but_parallel_run_in_the_upper_voxel_of_a_face()
     assert crossed_voxels(MIDDLE, [-1e6, 0.25, 0.25], [[1.0, 1e-5, 0.0]]).sum() == 0
 
 
+def test_a_ray_that_grazes_the_upper_wall_stays_within_the_region():
+    grid = VoxelGrid(BoundingBox((0.0, 0.0, 0.0), (4.0, 4.0, 1.0)), 1.0)
+    # Within a billionth of the wall at the last plane, and beyond it only after that.
+    found = np.argwhere(crossed_voxels(grid, [0.0, 4.0 - 3.5e-9, 0.5], [[1.0, 1e-9, 0.0]]))
+    assert found.tolist() == [[0, 3, 0], [1, 3, 0], [2, 3, 0], [3, 3, 0]]
+
+
 def some_rays(count=300):
     generator = np.random.default_rng(8)
     return generator.uniform(-4, 4, (count, 3)), generator.normal(size=(count, 3)), generator.uniform(0, 9, count)

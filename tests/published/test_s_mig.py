@@ -123,6 +123,9 @@ def test_boxes_that_overlap_count_once_and_beside_each_other_share_no_voxel():
     level = (0.25, 0.25, 0.35, 1.0, 1.0, 1.2, 0.0)
     assert occupied(level) == 2 * 2 * 2
     assert occupied(level, (1.25, *level[1:])) == 4 * 2 * 2
+    for tenths in range(6, 30):
+        standing = (0.0, 0.0, 0.25 + tenths / 20, 1.0, 1.0, tenths / 10, 0.0)
+        assert occupied(standing) == 2 * 2 * math.ceil(tenths / 5)
 
 
 def test_a_box_that_leaves_the_region_counts_as_far_as_it_is_within():
@@ -143,6 +146,10 @@ def test_errors_over_worlds_are_the_jackknife_by_hand_and_none_below_eight():
     assert whole.resampled(weights)[:, 1].tolist() == pytest.approx(left_out)
     assert whole.resampled(torch.zeros(1, 16)).isnan().all()
     assert math.isnan(value(s_mig(sensors, frames[:7])).standard_error)
+    hits = {"beam": torch.tensor([[9.0, 0.0, 1.0]])}
+    occluded = s_mig(sensors, [frame(one.index, one.boxes, clouds=hits) for one in frames], occlusion=True)
+    assert value(occluded).value < 0
+    assert math.isnan(value(occluded).standard_error)
 
 
 def test_with_occlusion_rays_end_at_what_was_measured_and_without_points_nowhere():

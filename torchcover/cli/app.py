@@ -45,21 +45,31 @@ def main() -> None:
             warnings.filterwarnings("ignore", "The run was cut short", RuntimeWarning)  # the last line says it
             code = typer.main.get_command(app).main(standalone_mode=False)
         sys.stdout.flush()
-    except USAGE_ERROR as error:
-        _fail(error.format_message())  # type: ignore[attr-defined]  # the typed name is private
-    except (ValueError, TypeError, OSError) as error:
-        _fail(str(error))
-    except MemoryError as error:
-        _fail(f"there is not enough memory ({error or 'for what was asked'}); ask for less, or use a larger machine")
-    except RuntimeError as error:
-        if type(error).__name__ != "OutOfMemoryError":  # of torch, which most mistakes are told without
+    except Exception as error:
+        message = _mistake(error)
+        if message is None:
             raise
-        _fail(f"there is not enough memory ({str(error).splitlines()[0]}); ask for less, or use --device cpu")
-    except (OverflowError, RecursionError) as error:
-        _fail(f"a number is too large, or a file nested too deeply ({error})")
+        _fail(message)
     if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
         _fail(*("terminated", TERMINATED) if terminated else ("interrupted", INTERRUPTED))
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _mistake(error: Exception) -> str | None:
+    """What a user did wrong, or lacks; None if it is a mistake of ours."""
+    if isinstance(error, USAGE_ERROR):
+        return str(error.format_message())  # type: ignore[attr-defined]  # the typed name is private
+    if isinstance(error, ValueError | TypeError | OSError):
+        return str(error)
+    if isinstance(error, ImportError) and "pip install" in str(error):
+        return str(error)  # of an extra
+    if isinstance(error, MemoryError):
+        return f"there is not enough memory ({error or 'for what was asked'}); ask for less, or use a larger machine"
+    if type(error).__name__ == "OutOfMemoryError":  # of torch, which most mistakes are told without
+        return f"there is not enough memory ({str(error).splitlines()[0]}); ask for less, or use --device cpu"
+    if isinstance(error, OverflowError | RecursionError):
+        return f"a number is too large, or a file nested too deeply ({error})"
+    return None
 
 
 @app.callback(invoke_without_command=True)
@@ -255,7 +265,7 @@ def rig(
 
 @app.command()
 def show(
-    name: Annotated[str, typer.Argument(help="Rig or scenario: a built-in name (see `list`) or a YAML file.")],
+    name: Annotated[str, typer.Argument(help="Rig, scenario or vehicle: a built-in name (see `list`) or a YAML file.")],
     scenario: Annotated[
         str | None, typer.Option(help="For a rig: the scenario whose ego carries it and that it sees (courtyard).")
     ] = None,
@@ -263,12 +273,15 @@ def show(
     vehicle: options.Vehicle = None,
     step: Annotated[int | None, typer.Option(min=0, help="Time step of the scenario or the depth images (0).")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the simulation, likewise (0).")] = None,
+    film: Annotated[
+        Path | None, typer.Option(help="For a scenario: 10 s of it from that step on, as a .gif or .mp4 (ffmpeg) file.")
+    ] = None,
     out: options.Out = Path("out"),
 ) -> None:
-    """Draw a rig on its vehicle and the depth images of its cameras, or a frame of a scenario from above."""
+    """Draw a rig and the depth images of its cameras, a frame of a scenario, or the mount regions of a vehicle."""
     from torchcover.cli.show import run
 
-    run(name, scenario=scenario, rig=rig, vehicle=vehicle, step=step, seed=seed, out=out)
+    run(name, scenario=scenario, rig=rig, vehicle=vehicle, step=step, seed=seed, film=film, out=out)
 
 
 app.command()(targets)

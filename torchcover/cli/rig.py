@@ -4,9 +4,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import typer
-import yaml
 
 from torchcover.data import open_recording, rig_document
+from torchcover.files import as_yaml
 
 
 def run(frames: Path, recording_format: str | None, sensors: Sequence[str], lidars: Sequence[str]) -> None:
@@ -19,7 +19,7 @@ def run(frames: Path, recording_format: str | None, sensors: Sequence[str], lida
     models = dict(_pair(text) for text in lidars)
     names = [name for of in sensors for name in of.split(",")]
     rig = rig_document(open_recording(frames, recording_format), sensors=names or None, models=models)
-    typer.echo(yaml.safe_dump(rig, sort_keys=False, default_flow_style=None, width=118, allow_unicode=True), nl=False)
+    typer.echo(as_yaml(rig), nl=False)
 
 
 def _pair(text: str) -> tuple[str, str]:

@@ -24,7 +24,8 @@ from .result import Result as Result
 from .result_files import claimed as claimed
 from .scene_pictures import cameras_of as cameras_of
 from .scene_pictures import rig_pictures as rig_pictures
-from .scene_pictures import scenario_picture as scenario_picture
+from .scene_pictures import scenario_pictures as scenario_pictures
+from .scene_pictures import vehicle_picture as vehicle_picture
 from .sensor_drawings import sensor_views as sensor_views
 from .study import Study as Study
 from .study import error_against_time as error_against_time

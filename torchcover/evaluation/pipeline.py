@@ -225,13 +225,13 @@ def _left(indices: Iterator[int], run: Run, *, skip_bad_frames: bool) -> Iterato
 
 def _worlds(frames: Frames) -> Callable[[int], int] | None:
     """Which world a frame is of, where there are several: each is built for its own frames."""
-    if not isinstance(frames, SimulatedFrames) or frames.scenario.traffic is None:
+    if not isinstance(frames, SimulatedFrames) or frames.scenario.repeats:
         return None
     return frames.simulator.run_of
 
 
 def made_together(frames: Frames, indices: Iterable[int], workers: int) -> Iterator[list[int]]:
-    """Which frames a worker makes in a row: in traffic those of one world, so that only one worker builds it.
+    """Which frames a worker makes in a row: those of one world, so that only one worker builds it.
 
     Args:
         frames: Where they come from.

@@ -6,12 +6,12 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import yaml
 from pydantic import BaseModel
 
 from torchcover.coverage import Region
 from torchcover.evaluation.omissions import Omission
 from torchcover.evaluation.sensor_drawings import sensor_views
+from torchcover.files import as_yaml
 from torchcover.published.tables import page_tables as metric_tables
 from torchcover.report import BOLD_MARKS, PLACE_HEADINGS, Line, Page, PageRig, PageTable, Words, maps_of, parts_of
 from torchcover.report.remarks import marks_on, notes_on
@@ -56,10 +56,7 @@ def rig_document(name: str, sensors: Sequence[Sensor]) -> str:
     known = [sensor.model_dump(mode="json", exclude_unset=True) for sensor in sensors if isinstance(sensor, BaseModel)]
     if not known or len(known) < len(sensors):
         return ""
-    text: str = yaml.safe_dump(
-        {"name": name, "sensors": known}, sort_keys=False, allow_unicode=True, default_flow_style=None
-    )
-    return text
+    return as_yaml({"name": name, "sensors": known})
 
 
 def _rig(name: str, sensors: Sequence[Sensor]) -> PageRig:

@@ -1,6 +1,6 @@
-"""Pictures before any measurement: a rig on its vehicle, what its cameras see, a frame of a scenario from above."""
+"""Pictures before any measurement: a rig on its vehicle, what its cameras see, frames of a scenario from above."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -9,10 +9,14 @@ from torchcover.data import GRID_X_M, GRID_Y_M, SimulatedFrames
 from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
-from torchcover.report import ActorMark, Standing, draw_depths, draw_rig, draw_scene
+from torchcover.report import ActorMark, SkinPatch, Standing, draw_depths, draw_rig, draw_scene, draw_vehicle
 from torchcover.simulation import CameraSensor, PaperReference, Rig, Scenario
+from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.mount_regions import MountRegion
+from torchcover.simulation.skin import Skin
 from torchcover.simulation.world import Actor, World
 
+PATCH_PLACES = 12  # along each side of a mount region
 FLAT = 0.9  # the least cosine between a face's normal and z
 # A picture needs fewer points than a measurement.
 REFERENCE = PaperReference(rows=256, columns=512)
@@ -55,34 +59,60 @@ def rig_pictures(
         yield "_depth", draw_depths(images, title=f"{rig.name}: distance along the ray", subtitle=when)
 
 
-def scenario_picture(
-    scenario: Scenario, rig: Rig, *, vehicle: str | None = None, step: int = 0, seed: int = 0
-) -> Figure:
-    """A frame of a scenario from above: its actors, the points of a rig, those of the reference.
+def scenario_pictures(
+    scenario: Scenario, rig: Rig, steps: Sequence[int], *, vehicle: str | None = None, seed: int = 0
+) -> Iterator[Figure]:
+    """Frames of a scenario from above: its actors, the points of a rig, those of the reference.
 
     Args:
         scenario: The scenario.
         rig: Whose points.
+        steps: The frames.
         vehicle: What carries it, instead of the scenario's ego.
-        step: The frame.
         seed: Seed of the simulation.
     """
-    frames = _frames(scenario, rig, vehicle, step, seed)
-    frame = frames[step]
-    scene, step_of_world = frames.simulator.scene_of(step)
-    time_s = step_of_world * scene.world.time_step_s
-    return draw_scene(
-        GRID_X_M,
-        GRID_Y_M,
-        standing=_standing(scene.world, time_s),
-        ego_outline_m=scene.ego_box.outline_m,
-        actors=_actor_marks(scene.world, time_s),
-        sensor=frame.sensor.numpy(),
-        reference=frame.reference.numpy(),
-        title=f"{scenario.name}, step {step}",
-        subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name} on {frames.scenario.ego_name}",
-        path_m=_path_m(scene.world, time_s),
-    )
+    frames = _frames(scenario, rig, vehicle, max(steps), seed)
+    for step in steps:
+        frame = frames[step]
+        scene, step_of_world = frames.simulator.scene_of(step)
+        time_s = step_of_world * scene.world.time_step_s
+        yield draw_scene(
+            GRID_X_M,
+            GRID_Y_M,
+            standing=_standing(scene.world, time_s),
+            ego_outline_m=scene.ego_box.outline_m,
+            actors=_actor_marks(scene.world, time_s),
+            sensor=frame.sensor.numpy(),
+            reference=frame.reference.numpy(),
+            title=f"{scenario.name}, step {step}",
+            subtitle=f"t = {time_s:g} s, seed {seed}; points of {rig.name} on {frames.scenario.ego_name}",
+            path_m=_path_m(scene.world, time_s),
+        )
+
+
+def vehicle_picture(vehicle: Vehicle) -> Figure:
+    """A vehicle from all sides, with its mount regions.
+
+    Args:
+        vehicle: The vehicle.
+
+    Raises:
+        ValueError: Nothing of the vehicle is seen in a part of a region.
+    """
+    mesh = vehicle.mesh()
+    skin, size_m = Skin(mesh), BoundingBox.around(mesh.vertices_m).size_m
+    patches = [_patch(name, region, skin) for name, region in vehicle.mount_regions.items()]
+    subtitle = f"{' x '.join(f'{extent:.2f}' for extent in size_m)} m; {len(patches) or 'no'} mount regions"
+    return draw_vehicle(mesh.vertices_m, mesh.faces, patches, title=vehicle.name, subtitle=subtitle)
+
+
+def _patch(name: str, region: MountRegion, skin: Skin) -> SkinPatch:
+    shares = np.linspace(0.0, 1.0, PATCH_PLACES).tolist()
+    try:
+        places_m = [[region.on(skin, u, v).place_m for v in shares] for u in shares]
+    except ValueError as error:
+        raise ValueError(f"mount region {name!r}: {error}") from error
+    return SkinPatch(name, region.seen_from, np.array(places_m))
 
 
 def _path_m(world: World, time_s: float) -> Matrix | None:

@@ -130,7 +130,7 @@ def _simulation(rigs: Sequence[AnyRig], scenario: AnyScenario, settings: Setting
 
 
 def _most_steps(frames: SimulatedFrames, settings: Settings) -> int | None:
-    """Where a target error ends a run at the latest: a given world that moves has no more to say than its instants."""
+    """Where a target error ends a run at the latest: what repeats and moves has no more to say than its instants."""
     distinct = frames.simulator.distinct_steps
     if settings.steps is not None or settings.target_error is None or distinct in (None, 1):
         return None

@@ -1,7 +1,7 @@
 """YAML without its traps: every key once, numbers that look like numbers, and an end."""
 
 import re
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from typing import Any, ClassVar
 
 import yaml
@@ -54,6 +54,24 @@ def parse_yaml(text: str) -> Any:  # noqa: ANN401  (YAML knows no types)
     except (yaml.YAMLError, ValueError) as error:
         reason = " ".join(str(error).replace('in "<unicode string>", ', "").split())
         raise ValueError(f"not a YAML file: {reason}") from error
+
+
+def as_yaml(content: Mapping[str, Any]) -> str:
+    """What `parse_yaml` reads as a mapping of plain values: keys in their order, short lists and mappings in one line.
+
+    Example:
+        >>> print(as_yaml({"name": "roof", "mount": {"x_m": 0.5}}), end="")
+        name: roof
+        mount: {x_m: 0.5}
+    """
+    text: str = yaml.dump(
+        dict(content), Dumper=_Dumper, sort_keys=False, default_flow_style=None, width=118, allow_unicode=True
+    )
+    return text
+
+
+class _Dumper(yaml.SafeDumper):
+    """Puts quotes around a text that would be a number, true or nothing to YAML 1.1 or to `parse_yaml`."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -123,7 +141,8 @@ class _Loader(yaml.SafeLoader):
 
 for _kind, _pattern in SCALARS.items():
     _firsts = {"null": ["~", "n", "N", ""], "bool": list("tTfF")}.get(_kind, list("-+0123456789."))
-    _Loader.add_implicit_resolver(TAG + _kind, re.compile(f"^(?:{_pattern})$"), _firsts)
+    for _class in (_Loader, _Dumper):
+        _class.add_implicit_resolver(TAG + _kind, re.compile(f"^(?:{_pattern})$"), _firsts)
 _Loader.add_implicit_resolver(TAG + "merge", re.compile("^<<$"), ["<"])
 for _kind in ("int", "float"):
     _Loader.add_constructor(TAG + _kind, _Loader.construct_number)

@@ -1,9 +1,11 @@
 """What a run shows: a table and its renderers, maps, drawings, a page. Imports matplotlib and rich: import it late."""
 
+from torchcover.report.drawings.film import check_film, write_film
 from torchcover.report.drawings.four_views import draw_four_views
 from torchcover.report.drawings.frame import ActorMark, Standing, draw_depths, draw_scene
 from torchcover.report.drawings.rig import draw_rig
 from torchcover.report.drawings.targets import draw_targets
+from torchcover.report.drawings.vehicle import SkinPatch, draw_vehicle
 from torchcover.report.drawings.work_precision import WorkPanel, draw_work_precision
 from torchcover.report.maps.arrays import draw_map, draw_side_by_side
 from torchcover.report.maps.colours import ColourScale, difference_scale, error_scale, scale_of
@@ -38,11 +40,13 @@ __all__ = [
     "Remark",
     "Row",
     "SensorView",
+    "SkinPatch",
     "Standing",
     "Words",
     "WorkPanel",
     "as_markdown",
     "band_figures",
+    "check_film",
     "difference_heading",
     "difference_scale",
     "draw_depths",
@@ -52,6 +56,7 @@ __all__ = [
     "draw_scene",
     "draw_side_by_side",
     "draw_targets",
+    "draw_vehicle",
     "draw_work_precision",
     "error_scale",
     "error_words",
@@ -71,4 +76,5 @@ __all__ = [
     "table_dict",
     "text_table",
     "write_figures",
+    "write_film",
 ]

@@ -9,6 +9,7 @@ from pydantic import Field, model_validator
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import shapes
 from torchcover.simulation.documents import Document, NameOrFile, Pose, is_file_name, load_document
+from torchcover.simulation.mount_regions import MountRegion
 from torchcover.simulation.plausible import warn_of_mover, warn_of_scenery
 from torchcover.simulation.shapes import Mesh
 
@@ -58,6 +59,9 @@ class Body(Document):
         return [mesh.moved(pose.matrix()) for pose in self.poses]
 
 
+RegionName = Annotated[str, Field(min_length=1)]
+
+
 class Vehicle(Document):
     """The body of a vehicle, put together from parts.
 
@@ -65,11 +69,13 @@ class Vehicle(Document):
         name: What messages call it.
         description: What it is.
         parts: Its parts, in one frame with x forward and z up.
+        mount_regions: By name, patches of its skin that sensors can be mounted on, in the vehicle frame.
     """
 
     name: str
     description: str = ""
     parts: tuple[Body, ...] = Field(min_length=1)
+    mount_regions: dict[RegionName, MountRegion] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _check_parts(self) -> Self:
@@ -84,6 +90,22 @@ class Vehicle(Document):
     def mesh(self) -> Mesh:
         """All parts in one mesh, in the vehicle frame."""
         return in_vehicle_frame(merge([mesh for part in self.parts for mesh in part.meshes()]))
+
+    def content(self) -> dict[str, Any]:
+        """Its body; where sensors may be mounted on it means nothing to those that are."""
+        return {key: value for key, value in super().content().items() if key != "mount_regions"}
+
+
+def mount_regions_of(shape: Shape | None) -> dict[str, MountRegion]:
+    """Where sensors can be mounted on a body: on a vehicle that says it.
+
+    Example:
+        >>> "roof" in mount_regions_of(VehicleShape(type="vehicle", vehicle="suv"))
+        True
+    """
+    if not isinstance(shape, VehicleShape):
+        return {}
+    return load_document(Vehicle, "vehicles", shape.vehicle).mount_regions
 
 
 def in_vehicle_frame(mesh: Mesh) -> Mesh:

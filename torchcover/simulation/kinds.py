@@ -4,12 +4,13 @@ from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.even_reference import EvenReference
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.paper_reference import PaperReference
+from torchcover.simulation.recorded.traffic import RecordedTraffic
 from torchcover.simulation.reference_sensor import ReferenceSensor
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.sumo import Sumo
 from torchcover.simulation.surface_reference import SurfaceReference
 from torchcover.simulation.traffic import Highway, Parking, Urban
-from torchcover.simulation.traffic.procedural import Procedural
+from torchcover.simulation.traffic.kind import Traffic
 
 # By the key `type` in a rig's file.
 SENSORS: dict[str, type[Sensor]] = {"lidar": Lidar, "camera": CameraSensor}
@@ -17,4 +18,10 @@ REFERENCE_SENSORS: dict[str, type[ReferenceSensor]] = {
     sensor.name: sensor for sensor in (EvenReference, PaperReference, SurfaceReference)
 }
 # By the key `type` of a scenario's `traffic`.
-TRAFFIC: dict[str, type[Procedural]] = {"urban": Urban, "highway": Highway, "parking": Parking, "sumo": Sumo}
+TRAFFIC: dict[str, type[Traffic]] = {
+    "urban": Urban,
+    "highway": Highway,
+    "parking": Parking,
+    "sumo": Sumo,
+    "tracks": RecordedTraffic,
+}

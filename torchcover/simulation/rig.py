@@ -5,8 +5,10 @@ from typing import Annotated, Any, Self
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationInfo, model_validator
 
-from torchcover.simulation.documents import Document, NameOrFile, load_document
+from torchcover.files import as_yaml, write_durably
+from torchcover.simulation.documents import Document, NameOrFile, is_file_name, load_document
 from torchcover.simulation.kinds import SENSORS
+from torchcover.simulation.lidar import Lidar, LidarModel
 from torchcover.simulation.sensor import Sensor
 
 
@@ -55,6 +57,39 @@ class Rig(Document):
         """
         return load_document(cls, "rigs", path_or_name)
 
+    def save(self, path: str | Path) -> None:
+        """Write it to a YAML file from which `load` makes the same rig, wherever that is put.
+
+        A LiDAR model from a file is written out, and so is the place of a vehicle's file.
+
+        Raises:
+            OSError: The file cannot be written.
+
+        Example:
+            >>> import tempfile
+            >>> with tempfile.TemporaryDirectory() as folder:
+            ...     Rig.load("kitti").save(Path(folder, "mine.yaml"))
+            ...     Rig.load(Path(folder, "mine.yaml")) == Rig.load("kitti")
+            True
+        """
+        keys = self.model_dump(mode="json", exclude_unset=True, exclude={"sensors"})
+        if self.vehicle is not None and is_file_name(self.vehicle):
+            keys["vehicle"] = str(Path(self.vehicle).resolve())
+        keys["sensors"] = [_written(sensor) for sensor in self.sensors]
+        write_durably(Path(path), lambda file: file.write(as_yaml(keys).encode()))
+
     def content(self) -> dict[str, Any]:
         """Its sensors; the vehicle is in the scenario that it is simulated in, if it is the one."""
         return {key: value for key, value in super().content().items() if key != "vehicle"}
+
+
+def _written(sensor: Sensor) -> dict[str, Any]:
+    """The keys of a sensor, without those that its model stands for."""
+    assert isinstance(sensor, Document)  # as all sensors of a rig
+    keys = sensor.model_dump(mode="json", exclude_unset=True)
+    if isinstance(sensor, Lidar) and sensor.model is not None:
+        if is_file_name(sensor.model):
+            return {key: value for key, value in keys.items() if key != "model"}
+        same = LidarModel.load(sensor.model).model_dump(mode="json", exclude={"name", "description"})
+        return {key: value for key, value in keys.items() if key not in same or same[key] != value}
+    return keys

@@ -13,7 +13,7 @@ from torchcover.simulation.documents import Document, PathBeside, Pose, load_doc
 from torchcover.simulation.kinds import TRAFFIC
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.tracks import read_boxes, read_trajectory
-from torchcover.simulation.traffic.procedural import Procedural
+from torchcover.simulation.traffic.kind import Traffic
 from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World, steps_of
 
@@ -21,7 +21,7 @@ from torchcover.simulation.world import Actor, World, steps_of
 DEFAULT_EGO = VehicleShape(type="vehicle", vehicle="suv")
 
 
-def _traffic(content: Any, info: ValidationInfo) -> Procedural | None:  # noqa: ANN401  (whatever stood in the file)
+def _traffic(content: Any, info: ValidationInfo) -> Traffic | None:  # noqa: ANN401  (whatever stood in the file)
     """Traffic of the kind that its `type` names."""
     if content is None:
         return None
@@ -78,19 +78,19 @@ class NamedMover(Mover):
 
 
 class Scenario(Document):
-    """A world with an ego in it: given body by body, or made by a procedure.
+    """A world with an ego in it: given body by body, or made of traffic.
 
     Args:
         name: What tables and maps call it.
         description: What it is.
-        ego: The vehicle that carries the rig; in procedural traffic its shape only. Without a shape, the rig's vehicle
+        ego: The vehicle that carries the rig; in traffic its shape only. Without a shape, the rig's vehicle
             takes its place, or an SUV.
         bodies: What never moves, in the world frame.
         actors: What moves, or may be recognised.
         boxes: File of recorded boxes that are actors too; relative to the document.
         time_step_s: Time between two frames.
         duration_s: Time of the last frame; frames beyond it start again at 0.
-        traffic: A procedure of a kind in `TRAFFIC`, which makes bodies, actors, the ego's drive, and the times.
+        traffic: Of a kind in `TRAFFIC`, drawn or recorded: it makes bodies, actors, the ego's drive, and the times.
 
     Example:
         >>> Scenario.load("courtyard").ego.pose.x_m
@@ -105,13 +105,12 @@ class Scenario(Document):
     boxes: PathBeside | None = None
     time_step_s: PositiveFloat = 0.1
     duration_s: NonNegativeFloat = 0.0
-    traffic: Annotated[Procedural | None, PlainValidator(_traffic)] = None
+    traffic: Annotated[Traffic | None, PlainValidator(_traffic)] = None
 
     @model_validator(mode="after")
     def _check_given_or_procedural(self) -> Self:
-        times = self.traffic or self
-        steps_of(times.duration_s, times.time_step_s)
         if self.traffic is None:
+            steps_of(self.duration_s, self.time_step_s)
             missing = [key for key in ("ego", "bodies") if not getattr(self, key)]
             if missing:
                 raise ValueError(f"{' and '.join(missing)} missing: give them, or traffic that makes them")
@@ -134,26 +133,39 @@ class Scenario(Document):
         return load_document(cls, "scenarios", path_or_name)
 
     def locate(self, index: int) -> tuple[int, int]:
-        """Which run through the scenario a frame belongs to, and its time step in it.
+        """Which run through the scenario a frame belongs to, and its time step in it; see `repeats`."""
+        episode, step = divmod(index, self.steps)
+        return (0 if self.repeats else episode), step
 
-        A given world plays again and again; procedural traffic starts anew with other random numbers.
+    @property
+    def repeats(self) -> bool:
+        """Whether the same plays again beyond its end: a given world, a recording.
+
+        Else another world of its kind begins, with other random numbers.
+
+        Example:
+            >>> Scenario.load("courtyard").repeats, Scenario.load("urban").repeats
+            (True, False)
         """
-        times = self.traffic or self
-        episode, step = divmod(index, steps_of(times.duration_s, times.time_step_s))
-        return (episode if self.traffic else 0), step
+        return self.traffic is None or self.traffic.repeats
+
+    @property
+    def steps(self) -> int:
+        """Number of instants of one run."""
+        return steps_of(self.duration_s, self.time_step_s) if self.traffic is None else self.traffic.steps
 
     @property
     def instants(self) -> int | None:
-        """How many different instants it can show: one if nothing moves; None for traffic, which never repeats itself.
+        """How many different instants it can show: one if nothing moves; None if it never repeats itself.
 
         Example:
             >>> Scenario.load("courtyard").instants
             1
         """
-        if self.traffic is not None:
+        if not self.repeats:
             return None
         moves = self.boxes is not None or any(mover and mover.trajectory for mover in (self.ego, *self.actors))
-        return steps_of(self.duration_s, self.time_step_s) if moves else 1
+        return self.steps if moves or self.traffic is not None else 1
 
     @property
     def step_s(self) -> float:

@@ -21,6 +21,7 @@ from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.stage import Stage, Stages
+from torchcover.simulation.standing import warn_of_floating
 from torchcover.simulation.surroundings import Surroundings
 
 # What a step takes at its largest: 73 to 246 were measured, for a LiDAR, a camera and the reference sensors.
@@ -35,12 +36,14 @@ class Simulator:
     are cast on as many threads as torch uses (`torch.set_num_threads`).
 
     Args:
-        scenario: The world; `with_ego` gives it its ego. Beyond its end a given one plays again; traffic starts anew
-            with other random numbers.
+        scenario: The world; `with_ego` gives it its ego. Beyond its end the same plays again, or another one; see
+            `Scenario.repeats`.
         rigs: The sensors, by the name under which `Observation.clouds` has their points.
         reference_sensor: The reference sensor.
         seed: Seed of the traffic, of the reference sensor, and of noise and drop-out.
         every_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
+        kept_bytes: What the worlds that are kept, in case they are needed again, may take; a small share of the
+            machine's memory if not given.
 
     Raises:
         ValueError: Rigs that name different vehicles, a negative seed, a time that is no multiple of the time step,
@@ -63,6 +66,7 @@ class Simulator:
         *,
         seed: int = 0,
         every_s: float | None = None,
+        kept_bytes: float | None = None,
     ) -> None:
         if seed < 0:
             raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
@@ -71,7 +75,7 @@ class Simulator:
         self.reference_sensor = reference_sensor
         self.seed = seed
         self._every_steps = 1 if every_s is None else scenario.steps_in(every_s)
-        self._stages = Stages(scenario, rigs, seed)
+        self._stages = Stages(scenario, rigs, seed, kept_bytes)
         self._check_size()
 
     @property
@@ -88,14 +92,14 @@ class Simulator:
     def place_in_time(self, index: int) -> int:
         """The number by which standard errors tell a step from others; steps that share it are alike.
 
-        In traffic that is the number of the run: its steps share a city. In a given world it is the instant, be it seen
-        for the first time or again. Where there is a single instant only the reference sensor's draw differs, and every
-        step has a number of its own.
+        Where each run has a world of its own, that is the number of the run: its steps share a city. In a scenario that
+        repeats it is the instant, be it seen for the first time or again. Where there is a single instant only the
+        reference sensor's draw differs, and every step has a number of its own.
         """
         if self.scenario.instants == 1:
             return index
         run, step = self.scenario.locate(index * self._every_steps)
-        return step if self.scenario.traffic is None else run
+        return step if self.scenario.repeats else run
 
     def with_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
         """The same instants as another reference sensor sees them; the geometry is built once for both."""
@@ -103,6 +107,41 @@ class Simulator:
         other.reference_sensor = reference_sensor
         other._check_size()
         return other
+
+    def with_rigs(self, rigs: Mapping[str, Rig]) -> Self:
+        """The same instants as other rigs see them, on the same ego; the geometry is built once for both.
+
+        Args:
+            rigs: The sensors, by the name under which `scans` has what they see. What vehicle they name says nothing.
+        """
+        other = copy.copy(self)
+        other.rigs = rigs
+        other._stages = self._stages.with_rigs(rigs)
+        other._check_size()
+        return other
+
+    def scans(self, index: int) -> Mapping[str, Sequence[Scan]]:
+        """What the sensors see at one step, as in `step`, bit for bit; the reference is not cast.
+
+        Args:
+            index: Number of the step, from 0.
+
+        Returns:
+            Name of each rig -> what each of its sensors saw.
+
+        Raises:
+            FileNotFoundError: A mesh, vehicle or trajectory file is missing.
+            ValueError: As for `step`.
+
+        Example:
+            >>> from torchcover.simulation import PaperReference
+            >>> empty = Simulator(Scenario.load("courtyard"), {}, PaperReference(rows=16, columns=16))
+            >>> [roof] = empty.with_rigs({"candidate": Rig.load("front_roof_128")}).scans(0)["candidate"]
+            >>> roof.rays, roof.points.dtype
+            (230400, dtype('float32'))
+        """
+        stage, instant = self._placed(index)
+        return self._scans(stage, instant, index)
 
     def step(self, index: int) -> Observation:
         """What is seen at one step.
@@ -115,10 +154,8 @@ class Simulator:
             ValueError: A negative index, a sensor inside a body or below the ground, an actor that overlaps the ego, an
                 ego below the ground.
         """
-        stage, step = self._stage(index)
-        instant = stage.scene.at(step, within_m=self._reach_m(stage.scene.ego_box))
-        stage.check_mounts(instant)
-        scans = {name: self._scan_rig(sensors, instant, index) for name, sensors in stage.mounted.items()}
+        stage, instant = self._placed(index)
+        scans = self._scans(stage, instant, index)
         reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
         return Observation(
@@ -135,20 +172,25 @@ class Simulator:
         )
 
     def check_run(self, steps: int) -> None:
-        """Refuse before its first step what a run through a given world would end with; traffic is made as it comes.
+        """Refuse before its first step what a run through a world that repeats would end with; others come as they are.
 
         Args:
             steps: How many steps the run has.
 
         Raises:
             ValueError: A sensor that is where none can be at the first step, an actor that overlaps the ego at any.
+
+        Warns:
+            UserWarning: Those that move do not stand on the ground.
         """
-        if self.scenario.traffic is None:
+        if self.scenario.repeats:
             stage, _ = self._stage(0)
             world_steps = stage.scene.world.steps
             indices = np.arange(min(steps, world_steps), dtype=np.int64)  # then they repeat themselves
-            stage.scene.check_apart(np.unique(indices * self._every_steps % world_steps))
+            seen = np.unique(indices * self._every_steps % world_steps)
+            stage.scene.check_apart(seen)
             stage.check_mounts(stage.scene.at(0))
+            warn_of_floating(self.scenario.name, stage.scene, seen)
 
     def labels(self, index: int) -> list[Label]:
         """The objects within the reference sensor's range at one step; names are an object's own within a run."""
@@ -164,7 +206,7 @@ class Simulator:
         return stage.scene, step
 
     def run_of(self, index: int) -> int:
-        """Which run through the scenario a step belongs to: in traffic, each is a world of its own."""
+        """Which run through the scenario a step belongs to: each is a world of its own, unless it repeats."""
         return self.scenario.locate(index * self._every_steps)[0]
 
     def _check_size(self) -> None:
@@ -182,6 +224,13 @@ class Simulator:
         run, step = self.scenario.locate(index * self._every_steps)
         return self._stages.of_run(run), step
 
+    def _placed(self, index: int) -> tuple[Stage, Instant]:
+        """The stage of a step, and all of it at its time, with no sensor where none can be."""
+        stage, step = self._stage(index)
+        instant = stage.scene.at(step, within_m=self._reach_m(stage.scene.ego_box))
+        stage.check_mounts(instant)
+        return stage, instant
+
     def _reach_m(self, ego: BoundingBox) -> float:
         """How far from the origin of the vehicle frame a sensor can see: its range starts where it is mounted."""
         farthest_m = np.abs(ego.corners_m).max(axis=0) + self.reference_sensor.shell_m
@@ -191,6 +240,9 @@ class Simulator:
             for sensor in rig.sensors
         ]
         return max([float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches])
+
+    def _scans(self, stage: Stage, instant: Instant, index: int) -> dict[str, list[Scan]]:
+        return {name: self._scan_rig(sensors, instant, index) for name, sensors in stage.mounted.items()}
 
     def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[Scan]:
         scans = []

@@ -1,9 +1,11 @@
 """Where a run through a scenario plays: its geometry, and the rigs' sensors in it."""
 
+import copy
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,19 +23,31 @@ from torchcover.simulation.solids import Solids
 
 # A sensor on the ground is asked about a place this far above it: whether it is inside of something else.
 LIFT_M = np.array([0.0, 0.0, 0.01])
-# What all stages that are kept may take: in a process, four cities of a minute or more of anything smaller; and of the
-# machine's memory in all workers of a DataLoader together. One stage is kept anyway, however large.
+# What all scenes that are kept may take: in a process, four cities of a minute or more of anything smaller; and of the
+# machine's memory in all workers of a DataLoader together. One scene is kept anyway, however large.
 KEPT_BYTES = 160e6
 KEPT_SHARE = 1 / 16
 
 
 @dataclass(eq=False)
+class Mounts:
+    """The sensors of each rig on the ego of a scene, and whether their places are known to be free for good."""
+
+    sensors: Mapping[str, Sequence[MountedSensor]]
+    free_for_good: bool = False
+
+
+@dataclass(frozen=True, eq=False)
 class Stage:
-    """One run's geometry, and the sensors of each rig at their places on its ego."""
+    """One run's geometry, and the sensors of each rig on its ego."""
 
     scene: Scene
-    mounted: Mapping[str, Sequence[MountedSensor]]
-    _free_for_good: bool = field(default=False, init=False)
+    mounts: Mounts
+
+    @property
+    def mounted(self) -> Mapping[str, Sequence[MountedSensor]]:
+        """The sensors of each rig."""
+        return self.mounts.sensors
 
     def check_mounts(self, instant: Instant) -> None:
         """Refuse a sensor that is where none can be; where nothing moves, the first answer holds.
@@ -41,13 +55,13 @@ class Stage:
         Raises:
             ValueError: It lies below the ground or inside a body.
         """
-        if self._free_for_good:
+        if self.mounts.free_for_good:
             return
         for rig, sensors in self.mounted.items():
             for mounted in sensors:
                 place_m = mounted.vehicle_T_sensor[:3, 3]
                 _check_place(f"rig {rig!r}: sensor {mounted.sensor.name!r}", place_m, instant)
-        self._free_for_good = not self.scene.moves
+        self.mounts.free_for_good = not self.scene.moves
 
 
 def _check_place(sensor: str, place_m: NDArray[np.float64], instant: Instant) -> None:
@@ -65,29 +79,82 @@ def _check_place(sensor: str, place_m: NDArray[np.float64], instant: Instant) ->
         )
 
 
-class Stages:
-    """The stages of a scenario's runs: each is built when first needed, and a few are kept, in case they are again.
+class Scenes:
+    """The geometry of a scenario's runs: each is built when first needed, and a few are kept, in case they are again.
 
-    In each process, that is: Embree's scenes cannot be pickled, so that a DataLoader worker builds its own. What runs
-    have in common is made once: the bodies of each kind, and in traffic the sensors on the ego.
+    In each process, that is: Embree's scenes cannot be pickled, so that a DataLoader worker builds its own. The bodies
+    of each kind, which runs have in common, are made once.
+
+    Args:
+        scenario: What plays.
+        seed: Seed of procedural traffic.
+        kept_bytes: What all that are kept may take; a small share of the machine's memory if not given.
+    """
+
+    def __init__(self, scenario: Scenario, seed: int, kept_bytes: float | None = None) -> None:
+        self.scenario = scenario
+        self._seed = seed
+        self._kept_bytes = kept_bytes
+        self._kept: dict[int, Scene] = {}
+        self._solids = Solids()
+        self._ego: Mesh | None = None
+
+    def of_run(self, run: int) -> Scene:
+        """That of one run; see `Scenario.locate`.
+
+        Raises:
+            FileNotFoundError: A mesh, vehicle or trajectory file is missing.
+            ValueError: A mesh or a trajectory cannot be used.
+        """
+        if run in self._kept:
+            scene = self._kept.pop(run)
+        else:
+            self._make_room()
+            if self._ego is None and self.scenario.traffic is not None:
+                self._ego = self.scenario.ego_mesh()
+            scene = Scene(self.scenario.world(self._seed, run, self._ego), self._solids)
+        self._kept[run] = scene  # at the end: the first is the one that was asked for longest ago
+        return scene
+
+    def _make_room(self) -> None:
+        """Before a scene is built, about as large as the others: there is not always memory for one more."""
+        most_bytes = self._kept_bytes
+        if most_bytes is None:
+            workers = get_worker_info()
+            most_bytes = min(KEPT_BYTES, KEPT_SHARE * machine_bytes() / (workers.num_workers if workers else 1))
+        sizes = [scene.bytes for scene in self._kept.values()]
+        while sizes and sum(sizes) + max(sizes) > most_bytes:
+            del self._kept[next(iter(self._kept))], sizes[0]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return Scenes(self.scenario, self._seed, self._kept_bytes).__dict__
+
+
+class Stages:
+    """The stages of a scenario's runs: rigs in its scenes. In traffic the sensors on the ego are the same in all.
 
     Args:
         scenario: What plays.
         rigs: Whose sensors are mounted.
         seed: Seed of procedural traffic.
+        kept_bytes: As in `Scenes`.
     """
 
-    def __init__(self, scenario: Scenario, rigs: Mapping[str, Rig], seed: int) -> None:
-        self._scenario = scenario
-        self._rigs = rigs
-        self._seed = seed
-        self._forget()
+    def __init__(self, scenario: Scenario, rigs: Mapping[str, Rig], seed: int, kept_bytes: float | None = None) -> None:
+        self._put(Scenes(scenario, seed, kept_bytes), rigs)
 
-    def _forget(self) -> None:
-        self._kept: dict[int, Stage] = {}
-        self._solids = Solids()
-        self._ego: Mesh | None = None
-        self._mounted: Mapping[str, Sequence[MountedSensor]] | None = None
+    def _put(self, scenes: Scenes, rigs: Mapping[str, Rig]) -> None:
+        self._scenes = scenes
+        self._rigs = rigs
+        # None of them outlives its scene, which may be dropped to make room.
+        self._mounts: WeakKeyDictionary[Scene, Mounts] = WeakKeyDictionary()
+        self._on_moving_ego: Mapping[str, Sequence[MountedSensor]] | None = None
+
+    def with_rigs(self, rigs: Mapping[str, Rig]) -> "Stages":
+        """Other rigs in the same scenes, none of which is built again."""
+        other = copy.copy(self)
+        other._put(self._scenes, rigs)
+        return other
 
     def of_run(self, run: int) -> Stage:
         """The stage of one run; see `Scenario.locate`.
@@ -96,31 +163,17 @@ class Stages:
             FileNotFoundError: A mesh, vehicle or trajectory file is missing.
             ValueError: A mesh or a trajectory cannot be used, or a sensor is mounted inside the ego's body.
         """
-        if run in self._kept:
-            stage = self._kept.pop(run)
-        else:
-            self._make_room()
-            stage = self._built(run)
-        self._kept[run] = stage  # at the end: the first is the one that was asked for longest ago
-        return stage
+        scene = self._scenes.of_run(run)
+        if scene not in self._mounts:
+            self._mounts[scene] = Mounts(self._sensors(scene))
+        return Stage(scene, self._mounts[scene])
 
-    def _make_room(self) -> None:
-        """Before a stage is built, about as large as the others: there is not always memory for one more."""
-        workers = get_worker_info()
-        most_bytes = min(KEPT_BYTES, KEPT_SHARE * machine_bytes() / (workers.num_workers if workers else 1))
-        sizes = [stage.scene.bytes for stage in self._kept.values()]
-        while sizes and sum(sizes) + max(sizes) > most_bytes:
-            del self._kept[next(iter(self._kept))], sizes[0]
-
-    def _built(self, run: int) -> Stage:
-        if self._ego is None and self._scenario.traffic is not None:
-            self._ego = self._scenario.ego_mesh()
-        scene = Scene(self._scenario.world(self._seed, run, self._ego), self._solids)
-        if self._ego is None or not scene.world.ego.trajectory.moves:
-            return Stage(scene, self._on(scene))
+    def _sensors(self, scene: Scene) -> Mapping[str, Sequence[MountedSensor]]:
+        if self._scenes.scenario.traffic is None or not scene.world.ego.trajectory.moves:
+            return self._on(scene)
         # What a sensor on an ego that moves sees of it is the same in all runs.
-        self._mounted = self._mounted or self._on(scene)
-        return Stage(scene, self._mounted)
+        self._on_moving_ego = self._on_moving_ego or self._on(scene)
+        return self._on_moving_ego
 
     def _on(self, scene: Scene) -> Mapping[str, Sequence[MountedSensor]]:
         """The rigs' sensors on the ego of a scene."""
@@ -131,6 +184,7 @@ class Stages:
         }
 
     def _check_mounts(self, scene: Scene) -> None:
+        scenario = self._scenes.scenario
         for name, rig in self._rigs.items():
             for sensor in rig.sensors:
                 place = sensor.mount.matrix()[:3, 3]
@@ -138,9 +192,12 @@ class Stages:
                     other = f", or use its own vehicle (--vehicle {rig.vehicle})" if rig.vehicle else ""
                     raise ValueError(
                         f"rig {name!r}: sensor {sensor.name!r} at {place.round(3).tolist()} m lies inside the ego of "
-                        f"{self._scenario.name!r}, {self._scenario.ego_name}, so that all its rays start blocked; move "
-                        f"its mount{other}"
+                        f"{scenario.name!r}, {scenario.ego_name}, so that all its rays start blocked; move its "
+                        f"mount{other}"
                     )
 
     def __getstate__(self) -> dict[str, Any]:
-        return Stages(self._scenario, self._rigs, self._seed).__dict__
+        return {"_scenes": self._scenes, "_rigs": self._rigs}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._put(state["_scenes"], state["_rigs"])

@@ -1,8 +1,8 @@
-"""Trajectories and actors from files."""
+"""Trajectories and boxes from tables."""
 
 import csv
 import io
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 from torchcover.files import NpyHeader, check_memory, decode, read_npz, reads
 from torchcover.geometry import check_rigid
+from torchcover.simulation.recorded.track import Track, checked_size, moving
+from torchcover.simulation.recorded.words import CLASSES
 from torchcover.simulation.shapes import Box, Mesh
 from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor
@@ -63,10 +65,26 @@ def read_boxes(path: Path) -> tuple[Actor, ...]:
         IsADirectoryError: A folder.
         BadFileError: As `read_trajectory`, or a box without volume; the message names the file and the id.
     """
+    return tuple(map(_box_actor, _tracks(path)))
+
+
+@reads("a file of boxes")
+def read_box_tracks(path: Path) -> tuple[Track, ...]:
+    """Read recorded boxes as tracks, which may have gaps; else as `read_boxes`."""
+    return tuple(_tracks(path))
+
+
+def _tracks(path: Path) -> Iterator[Track]:
     rows: dict[str, list[dict[str, str]]] = {}
     for row in _rows(path, BOX_COLUMNS):
         rows.setdefault(row["id"], []).append(row)
-    return tuple(_box_actor(name, track) for name, track in rows.items())
+    for name, track in rows.items():
+        numbers = _numbers(track, [column for column in BOX_COLUMNS if column not in ("id", "category")])
+        length, width, height = checked_size(name, numbers[0, 4:7])
+        angles_deg = np.column_stack([numbers[:, 7], np.zeros((len(track), 2))])
+        trajectory = moving(name, numbers[:, 0], numbers[:, 1:4], angles_deg)
+        category = track[0]["category"]
+        yield Track(name, category, CLASSES.get(category.strip().lower()), (length, width, height), trajectory)
 
 
 def _read_csv(path: Path) -> Trajectory:
@@ -132,20 +150,14 @@ def _check_gaps(times_s: NDArray[np.float64]) -> None:
         )
 
 
-def _box_actor(name: str, track: list[dict[str, str]]) -> Actor:
-    numbers = _numbers(track, [column for column in BOX_COLUMNS if column not in ("id", "category")])
-    size_m = numbers[0, 4:7]
-    if not (np.isfinite(size_m).all() and (size_m > 0).all()):
-        raise ValueError(f"id {name}: a box needs a positive length, width and height; got {size_m.tolist()}")
-    angles_deg = np.column_stack([numbers[:, 7], np.zeros((len(track), 2))])
+def _box_actor(track: Track) -> Actor:
     try:
-        trajectory = Trajectory(numbers[:, 0], numbers[:, 1:4], angles_deg, transient=True)
-        _check_gaps(trajectory.times_s)
+        _check_gaps(track.trajectory.times_s)
     except ValueError as error:
-        raise ValueError(f"id {name}: {error}") from error
-    return Actor(name, track[0]["category"], _box(size_m), trajectory)
+        raise ValueError(f"id {track.name}: {error}") from error
+    return Actor(track.name, track.category, box_mesh(track.size_m), track.trajectory)
 
 
-def _box(size_m: NDArray[np.float64]) -> Mesh:
-    length, width, height = size_m.tolist()
-    return Box(type="box", size_m=(length, width, height)).mesh()
+def box_mesh(size_m: tuple[float, float, float]) -> Mesh:
+    """A box of a length, width and height that stands on its origin."""
+    return Box(type="box", size_m=size_m).mesh()

@@ -107,7 +107,7 @@ class Steps:
             stage.check_mounts(instant)
             # Where nothing moves, the first answer holds.
             ends_m, free = resting or ([m.ends_m(instant) for m in stage.mounted[RIG]], self._free(instant))
-            if not stage.scene.moves and self._scenario.traffic is None:
+            if not stage.scene.moves and self._scenario.repeats:
                 resting = ends_m, free
             sensors = [
                 self._disturbed(m, ends, index, k)

@@ -16,18 +16,10 @@ from torchcover.simulation.sumo import Sumo, programs
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.streets import Streets
 
-from .towns import street, write_net
+from .towns import XODR, street, write_net
 
 LITTLE = {"traffic_per_km": 2.0, "people_per_km": 1.0, "buses_per_km": 0.2, "cyclists_per_km": 0.5}
-XODR = """<OpenDRIVE><header revMajor="1" revMinor="4"/><road name="r" length="300" id="1" junction="-1"><planView>
-<geometry s="0" x="0" y="0" hdg="0" length="200"><line/></geometry>
-<geometry s="200" x="200" y="0" hdg="0" length="100"><arc curvature="0.01"/></geometry></planView>
-<elevationProfile><elevation s="0" a="5" b="0.04" c="0" d="0"/></elevationProfile>
-<lanes><laneSection s="0"><center><lane id="0" type="none" level="false"/></center><right>
-<lane id="-1" type="driving" level="false"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
-<lane id="-2" type="driving" level="false"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
-<lane id="-3" type="sidewalk" level="false"><width sOffset="0" a="2" b="0" c="0" d="0"/></lane>
-</right></laneSection></lanes></road></OpenDRIVE>"""
+
 ROUTES = """<routes><vType id="car" length="5"/>{more}<vehicle id="{name}" type="car" depart="1" departSpeed="10">
 <route edges="-1"/></vehicle></routes>"""
 

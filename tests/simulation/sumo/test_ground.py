@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchcover.simulation.sumo.ground import Plain, Slopes, ground_of, tilts_deg
+from torchcover.simulation.height_field import Plain, Slopes
+from torchcover.simulation.sumo.ground import ground_of, tilts_deg
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.pavement import Pavement, decks
 from torchcover.simulation.sumo.vicinity import Vicinity

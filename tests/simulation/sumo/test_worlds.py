@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import shapely
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from torchcover import Scenario
 from torchcover.simulation.sumo import Sumo
@@ -100,7 +102,7 @@ def test_houses_stand_beside_streets_and_apart(z, tmp_path):
     north = edge("north", ("", 3.5, [(100, -200, z[1] / 4), (100, 200, z[1] / 4)]))
     world = made(tmp_path, street(z=z), north, built_share=1.0, ego_id="ego").world(0)
     ground, _, houses, _ = world.static
-    outlines_m = houses.vertices_m.reshape(-1, 8, 3)[:, :4, :2]
+    outlines_m = corners_of(houses)
     polygons = shapely.polygons(outlines_m)
     assert len(polygons) > 25
     assert all(polygon.exterior.is_ccw for polygon in polygons)
@@ -114,6 +116,51 @@ def test_houses_stand_beside_streets_and_apart(z, tmp_path):
     assert {-1.0, 1.0} == set(np.sign(middles_m[east, 1]))  # of a one-way street, too
     heights_m = houses.vertices_m[:, 2].reshape(-1, 8)
     assert heights_m[:, 4:].min() - ground.vertices_m[:, 2].min() > 4.9
+
+
+def test_fences_stand_where_nobody_built_and_off_the_street(tmp_path):
+    north = edge("north", ("", 3.5, [(100, -200, 0), (100, 200, 0)]))
+    world = made(tmp_path, street(), north, built_share=0.3, ego_id="ego").world(0)
+    houses, others = world.static[2:]
+    # Of the pieces with eight corners the arms of lamps are flat; posts and crowns have more corners.
+    fences = [piece for piece in others_of(others) if len(piece) == 8 and np.ptp(piece[:, 2]) > 1.0]
+    assert len(fences) > 10
+    around = shapely.STRtree([shapely.MultiPoint(piece[:, :2]).convex_hull for piece in fences])
+    streets = [shapely.box(-47.0, -3.75, 353.0, 1.75), shapely.box(51.25, -200.0, 54.75, 200.0)]
+    street_and_houses = [*streets, *shapely.polygons(corners_of(houses))]
+    assert len(around.query(street_and_houses, predicate="intersects")[0]) == 0
+    assert {0.08} == {round(2 * hull.area / hull.length, 2) for hull in around.geometries}
+
+
+def corners_of(houses):
+    return houses.vertices_m.reshape(-1, 8, 3)[:, :4, :2]
+
+
+def others_of(mesh):
+    """The corners of each connected piece."""
+    return [mesh.vertices_m[np.unique(piece)] for piece in pieces_of(mesh)]
+
+
+def pieces_of(mesh):
+    graph = coo_array((np.ones(len(mesh.faces)), mesh.faces[:, :2].T), shape=(len(mesh.vertices_m),) * 2)
+    labels = connected_components(graph, directed=False)[1][mesh.faces[:, 0]]
+    order = np.argsort(labels, kind="stable")
+    return np.split(mesh.faces[order], np.flatnonzero(np.diff(labels[order])) + 1)
+
+
+def test_a_narrow_gap_between_carriageways_is_a_median_and_a_wide_one_is_not(tmp_path):
+    for gap, found in ((2.0, 1), (8.0, 0)):
+        folder = tmp_path / str(gap)
+        folder.mkdir()
+        ways = [edge(name, ("", 3.5, [(0, y, 0), (400, y, 0)])) for name, y in (("a", 0.0), ("b", 3.5 + gap))]
+        world = made(folder, *ways, built_share=0.0, ego_id="ego").world(0)
+        raised = [mesh for mesh in world.static[1:] if np.ptp(mesh.vertices_m[:, 2]) < 0.5]
+        assert len(raised) == found
+        if raised:
+            top_m = raised[0].vertices_m[raised[0].vertices_m[:, 2] > 0.1]
+            assert shapely.MultiPoint(top_m[:, :2]).convex_hull.area == pytest.approx(400.0 * gap, rel=1e-2)
+            assert (raised[0].vertices_m[:, 1] > 1.7).all()
+            assert top_m[:, 2] == pytest.approx(0.15)
 
 
 def test_open_country_has_trees_only(tmp_path):
@@ -143,6 +190,17 @@ def test_cars_are_parked_in_bays_only(tmp_path):
             {"ego_id": "ego", "duration_s": 9.0},
             r"ego_id: 'ego' is not there all the time from t = 0 to 9 s",
         ),
+        (
+            {"ego_id": "ego", "steps": together({t: row for t, row in drive().items() if not 1.1 < t < 2.1})},
+            r"it leaves the network, teleports or has a gap after t = 1 s; shorten duration_s to 1",
+        ),
+        (
+            {
+                "ego_id": "ego",
+                "steps": {t: [row.replace('y="0.0"', f'y="{90.0 * (t > 2)}"')] for t, row in drive().items()},
+            },
+            r"teleports or has a gap after t = 2 s",
+        ),
         ({"duration_s": 9.0}, r"no car that could be the ego .* the longest drives for 4 s \(data end at t = 4 s\)"),
         ({"ego_type": "bus"}, "no vehicle of type 'bus' that could be the ego"),
         ({"begin_s": 3.0}, "no car that could be the ego"),
@@ -161,7 +219,7 @@ def test_without_an_ego_there_is_no_world(options, message, tmp_path):
         ({"type": "sumo", "random": {}, "ego_id": "a"}, "random draws all traffic; leave out ego_id"),
         ({"type": "sumo", "net": "a.net.xml", "random": {"lanes": 1}}, "random: lanes are for streets that are drawn"),
         ({"type": "sumo", "random": {"network": "star"}}, "'rand', 'grid' or 'spider'"),
-        ({"type": "somo"}, "type: traffic is one of 'urban', 'highway', 'parking', 'sumo'; got 'somo'"),
+        ({"type": "somo"}, "type: traffic is one of 'urban', 'highway', 'parking', 'sumo', 'tracks'; got 'somo'"),
         ({}, "type: traffic is one of"),
     ],
 )

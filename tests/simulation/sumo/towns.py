@@ -1,6 +1,15 @@
 """Little networks and floating car data, written by hand: SUMO is not asked."""
 
 LANE = '<lane id="{edge}_{index}" index="{index}" {who} width="{width}" speed="13.9" length="9" shape="{shape}"/>'
+XODR = """<OpenDRIVE><header revMajor="1" revMinor="4"/><road name="r" length="300" id="1" junction="-1"><planView>
+<geometry s="0" x="0" y="0" hdg="0" length="200"><line/></geometry>
+<geometry s="200" x="200" y="0" hdg="0" length="100"><arc curvature="0.01"/></geometry></planView>
+<elevationProfile><elevation s="0" a="5" b="0.04" c="0" d="0"/></elevationProfile>
+<lanes><laneSection s="0"><center><lane id="0" type="none" level="false"/></center><right>
+<lane id="-1" type="driving" level="false"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
+<lane id="-2" type="driving" level="false"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>
+<lane id="-3" type="sidewalk" level="false"><width sOffset="0" a="2" b="0" c="0" d="0"/></lane>
+</right></laneSection></lanes></road></OpenDRIVE>"""
 WALK, DRIVE = 'allow="pedestrian"', 'disallow="pedestrian"'
 
 

@@ -1,26 +1,24 @@
 """A log of Argoverse 2's sensor data set (Wilson et al., NeurIPS 2021): both LiDARs, poses and cuboids."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import Calibration
 from torchcover.data.recordings.calibrated import SensorCalibrations
 from torchcover.data.recordings.recording import Scan, check_times
 from torchcover.data.recordings.tracks import Seen, Tracks
 from torchcover.detection.boxes import Boxes
-from torchcover.files import check_memory, naming, reads
+from torchcover.files import naming, read_feather
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
+from torchcover.simulation.recorded.argoverse2 import CUBOIDS, POSE, poses_of, vehicle_T_ego
 
-# The ego frame lies in the rear axle, 0.30 m above the ground; the centre of a Ford Fusion is 1.339 m before it, as
-# in the rig `argoverse2`, where the source is. Its outline is 4.87 x 1.85 m, and the LiDARs are up to 1.94 m high.
-vehicle_T_ego = rigid(np.eye(3), [-1.339, 0.0, 0.30])
+# Its outline is 4.87 x 1.85 m, and the LiDARs are up to 1.94 m high.
 BODY = BoundingBox((-2.436, -0.926, 0.05), (2.436, 0.926, 2.14))
 # Each has 32 lasers; `laser_number` counts on from the upper one.
 LASERS = {"up_lidar": (0, 32), "down_lidar": (32, 64)}
@@ -98,10 +96,10 @@ class Argoverse2:
             ValueError: Other tables, or no such LiDAR in them.
         """
         folder = self.path / "calibration"
-        poses = read_feather(folder / "egovehicle_SE3_sensor.feather", ("sensor_name", *_POSE))
+        poses = read_feather(folder / "egovehicle_SE3_sensor.feather", ("sensor_name", *POSE))
         lenses = read_feather(folder / "intrinsics.feather", ("sensor_name", *_LENS))
         with naming(folder, "calibrations of Argoverse 2"):
-            ego_T = {str(name): pose for name, pose in zip(poses["sensor_name"], _poses_of(poses), strict=True)}
+            ego_T = {str(name): pose for name, pose in zip(poses["sensor_name"], poses_of(poses), strict=True)}
             missing = ({*LASERS} | {str(name) for name in lenses["sensor_name"]}) - ego_T.keys()
             if missing:
                 raise ValueError(f"egovehicle_SE3_sensor.feather has no {', '.join(sorted(missing))}")
@@ -115,7 +113,7 @@ class Argoverse2:
         path = self.path / "annotations.feather"
         if not path.exists():
             return None
-        columns = read_feather(path, _CUBOIDS)
+        columns = read_feather(path, CUBOIDS)
         times_s = (columns["timestamp_ns"].astype(np.int64) - self._times_ns[0]) * 1e-9
         rotations = np.column_stack([columns[name] for name in ("qw", "qx", "qy", "qz")])
         places = np.column_stack([columns[name] for name in ("tx_m", "ty_m", "tz_m")])
@@ -130,7 +128,7 @@ class Argoverse2:
 
     def _read_poses(self) -> list[Matrix]:
         path = self.path / "city_SE3_egovehicle.feather"
-        columns = read_feather(path, ("timestamp_ns", *_POSE))
+        columns = read_feather(path, ("timestamp_ns", *POSE))
         times_ns = columns["timestamp_ns"].astype(np.int64)
         order = np.argsort(times_ns, kind="stable")
         after = np.searchsorted(times_ns[order], self._times_ns).clip(1, len(order) - 1)
@@ -142,19 +140,10 @@ class Argoverse2:
             raise ValueError(
                 f"{path}: the pose nearest to the sweep {self.names[worst]} is {gaps[worst] * 1e-9:.3f} s off"
             )
-        return _poses_of({name: column[nearest] for name, column in columns.items()})
+        return poses_of({name: column[nearest] for name, column in columns.items()})
 
 
-_POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-_CUBOIDS = ("timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *_POSE)
 _LENS = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "height_px", "width_px")
-
-
-def _poses_of(columns: Mapping[str, NDArray[Any]]) -> list[Matrix]:
-    """(4, 4) of each row."""
-    rotations = np.column_stack([columns[name] for name in _POSE[:4]])
-    places = np.column_stack([columns[name] for name in _POSE[4:]])
-    return [rigid(rotation_from_quaternion(one), place) for one, place in zip(rotations, places, strict=True)]
 
 
 def _camera(row: Mapping[str, Any], vehicle_T_camera: Matrix) -> Calibration:
@@ -169,35 +158,6 @@ def _camera(row: Mapping[str, Any], vehicle_T_camera: Matrix) -> Calibration:
         vehicle_T_camera=vehicle_T_camera,
         name=str(row["sensor_name"]),
     )
-
-
-@reads("a feather table")
-def read_feather(path: Path, names: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """Read columns of a feather table.
-
-    Args:
-        path: The file.
-        names: The columns.
-
-    Raises:
-        BadFileError: No such table, a column that is missing or has holes, or no rows.
-        ImportError: pyarrow is not installed.
-    """
-    try:
-        from pyarrow import feather
-    except ImportError as error:
-        raise ImportError(f"{path}: Argoverse 2 needs pyarrow: pip install 'torchcover[av2]'") from error
-    check_memory(4 * path.stat().st_size)
-    table = feather.read_table(path, columns=None)
-    missing = [name for name in names if name not in table.column_names]
-    if missing:
-        raise ValueError(f"the columns {', '.join(names)} are needed; {', '.join(missing)} are missing")
-    if table.num_rows == 0:
-        raise ValueError("a table without rows")
-    holes = [name for name in names if table.column(name).null_count]
-    if holes:
-        raise ValueError(f"the columns {', '.join(holes)} have holes")
-    return {name: table.column(name).to_numpy() for name in names}
 
 
 def _time_ns(path: Path) -> int:

@@ -13,19 +13,16 @@ from numpy.typing import NDArray
 from torchcover.cameras.calibration import read_nuscenes
 from torchcover.data.clouds import read_cloud
 from torchcover.data.recordings.calibrated import SensorCalibrations
-from torchcover.data.recordings.json_tables import check_beneath, read_table
 from torchcover.data.recordings.recording import Scan, check_times
 from torchcover.data.recordings.tracks import Seen, Tracks
 from torchcover.detection.boxes import Boxes
-from torchcover.files import naming
+from torchcover.files import naming, read_json_table
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
+from torchcover.simulation.recorded.nuscenes import vehicle_T_ego
 
 CHANNEL = "LIDAR_TOP"
-# The ego frame lies under the rear axle, on the ground; the centre of a Renault Zoe's box is 1.385 m before it, as in
-# the rig `nuscenes`, where the source is. Nothing but the car and what is mounted on it can be in its outline of
-# 4.08 x 1.73 m up to a little above the LiDAR.
-vehicle_T_ego = rigid(np.eye(3), [-1.385, 0.0, 0.0])
+# Nothing but the car and what is mounted on it can be in its outline of 4.08 x 1.73 m up to a little above the LiDAR.
 BODY = BoundingBox((-2.042, -0.865, 0.05), (2.042, 0.865, 2.04))
 
 
@@ -86,7 +83,7 @@ class NuScenes:
             first = self._sample_tokens[self.frames[0]]
             rows = [
                 row
-                for row in read_table(self._tables / "sample_data.json").rows
+                for row in read_json_table(self._tables / "sample_data.json").rows
                 if row["sample_token"] == first and row["is_key_frame"] and "/CAM_" in str(row["filename"])
             ]
             cameras = [
@@ -105,10 +102,13 @@ class NuScenes:
 
     def _read(self, tables: Path, scenes: Sequence[str] | None) -> None:
         samples = self._samples(tables, scenes)
-        poses, calibrations = read_table(tables / "ego_pose.json"), read_table(tables / "calibrated_sensor.json")
+        poses, calibrations = (
+            read_json_table(tables / "ego_pose.json"),
+            read_json_table(tables / "calibrated_sensor.json"),
+        )
         data = [
             row
-            for row in read_table(tables / "sample_data.json").rows
+            for row in read_json_table(tables / "sample_data.json").rows
             if _is_lidar(row) and row["sample_token"] in samples
         ]
         data.sort(key=lambda row: row["timestamp"])
@@ -133,10 +133,10 @@ class NuScenes:
             return self._read_tracks()
 
     def _read_tracks(self) -> Tracks:
-        categories = {row["token"]: str(row["name"]) for row in read_table(self._tables / "category.json").rows}
-        instances = read_table(self._tables / "instance.json")
+        categories = {row["token"]: str(row["name"]) for row in read_json_table(self._tables / "category.json").rows}
+        instances = read_json_table(self._tables / "instance.json")
         tracks: dict[str, list[Seen]] = {}
-        for row in read_table(self._tables / "sample_annotation.json").rows:
+        for row in read_json_table(self._tables / "sample_annotation.json").rows:
             if row["sample_token"] not in self._sample_times:
                 continue
             width, length, height = row["size"]
@@ -152,12 +152,12 @@ class NuScenes:
 
     def _samples(self, tables: Path, scenes: Sequence[str] | None) -> dict[str, float]:
         """Token -> time in seconds of the key frames of the wanted scenes."""
-        by_name = {row["name"]: row["token"] for row in read_table(tables / "scene.json").rows}
+        by_name = {row["name"]: row["token"] for row in read_json_table(tables / "scene.json").rows}
         unknown = set(scenes or ()) - by_name.keys()
         if unknown:
             raise ValueError(f"no scene {', '.join(sorted(unknown))}; there are {', '.join(sorted(by_name))}")
         wanted = {token for name, token in by_name.items() if scenes is None or name in scenes}
-        rows = read_table(tables / "sample.json").rows
+        rows = read_json_table(tables / "sample.json").rows
         return {row["token"]: row["timestamp"] * 1e-6 for row in rows if row["scene_token"] in wanted}
 
 
@@ -200,3 +200,21 @@ def _tables(path: Path) -> Path:
         names = ", ".join(version.name for version in versions) or "none"
         raise ValueError(f"{path}: one folder of tables v1.0-*/ is needed; got {names}; name it in the path")
     return versions[0]
+
+
+def check_beneath(folder: Path, name: str) -> str:
+    """Return a path that a table names, if it is one within a folder.
+
+    Raises:
+        ValueError: It leads out of it.
+
+    Example:
+        >>> check_beneath(Path("drive"), "samples/a.bin")
+        'samples/a.bin'
+    """
+    # Of a hundred thousand names few need to be taken apart.
+    if ".." in name or ":" in name or "\\" in name or not name.strip("./") or name.startswith("/"):
+        parts = Path(name).parts
+        if Path(name).is_absolute() or ".." in parts or not parts:
+            raise ValueError(f"{folder}: a table names the file {name!r}, which is not within it")
+    return name

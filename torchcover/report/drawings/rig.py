@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
+from torchcover.report.drawings.body import VIEWS, draw_body
 from torchcover.report.maps.overlay import SensorView, sensor_colour
 from torchcover.report.maps.sheet import (
     HEADING_POINTS,
@@ -37,7 +37,6 @@ HIGHEST_RANGES_IN = 4.5
 UNLIMITED_M = 300.0
 ARC_POINTS = 241
 GROUND_M = -0.4
-LIGHT = np.array([0.3, -0.5, 0.81])
 
 
 def draw_rig(
@@ -62,8 +61,8 @@ def draw_rig(
     wide = [_sector(sensor, range_m) for sensor, range_m in zip(sensors, ranges_m, strict=True)]
     views = [(x, y), (x, (GROUND_M, top_m)), _bounds_of_ranges([vertices_m[:, :2], *wide])]
     figure, (above, side, ranges) = stack_views(views, width_in=WIDTH_IN)
-    for axes, axis in ((above, 2), (side, 1), (ranges, 2)):
-        _draw_body(axes, vertices_m, faces, axis=axis)
+    for axes, seen_from in ((above, "above"), (side, "right"), (ranges, "above")):
+        draw_body(axes, vertices_m, faces, VIEWS[seen_from])
     side.axhspan(GROUND_M, 0.0, facecolor="#d8d4cc", edgecolor="black", linewidth=0.8)
     for at, sensor in enumerate(sensors):
         near_m, place = min(ranges_m[at], beyond_m), sensor.position_m
@@ -138,19 +137,6 @@ def _runs(seen: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
     order = np.roll(np.arange(len(seen)), -int(np.argmin(seen)))
     pieces = np.split(order, np.flatnonzero(np.diff(seen[order])) + 1)
     return [piece for piece in pieces if seen[piece[0]]]
-
-
-def _draw_body(axes: Axes, vertices_m: Points, faces: NDArray[np.int64], axis: int) -> None:
-    """Draw a body, shaded, seen along an axis: 2 is from above, 1 from the right."""
-    corners = vertices_m[faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    shade = 0.55 + 0.35 * np.clip(normals @ LIGHT, 0.0, 1.0)
-    nearness = corners[:, :, axis].max(axis=1) * (1 if axis == 2 else -1)
-    order = np.argsort(nearness)
-    colours = np.repeat(shade[order, None], 3, axis=1)
-    shown = corners[order][:, :, [0, 1 if axis == 2 else 2]]
-    axes.add_collection(PolyCollection(list(shown), facecolors=colours, edgecolors=colours, linewidths=0.3, zorder=1))
 
 
 def _draw_sensor(axes: Axes, at: int, place: Points, views: Sequence[Points], numbers: Sequence[Points]) -> None:

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from torchcover.simulation.sumo.ground import Ground, tilts_deg
+from torchcover.simulation.height_field import Ground
+from torchcover.simulation.sumo.ground import tilts_deg
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.city import FREE_AT_CORNERS_M, PARKED, PARKED_GAP_M
 from torchcover.simulation.traffic.fleet import Fleet

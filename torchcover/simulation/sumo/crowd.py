@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.simulation.sumo.floating import Recorded, Track
-from torchcover.simulation.sumo.types import VehicleType, type_of
+from torchcover.simulation.sumo.types import type_of
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import CATEGORIES, Fleet
+from torchcover.simulation.traffic.vehicle_class import VehicleType
 
 Numbers = NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""What stands along streets: houses, trees and lamp posts."""
+"""What stands along streets: houses, fences, trees and lamp posts."""
 
 from collections.abc import Iterator
 
@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from torchcover.simulation.height_field import Ground
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sumo.ground import Ground
 from torchcover.simulation.sumo.network import Lane
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.roads import Line
@@ -20,6 +20,8 @@ SET_BACK_M, GAP_M = (0.8, 6.0), (0.3, 6.0)
 PIECE_EVERY_M = (9.0, 20.0)
 LAMP_SHARE = 0.35
 LAMP_RADIUS_M, CROWN_M = 0.1, (1.0, 1.6)
+FENCE_SHARE, FENCE_AT_M, FENCE_M, FENCE_PIECE_M = 0.6, 2.5, (0.9, 1.8), 3.0
+FENCE_THICK_M = 0.08
 CLEAR_BELOW_CROWN_M, TREE_M = (2.8, 3.4), (5.0, 8.5)
 # Nothing stands nearer to a lane than this.
 CLEAR_M = 0.4
@@ -44,11 +46,12 @@ class Frontage:
         self._taken = shapely.STRtree(shapely.buffer(vicinity.covered, CLEAR_M))
 
     def meshes(self) -> tuple[Mesh, ...]:
-        """Houses in one mesh, trees and lamp posts in another."""
+        """Houses in one mesh, fences, trees and lamp posts in another."""
         sides = list(self._sides())
-        lots_m = np.concatenate([np.empty((0, 4, 2)), *(self._lots(side) for side in sides)])
-        houses_m = self._free(lots_m)
-        return few(self._houses(houses_m), self._trees_and_lamps(sides, houses_m))
+        lots = [self._lots(side) for side in sides]
+        houses_m = self._free(np.concatenate([np.empty((0, 4, 2)), *(built for built, _ in lots)]))
+        gaps = [(side, *gap) for side, (_, open_m) in zip(sides, lots, strict=True) for gap in open_m]
+        return few(self._houses(houses_m), [*self._fences(gaps, houses_m), *self._trees_and_lamps(sides, houses_m)])
 
     def _sides(self) -> Iterator[Line]:
         """The outer edges of streets, so that what stands along them is on the right."""
@@ -66,20 +69,22 @@ class Frontage:
                 if lane is lanes[0] or len(self._taken.query(shapely.Point(beside), predicate="intersects")) == 0:
                     yield side
 
-    def _lots(self, side: Line) -> Numbers:
-        """(N, 4, 2) outlines of houses along a side, counter-clockwise."""
-        lots, way_m = [], self._drawn((0.0, 5.0))
+    def _lots(self, side: Line) -> tuple[Numbers, list[tuple[float, float]]]:
+        """(N, 4, 2) outlines of houses along a side, counter-clockwise; from where to where there is none."""
+        lots, open_m, way_m = [], [], self._drawn((0.0, 5.0))
         while way_m < side.length_m:
             end_m, front_m = way_m + self._drawn(WIDTH_M), self._drawn(SET_BACK_M)
             if self._generator.random() < self._built_share and end_m < side.length_m:
                 lots.append((way_m, end_m, front_m, front_m + self._drawn(DEPTH_M)))
+            elif end_m < side.length_m:
+                open_m.append((way_m, end_m))
             way_m = end_m + self._drawn(GAP_M)
         start_m, end, front, back = np.array(lots).reshape(-1, 4).T
         corner_m, other_m = side.poses(start_m), side.poses(end)
         # A house has straight walls, whatever the street does.
         corner_m[:, 2] = other_m[:, 2] = np.rad2deg(np.arctan2(*(other_m - corner_m)[:, 1::-1].T))
         corners = ((corner_m, back), (other_m, back), (other_m, front), (corner_m, front))
-        return np.stack([_right_of(poses, right_m[:, None]) for poses, right_m in corners], axis=1)
+        return np.stack([_right_of(poses, right_m[:, None]) for poses, right_m in corners], axis=1), open_m
 
     def _free(self, outlines_m: Numbers) -> Numbers:
         """Those that stand neither on a street nor in one that came before."""
@@ -100,6 +105,25 @@ class Frontage:
         bottoms_m = heights_m.min(axis=1) - SUNK_M
         levels = zip(bottoms_m.tolist(), tops_m.tolist(), strict=True)
         return [prism([outline, outline], level) for outline, level in zip(outlines_m, levels, strict=True)]
+
+    def _fences(self, gaps: list[tuple[Line, float, float]], houses_m: Numbers) -> list[Mesh]:
+        """Where nobody built, in a town: straight pieces that follow the street."""
+        outlines_m, heights_m = [np.empty((0, 4, 2))], []
+        for side, from_m, to_m in gaps:
+            if self._built_share == 0 or self._generator.random() >= FENCE_SHARE:
+                continue
+            poses = side.poses(np.linspace(from_m, to_m, 1 + max(round((to_m - from_m) / FENCE_PIECE_M), 1)))
+            near_m, far_m = (_right_of(poses, FENCE_AT_M + thick_m) for thick_m in (0.0, FENCE_THICK_M))
+            outlines_m.append(np.stack([far_m[:-1], far_m[1:], near_m[1:], near_m[:-1]], axis=1))
+            heights_m += [self._drawn(FENCE_M)] * (len(poses) - 1)
+        outlines = np.concatenate(outlines_m)
+        polygons = shapely.polygons(outlines)
+        free = np.all(self._vicinity.sees(outlines.reshape(-1, 2)).reshape(-1, 4), axis=1)
+        for others in (self._taken, shapely.STRtree(shapely.polygons(houses_m))):
+            free[others.query(polygons, predicate="intersects")[0]] = False
+        on_m = self._ground.heights_m(outlines.reshape(-1, 2)).reshape(-1, 4)
+        levels = np.stack([on_m.min(axis=1) - SUNK_M, on_m.max(axis=1) + np.array(heights_m)], axis=1)
+        return [prism([outlines[k], outlines[k]], levels[k].tolist()) for k in np.flatnonzero(free).tolist()]
 
     def _trees_and_lamps(self, sides: list[Line], houses_m: Numbers) -> list[Mesh]:
         """Between the streets and the houses, where there is room."""

@@ -3,12 +3,11 @@
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal, NamedTuple
-from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import parse_xml, reads
+from torchcover.files import check_memory, feed_xml, reads
 
 Numbers = NDArray[np.float64]
 
@@ -19,6 +18,9 @@ MAX_WIDTH_M = 100.0
 # Lanes of these only, as far as anybody may use them, are no roads.
 NO_ROADS = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "tram", "subway", "cable_car", "ship"})
 SAME_PLACE_M = 1e-3
+PIECE_BYTES = 1 << 18
+# What is kept of a file takes about so many times its bytes.
+KEPT_PER_BYTE = 5
 
 Use = Literal["road", "turn", "bay", "shoulder", "sidewalk", "crossing", "corner"]
 
@@ -99,31 +101,78 @@ def _read_again(path: Path, _version: tuple[int, int] | None) -> Network:
 
 @reads("a road network of SUMO")
 def _read(path: Path) -> Network:
-    root = parse_xml(path)
-    if root.tag != "net":
-        raise ValueError(f"a network of SUMO begins with <net>; got <{root.tag}>")
-    by_name = {
-        (lane.edge, item.get("index")): lane
-        for edge in root.iter("edge")
-        for item in edge.iter("lane")
-        if (lane := _lane(edge, item))
-    }
-    lanes = tuple(by_name.values())
+    check_memory(KEPT_PER_BYTE * path.stat().st_size)
+    collector = _Collector()
+    with path.open("rb") as file:
+        feed_xml(iter(lambda: file.read(PIECE_BYTES), b""), collector.start)
+    lanes = tuple(collector.lanes.values())
     if not any(lane.use == "road" for lane in lanes):
         raise ValueError(f"a network with a street for vehicles is needed; it has {len(lanes)} lanes, none of which is")
+    number = {name: at for at, name in enumerate(collector.lanes)}
+    joined = ((number.get(source), number.get(target)) for source, target in collector.connections)
     return Network(
         lanes=lanes,
-        junctions=tuple(
-            outline
-            for junction in root.iter("junction")
-            if junction.get("type") != "internal" and len(outline := _places(junction.get("shape", ""))) >= 3
-        ),
-        connections=_connections(root, {name: number for number, name in enumerate(by_name)}),
-        left_hand=root.get("lefthand") in ("true", "1"),
+        junctions=tuple(collector.junctions),
+        connections=tuple((one, other) for one, other in joined if one is not None and other is not None),
+        left_hand=collector.left_hand,
     )
 
 
-def _lane(edge: ElementTree.Element, item: ElementTree.Element) -> Lane | None:
+# A lane by the name of its edge and its number there.
+LaneName = tuple[str, str]
+Attributes = dict[str, str]
+
+
+class _Collector:
+    """Keeps what is needed of a network, as start tags come in: its file may be larger than a tree of it could be."""
+
+    def __init__(self) -> None:
+        self.lanes: dict[LaneName, Lane] = {}
+        self.junctions: list[Numbers] = []
+        self.connections: list[tuple[LaneName, LaneName]] = []
+        self.left_hand = False
+        self._edge: Attributes = {}
+        self._keep = {
+            "edge": self._begin_edge,
+            "lane": self._lane,
+            "junction": self._junction,
+            "connection": self._join,
+        }
+        self._began = False
+
+    def start(self, name: str, attributes: list[str]) -> None:
+        """A tag; see `feed_xml`."""
+        if not self._began:
+            if name != "net":
+                raise ValueError(f"a network of SUMO begins with <net>; got <{name}>")
+            self._began = True
+            self.left_hand = _named(attributes).get("lefthand") in ("true", "1")
+        elif name in self._keep:
+            self._keep[name](_named(attributes))
+
+    def _begin_edge(self, edge: Attributes) -> None:
+        self._edge = edge
+
+    def _lane(self, item: Attributes) -> None:
+        lane = _lane(self._edge, item)
+        if lane is not None:
+            self.lanes[lane.edge, item.get("index", "")] = lane
+
+    def _junction(self, item: Attributes) -> None:
+        outline_m = _places(item.get("shape", ""))
+        if item.get("type") != "internal" and len(outline_m) >= 3:
+            self.junctions.append(outline_m)
+
+    def _join(self, item: Attributes) -> None:
+        names = [item.get(key, "") for key in ("from", "fromLane", "to", "toLane")]
+        self.connections.append(((names[0], names[1]), (names[2], names[3])))
+
+
+def _named(attributes: list[str]) -> Attributes:
+    return dict(zip(attributes[::2], attributes[1::2], strict=True))
+
+
+def _lane(edge: Attributes, item: Attributes) -> Lane | None:
     name = item.get("id", "")
     width_m, speed_mps = _number(item, "width", LANE_WIDTH_M), _number(item, "speed", 0.0)
     if not 0.0 < width_m <= MAX_WIDTH_M:
@@ -153,15 +202,9 @@ def _use(function: str, kind: str, classes: frozenset[str], barred: frozenset[st
         return "turn"
     if kind.lower() == "parking":
         return "bay"
+    if kind.lower() == "median":
+        return None
     return "shoulder" if "all" in barred else "road"
-
-
-def _connections(root: ElementTree.Element, number: dict[tuple[str, str | None], int]) -> tuple[tuple[int, int], ...]:
-    found = (
-        ((item.get("from", ""), item.get("fromLane")), (item.get("to", ""), item.get("toLane")))
-        for item in root.iter("connection")
-    )
-    return tuple((number[source], number[target]) for source, target in found if source in number and target in number)
 
 
 def _places(shape: str) -> Numbers:
@@ -180,7 +223,7 @@ def _without_repeats(line_m: Numbers) -> Numbers:
     return kept
 
 
-def _number(item: ElementTree.Element, key: str, otherwise: float) -> float:
+def _number(item: Attributes, key: str, otherwise: float) -> float:
     text = item.get(key)
     try:
         return otherwise if text is None else float(text)

@@ -1,4 +1,4 @@
-"""What is raised: sidewalks with their kerbs, and the decks of bridges, as closed bodies."""
+"""What is raised: sidewalks and medians with their kerbs, and the decks of bridges, as closed bodies."""
 
 from itertools import pairwise
 
@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from torchcover.simulation.height_field import CELL_M, Ground, Plain
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sumo.ground import CELL_M, Ground, Plain
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.scenery import PAVEMENT_M
 
@@ -22,7 +22,7 @@ PLACES_ALIKE_M = 1e-6
 
 
 class Pavement:
-    """All sidewalks, in plan: where neither vehicles nor crossings are.
+    """All sidewalks and medians, in plan: where neither vehicles nor crossings are.
 
     Args:
         vicinity: What is near.
@@ -31,7 +31,7 @@ class Pavement:
 
     def __init__(self, vicinity: Vicinity, ground: Ground) -> None:
         self._ground = ground
-        walked = shapely.union_all(vicinity.surfaces("sidewalk", "corner"))
+        walked = shapely.union_all([*vicinity.surfaces("sidewalk", "corner"), *vicinity.medians])
         driven = shapely.union_all(vicinity.surfaces("road", "turn", "bay", "shoulder", "crossing"))
         parts = shapely.get_parts(shapely.difference(walked, driven))
         self.parts = parts[(shapely.get_type_id(parts) == 3) & (shapely.area(parts) > SMALLEST_M2)]

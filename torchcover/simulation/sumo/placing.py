@@ -5,9 +5,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.simulation.height_field import Ground, Plain
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.crowd import Walker
-from torchcover.simulation.sumo.ground import Ground, Plain, tilts_deg
+from torchcover.simulation.sumo.ground import tilts_deg
 from torchcover.simulation.sumo.pavement import Pavement
 from torchcover.simulation.traffic.attitude import attitude
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet

@@ -21,8 +21,9 @@ Plan = Literal["rand", "grid", "spider"]
 
 LANE_M, BICYCLE_LANE_M, BAY_M = 3.25, 1.8, 2.3
 SIDEWALK_M = (2.4, 3.4)
+MEDIAN_M = (0.8, 1.8)
 # Shares of the streets that have them.
-WITH_BAYS, WITH_BICYCLE_LANES = 0.7, 0.5
+WITH_BAYS, WITH_BICYCLE_LANES, WITH_MEDIAN = 0.7, 0.5, 0.3
 # Two streets that do not meet keep so far apart, middle to middle: the plan knows no widths.
 APART_M = 40.0
 BEND_PIECES = 10
@@ -133,6 +134,8 @@ class Streets(Document):
         if self.cyclists_per_km > 0 and generator.random() < WITH_BICYCLE_LANES:
             lanes.append(('allow="bicycle"', BICYCLE_LANE_M))
         lanes += [('disallow="pedestrian"', LANE_M)] * int(generator.integers(1, self.lanes + 1))
+        if generator.random() < WITH_MEDIAN:
+            lanes.append(('type="median" disallow="all"', generator.uniform(*MEDIAN_M)))
         return "".join(f'<lane index="{k}" {who} width="{width:.2f}"/>' for k, (who, width) in enumerate(lanes))
 
 

@@ -2,33 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from torchcover.files import feed_xml, reads
+from torchcover.simulation.traffic.vehicle_class import VehicleType
 
 PIECE_BYTES = 1 << 18
 
-# SUMO's classes (and children), and the kinds of bodies (`fleet.CATEGORIES`) among which the length decides; cars are
-# those of all others.
-BODIES: Mapping[str, tuple[str, ...]] = {
-    "pedestrian": ("adult",),
-    "child": ("child",),
-    "wheelchair": ("adult",),
-    "bicycle": ("cyclist",),
-    "scooter": ("cyclist",),
-    "moped": ("motorcycle",),
-    "motorcycle": ("motorcycle",),
-    "truck": ("truck",),
-    "trailer": ("truck",),
-    "bus": ("bus",),
-    "coach": ("bus",),
-    "tram": ("bus",),
-    "delivery": ("van",),
-    "emergency": ("van",),
-}
-CARS = ("hatchback", "sedan", "suv", "van")
-# They need no road, or one that is not built.
-LEFT_OUT = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship", "drone"})
 # What SUMO takes for the length of a type that has none.
 USUAL_LENGTH_M = {
     "pedestrian": 0.215, "bicycle": 1.6, "scooter": 1.2, "moped": 2.1, "motorcycle": 2.2, "truck": 7.1,
@@ -42,24 +21,6 @@ WORDS = (
     ("truck", "truck"), ("trailer", "trailer"), ("lorry", "truck"), ("tram", "tram"), ("rail", "rail"),
     ("train", "rail"), ("subway", "subway"), ("ship", "ship"), ("van", "delivery"), ("delivery", "delivery"),
 )  # fmt: skip
-
-
-class VehicleType(NamedTuple):
-    """What SUMO knows of a type: its class and its length."""
-
-    vehicle_class: str
-    length_m: float
-
-    def body(self, lengths_m: Mapping[str, float]) -> str | None:
-        """The kind of body whose length is nearest among those of the class; None if there is none of this class.
-
-        Args:
-            lengths_m: Of each kind of body.
-        """
-        if self.vehicle_class in LEFT_OUT:
-            return None
-        kinds = BODIES.get(self.vehicle_class, CARS)
-        return min(kinds, key=lambda kind: abs(lengths_m[kind] - self.length_m))
 
 
 def type_of(name: str, on_foot: bool, known: Mapping[str, VehicleType]) -> VehicleType:

@@ -19,6 +19,12 @@ BRIDGE_M = 2.5
 SQUARE_M = 4.0
 # Streets are built a little farther than is seen, so that none ends in sight; bodies are as long as this.
 BEYOND_M = 25.0
+# What lies between carriageways that are no farther apart, and has this share of its outline in common with them, is a
+# median; what is smaller is a gap that the drawing of a network left.
+MEDIAN_M = 6.0
+ENCLOSED = 0.95
+SMALLEST_MEDIAN_M2 = 3.0
+ALONGSIDE_M = 0.05
 WAY_WITHIN_M = 0.5
 
 
@@ -82,7 +88,21 @@ class Vicinity:
         lines = _lines([lane.line_m[:, :2] for lane in along])
         found = shapely.buffer(lines, [lane.width_m / 2 for lane in along], cap_style="flat", join_style="mitre")
         outlines_m = [*self.junctions, *(lane.line_m for lane in self.lanes if lane.use == "corner")]
-        return np.concatenate([found, np.array([_polygon(outline_m) for outline_m in outlines_m], dtype=object)])
+        outlines = np.array([_polygon(outline_m) for outline_m in outlines_m], dtype=object)
+        return np.concatenate([found, outlines, self.medians])
+
+    @cached_property
+    def medians(self) -> NDArray[np.object_]:
+        """The polygons in plan of what lies between carriageways."""
+        driven = shapely.union_all([*self.surfaces("road", "turn", "shoulder"), *map(_polygon, self.junctions)])
+        closed = shapely.buffer(shapely.buffer(driven, MEDIAN_M / 2, quad_segs=2), -MEDIAN_M / 2, quad_segs=2)
+        others = shapely.union_all(self.surfaces("bay", "sidewalk", "corner", "crossing"))
+        pieces = shapely.get_parts(shapely.difference(shapely.difference(closed, driven), others))
+        pieces = pieces[(shapely.get_type_id(pieces) == 3) & (shapely.area(pieces) > SMALLEST_MEDIAN_M2)]
+        outlines = shapely.get_exterior_ring(pieces)
+        shared = shapely.intersection(outlines, shapely.buffer(driven, ALONGSIDE_M))
+        medians: NDArray[np.object_] = pieces[shapely.length(shared) > ENCLOSED * shapely.length(outlines)]
+        return medians
 
     @cached_property
     def samples_m(self) -> Numbers:

@@ -1,27 +1,27 @@
-"""What all kinds of traffic have in common."""
+"""What all kinds of traffic that is drawn have in common."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from torchcover.simulation.documents import Document, builtin_hashes
+from torchcover.simulation.documents import builtin_hashes
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
+from torchcover.simulation.traffic.kind import Traffic
 from torchcover.simulation.world import Actor, World, steps_of
 
 # Streets are as long as the ego's way: what moves on them grows with the square of the duration.
 MAX_DURATION_S = 3600.0
-MIN_TIME_STEP_S = 0.01
 # To a kilometre of a lane; more have no room.
 MostVehicles = Annotated[float, Field(ge=0.0, le=200.0)]
 MostPeople = Annotated[float, Field(ge=0.0, le=1000.0)]
 
 
-class Procedural(Document):
+class Procedural(Traffic):
     """Traffic that is made from parameters and a seed.
 
     Args:
@@ -29,8 +29,9 @@ class Procedural(Document):
         time_step_s: Time between two frames.
     """
 
+    repeats: ClassVar[bool] = False
+
     duration_s: Annotated[float, Field(gt=0.0, le=MAX_DURATION_S)] = 60.0
-    time_step_s: Annotated[float, Field(ge=MIN_TIME_STEP_S)] = 0.1
 
     def world(self, seed: int, ego: Mesh | None = None, bodies: Mapping[str, Mesh] | None = None) -> World:
         """Build the world; the same for the same arguments.

@@ -4,7 +4,9 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torchcover.files import check_memory, decode, reads
+from torchcover.files.bad_file import reads
+from torchcover.files.budget import check_memory
+from torchcover.files.text import decode
 
 # Python's objects take about so many times the bytes of their text.
 OBJECTS_PER_BYTE = 8
@@ -35,7 +37,7 @@ class Table(NamedTuple):
 
 
 @reads("a table of rows")
-def read_table(path: Path) -> Table:
+def read_json_table(path: Path) -> Table:
     """Read a JSON list of objects.
 
     Raises:
@@ -46,21 +48,3 @@ def read_table(path: Path) -> Table:
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise ValueError(f"a list of objects is needed; got {type(rows).__name__}")
     return Table(path, rows, {row["token"]: row for row in rows if "token" in row})
-
-
-def check_beneath(folder: Path, name: str) -> str:
-    """Return a path that a table names, if it is one within a folder.
-
-    Raises:
-        ValueError: It leads out of it.
-
-    Example:
-        >>> check_beneath(Path("drive"), "samples/a.bin")
-        'samples/a.bin'
-    """
-    # Of a hundred thousand names few need to be taken apart.
-    if ".." in name or ":" in name or "\\" in name or not name.strip("./") or name.startswith("/"):
-        parts = Path(name).parts
-        if Path(name).is_absolute() or ".." in parts or not parts:
-            raise ValueError(f"{folder}: a table names the file {name!r}, which is not within it")
-    return name

@@ -1,0 +1,316 @@
+"""A search space: what values make of a rig, and what of it cannot be."""
+
+import pickle
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from torchcover.files import BadFileError, as_yaml
+from torchcover.placement import SearchSpace
+from torchcover.simulation import Lidar, Pose, Rig
+
+EXAMPLES = sorted(path for path in (Path(__file__).parents[2] / "examples" / "placement").glob("*.yaml"))
+SPACES = [path for path in EXAMPLES if "start" not in path.stem]
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+NEAR = {"near": {"band": "ground", "region": "20m"}}
+LIDAR = {
+    "columns": 60,
+    "channels": 4,
+    "vertical_fov_deg": (-20.0, 5.0),
+    "horizontal_fov_deg": 360.0,
+    "max_range_m": 80.0,
+}
+
+
+def lidar(name, **mount):
+    return Lidar(name=name, mount=Pose(**mount), **LIDAR)
+
+
+RIGHT = lidar("right", x_m=-0.5, y_m=-0.5, z_m=1.8)
+HIGH = {"mount": {"z_m": 1.9}}
+PAIR = Rig(
+    name="pair",
+    vehicle="suv",
+    sensors=(lidar("left", x_m=-0.5, y_m=0.5, z_m=1.8), RIGHT),
+)
+
+
+def space(free, start=PAIR, **keys):
+    return SearchSpace(name="here", start=start, scenario="courtyard", free=free, objectives=NEAR, **keys)
+
+
+def drawn(searched, count=20):
+    """Values all over a space."""
+    for shares in np.random.default_rng(1).random((count, len(searched.variables))).tolist():
+        yield {variable.name: variable.at(u) for variable, u in zip(searched.variables, shares, strict=True)}
+
+
+def place(sensor):
+    return sensor.mount.matrix()[:3, 3]
+
+
+@pytest.mark.parametrize("path", SPACES, ids=lambda path: path.stem)
+def test_rigs_of_the_examples_come_back_from_their_files(path, tmp_path):
+    searched = SearchSpace.load(path)
+    for values in drawn(searched, 1):
+        rig = searched.rig(values, "found")
+        rig.save(tmp_path / "found.yaml")
+        assert Rig.load(tmp_path / "found.yaml") == rig
+        assert searched.name in rig.description
+        assert searched.start.name in rig.description
+        assert rig.vehicle == "suv"
+
+
+def test_what_is_not_free_stays_and_what_is_lies_within_its_bounds():
+    searched = space({"left": {"x_m": (-1.0, 0.0), "pitch_deg": (-10.0, 10.0), "roll_deg": 3.0}})
+    assert [variable.name for variable in searched.variables] == ["left.x_m", "left.pitch_deg"]
+    for values in drawn(searched):
+        left, right = searched.rig(values, "found").sensors
+        assert right == PAIR.sensors[1]
+        x_m, pitch_deg = values["left.x_m"], values["left.pitch_deg"]
+        assert left == lidar("left", x_m=x_m, y_m=0.5, z_m=1.8, pitch_deg=pitch_deg, roll_deg=3.0)
+        assert -1.0 <= x_m <= 0.0
+        assert -10.0 <= pitch_deg <= 10.0
+
+
+def test_the_start_is_the_rig_of_its_own_values():
+    free = {"left": {"x_m": (-1.0, 0.0), "z_above_body_m": (0.1, 0.3), "yaw_deg": (-90.0, 90.0)}}
+    searched = space({**free, "right": {"mirror_of": "left"}}, constraints={"symmetric": True})
+    values = searched.start_values()
+    assert values.keys() == {variable.name for variable in searched.variables}
+    assert searched.rig(values, "same").sensors == PAIR.sensors
+    assert searched.violations(PAIR) == ()
+
+
+def test_a_sensor_with_a_quaternion_keeps_it_until_an_angle_is_free():
+    half = np.sqrt(0.5)
+    start = PAIR.model_copy(update={"sensors": (lidar("left", z_m=1.8, quaternion_wxyz=(half, 0.0, 0.0, half)),)})
+    moved = space({"left": {"x_m": (-1.0, 0.0)}}, start).rig({"left.x_m": -0.5}, "moved").sensors[0]
+    turned = space({"left": {"pitch_deg": (-10.0, 10.0)}}, start).rig({"left.pitch_deg": 5.0}, "turned").sensors[0]
+    assert moved.mount == Pose(x_m=-0.5, z_m=1.8, quaternion_wxyz=(half, 0.0, 0.0, half))
+    assert turned.mount == Pose(z_m=1.8, yaw_deg=90.0, pitch_deg=5.0)
+
+
+def test_a_pair_is_symmetric_whatever_its_values():
+    free = {"x_m": (-1.0, 0.0), "y_m": (0.3, 0.6), "yaw_deg": (-180.0, 180.0), "roll_deg": (-30.0, 30.0)}
+    free |= {"pitch_deg": (-30.0, 30.0), "model": ("velodyne_vlp16", "velodyne_vlp32c"), "present": (True, False)}
+    third = Rig(name="third", vehicle="suv", sensors=(*PAIR.sensors, lidar("middle", x_m=-1.4, z_m=2.0)))
+    searched = space({"left": free, "right": {"mirror_of": "left"}}, third, constraints={"symmetric": True})
+    counts = set()
+    for values in drawn(searched, 12):
+        *pair, middle = searched.rig(values, "found").sensors
+        assert middle == third.sensors[2]
+        counts.add(len(pair))
+        assert bool(pair) == values["left.present"]
+        if pair:
+            left, right = (sensor.mount.matrix() for sensor in pair)
+            assert right == pytest.approx(MIRROR @ left @ MIRROR, abs=1e-7)
+            assert [sensor.name for sensor in pair] == ["left", "right"]
+            assert {sensor.model for sensor in pair} == {values["left.model"]}
+        assert searched.violations(searched.rig(values, "found")) == ()
+    assert counts == {0, 2}
+
+
+def test_a_height_above_the_body_is_that():
+    searched = space({"left": {"x_m": (-2.0, 1.8), "y_m": (-0.8, 0.8), "z_above_body_m": (0.1, 0.3)}})
+    body = searched.scenarios[0].ego_mesh()
+    triangles = body.vertices_m[body.faces]
+    for values in drawn(searched):
+        at = place(searched.rig(values, "found").sensors[0])
+        below = at - [0.0, 0.0, values["left.z_above_body_m"]]
+        nearest = trimesh.triangles.closest_point(triangles, np.broadcast_to(below, (len(triangles), 3)))
+        assert np.linalg.norm(nearest - below, axis=1).min() < 1e-6
+
+
+def test_a_place_on_a_region_is_as_far_from_the_skin_as_its_height():
+    regions = ("roof", "grille", "front_bumper", "rear_bumper", "fender_left", "mirror_right")
+    searched = space({"left": {"region": regions, "height_m": (0.02, 0.06), "yaw_deg": (-30.0, 30.0)}})
+    body, faced = searched.scenarios[0].ego_mesh(), {"rear_bumper": 180.0, "fender_left": 90.0, "mirror_right": -90.0}
+    triangles, seen = body.vertices_m[body.faces], set()
+    for values in drawn(searched, 40):
+        sensor = searched.rig(values, "found").sensors[0]
+        nearest = trimesh.triangles.closest_point(triangles, np.broadcast_to(place(sensor), (len(triangles), 3)))
+        assert np.linalg.norm(nearest - place(sensor), axis=1).min() == pytest.approx(values["left.height_m"], abs=2e-6)
+        assert sensor.mount.yaw_deg == pytest.approx(faced.get(values["left.region"], 0.0) + values["left.yaw_deg"])
+        assert (sensor.mount.pitch_deg, sensor.mount.roll_deg) == (0.0, 0.0)
+        seen.add(values["left.region"])
+    assert seen == set(regions)
+    assert searched.start_values() == {}
+
+
+def test_a_model_brings_its_whole_pattern():
+    keys = {"name": "left", "model": "velodyne_vlp16"}
+    start = PAIR.model_copy(update={"sensors": (Lidar.model_validate(keys | HIGH),)})
+    searched = space({"left": {"model": ("velodyne_vlp16", "velodyne_vlp32c")}}, start)
+    for model in ("velodyne_vlp16", "velodyne_vlp32c"):
+        sensor = searched.rig({"left.model": model}, "found").sensors[0]
+        assert sensor == Lidar.model_validate({"name": "left", "mount": start.sensors[0].mount, "model": model})
+    assert searched.start_values() == {"left.model": "velodyne_vlp16"}
+
+
+def test_a_rig_costs_its_models_and_its_mounts():
+    cost = {"velodyne_vlp16": 3000.0, "velodyne_vlp32c": 9000.0, "right": 500.0, "mount": 100.0}
+    free = {"model": ("velodyne_vlp16", "velodyne_vlp32c"), "present": (True, False)}
+    with pytest.raises(ValueError, match="no price of 'left', for the sensor 'left'"):
+        space({"left": free}, cost=cost)
+    start = Rig(name="start", sensors=(Lidar.model_validate({"name": "left", "model": "velodyne_vlp16"} | HIGH), RIGHT))
+    searched = space({"left": free}, start, cost=cost)
+    prices = {
+        (model, there): searched.cost_eur(searched.rig({"left.model": model, "left.present": there}, "found"))
+        for model in ("velodyne_vlp16", "velodyne_vlp32c")
+        for there in (True, False)
+    }
+    assert prices["velodyne_vlp16", True] == 3000.0 + 500.0 + 200.0
+    assert prices["velodyne_vlp32c", True] == 9000.0 + 500.0 + 200.0
+    assert prices["velodyne_vlp32c", False] == 500.0 + 100.0
+    assert space({"left": {"x_m": (-1.0, 0.0)}}).cost_eur(PAIR) is None
+
+
+def test_what_a_rig_cannot_be_is_told():
+    cost = {"left": 1000.0, "right": 1000.0}
+    constraints = {"min_distance_m": 0.3, "symmetric": True, "max_cost_eur": 1500.0}
+    keys = {"y_m": (-0.6, 0.6), "z_m": (-1.0, 2.0)}
+    with pytest.warns(UserWarning, match=r"'pair' is none of the space \(it costs 2000 EUR"):
+        searched = space(
+            {"left": keys | {"present": (True, False)}, "right": {"y_m": (-0.6, 0.6)}},
+            cost=cost,
+            constraints=constraints | {"symmetric": False},
+        )
+    free = space({"left": keys}, constraints={"min_distance_m": 0.3})
+    inside, buried, close = (
+        free.rig({"left.y_m": y_m, "left.z_m": z_m}, "bad") for y_m, z_m in ((0.5, 1.0), (0.5, -0.5), (-0.3, 1.8))
+    )
+    assert free.violations(inside) == ("left at [-0.5, 0.5, 1.0] m is inside the vehicle's body",)
+    assert free.violations(buried) == ("left at [-0.5, 0.5, -0.5] m is not above the ground",)
+    assert free.violations(close) == ("left and right are 0.200 m apart; min_distance_m is 0.3",)
+    assert searched.violations(PAIR) == ("it costs 2000 EUR; max_cost_eur is 1500",)
+    lone = space({"left": {"pitch_deg": (-5.0, 5.0)}, "right": {"mirror_of": "left"}}, constraints={"symmetric": True})
+    one = PAIR.model_copy(update={"sensors": PAIR.sensors[:1]})
+    assert lone.violations(one) == ("left has no mirror image on the other side of the vehicle; symmetric is true",)
+
+
+def test_values_that_make_no_rig_are_refused():
+    everything = {"present": (True, False)}
+    searched = space({"left": everything | {"x_m": (-9.0, 0.0), "z_above_body_m": (0.1, 0.2)}, "right": everything})
+    values = {"left.present": True, "left.x_m": -0.5, "left.z_above_body_m": 0.15, "right.present": True}
+    for changed, message in (
+        ({"left.x_m": -8.0}, r"left: z_above_body_m: nothing of suv is below x = -8\.000 m, y = 0\.500 m"),
+        ({"left.present": False, "right.present": False}, "no sensor is left"),
+        ({"left.x_m": 5.0}, r"left\.x_m: a number from -9 to 0 is needed; got 5\.0"),
+        ({"left.yaw_deg": 5.0}, r"missing or unknown: left\.yaw_deg"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            searched.rig(values | changed, "none")
+
+
+MISTAKES = [
+    ({"free": {}}, "free: "),
+    ({"free": {"rof": {"x_m": [0, 1]}}}, "free.rof: 'front_roof_32' has no such sensor; it has roof"),
+    ({"free": {"roof": {}}}, "free.roof: nothing of it is free"),
+    ({"free": {"roof": {"x_m": 0.5}}}, "free: every number is set"),
+    ({"free": {"roof": {"x_cm": [0, 1]}}}, "free.roof.x_cm: "),
+    ({"free": {"roof": {"x_m": [1, 1]}}}, "free.roof.x_m: the lowest must be below the highest; got (1, 1)"),
+    ({"free": {"roof": {"x_m": [2, 1]}}}, "free.roof.x_m: the lowest must be below"),
+    ({"free": {"roof": {"x_m": [0, float("nan")]}}}, "free.roof.x_m: from -1e+09 to 1e+09 is allowed"),
+    ({"free": {"roof": {"x_m": [0, 1, 2]}}}, "free.roof.x_m: a number, or the lowest and the highest"),
+    ({"free": {"roof": {"x_m": True}}}, "free.roof.x_m: a number, or the lowest"),
+    ({"free": {"roof": {"z_m": [1.7, 1.8], "z_above_body_m": [0, 1]}}}, "z_m or z_above_body_m, not both"),
+    ({"free": {"roof": {"z_m": [-2.0, -1.0]}}}, "free.roof: in none of 256 places of its ranges can it be: roof at"),
+    ({"free": {"roof": {"x_m": [-0.5, 0.0], "z_m": [0.7, 1.4]}}}, "is inside the vehicle's body"),
+    ({"free": {"roof": {"x_m": [5.0, 6.0], "z_above_body_m": [0.1, 0.2]}}}, "z_above_body_m: nothing of suv is below"),
+    ({"free": {"roof": {"u": [0, 1]}}}, "free.roof: u: they are places in a region"),
+    ({"free": {"roof": {"region": "roof", "x_m": [0, 1]}}}, "free.roof: x_m: the place is that in the region"),
+    ({"free": {"roof": {"region": "spoiler"}}}, "free.roof.region: suv has no 'spoiler'; it has roof, hood, grille"),
+    ({"free": {"roof": {"region": "roof"}}, "vehicle": "cyclist"}, "cyclist has no 'roof'; it has none at all"),
+    ({"free": {"roof": {"region": ["roof"]}}}, "free.roof: region: at least two different options are needed"),
+    ({"free": {"roof": {"region": "roof", "u": [0.5, 1.5]}}}, "free.roof.u: from 0 to 1 is allowed"),
+    ({"free": {"roof": {"region": "roof", "height_m": [-0.1, 0.5]}}}, "free.roof.height_m: from 0.001 to 10"),
+    ({"free": {"roof": {"model": ["velodyne_vlp16"]}}}, "free.roof.model: "),
+    ({"free": {"roof": {"model": ["velodyne_vlp16", "velodyne_vlp16"]}}}, "model: at least two different options"),
+    ({"free": {"roof": {"model": ["velodyne_vlp16", "velodine"]}}}, "built-in lidars: hesai_at128"),
+    ({"free": {"roof": {"present": [True, True]}}}, "free.roof: present: [true, false] is the choice"),
+    (
+        {"free": {"roof": {"mirror_of": "left"}}},
+        "free.roof.mirror_of: a free sensor is needed, one of none",
+    ),
+    ({"free": {"roof": {"mirror_of": "roof"}}}, "free.roof.mirror_of: a free sensor is needed"),
+    ({"free": {"roof": {"mirror_of": "left", "x_m": [0, 1]}}}, "mirror_of: the mirror image has nothing of its own"),
+    ({"constraints": {"max_cost_eur": 100}}, "constraints.max_cost_eur: nothing has a price"),
+    ({"constraints": {"max_cost_eur": 100}, "cost": {"roof": 200}}, "the cheapest rig of the space costs 200"),
+    ({"cost": {"velodyne_vlp16": 200}}, "cost: no price of 'roof', for the sensor 'roof'"),
+    ({"cost": {"roof": 200, "rof": 200}}, "cost: rof: no LiDAR model, no sensor"),
+    ({"constraints": {"min_distance": 1}}, "constraints.min_distance: "),
+    (
+        {"constraints": {"symmetric": True}, "free": {"roof": {"yaw_deg": [5, 9]}}},
+        "constraints: none of 256 candidates",
+    ),
+    ({"objectives": {}}, "objectives: "),
+    ({"objectives": {name: {"region": "20m"} for name in "abcd"}}, "objectives: "),
+    ({"objectives": {"near": {"region": "21m"}}}, "objective 'near': region '21m': one of 20m, 80m, 160m"),
+    ({"objectives": {"near": {"region": "20m", "band": "sky"}}}, "objective 'near': "),
+    ({"scenario": []}, "scenario: "),
+    ({"scenario": "nowhere"}, "'nowhere' is neither a .yaml file nor one of the built-in scenarios"),
+    ({"vehicle": "spaceship"}, "vehicle: 'spaceship' is neither a .yaml file nor one of the built-in vehicles"),
+    ({"vehicle": "body.ply"}, "vehicle: the name of a vehicle, or the path of its YAML file, is needed"),
+    ({"start": "none"}, "start: 'none' is neither a .yaml file nor one of the built-in rigs"),
+    ({"start": 3}, "start: the name of a rig, or the path of its file, is needed; got int"),
+]
+
+
+@pytest.mark.filterwarnings("ignore:.*is none of the space")
+@pytest.mark.parametrize(("changed", "message"), MISTAKES)
+def test_a_space_that_cannot_be_searched_is_refused_at_the_door(changed, message, tmp_path):
+    keys = {"name": "here", "start": "front_roof_32", "scenario": "courtyard", "objectives": NEAR}
+    keys["free"] = {"roof": {"pitch_deg": [-5, 5]}}
+    path = tmp_path / "space.yaml"
+    path.write_text(as_yaml(keys | changed), encoding="utf-8")
+    with pytest.raises(BadFileError) as refused:
+        SearchSpace.load(path)
+    assert str(refused.value).startswith(f"{path}: ")
+    assert message in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_scenarios_with_different_egos_need_a_vehicle(tmp_path):
+    own = "name: own\nego: {shape: {type: vehicle, vehicle: van}}\ntraffic: {type: urban}\n"
+    (tmp_path / "own.yaml").write_text(own)
+    keys = {"name": "here", "start": PAIR, "scenario": ["courtyard", str(tmp_path / "own.yaml")], "objectives": NEAR}
+    keys["free"] = {"left": {"z_m": (3.0, 3.5)}}
+    with warnings.catch_warnings(action="ignore"):
+        with pytest.raises(ValueError, match=r"their egos differ \(courtyard suv, own van\)"):
+            SearchSpace(**keys)
+        assert SearchSpace(**keys, vehicle="bus").scenarios[1].ego_name == "bus"
+
+
+def test_a_start_outside_of_the_space_is_told_and_has_no_values_there():
+    with pytest.warns(UserWarning, match=r"'pair' is none of the space \(left\.x_m is -0\.5\)"):
+        searched = space({"left": {"x_m": (0.0, 0.1), "yaw_deg": (-5.0, 5.0)}})
+    assert searched.start_values() == {"left.yaw_deg": 0.0}
+
+
+def test_a_space_can_be_sent_to_another_process():
+    searched = space({"left": {"region": "roof"}})
+    assert searched.violations(PAIR) == ()
+    again = pickle.loads(pickle.dumps(searched))
+    assert again == searched
+    values = next(drawn(searched))
+    assert again.rig(values, "found") == searched.rig(values, "found")
+
+
+def test_a_rig_is_written_with_what_it_names_by_file(tmp_path):
+    model = (EXAMPLES[0].parents[2] / "datasets" / "lidars" / "velodyne_vlp16.yaml").read_text()
+    (tmp_path / "mine.yaml").write_text(model)
+    (tmp_path / "there").mkdir()
+    rig = Rig(
+        name="mine",
+        vehicle=str(EXAMPLES[0].parents[1] / "robot" / "robot.yaml"),
+        sensors=(Lidar.model_validate({"name": "a", "model": str(tmp_path / "mine.yaml"), "columns": 900}),),
+    )
+    rig.save(tmp_path / "there" / "rig.yaml")
+    (tmp_path / "mine.yaml").unlink()
+    again = Rig.load(tmp_path / "there" / "rig.yaml")
+    assert again.vehicle == rig.vehicle
+    assert (again.sensors[0].directions() == rig.sensors[0].directions()).all()

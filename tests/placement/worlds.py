@@ -1,0 +1,58 @@
+"""Small worlds and rigs, and scores that are made up."""
+
+import numpy as np
+
+from torchcover.placement import CommonInstants, Objective, Scores
+from torchcover.simulation import Rig, Scenario
+
+EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
+FLOOR = {"name": "floor", "shape": {"type": "plane", "size_m": [400, 400]}}
+WALL = {"name": "wall", "shape": {"type": "box", "size_m": [0.5, 6, 1.8]}, "poses": [{"x_m": 9.0, "y_m": 1.0}]}
+
+# Three instants a run that are 0.4 s apart.
+LOT = Scenario.model_validate(
+    {
+        "name": "lot",
+        "ego": EGO,
+        "traffic": {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings": 0, "parked_share": 0.3},
+    }
+)
+BAY = {"bay": {"polygon_m": [[2.5, -4.0], [9.0, -4.0], [9.0, 5.0]]}}
+OBJECTIVES = {
+    "near": Objective(detection=0.3, region="20m"),
+    "far": Objective(detection=0.2, region=["80m", "20m"], band="ground"),
+    "bay": Objective(detection=0.3, region=BAY, band=["obstacle", "ground"]),
+}
+
+
+def yard(*bodies, name="yard"):
+    return Scenario.model_validate({"name": name, "ego": EGO, "bodies": [FLOOR, *bodies]})
+
+
+def lidar(name="top", **keys):
+    keys = {"mount": {"z_m": 1.9}, "channels": 16, "vertical_fov_deg": [-40, 2], "columns": 181} | keys
+    return {"name": name, "horizontal_fov_deg": 360, "max_range_m": 90} | keys
+
+
+def rig(*sensors, name="small", **keys):
+    return Rig.model_validate({"name": name, "sensors": list(sensors) or [lidar()], **keys})
+
+
+def held(scenarios=(LOT,), objectives=OBJECTIVES, **keys):
+    return CommonInstants(scenarios, objectives, **{"worlds": 3, "per_world": 2, "every_s": 0.4, "rays": 1024} | keys)
+
+
+def made_up(values, world, instants=None):
+    """Scores of (n, O) given values: each objective is a question of its own, about one square metre."""
+    values = np.asarray(values, dtype=np.float64).reshape(len(world), -1)
+    known = ~np.isnan(values)
+    return Scores(
+        instants=np.arange(len(world)) if instants is None else np.asarray(instants),
+        world=np.asarray(world),
+        parts={f"o{k}": (k,) for k in range(values.shape[1])},
+        seen_m2=np.where(known, values, 0.0),
+        visible_m2=known.astype(np.float64),
+        known_share=values,
+        self_hit_share=0.0,
+        rays=1,
+    )

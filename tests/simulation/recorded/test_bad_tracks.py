@@ -1,0 +1,231 @@
+"""Recordings that cannot be shown say why, in a line that names them."""
+
+import json
+import re
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+from tests.simulation.recorded.drives import EGO, OTHERS, write_argoverse2, write_commonroad, write_csv, write_nuscenes
+from tests.simulation.recorded.test_tracks import FEW, RIG, scenario
+from torchcover import Scenario
+from torchcover.cli.app import main
+from torchcover.files import BadFileError
+from torchcover.simulation import Simulator
+
+
+def fails(drive, message, error=ValueError):
+    with pytest.raises(error, match=message) as caught:
+        drive.world()
+    assert "\n" not in str(caught.value)
+
+
+def replaced(path, old, new, count=1):
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, count))
+    return path
+
+
+@pytest.fixture
+def table(tmp_path):
+    folder = write_csv(tmp_path / "table")
+    return folder / "boxes.csv", {"ego_trajectory": str(folder / "ego.csv")}
+
+
+def test_paths_that_are_no_recording(tmp_path):
+    fails(scenario(tmp_path / "none"), "none: no such file or folder; recorded tracks are needed", FileNotFoundError)
+    fails(scenario(tmp_path), "recorded tracks are a log of Argoverse 2 .*; a table of boxes")
+    (tmp_path / "a.txt").write_text("x")
+    fails(scenario(tmp_path / "a.txt"), r"a\.txt: recorded tracks are")
+
+
+def test_an_ego_that_is_not_there(tmp_path, table):
+    path, keys = table
+    fails(scenario(path), "ego_id: the recording has no ego of its own; name one of its tracks, 'a1', 'a2'")
+    fails(scenario(path, ego_id="a11"), "ego_id: there is no 'a11' in the recording, but 'a1'")
+    fails(scenario(path, ego_id="a1", **keys), "ego_id and ego_trajectory exclude each other")
+    fails(scenario(path, ego_id="a1", ego_T_vehicle={"x_m": 1.0}), "ego_T_vehicle: is for an ego without a box")
+    log = write_argoverse2(tmp_path / "log")
+    fails(scenario(log, ego_id=7), "there is no '7' in the recording")
+
+
+def test_an_ego_that_leaves_or_jumps(tmp_path, table):
+    path, keys = table
+    fails(scenario(path, ego_id="a8", duration_s=4.0), r"'a8' and the others are known for 2\.8 s; begin_s 0 and")
+    assert scenario(path, ego_id="a8").steps == 29
+    fails(scenario(path, begin_s=9.0, **keys), "known for 4 s; begin_s 9 and duration_s 0 reach beyond")
+    rows = path.read_text().splitlines()
+    gap = [row for row in rows if not (",a1," in row and 1.3 < float(row.split(",")[0]) < 2.9)]
+    path.write_text("\n".join(gap))
+    fails(
+        scenario(path, ego_id="a1"), r"a gap of over 1 s \(max_gap_s\), or jumps. It is there from 0 to 1.2 s, 3 to 4 s"
+    )
+    assert scenario(path, ego_id="a1", begin_s=3.0).steps == 11
+    cells = [row.split(",") for row in rows]
+    path.write_text(
+        "\n".join(",".join([*row[:3], "9999", *row[4:]] if row[:2] == ["2.0", "a1"] else row) for row in cells)
+    )
+    fails(scenario(path, ego_id="a1"), "or jumps. It is there from 0 to 1.8 s, 2 to 2 s, 2.2 to 4 s")
+
+
+def test_an_ego_and_others_at_different_times(table):
+    path, keys = table
+    path.write_text(re.sub(r"(?m)^(\d\.\d),", r"10\1,", path.read_text()))
+    fails(scenario(path, **keys), "the ego 'ego.csv' is there from 0 to 4 s, the others from 100 to 104 s")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("4.5,1.8,1.5", "0,1.8,1.5", "id a1: a box needs a positive length, width and height"),
+        ("4.5,1.8,1.5", "4.5,nan,1.5", "id a1: a box needs a positive length"),
+        ("1425.800000", "nan", "id a1: .*NaN"),
+        ("0.2,a1", "0.0,a1", "id a1: .*must ascend"),
+        ("category", "kind", "category missing"),
+    ],
+)
+def test_tables_of_boxes(table, old, new, message):
+    path, keys = table
+    with pytest.raises(BadFileError, match=message) as caught:
+        scenario(replaced(path, old, new), **keys).world()
+    assert str(caught.value).startswith(str(path))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("<rectangle><length>4.5</length><width>1.8</width></rectangle>", "", "id 1: no rectangle, circle or polygon"),
+        ("<length>4.5</length>", "<length>-1</length>", "id 1: a box needs a positive length"),
+        ("<length>4.5</length>", "", "id 1: <rectangle> needs a number as its <length>; got None"),
+        ("<x>1424.000000</x>", "<x>nan</x>", "id 1: .*NaN"),
+        ("<time><exact>1</exact></time>", "<time><exact>0</exact></time>", "id 1: .*must ascend"),
+        ("<point><x>1424.000000</x><y>2200.000000</y></point>", "<circle/>", "id 1: a state without the point"),
+        ('timeStepSize="0.2"', 'timeStepSize="0"', "timeStepSize: a positive number is needed"),
+        ("commonRoad ", "OpenSCENARIO ", "mismatched tag"),
+        ("<commonRoad", '<!DOCTYPE a [<!ENTITY b "c">]><commonRoad', "without entities"),
+    ],
+)
+def test_scenarios_of_commonroad(tmp_path, old, new, message):
+    path = replaced(write_commonroad(tmp_path / "a.xml"), old, new)
+    fails(scenario(path), rf"a\.xml: .*{message}", BadFileError)
+
+
+def test_shapes_of_commonroad(tmp_path):
+    box = "<rectangle><length>4.5</length><width>1.8</width></rectangle>"
+    corners = "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in ((0, -1), (4, -1), (4, 1), (0, 1)))
+    path = replaced(write_commonroad(tmp_path / "a.xml"), box, f"<polygon>{corners}</polygon>")
+    actor = scenario(path, ego_id=5, duration_s=0.4).world().actors[0]
+    np.testing.assert_allclose(np.ptp(actor.mesh.vertices_m, axis=0)[:2], [4.0, 2.0])
+    np.testing.assert_allclose(actor.trajectory.at(0.0)[:2, 3], [1426.0, 2200.0])
+
+
+def test_tables_of_nuscenes(tmp_path):
+    folder = write_nuscenes(tmp_path)
+    annotations = folder / "sample_annotation.json"
+    good = json.loads(annotations.read_text())
+    for change, message in (
+        ({"size": [0.0, 4.0, 1.0]}, "id a1: a box needs a positive length"),
+        ({"size": [1.8]}, "index 1 is out of bounds|inhomogeneous"),
+        ({"rotation": [0, 0, 0, 0]}, "quaternion of norm 0"),
+        ({"translation": [float("nan"), 0, 0]}, "id a1: .*NaN"),
+        ({"instance_token": "nobody"}, "no row has the token 'nobody'"),
+    ):
+        annotations.write_text(json.dumps([{**good[0], **change}, *good[1:]]))
+        fails(scenario(folder), message, BadFileError)
+    annotations.write_text("[]")
+    assert len(scenario(folder).world().actors) == 0
+    (folder / "ego_pose.json").write_text("[]")
+    fails(scenario(folder), "no ego_pose from the first sample", BadFileError)
+    (folder / "instance.json").unlink()
+    fails(scenario(folder), r"instance\.json: no such file", FileNotFoundError)
+
+
+def feather(path, **columns):
+    import pyarrow as pa
+    from pyarrow import feather
+
+    table = feather.read_table(path).to_pydict()
+    feather.write_feather(
+        pa.table({**table, **{name: change(table[name]) for name, change in columns.items()}}), str(path)
+    )
+
+
+@pytest.mark.parametrize(
+    ("column", "change", "message"),
+    [
+        ("length_m", lambda lengths: [0.0] * len(lengths), "annotations.feather: id a1: a box needs a positive length"),
+        ("tx_m", lambda places: [float("nan"), *places[1:]], "annotations.feather: id a1: .*NaN"),
+        ("qw", lambda _: [float("nan")] * len(_), "annotations.feather: a quaternion needs four finite numbers"),
+        ("timestamp_ns", lambda times: [time + 10**12 for time in times], "are both of one log"),
+        ("timestamp_ns", lambda times: [times[0]] * len(times), "id a1: .*must ascend"),
+    ],
+)
+def test_logs_of_argoverse(tmp_path, column, change, message):
+    log = write_argoverse2(tmp_path)
+    feather(log / "annotations.feather", **{column: change})
+    fails(scenario(log), message, BadFileError)
+
+
+def test_logs_that_lack_something(tmp_path, monkeypatch):
+    log = write_argoverse2(tmp_path, (*OTHERS, EGO._replace(category="ego_vehicle")))
+    (log / "annotations.feather").rename(log / "annotations_with_ego.feather")
+    assert "ego" not in [actor.name for actor in scenario(log).world().actors]
+    fails(scenario(log, scene="a"), "scene: is for tables of nuScenes; a log of Argoverse 2 has but one")
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    fails(scenario(log), r"annotations_with_ego.feather: .*pip install 'torchcover\[av2\]'", ImportError)
+    monkeypatch.undo()
+    (log / "city_SE3_egovehicle.feather").unlink()
+    fails(scenario(log), r"city_SE3_egovehicle\.feather: no such file", FileNotFoundError)
+
+
+def test_a_missing_package_is_one_line_of_the_command_line(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    monkeypatch.setattr(sys, "argv", ["torchcover", "evaluate", "front_roof_32", "--scenario", "tracks_argoverse2"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "pip install 'torchcover[av2]'" in line
+
+
+def test_ground_that_is_far_from_the_tracks_gets_a_hint(tmp_path, table):
+    path, keys = table
+    plate = trimesh.creation.box((900.0, 900.0, 2.0))
+    for height_m, hinted in ((29.0, False), (12.0, True)):
+        plate.apply_translation([1400.0, 2200.0, height_m - plate.bounds[1][2]])
+        plate.export(tmp_path / "ground.ply")
+        low = scenario(path, ground=str(tmp_path / "ground.ply"), **keys)
+        if not hinted:
+            replaced(path, "category", "category")
+        simulator = Simulator(low, {"rig": RIG}, FEW)
+        if hinted:
+            with pytest.warns(UserWarning, match="ground within 1 m below or above the wheels") as told:
+                simulator.check_run(8)
+            assert {"the ego had", "others that move had"} <= {
+                part
+                for warning in told
+                for part in ("the ego had", "others that move had")
+                if part in str(warning.message)
+            }
+    Simulator(scenario(path, **keys), {"rig": RIG}, FEW).check_run(8)
+
+
+def test_true_poses_over_a_plane_get_the_hint_too(tmp_path):
+    folder = write_csv(tmp_path)
+    given = Scenario.model_validate(
+        {
+            "name": "given",
+            "ego": {"trajectory": str(folder / "ego.csv")},
+            "bodies": [{"name": "g", "shape": {"type": "plane", "size_m": [9e3, 9e3]}}],
+            "boxes": str(folder / "boxes.csv"),
+            "duration_s": 4.0,
+        }
+    )
+    with pytest.warns(UserWarning, match="given: .*Traffic of type 'tracks' without `ground` makes ground") as told:
+        Simulator(given, {"rig": RIG}, FEW).check_run(8)
+    assert len(told) == 2
+    resting = given.model_copy(update={"ego": given.ego.model_copy(update={"trajectory": None}), "boxes": None})
+    Simulator(resting, {"rig": RIG}, FEW).check_run(8)

@@ -1,0 +1,322 @@
+"""Recorded tracks as scenarios: where everybody is, on what ground, and what repeats."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from tests.simulation.recorded.drives import (
+    EGO,
+    ORIGIN_M,
+    OTHERS,
+    STEP_S,
+    STEPS,
+    TIMES_S,
+    Somebody,
+    flat_m,
+    hill_m,
+    poses,
+    write_all,
+    write_argoverse2,
+    write_csv,
+    write_nuscenes,
+)
+from torchcover import Rig, Scenario
+from torchcover.evaluation.settings import spread_s
+from torchcover.geometry import BoundingBox, rigid
+from torchcover.simulation import PaperReference, Simulator
+from torchcover.simulation.builtin import builtin_folder, builtin_names
+from torchcover.simulation.height_field import Slopes
+
+FEW = PaperReference(rows=24, columns=48)
+LIDAR = {"name": "top", "mount": {"z_m": 2.0}, "channels": 8, "vertical_fov_deg": (-20, 0), "columns": 60,
+         "horizontal_fov_deg": 360, "max_range_m": 100}  # fmt: skip
+RIG = Rig.model_validate({"name": "rig", "sensors": [LIDAR]})
+
+
+def scenario(path, **keys):
+    return Scenario.model_validate({"name": "drive", "traffic": {"type": "tracks", "path": str(path), **keys}})
+
+
+def of(world, name):
+    return next(actor for actor in world.actors if actor.name == name)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("written")
+    write_all(folder)
+    return folder
+
+
+FORMATS = {
+    "argoverse2": ("argoverse2", {}, hill_m, STEP_S, 1e-6),
+    "nuscenes": ("nuscenes", {}, flat_m, 5 * STEP_S, 1e-6),
+    "commonroad": ("commonroad.xml", {"ego_id": 1}, flat_m, STEP_S, 2e-6),
+    "table": ("table/boxes.csv", {"ego_trajectory": "ego.csv"}, hill_m, STEP_S, 1e-6),
+}
+
+
+def opened(written, kind):
+    path, keys, *rest = FORMATS[kind]
+    beside = (written / path).parent
+    keys = {key: str(beside / value) if key.endswith("trajectory") else value for key, value in keys.items()}
+    return scenario(written / path, **keys), *rest
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_everybody_is_where_a_slow_twin_says_at_instants_and_between(written, kind):
+    drive, heights, recorded_s, atol = opened(written, kind)
+    world = drive.world()
+    ego = OTHERS[0] if kind == "commonroad" else EGO
+    for time_s in (0.0, 0.4, 1.37, 2.05, 4.0):
+        for one in (ego, *OTHERS):
+            name = str([EGO, *OTHERS].index(one)) if kind == "commonroad" else one.name
+            actor = world.ego if one is ego else of(world, name)
+            known_s = TIMES_S[one.first : one.last + 1 : round(recorded_s / STEP_S)]
+            if kind == "nuscenes":  # samples are every fifth instant
+                known_s = np.array([time for time in TIMES_S[::5] if TIMES_S[one.first] <= time <= TIMES_S[one.last]])
+            there = (one.speed_mps == 0 and kind == "commonroad") or known_s[0] <= time_s <= known_s[-1]
+            at = actor.trajectory.positions_at(np.array([time_s]))[0]
+            if actor is not world.ego and not there:
+                assert np.isnan(at).all(), (name, time_s)
+                continue
+            dense_s = {"argoverse2": STEP_S / 2, "nuscenes": STEP_S}.get(kind, STEP_S) * np.arange(-1, 2 * STEPS)
+            own_s = dense_s if one is EGO else known_s
+            places_m = poses(one, heights, own_s)[:, :3, 3]
+            twin = [np.interp(time_s, own_s, column) for column in places_m.T]
+            np.testing.assert_allclose(at, twin, atol=atol, err_msg=f"{name} {time_s}")
+    turned = poses(ego, heights)[4, :3, :3]
+    np.testing.assert_allclose(world.ego.trajectory.at(TIMES_S[4])[:3, :3], turned, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_run_is_as_long_as_the_recording_and_then_the_same_again(written, kind):
+    drive, *_ = opened(written, kind)
+    assert drive.repeats
+    assert (drive.steps, drive.instants) == (41, 41)
+    assert [drive.locate(index) for index in (0, 40, 41, 100)] == [(0, 0), (0, 40), (0, 0), (0, 18)]
+    simulator = Simulator(drive, {"rig": RIG}, FEW, every_s=0.3)
+    assert simulator.distinct_steps == 41
+    assert [simulator.place_in_time(index) for index in (0, 1, 13, 14, 41)] == [0, 3, 39, 1, 0]
+    assert simulator.run_of(1000) == 0
+    assert round(spread_s(drive, None) / 0.1) == 25  # the golden share of its instants
+
+
+def test_an_instant_that_is_seen_again_is_counted_and_seen_as_before(written):
+    drive, *_ = opened(written, "table")
+    simulator = Simulator(drive, {"rig": RIG}, FEW)
+    first, again = simulator.step(3), simulator.step(3 + 41)
+    assert (first.counts["repeated_instants"], again.counts["repeated_instants"]) == (0, 1)
+    np.testing.assert_array_equal(first.clouds["rig"], again.clouds["rig"])
+    assert not np.array_equal(first.reference, again.reference)
+
+
+def test_nothing_is_drawn(written):
+    drive, *_ = opened(written, "argoverse2")
+    again, *_ = opened(written, "argoverse2")
+    one, other = drive.world(seed=1), again.world(seed=2, episode=5)
+    np.testing.assert_array_equal(one.static[0].vertices_m, other.static[0].vertices_m)
+    for mine, its in zip((one.ego, *one.actors), (other.ego, *other.actors), strict=True):
+        assert (mine.name, mine.category) == (its.name, its.category)
+        np.testing.assert_array_equal(mine.trajectory.positions_m, its.trajectory.positions_m)
+
+
+def test_a_step_is_the_same_in_another_process(written):
+    drive, *_ = opened(written, "argoverse2")
+    simulator = Simulator(drive, {"rig": RIG}, FEW)
+    seen, there = simulator.step(7), pickle.loads(pickle.dumps(simulator)).step(7)
+    np.testing.assert_array_equal(seen.clouds["rig"], there.clouds["rig"])
+    np.testing.assert_array_equal(seen.reference, there.reference)
+
+
+def heights_of(mesh, places_m):
+    """Heights of a raster's mesh."""
+    corners = np.unique(mesh.vertices_m[:, 0]), np.unique(mesh.vertices_m[:, 1])
+    raster = np.full((len(corners[1]), len(corners[0])), np.nan)
+    raster[np.searchsorted(corners[1], mesh.vertices_m[:, 1]), np.searchsorted(corners[0], mesh.vertices_m[:, 0])] = (
+        mesh.vertices_m[:, 2]
+    )
+    return Slopes(np.array([corners[0][0], corners[1][0]]), raster, np.empty((0, 0))).heights_m(places_m)
+
+
+def off_ground_m(world, others, heights=hill_m):
+    """How far the ground is from where each of some stood, at all times."""
+    places_m = np.concatenate([poses(one, heights)[one.first : one.last + 1, :3, 3] for one in others])
+    return heights_of(world.static[0], places_m[:, :2]) - places_m[:, 2]
+
+
+def test_the_ground_is_below_the_tracks_within_centimetres(written):
+    world = opened(written, "argoverse2")[0].world()
+    assert np.abs(off_ground_m(world, [EGO])).max() < 0.03
+    # Of things, nobody knows whether they stand or hang; Argoverse's bicycles are without a rider.
+    off_m = np.abs(off_ground_m(world, [one for one in OTHERS if one.category not in ("bollard", "bicycle")]))
+    assert off_m.max() < 0.05
+    assert np.median(off_m) < 0.01
+
+
+def test_the_ground_goes_on_beyond_the_tracks(written):
+    world = opened(written, "argoverse2")[0].world()
+    vertices_m = world.static[0].vertices_m
+    assert np.isfinite(vertices_m).all()
+    assert (np.ptp(vertices_m[:, :2], axis=0) > 500).all()
+    assert (np.abs(vertices_m[:, 2] - 31.0) < 8.0).all()
+
+
+def test_a_few_boxes_that_are_wrong_do_not_lift_the_ground(tmp_path):
+    def heights(places_m):
+        return hill_m(places_m)
+
+    drive = scenario(write_csv(tmp_path, heights=heights) / "boxes.csv", ego_trajectory=str(tmp_path / "ego.csv"))
+    lines = (tmp_path / "boxes.csv").read_text().splitlines()
+    lifted = [",".join([*(cells := line.split(","))[:5], str(float(cells[5]) + 3.0), *cells[6:]])
+              if line.split(",")[1] in ("a5", "a8") else line for line in lines]  # fmt: skip
+    (tmp_path / "boxes.csv").write_text("\n".join(lifted))
+    good = [EGO, *(one for one in OTHERS if one.name in ("a1", "a2", "a3", "a4", "a6", "a7"))]
+    assert np.abs(off_ground_m(drive.world(), good)).max() < 0.08
+    assert np.abs(off_ground_m(drive.world(), [one for one in OTHERS if one.name == "a5"])).max() < 0.5
+
+
+def test_where_nothing_has_a_height_the_ground_is_two_triangles(written):
+    assert len(opened(written, "commonroad")[0].world().static[0].faces) == 2
+
+
+def test_large_coordinates_change_nothing(tmp_path):
+    seen = []
+    for shift_m in (0.0, 1e6, 5e6):
+        folder = write_csv(tmp_path / f"{shift_m:g}")
+        for name in ("boxes.csv", "ego.csv"):
+            header, *rows = (folder / name).read_text().splitlines()
+            column = header.split(",").index("x")
+            cells = [row.split(",") for row in rows]
+            for row in cells:
+                row[column] = f"{float(row[column]) + shift_m:.9f}"
+            (folder / name).write_text("\n".join([header, *map(",".join, cells)]))
+        drive = scenario(folder / "boxes.csv", ego_trajectory=str(folder / "ego.csv"))
+        seen.append(Simulator(drive, {"rig": RIG}, FEW).step(11).clouds["rig"])
+    assert len(seen[0]) > 200
+    np.testing.assert_allclose(seen[1], seen[0], atol=2e-4)
+    np.testing.assert_allclose(seen[2], seen[0], atol=2e-4)
+
+
+def test_bodies_have_the_sizes_of_the_boxes(written):
+    for kind, of_category in (("argoverse2", {"car", "truck", "bus", "pedestrian"}), ("nuscenes", {"cyclist"})):
+        world = opened(written, kind)[0].world()
+        for one in OTHERS:
+            actor = of(world, one.name)
+            np.testing.assert_allclose(BoundingBox.around(actor.mesh.vertices_m).size_m, one.size_m)
+            if one.category in of_category:
+                assert actor.category == one.category
+                assert len(actor.mesh.faces) > 12
+    assert of(world, "a8").category == "cyclist"
+    assert (of(world, "a9").category, len(of(world, "a9").mesh.faces)) == ("movable_object.barrier", 12)
+
+
+def test_a_body_without_a_recorded_height_has_its_own(written):
+    world = opened(written, "commonroad")[0].world()
+    size_m = BoundingBox.around(of(world, "3").mesh.vertices_m).size_m
+    np.testing.assert_allclose(size_m, (9.5, 2.5, 4.0))
+
+
+def test_another_track_may_be_the_ego_and_then_the_recordings_own_is_one_of_the_others(written):
+    world = scenario(written / "argoverse2", ego_id="a1").world()
+    np.testing.assert_allclose(world.ego.trajectory.at(1.0), poses(OTHERS[0], times_s=np.array([1.0]))[0], atol=2e-4)
+    own = of(world, "ego")
+    np.testing.assert_allclose(own.trajectory.at(1.0), poses(EGO, times_s=np.array([1.0]))[0], atol=2e-4)
+    np.testing.assert_allclose(BoundingBox.around(own.mesh.vertices_m).size_m, (4.869, 1.852, 1.476))
+    assert "a1" not in [actor.name for actor in world.actors]
+
+
+def test_the_frame_of_the_ego_may_be_given(written):
+    known = scenario(written / "argoverse2").world().ego.trajectory.at(1.0)
+    given = scenario(written / "argoverse2", ego_T_vehicle={"x_m": 0.339, "z_m": -0.3}).world().ego.trajectory.at(1.0)
+    np.testing.assert_allclose(given, known @ rigid(np.eye(3), [-1.0, 0.0, 0.0]), atol=1e-9)
+
+
+def test_the_start_of_a_planning_problem_is_one_instant_unless_a_time_is_given(written):
+    start = scenario(written / "commonroad.xml")
+    assert (start.steps, start.instants) == (1, 1)
+    np.testing.assert_allclose(start.world().ego.trajectory.at(0.0)[:2, 3], ORIGIN_M)
+    standing = scenario(written / "commonroad.xml", duration_s=1.0)
+    assert standing.steps == 11
+    world = standing.world()
+    assert not world.ego.trajectory.moves
+    assert len(Simulator(standing, {"rig": RIG}, FEW).step(3).clouds["rig"]) > 200
+
+
+def test_who_was_not_seen_for_too_long_was_not_there(tmp_path):
+    gap = (Somebody("a1", "car", (4.5, 1.8, 1.5), (24.0, 0.0), 0.0, 9.0), *OTHERS[1:])
+    folder = write_csv(tmp_path, gap)
+    lines = (folder / "boxes.csv").read_text().splitlines()
+    kept = [line for line in lines if not (",a1," in line and 1.1 < float(line.split(",")[0]) < 2.5)]
+    (folder / "boxes.csv").write_text("\n".join(kept))
+    keys = {"ego_trajectory": str(folder / "ego.csv")}
+    world = scenario(folder / "boxes.csv", **keys).world()
+    times_s = np.array([0.9, 1.0, 1.1, 1.8, 2.5, 2.6, 3.0])
+    there = [np.isfinite(of(world, name).trajectory.positions_at(times_s)[:, 0]) for name in ("a1", "a1 #2")]
+    np.testing.assert_array_equal(there[0], [1, 1, 0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(there[1], [0, 0, 0, 0, 0, 1, 1])
+    world = scenario(folder / "boxes.csv", max_gap_s=2.0, **keys).world()
+    assert np.isfinite(of(world, "a1").trajectory.positions_at(times_s)).all()
+
+
+def test_who_is_seen_at_an_instant_is_there_whatever_is_subtracted_of_the_times(written):
+    for begin_s in (0.2, 0.6, 1.4):
+        drive, *_ = opened(written, "table")
+        world = Scenario.model_validate(
+            {"name": "part", "traffic": drive.traffic.model_copy(update={"begin_s": begin_s}).model_dump()}
+        ).world()
+        last = round((2.8 - begin_s) / 0.1)
+        times_s = 0.1 * np.array([last, last + 1], dtype=np.float64)
+        np.testing.assert_array_equal(
+            np.isfinite(of(world, "a8").trajectory.positions_at(times_s)[:, 0]), [True, False], err_msg=str(begin_s)
+        )
+
+
+def test_who_is_where_the_ego_is_is_left_out_and_named(tmp_path):
+    inside = Somebody("inside", "car", (4.0, 1.8, 1.5), (10.0, 0.5), 0.0)
+    above = Somebody("sign", "sign", (4.0, 1.8, 0.5), (20.0, 0.0), 0.0)
+    folder = write_csv(tmp_path, (*OTHERS, inside, above))
+    rows = (folder / "boxes.csv").read_text().splitlines()
+    cells = [row.split(",") for row in rows]
+    lifted = [
+        ",".join([*row[:5], str(float(row[5]) + 5), *row[6:]]) if row[1] == "sign" else ",".join(row) for row in cells
+    ]
+    (folder / "boxes.csv").write_text("\n".join(lifted))
+    drive = scenario(folder / "boxes.csv", ego_trajectory=str(folder / "ego.csv"))
+    with pytest.warns(UserWarning, match=r"boxes.csv: 1 of 11 tracks are where the ego is at some time \('inside'\)"):
+        names = [actor.name for actor in drive.world().actors]
+    assert "inside" not in names
+    assert "sign" in names
+
+
+def test_one_scene_of_several_is_shown(tmp_path):
+    folder = write_nuscenes(tmp_path / "v1.0-mini", scenes=("first", "second"))
+    for path in (tmp_path, folder):
+        for called in ("first", "s0"):
+            assert scenario(path, scene=called).steps == 41
+    with pytest.raises(ValueError, match="scene: one of first, second is needed; got none"):
+        scenario(tmp_path).world()
+    with pytest.raises(ValueError, match="got 'third'"):
+        scenario(tmp_path, scene="third").world()
+
+
+def test_what_a_run_means_depends_on_what_is_in_the_files(tmp_path):
+    folder = write_argoverse2(tmp_path / "log")
+    before = scenario(folder).content()
+    assert before == scenario(write_argoverse2(tmp_path / "copy")).content()
+    write_argoverse2(folder, OTHERS[:-1])
+    assert before != scenario(folder).content()
+    assert before != scenario(tmp_path / "copy", begin_s=1.0).content()
+
+
+def test_the_built_in_ones_are_those_that_are_written_here(written):
+    built_in = builtin_folder("scenarios") / "tracks"
+    for path in written.rglob("*.*"):
+        if path.suffix in (".csv", ".json", ".xml"):
+            assert path.read_text() == built_in.joinpath(path.relative_to(written)).read_text(), path
+    for name in builtin_names("scenarios"):
+        if name.startswith("tracks_"):
+            drive = Scenario.load(name)
+            drive.world()
+            Simulator(drive, {"rig": RIG}, FEW).check_run(4)

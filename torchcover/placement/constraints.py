@@ -1,0 +1,82 @@
+"""Constraints: what a rig must keep to, whatever its coverage."""
+
+from collections.abc import Collection, Iterator
+from itertools import combinations
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat
+
+from torchcover.geometry.rigid import Matrix
+from torchcover.simulation import Document, Rig, Sensor
+from torchcover.simulation.skin import Skin
+
+# Sensors whose poses differ by less are each other's mirror images.
+MIRRORED_M = 1e-4
+MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
+# A housing has about this size; closer, two sensors are at one place.
+APART_M = 0.1
+
+
+class Constraints(Document):
+    """What a rig must keep to.
+
+    Args:
+        min_distance_m: Between a sensor that is free and any other.
+        max_self_hits: Share of a rig's rays that may end on the vehicle; known once it has been scanned.
+        symmetric: Whether every sensor must have its mirror image beyond the vehicle's middle, or lie on that.
+        max_cost_eur: What the rig may cost; see `cost` of the space.
+    """
+
+    min_distance_m: NonNegativeFloat = APART_M
+    max_self_hits: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
+    symmetric: bool = False
+    max_cost_eur: NonNegativeFloat | None = None
+
+    def broken_by(self, rig: Rig, free: Collection[str], cost_eur: float | None) -> tuple[str, ...]:
+        """What of it a rig does not keep to, in words; not its self-hits, which only a scan knows.
+
+        Args:
+            rig: The rig.
+            free: Names of the sensors that a search may place.
+            cost_eur: What it costs.
+        """
+        return (*self._too_close(rig, free), *self._lopsided(rig), *self._too_dear(cost_eur))
+
+    def _too_close(self, rig: Rig, free: Collection[str]) -> Iterator[str]:
+        for one, other in combinations(rig.sensors, 2):
+            if one.name not in free and other.name not in free:
+                continue
+            apart_m = float(np.linalg.norm(one.mount.matrix()[:3, 3] - other.mount.matrix()[:3, 3]))
+            if apart_m < self.min_distance_m:
+                yield (
+                    f"{one.name} and {other.name} are {apart_m:.3f} m apart; min_distance_m is {self.min_distance_m:g}"
+                )
+
+    def _lopsided(self, rig: Rig) -> Iterator[str]:
+        if not self.symmetric:
+            return
+        poses = [sensor.mount.matrix() for sensor in rig.sensors]
+        for sensor, pose in zip(rig.sensors, poses, strict=True):
+            mirrored = MIRROR @ pose @ MIRROR
+            if not any(np.allclose(mirrored, other, rtol=0.0, atol=MIRRORED_M) for other in poses):
+                yield f"{sensor.name} has no mirror image on the other side of the vehicle; symmetric is true"
+
+    def _too_dear(self, cost_eur: float | None) -> Iterator[str]:
+        if self.max_cost_eur is not None and cost_eur is not None and cost_eur > self.max_cost_eur:
+            yield f"it costs {cost_eur:g} EUR; max_cost_eur is {self.max_cost_eur:g}"
+
+
+def misplaced(sensor: Sensor, skin: Skin) -> str | None:
+    """Why a sensor cannot be where it is: below the ground, or inside the vehicle; None if it can.
+
+    Args:
+        sensor: The sensor.
+        skin: Of the vehicle.
+    """
+    place_m: Matrix = sensor.mount.matrix()[:3, 3]
+    if place_m[2] <= 0.0:
+        return f"{sensor.name} at {place_m.round(3).tolist()} m is not above the ground"
+    if skin.encloses(place_m):
+        return f"{sensor.name} at {place_m.round(3).tolist()} m is inside the vehicle's body"
+    return None

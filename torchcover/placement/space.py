@@ -1,0 +1,294 @@
+"""A search space: the rig that a search starts from, what of it is free, what it must keep to, and what counts."""
+
+import warnings
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    NonNegativeFloat,
+    PlainValidator,
+    ValidationInfo,
+    model_validator,
+)
+
+from torchcover.placement.carrier import Carrier
+from torchcover.placement.constraints import Constraints, misplaced
+from torchcover.placement.free_sensor import FreeSensor, mirrored
+from torchcover.placement.objective import Objective
+from torchcover.placement.prices import check_prices, price_eur
+from torchcover.placement.question_grid import QuestionGrid
+from torchcover.placement.variables import Value, Variable
+from torchcover.simulation import Document, Lidar, LidarModel, Rig, Scenario, Sensor, with_ego
+from torchcover.simulation.documents import NameOrFile, beside, is_file_name, read_document
+
+MAX_OBJECTIVES = 3
+# How many candidates are looked at before a space is refused as one without any that can be.
+TRIES = 256
+
+
+def _rig(given: Any, info: ValidationInfo) -> Rig:  # noqa: ANN401  (whatever stood in the file)
+    """A rig, or one by its name or its file."""
+    if isinstance(given, Rig):
+        return given
+    if not isinstance(given, str):
+        raise ValueError(f"the name of a rig, or the path of its file, is needed; got {type(given).__name__}")
+    try:
+        return Rig.load(beside(Path(given), info) if is_file_name(given) else given)
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from error
+
+
+def _vehicle(given: str) -> str:
+    if Path(given).suffix and not is_file_name(given):
+        raise ValueError(f"the name of a vehicle, or the path of its YAML file, is needed; got {given!r}")
+    return given
+
+
+def _listed(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
+    return (given,) if isinstance(given, str) else given
+
+
+class SearchSpace(Document):
+    """Where sensors may go, and what a good place is.
+
+    Args:
+        name: What files and pages call it.
+        description: What it is.
+        start: The rig that is made better, by its name or its file: what is not free stays as it is.
+        scenario: One or several, by name or file: they count alike.
+        vehicle: What carries the rig, by name or file; if not given, what `start` is simulated on.
+        free: Name of a sensor of `start` -> what of it is free.
+        constraints: What a rig must keep to.
+        cost: Prices in euros, by model, by the name of a sensor that has none, and of `mount`, which each sensor needs.
+        objectives: One to three, by name. One is made as large as it gets; of several, what one gains is weighed
+            against what the others lose.
+
+    Raises:
+        ValueError: Nothing in it can be searched, for a reason that the message tells.
+
+    Warns:
+        UserWarning: The rig that the search starts from is none of the space.
+
+    Example:
+        >>> space = SearchSpace(
+        ...     name="pitch",
+        ...     start="front_roof_32",
+        ...     scenario="courtyard",
+        ...     free={"roof": {"pitch_deg": (-10.0, 15.0)}},
+        ...     objectives={"near": {"band": "ground", "region": "20m"}},
+        ... )
+        >>> space.variables
+        (Number(name='roof.pitch_deg', low=-10.0, high=15.0),)
+        >>> space.rig({"roof.pitch_deg": 5.0}, "found").sensors[0].mount.pitch_deg
+        5.0
+    """
+
+    name: str
+    description: str = ""
+    start: Annotated[Rig, PlainValidator(_rig)]
+    scenario: Annotated[tuple[NameOrFile, ...], BeforeValidator(_listed)] = Field(min_length=1)
+    vehicle: Annotated[NameOrFile, AfterValidator(_vehicle)] | None = None
+    free: dict[str, FreeSensor] = Field(min_length=1)
+    constraints: Constraints = Constraints()
+    cost: dict[NameOrFile, NonNegativeFloat] = Field(default_factory=dict)
+    objectives: dict[Annotated[str, Field(min_length=1)], Objective] = Field(min_length=1, max_length=MAX_OBJECTIVES)
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read a space from a YAML file.
+
+        Raises:
+            FileNotFoundError: No such file.
+            BadFileError: Not YAML, or no space in which a search makes sense; the message names the file and the key.
+        """
+        return read_document(cls, Path(path))
+
+    @model_validator(mode="after")
+    def _check_sensors(self) -> Self:
+        sensors = {sensor.name: sensor for sensor in self.start.sensors}
+        for name, free in self.free.items():
+            if name not in sensors:
+                raise ValueError(f"free.{name}: {self.start.name!r} has no such sensor; it has {', '.join(sensors)}")
+            if free.model is not None and not isinstance(sensors[name], Lidar):
+                raise ValueError(f"free.{name}.model: only a LiDAR has a model to choose")
+            for model in free.model or ():
+                try:
+                    LidarModel.load(model)
+                except FileNotFoundError as error:
+                    raise ValueError(f"free.{name}.model: {error}") from error
+            if free.mirror_of is not None and (free.mirror_of not in self.free or self.free[free.mirror_of].mirror_of):
+                others = [other for other, one in self.free.items() if one.mirror_of is None]
+                raise ValueError(
+                    f"free.{name}.mirror_of: a free sensor is needed, one of {', '.join(others) or 'none'}; got "
+                    f"{free.mirror_of!r}"
+                )
+        if not self.variables:
+            raise ValueError("free: every number is set, so that there is nothing to search; give two for a range")
+        check_prices(self.cost, self.constraints.max_cost_eur, self.start.sensors, self.free)
+        return self
+
+    @model_validator(mode="after")
+    def _check_places(self) -> Self:
+        try:
+            carrier = self._carrier
+        except FileNotFoundError as error:
+            raise ValueError(str(error)) from error
+        for name, free in self.free.items():
+            for region in (free.region,) if isinstance(free.region, str) else free.region or ():
+                try:
+                    carrier.region(region)
+                except ValueError as error:
+                    raise ValueError(f"free.{name}.{error}") from error
+        for name in self.free:
+            self._check_place(name)
+        QuestionGrid.around(carrier.outline_m, self.objectives)
+        self._check_constraints()
+        outside = self._outside()
+        if outside:
+            warnings.warn(
+                f"{self.name}: {self.start.name!r} is none of the space ({'; '.join(outside)}): candidates are "
+                "compared with it all the same",
+                stacklevel=2,
+            )
+        return self
+
+    def _check_place(self, name: str) -> None:
+        complaint = "it is there in none of them"
+        for values in self._tries():
+            try:
+                sensor = self._sensor(name, values)
+            except ValueError as error:
+                complaint = str(error)
+                continue
+            wrong = misplaced(sensor, self._carrier.skin) if sensor is not None else complaint
+            if wrong is None:
+                return
+            complaint = wrong
+        raise ValueError(f"free.{name}: in none of {TRIES} places of its ranges can it be: {complaint}")
+
+    def _check_constraints(self) -> None:
+        broken: Counter[str] = Counter()
+        for values in self._tries():
+            try:
+                violations = self.violations(self.rig(values, self.name))
+            except ValueError as error:
+                violations = (str(error),)
+            if not violations:
+                return
+            broken.update(violations[:1])
+        raise ValueError(
+            f"constraints: none of {TRIES} candidates keeps to them; as of one: {broken.most_common(1)[0][0]}"
+        )
+
+    def _tries(self) -> Iterator[dict[str, Value]]:
+        """Values all over the space; the same ones every time."""
+        for shares in np.random.default_rng(0).random((TRIES, len(self.variables))).tolist():
+            yield {variable.name: variable.at(share) for variable, share in zip(self.variables, shares, strict=True)}
+
+    def _outside(self) -> list[str]:
+        """Why the rig that the search starts from is none of the space."""
+        values, known = self._values_of_start(), {variable.name: variable for variable in self.variables}
+        out = [f"{name} is {value}" for name, value in values.items() if not known[name].holds(value)]
+        return out or list(self.violations(self.start))
+
+    @cached_property
+    def variables(self) -> tuple[Variable, ...]:
+        """What is free, in the order of the file."""
+        return tuple(variable for name, free in self.free.items() for variable in free.variables(name))
+
+    @cached_property
+    def scenarios(self) -> tuple[Scenario, ...]:
+        """The scenarios, each with what carries the rigs as its ego."""
+        rigs = {self.start.name: self.start}
+        return tuple(with_ego(Scenario.load(each), rigs, self.vehicle) for each in self.scenario)
+
+    @cached_property
+    def _carrier(self) -> Carrier:
+        return Carrier.of(self.scenarios)
+
+    def rig(self, values: Mapping[str, Value], name: str) -> Rig:
+        """The rig that values make.
+
+        Args:
+            values: Of all `variables`, by name.
+            name: What the rig is called.
+
+        Returns:
+            The rig; its description says what it was made from.
+
+        Raises:
+            ValueError: A value is missing, unknown or outside; no sensor is left, or one would be where the vehicle has
+                no skin to mount it on.
+        """
+        known = {variable.name: variable for variable in self.variables}
+        if values.keys() != known.keys():
+            odd = ", ".join(sorted(values.keys() ^ known.keys()))
+            raise ValueError(f"values of {', '.join(known)} are needed; missing or unknown: {odd}")
+        for variable in self.variables:
+            variable.unit(values[variable.name])
+        sensors = [self._sensor(sensor.name, values) for sensor in self.start.sensors]
+        if all(sensor is None for sensor in sensors):
+            raise ValueError("no sensor is left")
+        told = ", ".join(
+            f"{key} {value:g}" if isinstance(value, float) else f"{key} {value}" for key, value in values.items()
+        )
+        return Rig(
+            name=name,
+            description=f"Found by a placement search in the space {self.name!r}, from the rig {self.start.name!r}, of "
+            f"which it keeps all else: {told}.",
+            vehicle=self.vehicle or self.start.vehicle,
+            sensors=tuple(sensor for sensor in sensors if sensor is not None),
+        )
+
+    def _sensor(self, name: str, values: Mapping[str, Value]) -> Sensor | None:
+        """A sensor of the start, as the values have it."""
+        start = next(sensor for sensor in self.start.sensors if sensor.name == name)
+        free = self.free.get(name)
+        if free is None:
+            return start
+        if free.mirror_of is not None:
+            return mirrored(start, self._sensor(free.mirror_of, values))
+        return free.made(start, values, self._carrier)
+
+    def start_values(self) -> dict[str, Value]:
+        """Values of the rig that the search starts from, of those variables of which it has one in the space.
+
+        A sensor that is free on a mount region has none there.
+        """
+        known = {variable.name: variable for variable in self.variables}
+        return {name: value for name, value in self._values_of_start().items() if known[name].holds(value)}
+
+    def _values_of_start(self) -> dict[str, Value]:
+        return {
+            name: value
+            for sensor in self.start.sensors
+            if sensor.name in self.free
+            for name, value in self.free[sensor.name].start_values(sensor, self._carrier).items()
+        }
+
+    def violations(self, rig: Rig) -> tuple[str, ...]:
+        """Why a rig cannot be, in words; nothing if it can. Self-hits are not among it: they are known after a scan.
+
+        Args:
+            rig: A rig of the space.
+        """
+        wrong = (misplaced(sensor, self._carrier.skin) for sensor in rig.sensors if sensor.name in self.free)
+        places = tuple(each for each in wrong if each is not None)
+        return (*places, *self.constraints.broken_by(rig, self.free, self.cost_eur(rig)))
+
+    def cost_eur(self, rig: Rig) -> float | None:
+        """What a rig costs: its models, and a mount for each; None if the space has no prices.
+
+        Args:
+            rig: A rig of the space.
+        """
+        if not self.cost:
+            return None
+        return sum(price_eur(self.cost, sensor.name, getattr(sensor, "model", None)) for sensor in rig.sensors)

@@ -1,0 +1,97 @@
+"""Variables: what is free in a space, each a number or a choice, and where its values lie between 0 and 1."""
+
+import math
+from typing import NamedTuple
+
+Value = float | str | bool
+# Numbers are found on a grid of micrometres and millionths of a degree: a table of them can be read, and read back.
+DECIMALS = 6
+
+
+class Number(NamedTuple):
+    """A number between two others.
+
+    Args:
+        name: Sensor and key, as "roof.pitch_deg".
+        low: The lowest.
+        high: The highest.
+
+    Example:
+        >>> Number("roof.pitch_deg", -10.0, 15.0).at(0.5)
+        2.5
+    """
+
+    name: str
+    low: float
+    high: float
+
+    def at(self, u: float) -> float:
+        """The value at a share from 0 to 1 of the way from the lowest to the highest.
+
+        Raises:
+            ValueError: The share is not from 0 to 1.
+        """
+        _check_share(self.name, u)
+        return min(max(round(self.low + u * (self.high - self.low), DECIMALS), self.low), self.high)
+
+    def unit(self, value: Value) -> float:
+        """The share of the way at which a value lies.
+
+        Raises:
+            ValueError: It lies outside.
+        """
+        if not self.holds(value):
+            raise ValueError(f"{self.name}: a number from {self.low:g} to {self.high:g} is needed; got {value!r}")
+        return (float(value) - self.low) / (self.high - self.low)
+
+    def holds(self, value: object) -> bool:
+        """Whether a value is a number in between."""
+        return isinstance(value, int | float) and not isinstance(value, bool) and self.low <= value <= self.high
+
+
+class Choice(NamedTuple):
+    """One of several, between which there is nothing: each has an equal part of the way from 0 to 1.
+
+    Args:
+        name: Sensor and key, as "roof.model".
+        options: What there is to choose from.
+
+    Example:
+        >>> model = Choice("roof.model", ("a", "b"))
+        >>> model.at(0.49), model.at(0.5), model.unit("b")
+        ('a', 'b', 0.75)
+    """
+
+    name: str
+    options: tuple[Value, ...]
+
+    def at(self, u: float) -> Value:
+        """The option in whose part a share from 0 to 1 lies.
+
+        Raises:
+            ValueError: The share is not from 0 to 1.
+        """
+        _check_share(self.name, u)
+        return self.options[min(int(u * len(self.options)), len(self.options) - 1)]
+
+    def unit(self, value: Value) -> float:
+        """The middle of the part of an option.
+
+        Raises:
+            ValueError: It is none of them.
+        """
+        if not self.holds(value):
+            raise ValueError(f"{self.name}: one of {', '.join(map(str, self.options))} is needed; got {value!r}")
+        return (self.options.index(value) + 0.5) / len(self.options)
+
+    def holds(self, value: object) -> bool:
+        """Whether a value is one of them."""
+        return any(value == option and type(value) is type(option) for option in self.options)
+
+
+Variable = Number | Choice
+
+
+def _check_share(name: str, u: float) -> None:
+    if not (math.isfinite(u) and 0.0 <= u <= 1.0):
+        raise ValueError(f"{name}: a share from 0 to 1 is needed; got {u!r}")

@@ -1,0 +1,156 @@
+"""Which track is the ego, and from when to when a recording is shown."""
+
+from difflib import get_close_matches
+from typing import NamedTuple
+
+import numpy as np
+
+from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry.rigid import Matrix
+from torchcover.simulation.recorded.track import Ego, Recording, Track, pieces
+from torchcover.simulation.trajectory import Trajectory
+
+TIME_SLACK_S = 1e-6
+TOLD = 8
+
+
+class Cast(NamedTuple):
+    """Who is who.
+
+    Args:
+        name: Of the ego.
+        drive: Of the vehicle frame, as it was recorded.
+        others: Everybody else; the recording's own ego, too, if it is not the one.
+    """
+
+    name: str
+    drive: Trajectory
+    others: tuple[Track, ...]
+
+
+class Run(NamedTuple):
+    """What is shown of a recording.
+
+    Args:
+        begin_s: The first instant, in the time of the recording.
+        duration_s: From there to the last.
+        drive: Of the ego, in the time of the recording.
+        others: Everybody else.
+    """
+
+    begin_s: float
+    duration_s: float
+    drive: Trajectory
+    others: tuple[Track, ...]
+
+
+def cast_of(recording: Recording, ego_id: str | None, ego_T_vehicle: Matrix | None) -> Cast:
+    """Choose the ego.
+
+    Args:
+        recording: Who there is.
+        ego_id: The id of a track, or of one of its own egos; the first of these if None.
+        ego_T_vehicle: The vehicle frame in that of the poses of its own ego, if not as published.
+
+    Raises:
+        ValueError: No such id, or none of its own; a frame for a track.
+    """
+    egos = {ego.name: ego for ego in recording.egos}
+    if ego_id is None and not egos:
+        raise ValueError(f"ego_id: the recording has no ego of its own; name one of its tracks, {_told(recording, '')}")
+    own = next(iter(egos.values())) if ego_id is None else egos.get(ego_id)
+    if own is not None:
+        return Cast(own.name, _drive(own, ego_T_vehicle), recording.tracks)
+    found = [track for track in recording.tracks if track.name == ego_id]
+    if not found:
+        raise ValueError(f"ego_id: there is no {ego_id!r} in the recording, but {_told(recording, str(ego_id))}")
+    if ego_T_vehicle is not None:
+        raise ValueError(f"ego_T_vehicle: is for an ego without a box; that of {ego_id!r} says where its middle is")
+    others = [track for track in recording.tracks if track is not found[0]]
+    bodies = [_as_track(ego) for ego in recording.egos]
+    return Cast(found[0].name, found[0].trajectory, (*others, *(body for body in bodies if body is not None)))
+
+
+def run_of(cast: Cast, begin_s: float, duration_s: float | None, max_gap_s: float) -> Run:
+    """Choose the times: those at which the ego and the others are known, or of them what is asked for.
+
+    An ego of which one pose is known stands there; that instant alone is shown, unless a duration is given.
+
+    Args:
+        cast: Who is who.
+        begin_s: After the first such time.
+        duration_s: To the last such time if None.
+        max_gap_s: See `pieces`.
+
+    Raises:
+        ValueError: There are no such times, or the ego has a gap or jumps in between.
+    """
+    drive_s = cast.drive.times_s
+    stands = len(drive_s) == 1
+    known_s = [track.trajectory.times_s for track in cast.others if track.trajectory.transient]
+    earliest_s = min((float(times_s[0]) for times_s in known_s), default=-np.inf)
+    latest_s = max((float(times_s[-1]) for times_s in known_s), default=np.inf)
+    first_s = float(drive_s[0]) if stands else max(float(drive_s[0]), earliest_s)
+    last_s = max(latest_s, first_s) if stands else min(float(drive_s[-1]), latest_s)
+    if last_s < first_s - TIME_SLACK_S:
+        raise ValueError(
+            f"the ego {cast.name!r} is there from {drive_s[0]:g} to {drive_s[-1]:g} s, the others from {earliest_s:g} "
+            f"to {latest_s:g} s of the recording: never at the same time"
+        )
+    length_s = last_s - first_s
+    if duration_s is None:
+        duration_s = 0.0 if stands else length_s - begin_s
+    if begin_s + max(duration_s, 0.0) > length_s + TIME_SLACK_S:
+        raise ValueError(
+            f"the ego {cast.name!r} and the others are known for {length_s:g} s; begin_s {begin_s:g} and duration_s "
+            f"{max(duration_s, 0.0):g} reach beyond: make them shorter"
+        )
+    begin_s += first_s
+    whole = cast.drive if stands else _without_gaps(cast, begin_s, begin_s + duration_s, max_gap_s, first_s)
+    return Run(begin_s, duration_s, whole, cast.others)
+
+
+def _without_gaps(cast: Cast, begin_s: float, end_s: float, max_gap_s: float, first_s: float) -> Trajectory:
+    """The piece of the ego's drive that holds all of a time."""
+    found = pieces(cast.drive, max_gap_s)
+    for piece in found:
+        if piece.times_s[0] <= begin_s + TIME_SLACK_S and piece.times_s[-1] >= end_s - TIME_SLACK_S:
+            return piece
+    told = [
+        f"{max(piece.times_s[0], first_s) - first_s:.4g} to {piece.times_s[-1] - first_s:.4g} s"
+        for piece in found
+        if piece.times_s[-1] > first_s
+    ]
+    raise ValueError(
+        f"the ego {cast.name!r} is not there all the time: it has a gap of over {max_gap_s:g} s (max_gap_s), or jumps. "
+        f"It is there from {', '.join(told[:TOLD])}; choose begin_s and duration_s within one of these"
+    )
+
+
+def _drive(ego: Ego, ego_T_vehicle: Matrix | None) -> Trajectory:
+    """Of the vehicle frame of an ego."""
+    world_T_vehicle = ego.world_T_ego @ (ego.ego_T_vehicle if ego_T_vehicle is None else ego_T_vehicle)
+    return Trajectory.from_poses(ego.times_s, world_T_vehicle)
+
+
+def _as_track(ego: Ego) -> Track | None:
+    """A recording's own ego as one of the others; None if nobody knows how large it is."""
+    if ego.size_m is None:
+        return None
+    drive = _drive(ego, None)
+    there = Trajectory(drive.times_s, drive.positions_m, drive.angles_deg, transient=True)
+    return Track(ego.name, "car", "passenger", ego.size_m, there)
+
+
+def _told(recording: Recording, like: str) -> str:
+    """Some of the ids that there are, those that look like one first."""
+    names = [*(ego.name for ego in recording.egos), *(track.name for track in recording.tracks)]
+    alike = get_close_matches(like, names, n=TOLD, cutoff=0.3)
+    told = [*alike, *(name for name in names if name not in alike)]
+    more = len(told) - TOLD
+    return ", ".join(map(repr, told[:TOLD])) + (f" and {more} more" if more > 0 else "")
+
+
+def poses_at_all(trajectory: Trajectory) -> Matrix:
+    """(K, 4, 4) the poses that a trajectory was given."""
+    return rigid(rotation_from_euler(*trajectory.angles_deg.T), trajectory.positions_m)

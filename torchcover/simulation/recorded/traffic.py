@@ -1,0 +1,171 @@
+"""Traffic of type `tracks`: the ego and everybody about it as they were recorded."""
+
+import warnings
+from collections.abc import Iterator
+from functools import cached_property
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, Field
+
+from torchcover.geometry import BoundingBox, invert, overlap
+from torchcover.geometry.rigid import Matrix
+from torchcover.simulation.documents import PathBeside, Pose, builtin_hashes, file_hash
+from torchcover.simulation.recorded.bodies import Bodies
+from torchcover.simulation.recorded.formats import format_of
+from torchcover.simulation.recorded.ground import ground_below, stood_on
+from torchcover.simulation.recorded.run import Run, cast_of, poses_at_all, run_of
+from torchcover.simulation.recorded.track import Ego, Recording, pieces
+from torchcover.simulation.shapes import Mesh, MeshFile
+from torchcover.simulation.tracks import read_trajectory
+from torchcover.simulation.traffic.assemble import HORIZON_M
+from torchcover.simulation.traffic.fleet import EGO, load_bodies
+from torchcover.simulation.traffic.kind import Traffic
+from torchcover.simulation.trajectory import Trajectory
+from torchcover.simulation.world import Actor, World, steps_of
+
+# A time that is so near to an instant is that instant.
+SNAP_S = 1e-6
+
+
+def _as_id(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
+    return str(given) if isinstance(given, int) and not isinstance(given, bool) else given
+
+
+class RecordedTraffic(Traffic):
+    """Traffic as it was recorded; beyond the end of the recording the same plays again.
+
+    Args:
+        path: A log of Argoverse 2, tables of nuScenes, a scenario of CommonRoad or a table of boxes; relative to the
+            document.
+        scene: Name or token of one scene of tables of nuScenes that hold several.
+        ego_id: Which track is the ego; if not given, the recording's own, or in CommonRoad the start of the first
+            planning problem.
+        ego_trajectory: File of the ego's own trajectory instead, at times of the same clock.
+        ego_T_vehicle: Where the vehicle frame (on the ground under the middle of the body) lies in the frame of the
+            recording's own ego, or of its trajectory. If not given, Argoverse 2 and nuScenes have what is published of
+            their cars, which begin at the rear axle; all others have none.
+        begin_s: When the run begins, from the first time at which the ego and others are known.
+        duration_s: Length of the run; all of it if not given.
+        max_gap_s: Who was not seen for longer was not there.
+        ground: File of a mesh, in metres and in the recording's frame; a height field below the tracks if not given.
+        time_step_s: Time between two frames.
+    """
+
+    repeats: ClassVar[bool] = True
+
+    type: Literal["tracks"] = "tracks"
+    path: PathBeside
+    scene: str | None = None
+    ego_id: Annotated[str | None, BeforeValidator(_as_id)] = None
+    ego_trajectory: PathBeside | None = None
+    ego_T_vehicle: Pose | None = None
+    begin_s: Annotated[float, Field(ge=0.0)] = 0.0
+    duration_s: Annotated[float | None, Field(ge=0.0)] = None
+    max_gap_s: Annotated[float, Field(gt=0.0)] = 1.0
+    ground: PathBeside | None = None
+
+    @property
+    def steps(self) -> int:
+        """Number of instants."""
+        return steps_of(self._run.duration_s, self.time_step_s)
+
+    def content(self) -> dict[str, Any]:
+        """Its keys, what is in its files, and the bodies that may stand for boxes."""
+        files = format_of(self.path).files(self.path) or []
+        one_file = self.model_copy(update={"path": files[0]})
+        return {
+            **Traffic.content(one_file),
+            "files": list(map(file_hash, files)),
+            "vehicles": builtin_hashes("vehicles"),
+        }
+
+    def world(self, seed: int, ego: Mesh | None = None) -> World:
+        """Build the world: nothing in it is drawn.
+
+        Args:
+            seed: Not used.
+            ego: Body of the ego, in the vehicle frame; the built-in SUV if not given.
+
+        Returns:
+            The world, in the frame of the recording. Who is where the ego is at an instant is left out, with a warning.
+
+        Raises:
+            FileNotFoundError: A file is missing.
+            ValueError: A file that cannot be used, an id that is absent, times at which the ego is not there.
+            ImportError: A package is missing that the files need.
+        """
+        run, bodies = self._run, load_bodies()
+        drive = self._shown(run.drive)
+        mesh = bodies["suv"] if ego is None else ego
+        driver = Actor(EGO, "car", mesh, Trajectory(drive.times_s, drive.positions_m, drive.angles_deg))
+        others = self._apart(driver, list(self._actors(driver.trajectory, Bodies(bodies))))
+        ground = self._fitted(driver) if self.ground is None else MeshFile(type="mesh", path=self.ground).mesh()
+        return World((ground,), driver, tuple(others), self.time_step_s, run.duration_s)
+
+    @cached_property
+    def _run(self) -> Run:
+        """What of the recording is shown; read when first needed."""
+        recording = format_of(self.path).read(self.path, self.scene)
+        if self.ego_trajectory is not None:
+            if self.ego_id is not None:
+                raise ValueError("ego_id and ego_trajectory exclude each other: the ego is one of them")
+            drive = read_trajectory(self.ego_trajectory)
+            driven = Ego(self.ego_trajectory.name, drive.times_s, poses_at_all(drive), np.eye(4))
+            recording = Recording(recording.tracks, (driven,))
+        frame = None if self.ego_T_vehicle is None else self.ego_T_vehicle.matrix()
+        try:
+            return run_of(cast_of(recording, self.ego_id, frame), self.begin_s, self.duration_s, self.max_gap_s)
+        except ValueError as error:
+            raise ValueError(f"{self.path}: {error}") from error
+
+    def _shown(self, trajectory: Trajectory) -> Trajectory:
+        """The same in the time of the run."""
+        times_s = trajectory.times_s - self._run.begin_s
+        steps = np.round(times_s / self.time_step_s)
+        instants_s = self.time_step_s * steps
+        times_s = np.where(np.abs(times_s - instants_s) < SNAP_S, instants_s, times_s)
+        return Trajectory(times_s, trajectory.positions_m, trajectory.angles_deg, trajectory.transient)
+
+    @property
+    def _times_s(self) -> Matrix:
+        """(T,) the instants."""
+        return self.time_step_s * np.arange(self.steps, dtype=np.float64)
+
+    def _actors(self, drive: Trajectory, bodies: Bodies) -> Iterator[Actor]:
+        """Everybody who is there during the run and ever comes within the range of sensors."""
+        for track in self._run.others:
+            category, mesh = bodies.of(track)
+            for number, piece in enumerate(pieces(track.trajectory, self.max_gap_s), 1):
+                shown = self._shown(piece)
+                there = not shown.transient or (shown.times_s[0] <= self._run.duration_s and shown.times_s[-1] >= 0.0)
+                away_m = np.linalg.norm(shown.positions_m - drive.positions_at(shown.times_s), axis=1)
+                if there and away_m.min() < HORIZON_M + max(track.size_m[:2]):
+                    yield Actor(track.name if number == 1 else f"{track.name} #{number}", category, mesh, shown)
+
+    def _apart(self, ego: Actor, others: list[Actor]) -> list[Actor]:
+        """Those whose bounding boxes meet that of the ego at no instant; a warning names the others."""
+        times_s = self._times_s
+        ego_m, box = ego.trajectory.positions_at(times_s), BoundingBox.around(ego.mesh.vertices_m)
+        reach_m = float(np.linalg.norm(box.corners_m, axis=1).max())
+        met: list[str] = []
+        for other in others:
+            its_box = BoundingBox.around(other.mesh.vertices_m)
+            away_m = np.linalg.norm(other.trajectory.positions_at(times_s) - ego_m, axis=1)
+            near = np.flatnonzero(away_m < reach_m + np.linalg.norm(its_box.corners_m, axis=1).max())
+            for time_s in times_s[near].tolist():
+                if overlap(box, invert(ego.trajectory.at(time_s)) @ other.trajectory.at(time_s), its_box):
+                    met.append(other.name)
+                    break
+        if met:
+            warnings.warn(
+                f"{self.path}: {len(met)} of {len(others)} tracks are where the ego is at some time "
+                f"({', '.join(map(repr, met[:3]))}); they are left out",
+                stacklevel=2,
+            )
+        return [other for other in others if other.name not in met]
+
+    def _fitted(self, ego: Actor) -> Mesh:
+        """The ground below all road users of the recording."""
+        standing = [track.trajectory.positions_m for track in self._run.others if track.vehicle_class is not None]
+        return ground_below(stood_on(standing), stood_on([ego.trajectory.positions_at(self._times_s)])).mesh()

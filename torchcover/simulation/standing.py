@@ -1,0 +1,66 @@
+"""A hint where bodies that move do not stand on the ground: then hardly anything of it is seen, or known."""
+
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import transform
+from torchcover.simulation.instant import Instant
+from torchcover.simulation.scene import Scene
+
+# Nearer than this is near enough, above or below.
+NEAR_M = 1.0
+# Instants that are looked at, and how far about the ego.
+LOOKS = 8
+WITHIN_M = 100.0
+# Faces of its own that lie above the ground under the middle of a resting ego, at most.
+OWN_FACES = 16
+LIFT_M = 1e-3
+
+
+def warn_of_floating(name: str, scene: Scene, steps: NDArray[np.int64]) -> None:
+    """Warn if the ego, or more than half of the others that move, have no ground near the bottoms of their bodies.
+
+    Args:
+        name: What the warning calls the scenario.
+        scene: It as geometry.
+        steps: (T,) time steps, of which a few are looked at.
+    """
+    found = np.concatenate([_grounded(scene, step) for step in steps[:: -(-len(steps) // LOOKS)].tolist()])
+    of_ego, of_others = found[found[:, 0] > 0, 1], found[found[:, 0] == 0, 1]
+    for who, grounded, share in (("the ego", of_ego, 0.0), ("others that move", of_others, 0.5)):
+        missing = int((grounded == 0).sum())
+        if missing > share * len(grounded):
+            warnings.warn(
+                f"{name}: {missing} of {len(grounded)} times that were looked at, {who} had no ground within "
+                f"{NEAR_M:g} m below or above the wheels, so that little of it will be known; is the ground a mesh in "
+                "the same frame, and z that of the bottom? Traffic of type 'tracks' without `ground` makes ground that "
+                "follows the tracks",
+                stacklevel=4,
+            )
+
+
+def _grounded(scene: Scene, step: int) -> NDArray[np.int64]:
+    """(bodies, 2) whether each that is there at a step is the ego, and whether it has ground."""
+    instant = scene.at(step, within_m=WITHIN_M)
+    up = scene.world.ego.trajectory.at(step * scene.world.time_step_s)[2, :3]
+    others = instant.moving.vehicle_T_part[instant.moving.body != instant.ego, :3, 3]
+    places_m = np.concatenate([np.zeros((1, 3)), others])
+    is_ego = np.arange(len(places_m)) == 0
+    return np.column_stack([is_ego, [_has_ground(instant, place_m, up) for place_m in places_m]]).astype(np.int64)
+
+
+def _has_ground(instant: Instant, place_m: NDArray[np.float64], up: NDArray[np.float64]) -> bool:
+    """Whether a ray from above a place to below it meets what never moves, the ego itself aside."""
+    down = -(instant.static_T_vehicle[:3, :3] @ up).astype(np.float32)[:, None]
+    left_m = 2 * NEAR_M
+    for _ in range(OWN_FACES):
+        start_m = transform(instant.static_T_vehicle, (place_m + (left_m - NEAR_M) * up)[None])[0]
+        hits = instant.static.cast(start_m, down, np.array([left_m], dtype=np.float32))
+        if hits.body[0] != instant.ego:
+            return bool(hits.body[0] >= 0)
+        left_m -= float(hits.range_m[0]) + LIFT_M
+        if left_m <= 0:
+            return False
+    return False

@@ -1,0 +1,44 @@
+"""Which of our bodies stands for a road user of a class and a length, be it simulated or recorded."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+# SUMO's classes (and children), and the kinds of bodies (`fleet.CATEGORIES`) among which the length decides; cars are
+# those of all others.
+BODIES: Mapping[str, tuple[str, ...]] = {
+    "pedestrian": ("adult",),
+    "child": ("child",),
+    "wheelchair": ("adult",),
+    "bicycle": ("cyclist",),
+    "scooter": ("cyclist",),
+    "moped": ("motorcycle",),
+    "motorcycle": ("motorcycle",),
+    "truck": ("truck",),
+    "trailer": ("truck",),
+    "bus": ("bus",),
+    "coach": ("bus",),
+    "tram": ("bus",),
+    "delivery": ("van",),
+    "emergency": ("van",),
+}
+CARS = ("hatchback", "sedan", "suv", "van")
+# They need no road, or one that is not built.
+LEFT_OUT = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship", "drone"})
+
+
+class VehicleType(NamedTuple):
+    """What is known of somebody: a class, by SUMO's names, and a length."""
+
+    vehicle_class: str
+    length_m: float
+
+    def body(self, lengths_m: Mapping[str, float]) -> str | None:
+        """The kind of body whose length is nearest among those of the class; None if there is none of this class.
+
+        Args:
+            lengths_m: Of each kind of body.
+        """
+        if self.vehicle_class in LEFT_OUT:
+            return None
+        kinds = BODIES.get(self.vehicle_class, CARS)
+        return min(kinds, key=lambda kind: abs(lengths_m[kind] - self.length_m))
