@@ -11,7 +11,7 @@ from torchcover.data import RegionsOfInterest
 from torchcover.evaluation import agree, save_agreement, score_placements
 from torchcover.evaluation.agreeing import READINGS, TRUTHS
 from torchcover.evaluation.placement_scores import circle
-from torchcover.published import published_results
+from torchcover.published import agreement_of, published_results
 
 RIGS = {name: f"place3d2024_{name}" for name in ("center", "line", "pyramid")}
 
@@ -45,6 +45,11 @@ def test_a_reading_takes_its_own_rigs(study):
     )
     assert abs(pyramid - degrees) < abs(pyramid - radians)
     assert len(rigs) == 13
+    found = study.found["car mAP", "degrees"]
+    tilted = ("line_roll", "pyramid_roll", "optimised_detection")
+    named = [f"place3d2024_{each}{'_degrees' * (each in tilted)}" for each in found.judged.placements]
+    assert str(agreement_of(study.scores.of(named), found.judged).ranked) == str(found.ranked)
+    assert str(study.found["car mAP", "radians"].ranked) != str(found.ranked)
 
 
 def test_the_notes_say_what_the_data_say(study):
