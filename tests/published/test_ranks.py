@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from torchcover.published.ranks import kendall_tau_b, midranks, orders, permutation_p, spearman
+from torchcover.published.ranks import kendall_tau_b, midranks, orders, permutation_p, spearman, strongest_by_chance
 
 STATISTICS = pytest.mark.parametrize(
     ("own", "of_scipy"), [(kendall_tau_b, stats.kendalltau), (spearman, stats.spearmanr)], ids=["tau", "spearman"]
@@ -88,3 +88,11 @@ def test_of_more_than_eight_orders_are_drawn_the_same_each_time_and_p_is_never_0
 def test_what_is_unknown_has_no_p():
     assert math.isnan(permutation_p([1, 1, 1], [1, 2, 3]))
     assert math.isnan(permutation_p([1, math.nan, 2], [1, 2, 3]))
+
+
+@pytest.mark.parametrize("tied", [False, True])
+def test_the_orders_of_a_series_are_ranked_at_once_as_one_by_one(tied):
+    generator = np.random.default_rng(5)
+    first, second = generator.normal(size=(2, 6)).round(0 if tied else 6)
+    one_by_one = [abs(spearman(first, second[order])) for order in orders(6)]
+    np.testing.assert_allclose(strongest_by_chance(first, second), np.nan_to_num(one_by_one), atol=1e-12)

@@ -66,13 +66,28 @@ CARLA = {
     "place3d_square": ((-1, -1, 0.2, 0.2), (0.5, -0.5, 0.5, -0.5), (2.0, 2.0, 2.2, 2.2)),
     "place3d_trapezoid": ((-0.6, -0.6, 0.2, 0.2), (0.6, -0.6, 0.4, -0.4), (2.0, 2.0, 1.8, 1.8)),
     "place3d_optimised_detection": ((0.5, -0.4, 0, -0.1), (0.5, 0.1, 0, -0.5), (2.5, 2.6, 2.8, 2.7)),
+    "place3d2024_center": ((0, 0, 0, 0), (0, 0, 0, 0), (2.2, 2.4, 2.6, 2.8)),
+    "place3d2024_line": ((0, 0, 0, 0), (-0.6, -0.4, 0.4, 0.6), (2.2,) * 4),
+    "place3d2024_pyramid": ((-0.2, 0.4, -0.2, -0.2), (-0.6, 0, 0, 0.6), (2.2, 2.4, 2.6, 2.2)),
+    "place3d2024_square": ((-0.5, -0.5, 0.5, 0.5), (0.5, -0.5, 0.5, -0.5), (2.2,) * 4),
+    "place3d2024_trapezoid": ((-0.4, -0.4, 0.2, 0.2), (0.2, -0.2, 0.5, -0.5), (2.2,) * 4),
+    "place3d2024_line_roll": ((0, 0, 0, 0), (-0.6, -0.4, 0.4, 0.6), (2.2,) * 4),
+    "place3d2024_pyramid_roll": ((-0.2, 0.4, -0.2, -0.2), (-0.6, 0, 0, 0.6), (2.2, 2.4, 2.6, 2.2)),
+    "place3d2024_optimised_detection": ((0.5, -0.4, 0, -0.1), (0.5, 0.1, 0, -0.5), (2.5, 2.6, 2.8, 2.7)),
+    "place3d2024_optimised_segmentation": ((0, 0.6, 0.4, 0.1), (0.5, 0.3, 0, -0.6), (2.6, 2.8, 2.5, 2.8)),
 }
 # Roll in radians in CARLA, where a positive one lowers the right side, as here.
 ROLLS = {
     "hu2022_line_roll": (-0.28, 0, 0, 0.28),
     "hu2022_pyramid_roll": (-0.28, 0, 0, 0.28),
     "place3d_optimised_detection": (-0.3, -0.2, 0, 0),
+    "place3d2024_line_roll": (-0.3, 0, 0, -0.3),
+    "place3d2024_pyramid_roll": (-0.3, 0, 0, -0.3),
+    "place3d2024_optimised_detection": (-0.3, -0.2, 0, 0),
+    "place3d2024_optimised_segmentation": (-0.3, 0, 0, 0.2),
 }
+# Placements whose rolls are in another rig in degrees.
+IN_DEGREES = [name for name in ROLLS if name.startswith("place3d2024")]
 
 
 def mounted(rig, sensor):
@@ -131,6 +146,30 @@ def test_the_right_axis_drops_by_the_sine_of_carlas_roll(rig):
     for sensor, roll in zip(Rig.load(rig).sensors, rolls, strict=True):
         right = sensor.mount.matrix()[:3, :3] @ [0, -1, 0]
         assert right[2] == pytest.approx(-np.sin(roll), abs=1e-5)
+
+
+@pytest.mark.parametrize("name", IN_DEGREES)
+def test_the_other_reading_of_a_roll_has_the_same_number_of_degrees_and_nothing_else_changed(name):
+    radians, degrees = Rig.load(name), Rig.load(f"{name}_degrees")
+    for sensor, other, roll in zip(radians.sensors, degrees.sensors, ROLLS[name], strict=True):
+        assert other.mount.roll_deg == roll
+        assert other.model_copy(update={"mount": sensor.mount}) == sensor
+        assert other.mount.model_copy(update={"roll_deg": sensor.mount.roll_deg}) == sensor.mount
+    assert "Doubt about the unit" in radians.description
+    assert "Doubt about the unit" in degrees.description
+
+
+def test_the_placements_of_place3ds_tables_have_the_lidar_of_its_tables():
+    placements = [name for name in RIGS if name.startswith("place3d2024_")]
+    assert len(placements) == 9 + len(IN_DEGREES)
+    for name in placements:
+        for sensor in Rig.load(name).sensors:
+            rows = sensor.rows_deg()
+            assert (len(rows), rows.min(), rows.max()) == (16, pytest.approx(-24.8), pytest.approx(2.0))
+            assert (sensor.columns, sensor.max_range_m, sensor.horizontal_fov_deg) == (250, 100.0, 360.0)
+    for name in RIGS:
+        if name.startswith("place3d_"):
+            assert "no mAP has been published" in Rig.load(name).description
 
 
 def test_tilted_placements_look_down_on_their_own_side():

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from torchcover.cli import options
+from torchcover.cli.agree import agree
 from torchcover.cli.asking import asked
 from torchcover.cli.running import checkpoint_in, finish, logged, opened, sharing, watching
 from torchcover.cli.search import search
@@ -286,6 +287,7 @@ def show(
 
 app.command()(targets)
 app.command()(search)
+app.command()(agree)
 
 
 @app.command("list")

@@ -6,7 +6,18 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from torchcover.evaluation import Omission, Result, Study, StudyPlan, WorkPoint, stage_table, study_table
+from torchcover.evaluation import (
+    AgreementStudy,
+    Omission,
+    Result,
+    Study,
+    StudyPlan,
+    WorkPoint,
+    relation,
+    stage_table,
+    study_table,
+    verdict,
+)
 from torchcover.published.tables import text_tables
 from torchcover.report import UNITS, error_words, narrowest_width, print_table, text_table
 
@@ -55,6 +66,27 @@ def print_study(study: Study, out: Path) -> None:
     for wanted, point in study.recommended.items():
         console.print(advice(wanted, point, study.plan), soft_wrap=True)
     console.print(f"Wrote study.json, long_run.npz and work_precision.png to {out}", markup=False, soft_wrap=True)
+
+
+def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> None:
+    """How metrics rank the placements beside each thing that detectors say of them, and the notes."""
+    console = Console()
+    truths = list(dict.fromkeys(truth for truth, _ in study.found))
+    readings = list(dict.fromkeys(reading for _, reading in study.found))
+    tables = []
+    for reading in readings:
+        each = [study.found[truth, reading].ranked for truth in truths]
+        rows = [(of[0].metric, *(relation(row.spearman) for row in of)) for of in zip(*each, strict=True)]
+        title = f"Spearman correlation with what detectors reached, rolls in {reading}; 95 % intervals"
+        tables.append(text_table(("metric", *truths), [rows], title=title))
+    wide = Console(width=max(console.width, narrowest_width(tables)))
+    for table in tables:
+        wide.print(table)
+    for truth in truths:
+        console.print(verdict(truth, {one: study.found[truth, one] for one in readings}), markup=False, soft_wrap=True)
+    for note in study.notes:
+        console.print(note, markup=False, soft_wrap=True)
+    console.print(f"Wrote {', '.join(path.name for path in files)} to {out}", markup=False, soft_wrap=True)
 
 
 def advice(wanted: float, point: WorkPoint | None, plan: StudyPlan) -> str:

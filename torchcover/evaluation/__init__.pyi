@@ -1,3 +1,8 @@
+from .agreeing import AgreementStudy as AgreementStudy
+from .agreeing import agree as agree
+from .agreement_files import relation as relation
+from .agreement_files import save_agreement as save_agreement
+from .agreement_files import verdict as verdict
 from .checkpoint import Checkpoint as Checkpoint
 from .evaluating import compare as compare
 from .evaluating import evaluate as evaluate
@@ -9,6 +14,8 @@ from .omissions import left_out as left_out
 from .pipeline import Run as Run
 from .pipeline import StoppingRule as StoppingRule
 from .pipeline import observe as observe
+from .placement_scores import PlacementScores as PlacementScores
+from .placement_scores import score_placements as score_placements
 from .progress import Progress as Progress
 from .ranks import Ranks as Ranks
 from .ranks import joined_ranks as joined_ranks

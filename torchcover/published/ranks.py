@@ -118,13 +118,44 @@ def permutation_p(first: ArrayLike, second: ArrayLike, statistic: Statistic = sp
     found = np.abs([statistic(one, target) for one in series])
     if np.isnan(found).all():
         return math.nan
-    shuffled = target[orders(target.size, seed)]
-    best = np.zeros(len(shuffled))
-    for one in series:
-        best = np.fmax(best, np.abs(statistic(one, shuffled)))
+    best = strongest_by_chance(series, target, statistic, seed)
     as_strong = int((best >= np.nanmax(found) - 1e-12).sum())
     drawn = math.factorial(target.size) > MOST_TRIED  # then the order that was found is one more
-    return (as_strong + drawn) / (len(shuffled) + drawn)
+    return (as_strong + drawn) / (len(best) + drawn)
+
+
+def strongest_by_chance(first: ArrayLike, second: ArrayLike, statistic: Statistic = spearman, seed: int = 0) -> Array:
+    """The strongest relation of several series, of either sign, to each of many orders of the second.
+
+    Args:
+        first: (n,) or (k, n), NaN where unknown.
+        second: (n,) what is put in other orders.
+        statistic: As in `permutation_p`.
+        seed: Likewise.
+
+    Returns:
+        (P,) from 0 to 1: what the best of k metrics that mean nothing reaches.
+
+    Example:
+        >>> float(strongest_by_chance([1, 2, 3], [1, 2, 3]).mean())             # of six orders two have 1, four 0.5
+        0.666...
+    """
+    target, numbers = np.asarray(second, dtype=np.float64), orders(np.size(second), seed)
+    best = np.zeros(len(numbers))
+    for one in np.atleast_2d(np.asarray(first, dtype=np.float64)):
+        if statistic is spearman and not np.isnan(one + target).any():
+            found = _spearman_of_orders(one, target, numbers)
+        else:
+            found = statistic(one, target[numbers])
+        best = np.fmax(best, np.abs(found))
+    return best
+
+
+def _spearman_of_orders(one: Array, target: Array, numbers: NDArray[np.int64]) -> Array:
+    """(P,) what `spearman` gives for each order of the second, where all is known: ranks move with what they are of."""
+    own, other = (ranks - ranks.mean() for ranks in (midranks(one), midranks(target)))
+    spread = np.sqrt((own**2).sum() * (other**2).sum())
+    return _ratio(other[numbers] @ own, np.full(len(numbers), spread), np.broadcast_to(one, numbers.shape))
 
 
 def _signs(one: Array, other: Array) -> Array:

@@ -75,7 +75,7 @@ def record(comparison: MetricComparison) -> dict[str, Any]:
 
 def numbers_csv(comparison: MetricComparison) -> str:
     """A line for each rig and number; an unknown one is an empty field, parameters are JSON."""
-    rows = [{**row, "parameters": json.dumps(row["parameters"], sort_keys=True)} for row in comparison.rows()]
+    rows = [{**row, "parameters": json.dumps(_plain(row["parameters"]), sort_keys=True)} for row in comparison.rows()]
     return _csv(rows, ["rig", "metric", *PublishedNumber._fields, "rank"])
 
 
@@ -112,8 +112,11 @@ def _tau_words(tau: Tau) -> str:
     return f"{tau.tau:+.2f}{interval}"
 
 
-def _plain(row: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: None if isinstance(value, float) and math.isnan(value) else value for name, value in row.items()}
+def _plain(value: Any) -> Any:  # noqa: ANN401  (whatever a record holds)
+    """Without NaN, which JSON does not know."""
+    if isinstance(value, Mapping):
+        return {name: _plain(each) for name, each in value.items()}
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 def _csv(rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> str:

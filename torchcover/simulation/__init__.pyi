@@ -1,4 +1,5 @@
 from .builtin import builtin_documents as builtin_documents
+from .builtin import builtin_folder as builtin_folder
 from .builtin import builtin_names as builtin_names
 from .camera_sensor import CameraSensor as CameraSensor
 from .documents import Document as Document

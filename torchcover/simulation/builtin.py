@@ -30,7 +30,7 @@ def builtin_folder(kind: str) -> Path:
     """Where the built-in documents of a kind lie.
 
     Args:
-        kind: "rigs", "scenarios", "vehicles" or "lidars".
+        kind: "rigs", "scenarios", "vehicles", "lidars", or "published", which has tables.
     """
     package = Path(str(files("torchcover")))
     # In a wheel the folder lies inside the package; in a checkout beside it.

@@ -1,0 +1,103 @@
+"""Ranks of metrics beside those of judges: what is equal, what is chance, and what the best of many is worth."""
+
+import numpy as np
+import pytest
+from scipy.stats import kendalltau, spearmanr
+
+from torchcover.published import Candidate, Judged, agreement_of, lead
+from torchcover.published.ranks import orders
+
+
+def judged_by(values):
+    values = np.array(values, dtype=float)
+    placements = tuple(f"placement {number}" for number in range(values.shape[1]))
+    return Judged("AP", placements, tuple(f"net {number}" for number in range(len(values))), values)
+
+
+def metric(values, draws=None, name="metric"):
+    return Candidate(name, "published", np.array(values, dtype=float), draws)
+
+
+def test_a_metric_that_is_the_truth_has_rank_1_and_one_that_is_its_negative_minus_1():
+    truth = judged_by([[3.0, 1.0, 4.0, 1.5, 5.0], [3.5, 0.0, 4.5, 2.0, 6.0]])
+    found = agreement_of([metric(truth.mean, name="same"), metric(-truth.mean, name="opposite")], truth)
+    for row, value in zip(found.ranked, (1.0, -1.0), strict=True):
+        assert row.spearman == (pytest.approx(value),) * 3
+        assert row.kendall == (pytest.approx(value),) * 3
+        assert row.p == pytest.approx(2 / 120)
+    assert found.best_p == pytest.approx(2 / 120)  # the same order, or the opposite one
+
+
+def test_ties_are_those_of_scipy():
+    truth = judged_by([[1.0, 2.0, 2.0, 3.0, 5.0, 4.0]])
+    values = [1.0, 1.0, 2.0, 2.0, 2.0, 4.0]
+    (row,) = agreement_of([metric(values)], truth).ranked
+    assert row.spearman.value == pytest.approx(spearmanr(values, truth.mean).statistic)
+    assert row.kendall.value == pytest.approx(kendalltau(values, truth.mean).statistic)
+
+
+def test_what_does_not_vary_has_no_rank_and_is_not_counted_among_those_looked_at():
+    truth = judged_by([[1.0, 2.0, 3.0, 4.0]])
+    found = agreement_of([metric([7.0] * 4, name="rays"), metric([1.0, 3.0, 2.0, 4.0], name="other")], truth)
+    assert np.isnan([*found.ranked[0].spearman, *found.ranked[0].kendall, found.ranked[0].p]).all()
+    assert (found.looked_at, found.best) == (1, "other")
+    nothing = agreement_of([metric([7.0] * 4)], truth)
+    assert (nothing.looked_at, nothing.best) == (0, None)
+    assert np.isnan([nothing.best_p, nothing.by_chance]).all()
+
+
+def test_the_p_of_the_best_of_many_is_uniform_where_nothing_is_there_to_be_found():
+    generator = np.random.default_rng(0)
+    many, values = [metric(generator.normal(size=4)) for _ in range(6)], generator.normal(size=4)
+    # A truth that has nothing to do with the metrics is any of its orders, each as likely.
+    found = [agreement_of(many, judged_by([values[order]]), draws=1) for order in orders(4)]
+    best, alone = (
+        np.array(p) for p in zip(*((one.best_p, [row.p for row in one.ranked]) for one in found), strict=True)
+    )
+    for level in np.unique(best):
+        assert (best <= level).mean() == pytest.approx(level)
+    # Whoever takes the p of the best one alone is far too often sure.
+    for level in np.unique(alone)[:2]:
+        assert (alone[:, 0] <= level).mean() == pytest.approx(level)
+        assert (alone.min(axis=1) <= level).mean() > 2 * level
+
+
+def test_more_metrics_make_chance_stronger():
+    generator = np.random.default_rng(1)
+    truth, many = judged_by(generator.normal(size=(1, 6))), [metric(generator.normal(size=6)) for _ in range(8)]
+    few, all_of_them = agreement_of(many[:2], truth, draws=1), agreement_of(many, truth, draws=1)
+    assert few.by_chance < all_of_them.by_chance <= 1.0
+
+
+def test_intervals_are_over_judges_over_worlds_and_over_placements_if_they_are_drawn():
+    generator = np.random.default_rng(2)
+    values = np.arange(6.0)
+    alike, unlike = judged_by([values] * 4), judged_by(values + generator.normal(0, 2, (4, 6)))
+
+    def width(candidate, judged, **how):
+        relation = agreement_of([candidate], judged, **how).ranked[0].spearman
+        return relation.high - relation.low
+
+    sure = metric(values)
+    noisy = metric(values, values + generator.normal(0, 2, (500, 6)))
+    assert width(sure, alike) == 0.0
+    assert width(sure, unlike) > 0.05
+    assert width(noisy, alike) > 0.1
+    assert width(sure, unlike, placements=True) > width(sure, unlike)
+
+
+def test_the_lead_is_the_difference_and_what_is_shared_cancels_out():
+    generator = np.random.default_rng(3)
+    truth = judged_by(np.arange(6.0) + generator.normal(0, 2, (4, 6)))
+    first, second = metric(np.arange(6.0)), metric(generator.permutation(6))
+    rho = [row.spearman.value for row in agreement_of([first, second], truth).ranked]
+    assert lead(first, second, truth).value == pytest.approx(rho[0] - rho[1])
+    assert lead(first, metric(first.values**3), truth, placements=True) == (0.0, 0.0, 0.0)
+
+
+def test_another_number_of_placements_or_of_draws_is_refused():
+    truth = judged_by([[1.0, 2.0, 3.0]])
+    with pytest.raises(ValueError, match="a value of each of 3 placements"):
+        agreement_of([metric([1.0, 2.0])], truth)
+    with pytest.raises(ValueError, match="500 draws"):
+        agreement_of([metric([1.0, 2.0, 3.0], np.zeros((7, 3)))], truth)

@@ -1,0 +1,189 @@
+"""Whether metrics rank sensor placements as detectors do, and how much that can mean."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.published.ranks import Array, kendall_tau_b, permutation_p, spearman, strongest_by_chance
+from torchcover.published.results import Judged
+
+# coverage: torchcover's own numbers; published: those of others; baseline: what takes no simulation to know, or little.
+Kind = Literal["coverage", "published", "baseline"]
+# Ends of the intervals.
+LEVELS = 0.025, 0.975
+# What the best of several metrics that mean nothing exceeds in one of twenty orders.
+BY_CHANCE = 0.95
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """What a metric says of n placements.
+
+    Args:
+        name: The metric, with what decides it.
+        kind: Whose it is.
+        values: (n,), NaN where unknown; more is better, as its authors say it.
+        draws: (R, n) what it would have said of other worlds; None if nobody knows.
+    """
+
+    name: str
+    kind: Kind
+    values: Array
+    draws: Array | None = None
+
+
+class Relation(NamedTuple):
+    """A rank correlation and its 95 % interval; NaN where one of the two series does not vary."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """How one metric ranks the placements.
+
+    Args:
+        metric: Its name.
+        kind: Whose it is.
+        spearman: Spearman's rank correlation with the mean of the judges.
+        kendall: Kendall's tau-b with it.
+        p: Probability of a Spearman correlation as strong, of either sign, by chance; of this metric alone.
+        over_worlds: Whether the intervals are over worlds too, or over judges only.
+    """
+
+    metric: str
+    kind: Kind
+    spearman: Relation
+    kendall: Relation
+    p: float
+    over_worlds: bool
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How metrics rank placements, beside what judges say of them.
+
+    Args:
+        judged: What the judges say.
+        ranked: A row for each metric.
+        best: The metric with the strongest Spearman correlation, of either sign; None if none has one.
+        best_p: Probability that the best of so many metrics that mean nothing is as strong.
+        by_chance: What the best of them exceeds in one of twenty orders.
+    """
+
+    judged: Judged
+    ranked: tuple[Ranked, ...]
+    best: str | None
+    best_p: float
+    by_chance: float
+
+    @property
+    def looked_at(self) -> int:
+        """How many metrics have a rank correlation."""
+        return sum(not math.isnan(row.spearman.value) for row in self.ranked)
+
+
+def agreement_of(
+    candidates: Sequence[Candidate], judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
+) -> Agreement:
+    """Rank placements by metrics, and compare with the mean of the judges.
+
+    The intervals are those of a bootstrap: judges are drawn anew, and with them the worlds of the metrics that have
+    `draws`. The placements are the same in each draw, unless they too are a sample.
+
+    Args:
+        candidates: What the metrics say of the placements of `judged`, in its order.
+        judged: What the judges say.
+        draws: How often; at most as many as the candidates have.
+        seed: Of the draws.
+        placements: Whether to draw placements, too.
+
+    Raises:
+        ValueError: A metric of another number of placements, or with fewer draws.
+
+    Example:
+        >>> judged = Judged("AP", tuple("abcd"), ("net", "other"), np.array([[1.0, 2, 3, 4], [1, 2, 4, 3]]))
+        >>> found = agreement_of([Candidate("height", "baseline", np.array([1.0, 2, 3, 3]))], judged, draws=100)
+        >>> round(found.ranked[0].spearman.value, 3), found.best, found.looked_at
+        (1.0, 'height', 1)
+    """
+    count = len(judged.placements)
+    for one in candidates:
+        if one.values.shape != (count,) or (one.draws is not None and one.draws[:draws].shape != (draws, count)):
+            raise ValueError(f"{one.name}: a value of each of {count} placements is needed, and {draws} draws or none")
+    truths, columns = _drawn(judged, draws, seed, placements=placements)
+    ranked = tuple(_ranked(one, judged.mean, truths, columns) for one in candidates)
+    strength = np.array([abs(row.spearman.value) for row in ranked])
+    if np.isnan(strength).all():
+        return Agreement(judged, ranked, None, math.nan, math.nan)
+    series = np.stack([one.values for one in candidates])
+    return Agreement(
+        judged=judged,
+        ranked=ranked,
+        best=candidates[int(np.nanargmax(strength))].name,
+        best_p=permutation_p(series, judged.mean),
+        by_chance=float(np.quantile(strongest_by_chance(series, judged.mean), BY_CHANCE)),
+    )
+
+
+def lead(
+    one: Candidate, other: Candidate, judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
+) -> Relation:
+    """By how much Spearman's correlation of a metric is above that of another one, with its interval.
+
+    Both are held against the same draws, so that what they share cancels out.
+
+    Args:
+        one: The metric.
+        other: What it is to beat.
+        judged: As in `agreement_of`, and so are all that follow.
+        draws: How often.
+        seed: Of the draws.
+        placements: Whether to draw placements, too.
+
+    Example:
+        >>> judged = Judged("AP", tuple("abcd"), ("net",), np.array([[1.0, 2, 3, 4]]))
+        >>> good, bad = (Candidate("", "published", np.array(values)) for values in ([1.0, 2, 3, 4], [4.0, 3, 2, 1]))
+        >>> lead(good, bad, judged)
+        Relation(value=2.0, low=2.0, high=2.0)
+    """
+    truths, columns = _drawn(judged, draws, seed, placements=placements)
+    found = [spearman(each.values, judged.mean) for each in (one, other)]
+    drawn = [spearman(*_along(each, truths, columns)) for each in (one, other)]
+    return _with_ends(float(found[0] - found[1]), drawn[0] - drawn[1])
+
+
+def _drawn(judged: Judged, draws: int, seed: int, *, placements: bool) -> tuple[Array, NDArray[np.int64]]:
+    """(R, n) the mean of judges that are drawn anew, and which placements are drawn."""
+    generator, count = np.random.default_rng(seed), len(judged.placements)
+    chosen = generator.integers(len(judged.judges), size=(draws, len(judged.judges)))
+    columns = generator.integers(count, size=(draws, count)) if placements else np.tile(np.arange(count), (draws, 1))
+    return judged.values[chosen].mean(axis=1), columns
+
+
+def _along(one: Candidate, truths: Array, columns: NDArray[np.int64]) -> tuple[Array, Array]:
+    """(R, n) what a metric and the judges say in each draw."""
+    drawn = np.broadcast_to(one.values, truths.shape) if one.draws is None else one.draws[: len(truths)]
+    return np.take_along_axis(drawn, columns, axis=1), np.take_along_axis(truths, columns, axis=1)
+
+
+def _ranked(one: Candidate, truth: Array, truths: Array, columns: NDArray[np.int64]) -> Ranked:
+    drawn = _along(one, truths, columns)
+    rho, tau = (
+        _with_ends(float(statistic(one.values, truth)), statistic(*drawn)) for statistic in (spearman, kendall_tau_b)
+    )
+    return Ranked(one.name, one.kind, rho, tau, permutation_p(one.values, truth), one.draws is not None)
+
+
+def _with_ends(value: float, drawn: Array) -> Relation:
+    known = drawn[~np.isnan(drawn)]
+    if math.isnan(value) or not known.size:
+        return Relation(value, math.nan, math.nan)
+    low, high = np.quantile(known, LEVELS).tolist()
+    return Relation(value, low, high)
