@@ -62,5 +62,12 @@ def test_a_mistake_is_one_line(torchcover, space, tmp_path, options, message):
     assert not (tmp_path / "found" / "summary.json").exists()
 
 
+@pytest.mark.parametrize("options", [("--budget", "5s"), ("--evaluations", "3"), ("--optimiser", "gp"), ("--resume",)])
+def test_a_choice_has_no_budget(torchcover, tmp_path, options):
+    code, _, said = torchcover("search", "examples/placement/robot_corners.yaml", "--out", tmp_path / "found", *options)
+    assert code == 2
+    assert "candidates are all looked at; leave them out" in said
+
+
 def test_times():
     assert [parsed_budget(text) for text in ("10s", "30min", "2h", "0.5 h")] == [10, 1800, 7200, 1800]

@@ -1,5 +1,6 @@
 """What `torchcover search` does and prints."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from torchcover.report import narrowest_width, text_table
 from torchcover.simulation.documents import read_mapping
 
 CHOICE_KEY = "candidates"
+# Of a search, if nothing is given.
+BUDGET_S = 30 * 60.0
 
 
 def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noqa: ANN401  (those of `SearchPlan`)
@@ -30,6 +33,8 @@ def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noq
     if CHOICE_KEY in read_mapping(path):
         _choose(ChoiceSpace.load(path), out, resume=resume, **settings)
         return
+    if settings["budget_s"] is None and settings["evaluations"] is None:
+        settings["budget_s"] = BUDGET_S
     search = PlacementSearch(SearchSpace.load(path), SearchPlan(**settings))
     if resume and not (out / NAME).exists():
         typer.echo(f"torchcover: {out / NAME} is not there: the search starts with its first candidate", err=True)
@@ -46,9 +51,10 @@ def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noq
 
 
 def _choose(space: ChoiceSpace, out: Path, *, resume: bool, **settings: Any) -> None:  # noqa: ANN401
-    if resume or settings["evaluations"] is not None or settings["optimiser"] != "auto":
-        raise ValueError("--resume, --evaluations, --optimiser: candidates are all looked at; leave them out")
-    plan = SearchPlan(**settings)
+    asked = resume, settings["budget_s"] is not None, settings["evaluations"] is not None
+    if any(asked) or settings["optimiser"] != "auto":
+        raise ValueError("--resume, --budget, --evaluations, --optimiser: candidates are all looked at; leave them out")
+    plan = SearchPlan(**settings | {"budget_s": math.inf})
     with claimed(out):
         instants = CommonInstants(
             space.scenarios,
