@@ -161,6 +161,7 @@ def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
         ),
         (["courtyard", "--scenario", "urban"], "--scenario: for a rig only, and 'courtyard' is a scenario"),
         (["suv", "--step", "1"], "--step: for rigs and scenarios only, and 'suv' is a vehicle"),
+        (["suv", "--film", "x.gif"], "--film: for a scenario only, and 'suv' is a vehicle"),
         (["courtyard", "--rig", "moon"], "built-in rigs: argoverse2,"),
         (["kitti", "--scenario", "moon"], "built-in scenarios: courtyard,"),
         (["courtyard", "--step", "-1"], "--step"),

@@ -46,7 +46,8 @@ def run(
     console, kind = Console(), _kind(name)
     if kind == "vehicle":
         given = {"--scenario": scenario, "--rig": rig, "--vehicle": vehicle, "--step": step, "--seed": seed}
-        _refuse("rigs and scenarios", given | {"--film": film}, f"{name!r} is a vehicle")
+        _refuse("rigs and scenarios", given, f"{name!r} is a vehicle")
+        _refuse("a scenario", {"--film": film}, f"{name!r} is a vehicle")
         body = load_document(Vehicle, "vehicles", name)
         _say(console, body.description)
         _write(console, out / Path(name).stem, [("", vehicle_picture(body))])

@@ -130,6 +130,13 @@ def test_what_sumo_says_is_passed_on_and_entities_never_get_to_it(tmp_path):
         Sumo(net=net, routes=(tmp_path / "none.xml",), duration_s=2.0).world(0)
 
 
+def test_a_simulation_that_is_over_before_the_run_begins_is_refused(tmp_path):
+    net, routes = Streets().build(tmp_path, np.random.default_rng(0)), tmp_path / "r.xml"
+    routes.write_text("<routes/>")
+    with pytest.raises(ValueError, match=r"the simulation is over before t = 60 s, where the run begins: .*begin_s"):
+        Sumo(net=net, routes=(routes,), duration_s=2.0).world(0)
+
+
 def test_without_sumo_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setattr(programs, "find_spec", lambda _: None)
     monkeypatch.setattr(programs, "which", lambda _: None)

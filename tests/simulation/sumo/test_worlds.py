@@ -204,6 +204,11 @@ def test_cars_are_parked_in_bays_only(tmp_path):
         ({"duration_s": 9.0}, r"no car that could be the ego .* the longest drives for 4 s \(data end at t = 4 s\)"),
         ({"ego_type": "bus"}, "no vehicle of type 'bus' that could be the ego"),
         ({"begin_s": 3.0}, "no car that could be the ego"),
+        (
+            {"ego_id": "ego", "begin_s": 2.0, "duration_s": 2.0, "steps": together(drive(start=335.0, speed=30.0))},
+            r"the ego is farther than 10 m from all streets of the network at t = 2\.6 s: it leaves them, or the data",
+        ),
+        ({"ego_id": "ego", "steps": together(drive(y=9000.0))}, "farther than 10 m from all streets .* t = 0 s"),
     ],
 )
 def test_without_an_ego_there_is_no_world(options, message, tmp_path):

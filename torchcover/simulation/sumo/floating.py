@@ -140,7 +140,7 @@ class Recorded(NamedTuple):
     Args:
         tracks: All, in the order of their first appearance; somebody who was gone in between has several.
         begin_s: When it begins, in the time of the simulation.
-        last_s: The last time that was read.
+        last_s: The last time that was read; minus infinity if there was none.
     """
 
     tracks: tuple[Track, ...]
@@ -162,8 +162,6 @@ def record(pieces: Iterable[bytes], window: Window) -> Recorded:
     with suppress(_Enough):
         feed_xml(pieces, collector.start)
         collector.end_step()
-    if not np.isfinite(collector.last_s):
-        raise ValueError("floating car data of SUMO with at least one <timestep> is needed")
     return Recorded(tuple(_tracks(collector)), collector.begin_s, collector.last_s)
 
 
@@ -176,7 +174,10 @@ def read_floating(path: Path, window: Window) -> Recorded:
         BadFileError: As `record`.
     """
     with path.open("rb") as file:
-        return record(iter(lambda: file.read(PIECE_BYTES), b""), window)
+        recorded = record(iter(lambda: file.read(PIECE_BYTES), b""), window)
+    if not np.isfinite(recorded.last_s):
+        raise ValueError("floating car data of SUMO with at least one <timestep> is needed")
+    return recorded
 
 
 def _tracks(collector: _Collector) -> Iterator[Track]:

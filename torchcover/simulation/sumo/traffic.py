@@ -22,7 +22,7 @@ from torchcover.simulation.sumo.placing import Placing
 from torchcover.simulation.sumo.simulating import from_opendrive, simulate
 from torchcover.simulation.sumo.streets import Streets
 from torchcover.simulation.sumo.types import types_of
-from torchcover.simulation.sumo.vicinity import Vicinity
+from torchcover.simulation.sumo.vicinity import OFF_STREET_M, Vicinity
 from torchcover.simulation.traffic.fleet import EGO, Fleet
 from torchcover.simulation.traffic.procedural import Procedural
 from torchcover.simulation.traffic.scenery import few
@@ -89,6 +89,12 @@ class Sumo(Procedural):
         way_m, _ = found.ego.at(times_s)
         origin_m = np.floor(way_m[0])
         vicinity = Vicinity(network, way_m - origin_m, origin_m)
+        gone = np.flatnonzero(~vicinity.on_streets(way_m - origin_m))
+        if len(gone):
+            raise ValueError(
+                f"the ego is farther than {OFF_STREET_M:g} m from all streets of the network at t = "
+                f"{recorded.begin_s + times_s[gone[0]]:g} s: it leaves them, or the data are those of another network"
+            )
         ground = ground_of(vicinity)
         pavement = Pavement(vicinity, ground)
         frontage = Frontage(vicinity, ground, self.built_share, generator)
@@ -123,4 +129,10 @@ class Sumo(Procedural):
         begin_s = WARM_UP_S if self.random is not None else USUAL_BEGIN_S if self.begin_s is None else self.begin_s
         seed, drawn = int(generator.integers(1 << 31)), self.random is not None
         pieces = simulate(network_file, routes, begin_s, seed, around=self.ego_id, drawn=drawn)
-        return record(pieces, Window(begin_s, duration_s, self.ego_id))
+        recorded = record(pieces, Window(begin_s, duration_s, self.ego_id))
+        if not np.isfinite(recorded.last_s):
+            raise ValueError(
+                f"the simulation is over before t = {begin_s:g} s, where the run begins: everybody has arrived, "
+                "or nobody sets off; change begin_s, or the routes"
+            )
+        return recorded

@@ -26,6 +26,8 @@ ENCLOSED = 0.95
 SMALLEST_MEDIAN_M2 = 3.0
 ALONGSIDE_M = 0.05
 WAY_WITHIN_M = 0.5
+# Whoever is farther from all streets has left them.
+OFF_STREET_M = 10.0
 
 
 class Vicinity:
@@ -66,6 +68,14 @@ class Vicinity:
         """(N,) whether (N, 2) places may be seen from the way."""
         seen: NDArray[np.bool_] = shapely.dwithin(shapely.points(places_m), self.way, HORIZON_M + BEYOND_M)
         return seen
+
+    def on_streets(self, places_m: Numbers) -> NDArray[np.bool_]:
+        """(N,) whether (N, 2) places are on a street, or at least near to one."""
+        on = np.zeros(len(places_m), dtype=bool)
+        if self.lanes:
+            near = shapely.STRtree(self.covered).query(shapely.points(places_m), "dwithin", OFF_STREET_M)
+            on[near[0]] = True
+        return on
 
     def surfaces(self, *uses: Use) -> NDArray[np.object_]:
         """The polygons in plan of all lanes of some uses that lie on the ground."""
