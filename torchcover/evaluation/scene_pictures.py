@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 import numpy as np
+import shapely
 from matplotlib.figure import Figure
 
 from torchcover.data import GRID_X_M, GRID_Y_M, SimulatedFrames
@@ -126,21 +127,41 @@ def _frames(scenario: Scenario, rig: Rig, vehicle: str | None, step: int, seed: 
 
 
 def _standing(world: World, time_s: float) -> Standing:
-    """The scenery within the picture, from above."""
+    """The scenery within the picture, from above, by its height over the ground below it."""
     vehicle_T_world = invert(world.ego.trajectory.at(time_s))
     low, high = np.array([(GRID_X_M[end], GRID_Y_M[end]) for end in (0, 1)])
-    triangles, heights = [np.empty((0, 3, 2))], [np.empty(0)]
+    standing, terrain = [np.empty((0, 3, 3))], [np.empty((0, 3, 3))]
     for mesh in world.static:
         corners = transform(vehicle_T_world, mesh.vertices_m)[mesh.faces]
+        # What faces up everywhere is the ground, and no body on it.
+        lies = (_normals(corners)[:, 2] > 0).all()
         inside = ((corners[..., :2].max(axis=1) > low) & (corners[..., :2].min(axis=1) < high)).all(axis=1)
-        triangles.append(corners[inside][..., :2])
-        heights.append(_heights_m(corners[inside]))
-    return Standing(np.concatenate(triangles), np.concatenate(heights))
+        (terrain if lies else standing).append(corners[inside])
+    corners = np.concatenate(standing)
+    ground_m = _ground_m(np.concatenate(terrain), corners.mean(axis=1)[:, :2])
+    return Standing(corners[..., :2], _heights_m(corners) - ground_m)
+
+
+def _ground_m(terrain_m: Matrix, places_m: Matrix) -> Matrix:
+    """(N,) height at (N, 2) places of the lowest of (G, 3, 3) faces; 0, that of the vehicle, where there is none."""
+    faces = shapely.polygons(terrain_m[..., :2])
+    place, face = shapely.STRtree(faces).query(shapely.points(places_m), predicate="intersects")
+    normals, corners = _normals(terrain_m)[face], terrain_m[face, 0]
+    away_m = ((places_m[place] - corners[:, :2]) * normals[:, :2]).sum(axis=1)
+    heights_m = np.full(len(places_m), np.inf)
+    np.minimum.at(heights_m, place, corners[:, 2] - away_m / normals[:, 2])
+    return np.where(np.isfinite(heights_m), heights_m, 0.0)
+
+
+def _normals(corners_m: Matrix) -> Matrix:
+    """(F, 3) of (F, 3, 3) faces, as long as these are large."""
+    normals: Matrix = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    return normals
 
 
 def _heights_m(corners_m: Matrix) -> Matrix:
-    """(F,) the highest point of each of (F, 3, 3) faces; of flat ones the lowest, for the ground may be a slope."""
-    normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    """(F,) the highest point of each of (F, 3, 3) faces; of flat ones the lowest, for a pavement may be on a slope."""
+    normals = _normals(corners_m)
     flat = np.abs(normals[:, 2]) > FLAT * np.linalg.norm(normals, axis=1)
     heights_m: Matrix = np.where(flat, corners_m[..., 2].min(axis=1), corners_m[..., 2].max(axis=1))
     return heights_m
