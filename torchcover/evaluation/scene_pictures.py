@@ -160,10 +160,10 @@ def _normals(corners_m: Matrix) -> Matrix:
 
 
 def _heights_m(corners_m: Matrix) -> Matrix:
-    """(F,) the highest point of each of (F, 3, 3) faces; of flat ones the lowest, for a pavement may be on a slope."""
+    """(F,) the highest point of each of (F, 3, 3) faces; of flat ones the middle, for a pavement may be on a slope."""
     normals = _normals(corners_m)
     flat = np.abs(normals[:, 2]) > FLAT * np.linalg.norm(normals, axis=1)
-    heights_m: Matrix = np.where(flat, corners_m[..., 2].min(axis=1), corners_m[..., 2].max(axis=1))
+    heights_m: Matrix = np.where(flat, corners_m[..., 2].mean(axis=1), corners_m[..., 2].max(axis=1))
     return heights_m
 
 
