@@ -27,6 +27,9 @@ def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
     assert numbers["both", "points"]["rank"] == 1.0
     assert numbers["both", "k_cover_1_2m"]["value"] >= numbers["low", "k_cover_1_2m"]["value"]
     assert numbers["low", "object_coverage_2m:bus"]["value"] is None
+    notes = summary["metrics"]["notes"]
+    assert sum(note.startswith("s_mig, s_mig_occluded: S-MIG falls") for note in notes) == 1
+    assert sum(note.startswith("lob: the distance decides") for note in notes) == 1
     with (out / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(summary["metrics"]["numbers"])

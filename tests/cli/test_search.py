@@ -1,6 +1,7 @@
 """The command `search`."""
 
 from functools import partial
+from pathlib import Path
 
 import pytest
 
@@ -9,6 +10,7 @@ from torchcover.cli import search_run
 from torchcover.cli.search import parsed_budget
 from torchcover.placement import SearchPlan
 
+CHOICE = Path(__file__).parents[2] / "examples" / "placement" / "robot_corners.yaml"
 SPACE = """
 name: roof
 start: front_roof_32
@@ -64,7 +66,7 @@ def test_a_mistake_is_one_line(torchcover, space, tmp_path, options, message):
 
 @pytest.mark.parametrize("options", [("--budget", "5s"), ("--evaluations", "3"), ("--optimiser", "gp"), ("--resume",)])
 def test_a_choice_has_no_budget(torchcover, tmp_path, options):
-    code, _, said = torchcover("search", "examples/placement/robot_corners.yaml", "--out", tmp_path / "found", *options)
+    code, _, said = torchcover("search", CHOICE, "--out", tmp_path / "found", *options)
     assert code == 2
     assert "candidates are all looked at; leave them out" in said
 

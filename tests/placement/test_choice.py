@@ -2,6 +2,7 @@
 
 import csv
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -168,3 +169,11 @@ def test_of_few_fresh_worlds_there_is_no_error_and_no_gain_is_shown(folder):
     assert "nan" not in found.sentence
     save_choice(found, folder / "few")
     assert json.loads((folder / "few" / "search.json").read_text())["fresh"]["error"] is None
+
+
+def test_the_example_has_money_for_two_but_not_for_two_wide_ones():
+    space = ChoiceSpace.load(Path(__file__).parents[2] / "examples" / "placement" / "robot_corners.yaml")
+    limits = space.limits(list(range(12)))
+    assert len(space.sensors) == 12
+    assert limits.allow([0], 7)
+    assert not limits.allow([0], 1)

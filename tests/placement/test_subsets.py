@@ -38,6 +38,7 @@ LIMITS = {
     "money": lambda generator: Limits(9, list(generator.uniform(0.5, 3.0, 9)), 4.0),
     "two for money": lambda generator: Limits(2, list(generator.uniform(0.5, 3.0, 9)), 3.5),
     "free of charge": lambda generator: Limits(9, [0.0, *generator.uniform(0.5, 3.0, 8)], 4.0),
+    "nothing to pay with": lambda generator: Limits(9, [0.0, 0.0, 0.0, *generator.uniform(0.5, 3.0, 6)], 0.0),
     "apart": lambda generator: Limits(4, apart=_apart(generator)),
 }
 

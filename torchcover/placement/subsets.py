@@ -173,11 +173,10 @@ def _most_to_add(gains: dict[int, float], limits: Limits, count: int, to_pay: fl
         return most
     added = 0.0
     for one in sorted(gains, key=lambda one: -gains[one] / max(limits.prices[one], SAME)):
-        share = min(to_pay / limits.prices[one], 1.0) if limits.prices[one] > 0 else 1.0
+        price = limits.prices[one]
+        share = min(max(to_pay, 0.0) / price, 1.0) if price > 0 else 1.0
         added += share * gains[one]
-        to_pay -= share * limits.prices[one]
-        if to_pay <= 0:
-            break
+        to_pay -= share * price
     return min(most, added)
 
 
