@@ -53,7 +53,7 @@ def search(
         out,
         resume=resume,
         evaluations=evaluations,
-        budget_s=None if evaluations is not None else parsed_budget(budget or "30min"),
+        budget_s=None if budget is None else parsed_budget(budget),
         optimiser=optimiser,
         measure=measure,
         seed=seed,

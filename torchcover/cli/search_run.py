@@ -18,6 +18,8 @@ from torchcover.report import narrowest_width, text_table
 from torchcover.simulation.documents import read_mapping
 
 CHOICE_KEY = "candidates"
+# If neither a time nor a number of candidates is given.
+BUDGET_S = 1800.0
 
 
 def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noqa: ANN401  (those of `SearchPlan`)
@@ -30,6 +32,8 @@ def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noq
     if CHOICE_KEY in read_mapping(path):
         _choose(ChoiceSpace.load(path), out, resume=resume, **settings)
         return
+    if settings["evaluations"] is None and settings["budget_s"] is None:
+        settings["budget_s"] = BUDGET_S
     search = PlacementSearch(SearchSpace.load(path), SearchPlan(**settings))
     if resume and not (out / NAME).exists():
         typer.echo(f"torchcover: {out / NAME} is not there: the search starts with its first candidate", err=True)
@@ -46,9 +50,17 @@ def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noq
 
 
 def _choose(space: ChoiceSpace, out: Path, *, resume: bool, **settings: Any) -> None:  # noqa: ANN401
-    if resume or settings["evaluations"] is not None or settings["optimiser"] != "auto":
-        raise ValueError("--resume, --evaluations, --optimiser: candidates are all looked at; leave them out")
-    plan = SearchPlan(**settings)
+    given = {
+        "--budget": settings["budget_s"] is not None,
+        "--evaluations": settings["evaluations"] is not None,
+        "--optimiser": settings["optimiser"] != "auto",
+        "--resume": resume,
+    }
+    if useless := [option for option, is_given in given.items() if is_given]:
+        raise ValueError(
+            f"{', '.join(useless)}: this file has `{CHOICE_KEY}`, which are all looked at, once; leave the option out"
+        )
+    plan = SearchPlan(**{**settings, "budget_s": BUDGET_S})
     with claimed(out):
         instants = CommonInstants(
             space.scenarios,
