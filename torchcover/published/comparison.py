@@ -110,10 +110,15 @@ class MetricComparison:
     def notes(self) -> list[str]:
         """What a reader is to know."""
         few = [] if len(self.rigs) >= LEAST else [f"{TOO_FEW.format(len(self.rigs))}."]
-        warned = {number.warning for one in self.series for number in one.numbers if number and number.warning}
+        warned: dict[str, list[str]] = {}  # the metrics that a warning is about
+        for one in self.series:
+            for number in one.numbers:
+                if number and number.warning and one.metric not in warned.setdefault(number.warning, []):
+                    warned[number.warning].append(one.metric)
+        warnings = [f"{', '.join(metrics)}: {warning}" for warning, metrics in warned.items()]
         rays = [note for one in self.main if one.metric.startswith("s_mig") and (note := self._unequal_rays(one))]
         missing = [f"Without {name}: {why}" for name, why in (self.left_out or {}).items()]
-        return [NOT_VALIDATED, *few, *sorted(warned), *rays, *missing]
+        return [NOT_VALIDATED, *few, *warnings, *rays, *missing]
 
     def _unequal_rays(self, one: Series) -> str | None:
         known = {rig: number for rig, number in zip(self.rigs, one.numbers, strict=True) if number is not None}
