@@ -13,6 +13,7 @@ from pathlib import Path
 
 from examples.paper import cameras, tables
 
+STRAIGHT = Path(__file__).with_name("straight.yaml")
 EXPERIMENTS = {"tables": tables.run, "cameras": cameras.run}
 
 
@@ -37,7 +38,7 @@ def main():
         default=["front_{}", "paper_fit_{}"],
         help="sets of LiDARs: names or YAML files, {} for each of grille_128, roof_128, roof_64, roof_32",
     )
-    parser.add_argument("--scenario", default="urban")
+    parser.add_argument("--scenario", default=str(STRAIGHT), help="name or YAML file; a straight city if not given")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/paper"))
     options = parser.parse_args()

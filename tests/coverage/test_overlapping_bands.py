@@ -55,6 +55,21 @@ def test_bins_are_the_cells_of_each_band():
     assert bins.inside.tolist() == sorted({at for at, _ in expected})
 
 
+@pytest.mark.parametrize("heights", [BANDS, {"ground": (-0.5, 0.5), "obstacle": (0.5, 2.0)}], ids=["over", "above"])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_points_by_column_are_those_of_the_bins(heights, dtype, monkeypatch):
+    monkeypatch.setattr("torchcover.coverage.grid.PART", 300)
+    points = torch.randn(1000, 3, generator=torch.Generator().manual_seed(1), dtype=dtype)
+    points[:9] = torch.tensor([-2.0, -1.0, 0.05, 0.5, 1.0, 1.1, 2.0, torch.inf, torch.nan])[:, None]
+    points[9:18, :2], points[9:18, 2] = 0.25, points[:9, 0]  # on the borders of the bands
+    points[18:27, 0] = points[:9, 0]
+    grid = grid_of(heights)
+    expected = torch.bincount(grid.bins(points).cell % 32, minlength=32).view(4, 8)
+    assert torch.equal(grid.points_by_column(points), expected.double())
+    assert expected.sum() > 300
+    assert torch.equal(grid.points_by_column(points[:0]), torch.zeros(4, 8, dtype=torch.float64))
+
+
 def test_where_bands_overlap_a_point_has_no_single_cell():
     with pytest.raises(ValueError, match="the height bands overlap, so that a point may be in several cells: use"):
         grid_of(BANDS).cell_of(torch.zeros(1, 3))

@@ -48,6 +48,22 @@ def test_points_in_boxes_are_those_of_the_definition(seed):
     assert len(inside.box) > 20
 
 
+@pytest.mark.parametrize("far_m", [30.0, 3e4, 1e30])
+def test_boxes_may_be_far_apart_and_of_any_size(far_m):
+    """More cells than there may be, of which some boxes fill many; points beyond all, and none at all."""
+    generator = torch.Generator().manual_seed(5)
+    rows = random_boxes(12, generator, reach=6.0).rows.double()
+    rows[3, 0], rows[5, 1], rows[7, 3:5] = far_m, -far_m, min(far_m, 3e4)
+    boxes = Boxes.from_rows(rows)
+    points = (torch.rand(300, 3, generator=generator) * 16 - 8).double()
+    points[:4, 0] = torch.tensor([torch.inf, -torch.inf, torch.nan, far_m])
+    points[4] = rows[3, :3]
+    given = points.clone()
+    inside = points_in_boxes(points, boxes)
+    assert set(zip(inside.box.tolist(), inside.point.tolist(), strict=True)) == slow_inside(points, boxes)
+    assert torch.equal(points.nan_to_num(), given.nan_to_num())
+
+
 def test_sides_and_top_are_closed_and_the_ground_below_is_outside():
     box = Boxes.from_rows(torch.tensor([[10.0, -3.0, 1.0, 4.0, 2.0, 2.0, 0.0]]))
     in_it = [

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -50,6 +51,12 @@ class Case:
         for step in steps:
             metric.update(**step)
         return metric
+
+    @cached_property
+    def whole(self) -> tuple[dict[str, torch.Tensor], Any]:
+        """The states and the result over all steps, which many laws compare with: not to be changed."""
+        metric = self.over(self.steps)
+        return {name: value.clone() for name, value in metric.metric_state.items()}, metric.compute()
 
 
 def in_lists(steps: Sequence[Step]) -> dict[str, list[Any]]:

@@ -121,9 +121,15 @@ def test_places_all_over_a_region_lie_on_its_skin(tmp_path):
         ({"choose": {"max_cost_eur": 500}, "cost": {"wide": 600}}, "500, but the cheapest candidate costs 600"),
         ({"cost": {"narrow": 1}}, "cost: narrow: no group of candidates"),
         ({"now": ["wide_top"]}, "now: wide_top: no candidate"),
+        ({"now": ["wide_left", "wide_left"]}, "now: wide_left is there once at most"),
+        ({"always": "front_roof_32", "now": ["roof"]}, "now: roof: no candidate; they are wide_front"),
+        ({"scenario": "moon"}, "'moon' is neither"),
         ({"candidates": {"wide": {"sensor": SENSOR}}}, "places, grid: at least one of the two is needed"),
         ({"candidates": {"wide": {"sensor": {**SENSOR, "name": "x"}, "places": PLACES}}}, "name: the places make them"),
-        ({"candidates": {"wide": {"sensor": SENSOR, "grid": {"region": ["wing"], "spacing_m": 1}}}}, "no 'wing'"),
+        (
+            {"candidates": {"wide": {"sensor": SENSOR, "grid": {"region": ["wing"], "spacing_m": 1}}}},
+            "candidates.wide.grid.region: .* has no 'wing'",
+        ),
         ({"objective": {"band": "sky", "region": "20m"}}, "sky"),
         ({"objective": {"region": "behind"}}, "behind"),
         ({"candidates": {}}, "candidates"),
@@ -142,3 +148,23 @@ def test_candidates_that_are_all_inside_are_refused(folder):
         pytest.raises(ValueError, match=r"none of 1 can be there; of wide_a: .* inside the ego"),
     ):
         choose(space, instants, test_seed=5, fresh_worlds=1)
+
+
+def test_candidates_that_see_nothing_that_counts_are_refused(folder):
+    up = {**SENSOR, "vertical_fov_deg": [60, 80]}
+    space = loaded(folder, candidates={"wide": {"sensor": up, "places": PLACES}})
+    with (
+        held(space.scenarios, {OBJECTIVE: space.objective}, worlds=1) as instants,
+        pytest.raises(ValueError, match="none of the 3 that can be there adds anything"),
+    ):
+        choose(space, instants, test_seed=5, fresh_worlds=1)
+
+
+def test_of_few_fresh_worlds_there_is_no_error_and_no_gain_is_shown(folder):
+    space = loaded(folder, now=["wide_left"])
+    with held(space.scenarios, {OBJECTIVE: space.objective}, worlds=1) as instants:
+        found = choose(space, instants, test_seed=5, fresh_worlds=1)
+    assert "no gain is shown" in found.sentence
+    assert "nan" not in found.sentence
+    save_choice(found, folder / "few")
+    assert json.loads((folder / "few" / "search.json").read_text())["fresh"]["error"] is None

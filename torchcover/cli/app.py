@@ -11,6 +11,7 @@ import typer
 from torchcover.cli import options
 from torchcover.cli.agree import agree
 from torchcover.cli.asking import asked
+from torchcover.cli.record import record
 from torchcover.cli.running import checkpoint_in, finish, logged, opened, sharing, watching
 from torchcover.cli.search import search
 from torchcover.cli.study import study
@@ -216,36 +217,7 @@ def compare(
 
 
 app.command()(study)
-
-
-@app.command()
-def record(
-    rig: options.Rig,
-    out: options.RecordingOut,
-    scenario: options.ScenarioOrNone = None,
-    steps: options.RecordedSteps = None,
-    seed: options.Seed = 0,
-    vehicle: options.Vehicle = None,
-    every: options.Every = None,
-    reference: options.RecordedReference = None,
-    rays: options.Rays = None,
-    layout: options.Layout = "folder",
-) -> None:
-    """Write what a simulated rig sees as a recording, for other tools and for `evaluate --frames`."""
-    from torchcover.cli.record import run
-
-    run(
-        rig,
-        out,
-        layout,
-        scenario=scenario,
-        steps=steps,
-        seed=seed,
-        vehicle=vehicle,
-        every_s=every,
-        reference=reference,
-        rays=rays,
-    )
+app.command()(record)
 
 
 @app.command()

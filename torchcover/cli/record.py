@@ -1,35 +1,29 @@
-"""`torchcover record`."""
+"""The command `torchcover record` and its options."""
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import typer
 
-from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called, write_recording
-from torchcover.evaluation.progress import progress_of
-from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, spread_s
-from torchcover.simulation import Rig, Scenario, with_ego
+from torchcover.cli import options
 
 
-def run(
-    rig: str,
-    out: Path,
-    layout: str,
-    *,
-    scenario: str | None,
-    steps: int | None,
-    seed: int,
-    vehicle: str | None,
-    every_s: float | None,
-    reference: str | None,
-    rays: int | None,
+def record(
+    rig: options.Rig,
+    out: options.RecordingOut,
+    scenario: options.ScenarioOrNone = None,
+    steps: options.RecordedSteps = None,
+    seed: options.Seed = 0,
+    vehicle: options.Vehicle = None,
+    every: options.Every = None,
+    reference: options.RecordedReference = None,
+    rays: options.Rays = None,
+    layout: options.Layout = "folder",
 ) -> None:
-    """Simulate as `evaluate` does, and write what is seen.
+    """Write what a simulated rig sees as a recording, for other tools and for `evaluate --frames`."""
+    from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called, write_recording
+    from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, spread_s
+    from torchcover.simulation import Rig, Scenario, with_ego
 
-    Raises:
-        ValueError: A folder that is not empty, a layout that cannot hold the rig, or as `SimulatedFrames`.
-        FileNotFoundError: An unknown name or file.
-    """
     carried = Rig.load(rig)
     world = with_ego(Scenario.load(scenario or DEFAULT_SCENARIO), {carried.name: carried}, vehicle)
     frames = SimulatedFrames(
@@ -37,7 +31,7 @@ def run(
         carried,
         steps=steps or DEFAULT_STEPS,
         seed=seed,
-        every_s=spread_s(world, every_s),
+        every_s=spread_s(world, every),
         reference_sensor=reference_called(reference, rays, RegionsOfInterest().around(world.ego_box().outline_m)),
         boxes=True,
     )
@@ -47,6 +41,8 @@ def run(
 
 
 def _with_a_bar(steps: range) -> Iterator[int]:
+    from torchcover.evaluation.progress import progress_of
+
     with progress_of(len(steps), "record", shown=True) as bar:
         for step in steps:
             yield step

@@ -1,5 +1,6 @@
 """What `torchcover search` does and prints."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +19,8 @@ from torchcover.report import narrowest_width, text_table
 from torchcover.simulation.documents import read_mapping
 
 CHOICE_KEY = "candidates"
-# If neither a time nor a number of candidates is given.
-BUDGET_S = 1800.0
+# Of a search, if nothing is given.
+BUDGET_S = 30 * 60.0
 
 
 def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noqa: ANN401  (those of `SearchPlan`)
@@ -32,7 +33,7 @@ def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noq
     if CHOICE_KEY in read_mapping(path):
         _choose(ChoiceSpace.load(path), out, resume=resume, **settings)
         return
-    if settings["evaluations"] is None and settings["budget_s"] is None:
+    if settings["budget_s"] is None and settings["evaluations"] is None:
         settings["budget_s"] = BUDGET_S
     search = PlacementSearch(SearchSpace.load(path), SearchPlan(**settings))
     if resume and not (out / NAME).exists():
@@ -50,17 +51,15 @@ def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noq
 
 
 def _choose(space: ChoiceSpace, out: Path, *, resume: bool, **settings: Any) -> None:  # noqa: ANN401
-    given = {
+    asked = {
         "--budget": settings["budget_s"] is not None,
         "--evaluations": settings["evaluations"] is not None,
         "--optimiser": settings["optimiser"] != "auto",
         "--resume": resume,
     }
-    if useless := [option for option, is_given in given.items() if is_given]:
-        raise ValueError(
-            f"{', '.join(useless)}: this file has `{CHOICE_KEY}`, which are all looked at, once; leave the option out"
-        )
-    plan = SearchPlan(**{**settings, "budget_s": BUDGET_S})
+    if useless := [option for option, given in asked.items() if given]:
+        raise ValueError(f"{', '.join(useless)}: the {CHOICE_KEY} of this file are all looked at; leave it out")
+    plan = SearchPlan(**settings | {"budget_s": math.inf})
     with claimed(out):
         instants = CommonInstants(
             space.scenarios,

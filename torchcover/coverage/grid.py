@@ -9,6 +9,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from torchcover.coverage.borders import borders_below, edges_below, with_ends
+
 # Height bands of Uecker & Zöllner 2024.
 PAPER_HEIGHTS: Mapping[str, tuple[float, float]] = MappingProxyType({"ground": (-0.5, 0.5), "obstacle": (0.5, 2.0)})
 
@@ -20,10 +22,6 @@ MAX_CELLS = 100_000_000
 
 # Points that are looked at together on a CPU.
 PART = 32_768
-# A cell that is smaller than this share of the coordinates is not found by a division.
-MIN_CELL_SHARE = 1e-14
-# More borders than this are searched.
-MAX_BORDERS_COMPARED = 32
 # A sum with it is negative, whatever the other terms.
 OUTSIDE = -(2**40)
 
@@ -175,6 +173,36 @@ class BevGrid:
         tier, of = within[:, inside].nonzero(as_tuple=True)
         return Bins(inside, of, cells[tier, inside[of]])
 
+    def points_by_column(self, points: Tensor) -> Tensor:
+        """How many points lie above each square of ground, in each band: what counting `bins` gives, sooner.
+
+        Args:
+            points: As in `cell_of`.
+
+        Returns:
+            (Y, X) float64.
+
+        Raises:
+            ValueError: Another shape.
+
+        Example:
+            >>> grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0)
+            >>> grid.points_by_column(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.9], [1.5, 0.5, 9.0]]))
+            tensor([[2., 0.]], dtype=torch.float64)
+        """
+        parts = _parts_of(points)
+        _, rows, columns = (count + 2 for count in self.shape)  # with a border for what is beyond
+        x_bounds, y_bounds = self._bounds_on(points.device)
+        count = torch.zeros(rows * columns, dtype=torch.float64, device=points.device)
+        for part in parts:
+            x, y, z = (part[:, axis].double() for axis in range(3))
+            place = edges_below(y, y_bounds, *self.y).mul_(columns).add_(edges_below(x, x_bounds, *self.x))
+            bands = torch.zeros_like(z)
+            for low, high in self.heights.values():
+                bands += (z >= low) & (z < high)
+            count += torch.bincount(place, weights=bands, minlength=len(count))
+        return count.view(rows, columns)[1:-1, 1:-1]
+
     @property
     def _tiers(self) -> list[list[int]]:
         """The numbers of the bands, from below, shared out so that those of a tier do not overlap."""
@@ -189,65 +217,38 @@ class BevGrid:
 
     def _cells_of(self, points: Tensor) -> Tensor:
         """(tiers, N) int64 cell numbers, -1 for none."""
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise ValueError(f"points: shape (N, 3) is needed; got {tuple(points.shape)}")
-        points = points.detach()
+        parts = _parts_of(points)
         _, rows, columns = self.shape
-        x_bounds, y_bounds = (
-            _with_ends(edges, math.nan).to(points.device) for edges in (self.x_edges_m, self.y_edges_m)
-        )
+        x_bounds, y_bounds = self._bounds_on(points.device)
         steps = torch.arange(columns), torch.arange(rows) * columns
-        x_terms, y_terms = (_with_ends(terms, OUTSIDE).to(points.device) for terms in steps)
+        x_terms, y_terms = (with_ends(terms, OUTSIDE).to(points.device) for terms in steps)
         # Between the borders of the bands of a tier lie, in turn, a band and a gap (which may be empty).
         bounds, tiers = list(self.heights.values()), []
         for bands in self._tiers:
             terms = torch.tensor([term for band in bands for term in (band * rows * columns, OUTSIDE)][:-1])
             borders = [border for band in bands for border in bounds[band]]
-            tiers.append((borders, _with_ends(terms, OUTSIDE).to(points.device)))
+            tiers.append((borders, with_ends(terms, OUTSIDE).to(points.device)))
 
         def cells_of(points: Tensor) -> Tensor:
             x, y, z = (points[:, axis].double() for axis in range(3))
-            place = x_terms.index_select(0, _edges_below(x, x_bounds, *self.x))
-            place += y_terms.index_select(0, _edges_below(y, y_bounds, *self.y))
-            in_tiers = [place + z_terms.index_select(0, _borders_below(z, borders)) for borders, z_terms in tiers]
+            place = x_terms.index_select(0, edges_below(x, x_bounds, *self.x))
+            place += y_terms.index_select(0, edges_below(y, y_bounds, *self.y))
+            in_tiers = [place + z_terms.index_select(0, borders_below(z, borders)) for borders, z_terms in tiers]
             return torch.stack(in_tiers).clamp_(min=-1)
 
-        # In parts that stay in the processor's cache; a GPU takes all at once.
-        part = PART if points.device.type == "cpu" else max(len(points), 1)
-        return torch.cat([cells_of(some) for some in torch.split(points, part)], dim=1)
+        return torch.cat([cells_of(some) for some in parts], dim=1)
+
+    def _bounds_on(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """The borders along x and along y as `edges_below` takes them."""
+        x, y = (with_ends(edges, math.nan).to(device) for edges in (self.x_edges_m, self.y_edges_m))
+        return x, y
 
 
-def _edges_below(values: Tensor, bounds: Tensor, low: float, high: float) -> Tensor:
-    """How many edges at equal distances are not above each value: what `torch.bucketize` gives, sooner.
-
-    Divided by their distance first, then compared with, so that no rounding moves a point over a border.
-
-    Args:
-        values: (N,) float64.
-        bounds: (B + 3,) float64 edges between two NaN, which are never less, nor more.
-        low: The first edge; as a number, for which a GPU need not be waited for.
-        high: The last edge.
-    """
-    cells = len(bounds) - 3
-    fine = high - low <= MIN_CELL_SHARE * cells * max(abs(low), abs(high))  # the quotient would be off by more than one
-    if fine or not math.isfinite(cells / (high - low)):
-        return torch.bucketize(values.contiguous(), bounds[1:-1], right=True)
-    below = values.sub(low).mul_(cells / (high - low)).add_(1.0).clamp_(0, cells + 1).nan_to_num_().long()
-    too_few, too_many = values >= bounds.index_select(0, below + 1), values < bounds.index_select(0, below)
-    return below.add_(too_few).sub_(too_many.long())
-
-
-def _borders_below(values: Tensor, borders: Sequence[float]) -> Tensor:
-    """The same for borders at any distances; a few are sooner compared with than searched."""
-    if len(borders) > MAX_BORDERS_COMPARED:
-        return torch.bucketize(values.contiguous(), values.new_tensor(borders), right=True)
-    return torch.stack([values >= border for border in borders]).sum(dim=0)
-
-
-def _with_ends(values: Tensor, end: float) -> Tensor:
-    """The values between two ends."""
-    ends = values.new_tensor([end])
-    return torch.cat([ends, values, ends])
+def _parts_of(points: Tensor) -> Sequence[Tensor]:
+    """The points in parts that stay in the processor's cache; a GPU takes all at once."""
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"points: shape (N, 3) is needed; got {tuple(points.shape)}")
+    return torch.split(points.detach(), PART if points.device.type == "cpu" else max(len(points), 1))
 
 
 def _check_bounds(name: str, bounds: tuple[float, float]) -> None:

@@ -1,5 +1,6 @@
 """Which points lie in which boxes."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
@@ -12,8 +13,8 @@ from torchcover.neighbors import check_tensor
 
 # A body's points lie on its box as often as in it; rounding of coordinates may put them on either side.
 SKIN_M = 0.01
-# Points are first looked for in cells of this size; of more cells nobody makes a map.
-CELL_M = 1.0
+# Points are first looked for in cells of this size, or in larger ones, so that there are about so many at most.
+CELL_M = 2.0
 MAX_CELLS = 1_000_000
 
 
@@ -48,57 +49,82 @@ def points_in_boxes(points: Tensor, boxes: Boxes, *, skin_m: float = SKIN_M) -> 
         Inside(box=tensor([0]), point=tensor([0]))
     """
     check_tensor(points, "points")
-    if len(boxes) == 0 or len(points) == 0:
-        none = torch.empty(0, dtype=torch.int64, device=points.device)
-        return Inside(none, none)
-    points = points.detach().to(torch.promote_types(points.dtype, torch.float32))
-    reach_m = torch.linalg.vector_norm(boxes.size_m[:, :2].double(), dim=1) / 2 + 2 * skin_m + SKIN_M
-    near = _near_any(points, boxes, reach_m)
-    # Sorted by x, the points that a box can hold are next to each other.
-    x_m, order = points[near, 0].sort()
-    first = torch.searchsorted(x_m, (boxes.centre_m[:, 0].double() - reach_m).to(x_m.dtype))
-    end = torch.searchsorted(x_m, (boxes.centre_m[:, 0].double() + reach_m).to(x_m.dtype))
-    counts = (end - first).clamp(min=0)
-    box = torch.arange(len(boxes), device=points.device).repeat_interleave(counts)
-    place = torch.arange(len(box), device=points.device) - (counts.cumsum(0) - counts - first)[box]
-    point = near[order[place]]
-    beside = (points[point, 1] - boxes.centre_m[box, 1]).abs() < reach_m[box]
-    box, point = box[beside], point[beside]
-    inside = _is_inside(points[point], boxes.rows[box], skin_m)
-    return Inside(box[inside], point[inside])
+    return _BoxMap(boxes, skin_m).holding(points)
 
 
-def _near_any(points: Tensor, boxes: Boxes, reach_m: Tensor) -> Tensor:
-    """(n,) numbers of the points that share a cell, seen from above, with what any box can reach: most are far away."""
-    centre_m = boxes.centre_m[:, :2].double()
-    lower_m, upper_m = centre_m - reach_m[:, None], centre_m + reach_m[:, None]
-    corner_m = lower_m.amin(dim=0)
-    first, last = (((bound - corner_m) / CELL_M).floor().long() for bound in (lower_m, upper_m))
-    rows, columns = (last.amax(dim=0) + 3).tolist()  # with a border for all that is beyond
-    if rows * columns > MAX_CELLS:
-        return torch.arange(len(points), device=points.device)
-    offset = torch.arange(int((last - first).amax()) + 1, device=points.device)
-    row, column = (first[:, axis, None] + offset for axis in range(2))
-    reached = (row <= last[:, 0, None])[:, :, None] & (column <= last[:, 1, None])[:, None]
-    marked = torch.zeros(rows * columns, dtype=torch.bool, device=points.device)
-    marked[((row + 1)[:, :, None] * columns + (column + 1)[:, None])[reached]] = True
-    x, y = (
-        ((points[:, axis].double() - corner_m[axis]) / CELL_M + 1).clamp_(0, most - 1).nan_to_num_(0.0).long()
-        for axis, most in enumerate((rows, columns))
-    )
-    return marked.index_select(0, x * columns + y).nonzero().squeeze(1)
+class _BoxMap:
+    """The boxes as seen from above: which of them reach into which cell.
+
+    Args:
+        boxes: K boxes.
+        skin_m: How much thicker they are.
+    """
+
+    def __init__(self, boxes: Boxes, skin_m: float = SKIN_M) -> None:
+        self._skin_m = skin_m
+        centre_m, size_m, yaw_rad = boxes.centre_m.double(), boxes.size_m.double(), boxes.yaw_rad.double()
+        self._boxes = torch.cat([centre_m, size_m / 2, yaw_rad.cos()[:, None], yaw_rad.sin()[:, None]], dim=1)
+        if not len(boxes):
+            return
+        reach_m = torch.linalg.vector_norm(size_m[:, :2], dim=1, keepdim=True) / 2 + 2 * skin_m + SKIN_M
+        lower_m, upper_m = centre_m[:, :2] - reach_m, centre_m[:, :2] + reach_m
+        self._corner_m = lower_m.amin(dim=0)
+        length_m, width_m = (upper_m.amax(dim=0) - self._corner_m).tolist()
+        most_m = max(length_m, width_m)
+        self._cell_m = max(CELL_M, math.sqrt(length_m / MAX_CELLS) * math.sqrt(width_m), most_m / MAX_CELLS)
+        first, last = (((bound - self._corner_m) / self._cell_m).floor().long() for bound in (lower_m, upper_m))
+        self._shape = (last.amax(dim=0) + 3).tolist()  # with a border for all that is beyond
+        rows, columns = self._shape
+        wide, deep = (last - first + 1).T
+        box = torch.arange(len(boxes), device=centre_m.device).repeat_interleave(wide * deep)
+        row, column = (_numbered(wide * deep).div(deep[box], rounding_mode="floor"), _numbered(wide * deep) % deep[box])
+        cell, order = ((first[box, 0] + row + 1) * columns + first[box, 1] + column + 1).sort()
+        # Cell by cell, the boxes that reach into it; where those of a cell start, and how many they are.
+        self._listed = box[order]
+        self._count = torch.bincount(cell, minlength=rows * columns)
+        self._start = self._count.cumsum(0) - self._count
+
+    def holding(self, points: Tensor) -> Inside:
+        """Which of the points lie in which boxes."""
+        if len(self._boxes) == 0 or len(points) == 0:
+            none = torch.empty(0, dtype=torch.int64, device=points.device)
+            return Inside(none, none)
+        points = points.detach().to(torch.promote_types(points.dtype, torch.float32))
+        box, point = self._near(points)
+        inside = self._is_inside(points.index_select(0, point), box)
+        box, order = box[inside].sort(stable=True)
+        return Inside(box, point[inside][order])
+
+    def _near(self, points: Tensor) -> Inside:
+        """Pairs of a box and a point in a cell that it reaches into, by ascending point."""
+        x, y = (
+            points[:, axis].double().sub(self._corner_m[axis]).div_(self._cell_m).add_(1.0).clamp_(0, cells - 1)
+            for axis, cells in enumerate(self._shape)
+        )
+        cell = x.nan_to_num_().int().mul_(self._shape[1]).add_(y.nan_to_num_().int())
+        count = self._count.index_select(0, cell)
+        point = count.nonzero().squeeze(1)
+        count, start = count.index_select(0, point), self._start.index_select(0, cell.index_select(0, point))
+        listed = start.repeat_interleave(count) + _numbered(count)
+        return Inside(self._listed.index_select(0, listed), point.repeat_interleave(count))
+
+    def _is_inside(self, points: Tensor, box: Tensor) -> Tensor:
+        """(N,) whether each of (N, 3) points lies in its own of the boxes."""
+        of_box = self._boxes.index_select(0, box)
+        x, y, z = (points.double() - of_box[:, :3]).T
+        half_length, half_width, half_height, cosine, sine = of_box[:, 3:].T
+        beside = ((x * cosine + y * sine).abs() <= half_length + self._skin_m) & (
+            (y * cosine - x * sine).abs() <= half_width + self._skin_m
+        )
+        inside: Tensor = beside & (z > self._skin_m - half_height) & (z <= half_height + self._skin_m)
+        return inside
 
 
-def _is_inside(points: Tensor, rows: Tensor, skin_m: float) -> Tensor:
-    """(N,) whether each of (N, 3) points lies in the box of its (N, 7) row."""
-    x, y, z = (points.double() - rows[:, :3].double()).T
-    half_length, half_width, half_height = rows[:, 3:6].double().T / 2
-    cosine, sine = rows[:, 6].double().cos(), rows[:, 6].double().sin()
-    beside = ((x * cosine + y * sine).abs() <= half_length + skin_m) & (
-        (y * cosine - x * sine).abs() <= half_width + skin_m
-    )
-    inside: Tensor = beside & (z > skin_m - half_height) & (z <= half_height + skin_m)
-    return inside
+def _numbered(counts: Tensor) -> Tensor:
+    """0, 1, ... up to each count, one after the other."""
+    total = counts.cumsum(0)
+    every = torch.arange(int(total[-1]) if len(total) else 0, device=counts.device)
+    return every - (total - counts).repeat_interleave(counts)
 
 
 def with_hits(boxes: Boxes, clouds: Mapping[str, Tensor]) -> Boxes:
@@ -108,5 +134,6 @@ def with_hits(boxes: Boxes, clouds: Mapping[str, Tensor]) -> Boxes:
         boxes: K boxes.
         clouds: Name of each rig -> (N, 3) its points in the vehicle frame.
     """
-    inside = {rig: points_in_boxes(cloud, boxes).box for rig, cloud in clouds.items()}
+    of_all = _BoxMap(boxes)
+    inside = {rig: of_all.holding(cloud).box for rig, cloud in clouds.items()}
     return replace(boxes, hits={rig: torch.bincount(box, minlength=len(boxes)) for rig, box in inside.items()})

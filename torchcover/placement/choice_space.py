@@ -1,5 +1,6 @@
 """A choice: candidates at given places, how many of them may be taken, and what a good choice is."""
 
+from collections import Counter
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Self
@@ -95,14 +96,23 @@ class ChoiceSpace(Document):
 
     @model_validator(mode="after")
     def _check_candidates(self) -> Self:
-        names = [sensor.name for sensor in (*(self.always.sensors if self.always else ()), *self.sensors)]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
+        try:
+            candidates = [sensor.name for sensor in self.sensors]
+        except FileNotFoundError as error:
+            raise ValueError(str(error)) from error
+        counts = Counter([*candidates, *(sensor.name for sensor in (self.always.sensors if self.always else ()))])
+        if twice := sorted(name for name, count in counts.items() if count > 1):
             raise ValueError(f"candidates: two sensors are called {twice[0]}; names are those of group and place")
-        if len(self.sensors) > MOST_CANDIDATES:
-            raise ValueError(f"candidates: at most {MOST_CANDIDATES:,} are looked at; got {len(self.sensors):,}")
+        if not candidates:
+            raise ValueError("candidates: there is none; the regions of the grids have nothing of the vehicle's skin")
+        if len(candidates) > MOST_CANDIDATES:
+            raise ValueError(f"candidates: at most {MOST_CANDIDATES:,} are looked at; got {len(candidates):,}")
         self._check_prices()
-        if unknown := [name for name in self.now or () if name not in names]:
-            raise ValueError(f"now: {', '.join(unknown)}: no candidate; they are {', '.join(names[:20])}")
+        now = Counter(self.now or ())
+        if unknown := [name for name in now if name not in candidates]:
+            raise ValueError(f"now: {', '.join(unknown)}: no candidate; they are {', '.join(candidates[:20])}")
+        if twice := [name for name, count in now.items() if count > 1]:
+            raise ValueError(f"now: {twice[0]} is there once at most; it is named twice")
         QuestionGrid.around(self._carrier.outline_m, {"objective": self.objective})
         return self
 
@@ -133,8 +143,13 @@ class ChoiceSpace(Document):
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
         """The candidates, group by group."""
-        groups = self.candidates.items()
-        return tuple(sensor for name, group in groups for sensor in group.sensors(name, self._carrier))
+        carrier, found = self._carrier, list[Sensor]()
+        for name, group in self.candidates.items():
+            try:
+                found += group.sensors(name, carrier)
+            except ValueError as error:
+                raise ValueError(f"candidates.{name}.grid.{error}") from error
+        return tuple(found)
 
     @cached_property
     def prices(self) -> tuple[float, ...]:

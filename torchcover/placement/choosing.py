@@ -12,6 +12,7 @@ from torchcover.placement.bits import Bits
 from torchcover.placement.choice_space import ChoiceSpace
 from torchcover.placement.common_instants import CommonInstants
 from torchcover.placement.fresh import FreshGain, FreshTest, fresh_test
+from torchcover.placement.result import known, told, told_optimism
 from torchcover.placement.subsets import Candidates, Limits, Subset, exact, greedy, marginal_values, random_subsets
 from torchcover.placement.worth import Worth
 from torchcover.simulation import Rig, Sensor
@@ -88,12 +89,8 @@ class SensorChoice:
         found = f"{', '.join(self.names(self.best.chosen))}: {100 * self.best.value:.2f} %, {kind}"
         if self.gain is None:
             return f"{found}; not tested in fresh worlds: {self.untested}."
-        gain, now = self.gain, ", ".join(self.names(self.now))
-        verdict = "" if abs(gain.t) >= 2 else ", which may be chance"
-        return (
-            f"{found}. On {gain.worlds} fresh worlds {100 * gain.gain:+.2f} ± {100 * gain.error:.2f} points against "
-            f"{now} (t {gain.t:.1f}{verdict}; optimism {100 * gain.optimism:+.2f})."
-        )
+        now = ", ".join(self.names(self.now))
+        return f"{found}. Against {now}: {told(self.gain)}{told_optimism(self.gain)}."
 
     @property
     def _gap(self) -> float:
@@ -101,31 +98,34 @@ class SensorChoice:
 
     @property
     def record(self) -> dict[str, Any]:
-        """All of it, for JSON."""
-        return {
-            "torchcover": __version__,
-            "choice": self.space.name,
-            "measure": self.measure,
-            "sentence": self.sentence,
-            "best": {
-                "sensors": self.names(self.best.chosen),
-                "value": self.best.value,
-                "upper_bound": self.best.upper_bound,
-                "proven": self.best.proven,
-                "cost_eur": self.limits.price(self.best.chosen) if self.space.cost else None,
-                "lost_without": dict(zip(self.names(self.best.chosen), self.marginal_values, strict=True)),
-            },
-            "greedy": {"sensors": self.names(self.greedy.chosen), "value": self.greedy.value},
-            "drawn": {
-                "count": len(self.drawn),
-                "median": self.drawn[len(self.drawn) // 2].value,
-                "best": self.drawn[-1].value,
-                "share_below_best": self.better_than_drawn,
-            },
-            "now": {"sensors": self.names(self.now), "value": self.candidates.value(self.now)},
-            "fresh": None if self.gain is None else vars(self.gain),
-            "refused": self.refused,
-        }
+        """All of it, for JSON; what nobody knows is None."""
+        record: dict[str, Any] = known(
+            {
+                "torchcover": __version__,
+                "choice": self.space.name,
+                "measure": self.measure,
+                "sentence": self.sentence,
+                "best": {
+                    "sensors": self.names(self.best.chosen),
+                    "value": self.best.value,
+                    "upper_bound": self.best.upper_bound,
+                    "proven": self.best.proven,
+                    "cost_eur": self.limits.price(self.best.chosen) if self.space.cost else None,
+                    "lost_without": dict(zip(self.names(self.best.chosen), self.marginal_values, strict=True)),
+                },
+                "greedy": {"sensors": self.names(self.greedy.chosen), "value": self.greedy.value},
+                "drawn": {
+                    "count": len(self.drawn),
+                    "median": self.drawn[len(self.drawn) // 2].value,
+                    "best": self.drawn[-1].value,
+                    "share_below_best": self.better_than_drawn,
+                },
+                "now": {"sensors": self.names(self.now), "value": self.candidates.value(self.now)},
+                "fresh": None if self.gain is None else vars(self.gain),
+                "refused": self.refused,
+            }
+        )
+        return record
 
 
 def choose(
@@ -148,7 +148,7 @@ def choose(
         measure: What a value is.
 
     Raises:
-        ValueError: No candidate can be mounted, or none of those of `now`.
+        ValueError: No candidate can be mounted, or sees anything that counts; one of `now` cannot be mounted.
     """
     sensors, bits, refused = _mounted(space, instants)
     always = instants.bits(space.always).seen if space.always else np.zeros_like(bits[0].seen)
@@ -156,6 +156,11 @@ def choose(
     numbers = {sensor.name: number for number, sensor in enumerate(space.sensors)}
     limits = space.limits([numbers[sensor.name] for sensor in sensors])
     best = exact(candidates, limits)
+    if not best.chosen:
+        raise ValueError(
+            f"candidates: none of the {len(sensors)} that can be there adds anything to the objective; move or turn "
+            "them, or ask about places that they see"
+        )
     drawn = sorted(random_subsets(candidates, limits, DRAWN, instants.seed), key=lambda one: one.value)
     now = drawn[len(drawn) // 2].chosen
     if space.now is not None:

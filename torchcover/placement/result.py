@@ -134,7 +134,7 @@ class SearchResult:
         for objective, measure, gain in self.gains_of(pick):
             if measure != self.search.plan.measure:
                 continue
-            yield f"{objective}: {told(gain)}" + ("" if short else f", optimism {100 * gain.optimism:+.2f}")
+            yield f"{objective}: {told(gain)}" + ("" if short else told_optimism(gain))
 
     def _spent(self, arm: str) -> str:
         one = self.search.arms[arm]
@@ -145,22 +145,23 @@ class SearchResult:
         """All but the single evaluations: what stands in `search.json`; what nobody knows is None."""
         search, plan = self.search, self.search.plan
         several = len(search.space.objectives) > 1
-        record = {
-            **plan.settings(search.space),
-            "evaluations": plan.evaluations,
-            "budget_s": plan.budget_s,
-            "test_seed": plan.seed_of_test,
-            "fresh_worlds": plan.fresh_worlds,
-            "seconds": round(self.seconds, 3),
-            "arms": {name: _arm_record(arm) for name, arm in search.arms.items()},
-            "share_of_instants_saved": search.share_saved,
-            "hypervolume": self.hypervolumes if several else None,
-            "found": [self._pick_record(pick) for pick in self.picks],
-            "untested": self.untested or None,
-            "sentence": self.sentence,
-        }
-        known: dict[str, Any] = _known(record)
-        return known
+        record: dict[str, Any] = known(
+            {
+                **plan.settings(search.space),
+                "evaluations": plan.evaluations,
+                "budget_s": plan.budget_s,
+                "test_seed": plan.seed_of_test,
+                "fresh_worlds": plan.fresh_worlds,
+                "seconds": round(self.seconds, 3),
+                "arms": {name: _arm_record(arm) for name, arm in search.arms.items()},
+                "share_of_instants_saved": search.share_saved,
+                "hypervolume": self.hypervolumes if several else None,
+                "found": [self._pick_record(pick) for pick in self.picks],
+                "untested": self.untested or None,
+                "sentence": self.sentence,
+            }
+        )
+        return record
 
     def _pick_record(self, pick: Pick) -> dict[str, Any]:
         return {
@@ -211,6 +212,11 @@ def told(gain: FreshGain) -> str:
     return f"no gain is shown: {100 * gain.gain:+.2f} {rest}"
 
 
+def told_optimism(gain: FreshGain) -> str:
+    """How much more the search had promised, to follow `told`; nothing where nobody knows."""
+    return "" if math.isnan(gain.optimism) else f", optimism {100 * gain.optimism:+.2f}"
+
+
 def _arm_record(arm: Arm) -> dict[str, Any]:
     others = arm.evaluations[1:]
     return {
@@ -222,9 +228,10 @@ def _arm_record(arm: Arm) -> dict[str, Any]:
     }
 
 
-def _known(value: Any) -> Any:  # noqa: ANN401  (whatever a record holds)
+def known(value: Any) -> Any:  # noqa: ANN401  (whatever a record holds)
+    """A record as JSON can have it: what nobody knows is None."""
     if isinstance(value, Mapping):
-        return {key: _known(each) for key, each in value.items()}
+        return {key: known(each) for key, each in value.items()}
     if isinstance(value, list | tuple):
-        return [_known(each) for each in value]
+        return [known(each) for each in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -88,6 +88,6 @@ class ObjectCoverage(WorldRatios):
         # (1 + hits, K) of each object, whether it counts, and with what.
         counts = torch.stack([known.double(), *[torch.ones_like(share)] * len(self.hits)])
         values = torch.stack([share.where(known, 0.0), *((hits >= least).double() for least in self.hits)])
-        members = self.strata.members(boxes).to(share.device)
+        members = self.sights.members(frame, self.strata).to(share.device)
         base = (counts @ members.T).flatten()
         return base, (values @ members.T).flatten(), base.long()

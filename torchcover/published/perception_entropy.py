@@ -109,7 +109,7 @@ class PerceptionEntropy(WorldRatios):
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         sigma = self._sigma(frame, rig_of(frame, self.rig))
-        members = self.strata.members(self.sights.boxes(frame)).to(sigma.device)
+        members = self.sights.members(frame, self.strata).to(sigma.device)
         values = torch.stack([entropy(sigma), entropy(sigma, bounded=True)])
         count = members.sum(dim=1).repeat(2)
         return count, (values @ members.T).flatten(), count.long()

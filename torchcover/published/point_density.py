@@ -60,8 +60,7 @@ class PointDensity(WorldRatios):
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         cloud = frame.cloud_of(rig_of(frame, self.rig))
         check_cloud(cloud, "sensor")
-        flat = self._members.shape[1]
-        each = torch.bincount(self.grid.bins(cloud).cell % flat, minlength=flat).double().cpu()
+        each = self.grid.points_by_column(cloud).flatten().cpu()
         cells = self._members.sum(dim=1)
         points, squares = (self._members @ torch.stack([each, each.square()], dim=1)).T
         somewhere = (points > 0).double()

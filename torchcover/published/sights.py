@@ -13,6 +13,7 @@ from torchcover.detection import Boxes, points_in_boxes
 from torchcover.detection.inside import Inside
 from torchcover.neighbors import check_cloud, nearest
 from torchcover.neighbors.choice import backend_of_several
+from torchcover.published.object_strata import ObjectStrata
 
 Found = TypeVar("Found")
 
@@ -80,6 +81,11 @@ class Sights:
     def reference_in_boxes(self, frame: Frame) -> Inside:
         """Which reference points lie in which objects."""
         return self.once(frame, ("boxes",), lambda: points_in_boxes(frame.reference, self.boxes(frame)))
+
+    def members(self, frame: Frame, strata: ObjectStrata) -> Tensor:
+        """(strata, K) float64: 1 where an object is one of them."""
+        what = ("strata", *strata.meaning.values())
+        return self.once(frame, what, lambda: strata.members(self.boxes(frame)))
 
     def hits(self, frame: Frame, rig: str) -> Tensor:
         """(K,) int64 how many points of the rig lie in each object."""

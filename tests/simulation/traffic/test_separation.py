@@ -41,12 +41,6 @@ def triangles(mesh):
         yield triangle[:, :2], low, high
 
 
-def place_at(actor, time_s):
-    """Number of the pose for a time; none if the body is not there."""
-    found = np.flatnonzero(np.isclose(actor.trajectory.times_s, time_s, rtol=0.0, atol=1e-6))
-    return int(found[0]) if len(found) else None
-
-
 class Solids:
     """Convex prisms: `outline` (N, K, 2), padded by repeating a corner, and `low`, `high` (N,)."""
 
@@ -63,18 +57,31 @@ class Solids:
         outline = np.stack([o[np.minimum(np.arange(corners), len(o) - 1)] for o, _, _ in found])
         return cls(outline, np.array([low for _, low, _ in found]), np.array([high for _, _, high in found]))
 
-    @classmethod
-    def of_actors(cls, actors, step):
-        lower = np.stack([actor.mesh.vertices_m.min(axis=0) for actor in actors])
-        upper = np.stack([actor.mesh.vertices_m.max(axis=0) for actor in actors])
-        poses = [place_at(actor, 0.1 * step) if actor.trajectory.transient else step for actor in actors]
-        position = np.stack([actor.trajectory.positions_m[k] for actor, k in zip(actors, poses, strict=True)])
-        yaw = np.deg2rad([actor.trajectory.angles_deg[k, 0] for actor, k in zip(actors, poses, strict=True)])
+
+class Movers:
+    """The boxes of actors at several times, each of which is one of those of their trajectories, or not among them."""
+
+    def __init__(self, actors, times_s):
+        self.poses = np.full((len(times_s), len(actors), 4), np.nan)  # x, y, z, yaw; NaN who is not there
+        for k, actor in enumerate(actors):
+            own = actor.trajectory
+            place = np.minimum(np.searchsorted(own.times_s, times_s - 1e-6), len(own.times_s) - 1)
+            there = np.isclose(own.times_s[place], times_s, rtol=0.0, atol=1e-6)
+            assert own.transient or there.all()
+            self.poses[there, k, :3] = own.positions_m[place[there]]
+            self.poses[there, k, 3] = np.deg2rad(own.angles_deg[place[there], 0])
+        self.lower = np.stack([actor.mesh.vertices_m.min(axis=0) for actor in actors])
+        self.upper = np.stack([actor.mesh.vertices_m.max(axis=0) for actor in actors])
+
+    def at(self, number):
+        """Who is there at one of the times, and their numbers."""
+        there = np.flatnonzero(~np.isnan(self.poses[number, :, 0]))
+        lower, upper, poses = self.lower[there], self.upper[there], self.poses[number, there]
         x = np.stack([lower[:, 0], upper[:, 0], upper[:, 0], lower[:, 0]], axis=1)
         y = np.stack([lower[:, 1], lower[:, 1], upper[:, 1], upper[:, 1]], axis=1)
-        cos, sin = np.cos(yaw)[:, None], np.sin(yaw)[:, None]
-        outline = np.stack([cos * x - sin * y, sin * x + cos * y], axis=2) + position[:, None, :2]
-        return cls(outline, position[:, 2] + lower[:, 2], position[:, 2] + upper[:, 2])
+        cos, sin = np.cos(poses[:, 3:]), np.sin(poses[:, 3:])
+        outline = np.stack([cos * x - sin * y, sin * x + cos * y], axis=2) + poses[:, None, :2]
+        return Solids(outline, poses[:, 2] + lower[:, 2], poses[:, 2] + upper[:, 2]), there
 
 
 def overlaps(a, b, pairs):
@@ -94,8 +101,9 @@ def overlaps(a, b, pairs):
 
 def near_pairs(a, b):
     """(P, 2) indices of those whose circles in plan view meet: nobody else can overlap."""
-    away = ((a.centre[:, None, :] - b.centre) ** 2).sum(axis=2)
-    return np.argwhere(away < (a.radius[:, None] + b.radius) ** 2)
+    away = np.subtract.outer(a.centre[:, 0], b.centre[:, 0]) ** 2
+    away += np.subtract.outer(a.centre[:, 1], b.centre[:, 1]) ** 2
+    return np.argwhere(away < np.add.outer(a.radius, b.radius) ** 2)
 
 
 def among(solids):
@@ -131,12 +139,14 @@ def test_what_rests_does_not_interpenetrate(kind, seed, world):
 def test_who_moves_does_not_interpenetrate(kind, seed, world):
     w = world(kind, seed)
     static = at_rest(w, kind in BENT)
-    for step in range(0, len(w.ego.trajectory.times_s), 3):
-        everybody = [a for a in (w.ego, *w.actors) if not a.trajectory.transient or place_at(a, 0.1 * step) is not None]
-        moving = Solids.of_actors(everybody, step)
+    everybody = (w.ego, *w.actors)
+    times_s = w.ego.trajectory.times_s[::3]
+    movers = Movers(everybody, times_s)
+    for number, time_s in enumerate(times_s):
+        moving, who = movers.at(number)
         found = among(moving)
-        assert not found, [(step, everybody[i].name, everybody[j].name, d) for i, j, d in found[:3]]
-        if step % 2:
+        assert not found, [(time_s, everybody[who[i]].name, everybody[who[j]].name, d) for i, j, d in found[:3]]
+        if number % 2:
             continue
         found = overlaps(moving, static, near_pairs(moving, static))
-        assert not found, [(step, everybody[i].name, static.centre[j], d) for i, j, d in found[:3]]
+        assert not found, [(time_s, everybody[who[i]].name, static.centre[j], d) for i, j, d in found[:3]]
