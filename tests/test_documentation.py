@@ -22,7 +22,7 @@ from torchcover import BevGrid
 from torchcover.cli.app import app
 from torchcover.data import RegionsOfInterest, SimulatedFrames, collate_frames
 from torchcover.data.recordings.folder_settings import read_folder_settings
-from torchcover.placement import SearchSpace
+from torchcover.placement import ChoiceSpace, SearchSpace
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.documents import load_document
@@ -153,6 +153,7 @@ READERS = (
     RegionsOfInterest.load,
     Requirements.load,
     SearchSpace.load,
+    ChoiceSpace.load,
     read_folder_settings,
 )
 

@@ -22,6 +22,7 @@ def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
     code, printed, error, out = run(torchcover, worlds, "low", "both", "other/low", options=["--metrics", "all"])
     assert (code, error.count("warning")) == (0, 0)
     assert "None of these metrics is validated" in printed
+    assert "lob: the distance decides the order" in " ".join(printed.split())
     summary = json.loads((out / "summary.json").read_text())
     numbers = {(row["rig"], row["name"]): row for row in summary["metrics"]["numbers"]}
     assert numbers["both", "points"]["rank"] == 1.0

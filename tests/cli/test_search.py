@@ -68,7 +68,7 @@ def test_a_mistake_is_one_line(torchcover, space, tmp_path, options, message):
 def test_a_choice_has_no_budget(torchcover, tmp_path, options):
     code, _, said = torchcover("search", CHOICE, "--out", tmp_path / "found", *options)
     assert code == 2
-    assert "candidates are all looked at; leave them out" in said
+    assert f"torchcover: {options[0]}: the candidates of this file are all looked at" in said
 
 
 def test_times():

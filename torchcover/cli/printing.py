@@ -68,6 +68,9 @@ def print_study(study: Study, out: Path) -> None:
     console.print(f"Wrote study.json, long_run.npz and work_precision.png to {out}", markup=False, soft_wrap=True)
 
 
+DETECTORS_ONLY = "* an interval over detectors only: of worlds there are none, or too few"
+
+
 def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> None:
     """How metrics rank the placements beside each thing that detectors say of them, and the notes."""
     console = Console()
@@ -76,9 +79,12 @@ def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> 
     tables = []
     for reading in readings:
         each = [study.found[truth, reading].ranked for truth in truths]
-        rows = [(of[0].metric, *(relation(row.spearman) for row in of)) for of in zip(*each, strict=True)]
+        rows = [
+            (of[0].metric + " *" * (not of[0].over_worlds), *(relation(row.spearman) for row in of))
+            for of in zip(*each, strict=True)
+        ]
         title = f"Spearman correlation with what detectors reached, rolls in {reading}; 95 % intervals"
-        tables.append(text_table(("metric", *truths), [rows], title=title))
+        tables.append(text_table(("metric", *truths), [rows], title=title, caption=DETECTORS_ONLY))
     wide = Console(width=max(console.width, narrowest_width(tables)))
     for table in tables:
         wide.print(table)

@@ -51,9 +51,14 @@ def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noq
 
 
 def _choose(space: ChoiceSpace, out: Path, *, resume: bool, **settings: Any) -> None:  # noqa: ANN401
-    asked = resume, settings["budget_s"] is not None, settings["evaluations"] is not None
-    if any(asked) or settings["optimiser"] != "auto":
-        raise ValueError("--resume, --budget, --evaluations, --optimiser: candidates are all looked at; leave them out")
+    asked = {
+        "--budget": settings["budget_s"] is not None,
+        "--evaluations": settings["evaluations"] is not None,
+        "--optimiser": settings["optimiser"] != "auto",
+        "--resume": resume,
+    }
+    if useless := [option for option, given in asked.items() if given]:
+        raise ValueError(f"{', '.join(useless)}: the {CHOICE_KEY} of this file are all looked at; leave it out")
     plan = SearchPlan(**settings | {"budget_s": math.inf})
     with claimed(out):
         instants = CommonInstants(

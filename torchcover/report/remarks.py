@@ -94,7 +94,7 @@ def marks_on(table: CoverageTable) -> dict[str, str]:
     marks = {"best": "the best of its row; equal numbers are all marked, unknown ones never."} if several else {}
     if not (several or by_sensor):
         return {}
-    if table.first.blocks is not None:
+    if (table.conditions[table.rigs[0]].blocks or 0) >= MIN_BLOCKS:
         chance = "more than chance, by Student's t at 95 %: of 20 rows without a difference, one is marked."
         marks["significant"] = chance
     return marks

@@ -227,9 +227,11 @@ def _find(kind: str, path_or_name: str | Path) -> Path:
         return path
     builtin = builtin_folder(kind) / f"{path_or_name}.yaml"
     if path.name != str(path_or_name) or not builtin.is_file():
+        known = builtin_names(kind)
+        meant = get_close_matches(str(path_or_name), known, n=1)
         raise FileNotFoundError(
-            f"{str(path_or_name)!r} is neither a .yaml file nor one of the built-in {kind}: "
-            f"{', '.join(builtin_names(kind))}"
+            f"{str(path_or_name)!r} is neither a .yaml file nor one of the built-in {kind}: {', '.join(known)}"
+            + (f"; is {meant[0]!r} meant?" if meant else "")
         )
     return builtin
 
