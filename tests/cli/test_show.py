@@ -261,3 +261,18 @@ def test_a_film_that_cannot_be_written_is_refused_at_once(options, message, torc
     code, _, told = torchcover("show", worlds / name, *others)
     assert code == 2
     assert message in told
+
+
+def test_what_stands_on_a_slope_is_as_high_as_it_is_above_the_slope(torchcover, worlds, drawn):
+    (worlds / "slope.yaml").write_text(
+        "name: slope\nego: {shape: {type: box, size_m: [4, 2, 1]}, pose: {z_m: 0.2}}\nbodies:\n"
+        "  - {name: ground, shape: {type: plane, size_m: [400, 400]}, poses: [{pitch_deg: -4}]}\n"
+        "  - {name: kerb, shape: {type: box, size_m: [9, 5, 1]}, poses: [{x_m: 49.878, z_m: 3.488, pitch_deg: -4}]}\n"
+    )
+    code, _, _ = torchcover("show", worlds / "slope.yaml", "--rig", worlds / "low.yaml", "--out", worlds)
+    assert code == 0
+    standing = drawn["standing"]
+    assert np.abs(standing.triangles_m[..., 0] - 50.0).max() < 5.0  # the slope itself is no scenery
+    top = standing.height_m.reshape(-1)
+    assert top.max() < 1.5  # and not 4.5, above the ego
+    assert np.isclose(top, 1.0 / np.cos(np.deg2rad(4)), atol=0.01).sum() == 2  # the two faces of its top
