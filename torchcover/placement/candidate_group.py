@@ -78,8 +78,8 @@ class CandidateGroup(Document):
         ...     sensor={"type": "lidar", "model": "velodyne_vlp16"},
         ...     places={"left": {"x_m": 0.4, "y_m": 0.25, "z_m": 0.3}},
         ... )
-        >>> corner.places["left"].y_m, corner.sensor.channels
-        (0.25, 16)
+        >>> corner.places["left"].y_m, corner.sensor.model
+        (0.25, 'velodyne_vlp16')
     """
 
     sensor: Annotated[Sensor, PlainValidator(_sensor)]

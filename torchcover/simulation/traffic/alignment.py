@@ -26,7 +26,7 @@ class Alignment:
     Example:
         >>> quarter = Alignment([0.0, 10.0, 30.0, 40.0], [0.0, np.pi / 60, np.pi / 60, 0.0])
         >>> quarter.poses(50.0, 0.0).round(3)
-        array([27.883, 37.883, 90.   ])
+        array([24.305, 34.305, 90.   ])
     """
 
     def __init__(
