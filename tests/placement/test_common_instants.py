@@ -188,3 +188,10 @@ def test_threads_make_no_difference(instants):
     finally:
         torch.set_num_threads(before)
     same(other, instants.score(TWO))
+
+
+def test_a_recording_is_one_world_for_any_seed_and_none_of_it_is_fresh():
+    with held(["tracks_table"], {"near": Objective(region="20m", band="ground")}, worlds=3, every_s=0.5) as recorded:
+        assert recorded.world_of.tolist() == [0, 0]
+        with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'tracks_table' is the same"):
+            recorded.anew(9, 3)

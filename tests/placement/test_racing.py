@@ -184,5 +184,5 @@ def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(instant
     assert found.gains["far"]["area"].p < 0.5
     with pytest.raises(ValueError, match="seed: another one than that of these worlds is needed; got 0 for both"):
         instants.anew(0, worlds=4)
-    with pytest.raises(ValueError, match="one with traffic is needed; 'yard' shows the same world for any seed"):
+    with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'yard' is the same for any seed"):
         held([yard()], {"far": instants.objectives["far"]}).anew(1, worlds=4)

@@ -161,9 +161,9 @@ class CommonInstants:
         """
         if seed == self.seed:
             raise ValueError(f"seed: another one than that of these worlds is needed; got {seed} for both")
-        if not (fresh := [one for one in self.scenarios if one.traffic is not None]):
+        if not (fresh := [one for one in self.scenarios if not one.repeats]):
             names = ", ".join(repr(one.name) for one in self.scenarios)
-            raise ValueError(f"scenarios: one with traffic is needed; {names} shows the same world for any seed")
+            raise ValueError(f"scenarios: one whose worlds are drawn is needed; {names} is the same for any seed")
         return CommonInstants(
             fresh,
             self.objectives,

@@ -114,7 +114,7 @@ class _Budget:
         plan = search.plan
         one = search.evaluations[0].seconds
         rigs = 1 + 2 * (1 if len(search.space.objectives) == 1 else len(search.space.objectives) + 1)
-        fresh = plan.fresh_worlds * plan.per_world * sum(each.traffic is not None for each in search.space.scenarios)
+        fresh = plan.fresh_worlds * plan.per_world * sum(not each.repeats for each in search.space.scenarios)
         # Of the fresh instants, and of those of the search, for the optimism.
         self.one_s, self.test_s = one, fresh * (build_s + rigs * one / len(search.instants)) + rigs * one
         self.until = math.inf if plan.budget_s is None else began + plan.budget_s - self.test_s

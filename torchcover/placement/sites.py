@@ -79,7 +79,7 @@ def instants_of(sites: Sequence[Site], worlds: int, per_world: int) -> list[Held
 
 def _steps(simulator: Simulator, site: Site, worlds: int, per_world: int) -> list[list[int]]:
     """Numbers of the steps of each world."""
-    if site.scenario.traffic is None:
+    if site.scenario.repeats:
         # Where nothing moves every step draws another reference.
         distinct = simulator.distinct_steps
         return [list(range(per_world if distinct in (None, 1) else min(per_world, distinct or 0)))]
