@@ -1,22 +1,25 @@
-"""What every reader of a file shares: its door, its error, the memory it may take, and NumPy's files, tables."""
+"""What readers and writers of files share: their door, its error, what is whole, NumPy's files, tables."""
 
 from torchcover.files.bad_file import BadFileError, naming, reads
 from torchcover.files.budget import TooLargeError, check_memory
-from torchcover.files.durable import write_durably
 from torchcover.files.feather import read_feather
 from torchcover.files.json_tables import read_json_table
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, npz_headers, read_npy, read_npz, write_npz
+from torchcover.files.publishing import SUMMARY, Publication, claimed, settled, write_durably
 from torchcover.files.text import decode, read_short_text
 from torchcover.files.xml_text import feed_xml, parse_xml
 from torchcover.files.yaml_text import as_yaml, parse_yaml
 
 __all__ = [
     "DEFLATE_MAX_RATIO",
+    "SUMMARY",
     "BadFileError",
     "NpyHeader",
+    "Publication",
     "TooLargeError",
     "as_yaml",
     "check_memory",
+    "claimed",
     "decode",
     "feed_xml",
     "naming",
@@ -29,6 +32,7 @@ __all__ = [
     "read_npz",
     "read_short_text",
     "reads",
+    "settled",
     "write_durably",
     "write_npz",
 ]
