@@ -5,6 +5,8 @@ import os
 import signal
 import sys
 
+# A fork may wait without end for a thread that only its parent has.
+LONGEST_S = 120
 # Of Python's audit events.
 OPERATIONS = ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate")
 
@@ -36,6 +38,7 @@ def operations_of(act, at=None, number=signal.SIGKILL):
             os.write(here, b".")
 
     code = 1
+    signal.alarm(LONGEST_S)
     try:
         sys.addaudithook(touched)
         act()

@@ -16,6 +16,7 @@ from torchcover.evaluation.observers import CoverageObserver
 from torchcover.evaluation.progress import progress_of
 from torchcover.evaluation.study_plan import StudyPlan
 from torchcover.evaluation.study_truth import area_sums
+from torchcover.files import end_with_parent
 
 
 @dataclass
@@ -139,7 +140,13 @@ def command_s(plan: StudyPlan) -> float:
     clock = Clock()
     with TemporaryDirectory() as folder, clock.running():
         options = [f"--{name}={value}" for name, value in settings.items()]
-        done = subprocess.run([*command, *options, f"--out={folder}"], check=False, capture_output=True, text=True)
+        done = subprocess.run(
+            [*command, *options, f"--out={folder}"],
+            check=False,
+            capture_output=True,
+            text=True,
+            preexec_fn=end_with_parent(),
+        )
     if done.returncode:
         raise ValueError(f"{' '.join([*command[1:], *options])} ended with {done.returncode}: {done.stderr.strip()}")
     return clock.seconds

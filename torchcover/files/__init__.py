@@ -1,11 +1,12 @@
-"""What readers and writers of files share: their door, its error, what is whole, NumPy's files, tables."""
+"""What the system gives: the door of all readers, its error, files that are whole, NumPy's, tables, processes."""
 
 from torchcover.files.bad_file import BadFileError, naming, reads
 from torchcover.files.budget import TooLargeError, check_memory
 from torchcover.files.feather import read_feather
 from torchcover.files.json_tables import read_json_table
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, npz_headers, read_npy, read_npz, write_npz
-from torchcover.files.publishing import SUMMARY, Publication, claimed, settled, write_durably
+from torchcover.files.processes import end_with_parent
+from torchcover.files.publishing import SUMMARY, Publication, claimed, settled, write_durably, written_since
 from torchcover.files.text import decode, read_short_text
 from torchcover.files.xml_text import feed_xml, parse_xml
 from torchcover.files.yaml_text import as_yaml, parse_yaml
@@ -21,6 +22,7 @@ __all__ = [
     "check_memory",
     "claimed",
     "decode",
+    "end_with_parent",
     "feed_xml",
     "naming",
     "npz_headers",
@@ -35,4 +37,5 @@ __all__ = [
     "settled",
     "write_durably",
     "write_npz",
+    "written_since",
 ]

@@ -26,6 +26,9 @@ PARTIAL = ".partial_"
 WHOLE = ".whole"
 BEFORE = ".before.json"
 
+# Folders that this process has claimed.
+_claims: list[Path] = []
+
 
 def write_durably(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     """Write a file aside, see it onto the disk, and put it in the place of the one that is there.
@@ -81,11 +84,13 @@ def claimed(folder: Path) -> Iterator[None]:
     lock = FileLock(folder / LOCK, timeout=0, is_singleton=True)  # one for the whole process: it may claim it twice
     try:
         with lock:
+            _claims.append(folder)
             try:
                 if lock.lock_counter == 1:
                     _finish(folder)
                 yield
             finally:
+                _claims.remove(folder)
                 if lock.lock_counter == 1:
                     (folder / LOCK).unlink(missing_ok=True)
     except Timeout as error:
@@ -96,6 +101,21 @@ def claimed(folder: Path) -> Iterator[None]:
         with suppress(OSError):
             for place in made:
                 place.rmdir()
+
+
+def written_since(start_s: float) -> list[Path]:
+    """Files in the folders that this process has claimed, written since a time; none that lies aside.
+
+    Args:
+        start_s: As `time.time` gives it.
+    """
+    return [
+        folder / path.name
+        for folder in dict.fromkeys(_claims)
+        for place in (folder, folder / WHOLE)
+        for path in sorted(place.glob("[!.]*"))
+        if path.is_file() and path.stat().st_mtime >= start_s
+    ]
 
 
 class Publication:

@@ -9,6 +9,8 @@ from pathlib import Path
 from shutil import which
 from tempfile import TemporaryFile
 
+from torchcover.files import end_with_parent
+
 PIECE_BYTES = 1 << 18
 MAX_TOLD_CHARS = 500
 # They would look for schemas on the network.
@@ -41,7 +43,12 @@ def output_of(program: str, *options: str | Path) -> Iterator[bytes]:
     command = [str(home / "bin" / program), *ALWAYS, *map(str, options)]
     with TemporaryFile() as said:
         process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=said, env=_environment(home)
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=said,
+            env=_environment(home),
+            preexec_fn=end_with_parent(),  # noqa: PLW1509  (one call of the system, no lock)
         )
         assert process.stdout is not None  # as asked for
         try:
