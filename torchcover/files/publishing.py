@@ -205,12 +205,12 @@ def settled(path: Path) -> Path:
         FileNotFoundError: It was one of the publication before.
     """
     for folder in path.absolute().parents[:2]:
-        if not _is_waiting(folder):
+        if not (listed := _waiting(folder)):
             continue
         with suppress(OSError, ValueError), claimed(folder):
             return path
         name = path.absolute().relative_to(folder).as_posix()
-        if name in _outdated(folder):
+        if name in _outdated(folder, listed):
             raise FileNotFoundError(f"{path}: no such file; it was part of an earlier result")
         if (folder / WHOLE / name).is_file():
             return folder / WHOLE / name
@@ -220,10 +220,10 @@ def settled(path: Path) -> Path:
 def _finish(folder: Path) -> None:
     """Put in their places the files that are the new content of a folder; done again, it does what is left to do."""
     whole = folder / WHOLE
-    if _is_waiting(folder):
+    if listed := _waiting(folder):
         names = [path.relative_to(whole).as_posix() for path in whole.rglob("*") if path.is_file()]
         names = [name for name in names if name not in (SUMMARY, BEFORE)]
-        earlier, outdated = _listed(folder / SUMMARY), _outdated(folder)
+        earlier, outdated = _listed(folder / SUMMARY), _outdated(folder, listed)
         if not earlier or outdated or not earlier.isdisjoint(names):  # else what it says holds until it is replaced
             with suppress(FileNotFoundError):
                 os.replace(folder / SUMMARY, whole / BEFORE)
@@ -239,11 +239,11 @@ def _finish(folder: Path) -> None:
     rmtree(whole, ignore_errors=True)
 
 
-def _is_waiting(folder: Path) -> bool:
-    """Whether a publication is to be finished; none whose files somebody has taken away."""
+def _waiting(folder: Path) -> set[str]:
+    """What a publication lists that is to be finished; nothing where somebody has taken away some of it."""
     whole = folder / WHOLE
     listed = _listed(whole / SUMMARY)
-    return bool(listed) and all((whole / name).is_file() or (folder / name).is_file() for name in listed)
+    return listed if all((whole / name).is_file() or (folder / name).is_file() for name in listed) else set()
 
 
 def _move(source: Path, target: Path) -> None:
@@ -257,11 +257,10 @@ def _move(source: Path, target: Path) -> None:
         source.unlink()
 
 
-def _outdated(folder: Path) -> set[str]:
-    """Files of an earlier publication that the one which is to be finished does not have."""
-    whole = folder / WHOLE
-    earlier = _listed(folder / SUMMARY) | _listed(whole / BEFORE)
-    return {name for name in earlier - _listed(whole / SUMMARY) if (folder / name).is_file()}
+def _outdated(folder: Path, listed: set[str]) -> set[str]:
+    """Files of an earlier publication that are not among those of the one which is to be finished."""
+    earlier = _listed(folder / SUMMARY) | _listed(folder / WHOLE / BEFORE)
+    return {name for name in earlier - listed if (folder / name).is_file()}
 
 
 def _listed(summary: Path) -> set[str]:
