@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcover.coverage import Coverage, Quantity, Region
 from torchcover.coverage.blocks import MIN_BLOCKS
 from torchcover.coverage.estimate import area_in_blocks
-from torchcover.data import BadFrameError, Frame, SimulatedFrames
+from torchcover.data import BadFrameError, Frame, FrameSource, SimulatedFrames
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
 from torchcover.published import PUBLISHED, FrameMetric, PublishedNumber, Setup, Sights
@@ -55,7 +55,7 @@ class OtherMetrics(NamedTuple):
         return OtherMetrics(of_rigs, self.left_out)
 
 
-def metrics_of(task: Task, settings: Settings) -> OtherMetrics:
+def metrics_of(task: Task[FrameSource], settings: Settings) -> OtherMetrics:
     """Make the metrics that were asked for; what cannot be made for all rigs is left out, if others can.
 
     Raises:
@@ -63,7 +63,7 @@ def metrics_of(task: Task, settings: Settings) -> OtherMetrics:
     """
     if not settings.metrics:
         return OtherMetrics({}, {})
-    sights, threshold_m = Sights(), settings.thresholds[0] if settings.thresholds else 0.4
+    sights, threshold_m = Sights(), settings.thresholds_m[0] if settings.thresholds_m else 0.4
     ego = task.frames.scenario.ego_mesh() if isinstance(task.frames, SimulatedFrames) else None
     lacking = _lacking(task)
     left_out = {name: WHY[min(missing)] for name in settings.metrics if (missing := PUBLISHED[name].needs & lacking)}
@@ -87,7 +87,7 @@ def metrics_of(task: Task, settings: Settings) -> OtherMetrics:
     return OtherMetrics(observers, left_out)
 
 
-def _lacking(task: Task) -> frozenset[Need]:
+def _lacking(task: Task[FrameSource]) -> frozenset[Need]:
     """What the frames, or the rigs, do not have."""
     first = None if isinstance(task.frames, SimulatedFrames) else _first_frame(task)
     there: dict[Need, bool] = {
@@ -100,7 +100,7 @@ def _lacking(task: Task) -> frozenset[Need]:
     return frozenset(need for need, known in there.items() if not known)
 
 
-def _first_frame(task: Task) -> Frame | None:
+def _first_frame(task: Task[FrameSource]) -> Frame | None:
     for index in range(len(task.frames)):
         try:
             return task.frames[index]
