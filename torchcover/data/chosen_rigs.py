@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchcover.data.frame import Frame
 from torchcover.data.source import FrameDataset, FrameSource
-from torchcover.simulation import Sensor, WeightKind
+from torchcover.simulation import Sensor
 
 ValueT = TypeVar("ValueT")
 
@@ -53,9 +53,9 @@ class ChosenRigs(FrameDataset):
         return self.frames.description
 
     @property
-    def weight_kind(self) -> WeightKind | None:
+    def square_metres(self) -> bool:
         """As there."""
-        return self.frames.weight_kind
+        return self.frames.square_metres
 
     @property
     def reference_record(self) -> Mapping[str, object] | None:

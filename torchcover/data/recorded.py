@@ -18,7 +18,7 @@ from torchcover.data.recorded_reference import RecordedReference, Reference
 from torchcover.data.recordings import Recording, open_recording
 from torchcover.data.source import FrameDataset
 from torchcover.detection.inside import with_hits
-from torchcover.simulation import Sensor, WeightKind
+from torchcover.simulation import Sensor
 
 # What a folder of results holds, during the run or after it.
 RESULTS = frozenset({".lock", "summary.json", "checkpoint.npz"})
@@ -94,9 +94,9 @@ class RecordedFrames(FrameDataset):
         return {"scenario": None, "vehicle": None, "frames": str(self.recording.path), "seed": None}
 
     @property
-    def weight_kind(self) -> WeightKind | None:
-        """What the weights of the reference points are; None: all of them count the same."""
-        return self.reference.weight_kind(self.recording)
+    def square_metres(self) -> bool:
+        """Whether the reference has the square metres of its points."""
+        return self.reference.square_metres(self.recording)
 
     @property
     def reference_record(self) -> Mapping[str, object]:
@@ -157,7 +157,6 @@ class RecordedFrames(FrameDataset):
             name,
             counts=counts,
             reference_weights=None if reference.weights is None else torch.from_numpy(reference.weights),
-            weight_kind=self.weight_kind,
             boxes=boxes,
             instant=None if self.recording.instants is None else self.recording.instants[instant],
             sensor_points={

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from torchcover.data.frame import Frame
-from torchcover.simulation import Sensor, WeightKind
+from torchcover.simulation import Sensor
 
 
 @runtime_checkable
@@ -40,8 +40,8 @@ class FrameSource(Protocol):
         ...
 
     @property
-    def weight_kind(self) -> WeightKind | None:
-        """What the weights of the reference points are, as in `Frame`."""
+    def square_metres(self) -> bool:
+        """Whether all frames have `Frame.reference_weights`, the square metres of reference points; else none has."""
         ...
 
     @property

@@ -5,7 +5,6 @@ from .camera_sensor import CameraSensor as CameraSensor
 from .documents import Document as Document
 from .documents import Pose as Pose
 from .ego import with_ego as with_ego
-from .even_reference import EvenReference as EvenReference
 from .kinds import REFERENCE_SENSORS as REFERENCE_SENSORS
 from .kinds import SENSORS as SENSORS
 from .labels import Label as Label
@@ -18,7 +17,6 @@ from .rays import into_tiles as into_tiles
 from .reference_sensor import Areas as Areas
 from .reference_sensor import ReferenceScan as ReferenceScan
 from .reference_sensor import ReferenceSensor as ReferenceSensor
-from .reference_sensor import WeightKind as WeightKind
 from .rig import Rig as Rig
 from .scenario import Scenario as Scenario
 from .sensor import Sensor as Sensor

@@ -48,8 +48,8 @@ def write_recording(
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_recording(frames, folder)
         ...     again = RecordedFrames(folder)[0]
-        >>> len(again.sensor) == len(frames[0].sensor), again.weight_kind
-        (True, 'm2')
+        >>> len(again.sensor) == len(frames[0].sensor), again.reference_weights is None
+        (True, False)
     """
     folder = Path(folder)
     if layout not in RECORDERS:

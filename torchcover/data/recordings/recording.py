@@ -12,7 +12,6 @@ from torchcover.data.formats.arrays import Points
 from torchcover.detection.boxes import Boxes
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix
-from torchcover.simulation import WeightKind
 
 # A return from so near to the origin of its frame is one that never came, which drivers store as zeros.
 NO_RETURN_M = 1e-3
@@ -109,8 +108,8 @@ class Recording(Protocol):
         ...
 
     @property
-    def weight_kind(self) -> WeightKind | None:
-        """What the weights of the reference sensors' points are; None if they have none."""
+    def square_metres(self) -> bool:
+        """Whether the scans of the reference sensors have weights, the square metres that their points stand for."""
         ...
 
     @property
