@@ -78,7 +78,7 @@ def metrics_of(task: Task, settings: Settings) -> OtherMetrics:
             ego=ego,
             grid=task.asked.grid,
             regions=task.asked.regions,
-            square_metres=task.frames.weight_kind == "m2",
+            square_metres=task.frames.square_metres,
             threshold_m=threshold_m,
             sights=sights,
             sync_on_compute=False,
@@ -93,7 +93,7 @@ def _lacking(task: Task) -> frozenset[Need]:
     first = None if isinstance(task.frames, SimulatedFrames) else _first_frame(task)
     there: dict[Need, bool] = {
         "sensors": all(task.sensors.get(rig) for rig in task.rigs),
-        "m2": task.frames.weight_kind == "m2",
+        "m2": task.frames.square_metres,
         "boxes": first is None or first.boxes is not None,
         "sensor_points": first is None or all(rig in (first.sensor_points or {}) for rig in task.rigs),
         "tags": False,
