@@ -68,10 +68,9 @@ def record(
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """Write what a simulated rig sees as a recording, for other tools and for `evaluate --frames`."""
-    from torchcover.data import write_recording
     from torchcover.evaluation import Settings
     from torchcover.evaluation.task import simulation
-    from torchcover.simulation import Rig
+    from torchcover.simulation import Rig, write_recording
 
     frames = simulation(Settings(Rig.load(rig), steps=steps, **settings), boxes=True).frames
     write_recording(frames, out, layout, progress=_with_a_bar)
@@ -100,8 +99,9 @@ def rig(
     ] = None,
 ) -> None:
     """Print the sensors of a recording as a rig: mounts, LiDARs and cameras for `show` and `evaluate`."""
-    from torchcover.data import open_recording, rig_document
     from torchcover.files import as_yaml
+    from torchcover.recordings import open_recording
+    from torchcover.simulation import rig_document
 
     models = dict(_pair(text) for text in lidar or ())
     names = [name for of in sensors or () for name in of.split(",")]

@@ -12,7 +12,7 @@ import typer
 from torchcover.evaluation.settings import OPTIONS, Settings
 
 if TYPE_CHECKING:
-    from torchcover.data import RegionsOfInterest
+    from torchcover.simulation import RegionsOfInterest
 
 Command = Callable[..., None]
 
@@ -100,7 +100,7 @@ def asked(
         return None
     from pydantic import ValidationError
 
-    from torchcover.data import RegionsOfInterest
+    from torchcover.simulation import RegionsOfInterest
     from torchcover.simulation.documents import explain
 
     content = {} if file is None else RegionsOfInterest.load(file).model_dump(exclude_unset=True)

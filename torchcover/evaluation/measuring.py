@@ -11,7 +11,6 @@ from pathlib import Path
 
 from torchcover import __version__
 from torchcover.coverage import CoverageMetric
-from torchcover.data import Asked, BadFrameError, FrameSource
 from torchcover.evaluation.checkpoint import Checkpoint, Journal
 from torchcover.evaluation.observers import BLOCKS, AnyObserver, CoverageObserver, new_metric, usable_device
 from torchcover.evaluation.omissions import left_out
@@ -24,7 +23,8 @@ from torchcover.evaluation.sensor_drawings import check_drawable
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import TargetWatch
 from torchcover.evaluation.task import CALLER, Task
-from torchcover.simulation import WeightKind
+from torchcover.frames import BadFrameError, FrameSource
+from torchcover.simulation import Asked
 
 Observers = Mapping[str, AnyObserver]
 # Of an identity, what is longer is told by its hash.
@@ -84,9 +84,12 @@ def _observed(task: Task[FrameSource], settings: Settings, others: Observers) ->
     ranks, checkpoint = settings.ranks, settings.checkpoint
     if ranks:
         settings = replace(settings, device=ranks.device(settings.device))
-    kind, sensors = task.frames.weight_kind, task.sensor_names() if settings.redundancy else {}
+    sensors = task.sensor_names() if settings.redundancy else {}
     coverage = {
-        name: CoverageObserver(metric_of(settings, task.asked, kind, sensors.get(name, ())), name) for name in task.rigs
+        name: CoverageObserver(
+            metric_of(settings, task.asked, sensors.get(name, ()), square_metres=task.frames.square_metres), name
+        )
+        for name in task.rigs
     }
     target = settings.target_error
     watch = TargetWatch(target, coverage, task.asked.awaited) if target else None
@@ -165,9 +168,9 @@ def _states(coverage: Observers, others: Observers, watch: TargetWatch | None) -
 def metric_of(
     settings: Settings,
     asked: Asked,
-    weight_kind: WeightKind | None,
     sensors: Sequence[str] = (),
     *,
+    square_metres: bool,
     blocks: int = BLOCKS,
 ) -> CoverageMetric:
     """An empty metric of what `evaluate` is to measure.
@@ -175,15 +178,15 @@ def metric_of(
     Args:
         settings: How.
         asked: What is asked about.
-        weight_kind: What the weights of reference points are.
         sensors: Names of the sensors, for redundancy.
+        square_metres: Whether the frames have the square metres of reference points.
         blocks: For standard errors.
 
     Raises:
-        ValueError: An estimate by area is wanted, and the weights are no square metres; a device that cannot be used;
-            as `new_metric`.
+        ValueError: An estimate by area is wanted, and there are no square metres; a device that cannot be used; as
+            `new_metric`.
     """
-    if settings.estimate == "area" and weight_kind != "m2":
+    if settings.estimate == "area" and not square_metres:
         raise ValueError(
             "estimate area: it needs the square metres of reference points, which the surface reference of a "
             "simulation gives; leave it out for means over the known cells"
@@ -195,7 +198,7 @@ def metric_of(
         blocks=blocks,
         aggregations=settings.aggregations,
         sensors=sensors,
-        square_metres=weight_kind == "m2" and settings.estimate != "known",
+        square_metres=square_metres and settings.estimate != "known",
     )
 
 

@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import Aggregation, Coverage, CoverageMetric
-from torchcover.data import Asked, Frame
+from torchcover.frames import Frame
+from torchcover.simulation import Asked
 from torchcover.simulation.memory import check_fits
 
 # For standard errors: at least half as many are in use at the end of a long run.
@@ -96,7 +97,6 @@ class CoverageObserver:
                 square metres that the metric wants, or nobody knows which points are of which sensor and it wants
                 that.
         """
-        frame.check_weights(square_metres=self.metric.square_metres)
         sensor = self._by_sensor(frame) if self.metric.sensors else self._whole(frame)
         self.metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.place_in_time)
 

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import Coverage, Region
-from torchcover.coverage.estimate import Measure, area_in_blocks
-from torchcover.data import RegionsOfInterest
+from torchcover.coverage.measures import Measure, area_in_blocks
 from torchcover.evaluation.evaluating import evaluate
 from torchcover.evaluation.other_metrics import drawn_worlds
 from torchcover.evaluation.task import AnyRig, loaded
@@ -19,7 +18,7 @@ from torchcover.published import PUBLISHED, Candidate
 from torchcover.published.baselines import mean_height_m, rays
 from torchcover.published.comparison import Series
 from torchcover.published.ranks import LEAST, Array
-from torchcover.simulation import Scenario
+from torchcover.simulation import RegionsOfInterest, Scenario
 
 THRESHOLD_M = 0.4
 CELL_M = 1.0

@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     import torch
 
     from torchcover.coverage import Aggregation
-    from torchcover.data import FrameSource, RegionsOfInterest
     from torchcover.evaluation.checkpoint import Checkpoint
     from torchcover.evaluation.observers import AnyObserver
     from torchcover.evaluation.ranks import Ranks
     from torchcover.evaluation.target_error import TargetError
-    from torchcover.simulation import Rig, Scenario
+    from torchcover.frames import FrameSource
+    from torchcover.simulation import RegionsOfInterest, Rig, Scenario
 
     AnyRig = Rig | str | Path
 
@@ -63,7 +63,7 @@ def _metrics(given: str | Iterable[str]) -> tuple[str, ...]:
 def _asked(given: "RegionsOfInterest | str | Path | None") -> "RegionsOfInterest | None":
     if given is None:
         return None
-    from torchcover.data import RegionsOfInterest
+    from torchcover.simulation import RegionsOfInterest
 
     if isinstance(given, str | Path):
         return RegionsOfInterest.load(given)
@@ -146,15 +146,14 @@ class Settings:
     reference: Annotated[
         str | None,
         Option(
-            "Reference sensor: `surface`, points drawn evenly on what can be seen (default); `even`, rays spread over "
-            "the regions and the grid; or `paper`. On the command line with --frames: `recorded`, or `accumulated` "
+            "Reference sensor: `surface`, points drawn evenly on what can be seen (default), or `paper`. On the command line with --frames: `recorded`, or `accumulated` "
             "from the recording itself."
         ),
     ] = None
     rays: Annotated[
         int | None,
         Option(
-            "Rays of the reference sensor at each step (surface: 16384; even: 262144; paper: 1048576, a square).",
+            "Rays of the reference sensor at each step (surface: 16384; paper: 1048576, a square).",
             minimum=1,
         ),
     ] = None

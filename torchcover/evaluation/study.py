@@ -12,15 +12,15 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from torchcover import __version__
-from torchcover.coverage import Quantity
+from torchcover.estimation import Quantity
 from torchcover.evaluation.study_runs import StudyPlan, Truth, command_s, long_run, tried
 from torchcover.report import (
-    UNITS,
     WorkPanel,
     difference_heading,
     draw_work_precision,
     error_words,
     json_record,
+    shown_unit,
     text_table,
 )
 
@@ -118,7 +118,7 @@ def work_panels(
         floor: Standard errors of the long run, likewise by key: errors below them say nothing.
     """
     for quantity in quantities:
-        key, factor = quantity.key, UNITS[quantity.unit].factor
+        key, factor = quantity.key, shown_unit(quantity.unit).factor
 
         def line(of: Sequence[WorkPoint], key: str = key, factor: float = factor) -> list[tuple[float, float]]:
             return [(point.seconds, factor * point.errors[key]) for point in of]

@@ -14,14 +14,13 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import Coverage, CoverageMetric, forward_regions
-from torchcover.data import SimulatedFrames, reference_called
 from torchcover.evaluation.measuring import metric_of
 from torchcover.evaluation.observers import BLOCKS, CoverageObserver
 from torchcover.evaluation.pipeline import observe
 from torchcover.evaluation.progress import progress_of
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, OPTIONS, Settings
 from torchcover.evaluation.task import Task, simulation
-from torchcover.simulation import ReferenceSensor
+from torchcover.simulation import ReferenceSensor, SimulatedFrames, reference_called
 
 # The long run's seed is far away from any other.
 LONG_RUN_SEED = 1_000_003
@@ -92,7 +91,7 @@ class StudyPlan:
 
     def metric(self, blocks: int) -> CoverageMetric:
         """An empty metric."""
-        return metric_of(self.settings, self.task.asked, "m2", blocks=blocks)
+        return metric_of(self.settings, self.task.asked, square_metres=True, blocks=blocks)
 
     @property
     def command(self) -> list[str]:

@@ -6,19 +6,21 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
-from torchcover.data import (
-    Asked,
-    BadFrameError,
-    ChosenRigs,
-    FrameSource,
-    RecordedFrames,
-    RegionsOfInterest,
-    SimulatedFrames,
-    reference_called,
-)
-from torchcover.data.suspicion import suspicions
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings
-from torchcover.simulation import Rig, Scenario, Sensor, builtin_names, with_ego
+from torchcover.frames import BadFrameError, ChosenRigs, FrameSource
+from torchcover.recordings import RecordedFrames
+from torchcover.recordings.suspicion import suspicions
+from torchcover.simulation import (
+    Asked,
+    RegionsOfInterest,
+    Rig,
+    Scenario,
+    Sensor,
+    SimulatedFrames,
+    builtin_names,
+    reference_called,
+    with_ego,
+)
 
 AnyRig = Rig | str | Path
 SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
@@ -79,7 +81,7 @@ def task_of(settings: Settings) -> Task[FrameSource]:
         TypeError: Frames that do not say whose they are.
 
     Warns:
-        UserWarning: A recording that looks wrong; see `torchcover.data.suspicion`.
+        UserWarning: A recording that looks wrong; see `torchcover.recordings.suspicion`.
     """
     for rig in settings.rigs:
         if not isinstance(rig, Rig) and Path(rig).suffix == ".npz":
