@@ -79,10 +79,11 @@ def _measure(
     recording = opened(frames, recording_format, sensors, settings.get("reference"), window_s)
     if recording is not None:
         settings.pop("reference", None)
-    if (count := len(rigs or (() if recording is None else recording.rigs))) < at_least:
+    named = list(rigs or (() if recording is None else recording.rigs))
+    if 0 < len(named) < at_least:
         raise ValueError(
-            f"compare: at least two rigs are needed; got {count} (for one: `evaluate`; of a recording, each --sensors "
-            "makes a rig)"
+            f"compare: at least two rigs are needed; got {named[0]} only (for one: `evaluate`; of a recording, each "
+            "--sensors makes a rig)"
         )
     if (asked := options.asked(settings.get("ask"), region, height, grid)) is not None:
         settings["ask"] = asked
@@ -119,7 +120,7 @@ def evaluate(
     **given: Any,  # noqa: ANN401
 ) -> None:
     """Measure the coverage of a rig, or of several: a table, maps, and files to compare and to log."""
-    _measure(rigs, 1 if rigs else 0, **given)
+    _measure(rigs, 1, **given)
 
 
 @with_options(MEASURING)

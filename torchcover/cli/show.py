@@ -29,7 +29,7 @@ def run(
     *,
     scenario: str | None,
     rig: str | None,
-    vehicle: str | None,
+    vehicle: str | None = None,
     step: int | None,
     seed: int | None,
     film: Path | None,

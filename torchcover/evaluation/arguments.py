@@ -66,11 +66,16 @@ def taking(
     """A decorator: a function of one document is called with the document's fields, and is documented with them."""
 
     def decorate(function: Callable[[DocumentT], ReturnT]) -> Callable[Arguments, ReturnT]:
+        signature = inspect.signature(document)
+
         def called(*args: Arguments.args, **kwargs: Arguments.kwargs) -> ReturnT:
+            try:
+                signature.bind(*args, **kwargs)
+            except TypeError as error:
+                raise TypeError(f"{function.__name__}: {error}") from None
             return function(document(*args, **kwargs))
 
         update_wrapper(called, function)
-        signature = inspect.signature(document)
         parameters = [each.replace(annotation=_plain(each.annotation)) for each in signature.parameters.values()]
         returns = inspect.signature(function).return_annotation
         called.__signature__ = signature.replace(  # type: ignore[attr-defined]

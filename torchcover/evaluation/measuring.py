@@ -85,10 +85,9 @@ def _observed(task: Task[FrameSource], settings: Settings, others: Observers) ->
     if ranks:
         settings = replace(settings, device=ranks.device(settings.device))
     sensors = task.sensor_names() if settings.redundancy else {}
+    has_areas = task.frames.square_metres
     coverage = {
-        name: CoverageObserver(
-            metric_of(settings, task.asked, sensors.get(name, ()), square_metres=task.frames.square_metres), name
-        )
+        name: CoverageObserver(metric_of(settings, task.asked, sensors.get(name, ()), square_metres=has_areas), name)
         for name in task.rigs
     }
     target = settings.target_error

@@ -146,8 +146,8 @@ class Settings:
     reference: Annotated[
         str | None,
         Option(
-            "Reference sensor: `surface`, points drawn evenly on what can be seen (default), or `paper`. On the command line with --frames: `recorded`, or `accumulated` "
-            "from the recording itself."
+            "Reference sensor: `surface`, points drawn evenly on what can be seen (default), or `paper`. On the "
+            "command line with --frames: `recorded`, or `accumulated` from the recording itself."
         ),
     ] = None
     rays: Annotated[
