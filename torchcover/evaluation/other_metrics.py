@@ -13,12 +13,11 @@ from torchcover.coverage.measures import area_in_blocks
 from torchcover.estimation import MIN_BLOCKS, Quantity
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
-from torchcover.frames import BadFrameError, Frame, FrameSource
+from torchcover.frames import FrameSource
 from torchcover.published import PUBLISHED, FrameMetric, PublishedNumber, Setup, Sights
 from torchcover.published.comparison import OWN, MetricComparison, Series
 from torchcover.published.ranks import Array
 from torchcover.published.setup import Need
-from torchcover.simulation import SimulatedFrames
 
 # Worlds are drawn again so many times for the intervals of tau.
 DRAWS = 500
@@ -26,7 +25,7 @@ DRAWS = 500
 WHY: Mapping[Need, str] = {
     "boxes": "it needs boxes of objects, which simulations and labelled recordings have",
     "sensors": "it needs the rig's sensors, with mounts and rays: give the rig's YAML file or a built-in name",
-    "sensor_points": "nobody knows which points are of which sensor",
+    "sensor_points": "it is unknown which points are of which sensor",
     "m2": "it needs the square metres of reference points, which the surface reference of a simulation gives",
     "tags": "it needs classes of the reference points, which the frames do not have",
 }
@@ -65,8 +64,7 @@ def metrics_of(task: Task[FrameSource], settings: Settings) -> OtherMetrics:
     if not settings.metrics:
         return OtherMetrics({}, {})
     sights, threshold_m = Sights(), settings.thresholds_m[0] if settings.thresholds_m else 0.4
-    ego = task.frames.scenario.ego_mesh() if isinstance(task.frames, SimulatedFrames) else None
-    lacking = _lacking(task)
+    lacking, ego = _lacking(task), task.frames.ego_mesh()
     left_out = {name: WHY[min(missing)] for name in settings.metrics if (missing := PUBLISHED[name].needs & lacking)}
     if len(left_out) == len(settings.metrics):
         raise ValueError("; ".join(f"metric {name}: {why}" for name, why in left_out.items()))
@@ -90,24 +88,14 @@ def metrics_of(task: Task[FrameSource], settings: Settings) -> OtherMetrics:
 
 def _lacking(task: Task[FrameSource]) -> frozenset[Need]:
     """What the frames, or the rigs, do not have."""
-    first = None if isinstance(task.frames, SimulatedFrames) else _first_frame(task)
     there: dict[Need, bool] = {
         "sensors": all(task.sensors.get(rig) for rig in task.rigs),
         "m2": task.frames.square_metres,
-        "boxes": first is None or first.boxes is not None,
-        "sensor_points": first is None or all(rig in (first.sensor_points or {}) for rig in task.rigs),
+        "boxes": task.frames.has_boxes(),
+        "sensor_points": all(rig in task.frames.sensor_names for rig in task.rigs),
         "tags": False,
     }
     return frozenset(need for need, known in there.items() if not known)
-
-
-def _first_frame(task: Task[FrameSource]) -> Frame | None:
-    for index in range(len(task.frames)):
-        try:
-            return task.frames[index]
-        except BadFrameError:
-            continue  # the run itself skips it, or ends with it
-    return None
 
 
 def compared(
