@@ -1,7 +1,8 @@
 """Aggregations beside the mean of means, each by its definition; and one that nobody here has heard of."""
 
 import math
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import numpy as np
@@ -18,6 +19,7 @@ from torchcover.coverage import (
     Quantiles,
     State,
     StepQuantiles,
+    aggregation_named,
 )
 from torchcover.estimation import Estimate, Quantity
 from torchcover.report import RENDERERS, CoverageTable
@@ -301,3 +303,23 @@ def test_an_aggregation_of_ones_own_is_measured_merged_saved_and_loaded(tmp_path
 
 def test_aggregations_have_names_of_their_own():
     assert len({kind.name for kind in AGGREGATIONS}) == len({kind.words for kind in AGGREGATIONS}) == len(AGGREGATIONS)
+
+
+def test_each_of_the_package_has_a_name_that_makes_it():
+    for kind in AGGREGATIONS:
+        words = f"{kind.name}:0.5,0.9" if fields(kind) else kind.name
+        assert aggregation_named(words) == (kind((0.5, 0.9)) if fields(kind) else kind())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("minimum", "aggregation minimum: one of maximum, quantiles, step_quantiles, pooled is needed"),
+        ("maximum:0.5", "aggregation maximum:0.5: maximum takes no levels"),
+        ("quantiles", "aggregation quantiles: levels are needed, as in quantiles:0.5,0.9"),
+        ("quantiles:0.5,2", "aggregation quantiles:0.5,2: levels are needed"),
+    ],
+)
+def test_what_makes_no_aggregation_is_refused(words, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        aggregation_named(words)
