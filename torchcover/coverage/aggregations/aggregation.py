@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
 from torch import Tensor
@@ -52,6 +53,7 @@ class BinnedStep(NamedTuple):
         return self.values[0]
 
 
+@dataclass(frozen=True)
 class Aggregation(ABC):
     """How the radii of a cell, point by point and step by step, become one number, or a few.
 
