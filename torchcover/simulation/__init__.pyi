@@ -13,6 +13,7 @@ from .lidar import Lidar as Lidar
 from .lidar import LidarModel as LidarModel
 from .observation import Observation as Observation
 from .paper_reference import PaperReference as PaperReference
+from .radar import Radar as Radar
 from .rays import Tile as Tile
 from .rays import into_tiles as into_tiles
 from .reference_sensor import Areas as Areas
@@ -21,6 +22,9 @@ from .reference_sensor import ReferenceSensor as ReferenceSensor
 from .reference_sensor import WeightKind as WeightKind
 from .rig import Rig as Rig
 from .scenario import Scenario as Scenario
+from .sensor import Draws as Draws
+from .sensor import RayHits as RayHits
+from .sensor import Returns as Returns
 from .sensor import Sensor as Sensor
 from .sensor import vertical_fov_deg as vertical_fov_deg
 from .shell import position_in_shell as position_in_shell

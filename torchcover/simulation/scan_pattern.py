@@ -4,10 +4,10 @@ from typing import Annotated, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
+from pydantic import Field, model_validator
 
-from torchcover.simulation.documents import Document
 from torchcover.simulation.rays import unit_directions
+from torchcover.simulation.sensor import Ranging
 
 # A hundred times what there is on the market.
 MAX_ROWS, MAX_COLUMNS = 100_000, 1_000_000
@@ -15,7 +15,7 @@ MAX_ROWS, MAX_COLUMNS = 100_000, 1_000_000
 Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
 
 
-class ScanPattern(Document):
+class ScanPattern(Ranging):
     """Where the rays of a LiDAR point, and which of their hits become points.
 
     The ray of row i in column j points to elevation `E[i]` and azimuth `A[j] + D[i]`, where the rows' elevations E are
@@ -29,10 +29,7 @@ class ScanPattern(Document):
         azimuth_offsets_deg: Offset of each row; positive is left. None if not given.
         horizontal_fov_deg: Field of view about the x axis, 360 for a full turn.
         columns: Number of columns.
-        min_range_m: Closer hits give no point.
-        max_range_m: Farther hits give no point.
-        range_noise_m: Standard deviation of the measured range, along the ray.
-        dropout: Probability that a ray gives no point, from 0 to 1.
+        min_range_m, max_range_m, range_noise_m, dropout: As in `Ranging`.
     """
 
     channels: Annotated[int, Field(gt=0, le=MAX_ROWS)] | None = None
@@ -41,10 +38,6 @@ class ScanPattern(Document):
     azimuth_offsets_deg: tuple[float, ...] | None = None
     horizontal_fov_deg: Annotated[float, Field(gt=0.0, le=360.0)]
     columns: Annotated[int, Field(gt=0, le=MAX_COLUMNS)]
-    min_range_m: NonNegativeFloat = 0.0
-    max_range_m: PositiveFloat
-    range_noise_m: NonNegativeFloat = 0.0
-    dropout: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
 
     @model_validator(mode="after")
     def _check_rows(self) -> Self:
@@ -58,8 +51,6 @@ class ScanPattern(Document):
         rows, offsets = len(self.rows_deg()), self.azimuth_offsets_deg
         if offsets is not None and len(offsets) != rows:
             raise ValueError(f"azimuth_offsets_deg: one for each of the {rows} rows is needed; got {len(offsets)}")
-        if self.min_range_m >= self.max_range_m:
-            raise ValueError(f"min_range_m ({self.min_range_m}) must be below max_range_m ({self.max_range_m})")
         return self
 
     @property

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from torchcover.geometry import BoundingBox
-from torchcover.simulation.disturbance import disturb
 from torchcover.simulation.ego import with_ego
 from torchcover.simulation.instant import Instant, Scan
 from torchcover.simulation.labels import Label, labels
@@ -20,6 +19,7 @@ from torchcover.simulation.reference_sensor import ReferenceSensor
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
+from torchcover.simulation.sensor import Draws
 from torchcover.simulation.stage import Stage, Stages
 from torchcover.simulation.standing import warn_of_floating
 from torchcover.simulation.surroundings import Surroundings
@@ -247,10 +247,8 @@ class Simulator:
     def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[Scan]:
         scans = []
         for k, mounted in enumerate(sensors, 1):
-            scan = mounted.scan(instant, threads=torch.get_num_threads())
-            generator = np.random.default_rng([self.seed, index, k])
-            origin_m, sensor = mounted.vehicle_T_sensor[:3, 3], mounted.sensor
-            scans.append(disturb(scan, origin_m, sensor.range_noise_m, sensor.dropout, generator))
+            draws = Draws(np.random.default_rng([self.seed, index, k]))
+            scans.append(mounted.scan(instant, draws, threads=torch.get_num_threads()))
         return scans
 
     def _surroundings(self, scene: Scene, instant: Instant, index: int) -> Surroundings:
