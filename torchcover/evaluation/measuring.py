@@ -7,7 +7,6 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-from torchcover.data import BadFrameError
 from torchcover.evaluation.checkpoint import AnyCheckpoint, Checkpoint, Journal
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.omissions import left_out
@@ -21,6 +20,7 @@ from torchcover.evaluation.sensor_drawings import check_drawable
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import TargetWatch
 from torchcover.evaluation.task import Task
+from torchcover.frames import BadFrameError
 
 Observers = Mapping[str, AnyObserver]
 
@@ -98,9 +98,12 @@ def _observed(
     """All that was seen, by all ranks."""
     if ranks:
         settings = replace(settings, device=ranks.device(settings.device))
-    kind, sensors = task.frames.weight_kind, task.sensor_names() if settings.redundancy else {}
+    sensors = task.sensor_names() if settings.redundancy else {}
     coverage = {
-        name: CoverageObserver(settings.metric(task.asked, kind, sensors.get(name, ())), name) for name in task.rigs
+        name: CoverageObserver(
+            settings.metric(task.asked, sensors.get(name, ()), square_metres=task.frames.square_metres), name
+        )
+        for name in task.rigs
     }
     target = settings.target_error
     watch = TargetWatch(target, coverage, task.asked.awaited) if target else None

@@ -6,7 +6,7 @@ from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 from torch import Tensor
 
 from torchcover.coverage import Coverage, CoverageMetric
-from torchcover.data import Frame
+from torchcover.frames import Frame
 
 ResultT = TypeVar("ResultT", covariant=True)
 
@@ -87,7 +87,6 @@ class CoverageObserver:
                 square metres that the metric wants, or nobody knows which points are of which sensor and it wants
                 that.
         """
-        frame.check_weights(square_metres=self.metric.square_metres)
         sensor = self._by_sensor(frame) if self.metric.sensors else self._whole(frame)
         self.metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.place_in_time)
 

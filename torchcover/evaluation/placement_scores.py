@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import Coverage, Region
-from torchcover.coverage.estimate import Measure, area_in_blocks
-from torchcover.data import RegionsOfInterest
+from torchcover.coverage.measures import Measure, area_in_blocks
 from torchcover.evaluation.evaluating import compare
 from torchcover.evaluation.other_metrics import drawn_worlds
 from torchcover.evaluation.rig_names import AnyRig, loaded
@@ -19,6 +18,7 @@ from torchcover.published import PUBLISHED, Candidate
 from torchcover.published.baselines import mean_height_m, rays
 from torchcover.published.comparison import Series
 from torchcover.published.ranks import LEAST, Array
+from torchcover.simulation import RegionsOfInterest
 
 THRESHOLD_M = 0.4
 CELL_M = 1.0

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.neighbors import check_cloud
 from torchcover.published.frame_metric import FrameMetric
 from torchcover.published.number import PublishedNumber

@@ -8,9 +8,9 @@ from typing import Self
 
 import numpy as np
 
-from torchcover.data.recordings.csv_tables import read_csv
 from torchcover.files import reads
 from torchcover.published.ranks import Array, spearman
+from torchcover.recordings.formats.csv_tables import read_csv
 from torchcover.simulation import builtin_folder
 
 COLUMNS = ("placement", "quantity", "model", "class")

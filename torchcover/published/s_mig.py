@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.coverage.errors import ROUND_OFF, jackknife_error
-from torchcover.data import Frame
+from torchcover.estimation import ROUND_OFF, jackknife_error
+from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox
 from torchcover.metrics import with_rows
 from torchcover.neighbors import check_cloud

@@ -1,3 +1,6 @@
+from .aimed_reference import DEFAULT_REFERENCE as DEFAULT_REFERENCE
+from .aimed_reference import reference_called as reference_called
+from .aimed_reference import reference_of_objects as reference_of_objects
 from .builtin import builtin_documents as builtin_documents
 from .builtin import builtin_folder as builtin_folder
 from .builtin import builtin_names as builtin_names
@@ -5,7 +8,6 @@ from .camera_sensor import CameraSensor as CameraSensor
 from .documents import Document as Document
 from .documents import Pose as Pose
 from .ego import with_ego as with_ego
-from .even_reference import EvenReference as EvenReference
 from .kinds import REFERENCE_SENSORS as REFERENCE_SENSORS
 from .kinds import SENSORS as SENSORS
 from .labels import Label as Label
@@ -16,10 +18,14 @@ from .paper_reference import PaperReference as PaperReference
 from .radar import Radar as Radar
 from .rays import Tile as Tile
 from .rays import into_tiles as into_tiles
+from .recorded_rig import rig_document as rig_document
 from .reference_sensor import Areas as Areas
 from .reference_sensor import ReferenceScan as ReferenceScan
 from .reference_sensor import ReferenceSensor as ReferenceSensor
-from .reference_sensor import WeightKind as WeightKind
+from .regions_of_interest import GRID_X_M as GRID_X_M
+from .regions_of_interest import GRID_Y_M as GRID_Y_M
+from .regions_of_interest import Asked as Asked
+from .regions_of_interest import RegionsOfInterest as RegionsOfInterest
 from .rig import Rig as Rig
 from .scenario import Scenario as Scenario
 from .sensor import Draws as Draws
@@ -28,6 +34,8 @@ from .sensor import Returns as Returns
 from .sensor import Sensor as Sensor
 from .sensor import vertical_fov_deg as vertical_fov_deg
 from .shell import position_in_shell as position_in_shell
+from .simulated_frames import SimulatedFrames as SimulatedFrames
 from .simulator import Simulator as Simulator
 from .surface_reference import SurfaceReference as SurfaceReference
 from .surroundings import Surroundings as Surroundings
+from .writing import write_recording as write_recording
