@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.timing import compare, table
-from torchcover.simulation import PaperReference, Rig, Scenario
-from torchcover.simulation import Draws
+from torchcover.simulation import Draws, PaperReference, Rig, Scenario
 from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor

@@ -95,7 +95,7 @@ def scanned(lidar, instant, pose, generator):
             own_m = transform(part_T_vehicle, points_m)
             on_moving |= ((own_m >= low) & (own_m <= high)).all(axis=1)
     points_m = transform(invert(pose), points_m)
-    cloud = Cloud(points_m, np.ones(len(points_m)), on_moving, *np.divmod(ray, rays.shape[1]))
+    cloud = Cloud(points_m, np.ones(len(points_m)), on_moving, *np.divmod(ray, directions.shape[2]))
     return cloud.where(GRID.cell_of(torch.from_numpy(points_m)).numpy() >= 0)
 
 

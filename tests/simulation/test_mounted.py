@@ -67,6 +67,22 @@ def test_every_step_is_that_of_a_scan_afresh(ego_moves, actor_moves, origin_m):
     assert (min(self_hits) < self_hits[0] - 20) == ego_moves
 
 
+@pytest.mark.parametrize("moves", [False, True])
+def test_hits_that_are_too_close_give_no_points_and_hide_what_lies_behind(moves):
+    scene = Scene(world(moves, moves))
+    instant, exact = scene.at(3), MountedSensor(LIDAR, scene).scan(scene.at(3), EXACT)
+    mounted = MountedSensor(LIDAR.model_copy(update={"min_range_m": 4.0}), scene)
+    seen, again = mounted.scan(instant, EXACT), mounted.scan(instant, EXACT)
+    far = exact.range_m >= 4.0
+    assert 100 < far.sum() < len(far) - 100
+    for one in (seen, again):
+        np.testing.assert_array_equal(one.points, exact.points[far])
+        np.testing.assert_array_equal(one.ray, exact.ray[far])
+        np.testing.assert_array_equal(one.range_m, exact.range_m[far])
+    ways_m = np.linalg.norm(seen.points - LIDAR.mount.matrix()[:3, 3], axis=1)
+    np.testing.assert_allclose(seen.range_m, ways_m, rtol=1e-5)
+
+
 def test_a_scan_is_made_again_only_where_something_moves(monkeypatch):
     scans, original = [], Instant.scan
     monkeypatch.setattr(Instant, "scan", lambda *args, **options: scans.append(1) or original(*args, **options))

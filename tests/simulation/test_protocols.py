@@ -83,7 +83,10 @@ KEYS = {
     "lidar": {"channels": 4, "vertical_fov_deg": [-20, 10], "horizontal_fov_deg": 90, "columns": 16},
     "camera": {"width": 24, "height": 16, "fov_deg": 80},
     "radar": {
-        "horizontal_fov_deg": 90, "vertical_fov_deg": [-20, 10], "azimuth_cell_deg": 7, "range_cell_m": 0.5,
+        "horizontal_fov_deg": 90,
+        "vertical_fov_deg": [-20, 10],
+        "azimuth_cell_deg": 7,
+        "range_cell_m": 0.5,
         "ray_spacing_m": 2,
     },
     "altimeter": {},

@@ -13,7 +13,6 @@ from .kinds import SENSORS as SENSORS
 from .labels import Label as Label
 from .lidar import Lidar as Lidar
 from .lidar import LidarModel as LidarModel
-from .observation import Observation as Observation
 from .paper_reference import PaperReference as PaperReference
 from .radar import Radar as Radar
 from .rays import Tile as Tile
@@ -35,6 +34,7 @@ from .sensor import Sensor as Sensor
 from .sensor import vertical_fov_deg as vertical_fov_deg
 from .shell import position_in_shell as position_in_shell
 from .simulated_frames import SimulatedFrames as SimulatedFrames
+from .simulator import Observation as Observation
 from .simulator import Simulator as Simulator
 from .surface_reference import SurfaceReference as SurfaceReference
 from .surroundings import Surroundings as Surroundings

@@ -29,8 +29,8 @@ Float32 = NDArray[np.float32]
 class Scan(NamedTuple):
     """What one sensor saw: `points` (N, 3) float32 in the vehicle frame, and how many rays went where.
 
-    `ray` (N,) says which ray, counted over the tiles, made each point, and `range_m` (N,) how far it went. `body_casts` is the number of pairs of a ray and
-    a moving body at which it was cast: the other pairs could not meet.
+    `ray` (N,) says which ray, counted over the tiles, made each point, and `range_m` (N,) how far it went. `body_casts`
+    is the number of pairs of a ray and a moving body at which it was cast: the other pairs could not meet.
     """
 
     points: Float32

@@ -1,6 +1,5 @@
 """A sensor at its place on the ego of one scene: what is the same at every step is worked out once."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np

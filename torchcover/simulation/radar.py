@@ -9,8 +9,7 @@ from pydantic import Field, model_validator
 
 from torchcover.simulation.documents import Pose
 from torchcover.simulation.rays import unit_directions
-from torchcover.simulation.scan_pattern import Elevation
-from torchcover.simulation.sensor import Draws, Numbers, Ranging, RayHits, Returns
+from torchcover.simulation.sensor import Draws, Elevation, Numbers, Ranging, RayHits, Returns
 
 # What is told about a division by rounding is no cell more.
 ROUNDING = 1e-9

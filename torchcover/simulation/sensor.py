@@ -15,6 +15,7 @@ from torchcover.simulation.documents import Document, Pose
 
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
+Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,8 +90,7 @@ class Draws:
         with self._lock:  # whichever thread asks first draws for all
             if kind not in self._of_rays:
                 self._of_rays[kind] = draw(self._rays)
-        drawn = self._of_rays[kind][ray]
-        return drawn
+            return self._of_rays[kind][ray]
 
 
 class Sensor(Protocol):

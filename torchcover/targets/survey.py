@@ -20,7 +20,7 @@ from torchcover.targets.target import Target
 
 Float64 = NDArray[np.float64]
 
-# Of one step: where each ends and on what, and two random numbers. Of one cell: poses, sums, and what is made on the way.
+# Of one step: where each ends, on what, two random numbers. Of one cell: poses, sums, and what is made on the way.
 BYTES_PER_RAY = 21
 BYTES_PER_CELL = 500
 
