@@ -32,7 +32,7 @@ def test_what_is_left_without_a_radar_is_the_other_alone(torchcover, rigs):
     for row, rest in zip(both.coverage.summary(), alone.coverage.summary(), strict=True):
         for key, number in rest.numbers.items():
             assert row.redundancy.without["front"][key].value == pytest.approx(number.value, rel=1e-12, nan_ok=True)
-    seen = [found.coverage.summary()[0].numbers["detection@0.4"].value for found in (both, alone)]
+    seen = [found.coverage.summary()[0].numbers["detection_0.4m"].value for found in (both, alone)]
     assert seen[0] > seen[1]
 
 
@@ -63,8 +63,16 @@ def test_targets_count_the_points_of_a_radar_and_not_its_rays(torchcover, rigs):
 @pytest.mark.parametrize(
     ("was", "cell", "message"),
     [
-        ("azimuth_cell_deg: 5", "azimuth_cell_deg: 91", "azimuth_cell_deg: a cell within the opening is needed, at most"),
-        ("range_cell_m: 0.5", "range_cell_m: 40.5", "range_cell_m: a cell within the opening is needed, at most max_ran"),
+        (
+            "azimuth_cell_deg: 5",
+            "azimuth_cell_deg: 91",
+            "azimuth_cell_deg: a cell within the opening is needed, at most",
+        ),
+        (
+            "range_cell_m: 0.5",
+            "range_cell_m: 40.5",
+            "range_cell_m: a cell within the opening is needed, at most max_ran",
+        ),
     ],
 )
 def test_a_cell_wider_than_the_opening_is_one_line_that_names_the_key(torchcover, rigs, was, cell, message):
