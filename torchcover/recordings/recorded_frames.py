@@ -14,7 +14,6 @@ from torchcover.detection.inside import with_hits
 from torchcover.frames.frame import Frame, WeightKind
 from torchcover.frames.source import BadFrameError, FrameDataset
 from torchcover.recordings.accumulated_reference import AccumulatedReference
-from torchcover.recordings.formats import open_recording
 from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, joined
 from torchcover.recordings.recorded_reference import RecordedReference, Reference
 from torchcover.recordings.recording import Recording
@@ -58,7 +57,11 @@ class RecordedFrames(FrameDataset):
         rigs: Mapping[str, Sequence[str]] | None = None,
         reference: Reference | None = None,
     ) -> None:
-        self.recording = open_recording(recording) if isinstance(recording, str | os.PathLike) else recording
+        if isinstance(recording, str | os.PathLike):
+            from torchcover.recordings.formats import open_recording  # all formats, for a path only
+
+            recording = open_recording(recording)
+        self.recording = recording
         self.sensors_of_rigs = {name: tuple(of) for name, of in (rigs or self.recording.rigs).items()}
         self._check_sensors()
         if reference is None:
