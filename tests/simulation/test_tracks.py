@@ -5,11 +5,12 @@ import pytest
 
 from torchcover import Scenario
 from torchcover.geometry import euler_from_rotation, rotation_from_euler
+from torchcover.geometry.trajectory import Trajectory, poses_at
+from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.simulation import Pose
 from torchcover.simulation.rays import into_tiles, unit_directions
+from torchcover.simulation.recorded.bodies import read_boxes
 from torchcover.simulation.scene import Scene
-from torchcover.simulation.tracks import read_boxes, read_trajectory
-from torchcover.simulation.trajectory import Trajectory, poses_at
 
 HEADER = "t,x,y,z,roll,pitch,yaw\n"
 BOXES = "t,id,category,x,y,z,length,width,height,yaw\n"

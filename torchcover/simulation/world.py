@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.trajectory import Trajectory
 
 # A day at ten to a second.
 MAX_STEPS = 1_000_000

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from tests.recordings.drives import Drive
+from tests.recordings.layouts import kitti_raw, plain_folder
 from tests.simulation.recorded.drives import EGO, OTHERS, write_argoverse2, write_commonroad, write_csv, write_nuscenes
 from tests.simulation.recorded.test_tracks import FEW, RIG, scenario
 from torchcover import Scenario
@@ -40,6 +42,20 @@ def test_paths_that_are_no_recording(tmp_path):
     fails(scenario(tmp_path), "recorded tracks are a log of Argoverse 2 .*; a table of boxes")
     (tmp_path / "a.txt").write_text("x")
     fails(scenario(tmp_path / "a.txt"), r"a\.txt: recorded tracks are")
+
+
+def test_recordings_without_objects_over_time(tmp_path):
+    drive = Drive()
+    log = kitti_raw(drive, tmp_path / "kitti")
+    fails(scenario(log, scene="a"), "scene: is for tables of nuScenes; a recording of the format kitti_raw has but one")
+    (log / "tracklet_labels.xml").unlink()
+    fails(scenario(log), rf"{log}: no instant of it has labelled objects", BadFileError)
+    folder = plain_folder(drive, tmp_path / "folder")
+    boxes = folder / "boxes" / "f1.csv"
+    boxes.write_text(boxes.read_text().replace(",car,", ",,"))
+    fails(scenario(folder), rf"{folder}: an object of f1 has no id", BadFileError)
+    (folder / "poses.csv").unlink()
+    fails(scenario(folder), rf"{folder}: its vehicle has no poses with times", BadFileError)
 
 
 def test_an_ego_that_is_not_there(tmp_path, table):
@@ -128,7 +144,7 @@ def test_tables_of_nuscenes(tmp_path):
     good = json.loads(annotations.read_text())
     for change, message in (
         ({"size": [0.0, 4.0, 1.0]}, "id a1: a box needs a positive length"),
-        ({"size": [1.8]}, "index 1 is out of bounds|inhomogeneous"),
+        ({"size": [1.8]}, "not enough values to unpack"),
         ({"rotation": [0, 0, 0, 0]}, "quaternion of norm 0"),
         ({"translation": [float("nan"), 0, 0]}, "id a1: .*NaN"),
         ({"instance_token": "nobody"}, "no row has the token 'nobody'"),

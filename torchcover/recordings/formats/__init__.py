@@ -1,9 +1,11 @@
 """The layouts of recordings, by name: a new one is a class and a line here."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
+from torchcover.recordings.formats import argoverse2, commonroad, nuscenes, track_tables
 from torchcover.recordings.formats.argoverse2 import Argoverse2
 from torchcover.recordings.formats.carla import Carla
 from torchcover.recordings.formats.folder import FolderRecording
@@ -11,6 +13,7 @@ from torchcover.recordings.formats.kitti_object import KittiObject
 from torchcover.recordings.formats.kitti_raw import KittiRaw
 from torchcover.recordings.formats.nuscenes import NuScenes
 from torchcover.recordings.formats.ros2 import Ros2
+from torchcover.recordings.objects import Objects, objects_of, only_one_scene
 from torchcover.recordings.recording import Recording
 
 
@@ -66,3 +69,57 @@ def open_recording(path: str | os.PathLike[str], format_name: str | None = None)
             return recording_format(path)
     known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in FORMATS.items())
     raise ValueError(f"{path}: a recording of no known format; known are {known}")
+
+
+class ObjectFormat(NamedTuple):
+    """A format whose objects over time can be read without any scan.
+
+    Args:
+        layout: What it consists of, for messages.
+        recognises: Whether what is at a path that exists is meant to be of it.
+        read: From the path and the name of a scene, or None, to the objects.
+    """
+
+    layout: str
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path, str | None], Objects]
+
+
+OBJECT_FORMATS = (
+    ObjectFormat(
+        "a log of Argoverse 2 (a folder with annotations.feather)", argoverse2.has_objects, argoverse2.read_objects
+    ),
+    ObjectFormat(
+        "tables of nuScenes (a folder with sample_annotation.json)", nuscenes.has_objects, nuscenes.read_objects
+    ),
+    ObjectFormat("a scenario of CommonRoad (.xml)", lambda path: path.suffix == ".xml", commonroad.read_objects),
+    ObjectFormat("a table of boxes (.csv)", lambda path: path.suffix == ".csv", track_tables.read_objects),
+)
+
+
+def read_objects(path: str | os.PathLike[str], scene: str | None = None) -> Objects:
+    """Read the objects of a recording over time, and the drive of its ego.
+
+    Args:
+        path: A log of Argoverse 2, tables of nuScenes, a scenario of CommonRoad, a table of boxes, or any recording
+            with poses, times and boxes.
+        scene: Which of tables that hold several.
+
+    Raises:
+        FileNotFoundError: There is nothing at the path, or a part of it is missing.
+        ValueError: No format that recognises it; what the format itself finds wrong.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder; recorded tracks are needed")
+    for one in OBJECT_FORMATS:
+        if one.recognises(path):
+            return one.read(path, scene)
+    for name, recording_format in FORMATS.items():
+        if recording_format.recognises(path):
+            only_one_scene(scene, f"a recording of the format {name}")
+            return objects_of(recording_format(path))
+    layouts = "; ".join(one.layout for one in OBJECT_FORMATS)
+    raise ValueError(
+        f"{path}: recorded tracks are {layouts}; or a recording with poses and boxes ({', '.join(FORMATS)})"
+    )

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.height_field import Ground, Plain
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.crowd import Walker
@@ -13,7 +14,6 @@ from torchcover.simulation.sumo.pavement import Pavement
 from torchcover.simulation.traffic.attitude import attitude
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet
 from torchcover.simulation.traffic.scenery import PAVEMENT_M
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor
 
 Numbers = NDArray[np.float64]

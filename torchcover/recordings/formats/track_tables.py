@@ -1,4 +1,4 @@
-"""Trajectories and boxes from tables."""
+"""Tables that people write: a trajectory, and boxes of objects over time."""
 
 import csv
 import io
@@ -10,11 +10,8 @@ from numpy.typing import NDArray
 
 from torchcover.files import NpyHeader, check_memory, decode, read_npz, reads
 from torchcover.geometry import check_rigid
-from torchcover.simulation.recorded.track import Track, checked_size, moving
-from torchcover.simulation.recorded.words import CLASSES
-from torchcover.simulation.shapes import Box, Mesh
-from torchcover.simulation.trajectory import Trajectory
-from torchcover.simulation.world import Actor
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings.objects import Objects, Track, checked_size, class_of, moving, only_one_scene
 
 TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")
 BOX_COLUMNS = ("t", "id", "category", "x", "y", "z", "length", "width", "height", "yaw")
@@ -45,32 +42,33 @@ def read_trajectory(path: Path) -> Trajectory:
     if path.suffix not in readers:
         raise ValueError(f"a trajectory is a .csv or .npz file; got {path.suffix or 'no suffix'}")
     trajectory = readers[path.suffix](path)
-    _check_gaps(trajectory.times_s)
+    check_gaps(trajectory.times_s)
     return trajectory
 
 
+def read_objects(path: Path, scene: str | None) -> Objects:
+    """Read a table of boxes, which has no ego of its own; see `read_box_tracks`."""
+    only_one_scene(scene, "a table of boxes")
+    return Objects(read_box_tracks(path))
+
+
 @reads("a file of boxes")
-def read_boxes(path: Path) -> tuple[Actor, ...]:
-    """Read recorded boxes as actors, one for each id: the box of its first size, there between its first and last time.
+def read_box_tracks(path: Path) -> tuple[Track, ...]:
+    """Read recorded boxes, one track for each id: of its first size, there between its first and last time.
 
     Args:
         path: `.csv` with the columns t, id, category, x, y, z, length, width, height, yaw (seconds, metres, degrees; x,
             y, z of the centre of the bottom).
 
     Returns:
-        One actor an id, in the order of their first appearance.
+        In the order of their first appearance; there may be gaps.
 
     Raises:
         FileNotFoundError: No such file.
         IsADirectoryError: A folder.
-        BadFileError: As `read_trajectory`, or a box without volume; the message names the file and the id.
+        BadFileError: Missing columns, what is no number, NaN, times that do not ascend, a box without volume; the
+            message names the file and the id.
     """
-    return tuple(map(_box_actor, _tracks(path)))
-
-
-@reads("a file of boxes")
-def read_box_tracks(path: Path) -> tuple[Track, ...]:
-    """Read recorded boxes as tracks, which may have gaps; else as `read_boxes`."""
     return tuple(_tracks(path))
 
 
@@ -84,7 +82,7 @@ def _tracks(path: Path) -> Iterator[Track]:
         angles_deg = np.column_stack([numbers[:, 7], np.zeros((len(track), 2))])
         trajectory = moving(name, numbers[:, 0], numbers[:, 1:4], angles_deg)
         category = track[0]["category"]
-        yield Track(name, category, CLASSES.get(category.strip().lower()), (length, width, height), trajectory)
+        yield Track(name, category, class_of(category), (length, width, height), trajectory)
 
 
 def _read_csv(path: Path) -> Trajectory:
@@ -140,7 +138,12 @@ def _numbers(rows: Sequence[dict[str, str]], columns: Sequence[str]) -> NDArray[
     return numbers
 
 
-def _check_gaps(times_s: NDArray[np.float64]) -> None:
+def check_gaps(times_s: NDArray[np.float64]) -> None:
+    """Refuse times of which some seem to be missing.
+
+    Raises:
+        ValueError: A step that is many times longer than the usual one.
+    """
     steps = np.diff(times_s)
     if len(steps) and steps.max() > MAX_STEP * np.median(steps):
         at = int(steps.argmax())
@@ -148,16 +151,3 @@ def _check_gaps(times_s: NDArray[np.float64]) -> None:
             f"a gap of {steps[at]:g} s after t = {times_s[at]:g} s, where the usual step is {np.median(steps):g} s; "
             "fill it, or split the file"
         )
-
-
-def _box_actor(track: Track) -> Actor:
-    try:
-        _check_gaps(track.trajectory.times_s)
-    except ValueError as error:
-        raise ValueError(f"id {track.name}: {error}") from error
-    return Actor(track.name, track.category, box_mesh(track.size_m), track.trajectory)
-
-
-def box_mesh(size_m: tuple[float, float, float]) -> Mesh:
-    """A box of a length, width and height that stands on its origin."""
-    return Box(type="box", size_m=size_m).mesh()
