@@ -29,9 +29,9 @@ from torchcover.recordings.formats.carla_files import read_carla_sensors
 from torchcover.recordings.formats.folder_settings import read_folder_settings
 from torchcover.recordings.formats.folder_tables import PoseTable
 from torchcover.recordings.formats.folder_tables import read_boxes as read_labels
+from torchcover.recordings.formats.kitti_raw import read_tracklets
 from torchcover.recordings.formats.ros2 import Ros2
 from torchcover.recordings.formats.track_tables import read_trajectory
-from torchcover.recordings.formats.tracklets import read_tracklets
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.recorded.bodies import read_boxes
 from torchcover.simulation.shapes import MeshFile

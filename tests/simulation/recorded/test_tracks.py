@@ -333,8 +333,15 @@ def test_what_a_run_means_depends_on_what_is_in_the_files(tmp_path):
     folder = write_argoverse2(tmp_path / "log")
     before = scenario(folder).content()
     assert before == scenario(write_argoverse2(tmp_path / "copy")).content()
-    write_argoverse2(folder, OTHERS[:-1])
-    assert before != scenario(folder).content()
+    first = OTHERS[0]
+    for others in (
+        OTHERS[:-1],
+        (first._replace(start_m=(24.0, 0.1)), *OTHERS[1:]),
+        (first._replace(size_m=(4.5, 1.8, 1.6)), *OTHERS[1:]),
+        (first._replace(category="bus"), *OTHERS[1:]),
+    ):
+        assert before != scenario(write_argoverse2(folder, others)).content()
+    assert before != scenario(write_argoverse2(tmp_path / "flat", heights=flat_m)).content()
     assert before != scenario(tmp_path / "copy", begin_s=1.0).content()
 
 

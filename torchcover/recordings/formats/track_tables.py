@@ -1,22 +1,19 @@
 """Tables that people write: a trajectory, and boxes of objects over time."""
 
-import csv
-import io
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import NpyHeader, check_memory, decode, read_npz, reads
+from torchcover.files import NpyHeader, read_npz, reads
 from torchcover.geometry import check_rigid
 from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings.formats.csv_tables import read_csv
 from torchcover.recordings.objects import Objects, Track, checked_size, class_of, moving, only_one_scene
 
 TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")
-BOX_COLUMNS = ("t", "id", "category", "x", "y", "z", "length", "width", "height", "yaw")
-# Text as Python keeps it: a dict of strings for each row.
-_BYTES_PER_CHARACTER = 64
+BOX_COLUMNS = ("t", "x", "y", "z", "length", "width", "height", "yaw")
 # A step this many times longer than the usual one means that poses are missing.
 MAX_STEP = 5.0
 
@@ -73,22 +70,31 @@ def read_box_tracks(path: Path) -> tuple[Track, ...]:
 
 
 def _tracks(path: Path) -> Iterator[Track]:
-    rows: dict[str, list[dict[str, str]]] = {}
-    for row in _rows(path, BOX_COLUMNS):
-        rows.setdefault(row["id"], []).append(row)
-    for name, track in rows.items():
-        numbers = _numbers(track, [column for column in BOX_COLUMNS if column not in ("id", "category")])
+    table = read_csv(path, BOX_COLUMNS, ("id", "category"), None)
+    rows = _columns(table.numbers, BOX_COLUMNS)
+    own: dict[str, list[int]] = {}
+    for row, name in enumerate(table.words["id"]):
+        own.setdefault(name, []).append(row)
+    for name, of in own.items():
+        numbers, category = rows[of], table.words["category"][of[0]]
         length, width, height = checked_size(name, numbers[0, 4:7])
-        angles_deg = np.column_stack([numbers[:, 7], np.zeros((len(track), 2))])
+        angles_deg = np.column_stack([numbers[:, 7], np.zeros((len(of), 2))])
         trajectory = moving(name, numbers[:, 0], numbers[:, 1:4], angles_deg)
-        category = track[0]["category"]
         yield Track(name, category, class_of(category), (length, width, height), trajectory)
 
 
 def _read_csv(path: Path) -> Trajectory:
-    numbers = _numbers(_rows(path, TRAJECTORY_COLUMNS), TRAJECTORY_COLUMNS)
+    numbers = _columns(read_csv(path, TRAJECTORY_COLUMNS, optional=None).numbers, TRAJECTORY_COLUMNS)
     time_s, position_m, (roll, pitch, yaw) = numbers[:, 0], numbers[:, 1:4], numbers[:, 4:].T
     return Trajectory.from_arrays(time_s, position_m, np.stack([yaw, pitch, roll], axis=1))
+
+
+def _columns(numbers: Mapping[str, NDArray[np.float64]], names: Sequence[str]) -> NDArray[np.float64]:
+    """(rows, names) some columns of a table."""
+    rows = np.column_stack([numbers[name] for name in names])
+    if not len(rows):
+        raise ValueError("holds no row")
+    return rows
 
 
 def _read_npz(path: Path) -> Trajectory:
@@ -107,35 +113,6 @@ def _read_npz(path: Path) -> Trajectory:
     if times_s.ndim != 1 or poses.shape != (len(times_s), 4, 4):
         raise ValueError(f"times_s (K,) and world_T_body (K, 4, 4) are needed; got {times_s.shape} and {poses.shape}")
     return Trajectory.from_poses(times_s, np.stack([check_rigid(pose, f"pose {k}") for k, pose in enumerate(poses)]))
-
-
-def _rows(path: Path, columns: Sequence[str]) -> list[dict[str, str]]:
-    check_memory(_BYTES_PER_CHARACTER * path.stat().st_size)
-    reader = csv.DictReader(io.StringIO(decode(path.read_bytes()), newline=""), skipinitialspace=True)
-    names = [name.strip() for name in reader.fieldnames or ()]
-    missing = [column for column in columns if column not in names]
-    if missing:
-        raise ValueError(f"needs the columns {', '.join(columns)}; {', '.join(missing)} missing")
-    reader.fieldnames = names
-    rows: list[dict[str, str]] = []
-    for row in reader:
-        if None in row or None in row.values():
-            raise ValueError(f"line {reader.line_num}: not {len(names)} values, as the header has")
-        rows.append(row)
-    if not rows:
-        raise ValueError("holds no row")
-    return rows
-
-
-def _numbers(rows: Sequence[dict[str, str]], columns: Sequence[str]) -> NDArray[np.float64]:
-    numbers = np.empty((len(rows), len(columns)))
-    for line, row in enumerate(rows, 2):
-        for k, column in enumerate(columns):
-            try:
-                numbers[line - 2, k] = float(row[column])
-            except (TypeError, ValueError):
-                raise ValueError(f"line {line}: {column} is {row[column]!r}, not a number") from None
-    return numbers
 
 
 def check_gaps(times_s: NDArray[np.float64]) -> None:
