@@ -35,10 +35,10 @@ from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.recorded.bodies import read_boxes
 from torchcover.simulation.shapes import MeshFile
-from torchcover.simulation.sumo.floating import Window, read_floating
+from torchcover.simulation.sumo.crowd import read_types
+from torchcover.simulation.sumo.floating import TimeWindow, read_floating
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.simulating import from_opendrive
-from torchcover.simulation.sumo.types import read_types
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ Tr_velo_to_cam: 0 -1 0 0.01 0 0 -1 -0.07 1 0 0 -0.27
 POSES = b"""sensor:
   vehicle_T_sensor: [[1, 0, 0, -0.52], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]]
 vehicle: {lower_m: [-2.4, -0.9, 0.05], upper_m: [2.4, 0.9, 1.6]}
-reference: {weight_kind: m2}
+reference: {square_metres: true}
 rigs:
   roof: {flip_y: true, min_range_m: 0.5, vehicle_T_sensor: [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 2.0], [0, 0, 0, 1]]}
 """
@@ -227,7 +227,7 @@ def track_files(folder):
         yield Kind(f"tracks_{path.name}", path.read_bytes(), read_objects)
     yield Kind("town.net.xml", write_net(Path(folder) / "a.net.xml", street()).read_bytes(), read_network)
     driven = fcd(together(drive(until=2.0), drive("b", start=90.0, until=2.0))).encode()
-    yield Kind("fcd.xml", driven, lambda path: read_floating(path, Window(0.0, 1.0)))
+    yield Kind("fcd.xml", driven, lambda path: read_floating(path, TimeWindow(0.0, 1.0)))
     yield Kind("town.rou.xml", ROUTES, read_types)
     yield Kind("road.xodr", XODR.encode(), lambda path: from_opendrive(path, Path(folder)))
 

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.coverage import Coverage, Quantity, Region
-from torchcover.coverage.blocks import MIN_BLOCKS
-from torchcover.coverage.estimate import area_in_blocks
+from torchcover.coverage import Coverage, Region
+from torchcover.coverage.measures import area_in_blocks
+from torchcover.estimation import MIN_BLOCKS, Quantity
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
 from torchcover.frames import BadFrameError, Frame
@@ -78,7 +78,7 @@ def metrics_of(task: Task, settings: Settings) -> OtherMetrics:
             ego=ego,
             grid=task.asked.grid,
             regions=task.asked.regions,
-            square_metres=task.frames.weight_kind == "m2",
+            square_metres=task.frames.square_metres,
             threshold_m=threshold_m,
             sights=sights,
             sync_on_compute=False,
@@ -93,7 +93,7 @@ def _lacking(task: Task) -> frozenset[Need]:
     first = None if isinstance(task.frames, SimulatedFrames) else _first_frame(task)
     there: dict[Need, bool] = {
         "sensors": all(task.sensors.get(rig) for rig in task.rigs),
-        "m2": task.frames.weight_kind == "m2",
+        "m2": task.frames.square_metres,
         "boxes": first is None or first.boxes is not None,
         "sensor_points": first is None or all(rig in (first.sensor_points or {}) for rig in task.rigs),
         "tags": False,
@@ -177,16 +177,16 @@ def _own(coverages: Sequence[Coverage], region: Region, height: str, which: int,
 
 def _own_number(coverage: Coverage, region: Region, height: str, quantity: Quantity) -> PublishedNumber:
     (summary,) = (row for row in coverage.summary([region]) if row.height == height)
-    value, error = summary.numbers[quantity.key][:2]
+    number = summary.numbers[quantity.key]
     return PublishedNumber(
         f"{quantity.key} {region.name} {height}",
-        value,
+        number.value,
         quantity.unit,
         not quantity.lower_is_better,
         {"measure": summary.measure, "cell_m": coverage.grid.cell},
-        0 if math.isnan(value) else summary.known_cells,
+        0 if math.isnan(number.value) else summary.known_cells,
         "known cells",
-        error,
+        number.error,
     )
 
 

@@ -8,8 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcover.coverage.blocks import MIN_BLOCKS
-from torchcover.coverage.errors import ROUND_OFF, jackknife_error
+from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, jackknife_error
 from torchcover.frames import Frame
 from torchcover.published.number import PublishedNumber
 from torchcover.published.world_blocks import WorldBlocks
@@ -63,7 +62,7 @@ class WorldRatios(WorldBlocks):
 
     def _add_frame(self, frame: Frame) -> None:
         base, sums, counts = self._of_frame(frame)  # before anything is added
-        block = self._block_of(frame)
+        block = self._block_of(frame.place_in_time)
         self.base[block] += base.to(self.base)
         self.sums[block] += sums.to(self.sums)
         self.counts += counts.to(self.counts)
