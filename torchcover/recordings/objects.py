@@ -152,16 +152,6 @@ def moving(name: str, times_s: Matrix, places_m: Matrix, angles_deg: Matrix) -> 
         raise ValueError(f"id {name}: {error}") from error
 
 
-def only_one_scene(scene: str | None, what: str) -> None:
-    """Refuse the name of a scene where there is but one.
-
-    Raises:
-        ValueError: One was given.
-    """
-    if scene is not None:
-        raise ValueError(f"scene: is for tables of nuScenes; {what} has but one; leave it out")
-
-
 def objects_of(recording: Recording) -> Objects:
     """The labelled objects of a recording, and the drive of its vehicle, in the world of its poses.
 

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from torchcover.recordings.formats import argoverse2, commonroad, nuscenes, track_tables
+from torchcover.recordings.formats import argoverse2, commonroad, nuscenes
 from torchcover.recordings.formats.argoverse2 import Argoverse2
 from torchcover.recordings.formats.carla import Carla
 from torchcover.recordings.formats.folder import FolderRecording
@@ -13,7 +13,8 @@ from torchcover.recordings.formats.kitti_object import KittiObject
 from torchcover.recordings.formats.kitti_raw import KittiRaw
 from torchcover.recordings.formats.nuscenes import NuScenes
 from torchcover.recordings.formats.ros2 import Ros2
-from torchcover.recordings.objects import Objects, objects_of, only_one_scene
+from torchcover.recordings.formats.track_tables import read_box_tracks
+from torchcover.recordings.objects import Objects, objects_of
 from torchcover.recordings.recording import Recording
 
 
@@ -75,26 +76,27 @@ class ObjectFormat(NamedTuple):
     """A format whose objects over time can be read without any scan.
 
     Args:
-        layout: What it consists of, for messages.
         recognises: Whether what is at a path that exists is meant to be of it.
-        read: From the path and the name of a scene, or None, to the objects.
+        read: From the path to the objects.
     """
 
-    layout: str
     recognises: Callable[[Path], bool]
-    read: Callable[[Path, str | None], Objects]
+    read: Callable[[Path], Objects]
 
 
-OBJECT_FORMATS = (
-    ObjectFormat(
-        "a log of Argoverse 2 (a folder with annotations.feather)", argoverse2.has_objects, argoverse2.read_objects
+# By what it consists of, for messages.
+OBJECT_FORMATS = {
+    "tables of nuScenes (a folder with sample_annotation.json)": ObjectFormat(
+        nuscenes.has_objects, nuscenes.read_objects
     ),
-    ObjectFormat(
-        "tables of nuScenes (a folder with sample_annotation.json)", nuscenes.has_objects, nuscenes.read_objects
+    "a log of Argoverse 2 (a folder with annotations.feather)": ObjectFormat(
+        argoverse2.has_objects, argoverse2.read_objects
     ),
-    ObjectFormat("a scenario of CommonRoad (.xml)", lambda path: path.suffix == ".xml", commonroad.read_objects),
-    ObjectFormat("a table of boxes (.csv)", lambda path: path.suffix == ".csv", track_tables.read_objects),
-)
+    "a scenario of CommonRoad (.xml)": ObjectFormat(lambda path: path.suffix == ".xml", commonroad.read_objects),
+    "a table of boxes (.csv)": ObjectFormat(
+        lambda path: path.suffix == ".csv", lambda path: Objects(read_box_tracks(path))
+    ),
+}
 
 
 def read_objects(path: str | os.PathLike[str], scene: str | None = None) -> Objects:
@@ -112,14 +114,17 @@ def read_objects(path: str | os.PathLike[str], scene: str | None = None) -> Obje
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder; recorded tracks are needed")
-    for one in OBJECT_FORMATS:
+    if scene is not None:
+        if not nuscenes.has_objects(path):
+            raise ValueError(f"{path}: scene: is for tables of nuScenes; leave it out")
+        return nuscenes.read_objects(path, scene)
+    for one in OBJECT_FORMATS.values():
         if one.recognises(path):
-            return one.read(path, scene)
-    for name, recording_format in FORMATS.items():
+            return one.read(path)
+    for recording_format in FORMATS.values():
         if recording_format.recognises(path):
-            only_one_scene(scene, f"a recording of the format {name}")
             return objects_of(recording_format(path))
-    layouts = "; ".join(one.layout for one in OBJECT_FORMATS)
     raise ValueError(
-        f"{path}: recorded tracks are {layouts}; or a recording with poses and boxes ({', '.join(FORMATS)})"
+        f"{path}: recorded tracks are {'; '.join(OBJECT_FORMATS)}; or a recording with poses and boxes "
+        f"({', '.join(FORMATS)})"
     )

@@ -15,7 +15,7 @@ from torchcover.files import naming, read_feather
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.recordings.objects import Ego, Objects, only_one_scene, track_of
+from torchcover.recordings.objects import Ego, Objects, track_of
 from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
 from torchcover.recordings.seen import Seen, SeenObjects, by_name
 
@@ -167,19 +167,14 @@ def has_objects(path: Path) -> bool:
     return any((path / name).exists() for name in ANNOTATIONS)
 
 
-def read_objects(path: Path, scene: str | None) -> Objects:
+def read_objects(path: Path) -> Objects:
     """Read the cuboids of a log and the drive of its ego, at times after the first pose.
-
-    Args:
-        path: Its folder.
-        scene: None: a log is one.
 
     Raises:
         BadFileError: Tables of another content.
         FileNotFoundError: No poses.
         ImportError: pyarrow is not installed.
     """
-    only_one_scene(scene, "a log of Argoverse 2")
     annotations = next(path / name for name in ANNOTATIONS if (path / name).exists())
     cuboids, poses = read_feather(annotations, CUBOIDS), read_feather(path / POSES, ("timestamp_ns", *POSE))
     with naming(path / POSES, "poses of Argoverse 2"):

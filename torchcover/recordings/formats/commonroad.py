@@ -10,28 +10,19 @@ from torchcover.files import parse_xml, reads
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.recordings.objects import Ego, Objects, Track, checked_size, class_of, moving, only_one_scene
+from torchcover.recordings.objects import Ego, Objects, Track, checked_size, class_of, moving
 
 OBSTACLES = ("obstacle", "dynamicObstacle", "staticObstacle")
 
 
-def read_objects(path: Path, scene: str | None) -> Objects:
+@reads("a scenario of CommonRoad")
+def read_objects(path: Path) -> Objects:
     """Read the obstacles and planning problems of a file.
-
-    Args:
-        path: It.
-        scene: None: a file is one.
 
     Raises:
         BadFileError: Another content.
         FileNotFoundError: No such file.
     """
-    only_one_scene(scene, "a scenario of CommonRoad")
-    return _read(path)
-
-
-@reads("a scenario of CommonRoad")
-def _read(path: Path) -> Objects:
     root = parse_xml(path)
     if root.tag != "commonRoad":
         raise ValueError(f"<commonRoad> is needed as its root; got <{root.tag[:40]}>")

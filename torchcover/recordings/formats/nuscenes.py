@@ -168,7 +168,7 @@ def has_objects(path: Path) -> bool:
     return path.is_dir() and len(_tables_with("sample_annotation", path)) == 1
 
 
-def read_objects(path: Path, scene: str | None) -> Objects:
+def read_objects(path: Path, scene: str | None = None) -> Objects:
     """Read the annotations of one scene and the drive of its ego, at times after its first sample.
 
     Args:

@@ -10,7 +10,7 @@ from torchcover.files import NpyHeader, read_npz, reads
 from torchcover.geometry import check_rigid
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats.csv_tables import read_csv
-from torchcover.recordings.objects import Objects, Track, checked_size, class_of, moving, only_one_scene
+from torchcover.recordings.objects import Track, checked_size, class_of, moving
 
 TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")
 BOX_COLUMNS = ("t", "x", "y", "z", "length", "width", "height", "yaw")
@@ -41,12 +41,6 @@ def read_trajectory(path: Path) -> Trajectory:
     trajectory = readers[path.suffix](path)
     check_gaps(trajectory.times_s)
     return trajectory
-
-
-def read_objects(path: Path, scene: str | None) -> Objects:
-    """Read a table of boxes, which has no ego of its own; see `read_box_tracks`."""
-    only_one_scene(scene, "a table of boxes")
-    return Objects(read_box_tracks(path))
 
 
 @reads("a file of boxes")
