@@ -29,6 +29,7 @@ ROOMS = (
 # Where the classes of documents are defined.
 DOCUMENTS = (
     "torchcover.simulation",
+    "torchcover.recordings",
     "torchcover.data",
     "torchcover.targets",
     "torchcover.coverage",

@@ -81,7 +81,7 @@ class Ego(NamedTuple):
     size_m: tuple[float, float, float] | None = None
 
 
-class Objects(NamedTuple):
+class RecordedObjects(NamedTuple):
     """Who was recorded, at times of one clock.
 
     Args:
@@ -152,7 +152,7 @@ def moving(name: str, times_s: Matrix, places_m: Matrix, angles_deg: Matrix) -> 
         raise ValueError(f"id {name}: {error}") from error
 
 
-def objects_of(recording: Recording) -> Objects:
+def objects_of(recording: Recording) -> RecordedObjects:
     """The labelled objects of a recording, and the drive of its vehicle, in the world of its poses.
 
     Raises:
@@ -168,7 +168,7 @@ def objects_of(recording: Recording) -> Objects:
         tracks = tuple(track_of(of, class_of(of[0].category)) for of in seen.values())
     body = recording.body
     size_m = None if body is None else (*body.size_m[:2], body.upper_m[2])
-    return Objects(tracks, (Ego("ego", times_s, world_T_vehicle, np.eye(4), size_m),))
+    return RecordedObjects(tracks, (Ego("ego", times_s, world_T_vehicle, np.eye(4), size_m),))
 
 
 def class_of(category: str) -> str | None:

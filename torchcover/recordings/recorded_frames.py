@@ -23,7 +23,7 @@ RESULTS = frozenset({".lock", "summary.json", "checkpoint.npz"})
 
 
 class RecordedFrames(FrameDataset):
-    """What the sensors of a recording saw beside a reference, instant by instant. A map-style torch Dataset.
+    """What the sensors of a recording saw compared with a reference, instant by instant. A map-style torch Dataset.
 
     Points that are not finite, never came back (they lie in the sensor) or lie on the vehicle itself are in neither
     cloud; `Frame.counts` says how many (`sensor_nonfinite`, `reference_no_return`, ...). An empty sensor cloud is a
@@ -186,7 +186,7 @@ class RecordedFrames(FrameDataset):
 
 
 def _stamps(place: Path) -> Iterator[tuple[str, int, int]]:
-    """Path, size and time of change of every file; those of results that somebody keeps beside it are no part of it."""
+    """Path, size and time of change of every file; those of results that are kept in its folder are no part of it."""
     if place.is_file():
         yield place.name, place.stat().st_size, place.stat().st_mtime_ns
     for folder, folders, names in os.walk(place):

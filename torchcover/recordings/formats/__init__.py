@@ -14,7 +14,7 @@ from torchcover.recordings.formats.kitti_raw import KittiRaw
 from torchcover.recordings.formats.nuscenes import NuScenes
 from torchcover.recordings.formats.ros2 import Ros2
 from torchcover.recordings.formats.track_tables import read_box_tracks
-from torchcover.recordings.objects import Objects, objects_of
+from torchcover.recordings.objects import RecordedObjects, objects_of
 from torchcover.recordings.recording import Recording
 
 
@@ -81,7 +81,7 @@ class ObjectFormat(NamedTuple):
     """
 
     recognises: Callable[[Path], bool]
-    read: Callable[[Path], Objects]
+    read: Callable[[Path], RecordedObjects]
 
 
 # By what it consists of, for messages.
@@ -94,12 +94,12 @@ OBJECT_FORMATS = {
     ),
     "a scenario of CommonRoad (.xml)": ObjectFormat(lambda path: path.suffix == ".xml", commonroad.read_objects),
     "a table of boxes (.csv)": ObjectFormat(
-        lambda path: path.suffix == ".csv", lambda path: Objects(read_box_tracks(path))
+        lambda path: path.suffix == ".csv", lambda path: RecordedObjects(read_box_tracks(path))
     ),
 }
 
 
-def read_objects(path: str | os.PathLike[str], scene: str | None = None) -> Objects:
+def read_objects(path: str | os.PathLike[str], scene: str | None = None) -> RecordedObjects:
     """Read the objects of a recording over time, and the drive of its ego.
 
     Args:

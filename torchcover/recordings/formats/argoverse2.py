@@ -15,7 +15,7 @@ from torchcover.files import naming, read_feather
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.recordings.objects import Ego, Objects, track_of
+from torchcover.recordings.objects import Ego, RecordedObjects, track_of
 from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
 from torchcover.recordings.seen import Seen, SeenObjects, by_name
 
@@ -167,7 +167,7 @@ def has_objects(path: Path) -> bool:
     return any((path / name).exists() for name in ANNOTATIONS)
 
 
-def read_objects(path: Path) -> Objects:
+def read_objects(path: Path) -> RecordedObjects:
     """Read the cuboids of a log and the drive of its ego, at times after the first pose.
 
     Raises:
@@ -199,7 +199,7 @@ def read_objects(path: Path) -> Objects:
             for seen in by_name(_seen(cuboids, origin_ns)).values()
             if seen[0].category != EGO_CATEGORY
         )
-    return Objects(tracks, (Ego("ego", drive.times_s, world_T_driven, invert(vehicle_T_ego), SIZE_M),))
+    return RecordedObjects(tracks, (Ego("ego", drive.times_s, world_T_driven, invert(vehicle_T_ego), SIZE_M),))
 
 
 def _seen(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> list[Seen]:

@@ -10,13 +10,13 @@ from torchcover.files import parse_xml, reads
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.recordings.objects import Ego, Objects, Track, checked_size, class_of, moving
+from torchcover.recordings.objects import Ego, RecordedObjects, Track, checked_size, class_of, moving
 
 OBSTACLES = ("obstacle", "dynamicObstacle", "staticObstacle")
 
 
 @reads("a scenario of CommonRoad")
-def read_objects(path: Path) -> Objects:
+def read_objects(path: Path) -> RecordedObjects:
     """Read the obstacles and planning problems of a file.
 
     Raises:
@@ -33,7 +33,7 @@ def read_objects(path: Path) -> Objects:
     egos = tuple(_ego(problem, step_s) for problem in root.iter("planningProblem"))
     if not found:
         raise ValueError("no obstacle in it")
-    return Objects(tuple(found), egos)
+    return RecordedObjects(tuple(found), egos)
 
 
 def _ego(problem: Element, step_s: float) -> Ego:

@@ -17,7 +17,7 @@ from torchcover.files import naming, read_json_table
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.readers import read_cloud
-from torchcover.recordings.objects import Ego, Objects, track_of
+from torchcover.recordings.objects import Ego, RecordedObjects, track_of
 from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
 from torchcover.recordings.seen import Seen, SeenObjects, by_name
 
@@ -168,7 +168,7 @@ def has_objects(path: Path) -> bool:
     return path.is_dir() and len(_tables_with("sample_annotation", path)) == 1
 
 
-def read_objects(path: Path, scene: str | None = None) -> Objects:
+def read_objects(path: Path, scene: str | None = None) -> RecordedObjects:
     """Read the annotations of one scene and the drive of its ego, at times after its first sample.
 
     Args:
@@ -192,7 +192,7 @@ def read_objects(path: Path, scene: str | None = None) -> Objects:
         ego_s = np.array([(row["timestamp"] - first_us) * 1e-6 for row in driven])
         world_T_ego = np.stack([pose_of(row) for row in driven])
         tracks = tuple(track_of(one, _class(one[0].category)) for one in seen.values())
-    return Objects(tracks, (Ego("ego", ego_s, world_T_ego, invert(vehicle_T_ego), SIZE_M),))
+    return RecordedObjects(tracks, (Ego("ego", ego_s, world_T_ego, invert(vehicle_T_ego), SIZE_M),))
 
 
 def _seen(tables: Path, times_s: Mapping[str, float]) -> list[Seen]:

@@ -6,10 +6,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import NpyHeader, read_npz, reads
+from torchcover.files import NpyHeader, read_csv, read_npz, reads
 from torchcover.geometry import check_rigid
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.recordings.formats.csv_tables import read_csv
 from torchcover.recordings.objects import Track, checked_size, class_of, moving
 
 TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")

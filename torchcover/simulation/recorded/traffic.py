@@ -13,11 +13,11 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats import read_objects
 from torchcover.recordings.formats.track_tables import read_trajectory
-from torchcover.recordings.objects import Ego, Objects
+from torchcover.recordings.objects import Ego, RecordedObjects
 from torchcover.simulation.documents import PathBeside, Pose, builtin_hashes
 from torchcover.simulation.recorded.bodies import Bodies
 from torchcover.simulation.recorded.ground import ground_below, stood_on
-from torchcover.simulation.recorded.run import Run, cast_of, pieces, poses_at_all, run_of
+from torchcover.simulation.recorded.run import Excerpt, cast_of, excerpt_of, pieces, poses_at_all
 from torchcover.simulation.shapes import Mesh, MeshFile
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import EGO, load_bodies
@@ -102,12 +102,12 @@ class RecordedTraffic(Traffic):
         return World((ground,), driver, tuple(others), self.time_step_s, run.duration_s)
 
     @cached_property
-    def _objects(self) -> Objects:
+    def _objects(self) -> RecordedObjects:
         """Who was recorded; read when first needed."""
         return read_objects(self.path, self.scene)
 
     @cached_property
-    def _run(self) -> Run:
+    def _run(self) -> Excerpt:
         """What of the recording is shown."""
         recording = self._objects
         if self.ego_trajectory is not None:
@@ -115,10 +115,10 @@ class RecordedTraffic(Traffic):
                 raise ValueError("ego_id and ego_trajectory exclude each other: the ego is one of them")
             drive = read_trajectory(self.ego_trajectory)
             driven = Ego(self.ego_trajectory.name, drive.times_s, poses_at_all(drive), np.eye(4))
-            recording = Objects(recording.tracks, (driven,))
+            recording = RecordedObjects(recording.tracks, (driven,))
         frame = None if self.ego_T_vehicle is None else self.ego_T_vehicle.matrix()
         try:
-            return run_of(cast_of(recording, self.ego_id, frame), self.begin_s, self.duration_s, self.max_gap_s)
+            return excerpt_of(cast_of(recording, self.ego_id, frame), self.begin_s, self.duration_s, self.max_gap_s)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from error
 

@@ -8,13 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import check_memory, decode, reads
+from torchcover.files.bad_file import reads
+from torchcover.files.budget import check_memory
+from torchcover.files.text import decode
 
 # Of a word of a row, once it is an object of Python, for each byte of the file.
 BYTES_PER_BYTE = 20
 
 
-class Table(NamedTuple):
+class CsvTable(NamedTuple):
     """Columns of a table.
 
     Args:
@@ -29,7 +31,7 @@ class Table(NamedTuple):
 @reads("a table in CSV")
 def read_csv(
     path: Path, numbers: Sequence[str], words: Sequence[str] = (), optional: Sequence[str] | None = ()
-) -> Table:
+) -> CsvTable:
     """Read a table whose first line names its columns, in any order.
 
     Args:
@@ -54,7 +56,7 @@ def read_csv(
         lines.append(line)
         table.append(row)
     columns = dict(zip(names, zip(*table, strict=True) if table else [()] * len(names), strict=True))
-    return Table(
+    return CsvTable(
         {name: _finite(name, columns[name], lines) for name in (*numbers, *(optional or ())) if name in columns},
         {name: [word.strip() for word in columns[name]] for name in words},
     )
