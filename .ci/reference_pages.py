@@ -30,7 +30,6 @@ ROOMS = (
 DOCUMENTS = (
     "torchcover.simulation",
     "torchcover.recordings",
-    "torchcover.data",
     "torchcover.targets",
     "torchcover.coverage",
     "torchcover.placement",
