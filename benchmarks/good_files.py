@@ -22,7 +22,7 @@ from tests.simulation.sumo.towns import XODR, drive, fcd, street, together, writ
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
-from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
+from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
 from torchcover.files import read_feather, read_json_table
 from torchcover.recordings.formats import kitti_files, read_objects
 from torchcover.recordings.formats.carla_files import read_carla_sensors
