@@ -14,7 +14,7 @@ from torchcover.neighbors import check_cloud
 from torchcover.published.frame_metric import FrameMetric
 from torchcover.published.number import PublishedNumber
 from torchcover.published.region_voxels import check_sensors, ray_count
-from torchcover.simulation import Sensor
+from torchcover.simulation import Draws, RayHits, Sensor
 
 DISTANCES_M = (10.0, 20.0, 30.0, 40.0, 50.0)
 
@@ -131,10 +131,13 @@ class Lob(FrameMetric):
         for sensor in self.sensors:
             vehicle_T_sensor = sensor.mount.matrix()
             directions = sensor.directions().reshape(3, -1)
-            way = vehicle_T_sensor[:3, :3] @ directions[:, ~np.isnan(directions[0])]
+            pixel_of_ray = np.flatnonzero(~np.isnan(directions[0]))
+            way = vehicle_T_sensor[:3, :3] @ directions[:, pixel_of_ray]
             origin_m = vehicle_T_sensor[:3, 3]
             range_m = self._ranges_m(origin_m, way, distance_m)
-            measured = (range_m >= sensor.min_range_m) & (range_m <= sensor.max_range_m)
+            measured = np.flatnonzero(range_m <= sensor.max_range_m)
+            gives, _ = sensor.measure(RayHits(measured, range_m[measured], pixel_of_ray), Draws(None))
+            measured = measured if gives is None else measured[gives]
             place_m = origin_m[:, None] + range_m[measured] * way[:, measured]
             along = place_m[1] / around_m + 0.5
             if self.width_m is None:
