@@ -19,7 +19,7 @@ from torchcover.evaluation.pipeline import Run, observe
 from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.result_files import claimed
-from torchcover.evaluation.sensor_drawings import check_drawable
+from torchcover.evaluation.result_page import check_drawable
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import TargetWatch
 from torchcover.evaluation.task import CALLER, Task

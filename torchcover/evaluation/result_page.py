@@ -1,46 +1,25 @@
-"""The page of a result: its tables, maps and rigs, under which settings, and where they come from."""
+"""The parts of the page of a result: its tables, rigs as they are drawn and written, under which settings."""
 
 import platform
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
 from torchcover.coverage import Region
 from torchcover.evaluation.omissions import Omission
-from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.files import as_yaml
-from torchcover.published.tables import page_tables as metric_tables
-from torchcover.report import BOLD_MARKS, PLACE_HEADINGS, Line, Page, PageRig, PageTable, Words, maps_of, parts_of
+from torchcover.report import BOLD_MARKS, PLACE_HEADINGS, Line, PageTable, SensorView, Words, parts_of
 from torchcover.report.remarks import marks_on, notes_on
 from torchcover.report.table import CoverageTable
-from torchcover.simulation import Sensor
+from torchcover.simulation import Sensor, vertical_fov_deg
 
-if TYPE_CHECKING:
-    from torchcover.evaluation.result import Result
-
-# What decides about the numbers, beside this package.
+# What decides about the numbers, with this package.
 PACKAGES = ("torch", "numpy", "embreex", "trimesh", "pykdtree", "kornia")
 OF_THE_RUN = ("torchcover", "seconds", "complete", "device", "skipped_frames")
 ELSEWHERE = ("rows", "metrics", "counts", "frame_counts", "left_out", "rig", "rigs")
-
-
-def page_of(result: "Result") -> Page:
-    """All that a result knows, on one page."""
-    rigs = list(result.coverages)
-    return Page(
-        title=" against ".join(rigs) if len(rigs) == 2 else ", ".join(rigs),
-        lead=f"Blind spots and coverage in {_place(result)}, measured by torchcover.",
-        tables=[*page_tables(result.table), *(metric_tables(result.metrics) if result.metrics else [])],
-        maps=list(maps_of(result.coverages)),
-        rigs=[_rig(name, result.sensors.get(name, ())) for name in rigs],
-        ego_outline_m=result.ego_outline_m,
-        outlines=[Line(region.name, _corners(region)) for region in result.regions],
-        facts=_facts(result),
-        more_tables=[_left_out(result.left_out)] if result.left_out else [],
-    )
 
 
 def page_tables(table: CoverageTable) -> list[PageTable]:
@@ -51,6 +30,34 @@ def page_tables(table: CoverageTable) -> list[PageTable]:
     return [*parts[:-1], PageTable(last.title, last.headings, last.rows, last.words_first, [*marks, *notes_on(table)])]
 
 
+def sensor_views(sensors: Sequence[Sensor]) -> list[SensorView]:
+    """Where sensors are and what they see."""
+    return [
+        SensorView(
+            name=sensor.name,
+            vehicle_T_sensor=sensor.mount.matrix(),
+            horizontal_fov_deg=sensor.horizontal_fov_deg,
+            vertical_fov_deg=vertical_fov_deg(sensor),
+            range_m=sensor.max_range_m,
+        )
+        for sensor in sensors
+    ]
+
+
+def check_drawable(sensors: Sequence[Sensor]) -> None:
+    """Find out before a run, not after it, whether its maps can show the sensors.
+
+    Raises:
+        ValueError: A sensor none of whose rays in the middle row is one, so that it is unknown how wide it sees.
+    """
+    for sensor in sensors:
+        if not 0 < sensor.horizontal_fov_deg <= 360:
+            raise ValueError(
+                f"sensor {sensor.name!r}: its rays span {sensor.horizontal_fov_deg:g} degrees in the middle row; above "
+                "0 are needed, so check its lens and its principal point"
+            )
+
+
 def rig_document(name: str, sensors: Sequence[Sensor]) -> str:
     """A rig as YAML that `Rig.load` reads; empty if its sensors are not known, or are not of ours."""
     known = [sensor.model_dump(mode="json", exclude_unset=True) for sensor in sensors if isinstance(sensor, BaseModel)]
@@ -59,13 +66,9 @@ def rig_document(name: str, sensors: Sequence[Sensor]) -> str:
     return as_yaml({"name": name, "sensors": known})
 
 
-def _rig(name: str, sensors: Sequence[Sensor]) -> PageRig:
-    return PageRig(name, sensor_views(sensors), rig_document(name, sensors))
-
-
-def _place(result: "Result") -> str:
-    place = result.source.get("frames") or result.source.get("scenario")
-    return f"{place}, on {result.vehicle}" if result.vehicle else str(place or "runs that were saved")
+def region_line(region: Region) -> Line:
+    """Its outline on the maps."""
+    return Line(region.name, _corners(region))
 
 
 def _corners(region: Region) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -75,13 +78,18 @@ def _corners(region: Region) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.array([[left, low], [right, low], [right, high], [left, high]])
 
 
-def _facts(result: "Result") -> dict[str, dict[str, str]]:
-    record = result.record
+def facts_of(record: Mapping[str, Any], rigs: Mapping[str, str | None], steps: int) -> dict[str, dict[str, str]]:
+    """Under which settings, and how the run went.
+
+    Args:
+        record: What stands in `summary.json`.
+        rigs: What the user called each rig, by its name.
+        steps: Steps that were measured.
+    """
     settings = {name: value for name, value in record.items() if name not in (*OF_THE_RUN, *ELSEWHERE)}
-    steps = {"steps": next(iter(result.coverages.values())).counts["steps"]}
     run = {name: record[name] for name in OF_THE_RUN} | {"python": platform.python_version()} | _versions()
-    rigs = {f"rig {name}": str(given) for name, given in result.rigs.items() if given is not None}
-    return {"Settings": rigs | words_of(steps | settings), "Run": words_of(run)}
+    named = {f"rig {name}": str(given) for name, given in rigs.items() if given is not None}
+    return {"Settings": named | words_of({"steps": steps} | settings), "Run": words_of(run)}
 
 
 def _versions() -> dict[str, str]:
@@ -95,7 +103,7 @@ def _versions() -> dict[str, str]:
 
 
 def words_of(facts: Mapping[str, Any]) -> dict[str, str]:
-    """Facts of a record as a page says them; without those that nobody knows."""
+    """Facts of a record as a page says them; without those that are unknown."""
     return {name.replace("_", " "): _value(value) for name, value in facts.items() if value not in (None, [], {})}
 
 
@@ -113,7 +121,8 @@ def _value(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _left_out(omissions: Sequence[Omission]) -> PageTable:
+def left_out_table(omissions: Sequence[Omission]) -> PageTable:
+    """What a run left out."""
     rows = [tuple(map(Words, _omission(one))) for one in omissions]
     return PageTable("Left out, for this run did not need it", ("what", "count", "of", "share"), rows)
 

@@ -13,8 +13,7 @@ from torch.utils.data import Dataset
 from torchcover.frames.frame import Frame
 
 if TYPE_CHECKING:  # what they are is no matter of frames; who draws or measures them knows
-    from torchcover.simulation import Sensor
-    from torchcover.simulation.shapes import Mesh
+    from torchcover.simulation import Mesh, Sensor
 
 ValueT = TypeVar("ValueT")
 

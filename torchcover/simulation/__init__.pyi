@@ -18,9 +18,9 @@ from .reference_sensor import ReferenceScan as ReferenceScan
 from .reference_sensor import ReferenceSensor as ReferenceSensor
 from .reference_sensor import Surroundings as Surroundings
 from .reference_sensor import position_in_shell as position_in_shell
+from .regions_of_interest import Asked as Asked
 from .regions_of_interest import GRID_X_M as GRID_X_M
 from .regions_of_interest import GRID_Y_M as GRID_Y_M
-from .regions_of_interest import Asked as Asked
 from .regions_of_interest import RegionsOfInterest as RegionsOfInterest
 from .rig import Rig as Rig
 from .rig import with_ego as with_ego
@@ -30,6 +30,7 @@ from .sensor import RayHits as RayHits
 from .sensor import Returns as Returns
 from .sensor import Sensor as Sensor
 from .sensor import vertical_fov_deg as vertical_fov_deg
+from .shapes import Mesh as Mesh
 from .simulated_frames import DEFAULT_REFERENCE as DEFAULT_REFERENCE
 from .simulated_frames import SimulatedFrames as SimulatedFrames
 from .simulated_frames import reference_called as reference_called
