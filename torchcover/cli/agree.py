@@ -22,7 +22,7 @@ def agree(
 ) -> None:
     """Rank published placements by metrics, and by the detectors that were trained on them; say what that is worth."""
     from torchcover.cli.printing import print_agreement
-    from torchcover.evaluation import agree, claimed, rank_count, save_agreement
+    from torchcover.evaluation import agree, claimed, rank_count
     from torchcover.published import metric_names
 
     if rank_count() > 1:
@@ -38,5 +38,5 @@ def agree(
             workers=workers,
             progress=True,
         )
-        files = save_agreement(study, out)
+        files = study.save(out)
     print_agreement(study, files, out)

@@ -16,9 +16,9 @@ from torchcover.evaluation.other_metrics import drawn_worlds
 from torchcover.evaluation.rig_names import AnyRig, loaded
 from torchcover.evaluation.task import AnyScenario
 from torchcover.published import PUBLISHED, Candidate
-from torchcover.published.baselines import mean_height_m, rays
 from torchcover.published.comparison import Series
 from torchcover.published.ranks import LEAST, Array
+from torchcover.simulation import Rig
 
 THRESHOLD_M = 0.4
 CELL_M = 1.0
@@ -123,8 +123,8 @@ def score_placements(
         candidates=(
             *_own([result.coverages[rig] for rig in rigs], region, seed),
             *_of_others(result.metrics.series),
-            Candidate("mean mounting height", "baseline", np.array([mean_height_m(rig) for rig in carried.values()])),
-            Candidate("rays", "baseline", np.array([float(rays(rig)) for rig in carried.values()])),
+            Candidate("mean mounting height", "baseline", np.array([_mean_height_m(rig) for rig in carried.values()])),
+            Candidate("rays", "baseline", np.array([_rays(rig) for rig in carried.values()])),
         ),
         steps=steps,
     )
@@ -179,3 +179,11 @@ def _of_others(series: Sequence[Series]) -> Iterator[Candidate]:
         name = number.name if number.higher_is_better else f"{number.name} (less is better)"
         draws = None if one.draws is None else one.sign * one.draws
         yield Candidate(name, "baseline" if number.name == POINTS else "published", one.sign * one.values, draws)
+
+
+def _mean_height_m(rig: Rig) -> float:
+    return round(sum(sensor.mount.z_m for sensor in rig.sensors) / len(rig.sensors), 6)
+
+
+def _rays(rig: Rig) -> float:
+    return float(sum(sensor.rays for sensor in rig.sensors))

@@ -1,10 +1,11 @@
 from .agreement import Agreement as Agreement
 from .agreement import Candidate as Candidate
+from .agreement import Judged as Judged
 from .agreement import Ranked as Ranked
 from .agreement import Relation as Relation
 from .agreement import agreement_of as agreement_of
 from .agreement import lead as lead
-from .boards import Lob as Lob
+from .agreement import read_results as read_results
 from .false_visible import FalseVisible as FalseVisible
 from .field_of_view import field_of_view as field_of_view
 from .frame_metric import FrameMetric as FrameMetric
@@ -16,9 +17,6 @@ from .perception_entropy import PerceptionEntropy as PerceptionEntropy
 from .point_density import PointDensity as PointDensity
 from .registry import PUBLISHED as PUBLISHED
 from .registry import metric_names as metric_names
-from .results import Judged as Judged
-from .results import published_results as published_results
-from .results import read_results as read_results
 from .s_mig import SMig as SMig
 from .s_mig import unequal_rays as unequal_rays
 from .setup import Published as Published

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Mapping
 
-from torchcover.published.boards import Lob
 from torchcover.published.false_visible import FalseVisible
 from torchcover.published.k_cover import KCover
 from torchcover.published.m_sog import MSog
@@ -53,10 +52,6 @@ def _m_sog(setup: Setup) -> MSog:
     return MSog(setup.sensors, **setup.of_frames)
 
 
-def _lob(setup: Setup) -> Lob:
-    return Lob(setup.sensors, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
-
-
 PUBLISHED: Mapping[str, Published] = {
     "object_coverage": Published(
         _object_coverage, frozenset({"boxes"}), "share of an object within the threshold; objects with 1, 5, 10 points"
@@ -78,7 +73,6 @@ PUBLISHED: Mapping[str, Published] = {
     "m_sog": Published(
         _m_sog, frozenset({"boxes", "sensors"}), "minus the mean entropy of labels along the rays (Place3D 2024)"
     ),
-    "lob": Published(_lob, frozenset({"sensors"}), "cells of boards at 10 to 50 m that rays hit (Kim and Park 2020)"),
 }
 
 
