@@ -21,9 +21,9 @@ from torchcover.coverage.blocks import AreaSums
 from torchcover.coverage.errors import ratio_errors
 from torchcover.coverage.estimate import estimate_area
 from torchcover.data import SimulatedFrames
-from torchcover.data.reference import GRID_X_M, GRID_Y_M
 from torchcover.evaluation.settings import BLOCKS
 from torchcover.evaluation.target_error import LOOKS_IN_A_ROW, MAX_GROWTH, MIN_GROWTH, MIN_STEPS
+from torchcover.simulation.regions_of_interest import GRID_X_M, GRID_Y_M
 
 RIG, EVERY_S = "front_roof_128", 10.0
 GRID = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=0.25)

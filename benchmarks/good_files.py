@@ -15,22 +15,22 @@ import trimesh
 from PIL import Image
 
 from tests.cli.hostile import CAMERA, RIG, TOWN, YARD
-from tests.data.drives import Drive
-from tests.data.layouts import LAYOUTS
+from tests.recordings.drives import Drive
+from tests.recordings.layouts import LAYOUTS
 from tests.simulation.recorded.drives import OTHERS, write_argoverse2, write_commonroad, write_csv, write_nuscenes
 from tests.simulation.sumo.towns import XODR, drive, fcd, street, together, write_net
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
-from torchcover.data.recordings import kitti_files
-from torchcover.data.recordings.carla_files import read_carla_sensors
-from torchcover.data.recordings.folder_settings import read_folder_settings
-from torchcover.data.recordings.folder_tables import PoseTable
-from torchcover.data.recordings.folder_tables import read_boxes as read_labels
-from torchcover.data.recordings.ros2 import Ros2
-from torchcover.data.recordings.tracklets import read_tracklets
 from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
 from torchcover.files import read_feather, read_json_table
+from torchcover.recordings.formats import kitti_files
+from torchcover.recordings.formats.carla_files import read_carla_sensors
+from torchcover.recordings.formats.folder_settings import read_folder_settings
+from torchcover.recordings.formats.folder_tables import PoseTable
+from torchcover.recordings.formats.folder_tables import read_boxes as read_labels
+from torchcover.recordings.formats.ros2 import Ros2
+from torchcover.recordings.formats.tracklets import read_tracklets
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.recorded.formats import format_of
 from torchcover.simulation.shapes import MeshFile

@@ -16,13 +16,13 @@ from torch.utils.data import DataLoader
 from typer.main import get_command
 
 import torchcover
-from tests.data.drives import Drive
-from tests.data.layouts import argoverse2_log, kitti_raw
+from tests.recordings.drives import Drive
+from tests.recordings.layouts import argoverse2_log, kitti_raw
 from torchcover import BevGrid
 from torchcover.cli.app import app
 from torchcover.data import RegionsOfInterest, SimulatedFrames, collate_frames
-from torchcover.data.recordings.folder_settings import read_folder_settings
 from torchcover.placement import ChoiceSpace, SearchSpace
+from torchcover.recordings.formats.folder_settings import read_folder_settings
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.documents import load_document

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from torchcover.data import RegionsOfInterest
+    from torchcover.simulation import RegionsOfInterest
 
 
 def asked(
@@ -27,7 +27,7 @@ def asked(
         return None
     from pydantic import ValidationError
 
-    from torchcover.data import RegionsOfInterest
+    from torchcover.simulation import RegionsOfInterest
     from torchcover.simulation.documents import explain
 
     content = {} if file is None else RegionsOfInterest.load(file).model_dump(exclude_unset=True)

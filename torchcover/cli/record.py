@@ -20,9 +20,16 @@ def record(
     layout: options.Layout = "folder",
 ) -> None:
     """Write what a simulated rig sees as a recording, for other tools and for `evaluate --frames`."""
-    from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called, write_recording
     from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, spread_s
-    from torchcover.simulation import Rig, Scenario, with_ego
+    from torchcover.simulation import (
+        RegionsOfInterest,
+        Rig,
+        Scenario,
+        SimulatedFrames,
+        reference_called,
+        with_ego,
+        write_recording,
+    )
 
     carried = Rig.load(rig)
     world = with_ego(Scenario.load(scenario or DEFAULT_SCENARIO), {carried.name: carried}, vehicle)

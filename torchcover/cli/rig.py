@@ -5,8 +5,9 @@ from pathlib import Path
 
 import typer
 
-from torchcover.data import open_recording, rig_document
 from torchcover.files import as_yaml
+from torchcover.recordings import open_recording
+from torchcover.simulation import rig_document
 
 
 def run(frames: Path, recording_format: str | None, sensors: Sequence[str], lidars: Sequence[str]) -> None:

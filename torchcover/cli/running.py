@@ -10,10 +10,10 @@ import typer
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from torchcover.data import FrameSource
     from torchcover.evaluation import Checkpoint, Ranks, Result
     from torchcover.evaluation.observers import AnyObserver
     from torchcover.evaluation.rerun_log import RerunLog
+    from torchcover.frames import FrameSource
 
 
 def opened(
@@ -36,7 +36,7 @@ def opened(
     from rich.console import Console
     from rich.markup import escape
 
-    from torchcover.data import RecordedFrames, open_recording, reference_of_recording
+    from torchcover.recordings import RecordedFrames, open_recording, reference_of_recording
 
     with Console(stderr=True).status(f"opening {escape(str(frames))}"):  # seconds, where there are 100,000 frames
         recording = open_recording(frames, recording_format)

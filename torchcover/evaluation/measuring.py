@@ -7,7 +7,6 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-from torchcover.data import BadFrameError
 from torchcover.evaluation.checkpoint import AnyCheckpoint, Checkpoint, Journal
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.omissions import left_out
@@ -21,6 +20,7 @@ from torchcover.evaluation.sensor_drawings import check_drawable
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import TargetWatch
 from torchcover.evaluation.task import Task
+from torchcover.frames import BadFrameError
 
 Observers = Mapping[str, AnyObserver]
 

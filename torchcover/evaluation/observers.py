@@ -6,7 +6,7 @@ from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 from torch import Tensor
 
 from torchcover.coverage import Coverage, CoverageMetric
-from torchcover.data import Frame
+from torchcover.frames import Frame
 
 ResultT = TypeVar("ResultT", covariant=True)
 

@@ -11,13 +11,14 @@ from torch import Tensor
 from torchcover.coverage import Coverage, Quantity, Region
 from torchcover.coverage.blocks import MIN_BLOCKS
 from torchcover.coverage.estimate import area_in_blocks
-from torchcover.data import BadFrameError, Frame, SimulatedFrames
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
+from torchcover.frames import BadFrameError, Frame
 from torchcover.published import PUBLISHED, FrameMetric, PublishedNumber, Setup, Sights
 from torchcover.published.comparison import OWN, MetricComparison, Series
 from torchcover.published.ranks import Array
 from torchcover.published.setup import Need
+from torchcover.simulation import SimulatedFrames
 
 # Worlds are drawn again so many times for the intervals of tau.
 DRAWS = 500

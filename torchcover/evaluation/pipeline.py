@@ -13,12 +13,13 @@ from typing import Protocol
 import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
-from torchcover.data import BadFrameError, Frame, FrameSource, SimulatedFrames
 from torchcover.evaluation.checkpoint import Journal
 from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.progress import progress_of
 from torchcover.evaluation.ranks import Ranks
+from torchcover.frames import BadFrameError, Frame, FrameSource
+from torchcover.simulation import SimulatedFrames
 
 Frames = FrameSource | Dataset[Frame] | Sequence[Frame]
 

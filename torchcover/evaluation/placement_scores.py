@@ -10,7 +10,6 @@ from torch import Tensor
 
 from torchcover.coverage import Coverage, Region
 from torchcover.coverage.estimate import Measure, area_in_blocks
-from torchcover.data import RegionsOfInterest
 from torchcover.evaluation.evaluating import compare
 from torchcover.evaluation.other_metrics import drawn_worlds
 from torchcover.evaluation.rig_names import AnyRig, loaded
@@ -18,7 +17,7 @@ from torchcover.evaluation.task import AnyScenario
 from torchcover.published import PUBLISHED, Candidate
 from torchcover.published.comparison import Series
 from torchcover.published.ranks import LEAST, Array
-from torchcover.simulation import Rig
+from torchcover.simulation import RegionsOfInterest, Rig
 
 THRESHOLD_M = 0.4
 CELL_M = 1.0

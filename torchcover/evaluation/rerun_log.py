@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage.quantity import RADIUS, by_area
-from torchcover.data import Frame
 from torchcover.detection import Boxes
+from torchcover.frames import Frame
 from torchcover.neighbors import blind_spot_radius
 from torchcover.report import ColourScale, SensorView, scale_of
 from torchcover.simulation import Sensor

@@ -5,10 +5,10 @@ import json
 from collections.abc import Mapping
 
 from torchcover import __version__
-from torchcover.data import Asked
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
+from torchcover.simulation import Asked
 
 # Longer ones are told by their hash.
 MAX_TOLD = 40

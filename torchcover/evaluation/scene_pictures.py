@@ -6,12 +6,11 @@ import numpy as np
 import shapely
 from matplotlib.figure import Figure
 
-from torchcover.data import GRID_X_M, GRID_Y_M, SimulatedFrames
 from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
 from torchcover.report import ActorMark, SkinPatch, Standing, draw_depths, draw_rig, draw_scene, draw_vehicle
-from torchcover.simulation import CameraSensor, PaperReference, Rig, Scenario
+from torchcover.simulation import GRID_X_M, GRID_Y_M, CameraSensor, PaperReference, Rig, Scenario, SimulatedFrames
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.mount_regions import MountRegion
 from torchcover.simulation.skin import Skin

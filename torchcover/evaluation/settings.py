@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import Aggregation, CoverageMetric, Measure
-from torchcover.data import Asked, RegionsOfInterest
 from torchcover.evaluation.target_error import AnyTargetError, TargetError
-from torchcover.simulation import Scenario, WeightKind
+from torchcover.frames import WeightKind
+from torchcover.simulation import Asked, RegionsOfInterest, Scenario
 from torchcover.simulation.memory import check_fits
 
 DEFAULT_SCENARIO = "courtyard"

@@ -6,9 +6,17 @@ from pathlib import Path
 import torch
 
 from torchcover.coverage import CoverageMetric
-from torchcover.data import Asked, RegionsOfInterest, SimulatedFrames, reference_called
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, new_metric, spread_s
-from torchcover.simulation import ReferenceSensor, Rig, Scenario, with_ego
+from torchcover.simulation import (
+    Asked,
+    ReferenceSensor,
+    RegionsOfInterest,
+    Rig,
+    Scenario,
+    SimulatedFrames,
+    reference_called,
+    with_ego,
+)
 
 # The long run's seed is far away from any other.
 LONG_RUN_SEED = 1_000_003

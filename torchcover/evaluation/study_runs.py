@@ -11,11 +11,11 @@ from tempfile import TemporaryDirectory
 import torch
 from torch import Tensor
 
-from torchcover.data import SimulatedFrames
 from torchcover.evaluation.observers import CoverageObserver
 from torchcover.evaluation.progress import progress_of
 from torchcover.evaluation.study_plan import StudyPlan
 from torchcover.evaluation.study_truth import area_sums
+from torchcover.simulation import SimulatedFrames
 
 
 @dataclass

@@ -5,19 +5,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from torchcover.data import (
-    Asked,
-    BadFrameError,
-    ChosenRigs,
-    FrameSource,
-    RecordedFrames,
-    SimulatedFrames,
-    reference_called,
-)
-from torchcover.data.suspicion import suspicions
 from torchcover.evaluation.rig_names import AnyRig, distinct_names, given_as, is_document, loaded
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings, spread_s
-from torchcover.simulation import Scenario, Sensor, with_ego
+from torchcover.frames import BadFrameError, ChosenRigs, FrameSource
+from torchcover.recordings import RecordedFrames
+from torchcover.recordings.suspicion import suspicions
+from torchcover.simulation import Asked, Scenario, Sensor, SimulatedFrames, reference_called, with_ego
 
 AnyScenario = Scenario | str | Path
 AnyFrames = FrameSource | str | Path
@@ -84,7 +77,7 @@ def task_of(rigs: Sequence[AnyRig], scenario: AnyScenario | None, frames: AnyFra
         TypeError: Frames that do not say whose they are.
 
     Warns:
-        UserWarning: A recording that looks wrong; see `torchcover.data.suspicion`.
+        UserWarning: A recording that looks wrong; see `torchcover.recordings.suspicion`.
     """
     if frames is None:
         return _simulation(rigs, DEFAULT_SCENARIO if scenario is None else scenario, settings)

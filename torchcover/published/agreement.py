@@ -10,9 +10,9 @@ from typing import Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.data.recordings.csv_tables import read_csv
 from torchcover.files import reads
 from torchcover.published.ranks import Array, kendall_tau_b, permutation_p, spearman, strongest_by_chance
+from torchcover.recordings.formats.csv_tables import read_csv
 
 # coverage: torchcover's own numbers; published: those of others; baseline: what takes no simulation to know, or little.
 Kind = Literal["coverage", "published", "baseline"]

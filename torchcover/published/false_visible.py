@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import BevGrid
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.published.field_of_view import field_of_view
 from torchcover.published.places import coarse_grid
 from torchcover.published.sights import Sights, rig_of

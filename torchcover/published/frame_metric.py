@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.metrics import MergeableMetric, figure_of
 from torchcover.neighbors import check_tensor
 from torchcover.published.number import PublishedNumber

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import BevGrid, Region
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.published.places import Places
 from torchcover.published.sights import Sights, rig_of
 from torchcover.published.world_ratios import Ratio, WorldRatios

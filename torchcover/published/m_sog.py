@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.errors import ROUND_OFF, jackknife_error
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox
 from torchcover.neighbors import check_cloud
 from torchcover.published.number import PublishedNumber

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import BevGrid, Region, check_regions
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.neighbors import check_cloud
 from torchcover.published.sights import rig_of
 from torchcover.published.world_ratios import Ratio, WorldRatios

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox, VoxelGrid, crossed_voxels
 from torchcover.simulation import Sensor
 from torchcover.simulation.memory import check_fits

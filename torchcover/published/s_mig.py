@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage.errors import ROUND_OFF, jackknife_error
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox
 from torchcover.metrics import with_rows
 from torchcover.neighbors import check_cloud

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid
 from torchcover.coverage.grid import Bins
-from torchcover.data import Frame
 from torchcover.detection import Boxes, points_in_boxes
 from torchcover.detection.inside import Inside
+from torchcover.frames import Frame
 from torchcover.neighbors import check_cloud, nearest
 from torchcover.neighbors.choice import backend_of_several
 from torchcover.published.object_strata import ObjectStrata

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchmetrics.utilities.distributed import gather_all_tensors
 
 from torchcover.coverage.blocks import pair_up
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.published.frame_metric import FrameMetric
 
 # As many as `evaluate` keeps of the coverage, so that both can be drawn again together.

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcover.coverage.blocks import MIN_BLOCKS
 from torchcover.coverage.errors import ROUND_OFF, jackknife_error
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.published.number import PublishedNumber
 from torchcover.published.world_blocks import WorldBlocks
 

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.frames.frame import WeightKind
 from torchcover.simulation.instant import Instant, Scan
-from torchcover.simulation.reference_sensor import ReferenceScan, WeightKind
+from torchcover.simulation.reference_sensor import ReferenceScan
 from torchcover.simulation.scene import Scene
 
 Float32 = NDArray[np.float32]

@@ -8,10 +8,11 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.frames.frame import WeightKind
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.simulation.ray_pattern import cast_pattern
 from torchcover.simulation.rays import Tile, into_tiles, unit_directions
-from torchcover.simulation.reference_sensor import PAPER_BANDS_M, Areas, Bands, ReferenceScan, WeightKind, check_reach
+from torchcover.simulation.reference_sensor import PAPER_BANDS_M, Areas, Bands, ReferenceScan, check_reach
 from torchcover.simulation.shell import position_in_shell
 from torchcover.simulation.surroundings import Surroundings
 

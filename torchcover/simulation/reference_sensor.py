@@ -1,11 +1,12 @@
 """What a reference sensor is: another pattern is a class with these members and a line in `kinds.py`."""
 
 import math
-from typing import ClassVar, Literal, NamedTuple, Protocol, Self
+from typing import ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.frames.frame import WeightKind
 from torchcover.simulation.surroundings import Surroundings
 
 # A rectangle of the ground in the vehicle frame in metres: ((x_low, x_high), (y_low, y_high)).
@@ -16,10 +17,6 @@ Bands = tuple[tuple[float, float], ...]
 
 # The paper's heights: ground, and what stands on it.
 PAPER_BANDS_M: Bands = ((-0.5, 0.5), (0.5, 2.0))
-
-# What the weights of points are: "density", a ratio of densities of rays, good for means within a cell of a step; or
-# "m2", the visible square metres that each point stands for, good for sums over any cells and steps.
-WeightKind = Literal["density", "m2"]
 
 
 class ReferenceScan(NamedTuple):

@@ -7,6 +7,7 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.frames.frame import WeightKind
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation.patches import Bounds
 from torchcover.simulation.reference_sensor import (
@@ -14,7 +15,6 @@ from torchcover.simulation.reference_sensor import (
     Areas,
     Bands,
     ReferenceScan,
-    WeightKind,
     check_areas,
     check_reach,
 )

@@ -12,7 +12,7 @@ except ImportError as error:
 from lightning.pytorch.utilities import CombinedLoader, rank_zero_warn
 
 from torchcover.coverage import Coverage, CoverageMetric, Region
-from torchcover.data import FrameBatch
+from torchcover.frames import FrameBatch
 from torchcover.training.batches import UNKNOWN_INDEX, frames_in, sensor_of
 from torchcover.training.counting import CountOnce, Shard, is_distributed, shard_of
 

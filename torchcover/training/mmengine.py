@@ -14,7 +14,7 @@ except ImportError as error:
 from mmengine.dist import get_comm_device, get_dist_info
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.training.batches import UNKNOWN_INDEX, frames_in, sensor_of
 from torchcover.training.counting import CountOnce, Shard
 from torchcover.training.mmdetection3d import frames_of_data_batch

@@ -8,17 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import naming, read_feather
-from torchcover.geometry import rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix, invert
+from torchcover.recordings.formats.argoverse2 import CUBOIDS, POSE, poses_of, vehicle_T_ego
 from torchcover.simulation.recorded.track import Ego, Recording, only_one_scene, rows_by_name, track_of
 from torchcover.simulation.trajectory import Trajectory
 
-# The ego frame lies in the rear axle, 0.30 m above the ground; the centre of a Ford Fusion is 1.339 m before it, as
-# in the rig `argoverse2`, where the source is, and in the body `ford_fusion`, where its size has one.
-vehicle_T_ego = rigid(np.eye(3), [-1.339, 0.0, 0.30])
+# As in the body `ford_fusion`, where its source is.
 SIZE_M = (4.869, 1.852, 1.476)
-POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
-CUBOIDS = ("timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *POSE)
 POSES = "city_SE3_egovehicle.feather"
 ANNOTATIONS = ("annotations.feather", "annotations_with_ego.feather")
 # The cuboids of those who ride are of the riders only; what they ride has one of its own, and is a box without anybody.
@@ -88,13 +84,6 @@ def read(path: Path, scene: str | None) -> Recording:
                 where = sizes_m[own], times_s[own], world_T_box[own]
                 tracks.append(track_of(name, category, CLASSES.get(category), *where))
     return Recording(tuple(tracks), (Ego("ego", drive.times_s, world_T_driven, invert(vehicle_T_ego), SIZE_M),))
-
-
-def poses_of(columns: Mapping[str, NDArray[Any]]) -> list[Matrix]:
-    """(4, 4) of each row of a table with the columns `POSE`."""
-    rotations = np.column_stack([columns[name] for name in POSE[:4]])
-    places = np.column_stack([columns[name] for name in POSE[4:]])
-    return [rigid(rotation_from_quaternion(one), place) for one, place in zip(rotations, places, strict=True)]
 
 
 def _seconds(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> Matrix:

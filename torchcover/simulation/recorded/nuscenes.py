@@ -8,11 +8,10 @@ import numpy as np
 from torchcover.files import naming, read_json_table
 from torchcover.geometry import rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix, invert
+from torchcover.recordings.formats.nuscenes import vehicle_T_ego
 from torchcover.simulation.recorded.track import Ego, Recording, Track, rows_by_name, track_of
 
-# The ego frame lies under the rear axle, on the ground; the centre of a Renault Zoe's box is 1.385 m before it, as in
-# the rig `nuscenes`, where the source is, and in the body `renault_zoe`, where its size has one.
-vehicle_T_ego = rigid(np.eye(3), [-1.385, 0.0, 0.0])
+# As in the body `renault_zoe`, where its source is.
 SIZE_M = (4.084, 1.730, 1.562)
 TABLES = ("sample", "ego_pose", "sample_annotation", "instance", "category")
 # By the beginning of a category; the first that fits counts.

@@ -1,0 +1,118 @@
+"""A drive of KITTI's raw data: scans with the poses of the GPS and IMU, and tracklets."""
+
+import os
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchcover.detection.boxes import Boxes
+from torchcover.geometry.rigid import Matrix, invert
+from torchcover.recordings.clouds.readers import read_cloud
+from torchcover.recordings.formats.file_names import check_same_names, frame_files
+from torchcover.recordings.formats.kitti_files import (
+    BODY,
+    read_oxts,
+    read_rectified,
+    read_rigid,
+    read_timestamps,
+    vehicle_T_velodyne,
+    world_T_imu,
+)
+from torchcover.recordings.formats.tracklets import read_tracklets
+from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
+
+
+class KittiRaw:
+    """A folder `DATE/DATE_drive_NUMBER_sync` with `velodyne_points` and `oxts`; calibrations are in `DATE`.
+
+    Boxes are those of `tracklet_labels.xml`, if it is there.
+
+    Args:
+        path: The folder of the drive.
+
+    Raises:
+        FileNotFoundError: A part is missing.
+        ValueError: No frames, another number of times than of scans, times out of order, a bad calibration.
+    """
+
+    layout: ClassVar[str] = "DATE/DRIVE/velodyne_points/data/FRAME.bin, oxts/data/FRAME.txt"
+    sensors = ("velodyne",)
+    reference_sensors = ()
+    weight_kind = None
+    instants = None
+    body = BODY
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self._clouds = frame_files(self.path / "velodyne_points" / "data")
+        check_same_names(self.path, {"velodyne_points/data": self._clouds})
+        self.names = tuple(self._clouds)
+        self.rigs = {"kitti": self.sensors}
+        times = self.path / "velodyne_points" / "timestamps.txt"
+        self.times_s = check_times(read_timestamps(times), len(self.names), str(times))
+        self._imu_T_vehicle = self._calibrated()
+        self._tracklets = self.path / "tracklet_labels.xml"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether it has scans and records of the GPS and IMU."""
+        return all((path / place).is_dir() for place in ("velodyne_points", "oxts"))
+
+    @property
+    def frames(self) -> range:
+        """All of them."""
+        return range(len(self.names))
+
+    def scan(self, sensor: str, index: int) -> Scan:
+        """Read a cloud, which the development kit has corrected for the motion within a turn."""
+        path = self._clouds[self.names[index]]
+        return Scan(read_cloud(path), vehicle_T_velodyne, str(path))
+
+    def world_T_vehicle(self, index: int) -> Matrix:
+        """Where the vehicle was, by the GPS and IMU.
+
+        Raises:
+            FileNotFoundError: There is no record of that instant.
+            ValueError: It is not what it is meant to be.
+        """
+        return world_T_imu(self._oxts(index), self._latitude_deg) @ self._imu_T_vehicle
+
+    def calibrations(self) -> SensorCalibrations:
+        """The rectified cameras of the day, where its `calib_cam_to_cam.txt` is there.
+
+        Raises:
+            FileNotFoundError: `calib_velo_to_cam.txt` is missing beside it.
+            ValueError: They are not what they are meant to be.
+        """
+        day = self.path.parent
+        cameras = day / "calib_cam_to_cam.txt"
+        mounts = {"velodyne": vehicle_T_velodyne}
+        if not cameras.exists():
+            return SensorCalibrations(f"the LiDAR where KITTI's is; no cameras, for there is no {cameras.name}", mounts)
+        camera_T_velodyne = read_rigid(day / "calib_velo_to_cam.txt")
+        placed = read_rectified(cameras, vehicle_T_velodyne @ invert(camera_T_velodyne))
+        return SensorCalibrations(f"the LiDAR where KITTI's is, {cameras.name}", mounts, placed)
+
+    def boxes(self, index: int) -> Boxes | None:
+        """The tracklets of that instant; None without the file."""
+        if not self._tracklets.exists():
+            return None
+        return self._tracked.get(index, Boxes.from_rows(torch.empty(0, 7)))
+
+    def _oxts(self, index: int) -> NDArray[np.float64]:
+        return read_oxts(self.path / "oxts" / "data" / f"{self.names[index]}.txt")
+
+    @cached_property
+    def _latitude_deg(self) -> float:
+        return float(self._oxts(0)[0])
+
+    @cached_property
+    def _tracked(self) -> dict[int, Boxes]:
+        return read_tracklets(self._tracklets, vehicle_T_velodyne)
+
+    def _calibrated(self) -> Matrix:
+        return invert(read_rigid(self.path.parent / "calib_imu_to_velo.txt")) @ invert(vehicle_T_velodyne)
