@@ -1,4 +1,4 @@
-"""Ranks of metrics beside those of judges: what is equal, what is chance, and what the best of many is worth."""
+"""Ranks of metrics compared with those of judges: what is equal, what is chance, and what the best of many is worth."""
 
 import numpy as np
 import pytest

@@ -17,7 +17,7 @@ from torchcover.frames import BadFrameError, Frame
 from torchcover.published import PUBLISHED, FrameMetric, PublishedNumber, Setup, Sights
 from torchcover.published.comparison import OWN, MetricComparison, Series
 from torchcover.published.ranks import Array
-from torchcover.published.setup import Need
+from torchcover.published.registry import Need
 from torchcover.simulation import SimulatedFrames
 
 # Worlds are drawn again so many times for the intervals of tau.
@@ -26,9 +26,7 @@ DRAWS = 500
 WHY: Mapping[Need, str] = {
     "boxes": "it needs boxes of objects, which simulations and labelled recordings have",
     "sensors": "it needs the rig's sensors, with mounts and rays: give the rig's YAML file or a built-in name",
-    "sensor_points": "nobody knows which points are of which sensor",
-    "m2": "it needs the square metres of reference points, which the surface reference of a simulation gives",
-    "tags": "it needs classes of the reference points, which the frames do not have",
+    "sensor_points": "which points are of which sensor is unknown",
 }
 
 
@@ -93,10 +91,8 @@ def _lacking(task: Task) -> frozenset[Need]:
     first = None if isinstance(task.frames, SimulatedFrames) else _first_frame(task)
     there: dict[Need, bool] = {
         "sensors": all(task.sensors.get(rig) for rig in task.rigs),
-        "m2": task.frames.weight_kind == "m2",
         "boxes": first is None or first.boxes is not None,
         "sensor_points": first is None or all(rig in (first.sensor_points or {}) for rig in task.rigs),
-        "tags": False,
     }
     return frozenset(need for need, known in there.items() if not known)
 
@@ -113,7 +109,7 @@ def _first_frame(task: Task) -> Frame | None:
 def compared(
     metrics: OtherMetrics, coverages: Mapping[str, Coverage], regions: Sequence[Region], seed: int
 ) -> MetricComparison | None:
-    """What the metrics say, with the numbers of some regions beside; None if none was asked for.
+    """What the metrics say, and torchcover's numbers of some regions; None if none was asked for.
 
     Args:
         metrics: After the run.

@@ -7,7 +7,7 @@ from .agreement import agreement_of as agreement_of
 from .agreement import lead as lead
 from .agreement import read_results as read_results
 from .false_visible import FalseVisible as FalseVisible
-from .field_of_view import field_of_view as field_of_view
+from .false_visible import field_of_view as field_of_view
 from .frame_metric import FrameMetric as FrameMetric
 from .k_cover import KCover as KCover
 from .m_sog import MSog as MSog
@@ -16,11 +16,11 @@ from .object_coverage import ObjectCoverage as ObjectCoverage
 from .perception_entropy import PerceptionEntropy as PerceptionEntropy
 from .point_density import PointDensity as PointDensity
 from .registry import PUBLISHED as PUBLISHED
+from .registry import Published as Published
+from .registry import Setup as Setup
 from .registry import metric_names as metric_names
 from .s_mig import SMig as SMig
 from .s_mig import unequal_rays as unequal_rays
-from .setup import Published as Published
-from .setup import Setup as Setup
 from .sights import Sights as Sights
 from .world_blocks import WorldBlocks as WorldBlocks
 from .world_ratios import Ratio as Ratio

@@ -94,7 +94,7 @@ def read_results(path: Path) -> Mapping[tuple[str, str], Judged]:
     for (placement, quantity, model, category), value in zip(words, table.numbers["value"].tolist(), strict=True):
         of_kind = found.setdefault((quantity, category), {})
         if (model, placement) in of_kind:
-            raise ValueError(f"{quantity} {category} of {model or 'nobody'} on {placement} is there twice")
+            raise ValueError(f"{quantity} {category} of {model or 'no model'} on {placement} is there twice")
         of_kind[model, placement] = value
     return {key: _judged(" ".join(key).strip(), values) for key, values in found.items()}
 
@@ -116,7 +116,7 @@ class Candidate:
         name: The metric, with what decides it.
         kind: Whose it is.
         values: (n,), NaN where unknown; more is better, as its authors say it.
-        draws: (R, n) what it would have said of other worlds; None if nobody knows.
+        draws: (R, n) what it would have said of other worlds; None if that is unknown.
     """
 
     name: str
@@ -156,7 +156,7 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How metrics rank placements, beside what judges say of them.
+    """How metrics rank placements, compared with what judges say of them.
 
     Args:
         judged: What the judges say.

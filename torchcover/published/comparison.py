@@ -25,7 +25,7 @@ class Series(NamedTuple):
     Args:
         metric: The metric that it is of; `OWN` for a number of torchcover's table.
         numbers: One for each rig; None of a rig that the metric could not be made for.
-        draws: (R, rigs) the numbers over worlds that were drawn again; None if nobody knows them.
+        draws: (R, rigs) the numbers over worlds that were drawn again; None if they are unknown.
     """
 
     metric: str
@@ -74,7 +74,7 @@ class Tau(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MetricComparison:
-    """What metrics of others say of the rigs of a run, beside torchcover's own numbers.
+    """What metrics of others say of the rigs of a run, compared with torchcover's own numbers.
 
     Args:
         rigs: Their names.

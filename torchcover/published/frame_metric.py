@@ -63,7 +63,7 @@ class FrameMetric(MergeableMetric):
             weights: (R, 16) how often.
 
         Returns:
-            None if nobody knows, as here.
+            None if they are unknown, as here.
         """
         return None
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid, Region
 from torchcover.frames import Frame
-from torchcover.published.places import Places
+from torchcover.published.parts import Places
 from torchcover.published.sights import Sights, rig_of
 from torchcover.published.world_ratios import Ratio, WorldRatios
 
@@ -32,8 +32,8 @@ class KCover(WorldRatios):
         kwargs: For `torchmetrics.Metric`.
 
     Raises:
-        ValueError: k below 1, a threshold that is negative, regions that the grid does not hold. From `update`: nobody
-            knows which points are of which sensor; no square metres where they are wanted.
+        ValueError: k below 1, a threshold that is negative, regions that the grid does not hold. From `update`: points
+            of unknown sensors; no square metres where they are wanted.
 
     Example:
         >>> grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0)

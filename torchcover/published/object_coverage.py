@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchcover.detection.visibility import mean_by_box
 from torchcover.frames import Frame
-from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
+from torchcover.published.parts import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
 from torchcover.published.sights import Sights, rig_of
 from torchcover.published.world_ratios import Ratio, WorldRatios
 
@@ -20,7 +20,7 @@ class ObjectCoverage(WorldRatios):
 
     The share of one object is that of `torchcover.detection.box_visibility`: of what the reference's places see of it,
     in square metres where the weights are; an object of which they see nothing is unknown and not in the mean. Hits are
-    counted over all objects, those that nobody can see among them.
+    counted over all objects, those that are hidden from everywhere among them.
 
     Args:
         threshold_m: Distance within which a point counts as seen.

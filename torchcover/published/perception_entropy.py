@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.frames import Frame
-from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
+from torchcover.published.parts import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
 from torchcover.published.sights import Sights, count_in_boxes, rig_of
 from torchcover.published.world_ratios import Ratio, WorldRatios
 from torchcover.simulation import CameraSensor, Sensor
@@ -72,7 +72,7 @@ class PerceptionEntropy(WorldRatios):
         kwargs: For `torchmetrics.Metric`.
 
     Raises:
-        ValueError: From `update`: a frame without boxes; of a rig with cameras, if nobody knows which points are of
+        ValueError: From `update`: a frame without boxes; of a rig with cameras, if it is unknown which points are of
             which sensor.
 
     Example:

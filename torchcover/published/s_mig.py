@@ -43,7 +43,7 @@ class SMig(FrameMetric):
         S-MIG = - sum over the distinct voxels v on the way of any ray of  -p ln p - (1 - p) ln(1 - p)
 
     with independent voxels. Higher is better, say its authors; yet it falls as more voxels are crossed, and a rig
-    without rays has the highest value, 0. Its negative, which is beside it in `parameters["entropy_captured_nats"]`, is
+    without rays has the highest value, 0. Its negative, which is in its `parameters["entropy_captured_nats"]`, is
     what roadside placement maximises (EGVS, Jiang 2025, as far as its text could be read). Compare rigs of the same
     number of rays (`unequal_rays`).
 
@@ -67,7 +67,7 @@ class SMig(FrameMetric):
 
     Raises:
         ValueError: No sensor, no category or one twice, voxels that do not divide the region or do not fit into the
-            memory. From `update`: a frame without boxes; with occlusion, points of which nobody knows the sensor.
+            memory. From `update`: a frame without boxes; with occlusion, points of unknown sensors.
 
     Example:
         >>> from torchcover.detection import Boxes
@@ -165,7 +165,7 @@ class SMig(FrameMetric):
         )
 
     def resampled(self, weights: Tensor) -> Tensor | None:
-        """As `FrameMetric.resampled`; None with occlusion, for nobody knows what was crossed in each block."""
+        """As `FrameMetric.resampled`; None with occlusion: what was crossed in each block is unknown."""
         if self.occlusion:
             return None
         values = self._values(self._occupancies(), self._crossings(), weights.double().cpu().numpy())
