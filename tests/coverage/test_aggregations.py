@@ -9,7 +9,8 @@ import pytest
 import torch
 
 from torchcover import BevGrid, Coverage, CoverageMetric
-from torchcover.coverage import AGGREGATIONS, Aggregation, Layer, Quantiles, Quantity, State, StepQuantiles
+from torchcover.coverage import AGGREGATIONS, Aggregation, Layer, Quantiles, State, StepQuantiles
+from torchcover.estimation import Quantity
 
 ONE_CELL = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
 NOTHING = torch.zeros(0, 3)

@@ -10,7 +10,7 @@ import torch
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.coverage import Coverage, Layer, Maximum, MeanOfMeans, PooledMean, Quantiles
 from torchcover.coverage.blocks import Blocks
-from torchcover.coverage.errors import jackknife_error, ratio_errors
+from torchcover.estimation import jackknife_error, ratio_errors
 
 # Cells so large that the sensor point below a reference point is always the nearest.
 SHAPE = {"x": (0.0, 400.0), "y": (0.0, 100.0), "cell": 100.0, "heights": {"all": (-1.0, 1.0)}}

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchcover import BevGrid, CoverageMetric, Region
-from torchcover.coverage.estimate import known_mean
+from torchcover.coverage.measures import known_mean
 
 GRID = BevGrid(x=(0.0, 8.0), y=(0.0, 4.0), cell=1.0, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)})
 PART = Region("part", x=(1.0, 7.0), y=(0.0, 3.0))

@@ -20,7 +20,7 @@ from torchcover.evaluation import (
 )
 from torchcover.evaluation.agreeing import NOTES
 from torchcover.published.tables import text_tables
-from torchcover.report import UNITS, error_words, narrowest_width, print_table, text_table
+from torchcover.report import error_words, narrowest_width, print_table, shown_unit, text_table
 
 
 def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:
@@ -57,7 +57,8 @@ def print_study(study: Study, out: Path) -> None:
     for table in tables:
         wide.print(table)
     floor = [
-        f"{error_words(study.truth.errors[one.key], one.unit)} {UNITS[one.unit].difference_name}" for one in quantities
+        f"{error_words(study.truth.errors[one.key], one.unit)} {shown_unit(one.unit).difference_name}"
+        for one in quantities
     ]
     console.print(
         f"Times are those of `torchcover evaluate` from start to end: {study.start_s:.1f} s of each for Python, "

@@ -7,14 +7,13 @@ from .aggregations import PooledMean as PooledMean
 from .aggregations import Quantiles as Quantiles
 from .aggregations import State as State
 from .aggregations import StepQuantiles as StepQuantiles
-from .estimate import Measure as Measure
 from .grid import BevGrid as BevGrid
 from .layer import Layer as Layer
+from .measures import Measure as Measure
 from .metric import CoverageMetric as CoverageMetric
 from .number_metric import CoverageNumber as CoverageNumber
 from .paired import check_paired as check_paired
 from .paired import differences as differences
-from .quantity import Quantity as Quantity
 from .redundancy import Redundancy as Redundancy
 from .regions import Region as Region
 from .regions import check_regions as check_regions
@@ -22,7 +21,5 @@ from .regions import forward_regions as forward_regions
 from .regions import near_field_regions as near_field_regions
 from .regions import regions_within as regions_within
 from .result import Coverage as Coverage
-from .summary import Difference as Difference
-from .summary import Number as Number
 from .summary import RegionRedundancy as RegionRedundancy
 from .summary import RegionSummary as RegionSummary

@@ -8,8 +8,7 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
-# With fewer, the error itself is off by more than a quarter: 1 / sqrt(2 (blocks - 1)).
-MIN_BLOCKS = 8
+from torchcover.estimation import MIN_BLOCKS
 
 
 @dataclass(frozen=True)

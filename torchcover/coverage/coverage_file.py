@@ -19,9 +19,9 @@ from torch import Tensor
 from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
-from torchcover.coverage.quantity import Quantity
 from torchcover.coverage.redundancy import PlaceSums, Redundancy, redundancy_quantities
 from torchcover.coverage.regions import Region
+from torchcover.estimation import Quantity
 from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
 
 FORMAT_VERSION = 4
@@ -63,13 +63,13 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         "grid": {"x": grid.x, "y": grid.y, "cell": grid.cell, "heights": dict(grid.heights)},
         "thresholds": parts["thresholds"],
         "max_radius": parts["max_radius"],
-        "layers": [asdict(layer.quantity) for layer in parts["layers"]],
+        "layers": [layer.quantity._asdict() for layer in parts["layers"]],
         "counts": parts["counts"],
         "blocks": 1 if blocks is None else len(blocks.steps),
         "square_metres": area is not None,
         "regions": [asdict(region) for region in parts["regions"]],
         "sensors": None if redundancy is None else redundancy.sensors,
-        "redundancy": [] if redundancy is None else [asdict(layer.quantity) for layer in redundancy.layers.values()],
+        "redundancy": [] if redundancy is None else [layer.quantity._asdict() for layer in redundancy.layers.values()],
     }
     tensors = {"probed_steps": parts["probed_steps"], "points": parts["points"]}
     tensors |= {layer.quantity.key: layer.values for layer in parts["layers"]}

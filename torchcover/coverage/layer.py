@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from torchcover.coverage.quantity import Quantity
+from torchcover.estimation import Quantity
 
 
 class Layer(NamedTuple):

@@ -6,7 +6,7 @@ import torch
 
 from torchcover.coverage.regions import Region
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.summary import Difference, differences_of
+from torchcover.estimation import Difference
 
 
 def check_paired(coverages: Mapping[str, Coverage]) -> None:
@@ -54,8 +54,5 @@ def differences(coverages: Mapping[str, Coverage], region: Region, height: str) 
         Name of the rig -> key of the quantity -> difference.
     """
     estimates = {name: coverage.estimate(region, height) for name, coverage in coverages.items()}
-    first, quantities = next(iter(estimates.values())), next(iter(coverages.values())).quantities
-    found = {}
-    for name, estimate in estimates.items():
-        found[name] = dict(zip((one.key for one in quantities), differences_of(estimate, first), strict=True))
-    return found
+    first = next(iter(estimates.values()))
+    return {name: estimate.differences(first) for name, estimate in estimates.items()}

@@ -12,8 +12,9 @@ from torchcover.coverage.aggregations import Aggregation, BinnedStep, State
 from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
-from torchcover.coverage.quantity import RADIUS, Quantity, detection, seen_by_two, sensors_seeing, without
+from torchcover.coverage.quantity import RADIUS, detection, seen_by_two, sensors_seeing, without
 from torchcover.coverage.regions import Region
+from torchcover.estimation import Quantity
 
 
 class PlaceSums(NamedTuple):

@@ -5,34 +5,40 @@ import math
 import torch
 from torch import Tensor
 
-from torchcover.coverage.estimate import RegionEstimate, estimate_ratio
-from torchcover.coverage.quantity import RADIUS, Quantity, detection
+from torchcover.coverage.aggregations import MeanOfMeans
+from torchcover.coverage.quantity import without
 from torchcover.coverage.redundancy import PlaceSums, Redundancy, redundancy_quantities
-from torchcover.coverage.summary import Number, RegionRedundancy, differences_of
+from torchcover.coverage.summary import RegionRedundancy
+from torchcover.estimation import Estimate, Quantity
 
 
-def over_place(places: PlaceSums, place: int) -> RegionEstimate:
-    """(Q + V,) means over the visible surface of one place, as `PlaceSums` has them."""
-    return estimate_ratio(places.m2[:, place], places.sums[:, :, place], places.steps)
+def quantities_of(redundancy: Redundancy, thresholds: tuple[float, ...]) -> tuple[Quantity, ...]:
+    """The Q numbers with all sensors, then the V of `redundancy_quantities`."""
+    return (*MeanOfMeans(thresholds).quantities, *redundancy_quantities(redundancy.sensors, thresholds))
 
 
-def over_known(redundancy: Redundancy, with_all: Tensor, band: int, known: Tensor) -> RegionEstimate:
-    """(Q + V,) unweighted means over the known cells of a region; nobody knows their errors.
+def over_place(places: PlaceSums, place: int, quantities: tuple[Quantity, ...]) -> Estimate:
+    """Means over the visible surface of one place, as `PlaceSums` has them."""
+    return Estimate.of_ratios(quantities, places.m2[:, place], places.sums[:, :, place], places.steps)
+
+
+def over_known(
+    redundancy: Redundancy, with_all: Tensor, band: int, known: Tensor, quantities: tuple[Quantity, ...]
+) -> Estimate:
+    """Unweighted means over the known cells of a region; their errors are unknown.
 
     Args:
         redundancy: Of a coverage that is not by area.
         with_all: (Q,) the numbers with all sensors.
         band: Number of the height band.
         known: (Y, X) bool, the cells.
+        quantities: As `quantities_of`.
     """
-    without = torch.stack([layer.values[band][known].mean() for layer in redundancy.layers.values()])
-    value = torch.cat([with_all, without])
-    return RegionEstimate(value, value.new_empty((0, len(value))), value.new_empty(0))
+    values = torch.stack([layer.values[band][known].mean() for layer in redundancy.layers.values()])
+    return Estimate.of(quantities, torch.cat([with_all, values]))
 
 
-def region_redundancy(
-    redundancy: Redundancy, thresholds: tuple[float, ...], estimate: RegionEstimate
-) -> RegionRedundancy:
+def region_redundancy(redundancy: Redundancy, thresholds: tuple[float, ...], estimate: Estimate) -> RegionRedundancy:
     """The numbers of a region without each sensor.
 
     Args:
@@ -40,30 +46,20 @@ def region_redundancy(
         thresholds: Detection thresholds in metres.
         estimate: From `over_place` or `over_known`.
     """
-    single = (RADIUS, *map(detection, thresholds))
-    count, keys = len(single), [quantity.key for quantity in single]
-    values, errors = estimate.value.tolist(), estimate.error.tolist()
-    numbers = [Number(value, error) for value, error in zip(values, errors, strict=True)]
-    several = redundancy_quantities((), thresholds)
-    seen_by = {quantity.key: number for quantity, number in zip(several, numbers[count:], strict=False)}
-    without, change = {}, {}
-    first = _part(estimate, slice(0, count))
+    single, several = MeanOfMeans(thresholds).quantities, redundancy_quantities((), thresholds)
+    numbers, count = estimate.numbers(intervals=False), len(single)
+    each, change = {}, {}
     for at, sensor in enumerate(redundancy.sensors):
         start = count + len(several) + at * count
-        own = slice(start, start + count)
-        without[sensor] = dict(zip(keys, numbers[own], strict=True))
-        change[sensor] = dict(zip(keys, differences_of(_part(estimate, own), first), strict=True))
+        own = estimate[start : start + count]
+        each[sensor] = {quantity.key: numbers[without(sensor, quantity).key] for quantity in single}
+        change[sensor] = Estimate(single, own.value, own.left_out, own.steps).differences(estimate[:count])
     decisive = single[min(1, count - 1)]
-    losses = {sensor: _loss(changes[decisive.key].value, decisive) for sensor, changes in change.items()}
+    losses = {sensor: _loss(changes[decisive.key].gain) for sensor, changes in change.items()}
     worst = max(losses, key=losses.__getitem__)
-    return RegionRedundancy(seen_by, without, change, worst if losses[worst] > 0 else None)
+    seen_by = {quantity.key: numbers[quantity.key] for quantity in several}
+    return RegionRedundancy(seen_by, each, change, worst if losses[worst] > 0 else None)
 
 
-def _part(estimate: RegionEstimate, which: slice) -> RegionEstimate:
-    return RegionEstimate(estimate.value[which], estimate.left_out[:, which], estimate.steps)
-
-
-def _loss(change: float, quantity: Quantity) -> float:
-    if math.isnan(change):
-        return 0.0
-    return change if quantity.lower_is_better else -change
+def _loss(gain: float) -> float:
+    return 0.0 if math.isnan(gain) else -gain

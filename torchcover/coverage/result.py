@@ -12,16 +12,15 @@ from torch import Tensor
 from torchcover.coverage.aggregations import MeanOfMeans
 from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
-from torchcover.coverage.errors import MIN_BLOCKS_OF_A_CELL, ROUND_OFF, ratio_errors
-from torchcover.coverage.estimate import Measure, RegionEstimate, area_in_blocks, estimate_area, estimate_known
 from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.intervals import interval95
 from torchcover.coverage.layer import Layer
-from torchcover.coverage.quantity import RADIUS, Quantity, by_area
+from torchcover.coverage.measures import Measure, area_in_blocks, estimate_area, estimate_known
+from torchcover.coverage.quantity import RADIUS, by_area
 from torchcover.coverage.redundancy import Redundancy
-from torchcover.coverage.region_redundancy import over_known, over_place, region_redundancy
+from torchcover.coverage.region_redundancy import over_known, over_place, quantities_of, region_redundancy
 from torchcover.coverage.regions import Region, check_regions, regions_within
-from torchcover.coverage.summary import Number, RegionRedundancy, RegionSummary
+from torchcover.coverage.summary import RegionRedundancy, RegionSummary
+from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Estimate, Number, Quantity, ratio_errors
 
 
 class Coverage:
@@ -82,7 +81,7 @@ class Coverage:
         self.area = area
         self.regions = regions_within(grid) if regions is None else tuple(regions)
         self.redundancy = redundancy
-        self._estimates: dict[tuple[Region, str, Measure], RegionEstimate] = {}
+        self._estimates: dict[tuple[Region, str, Measure], Estimate] = {}
 
     def __repr__(self) -> str:
         known = float((self.probed_steps > 0).double().mean())
@@ -158,13 +157,13 @@ class Coverage:
         """What its numbers are means over: "area" if the reference points had square metres, else "known"."""
         return "known" if self.area is None else "area"
 
-    def estimate(self, region: Region, height: str, measure: Measure | None = None) -> RegionEstimate:
+    def estimate(self, region: Region, height: str, measure: Measure | None = None) -> Estimate:
         """The numbers of one region in one band with what they become without each block, for errors of differences.
 
         Args:
             region: A region within the grid.
             height: Name of the band.
-            measure: "area", the mean over the visible surface (`torchcover.coverage.estimate.estimate_area`), for
+            measure: "area", the mean over the visible surface (`torchcover.coverage.measures.estimate_area`), for
                 points that have square metres, or "known", the paper's unweighted mean over the known cells. Not given:
                 that of this result.
 
@@ -177,18 +176,18 @@ class Coverage:
             self._estimates[key] = self._estimate(*key)
         return self._estimates[key]
 
-    def _estimate(self, region: Region, height: str, measure: Measure) -> RegionEstimate:
+    def _estimate(self, region: Region, height: str, measure: Measure) -> Estimate:
         check_regions([region], self.grid)
         cells = region.mask(self.grid).to(self.radius.device)
         if height not in self.grid.heights:
             raise ValueError(f"height {height!r}: the grid has {', '.join(self.grid.heights)}")
         band = list(self.grid.heights).index(height)
         if measure == "area":
-            return estimate_area(self._square_metres(), band, cells)
+            return estimate_area(self.quantities, self._square_metres(), band, cells)
         known = cells & (self.probed_steps[band] > 0)
         probed = self.probed_steps[band][known]
         sums = probed * torch.stack([self.layers[quantity.key].values[band][known] for quantity in self.quantities])
-        return estimate_known(probed, sums, self.blocks, band, known)
+        return estimate_known(self.quantities, probed, sums, self.blocks, band, known)
 
     def _square_metres(self) -> AreaSums:
         if self.area is None:
@@ -254,16 +253,24 @@ class Coverage:
     def _summarise(self, region: Region, height: str) -> RegionSummary:
         cells, band = region.mask(self.grid), list(self.grid.heights).index(height)
         probed = self.probed_steps[band].cpu()[cells]
+        known_cells = int((probed > 0).sum())
         return RegionSummary(
             region=region.name,
             height=height,
             cells=len(probed),
-            known_cells=int((probed > 0).sum()),
+            known_cells=known_cells,
             measure=self.measure,
-            numbers=self._numbers(self.estimate(region, height), self.measure),
-            known=self._numbers(self.estimate(region, height, "known"), "known"),
+            numbers=self._numbers(region, height, self.measure, known_cells),
+            known=self._numbers(region, height, "known", known_cells),
             visible_m2=math.nan if self.area is None else self._visible_m2(self.area, band, cells),
             redundancy=self._without_each(region, height),
+        )
+
+    def _numbers(self, region: Region, height: str, measure: Measure, known_cells: int) -> dict[str, Number]:
+        # How often an interval around the mean over known cells holds the truth has not been measured.
+        intervals = measure == "area"
+        return self.estimate(region, height, measure).numbers(
+            intervals=intervals, count=known_cells, count_of="known cells"
         )
 
     def _without_each(self, region: Region, height: str) -> RegionRedundancy | None:
@@ -271,24 +278,14 @@ class Coverage:
         redundancy, band = self.redundancy, list(self.grid.heights).index(height)
         if redundancy is None or (redundancy.places is not None and region not in self.regions):
             return None
+        quantities = quantities_of(redundancy, self.thresholds)
         if redundancy.places is not None:
             place = self.regions.index(region) * len(self.grid.heights) + band
-            return region_redundancy(redundancy, self.thresholds, over_place(redundancy.places, place))
+            return region_redundancy(redundancy, self.thresholds, over_place(redundancy.places, place, quantities))
         known = region.mask(self.grid).to(self.radius.device) & (self.probed_steps[band] > 0)
         with_all = self.estimate(region, height, "known").value
-        return region_redundancy(redundancy, self.thresholds, over_known(redundancy, with_all, band, known))
+        return region_redundancy(redundancy, self.thresholds, over_known(redundancy, with_all, band, known, quantities))
 
     def _visible_m2(self, area: AreaSums, band: int, cells: Tensor) -> float:
         total = float(area_in_blocks(area, band, cells.to(area.at.device))[:, 0].sum())
         return total / self.counts["steps"] if self.counts["steps"] else math.nan
-
-    def _numbers(self, estimate: RegionEstimate, measure: Measure) -> dict[str, Number]:
-        numbers, freedom = {}, len(estimate.steps) - 1
-        for quantity, value, error in zip(
-            self.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True
-        ):
-            known = error if error > ROUND_OFF else math.nan  # blocks that all say the same prove nothing
-            # Of the mean over known cells nobody has measured how often an interval holds the truth.
-            ends = interval95(value, error, freedom, quantity.unit) if measure == "area" else ()
-            numbers[quantity.key] = Number(value, known, *ends)
-        return numbers

@@ -1,55 +1,10 @@
 """The numbers of a region, as tables and loggers take them."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
-from torchcover.coverage.estimate import Measure, RegionEstimate
-from torchcover.coverage.intervals import is_significant
-
-
-class Number(NamedTuple):
-    """A number in the unit of its quantity, its standard error and its 95 % interval; NaN where it is not known.
-
-    Args:
-        value: The number.
-        error: Its standard error.
-        low: Lower end of the interval, from `torchcover.coverage.intervals.interval95`; NaN for means over known cells.
-        high: Upper end.
-    """
-
-    value: float
-    error: float
-    low: float = math.nan
-    high: float = math.nan
-
-
-class Difference(NamedTuple):
-    """What a rig has more than the first one, in the same steps and against the same reference points.
-
-    Args:
-        value: Metres, or a share in [-1, 1]; NaN if unknown.
-        error: Standard error of `value` itself, which is less than that of the two numbers: what makes a step easy or
-            hard for both rigs cancels out. NaN if there are not enough blocks.
-        significant: Whether the difference is more than chance, by Student's t at 95 %; None if that is unknown.
-    """
-
-    value: float
-    error: float
-    significant: bool | None
-
-
-def differences_of(estimate: RegionEstimate, first: RegionEstimate) -> list[Difference]:
-    """The differences of one estimate to another over the same steps, quantity by quantity."""
-    # Two infinite numbers are equal; their difference would be NaN, which means unknown.
-    values = (estimate.value - first.value).where(estimate.value != first.value, 0.0)
-    errors = estimate.minus(first).error
-    freedom = len(estimate.steps) - 1
-    return [
-        Difference(value, error, is_significant(value, error, freedom))
-        for value, error in zip(values.tolist(), errors.tolist(), strict=True)
-    ]
+from torchcover.coverage.measures import Measure
+from torchcover.estimation import Difference, Number
 
 
 @dataclass(frozen=True)

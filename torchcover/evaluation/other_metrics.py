@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.coverage import Coverage, Quantity, Region
-from torchcover.coverage.blocks import MIN_BLOCKS
-from torchcover.coverage.estimate import area_in_blocks
+from torchcover.coverage import Coverage, Region
+from torchcover.coverage.measures import area_in_blocks
+from torchcover.estimation import MIN_BLOCKS, Quantity
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
 from torchcover.frames import BadFrameError, Frame
@@ -173,16 +173,16 @@ def _own(coverages: Sequence[Coverage], region: Region, height: str, which: int,
 
 def _own_number(coverage: Coverage, region: Region, height: str, quantity: Quantity) -> PublishedNumber:
     (summary,) = (row for row in coverage.summary([region]) if row.height == height)
-    value, error = summary.numbers[quantity.key][:2]
+    number = summary.numbers[quantity.key]
     return PublishedNumber(
         f"{quantity.key} {region.name} {height}",
-        value,
+        number.value,
         quantity.unit,
         not quantity.lower_is_better,
         {"measure": summary.measure, "cell_m": coverage.grid.cell},
-        0 if math.isnan(value) else summary.known_cells,
+        0 if math.isnan(number.value) else summary.known_cells,
         "known cells",
-        error,
+        number.error,
     )
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import Coverage, Region
-from torchcover.coverage.estimate import Measure, area_in_blocks
+from torchcover.coverage.measures import Measure, area_in_blocks
 from torchcover.evaluation.evaluating import compare
 from torchcover.evaluation.other_metrics import drawn_worlds
 from torchcover.evaluation.rig_names import AnyRig, loaded

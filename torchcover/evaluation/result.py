@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
-from torchcover.coverage.blocks import MIN_BLOCKS
+from torchcover.estimation import MIN_BLOCKS
 from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.omissions import Omission
 from torchcover.evaluation.pipeline import Run

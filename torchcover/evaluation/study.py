@@ -9,7 +9,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from torchcover import __version__
-from torchcover.coverage import Quantity
+from torchcover.estimation import Quantity
 from torchcover.evaluation.study_plan import StudyPlan
 from torchcover.evaluation.study_runs import command_s, tried
 from torchcover.evaluation.study_truth import Truth, long_run

@@ -8,8 +8,8 @@ from typing import Any
 
 from rich.table import Table
 
-from torchcover.coverage import Quantity
-from torchcover.report import UNITS, WorkPanel, difference_heading, error_words, json_record, text_table
+from torchcover.estimation import Quantity
+from torchcover.report import WorkPanel, difference_heading, error_words, json_record, shown_unit, text_table
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def work_panels(
         floor: Standard errors of the long run, likewise by key: errors below them say nothing.
     """
     for quantity in quantities:
-        key, factor = quantity.key, UNITS[quantity.unit].factor
+        key, factor = quantity.key, shown_unit(quantity.unit).factor
 
         def line(of: Sequence[WorkPoint], key: str = key, factor: float = factor) -> list[tuple[float, float]]:
             return [(point.seconds, factor * point.errors[key]) for point in of]

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.coverage.errors import ROUND_OFF, jackknife_error
+from torchcover.estimation import ROUND_OFF, jackknife_error
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox
 from torchcover.neighbors import check_cloud

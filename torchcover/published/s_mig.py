@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.coverage.errors import ROUND_OFF, jackknife_error
+from torchcover.estimation import ROUND_OFF, jackknife_error
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox
 from torchcover.metrics import with_rows

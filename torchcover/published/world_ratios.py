@@ -8,8 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcover.coverage.blocks import MIN_BLOCKS
-from torchcover.coverage.errors import ROUND_OFF, jackknife_error
+from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, jackknife_error
 from torchcover.frames import Frame
 from torchcover.published.number import PublishedNumber
 from torchcover.published.world_blocks import WorldBlocks

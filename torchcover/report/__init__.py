@@ -23,13 +23,12 @@ from torchcover.report.renderers.layout import BOLD_MARKS, PLACE_HEADINGS, Part,
 from torchcover.report.renderers.markdown_file import as_markdown
 from torchcover.report.renderers.text_file import narrowest_width, print_table, text_table
 from torchcover.report.table import CoverageTable, Row
-from torchcover.report.wording import UNITS, difference_heading, error_words, percent
+from torchcover.report.wording import difference_heading, error_words, percent, shown_unit
 
 __all__ = [
     "BOLD_MARKS",
     "PLACE_HEADINGS",
     "RENDERERS",
-    "UNITS",
     "ActorMark",
     "ChoiceSize",
     "ColourScale",
@@ -82,6 +81,7 @@ __all__ = [
     "print_table",
     "remarks_on",
     "scale_of",
+    "shown_unit",
     "table_dict",
     "text_table",
     "write_figures",

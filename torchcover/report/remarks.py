@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-from torchcover.coverage.blocks import MIN_BLOCKS
+from torchcover.estimation import MIN_BLOCKS
 from torchcover.report.failures import sensors_of, single_point_of_failure
 from torchcover.report.table import CoverageTable
 from torchcover.report.wording import span, steps_and_cell

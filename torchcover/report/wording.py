@@ -5,9 +5,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
-from torchcover.coverage import BevGrid, Difference, Number, Quantity
-from torchcover.coverage.errors import ROUND_OFF
-from torchcover.coverage.quantity import Unit
+from torchcover.coverage import BevGrid
+from torchcover.estimation import ROUND_OFF, Difference, Number, Quantity, Unit
 
 
 class ShownUnit(NamedTuple):
@@ -30,13 +29,23 @@ class ShownUnit(NamedTuple):
     highest: float
 
 
-UNITS: Mapping[Unit, ShownUnit] = MappingProxyType(
+_UNITS: Mapping[Unit, ShownUnit] = MappingProxyType(
     {
         "m": ShownUnit("m", "m", 1.0, 2, 4, math.inf),
         "sensors": ShownUnit("sensors", "sensors", 1.0, 2, 3, math.inf),
         "share": ShownUnit("%", "percentage points", 100.0, 1, 3, 100.0),
     }
 )
+
+
+def shown_unit(unit: Unit) -> ShownUnit:
+    """How numbers of a unit are shown: as they are where nothing else is known of it.
+
+    Example:
+        >>> shown_unit("share").name, shown_unit("nats").name
+        ('%', 'nats')
+    """
+    return _UNITS.get(unit) or ShownUnit(unit, unit, 1.0, 2, 4, math.inf)
 
 
 class Rounded(NamedTuple):
@@ -53,23 +62,24 @@ class Rounded(NamedTuple):
     relation: Literal["", "<", ">"] = ""
 
 
-def rounded(number: Number, unit: Unit) -> Rounded:
+def rounded(number: float, error: float, unit: Unit) -> Rounded:
     """Round a number: to the two digits of its error, or to the usual decimals if it has none.
 
     Args:
-        number: A number that is not NaN, and its error; NaN for none.
+        number: In its unit; not NaN.
+        error: Its standard error; NaN for none.
         unit: That of its quantity.
 
     Example:
-        >>> rounded(Number(0.34127, 0.0123), "m"), rounded(Number(0.9999, float("nan")), "share")
+        >>> rounded(0.34127, 0.0123, "m"), rounded(0.9999, float("nan"), "share")
         (Rounded(value=0.341, decimals=3, relation=''), Rounded(value=99.9, decimals=1, relation='>'))
     """
-    shown = UNITS[unit]
-    value, error = shown.factor * number.value, shown.factor * number.error
+    shown = shown_unit(unit)
+    value = shown.factor * number
     if math.isinf(value):
         return Rounded(value, 0)
-    if number.error > ROUND_OFF:
-        return _to_error(value, error, shown)
+    if error > ROUND_OFF:
+        return _to_error(value, shown.factor * error, shown)
     if value in (0.0, shown.highest) and math.isfinite(shown.highest):
         return Rounded(value, 0)
     return _to_decimals(value, shown)
@@ -129,12 +139,18 @@ def _round(value: float, decimals: int) -> Rounded:
 UNKNOWN = "unknown"
 
 
-def number_words(number: Number, unit: Unit) -> str:
+def number_words(number: Number) -> str:
+    """A number and its standard error, without the unit; see `value_words`."""
+    return value_words(number.value, number.error, number.quantity.unit)
+
+
+def value_words(number: float, error: float, unit: Unit) -> str:
     """A number and its standard error, without the unit.
 
     Args:
-        number: Metres, or a share in [0, 1]; its error is NaN for none.
-        unit: That of its quantity.
+        number: Metres, or a share in [0, 1].
+        error: Its standard error; NaN for none.
+        unit: Its unit.
 
     Returns:
         A length with two decimals, a share in percent with one; with an error as many as its two digits need, at most
@@ -142,19 +158,19 @@ def number_words(number: Number, unit: Unit) -> str:
 
     Example:
         >>> none = float("nan")
-        >>> [number_words(Number(length, none), "m") for length in (0.126, 12.0, float("inf"), none)]
+        >>> [value_words(length, none, "m") for length in (0.126, 12.0, float("inf"), none)]
         ['0.13', '12.00', 'infinite', 'unknown']
-        >>> [number_words(Number(0.34127, error), "m") for error in (0.0123, 0.00123, 1e-7, 0.0)]
+        >>> [value_words(0.34127, error, "m") for error in (0.0123, 0.00123, 1e-7, 0.0)]
         ['0.341 ± 0.012', '0.3413 ± 0.0012', '0.3413 ± <0.0001', '0.34 ± 0']
-        >>> number_words(Number(0.49812, 0.00123), "share"), number_words(Number(1.0, 0.0), "share")
+        >>> value_words(0.49812, 0.00123, "share"), value_words(1.0, 0.0, "share")
         ('49.81 ± 0.12', '100 ± 0')
     """
-    if math.isnan(number.value):
+    if math.isnan(number):
         return UNKNOWN
-    if math.isinf(number.value):
+    if math.isinf(number):
         return "infinite"
-    words = _words(rounded(number, unit))
-    return words if math.isnan(number.error) else f"{words} ± {_error_words(number.error, unit, ROUND_OFF)}"
+    words = _words(rounded(number, error, unit))
+    return words if math.isnan(error) else f"{words} ± {_error_words(error, unit, ROUND_OFF)}"
 
 
 def percent(share: float) -> str:
@@ -164,7 +180,7 @@ def percent(share: float) -> str:
         >>> [percent(share) for share in (0.0, 0.0001, 0.123, 0.9999, 1.0, float("nan"))]
         ['0', '<0.1', '12.3', '>99.9', '100', 'unknown']
     """
-    return number_words(Number(share, math.nan), "share")
+    return value_words(share, math.nan, "share")
 
 
 def square_metres(m2: float) -> str:
@@ -191,20 +207,22 @@ def error_words(error: float, unit: Unit) -> str:
     return UNKNOWN if math.isnan(error) else _error_words(error, unit, ROUND_OFF)
 
 
-def difference_words(difference: Difference, unit: Unit) -> str:
+def difference_words(difference: Difference) -> str:
     """A difference and its standard error, with its sign: lengths in metres, shares in percentage points.
 
     Example:
-        >>> difference_words(Difference(0.0213, 0.0041, True), "m"), difference_words(Difference(-0.5, 0.0, None), "m")
+        >>> radius = Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True)
+        >>> difference_words(Difference(radius, 0.0213, 0.0041)), difference_words(Difference(radius, -0.5, 0.0))
         ('+0.0213 ± 0.0041', '-0.50 ± 0')
-        >>> difference_words(Difference(-0.0213, 0.0041, True), "share")
+        >>> difference_words(Difference(radius._replace(unit="share"), -0.0213, 0.0041))
         '-2.13 ± 0.41'
     """
     if math.isnan(difference.value):
         return UNKNOWN
     if math.isinf(difference.value):
         return "+infinite" if difference.value > 0 else "-infinite"
-    shown = UNITS[unit]
+    unit = difference.quantity.unit
+    shown = shown_unit(unit)
     value, error = shown.factor * difference.value, shown.factor * difference.error
     inexact = error > 100 * ROUND_OFF
     decimals = decimals_of(error, shown.max_decimals) if inexact else shown.decimals
@@ -223,12 +241,12 @@ def heading(quantity: Quantity) -> str:
         >>> heading(Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True))
         'mean blind spot radius (m)'
     """
-    return f"{quantity.title} ({UNITS[quantity.unit].name})"
+    return f"{quantity.title} ({shown_unit(quantity.unit).name})"
 
 
 def difference_heading(quantity: Quantity) -> str:
     """What its differences are called, with their unit."""
-    return f"{quantity.title} ({UNITS[quantity.unit].difference_name})"
+    return f"{quantity.title} ({shown_unit(quantity.unit).difference_name})"
 
 
 def capitalised(words: str) -> str:
@@ -253,5 +271,5 @@ def _words(number: Rounded) -> str:
 def _error_words(error: float, unit: Unit, negligible: float) -> str:
     if error <= negligible:
         return "0"
-    shown = UNITS[unit]
+    shown = shown_unit(unit)
     return _words(rounded_error(shown.factor * error, shown.max_decimals))

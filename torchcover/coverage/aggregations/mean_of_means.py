@@ -10,7 +10,8 @@ from torch import Tensor
 
 from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, State
 from torchcover.coverage.layer import Layer
-from torchcover.coverage.quantity import RADIUS, Quantity, detection
+from torchcover.coverage.quantity import RADIUS, detection
+from torchcover.estimation import Quantity
 
 
 @dataclass(frozen=True)

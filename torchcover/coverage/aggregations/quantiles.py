@@ -10,7 +10,8 @@ from torch import Tensor
 from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, State
 from torchcover.coverage.histogram import RADIUS_EDGES_M, bin_of, check_levels, histogram_quantiles
 from torchcover.coverage.layer import Layer
-from torchcover.coverage.quantity import Quantity, radius
+from torchcover.coverage.quantity import radius
+from torchcover.estimation import Quantity
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, State
 from torchcover.coverage.layer import Layer
-from torchcover.coverage.quantity import RADIUS, Quantity, by_area, detection
+from torchcover.coverage.quantity import RADIUS, by_area, detection
+from torchcover.estimation import Quantity
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover.coverage.errors import jackknife_error, ratio_errors
+from torchcover.estimation import jackknife_error, ratio_errors
 
 
 def blocks_of(cells: int, blocks: int = 16, seed: int = 0):

@@ -5,9 +5,10 @@ import math
 import torch
 from torch import Tensor
 
-from torchcover.coverage.blocks import MIN_BLOCKS
-from torchcover.coverage.quantity import Unit
+from torchcover.estimation.quantity import Unit
 
+# With fewer, the error itself is off by more than a quarter: 1 / sqrt(2 (blocks - 1)).
+MIN_BLOCKS = 8
 # Errors below come from rounding in sums of float64: the estimate is the same whichever block is left out.
 ROUND_OFF = 1e-12
 # A cell has an error if it was probed in at least as many blocks.
@@ -16,7 +17,7 @@ MIN_BLOCKS_OF_A_CELL = 8
 IMAGINED_RADIUS = 5.0
 
 
-def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor) -> Tensor:
+def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor, least: int = MIN_BLOCKS) -> Tensor:
     """Standard error of an estimate from what it becomes as one block after the other is left out.
 
     The delete-m_j jackknife for blocks of unequal size (Busing, Meijer & van der Leeden 1999, Statistics and Computing
@@ -28,9 +29,10 @@ def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor) -> Tensor:
         left_out: (g, ...) estimates without block j.
         whole: (...) estimate from all blocks.
         steps: (g,) steps m_j of each block, all above 0.
+        least: Fewer blocks than these give no error; 2 at least.
 
     Returns:
-        (...) standard errors; NaN for fewer than 8 blocks, and where an estimate is not finite.
+        (...) standard errors; NaN for too few blocks, and where an estimate is not finite.
 
     Example:
         >>> values = torch.arange(10.0, dtype=torch.float64)           # one step a block: the error of a mean
@@ -40,13 +42,19 @@ def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor) -> Tensor:
         tensor(True)
     """
     blocks = len(steps)
-    if blocks < MIN_BLOCKS:
+    if blocks < least:
         return torch.full_like(whole, math.nan)
     ratio = (steps.sum() / steps.double()).view(-1, *[1] * whole.dim())
-    pseudo = ratio * whole - (ratio - 1) * left_out
+    pseudo = pseudo_values(left_out, whole, steps)
     centre = blocks * whole - ((1 - 1 / ratio) * left_out).sum(dim=0)
     error = (((pseudo - centre) ** 2 / (ratio - 1)).mean(dim=0)).sqrt()
     return error.where(whole.isfinite(), math.nan)
+
+
+def pseudo_values(left_out: Tensor, whole: Tensor, steps: Tensor) -> Tensor:
+    """(g, ...) the p_j of `jackknife_error`: what each block says by itself, had it been as long as all of them."""
+    ratio = (steps.sum() / steps.double()).view(-1, *[1] * whole.dim())
+    return ratio * whole - (ratio - 1) * left_out
 
 
 def ratio_errors(base: Tensor, sums: Tensor, unit: Unit) -> Tensor:
