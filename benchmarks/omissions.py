@@ -55,7 +55,7 @@ def rays_that_pass_by(scene):
     reference, instant = PaperReference(rows=256, columns=256), scene.at(STEP, within_m=RANGE_M)
     generator = np.random.default_rng(0)
     pose = reference.vehicle_T_reference(scene.ego_box, generator)
-    tiles = reference.tiles(pose, generator)
+    tiles = into_tiles(reference.directions())
     return (
         lambda: at_every_body(instant, pose, tiles),
         lambda: instant.scan(pose, tiles, max_range_m=RANGE_M),

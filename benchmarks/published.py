@@ -49,7 +49,9 @@ def seconds_of(rigs):
     )
     task, with_boxes = (task_of(rigs, "urban", None, each) for each in (plain, settings))
     metrics = metrics_of(with_boxes, settings).of_rigs
-    coverage = [CoverageObserver(plain.metric(task.asked, task.frames.weight_kind), rig) for rig in task.rigs]
+    coverage = [
+        CoverageObserver(plain.metric(task.asked, square_metres=task.frames.square_metres), rig) for rig in task.rigs
+    ]
     spent = []
     for step in range(STEPS + 1):
         row = {}

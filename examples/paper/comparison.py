@@ -76,7 +76,8 @@ def as_records(results):
             "steps": steps,
             **scores[lidars, measure, steps]._asdict(),
             "numbers": [
-                {**place._asdict(), **number._asdict(), "paper": published()[place]} for place, number in run.items()
+                {**place._asdict(), "value": number.value, "error": number.error, "paper": published()[place]}
+                for place, number in run.items()
             ],
         }
         for (lidars, measure, steps), run in results.items()

@@ -118,7 +118,7 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
     assert summary["reference"] == {"sensor": "paper", "rays_per_step": 128 * 128, "every_s": 0.1}
 
 
-def test_the_weights_of_an_even_reference_reach_the_metric(torchcover, worlds, monkeypatch):
+def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, worlds, monkeypatch):
     given = []
 
     def noted(self, sensor, reference, *, weights, index):
@@ -128,7 +128,7 @@ def test_the_weights_of_an_even_reference_reach_the_metric(torchcover, worlds, m
     update = CoverageMetric.update
     monkeypatch.setattr(CoverageMetric, "update", noted)
     options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell", 4, "--rays", 4096, "--out", worlds / "out"]
-    for reference in ("even", "paper"):
+    for reference in ("surface", "paper"):
         assert torchcover("evaluate", worlds / "low.yaml", *options, "--reference", reference)[0] == 0
     (points, weights, _), _, (_, none, _), _ = given
     assert weights.shape == (points,)
@@ -142,7 +142,7 @@ def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchco
     options = ["--scenario", worlds / "yard.yaml", "--steps", 1, "--cell", 4, "--rays", 1024, "--out", worlds / "out"]
     assert torchcover("evaluate", worlds / "low.yaml", *options, "--reference", name)[0] == 0
     summary = json.loads((worlds / "out" / "summary.json").read_text())
-    by_area = REFERENCE_SENSORS[name].weight_kind == "m2"
+    by_area = REFERENCE_SENSORS[name].square_metres
     assert (summary["reference"]["sensor"], summary["measure"]) == (name, "area" if by_area else "known")
     assert Coverage.load(worlds / "out" / "coverage.npz").measure == summary["measure"]
     assert name in torchcover("evaluate", "--help")[1]
@@ -223,10 +223,6 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             ["evaluate", "front_roof_128", "--reference", "best"],
             f"reference best: {' or '.join(f'`{name}`' for name in REFERENCE_SENSORS)} is needed",
         ),
-        (
-            ["evaluate", "front_roof_128", "--reference", "even", "--rays", "7"],
-            "rays: at least 2 for each of 5 areas are needed; got 7",
-        ),
         (["evaluate", "front_roof_128", "--estimate", "best"], "'best' is not one of 'area', 'known'"),
         (
             ["evaluate", "front_roof_128", "--reference", "paper", "--estimate", "area"],
@@ -234,7 +230,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         ),
         (["evaluate", "front_roof_128", "--rays", "0"], "--rays"),
         (["evaluate", "--frames", "recording", "--rays", "9"], "reference, rays and every are for simulations"),
-        (["evaluate", "--frames", "recording", "--reference", "even"], "for a recording `recorded` or `accumulated`"),
+        (["evaluate", "--frames", "recording", "--reference", "paper"], "for a recording `recorded` or `accumulated`"),
         (["evaluate", "--frames", "recording", "--reference", "accumulated"], "does not say when its scans were made"),
         (["evaluate", "--frames", "recording", "--sensors", "roof"], "which has sensor, reference; got roof"),
         (

@@ -28,7 +28,7 @@ class Drive:
     sensors = {}  # noqa: RUF012
     ego_outline_m = None
     description = {"scenario": None, "frames": "drive", "seed": None}  # noqa: RUF012
-    weight_kind = None
+    square_metres = False
     reference_record = None
 
     def __init__(self, frame_of, bad=(), content="drive", delay_s=0.0):

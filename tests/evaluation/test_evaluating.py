@@ -41,7 +41,7 @@ class Source:
     sensors = {}  # noqa: RUF012
     ego_outline_m = None
     description = {"scenario": None, "frames": "made up", "seed": None}  # noqa: RUF012
-    weight_kind = None
+    square_metres = False
     reference_record = None
     content = {"frames": "made up"}  # noqa: RUF012
 
@@ -331,7 +331,7 @@ def test_what_a_killed_process_left_aside_is_cleared(tmp_path):
 
 def test_a_source_that_lacks_something_is_told_what():
     class Unfinished(Single):
-        weight_kind = property()  # raises AttributeError, as what is not there does
+        square_metres = property()  # raises AttributeError, as what is not there does
 
-    with pytest.raises(TypeError, match="got Unfinished, which has no weight_kind; for a list"):
+    with pytest.raises(TypeError, match="got Unfinished, which has no square_metres; for a list"):
         torchcover.evaluate(frames=Unfinished(), cell_m=8.0)

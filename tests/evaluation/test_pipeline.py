@@ -187,12 +187,11 @@ def test_what_ended_a_run_is_raised_unless_the_caller_keeps_what_there_is(frames
     assert names.names == ["f0", "f1", "f2"]
 
 
-@pytest.mark.parametrize("kind", [None, "density"])
-def test_square_metres_are_not_made_up(frames, kind):
+def test_square_metres_are_not_made_up(frames):
     metric = CoverageMetric(GRID, square_metres=True)
-    with pytest.raises(ValueError, match="needs the square metres of each reference point"):
-        CoverageObserver(metric, "a").update(replace(frames[0], weight_kind=kind))
-    CoverageObserver(metric, "a").update(replace(frames[0], weight_kind="m2"))
+    with pytest.raises(ValueError, match="the square metres of each reference point are needed"):
+        CoverageObserver(metric, "a").update(replace(frames[0], reference_weights=None))
+    CoverageObserver(metric, "a").update(frames[0])
     assert metric.compute().measure == "area"
 
 

@@ -60,7 +60,7 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
         frame = source[index]
         assert frame.index == index
         assert list(frame.clouds) == list(source.rigs)
-        assert frame.weight_kind == source.weight_kind
+        assert (frame.reference_weights is not None) == source.square_metres
         assert all(cloud.dtype == torch.float32 for cloud in (*frame.clouds.values(), frame.reference))
     assert [frame.index for frame in source] == [frame.index for frame in source] == [0, 1]
     with pytest.raises(IndexError):
@@ -134,14 +134,12 @@ def test_a_batch_without_the_rig_that_is_asked_for_says_what_it_has(tmp_path):
         batch.clouds_of("c")
 
 
-def test_weights_of_several_kinds_are_no_weights_of_a_batch():
+def test_a_batch_has_weights_of_all_its_frames_or_of_none():
     points, weights = torch.zeros(3, 3), torch.ones(3)
-    area, other, none = (
-        Frame({"rig": points}, points, 0, name, reference_weights=given, weight_kind=kind)
-        for name, given, kind in (("a", weights, "m2"), ("b", weights, "density"), ("c", None, None))
-    )
+    area = Frame({"rig": points}, points, 0, "a", reference_weights=weights)
+    none = Frame({"rig": points}, points, 0, "b")
     assert torch.equal(collate_frames([area, area]).weights[1], weights)
     assert collate_frames([none, none]).weights is None
-    for mixed in ([area, other], [area, none], [none, other]):
-        with pytest.raises(ValueError, match=r"weights: one weight_kind is needed in a batch; got '?\w+'? \(as of '"):
+    for mixed in ([area, none], [none, area]):
+        with pytest.raises(ValueError, match=r"weights: frame 'a' has the square metres .*, and 'b' has none; batch"):
             _ = collate_frames(mixed).weights

@@ -182,7 +182,6 @@ def frame_step(index: int) -> Step:
         index=index,
         name=f"frame {index}",
         reference_weights=torch.rand(60 + 8 * count, generator=generator) + 0.1,
-        weight_kind="m2",
         boxes=Boxes.from_rows(rows, categories=categories),
         sensor_points={"rig": {"front": 25, "rear": 35 + 4 * count}},
     )
@@ -220,7 +219,6 @@ def of_frames(kind: Callable[..., Metric], usual: Step, changes: Mapping[str, St
         0,
         "nothing",
         reference_weights=torch.zeros(0),
-        weight_kind="m2",
         boxes=Boxes.from_rows(torch.zeros(0, 7)),
         sensor_points={"rig": {"front": 0, "rear": 0}},
     )

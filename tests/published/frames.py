@@ -16,7 +16,6 @@ def frame_of(cloud, reference=(), boxes=(), categories=(), *, index=0, weights=N
         index=index,
         name=f"frame {index}",
         reference_weights=None if weights is None else torch.tensor(weights, dtype=torch.float32),
-        weight_kind=None if weights is None else "m2",
         boxes=Boxes.from_rows(rows, categories=tuple(categories) or ("",) * len(rows)),
         sensor_points=None if sensors is None else {"rig": sensors},
         instant=instant,

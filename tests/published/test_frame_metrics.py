@@ -295,7 +295,7 @@ def test_frames_without_boxes_are_refused_with_the_way_to_them(name):
 
 
 def test_square_metres_that_are_missing_are_refused():
-    frame = replace(CASES["k-cover"].steps[0]["frame"], reference_weights=None, weight_kind=None)
+    frame = replace(CASES["k-cover"].steps[0]["frame"], reference_weights=None)
     with pytest.raises(ValueError, match="square metres"):
         CASES["k-cover"].make().update(frame)
     CASES["k-cover"].make(square_metres=False).update(frame)

@@ -27,7 +27,7 @@ class Drive:
     body: BoundingBox | None = None
     sensors = ("left", "right")
     reference_sensors = ()
-    weight_kind = None
+    square_metres = False
     instants = None
     path = Path("drive")
 

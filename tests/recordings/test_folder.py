@@ -56,14 +56,13 @@ def test_points_of_the_reference_keep_their_weights_and_those_left_out_take_thei
         np.savez(tmp_path / "reference" / f"{name}.npz", points=points, weights=np.arange(1.0, 6.0))
     assert RecordedFrames(tmp_path)[0].reference_weights is None
     (tmp_path / "frames.yaml").write_text(
-        "{reference: {weight_kind: m2}, vehicle: {lower_m: [-1, -1, 0], upper_m: [1, 1, 1]}}"
+        "{reference: {square_metres: true}, vehicle: {lower_m: [-1, -1, 0], upper_m: [1, 1, 1]}}"
     )
     frames = RecordedFrames(tmp_path)
-    assert frames.weight_kind == frames[1].weight_kind == "m2"
+    assert frames.square_metres
     assert frames[1].reference[:, 0].tolist() == [9.0, 7.0]
     assert frames[1].reference_weights.tolist() == [2.0, 5.0]
     assert frames[1].reference_weights.dtype == torch.float32
-    frames[1].check_weights(square_metres=True)
 
 
 @pytest.mark.parametrize(
@@ -81,7 +80,7 @@ def test_points_of_the_reference_keep_their_weights_and_those_left_out_take_thei
 )
 def test_bad_weights_are_a_bad_frame(tmp_path, arrays, message):
     clouds(tmp_path, sensor=CLOUD, reference=CLOUD)
-    (tmp_path / "frames.yaml").write_text("reference: {weight_kind: m2}")
+    (tmp_path / "frames.yaml").write_text("reference: {square_metres: true}")
     with pytest.raises(BadFrameError, match=r"f2\.npy: weights are read from a \.npz"):
         RecordedFrames(tmp_path)[0]
     (tmp_path / "reference" / "f2.npy").unlink()

@@ -40,7 +40,7 @@ class Street:
     path = Path("street")
     sensors = ("lidar",)
     reference_sensors = ("reference",)
-    weight_kind = None
+    square_metres = False
     instants = None
 
     def __post_init__(self):

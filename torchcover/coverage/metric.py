@@ -60,8 +60,9 @@ class CoverageMetric(MergeableMetric):
             the grid if not given. The sums do not depend on it.
         sensors: Names of the rig's sensors, for `Coverage.redundancy`: then `update` takes a cloud for each by its
             name, and what the rig is without each of them is known as well.
-        square_metres: Whether the weights of reference points are square metres of surface, as `SurfaceReference` gives
-            them: then there is an estimate by area too. The state grows by 8 (2 + thresholds) bytes a cell and block.
+        square_metres: Whether there is to be an estimate by area too; then every step needs the square metres of its
+            reference points, as `SurfaceReference` gives them. The state grows by 8 (2 + thresholds) bytes a cell and
+            block.
         backend: Nearest-neighbour search, as in `torchcover.nearest`.
         memory_mb: As in `torchcover.nearest`.
         kwargs: For `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
@@ -174,17 +175,17 @@ class CoverageMetric(MergeableMetric):
                 Of a metric with `sensors`: name of the sensor -> its points, or a list of such dicts.
             reference: (M, 3) points of the reference sensor in the same frame, or a list of the same length. M = 0:
                 the step says nothing.
-            weights: (M,) weight of each reference point in the mean over its cell in its step, or a list of the same
-                length. For reference sensors whose density within a cell is not the one that is asked for: the
-                weights are the second divided by the first (`frame.reference_weights`). Not given: all weigh the same.
+            weights: (M,) square metres that each reference point stands for (`frame.reference_weights`), or a list of
+                the same length: what it weighs in the mean over its cell in its step, and in the estimate by area. Not
+                given: all weigh the same.
             index: Number of the step in time, 10^15 at most, or a list of them; it decides about the block, so that
                 steps of one number, as of an instant that is seen again, share one. Not given: counted on from the
                 steps so far.
 
         Raises:
             ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights
-                that are not positive and finite, none where they are square metres, an index that is negative or too
-                large.
+                that are not positive and finite, none where there is to be an estimate by area, an index that is
+                negative or too large.
             TypeError: A cloud is not a floating-point tensor, an index not a whole number.
         """
         if self.square_metres and weights is None:

@@ -98,9 +98,12 @@ def _observed(
     """All that was seen, by all ranks."""
     if ranks:
         settings = replace(settings, device=ranks.device(settings.device))
-    kind, sensors = task.frames.weight_kind, task.sensor_names() if settings.redundancy else {}
+    sensors = task.sensor_names() if settings.redundancy else {}
     coverage = {
-        name: CoverageObserver(settings.metric(task.asked, kind, sensors.get(name, ())), name) for name in task.rigs
+        name: CoverageObserver(
+            settings.metric(task.asked, sensors.get(name, ()), square_metres=task.frames.square_metres), name
+        )
+        for name in task.rigs
     }
     target = settings.target_error
     watch = TargetWatch(target, coverage, task.asked.awaited) if target else None

@@ -87,7 +87,6 @@ class CoverageObserver:
                 square metres that the metric wants, or nobody knows which points are of which sensor and it wants
                 that.
         """
-        frame.check_weights(square_metres=self.metric.square_metres)
         sensor = self._by_sensor(frame) if self.metric.sensors else self._whole(frame)
         self.metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.place_in_time)
 

@@ -76,7 +76,7 @@ def metrics_of(task: Task, settings: Settings) -> OtherMetrics:
             ego=ego,
             grid=task.asked.grid,
             regions=task.asked.regions,
-            square_metres=task.frames.weight_kind == "m2",
+            square_metres=task.frames.square_metres,
             threshold_m=threshold_m,
             sights=sights,
             sync_on_compute=False,

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from torchcover.coverage import Aggregation, CoverageMetric, Measure
 from torchcover.evaluation.target_error import AnyTargetError, TargetError
-from torchcover.frames import WeightKind
 from torchcover.simulation import Asked, RegionsOfInterest, Scenario
 from torchcover.simulation.memory import check_fits
 
@@ -128,19 +127,19 @@ class Settings:
         if any(setting is not None for setting in (self.reference_sensor, self.rays, self.every_s)):
             raise ValueError("reference, rays and every are for simulations; a recording has its reference points")
 
-    def metric(self, asked: Asked, weight_kind: WeightKind | None, sensors: Sequence[str] = ()) -> CoverageMetric:
+    def metric(self, asked: Asked, sensors: Sequence[str] = (), *, square_metres: bool) -> CoverageMetric:
         """An empty metric.
 
         Args:
             asked: What is asked about.
             sensors: Names of the sensors, for redundancy.
-            weight_kind: What the weights of reference points are.
+            square_metres: Whether the frames have the square metres of reference points.
 
         Raises:
-            ValueError: An estimate by area is wanted, and the weights are no square metres; a device that cannot be
-                used; as `new_metric`.
+            ValueError: An estimate by area is wanted, and there are no square metres; a device that cannot be used; as
+                `new_metric`.
         """
-        if self.estimate == "area" and weight_kind != "m2":
+        if self.estimate == "area" and not square_metres:
             raise ValueError(
                 "estimate area: it needs the square metres of reference points, which the surface reference of a "
                 "simulation gives; leave it out for means over the known cells"
@@ -151,7 +150,7 @@ class Settings:
             usable_device(self.device),
             aggregations=self.aggregations,
             sensors=sensors,
-            square_metres=weight_kind == "m2" and self.estimate != "known",
+            square_metres=square_metres and self.estimate != "known",
         )
 
 

@@ -110,7 +110,7 @@ class Augmentation:
 def _moved(frame: Frame, similarity: Tensor) -> Frame:
     """Apply a (3, 3) float64 matrix that keeps shapes and z upright: a rotation about z, a mirror, a scale."""
     weights = frame.reference_weights
-    if weights is not None and frame.weight_kind == "m2":
+    if weights is not None:
         weights = weights * float(similarity[2, 2]) ** 2
     return replace(
         frame,

@@ -2,16 +2,11 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import torch
 from torch import Tensor
 
 from torchcover.detection.boxes import Boxes
-
-# What the weights of points are: "density", a ratio of densities of rays, good for means within a cell of a step; or
-# "m2", the visible square metres that each point stands for, good for sums over any cells and steps.
-WeightKind = Literal["density", "m2"]
 
 
 @dataclass(frozen=True)
@@ -25,12 +20,11 @@ class Frame:
         index: Position in its dataset.
         name: What a user calls it: a file stem, or scenario and step.
         counts: What was left out on the way here, by name (`sensor_self_hits`, `reference_nonfinite`, ...).
-        reference_weights: (M,) float32 weight of each reference point, where they differ; see `EvenReference`.
-        weight_kind: What the weights are: "density", good for means within a cell, or "m2", the visible square metres
-            that each point stands for; None if there are none, or nobody knows.
-        boxes: The objects of that instant; None if nobody looked for them, which is not the same as none being there.
+        reference_weights: (M,) float32 visible square metres that each reference point stands for, as a
+            `SurfaceReference` gives them; None if they are unknown, and all points count the same.
+        boxes: The objects of that instant; None if they are unknown, which is not the same as none being there.
         sensor_points: Name of each rig -> name of each of its sensors -> how many of the rig's points are its own, in
-            their order; None if nobody knows which points are whose.
+            their order; None if it is unknown which points are whose.
         instant: Number in time of what it shows, for standard errors: frames that share it, as of an instant that is
             seen again or of one city, do not count as independent. None: `index`, every frame is its own.
     """
@@ -41,7 +35,6 @@ class Frame:
     name: str
     counts: Mapping[str, int] = field(default_factory=dict)
     reference_weights: Tensor | None = None
-    weight_kind: WeightKind | None = None
     boxes: Boxes | None = None
     instant: int | None = None
     sensor_points: Mapping[str, Mapping[str, int]] | None = None
@@ -79,32 +72,16 @@ class Frame:
             rig: Which of several rigs; the only one if not given.
 
         Raises:
-            ValueError: No such rig, or nobody knows which points are whose.
+            ValueError: No such rig, or it is unknown which points are whose.
         """
         cloud, name = self.sensor if rig is None else self.cloud_of(rig), rig or next(iter(self.clouds))
         if self.sensor_points is None or name not in self.sensor_points:
             raise ValueError(
-                f"frame {self.name!r}: nobody knows which points of {name!r} are of which sensor (sensor_points), as "
+                f"frame {self.name!r}: it is unknown which points of {name!r} are of which sensor (sensor_points), as "
                 "redundancy needs"
             )
         points = self.sensor_points[name]
         return dict(zip(points, torch.split(cloud, list(points.values())), strict=True))
-
-    def check_weights(self, *, square_metres: bool) -> None:
-        """Whether a metric can take the weights of the reference points for what it needs.
-
-        Args:
-            square_metres: Whether it takes them for square metres, as `CoverageMetric.square_metres` says.
-
-        Raises:
-            ValueError: It does, and they are something else, or there are none.
-        """
-        if square_metres and (self.weight_kind != "m2" or self.reference_weights is None):
-            found = "no weights" if self.reference_weights is None else f"weight_kind {self.weight_kind!r}"
-            raise ValueError(
-                f'frame {self.name!r}: the metric needs the square metres of each reference point (weight_kind "m2", '
-                f"as of a SurfaceReference), and the frame has {found}; leave out square_metres=True"
-            )
 
     def pin_memory(self) -> "Frame":
         """A copy in page-locked memory; DataLoader calls it when `pin_memory=True`."""
@@ -152,19 +129,19 @@ class FrameBatch:
 
     @property
     def weights(self) -> list[Tensor] | None:
-        """One (M,) tensor a frame, the weights of its reference points; None if no frame has any.
+        """One (M,) tensor a frame, the square metres of its reference points; None if no frame has any.
 
         Raises:
-            ValueError: Weights of several kinds, which mean nothing side by side.
+            ValueError: Some frames have them, and others have not.
         """
-        kinds = {frame.weight_kind: frame.name for frame in self.frames}
-        if len(kinds) > 1:
-            several = ", ".join(f"{kind!r} (as of {name!r})" for kind, name in kinds.items())
-            raise ValueError(f"weights: one weight_kind is needed in a batch; got {several}; batch each kind by itself")
-        if all(frame.reference_weights is None for frame in self.frames):
-            return None
-        given = [(frame.reference_weights, frame.reference) for frame in self.frames]
-        return [cloud.new_ones(len(cloud)) if weights is None else weights for weights, cloud in given]
+        given = [frame.reference_weights for frame in self.frames if frame.reference_weights is not None]
+        if given and len(given) < len(self.frames):
+            named = {frame.reference_weights is None: frame.name for frame in self.frames}
+            raise ValueError(
+                f"weights: frame {named[False]!r} has the square metres of its reference points, and {named[True]!r} "
+                "has none; batch each kind of frames by itself"
+            )
+        return given or None
 
     @property
     def index(self) -> list[int]:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from torchcover.frames.frame import Frame, WeightKind
+from torchcover.frames.frame import Frame
 
 if TYPE_CHECKING:  # what they are is no matter of frames; who draws or measures them knows
     from torchcover.simulation import Sensor
@@ -69,8 +69,8 @@ class FrameSource(Protocol):
         ...
 
     @property
-    def weight_kind(self) -> WeightKind | None:
-        """What the weights of the reference points are, as in `Frame`."""
+    def square_metres(self) -> bool:
+        """Whether all frames have `Frame.reference_weights`, the square metres of reference points; else none has."""
         ...
 
     @property
@@ -154,9 +154,9 @@ class ChosenRigs(FrameDataset):
         return self.frames.description
 
     @property
-    def weight_kind(self) -> WeightKind | None:
+    def square_metres(self) -> bool:
         """As there."""
-        return self.frames.weight_kind
+        return self.frames.square_metres
 
     @property
     def reference_record(self) -> Mapping[str, object] | None:

@@ -26,7 +26,7 @@ class KCover(WorldRatios):
         regions: Those that have numbers of their own.
         threshold_m: Distance within which a point counts as seen.
         at_least: Numbers of sensors, k; more than the rig has are covered nowhere.
-        square_metres: Whether the weights of reference points are square metres; else the share is one of points.
+        square_metres: Whether the share is one of square metres, which frames are then to have; else one of points.
         rig: Whose clouds; those of the only rig if not given.
         sights: What metrics of a run share.
         kwargs: For `torchmetrics.Metric`.
@@ -78,15 +78,17 @@ class KCover(WorldRatios):
         self.sights.by_sensor = True
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        frame.check_weights(square_metres=self.square_metres)
+        weights = frame.reference_weights if self.square_metres else torch.ones(len(frame.reference))
+        if weights is None:
+            raise ValueError(
+                f"frame {frame.name!r}: the square metres of its reference points (reference_weights) are needed; got "
+                "none; for a share of the points use square_metres=False"
+            )
         within = self.sights.of_sensors(frame, rig_of(frame, self.rig), self.threshold_m) <= self.threshold_m
         inside, of, cell = self.sights.bins(frame, self.places.grid)
         point = inside[of]
         sensors = within.sum(dim=0)[point]
-        weight = torch.ones_like(point, dtype=torch.float64)
-        if self.square_metres:
-            assert frame.reference_weights is not None  # by check_weights
-            weight = frame.reference_weights[point].double()
+        weight = weights.to(point.device)[point].double()
         seen = [weight * (sensors >= k) for k in self.at_least]
         sums = self.places.sums(cell, torch.stack([torch.ones_like(weight), weight, *seen]))
         count, base = (row.repeat(len(seen)) for row in sums[:2])

@@ -37,7 +37,7 @@ class Setup:
         ego: The body that carries it, in the vehicle frame; None if it is unknown.
         grid: Cells and height bands of the run.
         regions: Those that numbers are given for.
-        square_metres: Whether the weights of reference points are square metres.
+        square_metres: Whether frames have the square metres of their reference points.
         threshold_m: Distance within which a point counts as seen.
         sights: What metrics of the same run share, so that each frame is searched once.
         sync_on_compute: As in `torchmetrics.Metric`.

@@ -148,8 +148,9 @@ class AccumulatedReference:
             raise ValueError(f"no reference point is left of the scans within {self.window_s / 2:g} s of this instant")
         return InVehicle(reference_m, dropped)
 
-    def weight_kind(self, recording: Recording) -> None:
-        """None: one point a voxel, which all count the same."""
+    def square_metres(self, recording: Recording) -> bool:
+        """No: one point a voxel, which all count the same."""
+        return False
 
     def record(self, recording: Recording, judged: Collection[str]) -> Mapping[str, object]:
         """Settings, and what such a reference cannot know."""

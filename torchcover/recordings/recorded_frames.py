@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.detection.inside import with_hits
-from torchcover.frames.frame import Frame, WeightKind
+from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
 from torchcover.recordings.accumulated_reference import AccumulatedReference
 from torchcover.recordings.formats import open_recording
@@ -93,9 +93,9 @@ class RecordedFrames(FrameDataset):
         return {"scenario": None, "vehicle": None, "frames": str(self.recording.path), "seed": None}
 
     @property
-    def weight_kind(self) -> WeightKind | None:
-        """What the weights of the reference points are; None: all of them count the same."""
-        return self.reference.weight_kind(self.recording)
+    def square_metres(self) -> bool:
+        """Whether the reference has the square metres of its points."""
+        return self.reference.square_metres(self.recording)
 
     @property
     def reference_record(self) -> Mapping[str, object]:
@@ -156,7 +156,6 @@ class RecordedFrames(FrameDataset):
             name,
             counts=counts,
             reference_weights=None if reference.weights is None else torch.from_numpy(reference.weights),
-            weight_kind=self.weight_kind,
             boxes=boxes,
             instant=None if self.recording.instants is None else self.recording.instants[instant],
             sensor_points={

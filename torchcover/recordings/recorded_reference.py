@@ -3,7 +3,6 @@
 from collections.abc import Collection, Mapping
 from typing import Protocol
 
-from torchcover.frames.frame import WeightKind
 from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, joined
 from torchcover.recordings.recording import Recording
 
@@ -31,8 +30,8 @@ class Reference(Protocol):
         """
         ...
 
-    def weight_kind(self, recording: Recording, /) -> WeightKind | None:
-        """What the weights of its points are, as in `Frame`."""
+    def square_metres(self, recording: Recording, /) -> bool:
+        """Whether its points have weights, the square metres that they stand for."""
         ...
 
     def record(self, recording: Recording, judged: Collection[str], /) -> Mapping[str, object]:
@@ -60,9 +59,9 @@ class RecordedReference:
             raise ValueError(f"{where}: the reference cloud has no points, so there is nothing to measure against")
         return found
 
-    def weight_kind(self, recording: Recording) -> WeightKind | None:
-        """As they were recorded."""
-        return recording.weight_kind
+    def square_metres(self, recording: Recording) -> bool:
+        """Whether they were recorded with them."""
+        return recording.square_metres
 
     def record(self, recording: Recording, judged: Collection[str]) -> Mapping[str, object]:
         """That it was recorded."""

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import Calibration
 from torchcover.detection.boxes import Boxes
-from torchcover.frames.frame import WeightKind
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import Points
@@ -110,8 +109,8 @@ class Recording(Protocol):
         ...
 
     @property
-    def weight_kind(self) -> WeightKind | None:
-        """What the weights of the reference sensors' points are; None if they have none."""
+    def square_metres(self) -> bool:
+        """Whether the scans of the reference sensors have weights, the square metres that their points stand for."""
         ...
 
     @property

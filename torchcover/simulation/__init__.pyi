@@ -8,7 +8,6 @@ from .camera_sensor import CameraSensor as CameraSensor
 from .documents import Document as Document
 from .documents import Pose as Pose
 from .ego import with_ego as with_ego
-from .even_reference import EvenReference as EvenReference
 from .kinds import REFERENCE_SENSORS as REFERENCE_SENSORS
 from .kinds import SENSORS as SENSORS
 from .labels import Label as Label

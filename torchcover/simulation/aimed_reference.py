@@ -24,8 +24,8 @@ def reference_called(name: str | None = None, rays: int | None = None, asked: As
 
     Example:
         >>> sensor = reference_called()
-        >>> sensor.name, sensor.rays, sensor.weight_kind
-        ('surface', 16384, 'm2')
+        >>> sensor.name, sensor.rays, sensor.square_metres
+        ('surface', 16384, True)
     """
     kind = REFERENCE_SENSORS.get(DEFAULT_REFERENCE if name is None else name)
     if kind is None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -50,7 +50,6 @@ class Instant:
         moving: The bodies that move and are near.
         ego: Number of the ego.
         out_of_range: How many bodies that move are not near, or not there.
-        vehicle_R_level: (3, 3) from axes that do not pitch and roll with the vehicle, x ahead and z up in the world.
     """
 
     static: RayCaster
@@ -58,7 +57,6 @@ class Instant:
     moving: Moving
     ego: int
     out_of_range: int = 0
-    vehicle_R_level: Matrix = field(default_factory=lambda: np.eye(3))
 
     def scan(
         self,

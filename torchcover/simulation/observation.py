@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.frames.frame import WeightKind
 from torchcover.simulation.instant import Instant, Scan
 from torchcover.simulation.reference_sensor import ReferenceScan
 from torchcover.simulation.scene import Scene
@@ -22,8 +21,7 @@ class Observation:
         clouds: Name of each rig -> (N, 3) float32 points of all its sensors, in their order.
         sensor_points: Name of each rig -> how many of its points are of each of its sensors.
         reference: (M, 3) float32 points of the reference sensor.
-        reference_weights: (M,) float32 weight of each of them; None if they weigh the same.
-        weight_kind: What the weights are, from `ReferenceScan`.
+        reference_weights: (M,) float32 square metres that each of them stands for; None if they count the same.
         drawn: (objects,) how many points the reference drew on each of `World.objects`, from `ReferenceScan`.
         counts: How many rays there were, how many of them the ego took, and what was left out, by name.
     """
@@ -32,7 +30,6 @@ class Observation:
     sensor_points: Mapping[str, Sequence[int]]
     reference: Float32
     reference_weights: Float32 | None
-    weight_kind: WeightKind | None
     drawn: NDArray[np.int64] | None
     counts: Mapping[str, int]
 

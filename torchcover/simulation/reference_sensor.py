@@ -6,7 +6,6 @@ from typing import ClassVar, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.frames.frame import WeightKind
 from torchcover.simulation.surroundings import Surroundings
 
 # A rectangle of the ground in the vehicle frame in metres: ((x_low, x_high), (y_low, y_high)).
@@ -24,8 +23,8 @@ class ReferenceScan(NamedTuple):
 
     Args:
         points: (M, 3) float32 in the vehicle frame, without those on the ego.
-        weights: (M,) float32, positive and finite: what each point counts for; None if all count the same.
-        weight_kind: What the weights are; None if there are none.
+        weights: (M,) float32, positive and finite: the visible square metres that each point stands for; None if all
+            count the same.
         rays: How many rays were cast.
         self_hits: How many of them the ego took.
         body_casts: At how many pairs of a ray and a moving body; the other pairs could not meet.
@@ -36,7 +35,6 @@ class ReferenceScan(NamedTuple):
 
     points: NDArray[np.float32]
     weights: NDArray[np.float32] | None
-    weight_kind: WeightKind | None
     rays: int
     self_hits: int
     body_casts: int
@@ -53,8 +51,8 @@ class ReferenceSensor(Protocol):
 
     name: ClassVar[str]
     """What it is registered as, and what `--reference` and `summary.json` call it."""
-    weight_kind: ClassVar[WeightKind | None]
-    """What the weights of its points are; None if all of them count the same. The same in every scan."""
+    square_metres: ClassVar[bool]
+    """Whether its points have weights, the square metres that they stand for. The same in every scan."""
 
     @classmethod
     def from_rays(cls, areas: Areas, rays: int | None, bands_m: Bands = PAPER_BANDS_M) -> Self:

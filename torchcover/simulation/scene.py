@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox, euler_from_rotation, invert, overlap, rotation_from_euler
+from torchcover.geometry import BoundingBox, invert, overlap
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.moving import Moving
@@ -126,7 +126,7 @@ class Scene:
         else:
             static_T_vehicle, ego = np.eye(4), 0
         out_of_range = len(self._moving) - len(moving)
-        return Instant(self._static, static_T_vehicle, moving, ego, out_of_range, level_axes(world_T_vehicle))
+        return Instant(self._static, static_T_vehicle, moving, ego, out_of_range)
 
     def check_apart(self, steps: NDArray[np.int64]) -> None:
         """Refuse time steps at which an actor overlaps the ego, as `at` does for one.
@@ -225,12 +225,3 @@ class Scene:
         # The ego is where it is, to the last bit: what a sensor sees of it is the same at every step.
         vehicle_T_part[[actor is self.world.ego for actor in actors]] = np.eye(4)
         return Moving.placed(solids, vehicle_T_part, self._first_moving + numbers)
-
-
-def level_axes(world_T_vehicle: Matrix) -> Matrix:
-    """(3, 3) rotation `vehicle_R_level`, from the axes that the vehicle would have if it did not pitch and roll."""
-    yaw_deg, *tilt_deg = euler_from_rotation(world_T_vehicle[:3, :3])
-    if not np.any(tilt_deg):
-        return np.eye(3)
-    vehicle_R_level: Matrix = world_T_vehicle[:3, :3].T @ rotation_from_euler(yaw_deg, 0.0, 0.0)
-    return vehicle_R_level

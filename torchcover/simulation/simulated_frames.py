@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import with_hits
-from torchcover.frames.frame import Frame, WeightKind
+from torchcover.frames.frame import Frame
 from torchcover.frames.source import FrameDataset
 from torchcover.simulation.aimed_reference import reference_called, reference_of_objects
 from torchcover.simulation.ego import with_ego
@@ -67,8 +67,8 @@ class SimulatedFrames(FrameDataset):
 
     Example:
         >>> frames = SimulatedFrames("courtyard", "front_roof_128", steps=2, seed=0)
-        >>> len(frames), frames[0].sensor.shape[1], frames[0].reference.dtype, frames[0].weight_kind
-        (2, 3, torch.float32, 'm2')
+        >>> len(frames), frames[0].sensor.shape[1], frames[0].reference.dtype, frames.square_metres
+        (2, 3, torch.float32, True)
     """
 
     def __init__(
@@ -147,9 +147,9 @@ class SimulatedFrames(FrameDataset):
         }
 
     @property
-    def weight_kind(self) -> WeightKind | None:
-        """What the weights of the reference sensor's points are."""
-        return self.reference_sensor.weight_kind
+    def square_metres(self) -> bool:
+        """Whether the reference sensor gives the square metres of its points."""
+        return self.reference_sensor.square_metres
 
     @property
     def reference_record(self) -> Mapping[str, object]:
@@ -196,7 +196,6 @@ class SimulatedFrames(FrameDataset):
             clouds=clouds,
             reference=torch.from_numpy(seen.reference),
             reference_weights=None if weights is None else torch.from_numpy(weights),
-            weight_kind=seen.weight_kind,
             index=index,
             name=f"{self.scenario.name} step {index}",
             counts=seen.counts,

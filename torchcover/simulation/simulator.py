@@ -163,7 +163,6 @@ class Simulator:
             sensor_points={name: [len(scan.points) for scan in of_rig] for name, of_rig in scans.items()},
             reference=reference.points,
             reference_weights=reference.weights,
-            weight_kind=reference.weight_kind,
             drawn=reference.drawn,
             counts={
                 **counts_of(stage.scene, instant, of_all_rigs, reference),

@@ -7,7 +7,6 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.frames.frame import WeightKind
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation.patches import Bounds
 from torchcover.simulation.reference_sensor import (
@@ -67,12 +66,12 @@ class SurfaceReference:
         >>> from torchcover.simulation import Scenario, Simulator
         >>> sensor = SurfaceReference(areas=(((0.0, 20.0), (-5.0, 5.0)),), rays=1024)
         >>> seen = Simulator(Scenario.load("courtyard"), {}, sensor).step(0)
-        >>> seen.weight_kind, bool(100 < seen.reference_weights.sum() < 400)
-        ('m2', True)
+        >>> bool(100 < seen.reference_weights.sum() < 400)  # square metres
+        True
     """
 
     name: ClassVar[str] = "surface"
-    weight_kind: ClassVar[WeightKind | None] = "m2"
+    square_metres: ClassVar[bool] = True
 
     areas: Areas
     rays: int = DEFAULT_RAYS
@@ -157,7 +156,6 @@ class SurfaceReference:
         return ReferenceScan(
             points=np.concatenate([found.points_m[look.seen] for found, look in looks]),
             weights=np.concatenate(weights).astype(np.float32),
-            weight_kind=self.weight_kind,
             rays=sum(len(found.points_m) for found, _ in looks),
             self_hits=sum(look.self_hits for _, look in looks),
             body_casts=sum(look.body_casts for _, look in looks),

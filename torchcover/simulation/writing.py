@@ -43,8 +43,8 @@ def write_recording(
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_recording(frames, folder)
         ...     again = RecordedFrames(folder)[0]
-        >>> len(again.sensor) == len(frames[0].sensor), again.weight_kind
-        (True, 'm2')
+        >>> len(again.sensor) == len(frames[0].sensor), again.reference_weights is None
+        (True, False)
     """
     folder = Path(folder)
     if layout not in RECORDERS:
@@ -65,7 +65,7 @@ def _setup(frames: SimulatedFrames) -> Setup:
         {sensor.name: sensor.mount.matrix() for sensor in rig.sensors},
         [sensor.name for sensor in rig.sensors if isinstance(sensor, Lidar)],
         frames.scenario.ego_box(),
-        frames.weight_kind,
+        frames.square_metres,
         frames.boxes,
     )
 

@@ -130,8 +130,6 @@ class CoverageCallback(Callback):
         new = FrameBatch(tuple(self._once.new(frames, self._shard(trainer, loader_index), loader_index)))
         if not new.frames:
             return
-        for frame in new.frames:
-            frame.check_weights(square_metres=self.metric.square_metres)
         self._added = True
         indices = [frame.index for frame in new.frames]
         self.metric.update(

@@ -74,8 +74,6 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         self._add(frames_in(self.frames_of(data_batch, data_samples)), size=None)
 
     def _add(self, frames: Sequence[Frame], size: int | None) -> None:
-        for frame in frames:
-            frame.check_weights(square_metres=self.metric.square_metres)
         rank, processes = get_dist_info()
         for frame in self._once.new(frames, Shard(rank, processes, size)):
             index = None if frame.index == UNKNOWN_INDEX else frame.place_in_time

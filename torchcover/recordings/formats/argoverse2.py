@@ -48,7 +48,7 @@ class Argoverse2:
     layout: ClassVar[str] = "sensors/lidar/TIME.feather, city_SE3_egovehicle.feather"
     sensors = tuple(LASERS)
     reference_sensors = ()
-    weight_kind = None
+    square_metres = False
     instants = None
     body = BODY
 

@@ -68,7 +68,7 @@ class Carla:
     """
 
     layout: ClassVar[str] = "sensors.json, ID/FRAME.ply of each LiDAR and ID/FRAME.png of each depth camera in it"
-    weight_kind = None
+    square_metres = False
     instants = None
 
     def __init__(self, path: str | os.PathLike[str]) -> None:

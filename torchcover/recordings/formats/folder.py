@@ -40,7 +40,7 @@ class FolderRecording:
             flip_y: true               # the cloud has y to the right, as CARLA's: turned before anything else
             min_range_m: 0.5           # nearer to the sensor is no return
           reference:
-            weight_kind: m2            # its files are .npz with points and weights
+            square_metres: true        # its files are .npz with points and weights
           vehicle:                     # what lies in it is the vehicle itself
             lower_m: [-2.4, -0.9, 0.05]
             upper_m: [2.4, 0.9, 1.6]
@@ -75,7 +75,7 @@ class FolderRecording:
         self._files = files
         self.names = tuple(next(iter(files.values())))
         self._settings = read_folder_settings(self.path / SETTINGS_FILE)
-        self.body, self.weight_kind = self._settings.body, self._settings.weight_kind
+        self.body, self.square_metres = self._settings.body, self._settings.square_metres
         self._poses = self._table(self.path, timed=True)
         self.instants = None if self._poses is None else self._poses.instants
         times_s = None if self._poses is None else self._poses.times_s
@@ -98,7 +98,7 @@ class FolderRecording:
         place = self._places[sensor]
         path = self._files[place][self.names[index]]
         weights = None
-        if sensor == REFERENCE and self.weight_kind is not None:
+        if sensor == REFERENCE and self.square_metres:
             points_m, weights = read_weighted_cloud(path)
         else:
             points_m = read_cloud(path)

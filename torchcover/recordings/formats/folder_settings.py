@@ -1,18 +1,17 @@
 """What `frames.yaml` says of a plain folder: where its sensors are, and how large the vehicle is."""
 
 from pathlib import Path
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from torchcover.files import parse_yaml, read_short_text, reads
-from torchcover.frames.frame import WeightKind
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix, check_rigid
 
 ALLOWED = (
     "allowed are sensor, or sensors or rigs by name, and reference, each with a 4x4 vehicle_T_sensor, flip_y and "
-    "min_range_m, for the reference also weight_kind (m2 or density); and vehicle with lower_m and upper_m"
+    "min_range_m, for the reference also square_metres (true or false); and vehicle with lower_m and upper_m"
 )
 
 
@@ -27,7 +26,7 @@ class _Place(_Strict):
 
 
 class _Reference(_Place):
-    weight_kind: Literal["density", "m2"] | None = None
+    square_metres: bool = False
 
 
 Corner = Annotated[list[float], Field(min_length=3, max_length=3)]
@@ -65,12 +64,12 @@ class FolderSettings(NamedTuple):
 
     Args:
         places: `sensor`, `sensors/NAME`, `rigs/NAME` or `reference` -> how its clouds are to be read, where it says so.
-        weight_kind: What the weights of the reference's points are; None if they have none.
-        body: The vehicle itself; None if nobody knows.
+        square_metres: Whether the reference's files have weights, the square metres of their points.
+        body: The vehicle itself; None if unknown.
     """
 
     places: dict[str, PlaceSettings]
-    weight_kind: WeightKind | None = None
+    square_metres: bool = False
     body: BoundingBox | None = None
 
 
@@ -101,7 +100,7 @@ def _read(path: Path) -> FolderSettings:
     given |= {f"rigs/{name}": place for name, place in settings.rigs.items()}
     return FolderSettings(
         {name: _place(name.replace("/", "."), place) for name, place in given.items() if place is not None},
-        None if settings.reference is None else settings.reference.weight_kind,
+        settings.reference is not None and settings.reference.square_metres,
         None if settings.vehicle is None else _body(settings.vehicle),
     )
 

@@ -40,7 +40,7 @@ class KittiObject:
     layout: ClassVar[str] = "velodyne/FRAME.bin, calib/FRAME.txt, label_2/FRAME.txt"
     sensors = ("velodyne",)
     times_s = None
-    weight_kind = None
+    square_metres = False
     instants = None
     body = BODY
 

@@ -42,7 +42,7 @@ class KittiRaw:
     layout: ClassVar[str] = "DATE/DRIVE/velodyne_points/data/FRAME.bin, oxts/data/FRAME.txt"
     sensors = ("velodyne",)
     reference_sensors = ()
-    weight_kind = None
+    square_metres = False
     instants = None
     body = BODY
 

@@ -43,7 +43,7 @@ class NuScenes:
     layout: ClassVar[str] = "v1.0-*/*.json, samples/LIDAR_TOP, sweeps/LIDAR_TOP"
     sensors = (CHANNEL,)
     reference_sensors = ()
-    weight_kind = None
+    square_metres = False
     instants = None
     body = BODY
 

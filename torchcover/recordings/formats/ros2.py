@@ -53,7 +53,7 @@ class Ros2:
 
     layout: ClassVar[str] = "metadata.yaml and *.db3 or *.mcap, or such a file, with topics of PointCloud2"
     reference_sensors = ()
-    weight_kind = None
+    square_metres = False
     instants = None
     body = None
 

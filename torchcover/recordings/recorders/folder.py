@@ -69,7 +69,7 @@ class FolderRecorder:
         body = BoundingBox((*own.lower_m[:2], own.lower_m[2] + CLEARANCE_M), own.upper_m)
         mounts = {name: {"vehicle_T_sensor": mount.tolist()} for name, mount in self._mounts.items()}
         lines = ["sensors:", *(f"  {json.dumps(name)}: {json.dumps(mount)}" for name, mount in mounts.items())]
-        if setup.weight_kind is not None:
-            lines.append(f"reference: {json.dumps({'weight_kind': setup.weight_kind})}")
+        if setup.square_metres:
+            lines.append("reference: {square_metres: true}")
         lines.append(f"vehicle: {json.dumps({'lower_m': body.lower_m, 'upper_m': body.upper_m})}")
         return "\n".join(lines) + "\n"

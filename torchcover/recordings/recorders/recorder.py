@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
-from torchcover.frames.frame import Frame, WeightKind
+from torchcover.frames.frame import Frame
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import Points
@@ -18,7 +18,7 @@ class Setup(NamedTuple):
         mounts: Name of each sensor -> (4, 4) `vehicle_T_sensor`.
         lidars: The sensors that are LiDARs.
         body: The vehicle itself, in its own frame.
-        weight_kind: What the weights of the reference points are, as in `Frame`.
+        square_metres: Whether frames have the square metres of their reference points.
         boxes: Whether the frames have boxes.
     """
 
@@ -26,7 +26,7 @@ class Setup(NamedTuple):
     mounts: Mapping[str, Matrix]
     lidars: Collection[str]
     body: BoundingBox
-    weight_kind: WeightKind | None
+    square_metres: bool
     boxes: bool
 
 
