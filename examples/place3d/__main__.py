@@ -8,13 +8,12 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from examples.place3d.boards import DISTANCES_M, cells_hit
 from examples.place3d.page import page
+from torchcover.estimation import Quantity
 from torchcover.evaluation import agree
 from torchcover.evaluation.agreeing import agreements
-from torchcover.published import Candidate, metric_names
+from torchcover.published import Ranking, metric_names
 from torchcover.simulation import Rig
 
 
@@ -23,8 +22,9 @@ def with_boards(study):
     boards = []
     for distance_m in DISTANCES_M:
         shares = [float(cells_hit(Rig.load(rig).sensors, distance_m).mean()) for rig in study.scores.rigs]
-        boards.append(Candidate(f"lob_{distance_m:g}m", "published", np.array(shares)))
-    scores = replace(study.scores, candidates=(*study.scores.candidates, *boards))
+        name = f"lob_{distance_m:g}m"
+        boards.append(Ranking.of_values(Quantity(name, name, "share", lower_is_better=False), shares, "lob"))
+    scores = replace(study.scores, rankings=(*study.scores.rankings, *boards))
     return replace(study, scores=scores, found=agreements(scores))
 
 

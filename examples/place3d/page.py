@@ -20,7 +20,7 @@ def page(study):
         found = {reading: study.found[truth, reading] for reading in READINGS}
         text += f"## {truth}\n\n{verdict(truth, found)}\n\n{ranks(found)}\n"
     heading = f"| metric | {' | '.join(scores.rigs)} |\n|---|{'---:|' * len(scores.rigs)}\n"
-    rows = "".join(f"| {' | '.join([one.name, *map(short, one.values)])} |\n" for one in scores.candidates)
+    rows = "".join(f"| {' | '.join([one.name, *map(short, one.gains)])} |\n" for one in scores.rankings)
     return f"{text}## What each metric says of each rig\n\n{heading}{rows}"
 
 

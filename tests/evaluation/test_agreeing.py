@@ -38,7 +38,7 @@ def test_each_truth_ranks_its_own_eight_placements_in_both_readings_of_the_rolls
 
 
 def test_a_reading_takes_its_own_rigs(study):
-    scores = {one.name: one.values for one in study.scores.candidates}["points"]
+    scores = {one.name: one.gains for one in study.scores.rankings}["points"]
     rigs = study.scores.rigs
     # Where a LiDAR leans by 17 degrees, other points are missing than where it leans by a third of one.
     pyramid, radians, degrees = (
@@ -87,7 +87,7 @@ def test_own_numbers_are_those_of_compare_over_both_measures():
         "grid": {"x_m": (0, 20), "y_m": (-10, 10), "cell_m": 1.0},
     }
     result = compare(list(RIGS.values()), "courtyard", ask=RegionsOfInterest.model_validate(asked), steps=8, seed=3)
-    found = {one.name: one for one in scores.candidates}
+    found = {one.name: one for one in scores.rankings}
     for measure, words in (("area", "visible surface"), ("known", "known cells")):
         each = [
             [float(coverage.estimate(region, band, measure).value[1]) for coverage in result.coverages.values()]
@@ -95,7 +95,7 @@ def test_own_numbers_are_those_of_compare_over_both_measures():
         ]
         for name, expected in zip(("ground", "obstacle", "both bands"), (*each, np.mean(each, axis=0)), strict=True):
             one = found[f"detection 0.4 m, {name}, front, {words}"]
-            np.testing.assert_allclose(one.values, expected)
+            np.testing.assert_array_equal(one.gains, expected)  # one number, not two of one name
             # Draws of worlds are around the number that all of them give.
             assert one.draws.shape[1] == 3
             np.testing.assert_allclose(one.draws.mean(axis=0), expected, atol=4 * one.draws.std(axis=0).max() + 1e-3)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import kendalltau, spearmanr
 
-from torchcover.published import Candidate, Judged, agreement_of, lead
+from torchcover.estimation import Quantity
+from torchcover.published import Judged, Ranking, agreement_of, lead
 from torchcover.published.ranks import orders
 
 
@@ -15,7 +16,7 @@ def judged_by(values):
 
 
 def metric(values, draws=None, name="metric"):
-    return Candidate(name, "published", np.array(values, dtype=float), draws)
+    return Ranking.of_values(Quantity(name, name, "share", lower_is_better=False), values, "published", draws)
 
 
 def test_a_metric_that_is_the_truth_has_rank_1_and_one_that_is_its_negative_minus_1():
@@ -92,7 +93,7 @@ def test_the_lead_is_the_difference_and_what_is_shared_cancels_out():
     first, second = metric(np.arange(6.0)), metric(generator.permutation(6))
     rho = [row.spearman.value for row in agreement_of([first, second], truth).ranked]
     assert lead(first, second, truth).value == pytest.approx(rho[0] - rho[1])
-    assert lead(first, metric(first.values**3), truth, placements=True) == (0.0, 0.0, 0.0)
+    assert lead(first, metric(first.gains**3), truth, placements=True) == (0.0, 0.0, 0.0)
 
 
 def test_another_number_of_placements_or_of_draws_is_refused():

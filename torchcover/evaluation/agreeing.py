@@ -14,6 +14,7 @@ from torchcover.evaluation.placement_scores import PlacementScores, score_placem
 from torchcover.evaluation.task import AnyScenario
 from torchcover.files import write_durably
 from torchcover.published import Agreement, Judged, Ranked, Relation, agreement_of, read_results
+from torchcover.published.agreement import kind_of
 from torchcover.simulation import builtin_folder, builtin_names
 
 PAPER = "place3d2024"
@@ -93,7 +94,7 @@ class AgreementStudy:
             of each rig; `agreement.json`, everything.
         """
         folder.mkdir(parents=True, exist_ok=True)
-        scores = [(one.name, one.kind, *map(_known, one.values.tolist())) for one in self.scores.candidates]
+        scores = [(one.name, kind_of(one), *map(_known, one.gains.tolist())) for one in self.scores.rankings]
         texts = {
             "agreement.csv": _csv([COLUMNS, *self.rows]),
             "scores.csv": _csv([("metric", "kind", *self.scores.rigs), *scores]),

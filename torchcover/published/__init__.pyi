@@ -1,5 +1,4 @@
 from .agreement import Agreement as Agreement
-from .agreement import Candidate as Candidate
 from .agreement import Judged as Judged
 from .agreement import Ranked as Ranked
 from .agreement import Relation as Relation
@@ -9,12 +8,14 @@ from .agreement import read_results as read_results
 from .false_visible import FalseVisible as FalseVisible
 from .false_visible import field_of_view as field_of_view
 from .frame_metric import FrameMetric as FrameMetric
+from .frame_metric import WorldRatios as WorldRatios
+from .frame_metric import said as said
 from .k_cover import KCover as KCover
 from .m_sog import MSog as MSog
-from .number import PublishedNumber as PublishedNumber
 from .object_coverage import ObjectCoverage as ObjectCoverage
 from .perception_entropy import PerceptionEntropy as PerceptionEntropy
 from .point_density import PointDensity as PointDensity
+from .ranks import Ranking as Ranking
 from .registry import PUBLISHED as PUBLISHED
 from .registry import Published as Published
 from .registry import Setup as Setup
@@ -22,6 +23,3 @@ from .registry import metric_names as metric_names
 from .s_mig import SMig as SMig
 from .s_mig import unequal_rays as unequal_rays
 from .sights import Sights as Sights
-from .world_blocks import WorldBlocks as WorldBlocks
-from .world_ratios import Ratio as Ratio
-from .world_ratios import WorldRatios as WorldRatios

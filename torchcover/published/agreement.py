@@ -11,7 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import reads
-from torchcover.published.ranks import Array, kendall_tau_b, permutation_p, spearman, strongest_by_chance
+from torchcover.published.ranks import (
+    BASELINE,
+    OWN,
+    Array,
+    Ranking,
+    kendall_tau_b,
+    permutation_p,
+    spearman,
+    strongest_by_chance,
+)
 from torchcover.recordings.formats.csv_tables import read_csv
 
 # coverage: torchcover's own numbers; published: those of others; baseline: what takes no simulation to know, or little.
@@ -81,6 +90,11 @@ class Judged:
         return type(self)(self.name, tuple(placements), self.judges, self.values[:, columns])
 
 
+def kind_of(one: Ranking) -> Kind:
+    """Whose number it is."""
+    return "coverage" if one.metric == OWN else "baseline" if one.metric == BASELINE else "published"
+
+
 @reads("a table of published results")
 def read_results(path: Path) -> Mapping[tuple[str, str], Judged]:
     """The results of a table in CSV with the columns placement, quantity, model, class and value.
@@ -106,23 +120,6 @@ def _judged(name: str, values: Mapping[tuple[str, str], float]) -> Judged:
         raise ValueError(f"{name}: no value of {', '.join(missing)}")
     array = np.array([[values[judge, place] for place in placements] for judge in judges])
     return Judged(name, placements, judges, array)
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """What a metric says of n placements.
-
-    Args:
-        name: The metric, with what decides it.
-        kind: Whose it is.
-        values: (n,), NaN where unknown; more is better, as its authors say it.
-        draws: (R, n) what it would have said of other worlds; None if that is unknown.
-    """
-
-    name: str
-    kind: Kind
-    values: Array
-    draws: Array | None = None
 
 
 class Relation(NamedTuple):
@@ -179,7 +176,7 @@ class Agreement:
 
 
 def agreement_of(
-    candidates: Sequence[Candidate], judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
+    rankings: Sequence[Ranking], judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
 ) -> Agreement:
     """Rank placements by metrics, and compare with the mean of the judges.
 
@@ -187,9 +184,9 @@ def agreement_of(
     `draws`. The placements are the same in each draw, unless they too are a sample.
 
     Args:
-        candidates: What the metrics say of the placements of `judged`, in its order.
+        rankings: What the metrics say of the placements of `judged`, in its order.
         judged: What the judges say.
-        draws: How often; at most as many as the candidates have.
+        draws: How often; at most as many as the rankings have.
         seed: Of the draws.
         placements: Whether to draw placements, too.
 
@@ -197,32 +194,34 @@ def agreement_of(
         ValueError: A metric of another number of placements, or with fewer draws.
 
     Example:
+        >>> from torchcover.estimation import Quantity
         >>> judged = Judged("AP", tuple("abcd"), ("net", "other"), np.array([[1.0, 2, 3, 4], [1, 2, 4, 3]]))
-        >>> found = agreement_of([Candidate("height", "baseline", np.array([1.0, 2, 3, 3]))], judged, draws=100)
+        >>> height = Ranking.of_values(Quantity("height", "mean height", "m", lower_is_better=False), [1.0, 2, 3, 3])
+        >>> found = agreement_of([height], judged, draws=100)
         >>> round(found.ranked[0].spearman.value, 3), found.best, found.looked_at
         (1.0, 'height', 1)
     """
     count = len(judged.placements)
-    for one in candidates:
-        if one.values.shape != (count,) or (one.draws is not None and one.draws[:draws].shape != (draws, count)):
+    for one in rankings:
+        if len(one.numbers) != count or (one.draws is not None and one.draws[:draws].shape != (draws, count)):
             raise ValueError(f"{one.name}: a value of each of {count} placements is needed, and {draws} draws or none")
     truths, columns = _drawn(judged, draws, seed, placements=placements)
-    ranked = tuple(_ranked(one, judged.mean, truths, columns) for one in candidates)
+    ranked = tuple(_ranked(one, judged.mean, truths, columns) for one in rankings)
     strength = np.array([abs(row.spearman.value) for row in ranked])
     if np.isnan(strength).all():
         return Agreement(judged, ranked, None, math.nan, math.nan)
-    series = np.stack([one.values for one in candidates])
+    series = np.stack([one.gains for one in rankings])
     return Agreement(
         judged=judged,
         ranked=ranked,
-        best=candidates[int(np.nanargmax(strength))].name,
+        best=rankings[int(np.nanargmax(strength))].name,
         best_p=permutation_p(series, judged.mean),
         by_chance=float(np.quantile(strongest_by_chance(series, judged.mean), BY_CHANCE)),
     )
 
 
 def lead(
-    one: Candidate, other: Candidate, judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
+    one: Ranking, other: Ranking, judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
 ) -> Relation:
     """By how much Spearman's correlation of a metric is above that of another one, with its interval.
 
@@ -237,13 +236,15 @@ def lead(
         placements: Whether to draw placements, too.
 
     Example:
+        >>> from torchcover.estimation import Quantity
         >>> judged = Judged("AP", tuple("abcd"), ("net",), np.array([[1.0, 2, 3, 4]]))
-        >>> good, bad = (Candidate("", "published", np.array(values)) for values in ([1.0, 2, 3, 4], [4.0, 3, 2, 1]))
+        >>> height = Quantity("height", "mean height", "m", lower_is_better=False)
+        >>> good, bad = (Ranking.of_values(height, values) for values in ([1.0, 2, 3, 4], [4.0, 3, 2, 1]))
         >>> lead(good, bad, judged)
         Relation(value=2.0, low=2.0, high=2.0)
     """
     truths, columns = _drawn(judged, draws, seed, placements=placements)
-    found = [spearman(each.values, judged.mean) for each in (one, other)]
+    found = [spearman(each.gains, judged.mean) for each in (one, other)]
     drawn = [spearman(*_along(each, truths, columns)) for each in (one, other)]
     return _with_ends(float(found[0] - found[1]), drawn[0] - drawn[1])
 
@@ -256,18 +257,18 @@ def _drawn(judged: Judged, draws: int, seed: int, *, placements: bool) -> tuple[
     return judged.values[chosen].mean(axis=1), columns
 
 
-def _along(one: Candidate, truths: Array, columns: NDArray[np.int64]) -> tuple[Array, Array]:
+def _along(one: Ranking, truths: Array, columns: NDArray[np.int64]) -> tuple[Array, Array]:
     """(R, n) what a metric and the judges say in each draw."""
-    drawn = np.broadcast_to(one.values, truths.shape) if one.draws is None else one.draws[: len(truths)]
+    drawn = np.broadcast_to(one.gains, truths.shape) if one.drawn_gains is None else one.drawn_gains[: len(truths)]
     return np.take_along_axis(drawn, columns, axis=1), np.take_along_axis(truths, columns, axis=1)
 
 
-def _ranked(one: Candidate, truth: Array, truths: Array, columns: NDArray[np.int64]) -> Ranked:
+def _ranked(one: Ranking, truth: Array, truths: Array, columns: NDArray[np.int64]) -> Ranked:
     drawn = _along(one, truths, columns)
     rho, tau = (
-        _with_ends(float(statistic(one.values, truth)), statistic(*drawn)) for statistic in (spearman, kendall_tau_b)
+        _with_ends(float(statistic(one.gains, truth)), statistic(*drawn)) for statistic in (spearman, kendall_tau_b)
     )
-    return Ranked(one.name, one.kind, rho, tau, permutation_p(one.values, truth), one.draws is not None)
+    return Ranked(one.name, kind_of(one), rho, tau, permutation_p(one.gains, truth), one.draws is not None)
 
 
 def _with_ends(value: float, drawn: Array) -> Relation:

@@ -8,54 +8,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from torchcover.published.number import PublishedNumber
-from torchcover.published.ranks import LEAST, Array, kendall_tau_b, midranks
+from torchcover.published.ranks import LEAST, Ranking, kendall_tau_b
 from torchcover.published.s_mig import unequal_rays
 
-# The metric that numbers of torchcover itself are of.
-OWN = "torchcover"
 INTERVAL = (0.025, 0.975)
 NOT_VALIDATED = "None of these metrics is validated; docs/metrics.md says what each is blind to."
 TOO_FEW = "Kendall's tau needs three rigs or more: two are in one order or in the other by chance; there are {}"
-
-
-class Series(NamedTuple):
-    """One number of every rig.
-
-    Args:
-        metric: The metric that it is of; `OWN` for a number of torchcover's table.
-        numbers: One for each rig; None of a rig that the metric could not be made for.
-        draws: (R, rigs) the numbers over worlds that were drawn again; None if they are unknown.
-    """
-
-    metric: str
-    numbers: tuple[PublishedNumber | None, ...]
-    draws: Array | None = None
-
-    @property
-    def any_number(self) -> PublishedNumber:
-        """That of the first rig that has one."""
-        return next(number for number in self.numbers if number is not None)
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        return self.any_number.name
-
-    @property
-    def sign(self) -> int:
-        """1 where more is better, else -1."""
-        return 1 if self.any_number.higher_is_better else -1
-
-    @property
-    def values(self) -> Array:
-        """(rigs,) its values; NaN where unknown."""
-        return np.array([math.nan if number is None else number.value for number in self.numbers])
-
-    @property
-    def ranks(self) -> Array:
-        """(rigs,) 1 for the best; equal ones share the mean of theirs, NaN where unknown."""
-        return midranks(-self.sign * self.values)
+# Of a table with a row for each rig and number.
+COLUMNS = ("rig", "metric", "name", "value", "error", "low", "high", "unit", "lower_is_better", "count", "count_of",
+           "parameters", "warning", "rank")  # fmt: skip
 
 
 class Tau(NamedTuple):
@@ -78,20 +39,20 @@ class MetricComparison:
 
     Args:
         rigs: Their names.
-        series: The metrics' numbers.
+        rankings: The metrics' numbers.
         own: torchcover's numbers of regions that they are held against.
         left_out: Name of a metric that could not be made -> why.
     """
 
     rigs: tuple[str, ...]
-    series: Sequence[Series]
-    own: Sequence[Series] = ()
+    rankings: Sequence[Ranking]
+    own: Sequence[Ranking] = ()
     left_out: Mapping[str, str] | None = None
 
     @property
-    def main(self) -> list[Series]:
+    def main(self) -> list[Ranking]:
         """The numbers that are about everything, and not about a category or a region only."""
-        return [one for one in self.series if not one.any_number.is_part]
+        return [one for one in self.rankings if not one.is_part]
 
     def taus(self) -> list[Tau]:
         """Of all pairs of the main numbers and torchcover's own; none for fewer than three rigs."""
@@ -100,38 +61,36 @@ class MetricComparison:
         return [tau_of(first, second) for first, second in combinations([*self.main, *self.own], 2)]
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """A row for each rig and number, those of parts too; NaN where unknown."""
-        for one in (*self.series, *self.own):
+        """A row of `COLUMNS` for each rig and number, those of parts too; NaN where unknown."""
+        for one in (*self.rankings, *self.own):
             for rig, number, rank in zip(self.rigs, one.numbers, one.ranks.tolist(), strict=True):
-                if number is not None:
-                    yield {"rig": rig, "metric": one.metric, **number._asdict(), "rank": rank}
+                given = {**number.quantity._asdict(), **number._asdict(), "rig": rig, "rank": rank}
+                row = {**given, "metric": one.metric, "name": one.name}
+                yield {column: row[column] for column in COLUMNS}
 
     @property
     def notes(self) -> list[str]:
         """What a reader is to know."""
         few = [] if len(self.rigs) >= LEAST else [f"{TOO_FEW.format(len(self.rigs))}."]
         warned: dict[str, dict[str, None]] = {}  # what to say of which metrics
-        for one in self.series:
+        for one in self.rankings:
             for number in one.numbers:
-                if number is not None and number.warning:
+                if number.warning:
                     warned.setdefault(number.warning, {})[one.metric] = None
         warnings = [f"{', '.join(metrics)}: {warning}" for warning, metrics in warned.items()]
-        rays = [note for one in self.main if one.metric.startswith("s_mig") and (note := self._unequal_rays(one))]
+        along_rays = [one for one in self.main if one.metric.startswith("s_mig")]
+        rays = [note for one in along_rays if (note := unequal_rays(dict(zip(self.rigs, one.numbers, strict=True))))]
         missing = [f"Without {name}: {why}" for name, why in (self.left_out or {}).items()]
         return [NOT_VALIDATED, *few, *warnings, *rays, *missing]
 
-    def _unequal_rays(self, one: Series) -> str | None:
-        known = {rig: number for rig, number in zip(self.rigs, one.numbers, strict=True) if number is not None}
-        return unequal_rays(known)
 
-
-def tau_of(first: Series, second: Series) -> Tau:
+def tau_of(first: Ranking, second: Ranking) -> Tau:
     """Kendall's tau-b of two numbers, each turned so that more is better, and its interval over drawn worlds."""
-    value = float(kendall_tau_b(first.sign * first.values, second.sign * second.values))
-    known = int((~np.isnan(first.values + second.values)).sum())
+    value = float(kendall_tau_b(first.gains, second.gains))
+    known = int((~np.isnan(first.gains + second.gains)).sum())
     low = high = math.nan
-    if first.draws is not None and second.draws is not None:
-        drawn = kendall_tau_b(first.sign * first.draws, second.sign * second.draws)
+    if first.drawn_gains is not None and second.drawn_gains is not None:
+        drawn = kendall_tau_b(first.drawn_gains, second.drawn_gains)
         if not np.isnan(value) and not np.isnan(drawn).all():
             low, high = (float(end) for end in np.nanquantile(drawn, INTERVAL))
     return Tau(first.name, second.name, value, low, high, known)

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid
 from torchcover.frames import Frame
+from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.parts import coarse_grid
 from torchcover.published.sights import Sights, rig_of
-from torchcover.published.world_ratios import Ratio, WorldRatios
 from torchcover.simulation import Sensor
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
@@ -48,7 +48,7 @@ class FalseVisible(WorldRatios):
         >>> metric = FalseVisible(Rig.load("front_roof_32").sensors, None, BevGrid(x=(0.0, 40.0), y=(-5.0, 5.0)))
         >>> hidden = torch.tensor([[30.5, 0.5, 0.0], [0.5, 0.5, 0.0]])
         >>> metric.update(Frame({"rig": torch.zeros(0, 3)}, hidden, 0, "a"))
-        >>> [(one.name, one.value) for one in metric.compute()]
+        >>> [(one.quantity.key, one.value) for one in metric.compute()]
         [('false_visible_ground_0.4m_1m', 0.5), ('false_visible_obstacle_0.4m_1m', nan)]
     """
 
@@ -75,7 +75,13 @@ class FalseVisible(WorldRatios):
         predicted = field_of_view(sensors, coarse, ego)
         given = {"threshold_m": float(threshold_m), "cell_m": float(cell_m)}
         ratios = [
-            Ratio(f"false_visible_{band}_{threshold_m:g}m_{cell_m:g}m", "share", False, "invisible cells", given)
+            said(
+                f"false_visible_{band}_{threshold_m:g}m_{cell_m:g}m",
+                "share",
+                "invisible cells",
+                lower_is_better=True,
+                **given,
+            )
             for band in coarse.heights
         ]
         fingerprint = hashlib.sha256(predicted.numpy().tobytes()).hexdigest()

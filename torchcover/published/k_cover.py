@@ -8,9 +8,9 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid, Region
 from torchcover.frames import Frame
+from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.parts import Places
 from torchcover.published.sights import Sights, rig_of
-from torchcover.published.world_ratios import Ratio, WorldRatios
 
 AT_LEAST = (1, 2, 3)
 
@@ -64,7 +64,7 @@ class KCover(WorldRatios):
         places = Places(grid, regions)
         counted = "reference points, by square metres" if square_metres else "reference points"
         ratios = [
-            Ratio(f"k_cover_{k}_{threshold_m:g}m{place}", "share", True, counted, {"k": k, "threshold_m": threshold_m})
+            said(f"k_cover_{k}_{threshold_m:g}m{place}", "share", counted, k=k, threshold_m=threshold_m)
             for k in at_least
             for place in places.names
         ]

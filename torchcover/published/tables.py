@@ -9,40 +9,19 @@ from typing import Any
 
 from rich.table import Table
 
-from torchcover.published.comparison import MetricComparison, Series, Tau
-from torchcover.published.number import PublishedNumber
-from torchcover.report import PageTable, Words, text_table
+from torchcover.estimation import Number
+from torchcover.published.comparison import COLUMNS, MetricComparison, Tau
+from torchcover.published.ranks import Ranking
+from torchcover.report import PageTable, Words, number_words, shown_unit, text_table
 
 TITLE, TAU_TITLE = "Metrics of others (rank)", "Kendall's tau-b with torchcover's numbers, 95 % over worlds"
-# Digits of a number without an error.
-DIGITS = 4
-
-
-def number_words(number: PublishedNumber | None, rank: float | None = None) -> str:
-    """A number to the two digits of its error, and its rank; NaN is a dash.
-
-    Example:
-        >>> number_words(PublishedNumber("a", 0.12345, "share", True, {}, 9, "objects", 0.0123), 1.0)
-        '0.123 ± 0.012 (1)'
-        >>> number_words(None)
-        '–'
-    """
-    if number is None or not number.known:
-        return "–"
-    error = number.standard_error
-    if error > 0 and math.isfinite(error):
-        decimals = max(0, 1 - math.floor(math.log10(error)))
-        words = f"{number.value:,.{decimals}f} ± {error:,.{decimals}f}"
-    else:
-        words = f"{number.value:,.{DIGITS}g}"
-    return words if rank is None or math.isnan(rank) else f"{words} ({rank:g})"
 
 
 def page_tables(comparison: MetricComparison) -> list[PageTable]:
     """All numbers, those of parts too; and the taus, if there are any."""
     several = len(comparison.rigs) > 1
     headings = ["metric", "unit", "better", *comparison.rigs]
-    rows = [[Words(word) for word in _row(one, several)] for one in comparison.series]
+    rows = [[Words(word) for word in _row(one, several)] for one in comparison.rankings]
     tables = [PageTable(TITLE if several else "Metrics of others", headings, rows, 3, comparison.notes)]
     if taus := _tau_rows(comparison):
         tau_rows = [[Words(word) for word in row] for row in taus]
@@ -76,7 +55,7 @@ def record(comparison: MetricComparison) -> dict[str, Any]:
 def numbers_csv(comparison: MetricComparison) -> str:
     """A line for each rig and number; an unknown one is an empty field, parameters are JSON."""
     rows = [{**row, "parameters": json.dumps(_plain(row["parameters"]), sort_keys=True)} for row in comparison.rows()]
-    return _csv(rows, ["rig", "metric", *PublishedNumber._fields, "rank"])
+    return _csv(rows, COLUMNS)
 
 
 def tau_csv(comparison: MetricComparison) -> str:
@@ -84,16 +63,22 @@ def tau_csv(comparison: MetricComparison) -> str:
     return _csv([tau._asdict() for tau in comparison.taus()], Tau._fields)
 
 
-def _row(one: Series, several: bool) -> list[str]:
-    number = one.any_number
-    better = "more" if number.higher_is_better else "less"
-    ranks = one.ranks.tolist() if several else [None] * len(one.numbers)
-    return [one.name, number.unit, better, *map(number_words, one.numbers, ranks)]
+def _row(one: Ranking, several: bool) -> list[str]:
+    better = "less" if one.quantity.lower_is_better else "more"
+    ranks = one.ranks.tolist() if several else [math.nan] * len(one.numbers)
+    return [one.name, shown_unit(one.quantity.unit).name, better, *map(_words, one.numbers, ranks)]
 
 
-def _shown(comparison: MetricComparison) -> list[Series]:
+def _words(number: Number, rank: float) -> str:
+    """A number and its rank; an unknown one is a dash."""
+    if not number.known:
+        return "–"
+    return number_words(number) if math.isnan(rank) else f"{number_words(number)} ({rank:g})"
+
+
+def _shown(comparison: MetricComparison) -> list[Ranking]:
     """Numbers of torchcover that the table has room for: the detections."""
-    return [own for own in comparison.own if own.any_number.higher_is_better]
+    return [own for own in comparison.own if not own.quantity.lower_is_better]
 
 
 def _tau_rows(comparison: MetricComparison) -> list[list[str]]:
