@@ -22,7 +22,7 @@ from tests.simulation.sumo.towns import XODR, drive, fcd, street, together, writ
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
-from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
+from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
 from torchcover.files import read_feather, read_json_table
 from torchcover.recordings.formats import kitti_files
 from torchcover.recordings.formats.carla_files import read_carla_sensors
@@ -34,10 +34,10 @@ from torchcover.recordings.formats.tracklets import read_tracklets
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.recorded.formats import format_of
 from torchcover.simulation.shapes import MeshFile
-from torchcover.simulation.sumo.floating import Window, read_floating
+from torchcover.simulation.sumo.crowd import read_types
+from torchcover.simulation.sumo.floating import TimeWindow, read_floating
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.simulating import from_opendrive
-from torchcover.simulation.sumo.types import read_types
 from torchcover.simulation.tracks import read_boxes, read_trajectory
 
 
@@ -227,7 +227,7 @@ def track_files(folder):
         yield Kind(f"tracks_{path.name}", path.read_bytes(), lambda path: format_of(path).read(path, None))
     yield Kind("town.net.xml", write_net(Path(folder) / "a.net.xml", street()).read_bytes(), read_network)
     driven = fcd(together(drive(until=2.0), drive("b", start=90.0, until=2.0))).encode()
-    yield Kind("fcd.xml", driven, lambda path: read_floating(path, Window(0.0, 1.0)))
+    yield Kind("fcd.xml", driven, lambda path: read_floating(path, TimeWindow(0.0, 1.0)))
     yield Kind("town.rou.xml", ROUTES, read_types)
     yield Kind("road.xodr", XODR.encode(), lambda path: from_opendrive(path, Path(folder)))
 

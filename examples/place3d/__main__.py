@@ -1,4 +1,4 @@
-"""Do metrics rank the placements of Place3D as its detectors do: `python -m examples.place3d --steps 200 --every 10`.
+"""Do metrics rank the placements of Place3D as its detectors do: `python -m examples.place3d --steps 200 --every-s 10`.
 
 What `torchcover agree place3d2024` measures, as a page in Markdown, with one metric more: the LiDAR occupancy boards
 (LOB) of Kim and Park 2020, which hang on the rig alone.
@@ -34,7 +34,7 @@ def main():
     parser.add_argument("--scenario", default="urban", help="name or YAML file")
     parser.add_argument("--metrics", default="all", help="metrics of others, as in `k_cover,point_density`")
     parser.add_argument("--steps", type=int, default=64)
-    parser.add_argument("--every", type=float, help="seconds between steps")
+    parser.add_argument("--every-s", type=float, help="seconds between steps")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/place3d"))
@@ -44,7 +44,7 @@ def main():
         metrics=metric_names(options.metrics),
         steps=options.steps,
         seed=options.seed,
-        every_s=options.every,
+        every_s=options.every_s,
         workers=options.workers,
         progress=True,
     )

@@ -223,6 +223,21 @@ def test_frames_of_one_world_are_no_more_worlds():
     assert all(math.isnan(number.error) for number in metric.compute())  # 7 of them
 
 
+@pytest.mark.parametrize(
+    ("worlds", "with_objects", "known"), [(10, 7, False), (10, 8, True), (5, 4, False), (5, 5, True)]
+)
+def test_a_number_that_few_worlds_know_has_no_error_and_none_to_race_with_unless_all_know_it(
+    worlds, with_objects, known
+):
+    metric = ObjectCoverage()
+    for index in range(worlds):
+        there = index < with_objects
+        metric.update(frame_of([[10.0, 0.0, 1.0]] * (index % 2), boxes=[CAR] if there else [], index=index))
+    (at,) = (at for at, one in enumerate(metric.compute()) if one.quantity.key == "objects_hit_1")
+    assert math.isfinite(float(metric.estimate().errors(least=3)[at])) == known
+    assert math.isfinite(metric.compute()[at].error) == (known and worlds >= 8)
+
+
 def test_what_a_draw_of_worlds_gives_is_what_the_metric_gives_over_them():
     case = CASES["object coverage"]
     estimate = case.over(case.steps).estimate()

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import IO
 
 from torchcover.evaluation.placement_scores import PlacementScores, score_placements
-from torchcover.evaluation.task import AnyScenario
 from torchcover.files import write_durably
 from torchcover.published import Agreement, Judged, Ranked, Relation, agreement_of, read_results
 from torchcover.published.agreement import kind_of
-from torchcover.simulation import builtin_folder, builtin_names
+from torchcover.simulation import Scenario, builtin_folder, builtin_names
 
 PAPER = "place3d2024"
 # Quantity and class in `datasets/published/place3d_2024.csv`, and what it is called here.
@@ -107,7 +106,7 @@ class AgreementStudy:
 
 def agree(
     paper: str = PAPER,
-    scenario: AnyScenario = "urban",
+    scenario: Scenario | str | Path = "urban",
     *,
     metrics: Sequence[str] | None = None,
     steps: int = 64,

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from torchcover.coverage import Coverage, Region
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
-from torchcover.frames import BadFrameError, Frame
+from torchcover.frames import BadFrameError, Frame, FrameSource
 from torchcover.published import PUBLISHED, FrameMetric, Ranking, Setup, Sights
 from torchcover.published.comparison import MetricComparison
 from torchcover.published.ranks import OWN, rankings
@@ -44,7 +44,7 @@ class OtherMetrics(NamedTuple):
         return OtherMetrics(of_rigs, self.left_out)
 
 
-def metrics_of(task: Task, settings: Settings) -> OtherMetrics:
+def metrics_of(task: Task[FrameSource], settings: Settings) -> OtherMetrics:
     """Make the metrics that were asked for; what cannot be made for all rigs is left out, if others can.
 
     Raises:
@@ -52,7 +52,7 @@ def metrics_of(task: Task, settings: Settings) -> OtherMetrics:
     """
     if not settings.metrics:
         return OtherMetrics({}, {})
-    sights, threshold_m = Sights(), settings.thresholds[0] if settings.thresholds else 0.4
+    sights, threshold_m = Sights(), settings.thresholds_m[0] if settings.thresholds_m else 0.4
     ego = task.frames.scenario.ego_mesh() if isinstance(task.frames, SimulatedFrames) else None
     lacking = _lacking(task)
     left_out = {name: WHY[min(missing)] for name in settings.metrics if (missing := PUBLISHED[name].needs & lacking)}
@@ -76,7 +76,7 @@ def metrics_of(task: Task, settings: Settings) -> OtherMetrics:
     return OtherMetrics(observers, left_out)
 
 
-def _lacking(task: Task) -> frozenset[Need]:
+def _lacking(task: Task[FrameSource]) -> frozenset[Need]:
     """What the frames, or the rigs, do not have."""
     first = None if isinstance(task.frames, SimulatedFrames) else _first_frame(task)
     there: dict[Need, bool] = {
@@ -87,7 +87,7 @@ def _lacking(task: Task) -> frozenset[Need]:
     return frozenset(need for need, known in there.items() if not known)
 
 
-def _first_frame(task: Task) -> Frame | None:
+def _first_frame(task: Task[FrameSource]) -> Frame | None:
     for index in range(len(task.frames)):
         try:
             return task.frames[index]

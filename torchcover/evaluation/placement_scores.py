@@ -3,18 +3,18 @@
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
 from torchcover.coverage import Coverage, Region
 from torchcover.coverage.measures import Measure
 from torchcover.estimation import Quantity
-from torchcover.evaluation.evaluating import compare
-from torchcover.evaluation.rig_names import AnyRig, loaded
-from torchcover.evaluation.task import AnyScenario
+from torchcover.evaluation.evaluating import evaluate
+from torchcover.evaluation.task import AnyRig, loaded
 from torchcover.published import PUBLISHED, Ranking
 from torchcover.published.ranks import BASELINE, LEAST, OWN, rankings
-from torchcover.simulation import RegionsOfInterest, Rig
+from torchcover.simulation import RegionsOfInterest, Rig, Scenario
 
 THRESHOLD_M = 0.4
 CELL_M = 1.0
@@ -55,7 +55,7 @@ class PlacementScores:
 
 def score_placements(
     rigs: Mapping[str, AnyRig],
-    scenario: AnyScenario = "urban",
+    scenario: Scenario | str | Path = "urban",
     *,
     region: Region | None = None,
     metrics: Sequence[str] | None = None,
@@ -96,11 +96,11 @@ def score_placements(
         raise ValueError(f"rigs: three or more are needed to speak of ranks; got {', '.join(rigs) or 'none'}")
     carried = {name: loaded(rig).model_copy(update={"name": name}) for name, rig in rigs.items()}
     region = circle() if region is None else region
-    result = compare(
+    result = evaluate(
         list(carried.values()),
         scenario,
         ask=_around(region),
-        thresholds=THRESHOLD_M,
+        thresholds_m=THRESHOLD_M,
         metrics=tuple(dict.fromkeys([*(PUBLISHED if metrics is None else metrics), COUNTS_POINTS])),
         steps=steps,
         seed=seed,

@@ -12,8 +12,7 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.report import ActorMark, SkinPatch, Standing, draw_depths, draw_rig, draw_scene, draw_vehicle
 from torchcover.simulation import GRID_X_M, GRID_Y_M, CameraSensor, PaperReference, Rig, Scenario, SimulatedFrames
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.mount_regions import MountRegion
-from torchcover.simulation.skin import Skin
+from torchcover.simulation.mount_regions import MountRegion, Skin
 from torchcover.simulation.world import Actor, World
 
 PATCH_PLACES = 12  # along each side of a mount region

@@ -200,7 +200,7 @@ def alone_in_window(recording: Recording, reference: AccumulatedReference) -> st
         return None
     return (
         f"its instants are {apart_s:g} s apart, and a window of {reference.window_s:g} s reaches none but its own: are "
-        "the times in seconds? Else ask for a longer window (--window)"
+        "the times in seconds? Else ask for a longer window (--window-s)"
     )
 
 

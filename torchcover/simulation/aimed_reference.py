@@ -17,7 +17,7 @@ def reference_called(name: str | None = None, rays: int | None = None, asked: As
         name: One of `torchcover.simulation.REFERENCE_SENSORS`; "surface" if not given.
         rays: About how many rays at each step; the sensor's own number if not given.
         asked: Regions, height bands and grid, as `RegionsOfInterest.around` gives them; those of `torchcover.evaluate`
-            without the near field, for nobody knows the vehicle, if not given.
+            without the near field, for the vehicle is unknown, if not given.
 
     Raises:
         ValueError: Another name, or too few rays.

@@ -10,9 +10,15 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.simulation.rays import Tile, into_tiles, unit_directions
-from torchcover.simulation.reference_sensor import PAPER_BANDS_M, Areas, Bands, ReferenceScan, check_reach
-from torchcover.simulation.shell import position_in_shell
-from torchcover.simulation.surroundings import Surroundings
+from torchcover.simulation.reference_sensor import (
+    PAPER_BANDS_M,
+    Areas,
+    Bands,
+    ReferenceScan,
+    Surroundings,
+    check_reach,
+    position_in_shell,
+)
 
 # Pitch and roll of the paper's sensor are uniform between minus this and this.
 MAX_TILT_DEG = 45.0

@@ -111,7 +111,7 @@ class RegionsOfInterest(Document):
         """What follows for one vehicle.
 
         Args:
-            ego_outline_m: (K, 2) corners x, y of the vehicle; None if nobody knows: then there is no near field.
+            ego_outline_m: (K, 2) corners x, y of the vehicle; None if unknown: then there is no near field.
             cell_m: Side of a cell, whatever `grid` says.
 
         Raises:

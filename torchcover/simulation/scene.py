@@ -14,7 +14,7 @@ from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import Tile, rotate
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.solids import Solids
-from torchcover.simulation.surface import Surface, bounds_along
+from torchcover.simulation.surface import SceneSurface, bounds_along
 from torchcover.simulation.trajectory import poses_at
 from torchcover.simulation.world import Actor, World
 
@@ -66,12 +66,12 @@ class Scene:
         scenery = self._scenery()
         self._static = RayCaster(resting + scenery)
         self._faces = sum(len(mesh.faces) for mesh in resting + scenery)
-        self._surfaces: dict[tuple[float, ...], Surface] = {}
+        self._surfaces: dict[tuple[float, ...], SceneSurface] = {}
 
     def _scenery(self) -> list[Mesh]:
         return [mesh.moved(invert(self._world_T_local)) for mesh in self.world.static]
 
-    def surface(self, lower_m: Matrix, upper_m: Matrix) -> Surface:
+    def surface(self, lower_m: Matrix, upper_m: Matrix) -> SceneSurface:
         """The surface of everything but the ego, for questions about a box that the vehicle carries along.
 
         It is cut when first asked for, once for each box.
@@ -87,7 +87,7 @@ class Scene:
             bounds = bounds_along(invert(self._world_T_local) @ poses, Bounds(lower_m[None], upper_m[None]))
             objects = self.world.objects
             number = {id(actor): k for k, actor in enumerate(objects)}
-            self._surfaces[box] = Surface(
+            self._surfaces[box] = SceneSurface(
                 self._scenery(),
                 [self._solids.of(actor.mesh).patches for actor in objects],
                 {
@@ -156,7 +156,7 @@ class Scene:
 
     @property
     def bytes(self) -> int:
-        """How much memory it takes, about, beside the solids that it shares with others."""
+        """How much memory it takes, about, without the solids that it shares with others."""
         return (
             self._positions_m.nbytes
             + sum(actor.trajectory.bytes for actor in self._moving)

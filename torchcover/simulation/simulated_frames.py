@@ -17,15 +17,14 @@ from torchcover.detection.inside import with_hits
 from torchcover.frames.frame import Frame
 from torchcover.frames.source import FrameDataset
 from torchcover.simulation.aimed_reference import reference_called, reference_of_objects
-from torchcover.simulation.ego import with_ego
-from torchcover.simulation.labels import Label
 from torchcover.simulation.observation import Observation
 from torchcover.simulation.reference_sensor import ReferenceSensor
 from torchcover.simulation.regions_of_interest import RegionsOfInterest
-from torchcover.simulation.rig import Rig
+from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.simulator import Simulator
+from torchcover.simulation.world import Label
 
 # What takes years.
 MAX_STEPS = 1_000_000_000

@@ -10,19 +10,17 @@ import torch
 
 from torchcover.geometry import BoundingBox
 from torchcover.simulation.disturbance import disturb
-from torchcover.simulation.ego import with_ego
 from torchcover.simulation.instant import Instant, Scan
-from torchcover.simulation.labels import Label, labels
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.observation import Observation, counts_of
-from torchcover.simulation.reference_sensor import ReferenceSensor
-from torchcover.simulation.rig import Rig
+from torchcover.simulation.reference_sensor import ReferenceSensor, Surroundings
+from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.stage import Stage, Stages
 from torchcover.simulation.standing import warn_of_floating
-from torchcover.simulation.surroundings import Surroundings
+from torchcover.simulation.world import Label, labels
 
 # What a step takes at its largest: 73 to 246 were measured, for a LiDAR, a camera and the reference sensors.
 BYTES_PER_RAY = 300

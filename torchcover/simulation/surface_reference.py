@@ -14,13 +14,13 @@ from torchcover.simulation.reference_sensor import (
     Areas,
     Bands,
     ReferenceScan,
+    Surroundings,
     check_areas,
     check_reach,
+    position_in_shell,
 )
-from torchcover.simulation.shell import position_in_shell
 from torchcover.simulation.sight import Sight, sight
 from torchcover.simulation.surface_points import SurfacePoints, SurfaceStrata
-from torchcover.simulation.surroundings import Surroundings
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]

@@ -11,12 +11,11 @@ from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation.disturbance import disturb
 from torchcover.simulation.instant import Instant, Scan
 from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.reference_sensor import Surroundings, position_in_shell
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
-from torchcover.simulation.shell import position_in_shell
 from torchcover.simulation.stage import Stages
-from torchcover.simulation.surroundings import Surroundings
 from torchcover.targets.placing import blocked
 from torchcover.targets.surface import SAMPLES, Surface
 from torchcover.targets.target import Target

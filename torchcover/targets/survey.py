@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.simulation.ego import with_ego
 from torchcover.simulation.memory import check_fits
-from torchcover.simulation.rig import Rig
+from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.targets.counting import Sums, count
 from torchcover.targets.placing import Heading, holding, overlapping, poses, yaws

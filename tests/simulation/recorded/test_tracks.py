@@ -22,7 +22,7 @@ from tests.simulation.recorded.drives import (
     write_nuscenes,
 )
 from torchcover import Rig, Scenario
-from torchcover.evaluation.settings import spread_s
+from torchcover.evaluation.task import spread_s
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import PaperReference, Simulator
 from torchcover.simulation.builtin import builtin_folder, builtin_names
