@@ -19,7 +19,7 @@ from torchcover.evaluation import (
     verdict,
 )
 from torchcover.evaluation.agreeing import NOTES
-from torchcover.published.tables import text_tables
+from torchcover.published.comparison import text_tables
 from torchcover.report import error_words, narrowest_width, print_table, shown_unit, text_table
 
 

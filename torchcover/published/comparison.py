@@ -1,15 +1,23 @@
-"""Metrics side by side: which rig each thinks best, and how alike their orders are."""
+"""Metrics side by side: which rig each thinks best, how alike their orders are, and both in tables and files."""
 
+import csv
+import io
+import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
+from rich.table import Table
 
+from torchcover.estimation import Number
 from torchcover.published.ranks import LEAST, Ranking, kendall_tau_b
 from torchcover.published.s_mig import unequal_rays
+from torchcover.report import PageTable, Words, json_record, number_words, shown_unit, text_table
+
+TITLE, TAU_TITLE = "Metrics of others", "Kendall's tau-b with torchcover's numbers, 95 % over worlds"
 
 INTERVAL = (0.025, 0.975)
 NOT_VALIDATED = "None of these metrics is validated; docs/metrics.md says what each is blind to."
@@ -94,3 +102,98 @@ def tau_of(first: Ranking, second: Ranking) -> Tau:
         if not np.isnan(value) and not np.isnan(drawn).all():
             low, high = (float(end) for end in np.nanquantile(drawn, INTERVAL))
     return Tau(first.name, second.name, value, low, high, known)
+
+
+def page_tables(comparison: MetricComparison) -> list[PageTable]:
+    """All numbers, those of parts too; and the taus, if there are any."""
+    rows = [[Words(word) for word in row] for row in map(_row, comparison.rankings)]
+    tables = [PageTable(_title(comparison), _headings(comparison), rows, 3, comparison.notes)]
+    if taus := _tau_rows(comparison):
+        headings, *tau_rows = taus
+        tables.append(PageTable(TAU_TITLE, headings, [[Words(word) for word in row] for row in tau_rows]))
+    return tables
+
+
+def text_tables(comparison: MetricComparison) -> list[Table]:
+    """The main numbers, and the taus, for `rich.console.Console.print`."""
+    by_metric: dict[str, list[list[str]]] = {}
+    for one in comparison.main:
+        by_metric.setdefault(one.metric, []).append(_row(one))
+    caption = "\n".join(comparison.notes)
+    tables = [text_table(_headings(comparison), by_metric.values(), title=_title(comparison), caption=caption)]
+    if taus := _tau_rows(comparison):
+        tables.append(text_table(taus[0], [taus[1:]], title=TAU_TITLE))
+    return tables
+
+
+def record(comparison: MetricComparison) -> dict[str, Any]:
+    """As `summary.json` has it: what is unknown is None."""
+    return {
+        "numbers": _number_records(comparison),
+        "tau": _tau_records(comparison),
+        "notes": comparison.notes,
+    }
+
+
+def numbers_csv(comparison: MetricComparison) -> str:
+    """A line for each rig and number; an unknown one is an empty field, parameters are JSON."""
+    rows = _number_records(comparison)
+    return _csv(COLUMNS, ({**row, "parameters": json.dumps(row["parameters"], sort_keys=True)} for row in rows))
+
+
+def tau_csv(comparison: MetricComparison) -> str:
+    """A line for each pair of numbers."""
+    return _csv(Tau._fields, _tau_records(comparison))
+
+
+def _number_records(comparison: MetricComparison) -> list[dict[str, Any]]:
+    return [{**json_record(row), "parameters": json_record(row["parameters"])} for row in comparison.rows()]
+
+
+def _tau_records(comparison: MetricComparison) -> list[dict[str, Any]]:
+    return [json_record(tau._asdict()) for tau in comparison.taus()]
+
+
+def _title(comparison: MetricComparison) -> str:
+    return f"{TITLE} (rank)" if len(comparison.rigs) > 1 else TITLE
+
+
+def _headings(comparison: MetricComparison) -> list[str]:
+    return ["metric", "unit", "better", *comparison.rigs]
+
+
+def _row(one: Ranking) -> list[str]:
+    better = "less" if one.quantity.lower_is_better else "more"
+    ranks = one.ranks.tolist() if len(one.numbers) > 1 else [math.nan]
+    return [one.name, shown_unit(one.quantity.unit).name, better, *map(_words, one.numbers, ranks)]
+
+
+def _words(number: Number, rank: float) -> str:
+    """A number and its rank; an unknown one is a dash."""
+    if not number.known:
+        return "–"
+    return number_words(number) if math.isnan(rank) else f"{number_words(number)} ({rank:g})"
+
+
+def _tau_rows(comparison: MetricComparison) -> list[list[str]]:
+    """The headings, then a row for each main number; nothing if there are no taus."""
+    found = {(tau.first, tau.second): tau for tau in comparison.taus()}
+    # Numbers of torchcover that the table has room for: the detections.
+    shown = [own.name for own in comparison.own if not own.quantity.lower_is_better]
+    rows = [[one.name, *(_tau_words(found[one.name, own]) for own in shown)] for one in comparison.main if found]
+    return [["metric", *shown], *rows] if rows else []
+
+
+def _tau_words(tau: Tau) -> str:
+    if math.isnan(tau.tau):
+        return "–"
+    interval = "" if math.isnan(tau.low) else f" [{tau.low:+.2f}, {tau.high:+.2f}]"
+    return f"{tau.tau:+.2f}{interval}"
+
+
+def _csv(columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in rows)
+    return text.getvalue()

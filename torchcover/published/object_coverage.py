@@ -63,7 +63,7 @@ class ObjectCoverage(WorldRatios):
         strata = ObjectStrata(categories, range_borders_m)
         names = [f"object_coverage_{threshold_m:g}m", *(f"objects_hit_{least}" for least in hits)]
         given: list[dict[str, Any]] = [{"threshold_m": threshold_m}, *({"hits": least} for least in hits)]
-        within = {"range_m": strata.range_borders_m[-1]}
+        within: dict[str, Any] = {"range_m": strata.range_borders_m[-1]}
         ratios = [
             said(name + stratum, "share", "objects", **parameters, **within)
             for name, parameters in zip(names, given, strict=True)
