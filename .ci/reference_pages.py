@@ -29,7 +29,7 @@ ROOMS = (
 # Where the classes of documents are defined.
 DOCUMENTS = (
     "torchcover.simulation",
-    "torchcover.data",
+    "torchcover.recordings",
     "torchcover.targets",
     "torchcover.coverage",
     "torchcover.placement",

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.timing import compare, table
-from torchcover.simulation import PaperReference, Rig, Scenario
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.simulation import Draws, PaperReference, Rig, Scenario
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor
 
 RANGE_M = 250.0
@@ -44,12 +44,12 @@ def main():
 def steps_of(scene):
     """A function that makes the scans of some steps."""
     (lidar,) = Rig.load("front_roof_128").sensors
-    mounted = MountedSensor(lidar, into_tiles(lidar.directions()), scene)
+    mounted = MountedSensor(lidar, scene)
 
     def run():
         for step in STEPS:
             instant = scene.at(step, within_m=RANGE_M)
-            mounted.scan(instant)
+            mounted.scan(instant, Draws(None))
             generator = np.random.default_rng(step)
             pose = REFERENCE.vehicle_T_reference(scene.ego_box, generator)
             instant.buried(pose[:3, 3])

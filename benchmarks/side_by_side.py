@@ -3,7 +3,8 @@
 Short runs of `evaluate` and `compare` in the courtyard, in traffic and over a recording. Every number of summary.json
 and every array of the coverage files of OLD has to be in NEW, the same to the last bit; `--renamed OLD=NEW` says what
 a key or an array is called now. A name of NEW with a `*` stands for all arrays like it, one on top of the other:
-`--renamed 'detection=detection_*m'`. `--called thresholds-m=threshold`: what OLD calls an option. Times, versions and what was left out are not compared.
+`--renamed 'detection=detection_*m'`. `--called thresholds-m=threshold`: what OLD calls an option.
+Times, versions and what was left out are not compared.
 """
 
 import argparse

@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 
+from torchcover.simulation import Draws, RayHits
+
 DISTANCES_M = (10.0, 20.0, 30.0, 40.0, 50.0)
 HEIGHT_M = (0.0, 2.0)
 CELL_M = 0.2
@@ -25,10 +27,13 @@ def cells_hit(sensors, distance_m, *, height_m=HEIGHT_M, cell_m=CELL_M, width_m=
     for sensor in sensors:
         vehicle_T_sensor = sensor.mount.matrix()
         directions = sensor.directions().reshape(3, -1)
-        way = vehicle_T_sensor[:3, :3] @ directions[:, ~np.isnan(directions[0])]
+        pixel_of_ray = np.flatnonzero(~np.isnan(directions[0]))
+        way = vehicle_T_sensor[:3, :3] @ directions[:, pixel_of_ray]
         origin_m = vehicle_T_sensor[:3, 3]
         range_m = ranges_m(origin_m, way, distance_m, flat=width_m is not None)
-        measured = (range_m >= sensor.min_range_m) & (range_m <= sensor.max_range_m)
+        measured = np.flatnonzero(range_m <= sensor.max_range_m)
+        gives, _ = sensor.measure(RayHits(measured, range_m[measured], pixel_of_ray), Draws(None))
+        measured = measured if gives is None else measured[gives]
         place_m = origin_m[:, None] + range_m[measured] * way[:, measured]
         along = place_m[1] / around_m + 0.5
         if width_m is None:

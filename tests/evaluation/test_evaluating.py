@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 import torchcover
 from torchcover import Coverage, Rig, Scenario
-from torchcover.coverage import Maximum
+from torchcover.coverage import Maximum, Quantiles
 from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame
 from torchcover.evaluation import Settings, TargetError
 from torchcover.evaluation.omissions import HEAVY
@@ -235,7 +235,8 @@ def test_settings_have_one_form_whatever_they_are_given_as():
         ({"steps": -1}, ValueError, "steps: at least 1 is needed; got -1"),
         ({"thresholds_m": "0.4"}, TypeError, "thresholds_m: metres are needed, as in 0.4"),
         ({"target_error": 0.1}, TypeError, "target error: numbers with their units"),
-        ({"aggregations": Maximum()}, TypeError, "aggregations: a sequence of objects"),
+        ({"aggregations": Maximum()}, TypeError, "aggregations: names such as maximum"),
+        ({"aggregations": "minimum"}, ValueError, "aggregation minimum: one of maximum"),
         ({"frames": [1, 2]}, TypeError, "FrameSource is needed; got list, which has no rigs, "),
     ],
 )
@@ -277,7 +278,8 @@ def test_every_argument_is_declared_once_and_stands_in_the_signature_and_in_the_
 
 
 def test_aggregations_are_measured_drawn_and_saved(tmp_path):
-    result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1, aggregations=[Maximum()])
+    result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1, aggregations=["maximum", Quantiles((0.5,))])
+    assert all(row["radius_q0.5_m"] <= 1.13 * row["radius_maximum_m"] + 0.01 for row in result.summary if row["known_cells"])
     (quantity,) = [layer.quantity for layer in result.coverage.layers.values() if "maximum" in layer.quantity.key]
     files = result.save(tmp_path)
     assert f"{quantity.key}_ground" in {path.stem for path in files}

@@ -14,9 +14,10 @@ from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import (
     REFERENCE_SENSORS,
     SENSORS,
-    Document,
+    Draws,
     PaperReference,
     Pose,
+    RayHits,
     ReferenceScan,
     Scenario,
     Simulator,
@@ -25,6 +26,7 @@ from torchcover.simulation import (
     position_in_shell,
     vertical_fov_deg,
 )
+from torchcover.simulation.sensor import Ranging
 
 EGO = BoundingBox((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6))
 AREAS = (((0.0, 20.0), (-5.0, 5.0)), ((-40.0, 160.0), (-40.0, 40.0)))
@@ -32,17 +34,13 @@ MOUNT = {"x_m": 2.6, "z_m": 1.0, "yaw_deg": 30.0}
 RANGES = {"min_range_m": 1.0, "max_range_m": 60.0, "range_noise_m": 0.02, "dropout": 0.1}
 
 
-class Altimeter(Document):
+class Altimeter(Ranging):
     """Looks down ahead: the smallest sensor there is."""
 
     type: Literal["altimeter"] = "altimeter"
     name: str
     mount: Pose = Pose()
-    max_range_m: float = 20.0
     horizontal_fov_deg: float = 20.0
-    min_range_m: float = 0.0
-    range_noise_m: float = 0.0
-    dropout: float = 0.0
     rays: int = 5
 
     def directions(self):
@@ -84,6 +82,13 @@ class DownReference:
 KEYS = {
     "lidar": {"channels": 4, "vertical_fov_deg": [-20, 10], "horizontal_fov_deg": 90, "columns": 16},
     "camera": {"width": 24, "height": 16, "fov_deg": 80},
+    "radar": {
+        "horizontal_fov_deg": 90,
+        "vertical_fov_deg": [-20, 10],
+        "azimuth_cell_deg": 7,
+        "range_cell_m": 0.5,
+        "ray_spacing_m": 2,
+    },
     "altimeter": {},
 }
 
@@ -135,6 +140,60 @@ def test_a_sensors_fields_of_view_hold_its_rays(sensor):
     assert 0 < np.nanmax(azimuth_deg) - np.nanmin(azimuth_deg) <= sensor.horizontal_fov_deg + 1e-9 <= 360 + 1e-9
 
 
+def hits_of(sensor, range_m, ray=None):
+    """Hits of all rays, or of some, at these distances."""
+    pixel_of_ray = np.flatnonzero(~np.isnan(sensor.directions()[0]))
+    ray = np.arange(len(pixel_of_ray)) if ray is None else ray
+    return RayHits(ray, np.broadcast_to(range_m, len(ray)).astype(np.float32), pixel_of_ray)
+
+
+def hit_by(returns, count):
+    """Which of so many hits give a point."""
+    return np.arange(count) if returns.hit is None else returns.hit
+
+
+def test_a_sensor_makes_points_of_hits_that_are_far_enough_and_of_no_others(sensor):
+    exact = sensor.model_copy(update={"range_noise_m": 0.0, "dropout": 0.0})
+    assert exact.is_exact
+    assert not sensor.is_exact
+    near, far = hits_of(exact, 0.99), hits_of(exact, 1.0)
+    assert len(hit_by(exact.measure(near, Draws(None)), len(near.ray))) == 0
+    hit = hit_by(exact.measure(far, Draws(None)), len(far.ray))
+    assert len(hit) > 0
+    assert (np.diff(hit) > 0).all()
+    none = hits_of(exact, 5.0, np.empty(0, dtype=np.int64))
+    assert len(hit_by(exact.measure(none, Draws(None)), 0)) == 0
+
+
+def test_what_a_sensor_makes_of_a_beam_does_not_depend_on_other_beams(sensor):
+    """Hits that are taken away change nothing about those of beams that keep theirs, in any number of places."""
+    beams, random = sensor.beams(), np.random.default_rng(5)
+    whole = hits_of(sensor, random.uniform(0.5, 9.0, len(hits_of(sensor, 1.0).ray)))
+    of_ray = whole.ray if beams is None else beams.ravel()[whole.pixel]
+    measured = sensor.measure(whole, Draws(np.random.default_rng(0), rays=len(whole.ray)))
+    kept = np.flatnonzero(of_ray % 3 != 1)
+    part = RayHits(whole.ray[kept], whole.range_m[kept], whole.pixel_of_ray, np.zeros(len(kept), dtype=np.int64))
+    of_part = sensor.measure(part, Draws(np.random.default_rng(0), rays=len(whole.ray)))
+    left = np.isin(measured.hit, kept)
+    np.testing.assert_array_equal(kept[of_part.hit], measured.hit[left])
+    np.testing.assert_array_equal(of_part.error_m, measured.error_m[left])
+    twice = RayHits(
+        np.tile(whole.ray, 2), np.tile(whole.range_m, 2), whole.pixel_of_ray, np.repeat([0, 1], len(whole.ray))
+    )
+    both = sensor.measure(twice, Draws(np.random.default_rng(0), rays=len(whole.ray)))
+    np.testing.assert_array_equal(both.hit, np.concatenate([measured.hit, measured.hit + len(whole.ray)]))
+
+
+def test_a_sensor_asks_for_the_same_numbers_whatever_is_hit(sensor):
+    """Else what one thread meets would decide what another draws."""
+    rays = len(hits_of(sensor, 1.0).ray)
+    used, fresh = (Draws(np.random.default_rng(2), rays=rays) for _ in range(2))
+    sensor.measure(hits_of(sensor, 1.0, np.empty(0, dtype=np.int64)), used)
+    one, other = (sensor.measure(hits_of(sensor, 5.0), draws) for draws in (used, fresh))
+    np.testing.assert_array_equal(one.hit, other.hit)
+    np.testing.assert_array_equal(one.error_m, other.error_m)
+
+
 def test_a_sensor_survives_pickling_and_its_own_document(sensor):
     assert pickle.loads(pickle.dumps(sensor)) == sensor
     rig = Rig(name="r", sensors=(sensor,))
@@ -159,9 +218,9 @@ def test_a_sensor_is_simulated(sensor):
     assert ranges_m.max() <= exact.max_range_m
 
 
-@pytest.mark.parametrize("content", ["lidar", 3, {"type": ["lidar"]}, {"type": "radar"}, None])
+@pytest.mark.parametrize("content", ["lidar", 3, {"type": ["lidar"]}, {"type": "sonar"}, None])
 def test_what_is_no_sensor_is_refused_with_the_kinds_there_are(content):
-    with pytest.raises(ValueError, match=r"sensors\.0\n.*type: a sensor is a 'lidar' or a 'camera'; got"):
+    with pytest.raises(ValueError, match=r"sensors\.0\n.*type: a sensor is a 'lidar' or a 'camera' or a 'radar'; got"):
         Rig.model_validate({"name": "r", "sensors": [content]})
 
 

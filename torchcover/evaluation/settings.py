@@ -46,10 +46,18 @@ def _thresholds(given: "float | Iterable[float]") -> tuple[float, ...]:
     return tuple(float(threshold) for threshold in each)
 
 
-def _aggregations(given: "Sequence[Aggregation]") -> "tuple[Aggregation, ...]":
-    if not isinstance(given, Sequence):  # what is in it the metric checks
-        raise TypeError(f"aggregations: a sequence of objects such as [Maximum()] is needed; got {given!r}")
-    return tuple(given)
+def _aggregations(given: "str | Sequence[Aggregation | str]") -> "tuple[Aggregation, ...]":
+    if not given:
+        return ()
+    from torchcover.coverage import aggregation_named
+
+    each = [given] if isinstance(given, str) else given
+    if not isinstance(each, Sequence):  # what is in it the metric checks
+        raise TypeError(
+            f"aggregations: names such as maximum, or a sequence of them or of objects such as Maximum(), are needed; "
+            f"got {given!r}"
+        )
+    return tuple(aggregation_named(one) if isinstance(one, str) else one for one in each)
 
 
 def _metrics(given: str | Iterable[str]) -> tuple[str, ...]:
@@ -140,8 +148,12 @@ class Settings:
         Option("Detection thresholds in metres (0.4); may be repeated.", list[float], in_study=True),
     ] = Read(_thresholds, (0.4,))
     aggregations: Annotated[
-        Read["Sequence[Aggregation]", "tuple[Aggregation, ...]"],
-        "Maps beside the mean of means, as in `CoverageMetric`.",
+        Read["str | Sequence[Aggregation | str]", "tuple[Aggregation, ...]"],
+        Option(
+            "Maps and numbers of regions other than means: `maximum`, `pooled`, `quantiles:0.5,0.9`, "
+            "`step_quantiles:0.9`; may be repeated. In Python also objects, as in `CoverageMetric`.",
+            list[str],
+        ),
     ] = Read(_aggregations, ())
     reference: Annotated[
         str | None,

@@ -68,7 +68,7 @@ def survey_target(
     rig = as_called(rig)
     world = free_space() if scenario is None else scenario
     world = with_ego(world if isinstance(world, Scenario) else Scenario.load(world), {rig.name: rig}, vehicle)
-    alike = world.instants == 1 and not any(sensor.range_noise_m or sensor.dropout for sensor in rig.sensors)
+    alike = world.instants == 1 and all(sensor.is_exact for sensor in rig.sensors)
     return survey(
         rig,
         world,

@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import reads
+from torchcover.files import read_csv, reads
 from torchcover.published.ranks import (
     BASELINE,
     OWN,
@@ -21,7 +21,6 @@ from torchcover.published.ranks import (
     spearman,
     strongest_by_chance,
 )
-from torchcover.recordings.formats.csv_tables import read_csv
 
 # coverage: torchcover's own numbers; published: those of others; baseline: what takes no simulation to know, or little.
 Kind = Literal["coverage", "published", "baseline"]

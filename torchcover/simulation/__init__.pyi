@@ -1,6 +1,3 @@
-from .aimed_reference import DEFAULT_REFERENCE as DEFAULT_REFERENCE
-from .aimed_reference import reference_called as reference_called
-from .aimed_reference import reference_of_objects as reference_of_objects
 from .builtin import builtin_documents as builtin_documents
 from .builtin import builtin_folder as builtin_folder
 from .builtin import builtin_names as builtin_names
@@ -11,8 +8,8 @@ from .kinds import REFERENCE_SENSORS as REFERENCE_SENSORS
 from .kinds import SENSORS as SENSORS
 from .lidar import Lidar as Lidar
 from .lidar import LidarModel as LidarModel
-from .observation import Observation as Observation
 from .paper_reference import PaperReference as PaperReference
+from .radar import Radar as Radar
 from .rays import Tile as Tile
 from .rays import into_tiles as into_tiles
 from .recorded_rig import rig_document as rig_document
@@ -28,9 +25,16 @@ from .regions_of_interest import RegionsOfInterest as RegionsOfInterest
 from .rig import Rig as Rig
 from .rig import with_ego as with_ego
 from .scenario import Scenario as Scenario
+from .sensor import Draws as Draws
+from .sensor import RayHits as RayHits
+from .sensor import Returns as Returns
 from .sensor import Sensor as Sensor
 from .sensor import vertical_fov_deg as vertical_fov_deg
+from .simulated_frames import DEFAULT_REFERENCE as DEFAULT_REFERENCE
 from .simulated_frames import SimulatedFrames as SimulatedFrames
+from .simulated_frames import reference_called as reference_called
+from .simulated_frames import reference_of_objects as reference_of_objects
+from .simulator import Observation as Observation
 from .simulator import Simulator as Simulator
 from .surface_reference import SurfaceReference as SurfaceReference
 from .world import Label as Label

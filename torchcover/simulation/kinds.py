@@ -3,6 +3,7 @@
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.paper_reference import PaperReference
+from torchcover.simulation.radar import Radar
 from torchcover.simulation.recorded.traffic import RecordedTraffic
 from torchcover.simulation.reference_sensor import ReferenceSensor
 from torchcover.simulation.sensor import Sensor
@@ -12,7 +13,7 @@ from torchcover.simulation.traffic import Highway, Parking, Urban
 from torchcover.simulation.traffic.kind import Traffic
 
 # By the key `type` in a rig's file.
-SENSORS: dict[str, type[Sensor]] = {"lidar": Lidar, "camera": CameraSensor}
+SENSORS: dict[str, type[Sensor]] = {"lidar": Lidar, "camera": CameraSensor, "radar": Radar}
 REFERENCE_SENSORS: dict[str, type[ReferenceSensor]] = {
     sensor.name: sensor for sensor in (PaperReference, SurfaceReference)
 }

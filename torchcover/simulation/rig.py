@@ -91,6 +91,7 @@ def _written(sensor: Sensor) -> dict[str, Any]:
     """The keys of a sensor, without those that its model stands for."""
     assert isinstance(sensor, Document)  # as all sensors of a rig
     keys = sensor.model_dump(mode="json", exclude_unset=True)
+    keys = {key: keys[key] for key in ("type", "name", "mount") if key in keys} | keys
     if isinstance(sensor, Lidar) and sensor.model is not None:
         if is_file_name(sensor.model):
             return {key: value for key, value in keys.items() if key != "model"}
