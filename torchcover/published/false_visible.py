@@ -1,6 +1,7 @@
 """How much of what is not seen was thought to be visible: where a rig would see something in an empty world."""
 
 import hashlib
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,7 +13,6 @@ from torch import Tensor
 from torchcover.coverage import BevGrid
 from torchcover.frames import Frame
 from torchcover.published.frame_metric import WorldRatios, said
-from torchcover.published.parts import coarse_grid
 from torchcover.published.sights import Sights, rig_of
 from torchcover.simulation import Sensor
 from torchcover.simulation.raycaster import RayCaster
@@ -102,6 +102,17 @@ class FalseVisible(WorldRatios):
         false_visible = invisible & self.predicted.to(cell.device).view(invisible.shape)
         base = invisible.sum(dim=1)
         return base.double(), false_visible.sum(dim=1).double(), base
+
+
+def coarse_grid(grid: BevGrid, cell_m: float) -> BevGrid:
+    """A grid of other cells, as large as the given one, or by a part of a cell larger.
+
+    Example:
+        >>> coarse_grid(BevGrid(x=(-0.5, 2.0), y=(0.0, 1.0), cell=0.25), 1.0).x
+        (-1.0, 2.0)
+    """
+    x, y = ((math.floor(low / cell_m) * cell_m, math.ceil(high / cell_m) * cell_m) for low, high in (grid.x, grid.y))
+    return BevGrid(x, y, cell_m, grid.heights)
 
 
 def field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego: Mesh | None = None) -> Tensor:

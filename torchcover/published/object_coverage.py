@@ -9,7 +9,7 @@ from torch import Tensor
 from torchcover.detection.visibility import mean_by_box
 from torchcover.frames import Frame
 from torchcover.published.frame_metric import WorldRatios, said
-from torchcover.published.parts import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
+from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
 from torchcover.published.sights import Sights, rig_of
 
 HITS = (1, 5, 10)

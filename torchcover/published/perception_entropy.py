@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchcover.frames import Frame
 from torchcover.published.frame_metric import WorldRatios, said
-from torchcover.published.parts import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
+from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
 from torchcover.published.sights import Sights, count_in_boxes, rig_of
 from torchcover.simulation import CameraSensor, Sensor
 

@@ -5,12 +5,11 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
 from torchcover.coverage import BevGrid, Region, forward_regions
-from torchcover.published.false_visible import FalseVisible
+from torchcover.published.false_visible import FalseVisible, coarse_grid
 from torchcover.published.frame_metric import FrameMetric
 from torchcover.published.k_cover import KCover
 from torchcover.published.m_sog import MSog
 from torchcover.published.object_coverage import ObjectCoverage
-from torchcover.published.parts import coarse_grid
 from torchcover.published.perception_entropy import PerceptionEntropy
 from torchcover.published.point_density import PointDensity
 from torchcover.published.s_mig import SMig

@@ -13,7 +13,7 @@ from torchcover.detection.inside import Inside
 from torchcover.frames import Frame
 from torchcover.neighbors import check_cloud, nearest
 from torchcover.neighbors.choice import backend_of_several
-from torchcover.published.parts import ObjectStrata
+from torchcover.published.object_strata import ObjectStrata
 
 Found = TypeVar("Found")
 
