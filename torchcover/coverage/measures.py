@@ -34,11 +34,10 @@ def estimate_known(
     if blocks is None:
         return Estimate.of(quantities, whole)
     used = blocks.steps.nonzero().flatten().tolist()
-    in_band = _in_band(blocks, band, cells)
-    own_probed, own_sums = blocks.spread_over(in_band)
+    own_probed, own_sums = blocks.spread_over(_in_band(blocks, band, cells))
     left_out = [known_mean(probed - own_probed[block], sums - own_sums[:, block]) for block in used]
     without = torch.stack(left_out) if left_out else whole[None][:0]
-    return Estimate(tuple(quantities), whole, without, blocks.steps[used], partial(_known_again, blocks, in_band))
+    return Estimate(tuple(quantities), whole, without, blocks.steps[used], partial(_known_again, blocks, band, cells))
 
 
 def estimate_area(quantities: Sequence[Quantity], area: AreaSums | None, band: int, cells: Tensor) -> Estimate:
@@ -91,10 +90,11 @@ def known_mean(probed: Tensor, sums: Tensor) -> Tensor:
     return (sums[:, known] / probed[known]).mean(dim=1)
 
 
-def _known_again(blocks: Blocks, in_band: Tensor, weights: Tensor) -> Tensor:
+def _known_again(blocks: Blocks, band: int, cells: Tensor, weights: Tensor) -> Tensor:
     """(R, Q) the same if the blocks in use come as often as (R, g) they are weighted."""
     used = blocks.steps > 0
-    probed, sums = blocks.spread_over(in_band)  # not kept: for every region it is as large as the run's own sums
+    # Not kept with the estimate: for all regions it is as large as the sums of the run.
+    probed, sums = blocks.spread_over(_in_band(blocks, band, cells))
     steps = weights @ probed[used].double()
     known = steps > 0
     means = (weights @ sums[:, used]) / steps.where(known, 1.0)
