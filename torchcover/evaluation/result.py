@@ -25,9 +25,8 @@ from torchcover.evaluation.result_page import (
     sensor_views,
 )
 from torchcover.evaluation.target_error import TargetError, outcome
-from torchcover.published.comparison import MetricComparison
-from torchcover.published.tables import numbers_csv, record, tau_csv
-from torchcover.published.tables import page_tables as metric_tables
+from torchcover.published.comparison import MetricComparison, numbers_csv, record, tau_csv
+from torchcover.published.comparison import page_tables as metric_tables
 from torchcover.report import (
     RENDERERS,
     CoverageTable,

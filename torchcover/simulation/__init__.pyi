@@ -18,9 +18,9 @@ from .reference_sensor import ReferenceScan as ReferenceScan
 from .reference_sensor import ReferenceSensor as ReferenceSensor
 from .reference_sensor import Surroundings as Surroundings
 from .reference_sensor import position_in_shell as position_in_shell
-from .regions_of_interest import Asked as Asked
 from .regions_of_interest import GRID_X_M as GRID_X_M
 from .regions_of_interest import GRID_Y_M as GRID_Y_M
+from .regions_of_interest import Asked as Asked
 from .regions_of_interest import RegionsOfInterest as RegionsOfInterest
 from .rig import Rig as Rig
 from .rig import with_ego as with_ego
