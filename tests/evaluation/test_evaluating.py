@@ -18,7 +18,7 @@ from torchcover import Coverage, Rig, Scenario
 from torchcover.coverage import Maximum, Quantiles
 from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame, FrameDataset
 from torchcover.evaluation import Settings, TargetError
-from torchcover.evaluation.omissions import HEAVY
+from torchcover.evaluation.result_page import HEAVY
 
 SMALL = {"steps": 2, "cell_m": 4.0, "rays": 1024}
 

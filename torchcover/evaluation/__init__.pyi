@@ -8,8 +8,6 @@ from .evaluating import evaluate as evaluate
 from .observers import CoverageObserver as CoverageObserver
 from .observers import Observer as Observer
 from .observers import Stateful as Stateful
-from .omissions import Omission as Omission
-from .omissions import left_out as left_out
 from .pipeline import Run as Run
 from .pipeline import StoppingRule as StoppingRule
 from .pipeline import observe as observe
@@ -21,6 +19,8 @@ from .ranks import joined_ranks as joined_ranks
 from .ranks import rank_count as rank_count
 from .result import Result as Result
 from .result_files import claimed as claimed
+from .result_page import Omission as Omission
+from .result_page import left_out as left_out
 from .result_page import sensor_views as sensor_views
 from .scene_pictures import cameras_of as cameras_of
 from .scene_pictures import rig_pictures as rig_pictures

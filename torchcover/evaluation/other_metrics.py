@@ -49,8 +49,6 @@ def metrics_of(task: Task[FrameSource], settings: Settings) -> OtherMetrics:
     Raises:
         ValueError: None of them can be made; the message says why.
     """
-    if not settings.metrics:
-        return OtherMetrics({}, {})
     sights, threshold_m = Sights(), settings.thresholds_m[0] if settings.thresholds_m else 0.4
     lacking, ego = _lacking(task), task.frames.ego_mesh()
     left_out = {name: WHY[min(missing)] for name in settings.metrics if (missing := PUBLISHED[name].needs & lacking)}
@@ -86,8 +84,8 @@ def _lacking(task: Task[FrameSource]) -> frozenset[Need]:
 
 def compared(
     metrics: OtherMetrics, coverages: Mapping[str, Coverage], regions: Sequence[Region], seed: int
-) -> MetricComparison | None:
-    """What the metrics say, and torchcover's numbers of some regions; None if none was asked for.
+) -> MetricComparison:
+    """What the metrics say, and torchcover's numbers of some regions.
 
     Args:
         metrics: After the run.
@@ -95,8 +93,6 @@ def compared(
         regions: Those whose numbers they are held against.
         seed: Of the worlds that are drawn again.
     """
-    if not metrics.of_rigs:
-        return None
     published = [
         one
         for name, of_rigs in metrics.of_rigs.items()

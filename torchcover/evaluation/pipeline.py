@@ -14,9 +14,8 @@ import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from torchcover.evaluation.checkpoint import Journal
-from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.progress import progress_of
+from torchcover.evaluation.progress import held_back, progress_of
 from torchcover.evaluation.ranks import Ranks
 from torchcover.frames import BadFrameError, Frame, FrameSource, worlds_of
 

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
 from torchcover.estimation import MIN_BLOCKS
-from torchcover.evaluation.interrupt import held_back
-from torchcover.evaluation.omissions import Omission
 from torchcover.evaluation.pipeline import Run
+from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_files import ResultFiles
 from torchcover.evaluation.result_page import (
+    Omission,
     facts_of,
     left_out_table,
     page_tables,
@@ -52,7 +52,7 @@ class Result:
         coverages: By the name of the rig; the others are compared with the first.
         regions: Those that numbers are given for.
         run: How the run went; None if unknown, for they were saved.
-        rigs: What the user called each rig, by its name; None for the rig of a recording that nobody named.
+        rigs: What the user called each rig, by its name; None for the rig of a recording that was not named.
         source: Where the frames came from: `scenario`, `vehicle`, `frames`, `seed`.
         reference_record: Where the reference comes from, as `FrameSource.reference_record` says; None if unknown.
         device: Where it ran; None if unknown.

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from torchcover import __version__
 from torchcover.coverage import BevGrid
-from torchcover.evaluation.interrupt import held_back
+from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_files import ResultFiles
 from torchcover.evaluation.result_page import rig_document, sensor_views, words_of
 from torchcover.evaluation.task import AnyRig, as_called, spread_s

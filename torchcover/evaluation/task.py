@@ -70,7 +70,7 @@ def task_of(settings: Settings) -> Task[FrameSource]:
     """Simulate a scenario, or read a recording.
 
     Raises:
-        ValueError: No rig, a scenario beside a recording, settings for the other of the two, a rig that is not there.
+        ValueError: No rig, a scenario and a recording, settings for the other of the two, a rig that is not there.
         FileNotFoundError: An unknown name or file.
         TypeError: Frames that do not say whose they are.
 
