@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 import torchcover
 from torchcover import Coverage, Rig, Scenario
 from torchcover.coverage import Maximum, Quantiles
-from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame
+from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame, FrameDataset
 from torchcover.evaluation import Settings, TargetError
-from torchcover.evaluation.omissions import HEAVY
+from torchcover.evaluation.result_page import HEAVY
 
 SMALL = {"steps": 2, "cell_m": 4.0, "rays": 1024}
 
@@ -37,7 +37,7 @@ class PointCount:
         self.points += other.points
 
 
-class Source:
+class Source(FrameDataset):
     """Frames of a source that is neither a simulation nor a recording."""
 
     rigs = ("low", "high")
@@ -47,6 +47,7 @@ class Source:
     square_metres = False
     reference_record = None
     content = {"frames": "made up"}  # noqa: RUF012
+    world_of = staticmethod(int)
 
     def __len__(self):
         return 3
@@ -279,7 +280,9 @@ def test_every_argument_is_declared_once_and_stands_in_the_signature_and_in_the_
 
 def test_aggregations_are_measured_drawn_and_saved(tmp_path):
     result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1, aggregations=["maximum", Quantiles((0.5,))])
-    assert all(row["radius_q0.5_m"] <= 1.13 * row["radius_maximum_m"] + 0.01 for row in result.summary if row["known_cells"])
+    assert all(
+        row["radius_q0.5_m"] <= 1.13 * row["radius_maximum_m"] + 0.01 for row in result.summary if row["known_cells"]
+    )
     (quantity,) = [layer.quantity for layer in result.coverage.layers.values() if "maximum" in layer.quantity.key]
     files = result.save(tmp_path)
     assert f"{quantity.key}_ground" in {path.stem for path in files}
