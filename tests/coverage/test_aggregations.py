@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import dataclass, fields
+from itertools import product
 from typing import ClassVar
 
 import numpy as np
@@ -118,7 +119,8 @@ def random_steps(count, seed=0):
 
 
 NEAR, ALL = Region("near", (-1.0, 1.0), (-1.0, 1.0)), Region("all", (-2.0, 2.0), (-2.0, 2.0))
-FOUR = BevGrid(x=(-2.0, 2.0), y=(-2.0, 2.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+BANDS = {"all": (-1.0, 1.0), "high": (0.1, 1.0)}
+FOUR = BevGrid(x=(-2.0, 2.0), y=(-2.0, 2.0), cell=1.0, heights=BANDS)
 MEANS = {"radius_m", "detection_0.4m"}
 EVERY = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), StepQuantiles((0.5,)))
 
@@ -130,17 +132,18 @@ def in_regions(steps, first=0, **options):
     return metric
 
 
-def radii_in(region, sensor, reference, weights):
+def radii_in(region, sensor, reference, weights, band=BANDS["all"]):
     """Of the points of a region, with their weights."""
-    inside = ((reference[:, :2] >= region.x[0]) & (reference[:, :2] < region.x[1])).all(dim=1)
+    low, high = (torch.tensor([region.x[end], region.y[end], band[end]]) for end in (0, 1))
+    inside = ((reference >= low) & (reference < high)).all(dim=1)
     return torch.cdist(reference[inside], sensor).amin(dim=1).numpy(), weights[inside].numpy()
 
 
 def test_the_number_of_a_region_is_what_the_aggregation_makes_of_all_its_points():
     steps = list(random_steps(40))
     coverage = in_regions(steps, square_metres=True).compute()
-    for row, region in zip(coverage.summary(), (NEAR, ALL), strict=True):
-        each = [radii_in(region, *step) for step in steps]
+    for row, (region, band) in zip(coverage.summary(), product((NEAR, ALL), BANDS.values()), strict=True):
+        each = [radii_in(region, *step, band) for step in steps]
         radii, m2 = (np.concatenate(parts) for parts in zip(*each, strict=True))
         found = {key: number.value for key, number in row.numbers.items()}
         assert found["radius_maximum_m"] == pytest.approx(radii.max(), rel=1e-6)
@@ -158,12 +161,12 @@ def test_the_number_of_a_region_is_what_the_aggregation_makes_of_all_its_points(
 def test_the_error_of_a_region_s_number_is_the_jackknife_over_its_blocks():
     steps = list(random_steps(16))
     coverage = in_regions(steps, square_metres=True).compute()
-    numbers = coverage.summary()[0].numbers
+    numbers = coverage.summary()[-1].numbers
     whole = numbers["radius_q0.9_m"].value
     left_out = []
     for block in range(8):
         rest = [step for at, step in enumerate(steps) if at // 2 != block]
-        left_out.append(in_regions(rest, square_metres=True).compute().summary()[0].numbers["radius_q0.9_m"].value)
+        left_out.append(in_regions(rest, square_metres=True).compute().summary()[-1].numbers["radius_q0.9_m"].value)
     pseudo = 8 * whole - 7 * np.array(left_out)
     assert numbers["radius_q0.9_m"].error == pytest.approx(pseudo.std(ddof=1) / 8**0.5, rel=1e-9)
     assert numbers["radius_pooled_m"].error == pytest.approx(numbers["radius_m"].error, rel=1e-9)
@@ -285,6 +288,19 @@ class Minimum(Aggregation):
     def layers(self, sums, probed_steps, max_radius):
         quantity = Quantity("radius_minimum_m", "smallest blind spot radius", "m", lower_is_better=True)
         return [Layer(quantity, (-sums["negative"]).where(probed_steps > 0, math.nan))]
+
+
+def test_what_is_known_of_means_only_is_told_of_means_only():
+    metric = CoverageMetric(
+        FOUR, (), aggregations=[Blind()], regions=[NEAR], sensors=["a"], square_metres=True, max_radius=9.0
+    )
+    for sensor, reference, weights in random_steps(4):
+        metric.update({"a": sensor}, reference, weights=weights)
+    table = CoverageTable.of({"rig": metric.compute()}, [NEAR])
+    columns = RENDERERS["csv"](table).splitlines()[0].split(",")
+    assert {"blind_share", "blind_share_error", "known_radius_m", "radius_m_without_a"} < set(columns)
+    assert not {"known_blind_share", "blind_share_without_a"} & set(columns)
+    assert "without it mean blind spot radius is 9.00 m" in " ".join(RENDERERS["text"](table).split())
 
 
 def test_an_aggregation_of_ones_own_is_measured_merged_saved_and_loaded(tmp_path):

@@ -279,7 +279,9 @@ def test_every_argument_is_declared_once_and_stands_in_the_signature_and_in_the_
 
 def test_aggregations_are_measured_drawn_and_saved(tmp_path):
     result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1, aggregations=["maximum", Quantiles((0.5,))])
-    assert all(row["radius_q0.5_m"] <= 1.13 * row["radius_maximum_m"] + 0.01 for row in result.summary if row["known_cells"])
+    assert all(
+        row["radius_q0.5_m"] <= 1.13 * row["radius_maximum_m"] + 0.01 for row in result.summary if row["known_cells"]
+    )
     (quantity,) = [layer.quantity for layer in result.coverage.layers.values() if "maximum" in layer.quantity.key]
     files = result.save(tmp_path)
     assert f"{quantity.key}_ground" in {path.stem for path in files}
