@@ -18,7 +18,7 @@ from torchcover.coverage.quantity import RADIUS
 from torchcover.report import Line, Page, PageMap, PageRig, PageTable, SensorView, Words, maps_of, page_html, scale_of
 from torchcover.report.page.codes import CellBytes, decoded, encoded
 from torchcover.report.page.content import Array
-from torchcover.report.page.fitting import fitted
+from torchcover.report.page.writing import fitted
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 NASTY = "</script><script>document.title='broken'</script>"

@@ -7,17 +7,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations import Aggregation, BinnedStep, MeanOfMeans, State, VisibleArea
+from torchcover.coverage.aggregations import Aggregation, BinnedStep, Layer, MeanOfMeans, State, VisibleArea
 from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.blocks import AreaSums, Blocks, BlockSumsT
 from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.layer import Layer
 from torchcover.coverage.plotting import draw_coverage
 from torchcover.coverage.redundancy import PlaceSums, Redundancy, SensorFailures
 from torchcover.coverage.region_sums import IN_REGIONS, RegionSums
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.steps import Clouds, SensorClouds, Step, as_list, check_parameters, checked_steps
+from torchcover.coverage.steps import CheckedStep, Clouds, SensorClouds, as_list, check_parameters, checked_steps
 from torchcover.metrics import SumsInBlocks, figure_of
 from torchcover.neighbors import nearest
 
@@ -205,7 +204,7 @@ class CoverageMetric(SumsInBlocks):
         return coverage
 
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
-    def _add_step(self, step: Step) -> None:
+    def _add_step(self, step: CheckedStep) -> None:
         sensors, reference, weights, index = step
         inside, of, cell = self.grid.bins(reference)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.

@@ -26,7 +26,7 @@ Clouds: TypeAlias = Tensor | Sequence[Tensor]
 SensorClouds: TypeAlias = Clouds | Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]]
 
 
-class Step(NamedTuple):
+class CheckedStep(NamedTuple):
     """One step: clouds in the vehicle frame, weights of the reference points, and its number in time.
 
     `sensors` has those of the rig by the names of the sensors; one without a name if they are not told apart.
@@ -81,7 +81,7 @@ def checked_steps(
     *,
     names: Sequence[str] = (),
     first: int,
-) -> list[Step]:
+) -> list[CheckedStep]:
     """The steps of an update, in order.
 
     Args:
@@ -109,7 +109,7 @@ def checked_steps(
         raise ValueError(
             f"{len(every_weights)} weights and {len(numbers)} indices for {count} reference clouds; one a step each"
         )
-    steps = [Step(*parts) for parts in zip(sensors, references, every_weights, numbers, strict=True)]
+    steps = [CheckedStep(*parts) for parts in zip(sensors, references, every_weights, numbers, strict=True)]
     for at, step in enumerate(steps):
         for name, cloud in step.sensors.items():
             check_cloud(cloud, f"sensor[{at}]" + f"[{name!r}]" * bool(name))
