@@ -17,7 +17,6 @@ from torchcover.geometry import BoundingBox
 from torchcover.published import (
     FalseVisible,
     KCover,
-    Lob,
     MSog,
     ObjectCoverage,
     PerceptionEntropy,
@@ -310,15 +309,4 @@ CASES = {
     ),
     "s-mig, occluded": of_frames(SMig, {**VOXELS, "occlusion": True}, OF_VOXELS),
     "m-sog": of_frames(MSog, VOXELS, {**OF_VOXELS, "category": {"category": "pedestrian"}}),
-    "lob": of_frames(
-        Lob,
-        {"sensors": BOTH, "distances_m": (8.0, 5.0)},
-        {
-            "sensors": {"sensors": BOTH[:1]},
-            "distances_m": {"distances_m": (5.0, 8.0)},
-            "height_m": {"height_m": (0.0, 1.0)},
-            "cell_m": {"cell_m": 0.5},
-            "width_m": {"width_m": 4.0},
-        },
-    ),
 }

@@ -24,4 +24,4 @@ def frame_of(cloud, reference=(), boxes=(), categories=(), *, index=0, weights=N
 
 def values(metric):
     """Its numbers by name."""
-    return {number.name: number.value for number in metric.compute()}
+    return {number.quantity.key: number.value for number in metric.compute()}

@@ -18,7 +18,8 @@ from torchcover.evaluation import (
     study_table,
     verdict,
 )
-from torchcover.published.tables import text_tables
+from torchcover.evaluation.agreeing import NOTES
+from torchcover.published.comparison import text_tables
 from torchcover.report import error_words, narrowest_width, print_table, shown_unit, text_table
 
 
@@ -91,7 +92,7 @@ def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> 
         wide.print(table)
     for truth in truths:
         console.print(verdict(truth, {one: study.found[truth, one] for one in readings}), markup=False, soft_wrap=True)
-    for note in study.notes:
+    for note in NOTES:
         console.print(note, markup=False, soft_wrap=True)
     console.print(f"Wrote {', '.join(path.name for path in files)} to {out}", markup=False, soft_wrap=True)
 

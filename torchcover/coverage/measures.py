@@ -1,6 +1,7 @@
 """The numbers of one region: over its visible surface, or over its known cells."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Literal
 
 import torch
@@ -35,9 +36,8 @@ def estimate_known(
     used = blocks.steps.nonzero().flatten().tolist()
     own_probed, own_sums = blocks.spread_over(_in_band(blocks, band, cells))
     left_out = [known_mean(probed - own_probed[block], sums - own_sums[:, block]) for block in used]
-    return Estimate(
-        tuple(quantities), whole, torch.stack(left_out) if left_out else whole[None][:0], blocks.steps[used]
-    )
+    without = torch.stack(left_out) if left_out else whole[None][:0]
+    return Estimate(tuple(quantities), whole, without, blocks.steps[used], partial(_known_again, blocks, band, cells))
 
 
 def estimate_area(quantities: Sequence[Quantity], area: AreaSums | None, band: int, cells: Tensor) -> Estimate:
@@ -88,3 +88,14 @@ def known_mean(probed: Tensor, sums: Tensor) -> Tensor:
     """
     known = probed > 0
     return (sums[:, known] / probed[known]).mean(dim=1)
+
+
+def _known_again(blocks: Blocks, band: int, cells: Tensor, weights: Tensor) -> Tensor:
+    """(R, Q) the same if the blocks in use come as often as (R, g) they are weighted."""
+    used = blocks.steps > 0
+    # Not kept with the estimate: for all regions it is as large as the sums of the run.
+    probed, sums = blocks.spread_over(_in_band(blocks, band, cells))
+    steps = weights @ probed[used].double()
+    known = steps > 0
+    means = (weights @ sums[:, used]) / steps.where(known, 1.0)
+    return (means.sum(dim=2) / known.sum(dim=1)).T

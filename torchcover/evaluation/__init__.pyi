@@ -1,8 +1,7 @@
 from .agreeing import AgreementStudy as AgreementStudy
 from .agreeing import agree as agree
-from .agreement_files import relation as relation
-from .agreement_files import save_agreement as save_agreement
-from .agreement_files import verdict as verdict
+from .agreeing import relation as relation
+from .agreeing import verdict as verdict
 from .checkpoint import Checkpoint as Checkpoint
 from .evaluating import compare as compare
 from .evaluating import evaluate as evaluate

@@ -20,8 +20,7 @@ from torchcover.evaluation.result_page import page_of
 from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.evaluation.target_error import TargetError
 from torchcover.evaluation.target_outcome import outcome
-from torchcover.published.comparison import MetricComparison
-from torchcover.published.tables import numbers_csv, record, tau_csv
+from torchcover.published.comparison import MetricComparison, numbers_csv, record, tau_csv
 from torchcover.report import RENDERERS, CoverageTable, file_stems, map_figures, page_html, table_dict
 from torchcover.simulation import Sensor
 

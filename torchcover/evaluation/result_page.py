@@ -12,7 +12,7 @@ from torchcover.coverage import Region
 from torchcover.evaluation.omissions import Omission
 from torchcover.evaluation.sensor_drawings import sensor_views
 from torchcover.files import as_yaml
-from torchcover.published.tables import page_tables as metric_tables
+from torchcover.published.comparison import page_tables as metric_tables
 from torchcover.report import BOLD_MARKS, PLACE_HEADINGS, Line, Page, PageRig, PageTable, Words, maps_of, parts_of
 from torchcover.report.remarks import marks_on, notes_on
 from torchcover.report.table import CoverageTable

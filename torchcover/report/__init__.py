@@ -23,7 +23,7 @@ from torchcover.report.renderers.layout import BOLD_MARKS, PLACE_HEADINGS, Part,
 from torchcover.report.renderers.markdown_file import as_markdown
 from torchcover.report.renderers.text_file import narrowest_width, print_table, text_table
 from torchcover.report.table import CoverageTable, Row
-from torchcover.report.wording import difference_heading, error_words, percent, shown_unit
+from torchcover.report.wording import difference_heading, error_words, number_words, percent, shown_unit
 
 __all__ = [
     "BOLD_MARKS",
@@ -75,6 +75,7 @@ __all__ = [
     "marks_on",
     "narrowest_width",
     "notes_on",
+    "number_words",
     "page_html",
     "parts_of",
     "percent",
