@@ -123,7 +123,7 @@ def over_surface(size: int, points) -> Coverage:
     metric = CoverageMetric(GRID, blocks=16, square_metres=True)
     for index in range(16):
         m2 = 0.1 + 0.8 * torch.rand(400, generator=torch.Generator().manual_seed(index))
-        metric.update(points(size, 100 + index), points(400, 1000 + index), weights=m2, index=index)
+        metric.update(points(size, 100 + index), points(400, 1000 + index), weights=m2, place_in_time=index)
     return metric.compute()
 
 
