@@ -39,9 +39,7 @@ def study(
     from torchcover.evaluation import Settings, StudyPlan, claimed, error_against_time, rank_count
 
     if rank_count() > 1:
-        raise ValueError(
-            "study measures run times, which ranks beside each other would change: run it without torchrun"
-        )
+        raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
     plan = StudyPlan(
         Settings(rig, steps=steps, **settings),
         rays=tuple(sorted(set(rays or StudyPlan.rays))),

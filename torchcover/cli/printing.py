@@ -74,7 +74,7 @@ DETECTORS_ONLY = "* an interval over detectors only: of worlds there are none, o
 
 
 def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> None:
-    """How metrics rank the placements beside each thing that detectors say of them, and the notes."""
+    """How metrics rank the placements, for each thing that detectors say of them, and the notes."""
     console = Console()
     truths = list(dict.fromkeys(truth for truth, _ in study.found))
     readings = list(dict.fromkeys(reading for _, reading in study.found))

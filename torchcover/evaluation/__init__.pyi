@@ -8,8 +8,6 @@ from .evaluating import evaluate as evaluate
 from .observers import CoverageObserver as CoverageObserver
 from .observers import Observer as Observer
 from .observers import Stateful as Stateful
-from .omissions import Omission as Omission
-from .omissions import left_out as left_out
 from .pipeline import Run as Run
 from .pipeline import StoppingRule as StoppingRule
 from .pipeline import observe as observe
@@ -21,11 +19,13 @@ from .ranks import joined_ranks as joined_ranks
 from .ranks import rank_count as rank_count
 from .result import Result as Result
 from .result_files import claimed as claimed
+from .result_page import Omission as Omission
+from .result_page import left_out as left_out
+from .result_page import sensor_views as sensor_views
 from .scene_pictures import cameras_of as cameras_of
 from .scene_pictures import rig_pictures as rig_pictures
 from .scene_pictures import scenario_pictures as scenario_pictures
 from .scene_pictures import vehicle_picture as vehicle_picture
-from .sensor_drawings import sensor_views as sensor_views
 from .settings import Settings as Settings
 from .study import Study as Study
 from .study import WorkPoint as WorkPoint
@@ -42,8 +42,8 @@ from .study_runs import area_sums as area_sums
 from .target_error import Standing as Standing
 from .target_error import TargetError as TargetError
 from .target_error import TargetWatch as TargetWatch
+from .target_error import outcome as outcome
 from .target_error import standings as standings
-from .target_outcome import outcome as outcome
 from .target_survey import free_space as free_space
 from .target_survey import save_targets as save_targets
 from .target_survey import survey_target as survey_target

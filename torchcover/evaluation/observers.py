@@ -94,7 +94,7 @@ class CoverageObserver:
 
         Raises:
             ValueError: As `CoverageMetric.update`, several rigs and none was named, or reference points without the
-                square metres that the metric wants, or nobody knows which points are of which sensor and it wants
+                square metres that the metric wants, or it is unknown which points are of which sensor and it wants
                 that.
         """
         sensor = self._by_sensor(frame) if self.metric.sensors else self._whole(frame)

@@ -6,12 +6,11 @@ from typing import Any, NamedTuple
 from torchcover.coverage import Coverage, Region
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
-from torchcover.frames import BadFrameError, Frame, FrameSource
+from torchcover.frames import FrameSource
 from torchcover.published import PUBLISHED, FrameMetric, Ranking, Setup, Sights
 from torchcover.published.comparison import MetricComparison
 from torchcover.published.ranks import OWN, rankings
 from torchcover.published.registry import Need
-from torchcover.simulation import SimulatedFrames
 
 WHY: Mapping[Need, str] = {
     "boxes": "it needs boxes of objects, which simulations and labelled recordings have",
@@ -50,11 +49,8 @@ def metrics_of(task: Task[FrameSource], settings: Settings) -> OtherMetrics:
     Raises:
         ValueError: None of them can be made; the message says why.
     """
-    if not settings.metrics:
-        return OtherMetrics({}, {})
     sights, threshold_m = Sights(), settings.thresholds_m[0] if settings.thresholds_m else 0.4
-    ego = task.frames.scenario.ego_mesh() if isinstance(task.frames, SimulatedFrames) else None
-    lacking = _lacking(task)
+    lacking, ego = _lacking(task), task.frames.ego_mesh()
     left_out = {name: WHY[min(missing)] for name in settings.metrics if (missing := PUBLISHED[name].needs & lacking)}
     if len(left_out) == len(settings.metrics):
         raise ValueError("; ".join(f"metric {name}: {why}" for name, why in left_out.items()))
@@ -78,28 +74,18 @@ def metrics_of(task: Task[FrameSource], settings: Settings) -> OtherMetrics:
 
 def _lacking(task: Task[FrameSource]) -> frozenset[Need]:
     """What the frames, or the rigs, do not have."""
-    first = None if isinstance(task.frames, SimulatedFrames) else _first_frame(task)
     there: dict[Need, bool] = {
         "sensors": all(task.sensors.get(rig) for rig in task.rigs),
-        "boxes": first is None or first.boxes is not None,
-        "sensor_points": first is None or all(rig in (first.sensor_points or {}) for rig in task.rigs),
+        "boxes": task.frames.has_boxes(),
+        "sensor_points": all(rig in task.frames.sensor_names for rig in task.rigs),
     }
     return frozenset(need for need, known in there.items() if not known)
 
 
-def _first_frame(task: Task[FrameSource]) -> Frame | None:
-    for index in range(len(task.frames)):
-        try:
-            return task.frames[index]
-        except BadFrameError:
-            continue  # the run itself skips it, or ends with it
-    return None
-
-
 def compared(
     metrics: OtherMetrics, coverages: Mapping[str, Coverage], regions: Sequence[Region], seed: int
-) -> MetricComparison | None:
-    """What the metrics say, and torchcover's numbers of some regions; None if none was asked for.
+) -> MetricComparison:
+    """What the metrics say, and torchcover's numbers of some regions.
 
     Args:
         metrics: After the run.
@@ -107,8 +93,6 @@ def compared(
         regions: Those whose numbers they are held against.
         seed: Of the worlds that are drawn again.
     """
-    if not metrics.of_rigs:
-        return None
     published = [
         one
         for name, of_rigs in metrics.of_rigs.items()

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 from matplotlib.figure import Figure
 
-from torchcover.evaluation.sensor_drawings import sensor_views
+from torchcover.evaluation.result_page import sensor_views
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
 from torchcover.report import ActorMark, Scenery, SkinPatch, draw_depths, draw_rig, draw_scene, draw_vehicle

@@ -22,6 +22,7 @@ from torchcover.simulation.regions_of_interest import Asked, RegionsOfInterest
 from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.sensor import Sensor
+from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.simulator import Observation, Simulator
 from torchcover.simulation.surface_reference import SurfaceReference
 from torchcover.simulation.world import Label
@@ -132,6 +133,23 @@ class SimulatedFrames(FrameDataset):
     def sensors(self) -> Mapping[str, Sequence[Sensor]]:
         """The sensors of each rig."""
         return {name: rig.sensors for name, rig in self.rigs.items()}
+
+    @property
+    def sensor_names(self) -> Mapping[str, Sequence[str]]:
+        """The names of the sensors of each rig."""
+        return {name: [sensor.name for sensor in rig.sensors] for name, rig in self.rigs.items()}
+
+    def world_of(self, index: int) -> int:
+        """Which world a frame is of; of one that plays again and again every process has it whole: the index."""
+        return index if self.scenario.repeats else self.simulator.run_of(index)
+
+    def has_boxes(self) -> bool:
+        """Whether they were asked for."""
+        return self.boxes
+
+    def ego_mesh(self) -> Mesh:
+        """What carries the rigs, in the vehicle frame; no world is built for it."""
+        return self.scenario.ego_mesh()
 
     @property
     def ego_outline_m(self) -> NDArray[np.float64]:
