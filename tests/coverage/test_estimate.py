@@ -28,7 +28,7 @@ def steps_of(count, seed=0, points=12):
 def metric_over(steps, index=None, **options):
     metric = CoverageMetric(GRID, (0.4, 0.8), **options)
     for number, (sensor, reference) in zip(index or range(len(steps)), steps, strict=True):
-        metric.update(sensor, reference, index=number)
+        metric.update(sensor, reference, place_in_time=number)
     return metric
 
 
@@ -95,7 +95,7 @@ def test_numbers_of_worlds_that_are_drawn_again_are_those_of_a_run_over_them(mea
         metric = CoverageMetric(GRID, (0.4, 0.8), blocks=16, square_metres=True)
         for number in numbers:
             sensor, reference, m2 = steps[number]
-            metric.update(sensor, reference, weights=m2, index=number)
+            metric.update(sensor, reference, weights=m2, place_in_time=number)
         return metric.compute().estimate(PART, "low", measure)
 
     drawn = [0, 0, 3, 3, 3, 4, 5, 7, 8, 9]

@@ -11,11 +11,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations import MeanOfMeans
+from torchcover.coverage.aggregations import Layer, MeanOfMeans
 from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
 from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.layer import Layer
 from torchcover.coverage.measures import Measure, area_in_blocks, estimate_area, estimate_known
 from torchcover.coverage.quantity import RADIUS, by_area, over_known
 from torchcover.coverage.redundancy import Redundancy, redundancy_quantities

@@ -88,7 +88,7 @@ class CoverageObserver:
                 that.
         """
         sensor = self._by_sensor(frame) if self.metric.sensors else self._whole(frame)
-        self.metric.update(sensor, frame.reference, weights=frame.reference_weights, index=frame.place_in_time)
+        self.metric.update(sensor, frame.reference, weights=frame.reference_weights, place_in_time=frame.place_in_time)
 
     def _whole(self, frame: Frame) -> Tensor:
         return frame.sensor if self.rig is None else frame.cloud_of(self.rig)

@@ -185,7 +185,7 @@ class RecordedFrames(FrameDataset):
             counts=counts,
             reference_weights=None if reference.weights is None else torch.from_numpy(reference.weights),
             boxes=boxes,
-            instant=None if self.recording.instants is None else self.recording.instants[instant],
+            place_in_time=position if self.recording.instants is None else self.recording.instants[instant],
             sensor_points={
                 rig: {sensor: len(scans[sensor].points_m) for sensor in of} for rig, of in self.sensors_of_rigs.items()
             },

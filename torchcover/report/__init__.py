@@ -3,7 +3,7 @@
 from torchcover.report.drawings.choice import ChoiceSize, draw_choice
 from torchcover.report.drawings.film import check_film, write_film
 from torchcover.report.drawings.four_views import draw_four_views
-from torchcover.report.drawings.frame import ActorMark, Standing, draw_depths, draw_scene
+from torchcover.report.drawings.frame import ActorMark, Scenery, draw_depths, draw_scene
 from torchcover.report.drawings.rig import draw_rig
 from torchcover.report.drawings.search import Slice, draw_fronts, draw_progress, draw_slices
 from torchcover.report.drawings.targets import draw_targets
@@ -42,10 +42,10 @@ __all__ = [
     "Part",
     "Remark",
     "Row",
+    "Scenery",
     "SensorView",
     "SkinPatch",
     "Slice",
-    "Standing",
     "Words",
     "WorkPanel",
     "as_markdown",

@@ -48,7 +48,7 @@ class SimulatedFrames(FrameDataset):
         rig: The sensors, the name of a built-in rig, or the path of a YAML file.
         rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds.
         steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
-            traffic, the same instants are seen again, which `Frame.instant` and `Frame.counts` say.
+            traffic, the same instants are seen again, which `Frame.place_in_time` and `Frame.counts` say.
         seed: Seed of the traffic and of the reference sensor's poses.
         reference_sensor: The reference sensor, such as `PaperReference()`. If not given, a `SurfaceReference` that is
             aimed at the usual regions: `reference_called`, and `reference_of_objects` with boxes, at up to twice the
@@ -220,7 +220,7 @@ class SimulatedFrames(FrameDataset):
             name=f"{self.scenario.name} step {index}",
             counts=seen.counts,
             boxes=_boxes(self.simulator.labels(index), clouds, seen.drawn) if self.boxes else None,
-            instant=self.simulator.place_in_time(index),
+            place_in_time=self.simulator.place_in_time(index),
             sensor_points={
                 name: dict(zip((sensor.name for sensor in self.rigs[name].sensors), points, strict=True))
                 for name, points in seen.sensor_points.items()
