@@ -1,5 +1,6 @@
-"""The numbers of one region: over its visible surface, or over its known cells."""
+"""The numbers of one region, over its visible surface or over its known cells; and the errors of maps."""
 
+import math
 from collections.abc import Sequence
 from functools import partial
 from typing import Literal
@@ -8,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
-from torchcover.estimation import Estimate, Quantity
+from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Estimate, Quantity, ratio_errors
 
 # What the number of a region is a mean over: its visible surface, or its known cells.
 Measure = Literal["area", "known"]
@@ -65,6 +66,17 @@ def estimate_area(quantities: Sequence[Quantity], area: AreaSums | None, band: i
         )
     each = area_in_blocks(area, band, cells)
     return Estimate.of_ratios(quantities, each[:, 0], each[:, 1:], area.steps)
+
+
+def errors_of_cells(quantities: Sequence[Quantity], blocks: BlockSums) -> dict[str, Tensor]:
+    """Key of each quantity -> (H, Y, X) standard errors of its map; NaN where too few blocks probed."""
+    where = blocks.known_in() >= MIN_BLOCKS_OF_A_CELL
+    base, sums = blocks.spread_over(where)
+    errors = {}
+    for quantity, own in zip(quantities, sums, strict=True):
+        errors[quantity.key] = sums.new_full(blocks.shape[1:], math.nan)
+        errors[quantity.key][where] = ratio_errors(base, own, quantity.unit)
+    return errors
 
 
 def area_in_blocks(area: AreaSums, band: int, cells: Tensor) -> Tensor:
