@@ -24,12 +24,12 @@ from torchcover.cli.app import app
 ROOT = Path(__file__).parent.parent
 ROOMS = (
     "coverage", "evaluation", "placement", "targets", "data", "simulation", "cameras", "detection", "training",
-    "metrics", "neighbors", "report", "geometry",
+    "metrics", "estimation", "neighbors", "report", "geometry",
 )  # fmt: skip
 # Where the classes of documents are defined.
 DOCUMENTS = (
     "torchcover.simulation",
-    "torchcover.data",
+    "torchcover.recordings",
     "torchcover.targets",
     "torchcover.coverage",
     "torchcover.placement",
@@ -172,7 +172,18 @@ def api():
             one = getattr(module, name)
             if inspect.isclass(one) or inspect.isfunction(one):
                 lines += ["", f"::: {one.__module__}.{one.__qualname__}"]
+                if hasattr(one, "__wrapped__"):  # whose arguments are the fields of a document: not in its source
+                    lines += ["    options:", "      show_signature: false", *argument_rows(one)]
     return "\n".join(lines)
+
+
+def argument_rows(function):
+    """A table of the arguments of a function."""
+    words = of_docstring(function)[1]
+    yield from ("", "| argument | default | |", "|---|---|---|")
+    for name, one in inspect.signature(function).parameters.items():
+        default = "" if one.default is None or callable(one.default) else f"`{one.default!r}`"
+        yield f"| `{name}` | {cell(default)} | {cell(words[name])} |"
 
 
 def cell(text):

@@ -18,7 +18,6 @@ BENCHMARKS = (
     "five_rigs",
     "omissions",
     "metric_omissions",
-    "even_reference",
     "ray_budget",
     "recorded_measure",
     "reading",

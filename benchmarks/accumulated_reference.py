@@ -57,11 +57,9 @@ class SimulatedDrive:
     """A `Recording` of sweeps around one instant, which is its only frame; scans are kept."""
 
     reference_sensors = ()
-    weight_kind = None
+    square_metres = False
     instants = None
     body = None
-    weight_kind = None
-    instants = None
     path = Path("simulated")
 
     def __init__(self, sweeps, instant, window_s, *, labelled=True):

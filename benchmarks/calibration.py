@@ -15,22 +15,22 @@ import torch
 
 from benchmarks.timing import table
 from torchcover import forward_regions, nearest
-from torchcover.coverage import BevGrid, intervals
+from torchcover.coverage import BevGrid, MeanOfMeans
 from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.blocks import AreaSums
-from torchcover.coverage.errors import ratio_errors
-from torchcover.coverage.estimate import estimate_area
+from torchcover.coverage.measures import estimate_area
 from torchcover.data import SimulatedFrames
-from torchcover.data.reference import GRID_X_M, GRID_Y_M
-from torchcover.evaluation.settings import BLOCKS
+from torchcover.estimation import ratio_errors, student
+from torchcover.evaluation.measuring import BLOCKS
 from torchcover.evaluation.target_error import LOOKS_IN_A_ROW, MAX_GROWTH, MIN_GROWTH, MIN_STEPS
+from torchcover.simulation.regions_of_interest import GRID_X_M, GRID_Y_M
 
 RIG, EVERY_S = "front_roof_128", 10.0
 GRID = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=0.25)
 REGIONS = forward_regions()
 PLACES = [(region, height) for region in REGIONS for height in GRID.heights]
 ALL = range(len(PLACES))
-UNITS = ("m", "share")
+QUANTITIES = MeanOfMeans((0.4,)).quantities
 NAMES = [f"{region.name} {height} {what}" for region, height in PLACES for what in ("radius", "detection")]
 # A cell has a truth if so many cities have probed it.
 CITIES_OF_A_CELL = 20
@@ -43,9 +43,9 @@ def main():
     parser.add_argument("--steps", type=int, default=720, help="steps to simulate, six a city")
     parser.add_argument("--runs", type=int, default=1000)
     parser.add_argument("--sums", type=Path, help="simulated if missing (out/calibration_SCENARIO_SEED_STEPS.npz)")
-    parser.add_argument("--blind-side", type=float, default=intervals.BLIND_SIDE, help="to try another factor")
+    parser.add_argument("--blind-side", type=float, default=student.BLIND_SIDE, help="to try another factor")
     options = parser.parse_args([] if __name__ != "__main__" else None)
-    intervals.BLIND_SIDE = options.blind_side
+    student.BLIND_SIDE = options.blind_side
     name = f"calibration_{options.scenario}_{options.seed}_{options.steps}.npz"
     path = options.sums or Path("out") / name
     if not path.is_file():
@@ -147,13 +147,13 @@ class Cities:
         area = AreaSums.of(lengths, sums[:, None, None, :, 0], sums[..., 1:].movedim(2, 1)[:, :, None, None])
         found = []
         for at in places:
-            estimate = estimate_area(area, 0, torch.arange(len(PLACES))[None] == at)
+            estimate = estimate_area(QUANTITIES, area, 0, torch.arange(len(PLACES))[None] == at)
             found += zip(estimate.value.tolist(), estimate.error.tolist(), strict=True)
         return [(value, error, len(blocks) - 1) for value, error in found]
 
     def covers(self, number, at):
         """Whether the interval around a number holds the truth."""
-        low, high = intervals.interval95(*number, UNITS[at % 2])
+        low, high = student.interval95(*number, QUANTITIES[at % 2])
         return low <= self.truth[at] <= high
 
     def covered(self, random, steps, runs):
@@ -188,8 +188,8 @@ class Cities:
         for _ in range(runs):
             drawn = self.drawn(random, steps)
             sums = torch.from_numpy(np.stack([of_steps[block].sum(axis=0, dtype=np.float64) for block in drawn]))
-            for at, unit in enumerate(UNITS, 1):
-                error = ratio_errors(sums[:, 0], sums[:, at], unit)
+            for at, quantity in enumerate(QUANTITIES, 1):
+                error = ratio_errors(sums[:, 0], sums[:, at], quantity.unit)
                 ratio = sums[:, at].sum(dim=0) / sums[:, 0].sum(dim=0)
                 known = error.isfinite()
                 holds = (ratio - total[at] / total[0]).abs()[known] <= 2 * error[known]

@@ -11,7 +11,7 @@ import torch
 
 from torchcover.data import SimulatedFrames, reference_called, reference_of_objects
 from torchcover.detection import box_visibility
-from torchcover.simulation import EvenReference, PaperReference
+from torchcover.simulation import PaperReference
 
 RIG = "front_roof_128"
 WITHIN_M = 60.0
@@ -22,7 +22,6 @@ REFERENCES = {
     "the paper's, 1024 x 1024": PaperReference(),
     "the paper's, 512 x 512": PaperReference(rows=512, columns=512),
     "512 x 512, level": PaperReference(rows=512, columns=512, max_tilt_deg=0.0),
-    "even, 65536 rays within 60 m": EvenReference((((-60.0, 60.0), (-60.0, 60.0)),), rays=65_536),
 }
 
 

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 
 from benchmarks.timing import compare, table
-from torchcover.simulation import PaperReference, Rig, Scenario
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.simulation import Draws, PaperReference, Rig, Scenario
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor
 
 RANGE_M = 250.0
@@ -17,6 +17,7 @@ STEPS = (100, 110, 120, 130)
 NEAR, FAR = 60, 1000
 FAR_M = 10_000.0
 REFERENCE = PaperReference(rows=256, columns=256, max_range_m=RANGE_M)
+REFERENCE_TILES = into_tiles(REFERENCE.directions())
 
 
 def main():
@@ -43,16 +44,16 @@ def main():
 def steps_of(scene):
     """A function that makes the scans of some steps."""
     (lidar,) = Rig.load("front_roof_128").sensors
-    mounted = MountedSensor(lidar, into_tiles(lidar.directions()), scene)
+    mounted = MountedSensor(lidar, scene)
 
     def run():
         for step in STEPS:
             instant = scene.at(step, within_m=RANGE_M)
-            mounted.scan(instant)
+            mounted.scan(instant, Draws(None))
             generator = np.random.default_rng(step)
             pose = REFERENCE.vehicle_T_reference(scene.ego_box, generator)
             instant.buried(pose[:3, 3])
-            instant.scan(pose, REFERENCE.tiles(pose, generator), max_range_m=RANGE_M)
+            instant.scan(pose, REFERENCE_TILES, max_range_m=RANGE_M)
 
     return run
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.timing import compare, table
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import PaperReference, Rig, Scenario
+from torchcover.simulation import Draws, PaperReference, Rig, Scenario
 from torchcover.simulation.instant import Scan, cast_from
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles, rotate
@@ -55,7 +55,7 @@ def rays_that_pass_by(scene):
     reference, instant = PaperReference(rows=256, columns=256), scene.at(STEP, within_m=RANGE_M)
     generator = np.random.default_rng(0)
     pose = reference.vehicle_T_reference(scene.ego_box, generator)
-    tiles = reference.tiles(pose, generator)
+    tiles = into_tiles(reference.directions())
     return (
         lambda: at_every_body(instant, pose, tiles),
         lambda: instant.scan(pose, tiles, max_range_m=RANGE_M),
@@ -78,28 +78,24 @@ def at_every_body(instant, pose, tiles):
         found.append((directions * hits.range_m + pose[:3, 3].astype(np.float32)[:, None])[:, seen].T)
         self_hits += int((hits.body == instant.ego).sum())
     points = np.concatenate(found)
-    return Scan(points, np.arange(len(points)), 0, self_hits)
+    return Scan(points, np.arange(len(points)), np.empty(0, dtype=np.float32), 0, self_hits)
 
 
 def ego_again(scene, sensor):
     """A sensor fixed to the ego need not be cast at it at every step."""
-    tiles = into_tiles(sensor.directions())
-    instant, mounted = scene.at(STEP, within_m=RANGE_M), MountedSensor(sensor, tiles, scene)
-    return afresh(instant, sensor, tiles), lambda: mounted.scan(instant)
+    instant, mounted = scene.at(STEP, within_m=RANGE_M), MountedSensor(sensor, scene)
+    return afresh(instant, sensor, mounted.tiles), lambda: mounted.scan(instant, Draws(None))
 
 
 def scan_again(scene, sensor):
     """Where nothing moves one scan serves for all steps."""
-    tiles = into_tiles(sensor.directions())
-    instant, mounted = scene.at(0), MountedSensor(sensor, tiles, scene)
-    return afresh(instant, sensor, tiles), lambda: mounted.scan(instant)
+    instant, mounted = scene.at(0), MountedSensor(sensor, scene)
+    return afresh(instant, sensor, mounted.tiles), lambda: mounted.scan(instant, Draws(None))
 
 
 def afresh(instant, sensor, tiles):
     """A scan that knows nothing of the steps before."""
-    return lambda: instant.scan(
-        sensor.mount.matrix(), tiles, min_range_m=sensor.min_range_m, max_range_m=sensor.max_range_m
-    )
+    return lambda: instant.scan(sensor.mount.matrix(), tiles, max_range_m=sensor.max_range_m)
 
 
 def world_again(scene, sensor):

@@ -21,7 +21,6 @@ GRID = BevGrid(x=(0.0, 160.0), y=(-40.0, 40.0), cell=0.25)
 # What a row is called, its reference sensor, and its estimator.
 ESTIMATORS = (
     ("paper's pattern, known cells", "paper", "known"),
-    ("even rays, known cells", "even", "known"),
     ("surface points, by area", "surface", "area"),
 )
 

@@ -14,8 +14,8 @@ import torch
 
 from benchmarks.timing import compare, table
 from torchcover.data import AccumulatedReference, RecordedFrames, open_recording
-from torchcover.data.in_vehicle import in_vehicle
-from torchcover.data.recordings.kitti_files import vehicle_T_velodyne
+from torchcover.recordings.formats.kitti_files import vehicle_T_velodyne
+from torchcover.recordings.in_vehicle import in_vehicle
 
 POINTS, SWEEPS, LONG = 120_000, 20, 100_000
 LINKS = 50_000  # files that may be one file

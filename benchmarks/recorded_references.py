@@ -9,7 +9,7 @@ from torchcover import BevGrid, forward_regions
 from torchcover.geometry import invert, transform
 from torchcover.simulation import Lidar
 from torchcover.simulation.patches import Bounds
-from torchcover.simulation.rays import TILE_COLUMNS, TILE_ROWS, into_tiles
+from torchcover.simulation.rays import into_tiles, pixels_in_tiles
 from torchcover.simulation.sight import sight
 from torchcover.simulation.surface_points import SurfaceStrata
 
@@ -81,12 +81,8 @@ def recorded_and_true(frames, index, lidar, generator):
 def scanned(lidar, instant, pose, generator):
     """One scan, in the vehicle frame from which `pose` leads to that of its instant."""
     directions, mount = lidar.directions(), lidar.mount.matrix()
-    scan = instant.scan(mount, into_tiles(directions), min_range_m=lidar.min_range_m, max_range_m=lidar.max_range_m)
-    rays = np.arange(directions[0].size).reshape(directions[0].shape)
-    rows, columns = range(0, len(rays), TILE_ROWS), range(0, rays.shape[1], TILE_COLUMNS)
-    ray = np.concatenate(
-        [rays[top : top + TILE_ROWS, left : left + TILE_COLUMNS].ravel() for top in rows for left in columns]
-    )[scan.ray]
+    scan = instant.scan(mount, into_tiles(directions), max_range_m=lidar.max_range_m)
+    ray = pixels_in_tiles(directions)[scan.ray]
     way_m = scan.points.astype(np.float64) - mount[:3, 3]
     way_m *= 1 + generator.normal(0.0, NOISE_M, (len(way_m), 1)) / np.linalg.norm(way_m, axis=1, keepdims=True)
     points_m = mount[:3, 3] + way_m
@@ -99,7 +95,7 @@ def scanned(lidar, instant, pose, generator):
             own_m = transform(part_T_vehicle, points_m)
             on_moving |= ((own_m >= low) & (own_m <= high)).all(axis=1)
     points_m = transform(invert(pose), points_m)
-    cloud = Cloud(points_m, np.ones(len(points_m)), on_moving, *np.divmod(ray, rays.shape[1]))
+    cloud = Cloud(points_m, np.ones(len(points_m)), on_moving, *np.divmod(ray, directions.shape[2]))
     return cloud.where(GRID.cell_of(torch.from_numpy(points_m)).numpy() >= 0)
 
 

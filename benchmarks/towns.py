@@ -13,7 +13,7 @@ from torchcover.data import SimulatedFrames
 from torchcover.simulation import PaperReference
 from torchcover.simulation.sumo import Sumo
 from torchcover.simulation.sumo.network import read_network
-from torchcover.simulation.sumo.programs import run
+from torchcover.simulation.sumo.simulating import run
 
 RIG = "front_roof_128"
 WORLDS, STEPS = 8, 12

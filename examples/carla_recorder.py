@@ -22,7 +22,8 @@ import carla
 import numpy as np
 from PIL import Image
 
-from torchcover.data.recordings.carla_files import (
+from torchcover.geometry import euler_from_rotation, invert
+from torchcover.recordings.formats.carla_files import (
     DEPTH,
     EXTENT,
     LIDARS,
@@ -31,7 +32,6 @@ from torchcover.data.recordings.carla_files import (
     VELOCITY,
     CarlaVehicle,
 )
-from torchcover.geometry import euler_from_rotation, invert
 from torchcover.simulation import PaperReference
 
 LOOKS = {"front": 0.0, "right": 90.0, "rear": 180.0, "left": 270.0}

@@ -13,7 +13,7 @@ import torch
 from torchcover.data import Frame
 from torchcover.evaluation import observe
 from torchcover.files import end_with_parent
-from torchcover.simulation.sumo import programs
+from torchcover.simulation.sumo import simulating
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux, which ends processes with their parent")
 # Of a child that is left alone.
@@ -35,12 +35,13 @@ class Alive:
         os.write(os.open(self.path, os.O_WRONLY), b".")
         time.sleep(LIVES_S)
 
-    def wait_for(self, count):
+    def wait_for(self, count, parent):
         """Until so many children are there."""
         there = b""
         while len(there) < count:
-            self.poll.poll()
-            there += os.read(self.reader, count)
+            assert os.waitpid(parent, os.WNOHANG) == (0, 0), "it has ended before its children were there"
+            if any(event & select.POLLIN for _, event in self.poll.poll(100)):
+                there += os.read(self.reader, count)
 
     def has_ended(self, within_s):
         """Whether all of them end."""
@@ -67,7 +68,7 @@ def is_killed(act, alive, children=1):
             act()
         finally:
             os._exit(1)
-    alive.wait_for(children)
+    alive.wait_for(children, parent)
     os.kill(parent, signal.SIGKILL)
     assert os.waitpid(parent, 0)[1] == signal.SIGKILL
 
@@ -98,6 +99,8 @@ def test_it_ends_though_its_parent_had_ended_before():
 
 def test_what_makes_frames_ends_though_it_is_in_the_middle_of_one(alive):
     class Drive:
+        world_of = int
+
         def __len__(self):
             return 4
 
@@ -113,6 +116,6 @@ def test_what_makes_traffic_ends(alive, tmp_path, monkeypatch):
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "sumo").write_text(f"#!/bin/sh\n{script(alive, LIVES_S)}\n")
     (tmp_path / "bin" / "sumo").chmod(0o755)
-    monkeypatch.setattr(programs, "_home", lambda: tmp_path)
-    is_killed(lambda: programs.run("sumo"), alive)
+    monkeypatch.setattr(simulating, "_home", lambda: tmp_path)
+    is_killed(lambda: simulating.run("sumo"), alive)
     assert alive.has_ended(within_s=LIVES_S / 3)

@@ -2,6 +2,7 @@ from . import cameras as cameras
 from . import coverage as coverage
 from . import data as data
 from . import detection as detection
+from . import estimation as estimation
 from . import evaluation as evaluation
 from . import geometry as geometry
 from . import metrics as metrics
@@ -17,12 +18,12 @@ from .coverage import Coverage as Coverage
 from .coverage import CoverageMetric as CoverageMetric
 from .coverage import Region as Region
 from .coverage import forward_regions as forward_regions
-from .data import RegionsOfInterest as RegionsOfInterest
 from .evaluation import compare as compare
 from .evaluation import evaluate as evaluate
 from .evaluation import survey_target as survey_target
 from .neighbors import blind_spot_radius as blind_spot_radius
 from .neighbors import nearest as nearest
+from .simulation import RegionsOfInterest as RegionsOfInterest
 from .simulation import Rig as Rig
 from .simulation import Scenario as Scenario
 

@@ -8,7 +8,6 @@ from itertools import product
 
 from examples.paper.published import HEIGHTS, LIDARS, QUANTITIES, REGIONS, Place, published
 from examples.paper.score import score
-from torchcover.coverage import Number
 
 HEADINGS = (
     "| region | height | LiDAR | detection (%) | paper | ratio | by area | radius (m) | paper | ratio | by area |"
@@ -32,8 +31,8 @@ def numbers_of(coverages, regions):
         for region in regions:
             for height in coverage.grid.heights:
                 estimate = coverage.estimate(region, height)
-                radius, share = map(Number, estimate.value.tolist(), estimate.error.tolist())
-                percent = Number(100 * share.value, 100 * share.error)
+                radius, share = estimate.numbers(intervals=False).values()
+                percent = share._replace(value=100 * share.value, error=100 * share.error)
                 for quantity, number in zip(QUANTITIES, (percent, radius), strict=True):
                     numbers[Place(quantity, lidar, region.name, height)] = number
     return numbers
@@ -77,7 +76,8 @@ def as_records(results):
             "steps": steps,
             **scores[lidars, measure, steps]._asdict(),
             "numbers": [
-                {**place._asdict(), **number._asdict(), "paper": published()[place]} for place, number in run.items()
+                {**place._asdict(), "value": number.value, "error": number.error, "paper": published()[place]}
+                for place, number in run.items()
             ],
         }
         for (lidars, measure, steps), run in results.items()
@@ -92,7 +92,7 @@ def _table(known, area):
         cells = [region, height, lidar]
         for quantity in QUANTITIES:
             place = Place(quantity, lidar, region, height)
-            ratio = Number(known[place].value / paper[place], math.nan)
+            ratio = known[place]._replace(value=known[place].value / paper[place], error=math.nan)
             cells += [_words(known[place]), f"{paper[place]:.2f}", _words(ratio), _words(area[place])]
         lines.append(f"| {' | '.join(cells)} |")
     return [*lines, ""]

@@ -8,11 +8,22 @@ import numpy as np
 import pytest
 
 from torchcover import Coverage
-from torchcover.evaluation import compare
+from torchcover.evaluation import evaluate
 
 
 def run(torchcover, worlds, *rigs, command="compare", options=(), out="out", steps=2):
-    arguments = ["--scenario", worlds / "yard.yaml", "--steps", steps, "--cell", 4, "--threshold", 2, "--rays", 4096]
+    arguments = [
+        "--scenario",
+        worlds / "yard.yaml",
+        "--steps",
+        steps,
+        "--cell-m",
+        4,
+        "--thresholds-m",
+        2,
+        "--rays",
+        4096,
+    ]
     paths = [worlds / f"{rig}.yaml" for rig in rigs]
     folder = worlds / out
     return *torchcover(command, *paths, *arguments, "--out", folder, *options), folder
@@ -22,7 +33,7 @@ def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
     code, printed, error, out = run(torchcover, worlds, "low", "both", "other/low", options=["--metrics", "all"])
     assert (code, error.count("warning")) == (0, 0)
     assert "None of these metrics is validated" in printed
-    assert "lob: the distance decides the order" in " ".join(printed.split())
+    assert "m_sog: only for ranks" in " ".join(printed.split())
     summary = json.loads((out / "summary.json").read_text())
     numbers = {(row["rig"], row["name"]): row for row in summary["metrics"]["numbers"]}
     assert numbers["both", "points"]["rank"] == 1.0
@@ -30,7 +41,7 @@ def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
     assert numbers["low", "object_coverage_2m:bus"]["value"] is None
     notes = summary["metrics"]["notes"]
     assert sum(note.startswith("s_mig, s_mig_occluded: S-MIG falls") for note in notes) == 1
-    assert sum(note.startswith("lob: the distance decides") for note in notes) == 1
+    assert sum(note.startswith("m_sog: only for ranks") for note in notes) == 1
     with (out / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(summary["metrics"]["numbers"])
@@ -84,7 +95,7 @@ def test_a_recording_without_boxes_has_the_metrics_that_need_none(torchcover, wo
     )
     shutil.rmtree(worlds / "drive" / "boxes")
     code, printed, error = torchcover(
-        "evaluate", "--frames", worlds / "drive", "--metrics", "all", "--cell", 4, "--out", worlds / "of_drive"
+        "evaluate", "--frames", worlds / "drive", "--metrics", "all", "--cell-m", 4, "--out", worlds / "of_drive"
     )
     assert code == 0, error
     assert "point_density" in printed
@@ -93,12 +104,12 @@ def test_a_recording_without_boxes_has_the_metrics_that_need_none(torchcover, wo
 
 def test_taus_have_intervals_over_worlds_that_are_drawn_the_same_again(worlds):
     def taus():
-        result = compare(
+        result = evaluate(
             [worlds / f"{rig}.yaml" for rig in ("low", "both", "other/low")],
             worlds / "yard.yaml",
             steps=9,
             cell_m=4.0,
-            thresholds=2.0,
+            thresholds_m=2.0,
             rays=2048,
             metrics="k_cover",
         )
@@ -114,7 +125,7 @@ def test_taus_have_intervals_over_worlds_that_are_drawn_the_same_again(worlds):
 
 @pytest.mark.parametrize("metrics", ["", ()])
 def test_nothing_is_asked_for_with_nothing(worlds, metrics):
-    result = compare(
+    result = evaluate(
         [worlds / "low.yaml", worlds / "both.yaml"],
         worlds / "yard.yaml",
         steps=1,

@@ -19,7 +19,18 @@ from torchcover.report.maps import figures
 def arguments(worlds, *, steps=3):
     """Two rigs in the tiny yard."""
     rigs = [worlds / "low.yaml", worlds / "both.yaml"]
-    settings = ["--scenario", worlds / "yard.yaml", "--cell", 4, "--threshold", 2, "--rays", 4096, "--steps", steps]
+    settings = [
+        "--scenario",
+        worlds / "yard.yaml",
+        "--cell-m",
+        4,
+        "--thresholds-m",
+        2,
+        "--rays",
+        4096,
+        "--steps",
+        steps,
+    ]
     return ["compare", *rigs, *settings, "--out", worlds / "out"]
 
 

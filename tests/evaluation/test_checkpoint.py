@@ -12,24 +12,25 @@ import torch
 
 import torchcover
 from torchcover.coverage import Maximum, StepQuantiles
-from torchcover.data import BadFrameError
+from torchcover.data import BadFrameError, FrameDataset
 from torchcover.evaluation import Checkpoint, checkpoint
-from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
+from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
 from torchcover.files import BadFileError
 
 STEPS = 16
 SETTINGS = {"cell_m": 8.0, "aggregations": (Maximum(), StepQuantiles((0.5,)))}
 
 
-class Drive:
+class Drive(FrameDataset):
     """A source of frames, some of which may be bad; slower than nothing, so that a kill finds it at work."""
 
     rigs = ("a",)
     sensors = {}  # noqa: RUF012
     ego_outline_m = None
     description = {"scenario": None, "frames": "drive", "seed": None}  # noqa: RUF012
-    weight_kind = None
+    square_metres = False
     reference_record = None
+    world_of = staticmethod(int)
 
     def __init__(self, frame_of, bad=(), content="drive", delay_s=0.0):
         self.frame_of, self.bad, self.content, self.delay_s = frame_of, bad, {"frames": content}, delay_s
@@ -155,7 +156,7 @@ def test_a_complete_run_goes_on_when_more_steps_are_wanted(frame_of, path):
 
 def test_looks_at_a_target_error_go_on_as_they_would_have(frame_of, path, monkeypatch):
     monkeypatch.setattr("torchcover.evaluation.target_error.MIN_STEPS", 8)
-    target = {"target_error": "0.2m", "thresholds": ()}
+    target = {"target_error": "0.2m", "thresholds_m": ()}
     whole = measured(Drive(frame_of), **target)
     assert 8 < whole.run.steps < STEPS
     for at in range(6, whole.run.steps - 1):
@@ -176,7 +177,7 @@ def test_what_one_observer_has_seen_and_another_has_not_is_not_kept(frame_of, pa
     ("changes", "named"),
     [
         ({"cell_m": 4.0}, r"cell_m \(8.0 there, 4.0 here\)"),
-        ({"thresholds": (0.4, 1.0)}, r"thresholds \(\[0.4\] there, \[0.4, 1.0\] here\)"),
+        ({"thresholds_m": (0.4, 1.0)}, r"thresholds_m \(\[0.4\] there, \[0.4, 1.0\] here\)"),
         ({"aggregations": ()}, r"aggregations \(other content\)"),
         ({"estimate": "known"}, r"estimate \(null there, \"known\" here\)"),
         ({"target_error": "1%"}, r"target_error \(other content\)"),

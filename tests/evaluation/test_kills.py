@@ -11,19 +11,20 @@ import torch
 import torchcover
 from tests.killing import operations_of
 from torchcover import Coverage
-from torchcover.data import Frame
+from torchcover.data import Frame, FrameDataset
 
 
-class Drive:
+class Drive(FrameDataset):
     """Two points that a sensor sees one of."""
 
     rigs = ("low",)
     sensors = {}  # noqa: RUF012
     ego_outline_m = None
     description = {"scenario": None, "frames": "made up", "seed": None}  # noqa: RUF012
-    weight_kind = None
+    square_metres = False
     reference_record = None
     content = {"frames": "made up"}  # noqa: RUF012
+    world_of = staticmethod(int)
 
     def __len__(self):
         return 3

@@ -12,22 +12,23 @@ import torch
 from torch.distributed import FileStore
 
 import torchcover
-from torchcover.data import BadFrameError, SimulatedFrames
+from torchcover.data import BadFrameError, FrameDataset, SimulatedFrames
 from torchcover.evaluation import Ranks, joined_ranks
 from torchcover.evaluation.transport import packed, unpacked
 
 LONGEST_S = 60.0
 
 
-class Drive:
+class Drive(FrameDataset):
     """A source of frames, some of which may be bad."""
 
     rigs = ("a", "b")
     sensors = {}  # noqa: RUF012
     ego_outline_m = None
     description = {"scenario": None, "frames": "drive", "seed": None}  # noqa: RUF012
-    weight_kind = None
+    square_metres = False
     reference_record = None
+    world_of = staticmethod(int)
 
     def __init__(self, frame_of, length=7, bad=(), content="drive", delay_s=0.0):
         self.frame_of, self.length, self.bad, self.content = frame_of, length, bad, {"frames": content}
@@ -88,7 +89,7 @@ def in_ranks(folder, work, size=2):
 
 
 def measured(source, ranks=None, **settings):
-    result = torchcover.compare(
+    result = torchcover.evaluate(
         ["a", "b"], frames=source, cell_m=8.0, observers={"names": Names()}, ranks=ranks, **settings
     )
     counts, sums = {}, {}

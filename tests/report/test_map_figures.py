@@ -11,18 +11,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from torchcover.coverage import (
-    AGGREGATIONS,
-    Aggregation,
-    BevGrid,
-    Coverage,
-    CoverageMetric,
-    Layer,
-    Quantity,
-    Region,
-)
+from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, Coverage, CoverageMetric, Layer, Region
 from torchcover.coverage.aggregations import State
 from torchcover.coverage.quantity import RADIUS, detection
+from torchcover.estimation import Quantity
 from torchcover.report import SensorView, band_figures, difference_scale, map_figures, write_figures
 
 SQUARE = BevGrid(x=(-20.0, 20.0), y=(-10.0, 10.0), cell=1.0)
@@ -41,7 +33,7 @@ def blocked(steps: int) -> Coverage:
     metric = CoverageMetric(SQUARE, blocks=16)
     for index in range(steps):
         points = [[0.5, 0.5, 0.0]] if index % 8 else [[0.5, 0.5, 0.0], [9.5, 0.5, 0.0]]
-        metric.update(torch.tensor([[0.5, 0.5, -0.3 - 0.02 * (index % 16)]]), torch.tensor(points), index=index)
+        metric.update(torch.tensor([[0.5, 0.5, -0.3 - 0.02 * (index % 16)]]), torch.tensor(points), place_in_time=index)
     return metric.compute()
 
 

@@ -60,8 +60,8 @@ def test_records_are_those_of_the_summary(table, surface_pair, regions):
     rows = [row for coverage in surface_pair.values() for row in coverage.summary(regions)]
     for record, row in zip(records(table), rows, strict=True):
         for key in KEYS if row.known_cells else ():
-            assert tuple(record[f"{key}{end}"] for end in ("", "_error", "_low", "_high")) == row.numbers[key]
-            assert (record[f"known_{key}"], record[f"known_{key}_error"]) == row.known[key][:2]
+            assert tuple(record[f"{key}{end}"] for end in ("", "_error", "_low", "_high")) == row.numbers[key][1:5]
+            assert (record[f"known_{key}"], record[f"known_{key}_error"]) == row.known[key][1:3]
             assert record[key] != record[f"known_{key}"]
 
 

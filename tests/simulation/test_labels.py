@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation.labels import labels
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Box
-from torchcover.simulation.trajectory import Trajectory
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import Actor, World, labels
 
 CAR = Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh()
 UTM_M = np.array([5.6e5, 5.9e6, 80.0])

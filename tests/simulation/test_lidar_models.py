@@ -161,7 +161,7 @@ def test_a_wrong_sensor_is_named(tmp_path, keys, message):
 
 def test_a_wrong_model_file_is_named(tmp_path):
     (tmp_path / "own.yaml").write_text("{name: own, elevations_deg: [95], horizontal_fov_deg: 90, columns: 4}")
-    with pytest.raises(ValueError, match=r"sensors\.0: .*own\.yaml: elevations_deg\.0: .*90.*; max_range_m: Field req"):
+    with pytest.raises(ValueError, match=r"sensors\.0: .*own\.yaml: max_range_m: Field req.*; elevations_deg\.0: .*90"):
         read(tmp_path, "model: own.yaml")
 
 

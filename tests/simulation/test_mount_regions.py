@@ -10,10 +10,9 @@ import trimesh
 from torchcover.simulation import builtin_names
 from torchcover.simulation.bodies import Vehicle, VehicleShape, mount_regions_of
 from torchcover.simulation.documents import load_document
-from torchcover.simulation.mount_regions import MountRegion
+from torchcover.simulation.mount_regions import SEEN_FROM, MountRegion, Skin
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Box, Mesh
-from torchcover.simulation.skin import SEEN_FROM, Skin
 
 ROBOT = Path(__file__).parents[2] / "examples" / "robot" / "robot.yaml"
 SMALL = ("adult", "child", "child_110cm", "cyclist", "dog_57cm", "motorcycle", "pole_100cm")

@@ -5,22 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from torchcover.simulation import Lidar, Pose
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.simulation import Draws, Lidar, Pose
 from torchcover.simulation.bodies import in_vehicle_frame
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Plane
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World
 
 UTM = np.array([513_248.37, 5_403_655.81, 312.5])
 LIDAR = Lidar(
     name="roof", mount=Pose(x_m=-0.3, z_m=1.5, yaw_deg=10), channels=30, vertical_fov_deg=(-80, 20),
-    horizontal_fov_deg=360, columns=120, min_range_m=0.2, max_range_m=40,
+    horizontal_fov_deg=360, columns=120, max_range_m=40,
 )  # fmt: skip
 TILES = into_tiles(LIDAR.directions())
+EXACT = Draws(None)
 
 
 def box(*size_m):
@@ -45,7 +46,7 @@ def world(ego_moves=True, actor_moves=True, origin_m=(0.0, 0.0, 0.0)):
 
 
 def afresh(instant):
-    return instant.scan(LIDAR.mount.matrix(), TILES, min_range_m=0.2, max_range_m=40)
+    return instant.scan(LIDAR.mount.matrix(), TILES, max_range_m=40)
 
 
 @pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), UTM])
@@ -53,10 +54,10 @@ def afresh(instant):
 @pytest.mark.parametrize("ego_moves", [False, True])
 def test_every_step_is_that_of_a_scan_afresh(ego_moves, actor_moves, origin_m):
     scene = Scene(world(ego_moves, actor_moves, origin_m))
-    mounted, self_hits = MountedSensor(LIDAR, TILES, scene), []
+    mounted, self_hits = MountedSensor(LIDAR, scene), []
     for step in (0, 3, 4, 5, 9):
         instant = scene.at(step, within_m=40.0)
-        seen, expected = mounted.scan(instant), afresh(instant)
+        seen, expected = mounted.scan(instant, EXACT), afresh(instant)
         np.testing.assert_array_equal(seen.points.view(np.int32), expected.points.view(np.int32))
         np.testing.assert_array_equal(seen.ray, expected.ray)
         assert (seen.rays, seen.self_hits) == (expected.rays, expected.self_hits)
@@ -66,22 +67,38 @@ def test_every_step_is_that_of_a_scan_afresh(ego_moves, actor_moves, origin_m):
     assert (min(self_hits) < self_hits[0] - 20) == ego_moves
 
 
+@pytest.mark.parametrize("moves", [False, True])
+def test_hits_that_are_too_close_give_no_points_and_hide_what_lies_behind(moves):
+    scene = Scene(world(moves, moves))
+    instant, exact = scene.at(3), MountedSensor(LIDAR, scene).scan(scene.at(3), EXACT)
+    mounted = MountedSensor(LIDAR.model_copy(update={"min_range_m": 4.0}), scene)
+    seen, again = mounted.scan(instant, EXACT), mounted.scan(instant, EXACT)
+    far = exact.range_m >= 4.0
+    assert 0 < far.sum() < len(far) - 20
+    for one in (seen, again):
+        np.testing.assert_array_equal(one.points, exact.points[far])
+        np.testing.assert_array_equal(one.ray, exact.ray[far])
+        np.testing.assert_array_equal(one.range_m, exact.range_m[far])
+    ways_m = np.linalg.norm(seen.points - LIDAR.mount.matrix()[:3, 3], axis=1)
+    np.testing.assert_allclose(seen.range_m, ways_m, rtol=1e-5)
+
+
 def test_a_scan_is_made_again_only_where_something_moves(monkeypatch):
     scans, original = [], Instant.scan
     monkeypatch.setattr(Instant, "scan", lambda *args, **options: scans.append(1) or original(*args, **options))
     for moves, expected in [((False, False), 1), ((False, True), 3), ((True, False), 3)]:
         scans.clear()
         scene = Scene(world(*moves))
-        mounted = MountedSensor(LIDAR, TILES, scene)
+        mounted = MountedSensor(LIDAR, scene)
         for step in (0, 1, 2):
-            mounted.scan(scene.at(step))
+            mounted.scan(scene.at(step), EXACT)
         assert len(scans) == expected
 
 
 def test_rays_that_the_ego_ends_are_not_cast_at_it():
     scene = Scene(world())
     instant = scene.at(0)
-    assert MountedSensor(LIDAR, TILES, scene).scan(instant).body_casts < afresh(instant).body_casts - 500
+    assert MountedSensor(LIDAR, scene).scan(instant, EXACT).body_casts < afresh(instant).body_casts - 500
 
 
 def test_the_ego_is_at_its_own_place_to_the_last_bit():

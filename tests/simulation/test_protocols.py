@@ -14,9 +14,11 @@ from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import (
     REFERENCE_SENSORS,
     SENSORS,
-    Document,
+    Draws,
     PaperReference,
     Pose,
+    RayHits,
+    ReferenceScan,
     Scenario,
     Simulator,
     builtin_names,
@@ -24,7 +26,7 @@ from torchcover.simulation import (
     position_in_shell,
     vertical_fov_deg,
 )
-from torchcover.simulation.ray_pattern import cast_pattern
+from torchcover.simulation.sensor import Ranging
 
 EGO = BoundingBox((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6))
 AREAS = (((0.0, 20.0), (-5.0, 5.0)), ((-40.0, 160.0), (-40.0, 40.0)))
@@ -32,17 +34,13 @@ MOUNT = {"x_m": 2.6, "z_m": 1.0, "yaw_deg": 30.0}
 RANGES = {"min_range_m": 1.0, "max_range_m": 60.0, "range_noise_m": 0.02, "dropout": 0.1}
 
 
-class Altimeter(Document):
+class Altimeter(Ranging):
     """Looks down ahead: the smallest sensor there is."""
 
     type: Literal["altimeter"] = "altimeter"
     name: str
     mount: Pose = Pose()
-    max_range_m: float = 20.0
     horizontal_fov_deg: float = 20.0
-    min_range_m: float = 0.0
-    range_noise_m: float = 0.0
-    dropout: float = 0.0
     rays: int = 5
 
     def directions(self):
@@ -56,7 +54,7 @@ class DownReference:
     """Looks straight down from its place: the smallest reference sensor there is."""
 
     name: ClassVar[str] = "down"
-    weight_kind: ClassVar[str] = "density"
+    square_metres: ClassVar[bool] = True
 
     rays: int
     shell_m: float = 0.5
@@ -69,23 +67,28 @@ class DownReference:
         return cls(8 if rays is None else rays)
 
     def scan(self, surroundings):
-        return cast_pattern(self, surroundings)
+        pose, redrawn = surroundings.free_pose(self.vehicle_T_reference)
+        x, y = surroundings.generator.uniform(-0.1, 0.1, size=(2, 1, self.rays))
+        tiles = into_tiles(np.stack([x, y, -np.sqrt(1 - x**2 - y**2)]))
+        seen = surroundings.instant.scan(pose, tiles, max_range_m=self.max_range_m)
+        weights = np.full(len(seen.points), 2.0, dtype=np.float32)
+        return ReferenceScan(seen.points, weights, seen.rays, seen.self_hits, seen.body_casts, redrawn)
 
     def vehicle_T_reference(self, ego, generator):
         return rigid(np.eye(3), position_in_shell(ego, self.shell_m, generator))
-
-    def tiles(self, vehicle_T_reference, generator):
-        x, y = generator.uniform(-0.1, 0.1, size=(2, 1, self.rays))
-        return into_tiles(np.stack([x, y, -np.sqrt(1 - x**2 - y**2)]))
-
-    def weights(self, vehicle_T_reference, tiles, ray):
-        return np.full(len(ray), 2.0, dtype=np.float32)
 
 
 # Keys of one sensor of each kind, beside name, type, mount and ranges.
 KEYS = {
     "lidar": {"channels": 4, "vertical_fov_deg": [-20, 10], "horizontal_fov_deg": 90, "columns": 16},
     "camera": {"width": 24, "height": 16, "fov_deg": 80},
+    "radar": {
+        "horizontal_fov_deg": 90,
+        "vertical_fov_deg": [-20, 10],
+        "azimuth_cell_deg": 7,
+        "range_cell_m": 0.5,
+        "ray_spacing_m": 2,
+    },
     "altimeter": {},
 }
 
@@ -107,23 +110,6 @@ def reference_sensor(request, monkeypatch):
     made = REFERENCE_SENSORS[request.param].from_rays(AREAS, 900)
     assert made.name == request.param
     return made
-
-
-@pytest.fixture(params=["even", "paper", "down"])
-def pattern(request):
-    """A reference sensor that is a pattern of rays."""
-    return {**REFERENCE_SENSORS, "down": DownReference}[request.param].from_rays(AREAS, 900)
-
-
-def step_of(sensor, seed=0):
-    """Pose and tiles of one step, and the generator's next number."""
-    generator = np.random.default_rng(seed)
-    pose = sensor.vehicle_T_reference(EGO, generator)
-    return pose, sensor.tiles(pose, generator), generator.random()
-
-
-def directions_of(tiles):
-    return np.concatenate([tile.directions for tile in tiles], axis=1)
 
 
 def test_a_sensor_says_who_and_where_it_is_and_how_far_it_sees(sensor):
@@ -154,6 +140,60 @@ def test_a_sensors_fields_of_view_hold_its_rays(sensor):
     assert 0 < np.nanmax(azimuth_deg) - np.nanmin(azimuth_deg) <= sensor.horizontal_fov_deg + 1e-9 <= 360 + 1e-9
 
 
+def hits_of(sensor, range_m, ray=None):
+    """Hits of all rays, or of some, at these distances."""
+    pixel_of_ray = np.flatnonzero(~np.isnan(sensor.directions()[0]))
+    ray = np.arange(len(pixel_of_ray)) if ray is None else ray
+    return RayHits(ray, np.broadcast_to(range_m, len(ray)).astype(np.float32), pixel_of_ray)
+
+
+def hit_by(returns, count):
+    """Which of so many hits give a point."""
+    return np.arange(count) if returns.hit is None else returns.hit
+
+
+def test_a_sensor_makes_points_of_hits_that_are_far_enough_and_of_no_others(sensor):
+    exact = sensor.model_copy(update={"range_noise_m": 0.0, "dropout": 0.0})
+    assert exact.is_exact
+    assert not sensor.is_exact
+    near, far = hits_of(exact, 0.99), hits_of(exact, 1.0)
+    assert len(hit_by(exact.measure(near, Draws(None)), len(near.ray))) == 0
+    hit = hit_by(exact.measure(far, Draws(None)), len(far.ray))
+    assert len(hit) > 0
+    assert (np.diff(hit) > 0).all()
+    none = hits_of(exact, 5.0, np.empty(0, dtype=np.int64))
+    assert len(hit_by(exact.measure(none, Draws(None)), 0)) == 0
+
+
+def test_what_a_sensor_makes_of_a_beam_does_not_depend_on_other_beams(sensor):
+    """Hits that are taken away change nothing about those of beams that keep theirs, in any number of places."""
+    beams, random = sensor.beams(), np.random.default_rng(5)
+    whole = hits_of(sensor, random.uniform(0.5, 9.0, len(hits_of(sensor, 1.0).ray)))
+    of_ray = whole.ray if beams is None else beams.ravel()[whole.pixel]
+    measured = sensor.measure(whole, Draws(np.random.default_rng(0), rays=len(whole.ray)))
+    kept = np.flatnonzero(of_ray % 3 != 1)
+    part = RayHits(whole.ray[kept], whole.range_m[kept], whole.pixel_of_ray, np.zeros(len(kept), dtype=np.int64))
+    of_part = sensor.measure(part, Draws(np.random.default_rng(0), rays=len(whole.ray)))
+    left = np.isin(measured.hit, kept)
+    np.testing.assert_array_equal(kept[of_part.hit], measured.hit[left])
+    np.testing.assert_array_equal(of_part.error_m, measured.error_m[left])
+    twice = RayHits(
+        np.tile(whole.ray, 2), np.tile(whole.range_m, 2), whole.pixel_of_ray, np.repeat([0, 1], len(whole.ray))
+    )
+    both = sensor.measure(twice, Draws(np.random.default_rng(0), rays=len(whole.ray)))
+    np.testing.assert_array_equal(both.hit, np.concatenate([measured.hit, measured.hit + len(whole.ray)]))
+
+
+def test_a_sensor_asks_for_the_same_numbers_whatever_is_hit(sensor):
+    """Else what one thread meets would decide what another draws."""
+    rays = len(hits_of(sensor, 1.0).ray)
+    used, fresh = (Draws(np.random.default_rng(2), rays=rays) for _ in range(2))
+    sensor.measure(hits_of(sensor, 1.0, np.empty(0, dtype=np.int64)), used)
+    one, other = (sensor.measure(hits_of(sensor, 5.0), draws) for draws in (used, fresh))
+    np.testing.assert_array_equal(one.hit, other.hit)
+    np.testing.assert_array_equal(one.error_m, other.error_m)
+
+
 def test_a_sensor_survives_pickling_and_its_own_document(sensor):
     assert pickle.loads(pickle.dumps(sensor)) == sensor
     rig = Rig(name="r", sensors=(sensor,))
@@ -178,9 +218,9 @@ def test_a_sensor_is_simulated(sensor):
     assert ranges_m.max() <= exact.max_range_m
 
 
-@pytest.mark.parametrize("content", ["lidar", 3, {"type": ["lidar"]}, {"type": "radar"}, None])
+@pytest.mark.parametrize("content", ["lidar", 3, {"type": ["lidar"]}, {"type": "sonar"}, None])
 def test_what_is_no_sensor_is_refused_with_the_kinds_there_are(content):
-    with pytest.raises(ValueError, match=r"sensors\.0\n.*type: a sensor is a 'lidar' or a 'camera'; got"):
+    with pytest.raises(ValueError, match=r"sensors\.0\n.*type: a sensor is a 'lidar' or a 'camera' or a 'radar'; got"):
         Rig.model_validate({"name": "r", "sensors": [content]})
 
 
@@ -189,23 +229,16 @@ def test_every_sensor_of_the_built_in_rigs_is_of_a_registered_kind(name):
     assert {type(sensor) for sensor in Rig.load(name).sensors} <= set(SENSORS.values())
 
 
-def test_a_patterns_place_is_in_the_shell_around_the_ego(pattern):
-    grown_m = pattern.shell_m + 1e-12
+@pytest.mark.parametrize("sensor", [PaperReference(8, 8), DownReference(8)], ids=["paper", "down"])
+def test_a_reference_sensors_place_is_in_the_shell_around_the_ego(sensor):
+    grown_m = sensor.shell_m + 1e-12
     for seed in range(50):
-        pose, _, _ = step_of(pattern, seed)
+        pose = sensor.vehicle_T_reference(EGO, np.random.default_rng(seed))
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
         np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
         assert (pose[:3, 3] >= np.array(EGO.lower_m) - [grown_m, grown_m, 0]).all()
         assert (pose[:3, 3] <= np.array(EGO.upper_m) + grown_m).all()
         assert ((pose[:3, 3] < EGO.lower_m) | (pose[:3, 3] > EGO.upper_m)).any()
-
-
-def test_a_patterns_rays_are_of_length_one_and_about_as_many_as_asked_for(pattern):
-    _, tiles, _ = step_of(pattern)
-    directions = directions_of(tiles)
-    assert directions.dtype == np.float32
-    assert directions.shape[1] == pytest.approx(900, rel=0.1)
-    np.testing.assert_allclose(np.linalg.norm(directions, axis=0), 1.0, atol=1e-6)
 
 
 def test_a_reference_sensor_without_a_number_of_rays_has_one_of_its_own(reference_sensor):
@@ -218,17 +251,6 @@ def test_a_reference_sensor_without_a_number_of_rays_has_one_of_its_own(referenc
 def test_a_reference_sensor_without_rays_is_refused(reference_sensor, rays):
     with pytest.raises(ValueError, match=f"rays: at least .*; got {rays}"):
         type(reference_sensor).from_rays(AREAS, rays)
-
-
-def test_a_pattern_depends_on_the_generator_and_on_nothing_else(pattern):
-    np.random.seed(1)  # noqa: NPY002  (the random numbers that it must not draw)
-    state = np.random.get_state()[1].copy()  # noqa: NPY002
-    (pose, tiles, after), (pose_again, tiles_again, after_again) = step_of(pattern), step_of(pattern)
-    np.testing.assert_array_equal(pose, pose_again)
-    np.testing.assert_array_equal(directions_of(tiles), directions_of(tiles_again))
-    assert after == after_again
-    assert not np.array_equal(step_of(pattern, seed=1)[0], pose)
-    np.testing.assert_array_equal(np.random.get_state()[1], state)  # noqa: NPY002
 
 
 def test_a_reference_sensor_survives_pickling(reference_sensor):
@@ -250,34 +272,18 @@ def test_a_reference_sensor_draws_from_the_generator_of_the_step_and_from_nothin
     np.testing.assert_array_equal(np.random.get_state()[1], state)  # noqa: NPY002
 
 
-def test_a_reference_sensors_points_are_near_enough_and_their_weights_say_what_they_are(reference_sensor):
+def test_a_reference_sensors_points_are_near_enough_and_have_the_weights_that_it_promises(reference_sensor):
     seen = Simulator(Scenario.load("courtyard"), {}, reference_sensor).step(0)
     assert seen.reference.dtype == np.float32
     assert seen.reference.shape == (len(seen.reference), 3)
     farthest_m = np.linalg.norm(EGO.corners_m, axis=1).max() + 2 * reference_sensor.shell_m
     assert np.linalg.norm(seen.reference, axis=1).max() <= reference_sensor.max_range_m + farthest_m
-    assert seen.weight_kind == reference_sensor.weight_kind
-    assert seen.weight_kind in ("density", "m2", None)
-    assert (seen.weight_kind is None) == (seen.reference_weights is None)
+    assert reference_sensor.square_metres == (seen.reference_weights is not None)
     if seen.reference_weights is not None:
         assert seen.reference_weights.dtype == np.float32
         assert len(seen.reference_weights) == len(seen.reference)
         assert (seen.reference_weights > 0).all()
         assert np.isfinite(seen.reference_weights).all()
-
-
-@pytest.mark.parametrize("every", [1, 7])
-def test_a_patterns_weights_are_positive_and_finite_one_for_each_point(pattern, every):
-    pose, tiles, _ = step_of(pattern)
-    ray = np.arange(0, directions_of(tiles).shape[1], every)
-    weights = pattern.weights(pose, tiles, ray)
-    if weights is not None:
-        assert weights.dtype == np.float32
-        assert weights.shape == ray.shape
-        assert np.isfinite(weights).all()
-        assert (weights > 0).all()
-        np.testing.assert_array_equal(pattern.weights(pose, tiles, ray[::3]), weights[::3])
-    assert len(pattern.weights(pose, tiles, ray[:0]) if weights is not None else ()) == 0
 
 
 def test_a_reference_sensor_is_simulated(reference_sensor):

@@ -7,10 +7,10 @@ import pytest
 
 from torchcover.data import SimulatedFrames
 from torchcover.geometry import BoundingBox
-from torchcover.simulation import EvenReference, PaperReference, Rig, Scenario, Simulator, builtin_names
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, SurfaceReference, builtin_names
 
 SMALL = PaperReference(rows=24, columns=32)
-EVEN = EvenReference((((0.0, 20.0), (-5.0, 5.0)),), rays=256)
+SURFACE = SurfaceReference((((0.0, 20.0), (-5.0, 5.0)),), rays=256)
 SHORT = {"name": "urban", "traffic": {"type": "urban", "duration_s": 2.0, "time_step_s": 0.5}}
 
 
@@ -27,7 +27,7 @@ def same(a, b):
     )
 
 
-@pytest.mark.parametrize("reference_sensor", [SMALL, EVEN])
+@pytest.mark.parametrize("reference_sensor", [SMALL, SURFACE])
 def test_a_frame_is_a_step_in_tensors(reference_sensor):
     seen = simulator(reference_sensor, seed=5).step(2)
     rigs = {name: name for name in seen.clouds}
@@ -55,9 +55,9 @@ def test_a_step_depends_on_seed_and_index_only_and_survives_pickling():
 
 def test_another_reference_sensor_sees_the_same_bodies_and_leaves_the_first_as_it_is():
     base = simulator(every_s=0.5)
-    other = base.with_reference_sensor(EVEN)
+    other = base.with_reference_sensor(SURFACE)
     assert other.scene_of(3)[0] is base.scene_of(3)[0]
-    assert (base.reference_sensor, other.reference_sensor) == (SMALL, EVEN)
+    assert (base.reference_sensor, other.reference_sensor) == (SMALL, SURFACE)
     assert (base.every_s, other.every_s) == (0.5, 0.5)
     assert len(other.step(1).reference_weights) == len(other.step(1).reference)
 

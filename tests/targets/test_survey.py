@@ -21,6 +21,11 @@ CAMERA = {
     "max_range_m": 3.5, "min_range_m": 1.0,
 }  # fmt: skip
 
+RADAR = {
+    "type": "radar", "name": "radar", "mount": {"x_m": 2.1, "z_m": 0.6}, "horizontal_fov_deg": 120,
+    "vertical_fov_deg": [-25, 25], "azimuth_cell_deg": 6, "range_cell_m": 0.3, "max_range_m": 20, "min_range_m": 0.3,
+}  # fmt: skip
+
 
 def with_target(scenario, name, x_m, y_m, yaw_rad):
     """The scenario with a target that stands there, in a world whose ego is at its origin."""
@@ -50,6 +55,36 @@ def test_points_are_those_of_a_simulation_with_the_target_in_the_world(name, hea
         assert seen.sensors[row, column] == sum(count >= 5 for count in counts)
         compared += sum(count > 0 for count in counts)
     assert compared > 8
+
+
+@pytest.mark.parametrize("name", ["adult", "dog"])
+def test_a_radars_points_are_those_of_its_cells_with_the_target_in_the_world(name):
+    """Rays of a cell that pass the target hit the floor and a wall behind it, and one point is left of all of them."""
+    target, sensors = Target.load(name), rig(RADAR)
+    behind = {"name": "w", "shape": {"type": "box", "size_m": [0.2, 8, 3]}, "poses": [{"x_m": 5.4}]}
+    scenario = world(behind)
+    seen = survey(sensors, scenario, target, Raster((2.5, 5.5), (-2.0, 2.0), 0.5), heading=0.0)
+    rays = survey(rig({**RADAR, "azimuth_cell_deg": 1.0, "range_cell_m": 0.01}), scenario, target, seen.raster)
+    counts = []
+    for row, column in zip(*np.nonzero(seen.state == FREE), strict=True):
+        place = seen.x_m[column], seen.y_m[row], 0.0
+        [scan] = Simulator(with_target(scenario, target.name, *place), {"r": sensors}, REFERENCE).scans(0)["r"]
+        counts.append(on_target(scan.points, target, *place))
+        assert seen.points[row, column] == counts[-1]
+    assert len(counts) > 20
+    assert 0 < max(counts) < np.nanmax(rays.points) / 3
+
+
+def test_a_radars_cell_gives_its_point_to_what_fills_it():
+    """A post before a wide wall in the same cell is lost in it; with the wall out of the cell, it is seen."""
+    cell = {"horizontal_fov_deg": 20, "azimuth_cell_deg": 20, "vertical_fov_deg": [0, 10]}
+    cell |= {"range_cell_m": 2.0, "ray_spacing_m": 0.05}
+    wall = {"name": "w", "shape": {"type": "box", "size_m": [0.2, 8, 6]}, "poses": [{"x_m": 5.9}]}
+    behind = {**wall, "poses": [{"x_m": 6.9}]}
+    raster = Raster((5.0, 6.0), (-0.5, 0.5), 1.0)
+    merged, apart = (survey(rig({**RADAR, **cell}), world(one), Target.load("pole"), raster) for one in (wall, behind))
+    assert (merged.state[0, 0], apart.state[0, 0]) == (FREE, FREE)
+    assert (merged.points[0, 0], apart.points[0, 0]) == (0, 1)
 
 
 def test_points_are_the_mean_over_the_steps_of_a_world_that_moves(tmp_path):
@@ -100,6 +135,9 @@ def test_rays_that_drop_out_are_missing_and_noise_moves_points_only():
     thinned = survey(rig(lidar(dropout=0.25)), world(), target, raster, steps=32).points.sum()
     # A standard error is 1 %.
     assert thinned == pytest.approx(0.75 * exact, rel=0.04)
+    cells = survey(rig(RADAR), world(), target, raster).points.sum()
+    thinned = survey(rig({**RADAR, "dropout": 0.25, "range_noise_m": 0.01}), world(), target, raster, steps=64).points
+    assert thinned.sum() == pytest.approx(0.75 * cells, rel=0.06)
     assert survey(rig(lidar(dropout=1.0)), world(), target, raster).share.max() == 0.0
 
 

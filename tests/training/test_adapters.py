@@ -122,13 +122,15 @@ def test_by_area_too_a_process_that_was_dealt_nothing_evaluates():
     assert metric.coverage.measure == "area"
 
 
-@pytest.mark.parametrize("kind", [None, "density"])
-def test_mmengine_takes_no_other_weights_for_square_metres(kind):
-    frame = Frame({"rig": cloud(9, 0, 3)}, cloud(9, 1, 3), 0, "0", reference_weights=torch.ones(9), weight_kind=kind)
-    metric = MMEngineCoverage({"grid": GRID, "square_metres": True}, frames_of=lambda batch, _: batch)
-    with pytest.raises(ValueError, match=r"frame '0': the metric needs the square metres"):
-        metric.process([frame], [{}])
-    metric.process([replace(frame, weight_kind="m2")], [{}])
+def test_mmengine_needs_the_square_metres_that_the_metric_wants():
+    frame = Frame({"rig": cloud(9, 0, 3)}, cloud(9, 1, 3), 0, "0")
+    without, metric = (
+        MMEngineCoverage({"grid": GRID, "square_metres": True}, frames_of=lambda batch, _: batch) for _ in range(2)
+    )
+    without.process([frame], [{}])
+    with pytest.raises(ValueError, match="the square metres of each reference point are needed"):
+        without.evaluate(1)
+    metric.process([replace(frame, reference_weights=torch.ones(9))], [{}])
     metric.evaluate(1)
     assert metric.coverage.counts["steps"] == 1
 

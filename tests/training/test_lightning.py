@@ -85,7 +85,7 @@ def make_metric(**options):
 def expected(frames):
     metric = make_metric()
     for frame in frames:
-        metric.update(frame.sensor, frame.reference, index=frame.index)
+        metric.update(frame.sensor, frame.reference, place_in_time=frame.index)
     return metric.compute()
 
 
@@ -266,26 +266,18 @@ def test_the_weights_of_reference_points_count(tmp_path):
     make_trainer(tmp_path, callback).fit(Validated(), loader(2), loader(frames))
     metric = make_metric()
     for frame in frames:
-        metric.update(frame.sensor, frame.reference, weights=weights, index=frame.index)
+        metric.update(frame.sensor, frame.reference, weights=weights, place_in_time=frame.index)
     assert_same(callback.coverage, metric.compute())
     assert not torch.equal(callback.coverage.radius, expected(frames).radius)
 
 
-def weighted(kind):
-    """Frames whose weights are of a kind, which knows what they are."""
-    weights = torch.ones(40)
-    return [replace(frame, reference_weights=weights, weight_kind=kind) for frame in RandomFrames(2)]
-
-
-@pytest.mark.parametrize("kind", [None, "density"])
-def test_weights_are_square_metres_only_where_they_say_so(tmp_path, kind):
+def test_every_frame_has_the_square_metres_that_the_metric_wants(tmp_path):
     callback = CoverageCallback(make_metric(square_metres=True))
-    with pytest.raises(ValueError, match=r"needs the square metres .* and the frame has weight_kind"):
-        make_trainer(tmp_path, callback).fit(Validated(), loader(2), loader(weighted(kind)))
-    for frames in (weighted("m2"), weighted(kind)):
-        without = replace(frames[1], reference_weights=None)
-        with pytest.raises(ValueError, match=r"needs the square metres"):
-            make_trainer(tmp_path, callback).fit(Validated(), loader(2), loader([frames[0], without]))
+    without, other = RandomFrames(2)
+    weighted = replace(other, reference_weights=torch.ones(40))
+    for frames in ([without], [without, weighted], [weighted, without]):
+        with pytest.raises(ValueError, match=r"the square metres of (each|its) reference point"):
+            make_trainer(tmp_path, callback).fit(Validated(), loader(2), loader(frames))
 
 
 def test_every_n_steps_logs_the_epoch_so_far(tmp_path, blank_maps):

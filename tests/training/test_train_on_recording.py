@@ -9,8 +9,8 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from tests.data.drives import Drive
-from tests.data.layouts import kitti_raw
+from tests.recordings.drives import Drive
+from tests.recordings.layouts import kitti_raw
 from torchcover.data import AccumulatedReference, RecordedFrames
 from torchcover.geometry import rigid
 

@@ -18,8 +18,9 @@ from torchcover.evaluation import (
     study_table,
     verdict,
 )
-from torchcover.published.tables import text_tables
-from torchcover.report import UNITS, error_words, narrowest_width, print_table, text_table
+from torchcover.evaluation.agreeing import NOTES
+from torchcover.published.comparison import text_tables
+from torchcover.report import error_words, narrowest_width, print_table, shown_unit, text_table
 
 
 def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:
@@ -56,7 +57,8 @@ def print_study(study: Study, out: Path) -> None:
     for table in tables:
         wide.print(table)
     floor = [
-        f"{error_words(study.truth.errors[one.key], one.unit)} {UNITS[one.unit].difference_name}" for one in quantities
+        f"{error_words(study.truth.errors[one.key], one.unit)} {shown_unit(one.unit).difference_name}"
+        for one in quantities
     ]
     console.print(
         f"Times are those of `torchcover evaluate` from start to end: {study.start_s:.1f} s of each for Python, "
@@ -72,7 +74,7 @@ DETECTORS_ONLY = "* an interval over detectors only: of worlds there are none, o
 
 
 def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> None:
-    """How metrics rank the placements beside each thing that detectors say of them, and the notes."""
+    """How metrics rank the placements, for each thing that detectors say of them, and the notes."""
     console = Console()
     truths = list(dict.fromkeys(truth for truth, _ in study.found))
     readings = list(dict.fromkeys(reading for _, reading in study.found))
@@ -90,7 +92,7 @@ def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> 
         wide.print(table)
     for truth in truths:
         console.print(verdict(truth, {one: study.found[truth, one] for one in readings}), markup=False, soft_wrap=True)
-    for note in study.notes:
+    for note in NOTES:
         console.print(note, markup=False, soft_wrap=True)
     console.print(f"Wrote {', '.join(path.name for path in files)} to {out}", markup=False, soft_wrap=True)
 
@@ -99,7 +101,7 @@ def advice(wanted: float, point: WorkPoint | None, plan: StudyPlan) -> str:
     """The options of `evaluate` that reach an error."""
     if point is None:
         return f"For {100 * wanted:g} percentage points of detection: not reached within {plan.lengths[-1]:,} steps."
-    every = "" if plan.every_s is None else f" --every {plan.every_s:g}"
+    every = "" if plan.settings.every_s is None else f" --every-s {plan.settings.every_s:g}"
     return (
         f"For {100 * wanted:g} percentage points of detection: --rays {point.rays} --steps {point.steps}{every} "
         f"({point.seconds:.0f} s)."

@@ -1,35 +1,31 @@
 """The coverage metric: clouds in, fixed-size sums, coverage out."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
-from torchmetrics.utilities.distributed import gather_all_tensors
 
-from torchcover.coverage.aggregations import Aggregation, BinnedStep, MeanOfMeans, VisibleArea
+from torchcover.coverage.aggregations import Aggregation, BinnedStep, Layer, MeanOfMeans, State, VisibleArea
 from torchcover.coverage.binning import mean_per_cell
-from torchcover.coverage.blocks import AreaSums, Blocks, check_blocks, pair_up
+from torchcover.coverage.blocks import AreaSums, Blocks, BlockSumsT
 from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.layer import Layer
 from torchcover.coverage.plotting import draw_coverage
 from torchcover.coverage.redundancy import PlaceSums, Redundancy, SensorFailures
-from torchcover.coverage.regions import Region, check_regions, regions_within
+from torchcover.coverage.region_sums import IN_REGIONS, RegionSums
+from torchcover.coverage.regions import Places, Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.steps import Clouds, SensorClouds, Step, as_list, check_parameters, checked_steps
-from torchcover.metrics import MergeableMetric, figure_of
+from torchcover.coverage.steps import CheckedStep, Clouds, SensorClouds, as_list, check_parameters, checked_steps
+from torchcover.metrics import SumsInBlocks, figure_of
 from torchcover.neighbors import nearest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# The states that have a row for each block, beside those of aggregations.
-PROBED_IN_BLOCKS = ("probed_steps", "block_steps")
 
-
-class CoverageMetric(MergeableMetric):
+class CoverageMetric(SumsInBlocks):
     """Blind spot radius and detection over a grid, as a mean over steps of means over reference points.
 
         radius[h, y, x]    = E_t[ E_q in cell [ r(q) ] ]
@@ -41,8 +37,7 @@ class CoverageMetric(MergeableMetric):
 
     With `blocks` the sums are kept in as many blocks of contiguous steps, and the result has standard errors. Steps
     that follow each other are alike, so that their number says little about the error; blocks that are longer than
-    the likeness lasts are independent. Blocks start with one step each; whenever a step comes that is past the last
-    one, neighbours are added up in pairs and blocks become twice as long.
+    the likeness lasts are independent.
 
     The state is part of `state_dict()`; `metric.persistent(False)` takes it out.
 
@@ -54,14 +49,16 @@ class CoverageMetric(MergeableMetric):
             infinity, such a step makes the radius of its cells infinite.
         blocks: 1 for no errors, or an even number from 8 on: at least half as many blocks are in use at the end of a
             long run. The state grows with it: 24 bytes a cell and block.
-        aggregations: Maps beside the mean of means, from `torchcover.coverage`: `Maximum()`, `PooledMean()`,
-            `Quantiles(levels)`, `StepQuantiles(levels)`, or a class of one's own; at most one of each.
+        aggregations: Others than the mean of means, from `torchcover.coverage`: `Maximum()`, `PooledMean()`,
+            `Quantiles(levels)`, `StepQuantiles(levels)`, or a class of one's own; at most one of each. Each gives maps,
+            and numbers of `regions`.
         regions: What the result gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
-            the grid if not given. The sums do not depend on it.
+            the grid if not given. Sums depend on it only with `aggregations` or `sensors`.
         sensors: Names of the rig's sensors, for `Coverage.redundancy`: then `update` takes a cloud for each by its
             name, and what the rig is without each of them is known as well.
-        square_metres: Whether the weights of reference points are square metres of surface, as `SurfaceReference` gives
-            them: then there is an estimate by area too. The state grows by 8 (2 + thresholds) bytes a cell and block.
+        square_metres: Whether there is to be an estimate by area too; then every step needs the square metres of its
+            reference points, as `SurfaceReference` gives them. The state grows by 8 (2 + thresholds) bytes a cell and
+            block.
         backend: Nearest-neighbour search, as in `torchcover.nearest`.
         memory_mb: As in `torchcover.nearest`.
         kwargs: For `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
@@ -83,8 +80,6 @@ class CoverageMetric(MergeableMetric):
     mean_sums: Tensor
     area_m2: Tensor
     area_sums: Tensor
-    block_length: Tensor
-    block_steps: Tensor
     empty_sensor_steps: Tensor
     empty_reference_steps: Tensor
     saturated_points: Tensor
@@ -107,7 +102,6 @@ class CoverageMetric(MergeableMetric):
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         check_parameters(thresholds, max_radius, aggregations)
-        check_blocks(blocks)
         regions = regions_within(grid) if regions is None else tuple(regions)
         check_regions(regions, grid)
         meaning = {
@@ -117,20 +111,20 @@ class CoverageMetric(MergeableMetric):
             "blocks": blocks,
             "aggregations": tuple(aggregations),
             "square_metres": square_metres,
-            **({"sensors": tuple(sensors), "regions": regions} if sensors else {}),
+            **({"sensors": tuple(sensors)} if sensors else {}),
+            **({"regions": regions} if sensors or aggregations else {}),
         }
-        super().__init__(meaning, **kwargs)
+        super().__init__(blocks, meaning, **kwargs)
         self.grid = grid
         self.regions = regions
         self.sensors = tuple(sensors)
         self.thresholds: tuple[float, ...] = tuple(float(threshold) for threshold in thresholds)
         self.max_radius = float(max_radius)
-        self.blocks = blocks
         self.square_metres = square_metres
         over_area = [VisibleArea(self.thresholds, blocks)] if square_metres else []
-        self._failures = SensorFailures(
-            self.sensors, self.thresholds, grid, regions, self.max_radius, blocks, square_metres
-        )
+        places = Places(regions, grid)
+        self._in_regions = RegionSums(aggregations, places, blocks)
+        self._failures = SensorFailures(self.sensors, self.thresholds, places, self.max_radius, blocks, square_metres)
         redundancy = [self._failures] if sensors else []
         self._of_grid: tuple[Aggregation, ...] = (MeanOfMeans(self.thresholds, blocks), *over_area, *aggregations)
         self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *redundancy)
@@ -139,25 +133,25 @@ class CoverageMetric(MergeableMetric):
         self._add_states()
 
     def _add_states(self) -> None:
-        self.add_sum("probed_steps", (self.blocks, self.grid.cells), torch.int64)
+        self.add_block_sum("probed_steps", (self.grid.cells,), torch.int64)
         self.add_sum("points", (self.grid.cells,), torch.int64)
-        self.add_sum("block_steps", (self.blocks,), torch.int64)
-        self.add_state("block_length", torch.tensor(1), dist_reduce_fx="max", persistent=True)
         for name in Coverage.COUNTS:
             if name != "steps":
                 self.add_sum(name, (), torch.int64)
-        self._in_blocks = list(PROBED_IN_BLOCKS)
         self._state_names: dict[str, list[str]] = {}
         for aggregation in self.aggregations:
-            states = aggregation.states(self.grid.cells)
-            self._state_names[aggregation.name] = list(states)
-            for name, state in states.items():
-                full_name = f"{aggregation.name}_{name}"
-                self.add_state(full_name, state.initial, dist_reduce_fx=state.reduction, persistent=True)
-                self._in_blocks += [full_name] * state.in_blocks
+            self._add_states_of(aggregation.name, aggregation.states(self.grid.cells))
+        self._add_states_of(IN_REGIONS, self._in_regions.states())
 
-    def _sums_of(self, aggregation: Aggregation) -> dict[str, Tensor]:
-        return {name: getattr(self, f"{aggregation.name}_{name}") for name in self._state_names[aggregation.name]}
+    def _add_states_of(self, owner: str, states: Mapping[str, State]) -> None:
+        self._state_names[owner] = list(states)
+        for name, state in states.items():
+            full_name = f"{owner}_{name}"
+            self.add_state(full_name, state.initial, dist_reduce_fx=state.reduction, persistent=True)
+            self._in_blocks = (*self._in_blocks, *[full_name] * state.in_blocks)
+
+    def _sums_of(self, owner: str) -> dict[str, Tensor]:
+        return {name: getattr(self, f"{owner}_{name}") for name in self._state_names[owner]}
 
     def update(
         self,
@@ -165,7 +159,7 @@ class CoverageMetric(MergeableMetric):
         reference: Clouds,
         *,
         weights: Clouds | None = None,
-        index: int | Sequence[int] | None = None,
+        place_in_time: int | Sequence[int] | None = None,
     ) -> None:
         """Add one step, or one step for each entry of two lists.
 
@@ -174,25 +168,25 @@ class CoverageMetric(MergeableMetric):
                 Of a metric with `sensors`: name of the sensor -> its points, or a list of such dicts.
             reference: (M, 3) points of the reference sensor in the same frame, or a list of the same length. M = 0:
                 the step says nothing.
-            weights: (M,) weight of each reference point in the mean over its cell in its step, or a list of the same
-                length. For reference sensors whose density within a cell is not the one that is asked for: the
-                weights are the second divided by the first (`frame.reference_weights`). Not given: all weigh the same.
-            index: Number of the step in time, 10^15 at most, or a list of them; it decides about the block, so that
-                steps of one number, as of an instant that is seen again, share one. Not given: counted on from the
-                steps so far.
+            weights: (M,) square metres that each reference point stands for (`frame.reference_weights`), or a list of
+                the same length: what it weighs in the mean over its cell in its step, and in the estimate by area. Not
+                given: all weigh the same.
+            place_in_time: Number of the step, 10^15 at most, or a list of them (`frame.place_in_time`); it decides
+                about the block, so that steps of one number, as of an instant that is seen again, share one. Not
+                given: counted on from the steps so far.
 
         Raises:
             ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights
-                that are not positive and finite, none where they are square metres, an index that is negative or too
-                large.
-            TypeError: A cloud is not a floating-point tensor, an index not a whole number.
+                that are not positive and finite, none where there is to be an estimate by area, a place in time that is
+                negative or too large.
+            TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
         """
         if self.square_metres and weights is None:
             raise ValueError(
                 "weights: the square metres of each reference point are needed, as a SurfaceReference gives them; got "
                 "none (without square_metres=True, points may do without)"
             )
-        for step in checked_steps(sensor, reference, weights, index, names=self.sensors, first=int(self.steps)):
+        for step in checked_steps(sensor, reference, weights, place_in_time, names=self.sensors, first=int(self.steps)):
             self._add_step(step)
 
     def forward(
@@ -201,17 +195,17 @@ class CoverageMetric(MergeableMetric):
         reference: Clouds,
         *,
         weights: Clouds | None = None,
-        index: int | Sequence[int] | None = None,
+        place_in_time: int | Sequence[int] | None = None,
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
-        if index is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
-            index = [int(self.steps) + step for step in range(len(as_list(reference, "reference")))]
-        coverage: Coverage = super().forward(sensor, reference, weights=weights, index=index)
+        if place_in_time is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
+            place_in_time = [int(self.steps) + step for step in range(len(as_list(reference, "reference")))]
+        coverage: Coverage = super().forward(sensor, reference, weights=weights, place_in_time=place_in_time)
         return coverage
 
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
-    def _add_step(self, step: Step) -> None:
-        sensors, reference, weights, index = step
+    def _add_step(self, step: CheckedStep) -> None:
+        sensors, reference, weights, place_in_time = step
         inside, of, cell = self.grid.bins(reference)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
         each = [self._distance(reference[inside], cloud.to(reference.device)) for cloud in sensors.values()]
@@ -219,10 +213,9 @@ class CoverageMetric(MergeableMetric):
         distance = each[0] if of_sensors is None else of_sensors.amin(dim=0)
         device = self.points.device
         weights = None if weights is None else weights.to(reference.device)[inside[of]].to(device)
-        block = self._block_of(index)
+        block = self._block_of(place_in_time)
         of_sensors = None if of_sensors is None else of_sensors[:, of].to(device)
         self._accumulate(block, cell.to(device), distance[of].to(device), weights, of_sensors)
-        self.block_steps[block] += 1
         self.steps += 1
         self.empty_sensor_steps += not any(map(len, sensors.values()))
         self.empty_reference_steps += len(reference) == 0
@@ -234,26 +227,20 @@ class CoverageMetric(MergeableMetric):
         found = nearest(reference, cloud, max_distance=self.max_radius, backend=self.backend, memory_mb=self.memory_mb)
         return found.distance
 
-    def _block_of(self, index: int) -> int:
-        """The block of a step; makes room for it."""
-        if self.blocks == 1:
-            return 0
-        while index >= self.blocks * int(self.block_length):
-            pair_up(self.metric_state, self._in_blocks)
-        return index // int(self.block_length)
-
     def _accumulate(
         self, block: int, cell: Tensor, distance: Tensor, weights: Tensor | None, of_sensors: Tensor | None
     ) -> None:
         # Before saturation: a point with nothing within `max_radius` is not detected at a threshold of `max_radius`.
         detected = [(distance <= threshold).double() for threshold in self.thresholds]
         radius = distance.clamp(max=distance.new_tensor(self.max_radius)).double()
-        means = mean_per_cell(cell, torch.stack([radius, *detected]), self.grid.cells, weights)
+        values = torch.stack([radius, *detected])
+        means = mean_per_cell(cell, values, self.grid.cells, weights)
         self.probed_steps[block, means.cell] += 1
         self.points[means.cell] += means.points
-        step = BinnedStep(cell, radius, weights, means, block, self.grid.cells, of_sensors)
+        step = BinnedStep(cell, values, weights, means, block, self.grid.cells, of_sensors)
         for aggregation in self.aggregations:
-            aggregation.update(self._sums_of(aggregation), step)
+            aggregation.update(self._sums_of(aggregation.name), step)
+        self._in_regions.update(self._sums_of(IN_REGIONS), step)
 
     def compute(self) -> Coverage:
         """The coverage so far. Cells that no reference point ever probed are NaN with count 0."""
@@ -265,22 +252,23 @@ class CoverageMetric(MergeableMetric):
             probed_steps=probed_steps.view(self.grid.shape),
             points=self.points.view(self.grid.shape).clone(),
             layers=[layer for one in self._of_grid for layer in self._layers(one, probed_steps)],
-            blocks=self._blocks() if self.blocks > 1 else None,
-            area=self._area() if self.square_metres else None,
+            blocks=self._listed(Blocks, self.probed_steps, self.mean_sums) if self.blocks > 1 else None,
+            area=self._listed(AreaSums, self.area_m2, self.area_sums) if self.square_metres else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
             regions=self.regions,
+            aggregated=self._in_regions.numbers(self._sums_of(IN_REGIONS), self.max_radius),
             redundancy=self._redundancy(probed_steps) if self.sensors else None,
         )
 
     def _layers(self, aggregation: Aggregation, probed_steps: Tensor) -> list[Layer]:
-        found = aggregation.layers(self._sums_of(aggregation), probed_steps, self.max_radius)
+        found = aggregation.layers(self._sums_of(aggregation.name), probed_steps, self.max_radius)
         return [Layer(layer.quantity, layer.values.view(self.grid.shape)) for layer in found]
 
     def _redundancy(self, probed_steps: Tensor) -> Redundancy:
         layers = {layer.quantity.key: layer for layer in self._layers(self._failures, probed_steps)}
         if not self.square_metres:
             return Redundancy(self.sensors, layers, None)
-        sums = self._sums_of(self._failures)
+        sums = self._sums_of(self._failures.name)
         places = PlaceSums(self.block_steps.clone(), sums["place_m2"].clone(), sums["place_sums"].clone())
         return Redundancy(self.sensors, layers, places)
 
@@ -307,27 +295,6 @@ class CoverageMetric(MergeableMetric):
         draw_coverage(self.compute() if val is None else val, ax, layer, height)
         return fig, ax
 
-    def _blocks(self) -> Blocks:
+    def _listed(self, kind: type[BlockSumsT], base: Tensor, sums: Tensor) -> BlockSumsT:
         shape = self.grid.shape
-        return Blocks.of(
-            self.block_steps, self.probed_steps.view(-1, *shape), self.mean_sums.view(self.blocks, -1, *shape)
-        )
-
-    def _area(self) -> AreaSums:
-        shape = self.grid.shape
-        return AreaSums.of(
-            self.block_steps, self.area_m2.view(-1, *shape), self.area_sums.view(self.blocks, -1, *shape)
-        )
-
-    def _align_with(self, incoming: dict[str, Any]) -> None:
-        # Blocks of the same length only can be added up.
-        longest = max(int(self.block_length), int(incoming["block_length"]))
-        states: tuple[dict[str, Any], ...] = (self.metric_state, incoming)
-        for state in states:
-            while int(state["block_length"]) < longest:
-                pair_up(state, self._in_blocks)
-
-    def _align_ranks(self, dist_sync_fn: Callable[..., Any] = gather_all_tensors, process_group: Any = None) -> None:  # noqa: ANN401
-        lengths = dist_sync_fn(self.block_length, group=process_group or self.process_group)
-        while int(self.block_length) < max(map(int, lengths)):
-            pair_up(self.metric_state, self._in_blocks)
+        return kind.of(self.block_steps, base.view(-1, *shape), sums.view(self.blocks, -1, *shape))

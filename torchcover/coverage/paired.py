@@ -6,7 +6,7 @@ import torch
 
 from torchcover.coverage.regions import Region
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.summary import Difference, differences_of
+from torchcover.estimation import Difference
 
 
 def check_paired(coverages: Mapping[str, Coverage]) -> None:
@@ -53,9 +53,10 @@ def differences(coverages: Mapping[str, Coverage], region: Region, height: str) 
     Returns:
         Name of the rig -> key of the quantity -> difference.
     """
-    estimates = {name: coverage.estimate(region, height) for name, coverage in coverages.items()}
-    first, quantities = next(iter(estimates.values())), next(iter(coverages.values())).quantities
-    found = {}
-    for name, estimate in estimates.items():
-        found[name] = dict(zip((one.key for one in quantities), differences_of(estimate, first), strict=True))
+    first = next(iter(coverages.values()))
+    found: dict[str, dict[str, Difference]] = {name: {} for name in coverages}
+    for part in (Coverage.estimate, Coverage.estimate_aggregated):
+        expected = part(first, region, height)
+        for name, coverage in coverages.items():
+            found[name] |= part(coverage, region, height).differences(expected)
     return found

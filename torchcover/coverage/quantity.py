@@ -1,36 +1,6 @@
-"""What a number is: its one key, its title, its unit, and which direction is better."""
+"""The numbers of coverage: radii and detections, and what a rig is without a sensor."""
 
-from dataclasses import dataclass, replace
-from typing import Literal
-
-# "m" is metres, "sensors" a number of them; a "share" lies in [0, 1], and tables and maps show it in percent.
-Unit = Literal["m", "share", "sensors"]
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """What a number, or every cell of a map, is.
-
-    Args:
-        key: Its name in files, dicts and loggers; with `_error` behind it, that of its standard error.
-        title: What tables and maps call it, without its unit.
-        unit: "m", "share" for a number in [0, 1], or "sensors".
-        lower_is_better: Whether less of it is better.
-
-    Example:
-        >>> detection(0.4).key, RADIUS.key
-        ('detection_0.4m', 'radius_m')
-    """
-
-    key: str
-    title: str
-    unit: Unit
-    lower_is_better: bool
-
-    @property
-    def error_key(self) -> str:
-        """The key of its standard error."""
-        return f"{self.key}_error"
+from torchcover.estimation import Quantity
 
 
 def radius(which: str = "", title: str = "mean") -> Quantity:
@@ -74,7 +44,7 @@ def without(sensor: str, quantity: Quantity) -> Quantity:
         >>> without("roof", detection(0.4)).key
         'detection_0.4m_without_roof'
     """
-    return replace(quantity, key=f"{quantity.key}_without_{sensor}", title=f"{quantity.title}, without {sensor}")
+    return quantity._replace(key=f"{quantity.key}_without_{sensor}", title=f"{quantity.title}, without {sensor}")
 
 
 def by_area(quantity: Quantity) -> Quantity:
@@ -88,7 +58,17 @@ def by_area(quantity: Quantity) -> Quantity:
         ('detection_area_0.4m', 'mean blind spot radius, by area')
     """
     kind, unit = quantity.key.split("_", 1)
-    return replace(quantity, key=f"{kind}_area_{unit}", title=f"{quantity.title}, by area")
+    return quantity._replace(key=f"{kind}_area_{unit}", title=f"{quantity.title}, by area")
+
+
+def over_known(quantity: Quantity) -> Quantity:
+    """The same over the known cells of a region, every cell weighing the same, where the number itself is by area.
+
+    Example:
+        >>> over_known(RADIUS).key
+        'known_radius_m'
+    """
+    return quantity._replace(key=f"known_{quantity.key}", title=f"{quantity.title}, over known cells")
 
 
 RADIUS = radius()

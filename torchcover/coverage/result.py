@@ -1,27 +1,27 @@
 """The result: maps over the grid, and one number a region."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+from functools import cached_property, partial
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations import MeanOfMeans
-from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
+from torchcover.coverage.aggregations import Layer, MeanOfMeans
+from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
-from torchcover.coverage.errors import MIN_BLOCKS_OF_A_CELL, ROUND_OFF, ratio_errors
-from torchcover.coverage.estimate import Measure, RegionEstimate, area_in_blocks, estimate_area, estimate_known
 from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.intervals import interval95
-from torchcover.coverage.layer import Layer
-from torchcover.coverage.quantity import RADIUS, Quantity, by_area
-from torchcover.coverage.redundancy import Redundancy
-from torchcover.coverage.region_redundancy import over_known, over_place, region_redundancy
+from torchcover.coverage.measures import Measure, area_in_blocks, errors_of_cells, estimate_area, estimate_known
+from torchcover.coverage.quantity import RADIUS, by_area, over_known
+from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
+from torchcover.coverage.region_sums import PlaceNumbers
 from torchcover.coverage.regions import Region, check_regions, regions_within
-from torchcover.coverage.summary import Number, RegionRedundancy, RegionSummary
+from torchcover.coverage.summary import RegionRedundancy, RegionSummary, estimate_redundancy, region_redundancy
+from torchcover.estimation import Estimate, Quantity
 
 
 class Coverage:
@@ -41,6 +41,7 @@ class Coverage:
         area: The sums over the visible surface, if the reference points had square metres.
         regions: What `summary` gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
             the grid if not given.
+        aggregated: What other aggregations than the mean of means say of `regions`, if there were any.
         redundancy: What each sensor of the rig adds, if the metric was told of the sensors.
 
     Attributes:
@@ -69,6 +70,7 @@ class Coverage:
         blocks: Blocks | None = None,
         area: AreaSums | None = None,
         regions: Sequence[Region] | None = None,
+        aggregated: PlaceNumbers | None = None,
         redundancy: Redundancy | None = None,
     ) -> None:
         self.grid = grid
@@ -81,8 +83,9 @@ class Coverage:
         self.blocks = blocks
         self.area = area
         self.regions = regions_within(grid) if regions is None else tuple(regions)
+        self.aggregated = aggregated
         self.redundancy = redundancy
-        self._estimates: dict[tuple[Region, str, Measure], RegionEstimate] = {}
+        self._estimates: dict[tuple[Region, str, Measure], Estimate] = {}
 
     def __repr__(self) -> str:
         known = float((self.probed_steps > 0).double().mean())
@@ -108,19 +111,10 @@ class Coverage:
         """Key of a quantity -> (H, Y, X) standard errors; NaN where too few blocks probed, empty without blocks."""
         if self.blocks is None:
             return {}
-        errors = self._errors_of(self.blocks, self.quantities)
+        errors = errors_of_cells(self.quantities, self.blocks)
         if self.area is not None:
-            each = self._errors_of(self.area, self.quantities)
+            each = errors_of_cells(self.quantities, self.area)
             errors |= {by_area(one).key: each[one.key] for one in self.quantities}
-        return errors
-
-    def _errors_of(self, blocks: BlockSums, quantities: Sequence[Quantity]) -> dict[str, Tensor]:
-        where = blocks.known_in() >= MIN_BLOCKS_OF_A_CELL
-        base, sums = blocks.spread_over(where)
-        errors = {}
-        for one, own in zip(quantities, sums, strict=True):
-            errors[one.key] = sums.new_full(self.grid.shape, math.nan)
-            errors[one.key][where] = ratio_errors(base, own, one.unit)
         return errors
 
     @property
@@ -158,15 +152,18 @@ class Coverage:
         """What its numbers are means over: "area" if the reference points had square metres, else "known"."""
         return "known" if self.area is None else "area"
 
-    def estimate(self, region: Region, height: str, measure: Measure | None = None) -> RegionEstimate:
+    def estimate(self, region: Region, height: str, measure: Measure | None = None) -> Estimate:
         """The numbers of one region in one band with what they become without each block, for errors of differences.
 
         Args:
             region: A region within the grid.
             height: Name of the band.
-            measure: "area", the mean over the visible surface (`torchcover.coverage.estimate.estimate_area`), for
+            measure: "area", the mean over the visible surface (`torchcover.coverage.measures.estimate_area`), for
                 points that have square metres, or "known", the paper's unweighted mean over the known cells. Not given:
                 that of this result.
+
+        Returns:
+            That of `quantities`.
 
         Raises:
             ValueError: A region that reaches beyond the grid, or holds no cell centre; no such band; "area" of points
@@ -177,26 +174,66 @@ class Coverage:
             self._estimates[key] = self._estimate(*key)
         return self._estimates[key]
 
-    def _estimate(self, region: Region, height: str, measure: Measure) -> RegionEstimate:
+    def _estimate(self, region: Region, height: str, measure: Measure) -> Estimate:
         check_regions([region], self.grid)
         cells = region.mask(self.grid).to(self.radius.device)
         if height not in self.grid.heights:
             raise ValueError(f"height {height!r}: the grid has {', '.join(self.grid.heights)}")
         band = list(self.grid.heights).index(height)
         if measure == "area":
-            return estimate_area(self._square_metres(), band, cells)
+            return estimate_area(self.quantities, self.area, band, cells)
         known = cells & (self.probed_steps[band] > 0)
         probed = self.probed_steps[band][known]
         sums = probed * torch.stack([self.layers[quantity.key].values[band][known] for quantity in self.quantities])
-        return estimate_known(probed, sums, self.blocks, band, known)
+        return estimate_known(self.quantities, probed, sums, self.blocks, band, known)
 
-    def _square_metres(self) -> AreaSums:
-        if self.area is None:
-            raise ValueError(
-                "no estimate by area: the reference points had no square metres; take them from a SurfaceReference and "
-                "give the metric square_metres=True"
-            )
-        return self.area
+    def estimate_aggregated(self, region: Region, height: str) -> Estimate:
+        """The numbers of other aggregations in one region and band; unknown where the metric was not told of it."""
+        if self.aggregated is None:
+            return self.estimate(region, height)[:0]
+        quantities, value, left_out = self.aggregated
+        place = self._place(region, height)
+        if place is None or self.blocks is None:
+            return Estimate.of(quantities, torch.full_like(value[0], math.nan) if place is None else value[place])
+        used = self.blocks.steps > 0
+        return Estimate(quantities, value[place], left_out[used, place], self.blocks.steps[used])
+
+    def estimate_of(self, key: str, region: Region, height: str) -> Estimate:
+        """Any one number, by the name of its column in `summary.csv`.
+
+        Args:
+            key: "radius_m", "detection_0.4m"; "known_detection_0.4m" over the known cells of a result by area;
+                "radius_maximum_m" of an aggregation; "radius_m_without_roof" and "seen_by_two_0.4m" of redundancy.
+            region: A region within the grid.
+            height: Name of the band.
+
+        Raises:
+            ValueError: There is no such number; as `estimate`.
+        """
+        for quantities, estimate in self._estimators.items():
+            for at, quantity in enumerate(quantities):
+                if quantity.key == key:
+                    return replace(estimate(region, height)[at : at + 1], quantities=(quantity,))
+        there = [quantity.key for quantity in self.every_quantity]
+        nearest = get_close_matches(key, there, n=1) or there
+        raise ValueError(f"{key}: the result has no such number; it has {', '.join(nearest)}")
+
+    @property
+    def every_quantity(self) -> tuple[Quantity, ...]:
+        """All that `estimate_of` has a number of."""
+        return tuple(quantity for quantities in self._estimators for quantity in quantities)
+
+    @property
+    def _estimators(self) -> dict[tuple[Quantity, ...], Callable[[Region, str], Estimate]]:
+        estimators: dict[tuple[Quantity, ...], Callable[[Region, str], Estimate]] = {self.quantities: self.estimate}
+        if self.aggregated is not None:
+            estimators[self.aggregated.quantities] = self.estimate_aggregated
+        if self.measure == "area":
+            estimators[tuple(map(over_known, self.quantities))] = partial(self.estimate, measure="known")
+        if self.redundancy is not None:
+            own = redundancy_quantities(self.redundancy.sensors, self.thresholds)
+            estimators[own] = lambda region, height: self._estimate_redundancy(region, height)[len(self.quantities) :]
+        return estimators
 
     def scalars(self, regions: Sequence[Region] | None = None) -> dict[str, float]:
         """The summary as a flat dict for a logger.
@@ -225,19 +262,8 @@ class Coverage:
 
         What `load` gives back has the same numbers, errors and differences to the last bit.
         """
-        parts: CoverageParts = {
-            "grid": self.grid,
-            "thresholds": self.thresholds,
-            "max_radius": self.max_radius,
-            "probed_steps": self.probed_steps,
-            "points": self.points,
-            "layers": list(self.layers.values()),
-            "counts": self.counts,
-            "blocks": self.blocks,
-            "area": self.area,
-            "regions": self.regions,
-            "redundancy": self.redundancy,
-        }
+        given = {name: getattr(self, name) for name in CoverageParts.__annotations__}
+        parts = cast("CoverageParts", given | {"layers": list(self.layers.values())})
         write_coverage(parts, self.errors, Path(path))
 
     @classmethod
@@ -254,41 +280,45 @@ class Coverage:
     def _summarise(self, region: Region, height: str) -> RegionSummary:
         cells, band = region.mask(self.grid), list(self.grid.heights).index(height)
         probed = self.probed_steps[band].cpu()[cells]
+        known_cells = int((probed > 0).sum())
+        numbers = partial(Estimate.numbers, count=known_cells, count_of="known cells")
         return RegionSummary(
             region=region.name,
             height=height,
             cells=len(probed),
-            known_cells=int((probed > 0).sum()),
+            known_cells=known_cells,
             measure=self.measure,
-            numbers=self._numbers(self.estimate(region, height), self.measure),
-            known=self._numbers(self.estimate(region, height, "known"), "known"),
+            # How often other intervals than those by area hold the truth has not been measured.
+            numbers=numbers(self.estimate(region, height), intervals=self.measure == "area")
+            | numbers(self.estimate_aggregated(region, height), intervals=False),
+            known=numbers(self.estimate(region, height, "known"), intervals=False),
             visible_m2=math.nan if self.area is None else self._visible_m2(self.area, band, cells),
             redundancy=self._without_each(region, height),
         )
 
     def _without_each(self, region: Region, height: str) -> RegionRedundancy | None:
         """What each sensor adds; by area it is known of the regions only that the metric was told of."""
-        redundancy, band = self.redundancy, list(self.grid.heights).index(height)
+        redundancy = self.redundancy
         if redundancy is None or (redundancy.places is not None and region not in self.regions):
             return None
-        if redundancy.places is not None:
-            place = self.regions.index(region) * len(self.grid.heights) + band
-            return region_redundancy(redundancy, self.thresholds, over_place(redundancy.places, place))
-        known = region.mask(self.grid).to(self.radius.device) & (self.probed_steps[band] > 0)
-        with_all = self.estimate(region, height, "known").value
-        return region_redundancy(redundancy, self.thresholds, over_known(redundancy, with_all, band, known))
+        return region_redundancy(redundancy, self.thresholds, self._estimate_redundancy(region, height))
+
+    def _estimate_redundancy(self, region: Region, height: str) -> Estimate:
+        """With all sensors, then of `redundancy_quantities`; unknown by area where the metric was not told of it."""
+        assert self.redundancy is not None
+        with_all = self.estimate(region, height, "known" if self.redundancy.places is None else "area")
+        known = region.mask(self.grid).to(self.radius.device) & (self.probed_steps[self._band(height)] > 0)
+        return estimate_redundancy(self.redundancy, with_all, self._place(region, height), self._band(height), known)
+
+    def _band(self, height: str) -> int:
+        return list(self.grid.heights).index(height)
+
+    def _place(self, region: Region, height: str) -> int | None:
+        """Which place of `Places` it is; None if it is none."""
+        if region not in self.regions:
+            return None
+        return self.regions.index(region) * len(self.grid.heights) + self._band(height)
 
     def _visible_m2(self, area: AreaSums, band: int, cells: Tensor) -> float:
         total = float(area_in_blocks(area, band, cells.to(area.at.device))[:, 0].sum())
         return total / self.counts["steps"] if self.counts["steps"] else math.nan
-
-    def _numbers(self, estimate: RegionEstimate, measure: Measure) -> dict[str, Number]:
-        numbers, freedom = {}, len(estimate.steps) - 1
-        for quantity, value, error in zip(
-            self.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True
-        ):
-            known = error if error > ROUND_OFF else math.nan  # blocks that all say the same prove nothing
-            # Of the mean over known cells nobody has measured how often an interval holds the truth.
-            ends = interval95(value, error, freedom, quantity.unit) if measure == "area" else ()
-            numbers[quantity.key] = Number(value, known, *ends)
-        return numbers

@@ -1,52 +1,22 @@
-"""Datasets of frames: simulated worlds, recordings, and the readers of cloud files."""
+"""Datasets of frames: simulated worlds, recordings, and the readers of cloud files.
 
-from torchcover.data.accumulated_reference import AccumulatedReference
-from torchcover.data.augmentation import Augmentation, flip, rotate, scale
-from torchcover.data.bad_frame import BadFrameError
-from torchcover.data.chosen_rigs import ChosenRigs
-from torchcover.data.clouds import read_cloud
-from torchcover.data.frame import Frame, FrameBatch, collate_frames
-from torchcover.data.recorded import RecordedFrames, reference_of_recording
-from torchcover.data.recorded_reference import RecordedReference, Reference
-from torchcover.data.recorded_rig import rig_document
-from torchcover.data.recorders import RECORDERS, write_recording
-from torchcover.data.recordings import FORMATS, Recording, RecordingFormat, Scan, open_recording
-from torchcover.data.reference import DEFAULT_REFERENCE, reference_called, reference_of_objects
-from torchcover.data.regions_of_interest import GRID_X_M, GRID_Y_M, Asked, RegionsOfInterest
-from torchcover.data.simulated import SimulatedFrames
-from torchcover.data.source import FrameSource
+The door to the rooms `frames`, `recordings` and `simulation`: a name loads its own room only, when it is first used.
+"""
 
-__all__ = [
-    "DEFAULT_REFERENCE",
-    "FORMATS",
-    "GRID_X_M",
-    "GRID_Y_M",
-    "RECORDERS",
-    "AccumulatedReference",
-    "Asked",
-    "Augmentation",
-    "BadFrameError",
-    "ChosenRigs",
-    "Frame",
-    "FrameBatch",
-    "FrameSource",
-    "RecordedFrames",
-    "RecordedReference",
-    "Recording",
-    "RecordingFormat",
-    "Reference",
-    "RegionsOfInterest",
-    "Scan",
-    "SimulatedFrames",
-    "collate_frames",
-    "flip",
-    "open_recording",
-    "read_cloud",
-    "reference_called",
-    "reference_of_objects",
-    "reference_of_recording",
-    "rig_document",
-    "rotate",
-    "scale",
-    "write_recording",
-]
+import ast
+from importlib import import_module
+from pathlib import Path
+
+_stub = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
+_ROOM_OF = {one.name: str(line.module) for line in _stub.body if isinstance(line, ast.ImportFrom) for one in line.names}
+__all__ = list(_ROOM_OF)
+
+
+def __getattr__(name: str) -> object:
+    if name not in _ROOM_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_ROOM_OF[name]), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

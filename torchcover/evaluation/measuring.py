@@ -5,57 +5,54 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-from torchcover.data import BadFrameError
-from torchcover.evaluation.checkpoint import AnyCheckpoint, Checkpoint, Journal
+import torch
+from torch import Tensor
+
+from torchcover.coverage import Aggregation, CoverageMetric
+from torchcover.evaluation.checkpoint import Checkpoint, Journal
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
-from torchcover.evaluation.omissions import left_out
 from torchcover.evaluation.other_metrics import compared, metrics_of
 from torchcover.evaluation.pipeline import Run, observe
 from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
-from torchcover.evaluation.result_files import claimed
-from torchcover.evaluation.run_identity import run_identity
-from torchcover.evaluation.sensor_drawings import check_drawable
+from torchcover.evaluation.result_page import check_drawable, left_out
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import TargetWatch
-from torchcover.evaluation.task import Task
+from torchcover.evaluation.task import CALLER, Task, run_identity
+from torchcover.files import claimed
+from torchcover.frames import BadFrameError, FrameSource
+from torchcover.simulation import Asked
+from torchcover.simulation.memory import check_fits
 
 Observers = Mapping[str, AnyObserver]
+# For standard errors: at least half as many are in use at the end of a long run.
+BLOCKS = 16
+# Beside its sums a metric makes a result of them, at most as large.
+STATE_COPIES = 2
+TOO_MANY_CELLS = "use larger cells, or a smaller grid"
 
 
-def measured(
-    task: Task,
-    settings: Settings,
-    others: Observers,
-    checkpoint: AnyCheckpoint | None = None,
-    ranks: Ranks | None = None,
-    *,
-    progress: bool = False,
-) -> Result:
+def measured(task: Task[FrameSource], settings: Settings) -> Result:
     """Measure it.
 
     Args:
         task: Which rigs in which frames.
         settings: How.
-        others: The user's own observers.
-        checkpoint: Where the run is saved, and goes on from.
-        ranks: The processes that share it.
-        progress: Whether to show a bar.
 
     Raises:
         ValueError: As `evaluate`.
     """
+    ranks = settings.ranks
     frames = task.frames
     sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
     check_drawable(sensors)
-    metrics = metrics_of(task, settings)
+    metrics = metrics_of(task, settings) if settings.metrics else None
+    others = {**settings.observers, **(metrics.observers if metrics else {})}
     with ranks.aborting() if ranks else nullcontext():
-        coverage, seen, run = _observed(
-            task, settings, {**others, **metrics.observers}, checkpoint, ranks, progress=progress
-        )
-    metrics = metrics.after(seen)
+        coverage, seen, run = _observed(task, settings, others)
     coverages = {name: observer.compute() for name, observer in coverage.items()}
     if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
@@ -71,8 +68,8 @@ def measured(
         awaited=task.asked.awaited,
         sensors=task.sensors,
         ego_outline_m=frames.ego_outline_m,
-        observed={name: seen[name].compute() for name in others},
-        metrics=compared(metrics, coverages, task.asked.awaited, settings.seed),
+        observed={name: seen[name].compute() for name in settings.observers},
+        metrics=compared(metrics.after(seen), coverages, task.asked.awaited, settings.seed) if metrics else None,
         left_out=left_out(
             run.counts,
             list(coverages.values()),
@@ -82,25 +79,20 @@ def measured(
         ),
     )
     if result.cut_short:
-        warnings.warn(result.cut_short, RuntimeWarning, stacklevel=3)
+        warnings.warn(result.cut_short, RuntimeWarning, stacklevel=CALLER)
     return result
 
 
-def _observed(
-    task: Task,
-    settings: Settings,
-    others: Observers,
-    checkpoint: AnyCheckpoint | None,
-    ranks: Ranks | None,
-    *,
-    progress: bool,
-) -> tuple[Observers, Observers, Run]:
+def _observed(task: Task[FrameSource], settings: Settings, others: Observers) -> tuple[Observers, Observers, Run]:
     """All that was seen, by all ranks."""
+    ranks, checkpoint = settings.ranks, settings.checkpoint
     if ranks:
         settings = replace(settings, device=ranks.device(settings.device))
-    kind, sensors = task.frames.weight_kind, task.sensor_names() if settings.redundancy else {}
+    sensors = task.sensor_names() if settings.redundancy else {}
+    has_areas = task.frames.square_metres
     coverage = {
-        name: CoverageObserver(settings.metric(task.asked, kind, sensors.get(name, ())), name) for name in task.rigs
+        name: CoverageObserver(metric_of(settings, task.asked, sensors.get(name, ()), square_metres=has_areas), name)
+        for name in task.rigs
     }
     target = settings.target_error
     watch = TargetWatch(target, coverage, task.asked.awaited) if target else None
@@ -125,7 +117,7 @@ def _observed(
             device=settings.device,
             skip_bad_frames=settings.skip_bad_frames,
             until=watch,
-            progress=progress and (ranks is None or ranks.rank == 0),
+            progress=settings.progress and (ranks is None or ranks.rank == 0),
             keep_partial=True,
             journal=journal,
             ranks=ranks,
@@ -161,7 +153,7 @@ def _whole(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Ru
     return whole, observers
 
 
-def _place(checkpoint: AnyCheckpoint, ranks: Ranks | None) -> Checkpoint:
+def _place(checkpoint: Checkpoint | str | Path, ranks: Ranks | None) -> Checkpoint:
     """Where this process keeps it: every rank has a file of its own."""
     place = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
     if ranks is None or ranks.rank == 0:
@@ -174,3 +166,97 @@ def _states(coverage: Observers, others: Observers, watch: TargetWatch | None) -
     """What a checkpoint keeps, by the names that its file and messages have."""
     rigs = {f"coverage of {name}": one for name, one in coverage.items()}
     return {**rigs, **{f"observer {name}": one for name, one in others.items()}, **({"watch": watch} if watch else {})}
+
+
+def metric_of(
+    settings: Settings,
+    asked: Asked,
+    sensors: Sequence[str] = (),
+    *,
+    square_metres: bool,
+    blocks: int = BLOCKS,
+) -> CoverageMetric:
+    """An empty metric of what `evaluate` is to measure.
+
+    Args:
+        settings: How.
+        asked: What is asked about.
+        sensors: Names of the sensors, for redundancy.
+        square_metres: Whether the frames have the square metres of reference points.
+        blocks: For standard errors.
+
+    Raises:
+        ValueError: An estimate by area is wanted, and there are no square metres; a device that cannot be used; as
+            `new_metric`.
+    """
+    if settings.estimate == "area" and not square_metres:
+        raise ValueError(
+            "estimate area: it needs the square metres of reference points, which the surface reference of a "
+            "simulation gives; leave it out for means over the known cells"
+        )
+    return new_metric(
+        asked,
+        settings.thresholds_m,
+        usable_device(settings.device),
+        blocks=blocks,
+        aggregations=settings.aggregations,
+        sensors=sensors,
+        square_metres=square_metres and settings.estimate != "known",
+    )
+
+
+def usable_device(name: str) -> torch.device:
+    """The device of this name.
+
+    Raises:
+        ValueError: It cannot be used here.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device, dtype=torch.float64).item()  # the device `meta` has no values
+    except (RuntimeError, AssertionError, TypeError, ImportError) as error:
+        said = str(error).splitlines()[0].partition(". ")[0]  # some go on for pages
+        raise ValueError(f"device {name}: cannot be used here ({said}); try cpu") from error
+    return device
+
+
+def new_metric(
+    asked: Asked,
+    thresholds: tuple[float, ...],
+    device: torch.device,
+    *,
+    blocks: int = BLOCKS,
+    aggregations: Sequence[Aggregation] = (),
+    sensors: Sequence[str] = (),
+    square_metres: bool = False,
+) -> CoverageMetric:
+    """An empty metric of what is asked about, with standard errors unless there is one block only.
+
+    Raises:
+        ValueError: A threshold that makes no sense, or more cells than there is memory for.
+    """
+    grid = asked.grid
+    build = partial(
+        CoverageMetric,
+        grid,
+        thresholds,
+        max_radius=grid.diagonal_m,
+        blocks=blocks,
+        aggregations=aggregations,
+        regions=asked.regions,
+        sensors=sensors,
+        square_metres=square_metres,
+        sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
+    )
+    try:
+        with torch.device("meta"):  # where tensors have a size and take no memory
+            need = STATE_COPIES * sum(
+                state.nbytes for state in build().metric_state.values() if isinstance(state, Tensor)
+            )
+        check_fits(f"the sums of {grid.cells:,} cells in {blocks} blocks", need, TOO_MANY_CELLS)
+        return build().to(device)
+    except RuntimeError as error:  # what torch raises when there is no memory left on the device
+        raise ValueError(
+            f"a cell of {grid.cell:g} m: there is not enough memory for the sums of {grid.cells:,} cells in {blocks} "
+            f"blocks; {TOO_MANY_CELLS}"
+        ) from error

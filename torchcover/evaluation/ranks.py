@@ -14,8 +14,8 @@ from torch import distributed
 from torch.distributed.distributed_c10d import PrefixStore, Store
 from torch.distributed.rendezvous import rendezvous
 
+from torchcover.evaluation.checkpoint import differences
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.run_identity import differences
 from torchcover.evaluation.transport import packed, unpacked
 
 Payload = TypeVar("Payload")
@@ -103,7 +103,7 @@ class Ranks:
 
     @contextmanager
     def connected(self) -> Iterator[None]:
-        """Where ranks `gather` and `merge`; elsewhere nobody knows of them, such as a metric that would add them up.
+        """Where ranks `gather` and `merge`; elsewhere other code, such as a metric that adds up, does not know of them.
 
         Raises:
             ChildProcessError: Another rank cannot go on.

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage.quantity import RADIUS, by_area
-from torchcover.data import Frame
 from torchcover.detection import Boxes
+from torchcover.frames import Frame
 from torchcover.neighbors import blind_spot_radius
 from torchcover.report import ColourScale, SensorView, scale_of
 from torchcover.simulation import Sensor
@@ -148,7 +148,7 @@ def log_sensors(stream: Any, rig: str, sensors: Sequence[Sensor]) -> None:  # no
     """Where sensors are, and the edges of what they see."""
     import rerun as rr
 
-    from torchcover.evaluation.sensor_drawings import sensor_views
+    from torchcover.evaluation.result_page import sensor_views
 
     for view in sensor_views(sensors):
         stream.log([rig, "sensors", view.name], rr.LineStrips3D(frustum(view)), static=True)

@@ -1,4 +1,4 @@
-"""Where `ResultFiles` was looked for."""
+"""Where placement looks for what writes a folder."""
 
 from torchcover.files import SUMMARY, claimed
 from torchcover.files import Publication as ResultFiles

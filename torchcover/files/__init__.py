@@ -1,13 +1,12 @@
 """What the system gives: the door of all readers, its error, files that are whole, NumPy's, tables, processes."""
 
-from torchcover.files.bad_file import BadFileError, naming, reads
-from torchcover.files.budget import TooLargeError, check_memory
+from torchcover.files.bad_file import BadFileError, TooLargeError, check_memory, decode, naming, read_short_text, reads
+from torchcover.files.csv_tables import read_csv
 from torchcover.files.feather import read_feather
 from torchcover.files.json_tables import read_json_table
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, npz_headers, read_npy, read_npz, write_npz
 from torchcover.files.processes import end_with_parent
 from torchcover.files.publishing import SUMMARY, Publication, claimed, settled, write_durably, written_since
-from torchcover.files.text import decode, read_short_text
 from torchcover.files.xml_text import feed_xml, parse_xml
 from torchcover.files.yaml_text import as_yaml, parse_yaml
 
@@ -28,6 +27,7 @@ __all__ = [
     "npz_headers",
     "parse_xml",
     "parse_yaml",
+    "read_csv",
     "read_feather",
     "read_json_table",
     "read_npy",

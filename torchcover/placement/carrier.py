@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import Scenario
 from torchcover.simulation.bodies import mount_regions_of
-from torchcover.simulation.mount_regions import MountRegion
-from torchcover.simulation.skin import Skin
+from torchcover.simulation.mount_regions import MountRegion, Skin
 
 
 class Carrier(NamedTuple):

@@ -9,7 +9,7 @@ from pydantic import Field, NonNegativeFloat
 
 from torchcover.geometry.rigid import Matrix
 from torchcover.simulation import Document, Rig, Sensor
-from torchcover.simulation.skin import Skin
+from torchcover.simulation.mount_regions import Skin
 
 # Sensors whose poses differ by less are each other's mirror images.
 MIRRORED_M = 1e-4

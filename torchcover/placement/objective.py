@@ -7,8 +7,8 @@ from pydantic import Field, NonNegativeFloat
 
 from torchcover.coverage import Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
-from torchcover.data.regions_of_interest import RegionOfInterest
 from torchcover.simulation import Document
+from torchcover.simulation.regions_of_interest import RegionOfInterest
 
 Name = Annotated[str, Field(min_length=1)]
 

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid, Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
-from torchcover.data.regions_of_interest import RegionOfInterest, RegionsOfInterest
 from torchcover.placement.objective import Objective, Question
 from torchcover.simulation import Areas, SurfaceReference
+from torchcover.simulation.regions_of_interest import RegionOfInterest, RegionsOfInterest
 
 # Of the "known cells" measure.
 CELL_M = 0.5

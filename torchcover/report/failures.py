@@ -4,10 +4,11 @@ import math
 from collections.abc import Sequence
 from textwrap import fill
 
-from torchcover.coverage import Number, RegionRedundancy
-from torchcover.coverage.quantity import RADIUS, Quantity, seen_by_two, sensors_seeing
+from torchcover.coverage import RegionRedundancy
+from torchcover.coverage.quantity import RADIUS, seen_by_two, sensors_seeing
+from torchcover.estimation import Quantity
 from torchcover.report.table import CoverageTable, Row
-from torchcover.report.wording import UNKNOWN, difference_heading, difference_words, number_words, percent
+from torchcover.report.wording import UNKNOWN, difference_heading, difference_words, number_words, percent, value_words
 
 MAX_HEADING_CHARS = 16
 NONE = "none"
@@ -15,7 +16,7 @@ NONE = "none"
 
 def decisive(table: CoverageTable) -> Quantity:
     """What sensors are judged by: the detection at the first threshold, or the radius where there is none."""
-    return table.quantities[min(1, len(table.quantities) - 1)]
+    return table.means[min(1, len(table.thresholds))]
 
 
 def sensors_of(rows: Sequence[Row]) -> tuple[str, ...]:
@@ -44,11 +45,11 @@ def failure_words(table: CoverageTable, row: Row) -> list[tuple[str, bool]]:
         return [(UNKNOWN, False)] * len(failure_headings(table, row.rig))
     words = []
     for threshold in table.thresholds[:1]:
-        words.append((number_words(redundancy.seen_by[sensors_seeing(threshold).key], "sensors"), False))
+        words.append((number_words(redundancy.seen_by[sensors_seeing(threshold).key]), False))
         words.append((percent(redundancy.seen_by[seen_by_two(threshold).key].value), False))
     for sensor in sensors:
         change = redundancy.change[sensor][key]
-        words.append((difference_words(change, decisive(table).unit), bool(change.significant)))
+        words.append((difference_words(change), bool(change.significant)))
     known = not math.isnan(row.summary.numbers[key].value)
     return [*words, (redundancy.indispensable or (NONE if known else UNKNOWN), False)]
 
@@ -68,7 +69,7 @@ def single_point_of_failure(table: CoverageTable, rig: str) -> str:
         return "No single point of failure: whichever sensor fails, nothing that is known changes."
     sensor = redundancy.indispensable
     before, after = worst.summary.numbers[quantity.key].value, redundancy.without[sensor][quantity.key].value
-    whole, rest = (number_words(Number(value, math.nan), quantity.unit) for value in (before, after))
+    whole, rest = (value_words(value, math.nan, quantity.unit) for value in (before, after))
     unit = "m" if quantity.unit == "m" else "%"
     where = f"{worst.summary.region} {worst.summary.height}"
     change = f"{quantity.title} is {rest} {unit} in {where}, not {whole} {unit}"
@@ -78,5 +79,4 @@ def single_point_of_failure(table: CoverageTable, rig: str) -> str:
 def _loss(redundancy: RegionRedundancy | None, quantity: Quantity) -> float:
     if redundancy is None or redundancy.indispensable is None:
         return 0.0
-    change = redundancy.change[redundancy.indispensable][quantity.key].value
-    return change if quantity.key == RADIUS.key else -change
+    return -redundancy.change[redundancy.indispensable][quantity.key].gain

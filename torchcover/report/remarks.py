@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-from torchcover.coverage.blocks import MIN_BLOCKS
+from torchcover.estimation import MIN_BLOCKS
 from torchcover.report.failures import sensors_of, single_point_of_failure
 from torchcover.report.table import CoverageTable
 from torchcover.report.wording import span, steps_and_cell
@@ -73,7 +73,8 @@ def _on_errors(table: CoverageTable, rig: str) -> list[Remark]:
         return []
     if blocks < MIN_BLOCKS:
         return [Remark("too_few_blocks", blocks, MIN_BLOCKS)]
-    numbers = [row.summary.numbers.values() for row in table.rows[rig]]
+    means = [quantity.key for quantity in table.means]  # of a largest radius no error is ever known
+    numbers = [[row.summary.numbers[key] for key in means] for row in table.rows[rig]]
     without = sum(any(math.isfinite(number.value) and math.isnan(number.error) for number in row) for row in numbers)
     return [Remark("standard_errors", blocks, blocks), Remark("one_block_regions", without, len(numbers))]
 

@@ -5,18 +5,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from torchcover.coverage import (
-    BevGrid,
-    Coverage,
-    Difference,
-    Number,
-    Quantity,
-    Region,
-    RegionSummary,
-    check_paired,
-    differences,
-)
-from torchcover.coverage.estimate import Measure
+from torchcover.coverage import BevGrid, Coverage, Region, RegionSummary, check_paired, differences
+from torchcover.coverage.measures import Measure
+from torchcover.estimation import Difference, Number, Quantity
 from torchcover.report.wording import rounded
 
 
@@ -61,7 +52,7 @@ class CoverageTable:
     """What a run has found, for one rig or for several over the same frames.
 
     Args:
-        quantities: What there is a number of.
+        quantities: What there is a number of: the means, then what other aggregations say.
         grid: Cells and height bands.
         thresholds: Detection thresholds in metres.
         max_radius: Saturation of the radius in metres.
@@ -103,7 +94,7 @@ class CoverageTable:
         summaries = {rig: coverage.summary(regions) for rig, coverage in coverages.items()}
         rows = _rows(coverages, regions, summaries)
         return cls(
-            quantities=first.quantities,
+            quantities=(*first.quantities, *(first.aggregated.quantities if first.aggregated else ())),
             grid=first.grid,
             thresholds=first.thresholds,
             max_radius=first.max_radius,
@@ -112,6 +103,11 @@ class CoverageTable:
             conditions={rig: _conditions(coverage) for rig, coverage in coverages.items()},
             notes=tuple(notes),
         )
+
+    @property
+    def means(self) -> tuple[Quantity, ...]:
+        """The mean radius, then the detection at each threshold."""
+        return self.quantities[: 1 + len(self.thresholds)]
 
     @property
     def rigs(self) -> tuple[str, ...]:
@@ -138,43 +134,40 @@ def _rows(
     several = len(coverages) > 1
     rows = []
     for (region, height), of_rigs in zip(places, zip(*summaries.values(), strict=True), strict=True):
-        best = _best(first.quantities, of_rigs) if several else [frozenset[str]()]
+        best = _best(of_rigs) if several else [frozenset[str]()]
         compared = differences(coverages, region, height) if several else {}
         each = zip(coverages, of_rigs, best, strict=True)
         rows.append({rig: Row(rig, region, summary, own, compared.get(rig, {})) for rig, summary, own in each})
     return rows
 
 
-def _best(quantities: Sequence[Quantity], rigs: Sequence[RegionSummary]) -> list[frozenset[str]]:
+def _best(rigs: Sequence[RegionSummary]) -> list[frozenset[str]]:
     """For each rig, the quantities in which it is best."""
-    marks = {
-        quantity.key: best_of([summary.numbers[quantity.key] for summary in rigs], quantity) for quantity in quantities
-    }
+    marks = {key: best_of([summary.numbers[key] for summary in rigs]) for key in rigs[0].numbers}
     return [frozenset(key for key, marked in marks.items() if marked[at]) for at in range(len(rigs))]
 
 
-def best_of(numbers: Sequence[Number], quantity: Quantity) -> list[bool]:
+def best_of(numbers: Sequence[Number]) -> list[bool]:
     """Which numbers are the best of their row.
 
     Args:
-        numbers: One for each rig.
-        quantity: What they are.
+        numbers: One for each rig, of one quantity.
 
     Returns:
         True for the best and for all that look the same as they are shown; never for an unknown one.
 
     Example:
         >>> from torchcover.coverage.quantity import RADIUS
-        >>> none = float("nan")
-        >>> best_of([Number(0.121, none), Number(0.123, none), Number(0.13, none), Number(none, none)], RADIUS)
+        >>> best_of([Number(RADIUS, radius_m) for radius_m in (0.121, 0.123, 0.13, float("nan"))])
         [True, True, False, False]
     """
     known = [number for number in numbers if not math.isnan(number.value)]
     if not known:
         return [False] * len(numbers)
-    best = (min if quantity.lower_is_better else max)(known, key=lambda number: number.value)
-    looks = rounded(best, quantity.unit)
-    return [number in known and rounded(number, quantity.unit) == looks for number in numbers]
+    unit = numbers[0].quantity.unit
+    best = max(known, key=lambda number: number.quantity.gain(number.value))
+    looks = rounded(best.value, best.error, unit)
+    return [number in known and rounded(number.value, number.error, unit) == looks for number in numbers]
 
 
 def _conditions(coverage: Coverage) -> Conditions:

@@ -5,9 +5,8 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
-from torchcover.coverage import BevGrid, Difference, Number, Quantity
-from torchcover.coverage.errors import ROUND_OFF
-from torchcover.coverage.quantity import Unit
+from torchcover.coverage import BevGrid
+from torchcover.estimation import ROUND_OFF, Difference, Number, Quantity, Unit
 
 
 class ShownUnit(NamedTuple):
@@ -17,7 +16,7 @@ class ShownUnit(NamedTuple):
         name: Behind a number.
         difference_name: Behind a difference of two of them.
         factor: From the unit of the quantity to what is shown.
-        decimals: Of a number without an error.
+        decimals: Of a number without an error; None for four digits.
         max_decimals: More than anybody can use, however small the error.
         highest: The largest number there is, as it is shown.
     """
@@ -25,18 +24,28 @@ class ShownUnit(NamedTuple):
     name: str
     difference_name: str
     factor: float
-    decimals: int
+    decimals: int | None
     max_decimals: int
     highest: float
 
 
-UNITS: Mapping[Unit, ShownUnit] = MappingProxyType(
+_UNITS: Mapping[Unit, ShownUnit] = MappingProxyType(
     {
         "m": ShownUnit("m", "m", 1.0, 2, 4, math.inf),
         "sensors": ShownUnit("sensors", "sensors", 1.0, 2, 3, math.inf),
         "share": ShownUnit("%", "percentage points", 100.0, 1, 3, 100.0),
     }
 )
+
+
+def shown_unit(unit: Unit) -> ShownUnit:
+    """How numbers of a unit are shown: as they are where nothing else is known of it.
+
+    Example:
+        >>> shown_unit("share").name, shown_unit("nats").name
+        ('%', 'nats')
+    """
+    return _UNITS.get(unit) or ShownUnit(unit, unit, 1.0, None, 9, math.inf)
 
 
 class Rounded(NamedTuple):
@@ -53,23 +62,24 @@ class Rounded(NamedTuple):
     relation: Literal["", "<", ">"] = ""
 
 
-def rounded(number: Number, unit: Unit) -> Rounded:
+def rounded(number: float, error: float, unit: Unit) -> Rounded:
     """Round a number: to the two digits of its error, or to the usual decimals if it has none.
 
     Args:
-        number: A number that is not NaN, and its error; NaN for none.
+        number: In its unit; not NaN.
+        error: Its standard error; NaN for none.
         unit: That of its quantity.
 
     Example:
-        >>> rounded(Number(0.34127, 0.0123), "m"), rounded(Number(0.9999, float("nan")), "share")
+        >>> rounded(0.34127, 0.0123, "m"), rounded(0.9999, float("nan"), "share")
         (Rounded(value=0.341, decimals=3, relation=''), Rounded(value=99.9, decimals=1, relation='>'))
     """
-    shown = UNITS[unit]
-    value, error = shown.factor * number.value, shown.factor * number.error
+    shown = shown_unit(unit)
+    value = shown.factor * number
     if math.isinf(value):
         return Rounded(value, 0)
-    if number.error > ROUND_OFF:
-        return _to_error(value, error, shown)
+    if error > ROUND_OFF:
+        return _to_error(value, shown.factor * error, shown)
     if value in (0.0, shown.highest) and math.isfinite(shown.highest):
         return Rounded(value, 0)
     return _to_decimals(value, shown)
@@ -108,9 +118,16 @@ def _to_error(value: float, error: float, shown: ShownUnit) -> Rounded:
 
 
 def _to_decimals(value: float, shown: ShownUnit) -> Rounded:
-    number = _round(value, shown.decimals)
+    decimals = _decimals(value, shown)
+    number = _round(value, decimals)
     # A share is told from none; a length below half a centimetre is none.
-    return _not_to_an_end(number, value, shown, shown.decimals) if math.isfinite(shown.highest) else number
+    return _not_to_an_end(number, value, shown, decimals) if math.isfinite(shown.highest) else number
+
+
+def _decimals(value: float, shown: ShownUnit) -> int:
+    if shown.decimals is not None:
+        return shown.decimals
+    return min(shown.max_decimals, max(0, 3 - math.floor(math.log10(abs(value))))) if value else 0
 
 
 def _not_to_an_end(number: Rounded, value: float, shown: ShownUnit, decimals: int) -> Rounded:
@@ -129,32 +146,41 @@ def _round(value: float, decimals: int) -> Rounded:
 UNKNOWN = "unknown"
 
 
-def number_words(number: Number, unit: Unit) -> str:
+def number_words(number: Number) -> str:
+    """A number and its standard error, without the unit; see `value_words`."""
+    return value_words(number.value, number.error, number.quantity.unit)
+
+
+def value_words(number: float, error: float, unit: Unit) -> str:
     """A number and its standard error, without the unit.
 
     Args:
-        number: Metres, or a share in [0, 1]; its error is NaN for none.
-        unit: That of its quantity.
+        number: In its unit.
+        error: Its standard error; NaN for none.
+        unit: Its unit.
 
     Returns:
-        A length with two decimals, a share in percent with one; with an error as many as its two digits need, at most
-        four and three. A share is never rounded to 0 or 100. "unknown" for NaN, "infinite" for infinity.
+        A length with two decimals, a share in percent with one, what has another unit with four digits; with an error
+        as many as its two digits need, of lengths and shares at most four and three. A share is never rounded to 0 or
+        100. "unknown" for NaN, "infinite" for infinity.
 
     Example:
         >>> none = float("nan")
-        >>> [number_words(Number(length, none), "m") for length in (0.126, 12.0, float("inf"), none)]
+        >>> [value_words(length, none, "m") for length in (0.126, 12.0, float("inf"), none)]
         ['0.13', '12.00', 'infinite', 'unknown']
-        >>> [number_words(Number(0.34127, error), "m") for error in (0.0123, 0.00123, 1e-7, 0.0)]
+        >>> [value_words(0.34127, error, "m") for error in (0.0123, 0.00123, 1e-7, 0.0)]
         ['0.341 ± 0.012', '0.3413 ± 0.0012', '0.3413 ± <0.0001', '0.34 ± 0']
-        >>> number_words(Number(0.49812, 0.00123), "share"), number_words(Number(1.0, 0.0), "share")
+        >>> value_words(0.49812, 0.00123, "share"), value_words(1.0, 0.0, "share")
         ('49.81 ± 0.12', '100 ± 0')
+        >>> value_words(-0.0123456, none, "nats"), value_words(12345.6, none, "points")
+        ('-0.01235', '12346')
     """
-    if math.isnan(number.value):
+    if math.isnan(number):
         return UNKNOWN
-    if math.isinf(number.value):
+    if math.isinf(number):
         return "infinite"
-    words = _words(rounded(number, unit))
-    return words if math.isnan(number.error) else f"{words} ± {_error_words(number.error, unit, ROUND_OFF)}"
+    words = _words(rounded(number, error, unit))
+    return words if math.isnan(error) else f"{words} ± {_error_words(error, unit, ROUND_OFF)}"
 
 
 def percent(share: float) -> str:
@@ -164,7 +190,7 @@ def percent(share: float) -> str:
         >>> [percent(share) for share in (0.0, 0.0001, 0.123, 0.9999, 1.0, float("nan"))]
         ['0', '<0.1', '12.3', '>99.9', '100', 'unknown']
     """
-    return number_words(Number(share, math.nan), "share")
+    return value_words(share, math.nan, "share")
 
 
 def square_metres(m2: float) -> str:
@@ -191,23 +217,25 @@ def error_words(error: float, unit: Unit) -> str:
     return UNKNOWN if math.isnan(error) else _error_words(error, unit, ROUND_OFF)
 
 
-def difference_words(difference: Difference, unit: Unit) -> str:
+def difference_words(difference: Difference) -> str:
     """A difference and its standard error, with its sign: lengths in metres, shares in percentage points.
 
     Example:
-        >>> difference_words(Difference(0.0213, 0.0041, True), "m"), difference_words(Difference(-0.5, 0.0, None), "m")
+        >>> radius = Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True)
+        >>> difference_words(Difference(radius, 0.0213, 0.0041)), difference_words(Difference(radius, -0.5, 0.0))
         ('+0.0213 ± 0.0041', '-0.50 ± 0')
-        >>> difference_words(Difference(-0.0213, 0.0041, True), "share")
+        >>> difference_words(Difference(radius._replace(unit="share"), -0.0213, 0.0041))
         '-2.13 ± 0.41'
     """
     if math.isnan(difference.value):
         return UNKNOWN
     if math.isinf(difference.value):
         return "+infinite" if difference.value > 0 else "-infinite"
-    shown = UNITS[unit]
+    unit = difference.quantity.unit
+    shown = shown_unit(unit)
     value, error = shown.factor * difference.value, shown.factor * difference.error
     inexact = error > 100 * ROUND_OFF
-    decimals = decimals_of(error, shown.max_decimals) if inexact else shown.decimals
+    decimals = decimals_of(error, shown.max_decimals) if inexact else _decimals(value, shown)
     # What rounds to nothing has no sign: a loss too small to be shown is no gain. Adding 0 turns -0.0 into 0.0.
     shown_value = round(value, decimals) + 0.0
     words = f"{shown_value:{'+' if shown_value else ''}.{decimals}f}" if inexact or value else "0"
@@ -223,12 +251,12 @@ def heading(quantity: Quantity) -> str:
         >>> heading(Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True))
         'mean blind spot radius (m)'
     """
-    return f"{quantity.title} ({UNITS[quantity.unit].name})"
+    return f"{quantity.title} ({shown_unit(quantity.unit).name})"
 
 
 def difference_heading(quantity: Quantity) -> str:
     """What its differences are called, with their unit."""
-    return f"{quantity.title} ({UNITS[quantity.unit].difference_name})"
+    return f"{quantity.title} ({shown_unit(quantity.unit).difference_name})"
 
 
 def capitalised(words: str) -> str:
@@ -253,5 +281,5 @@ def _words(number: Rounded) -> str:
 def _error_words(error: float, unit: Unit, negligible: float) -> str:
     if error <= negligible:
         return "0"
-    shown = UNITS[unit]
+    shown = shown_unit(unit)
     return _words(rounded_error(shown.factor * error, shown.max_decimals))

@@ -5,12 +5,13 @@ from typing import Annotated, Literal, Self
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 from torch import Tensor
 
 from torchcover.cameras import Camera
 from torchcover.geometry import rigid
-from torchcover.simulation.documents import Document, Pose
+from torchcover.simulation.documents import Pose
+from torchcover.simulation.sensor import Ranging
 
 # The camera frame is x right, y down, z forward; a mount looks along its x, with y left and z up.
 MOUNT_T_CAMERA = rigid(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
@@ -21,7 +22,7 @@ MAX_PIXELS = 200_000
 Side = Annotated[int, Field(gt=0, le=MAX_PIXELS)]
 
 
-class CameraSensor(Document):
+class CameraSensor(Ranging):
     """A camera as a depth sensor: every pixel that has a ray gives the point that it sees.
 
     Args:
@@ -34,10 +35,7 @@ class CameraSensor(Document):
         lens: Lens model, with the intrinsics; see `torchcover.Camera`.
         coefficients: Of the lens.
         stride: Use every stride-th row and column.
-        min_range_m: Closer hits give no point.
-        max_range_m: Farther hits give no point.
-        range_noise_m: Standard deviation of the measured range, along the ray.
-        dropout: Probability that a pixel gives no point, from 0 to 1.
+        min_range_m, max_range_m, range_noise_m, dropout: As in `Ranging`; ranges are along the ray.
 
     Example:
         >>> camera = CameraSensor(name="front", width=64, height=48, fov_deg=90, max_range_m=100)
@@ -58,10 +56,6 @@ class CameraSensor(Document):
     lens: str = "pinhole"
     coefficients: tuple[float, ...] = ()
     stride: PositiveInt = 1
-    min_range_m: NonNegativeFloat = 0.0
-    max_range_m: PositiveFloat
-    range_noise_m: NonNegativeFloat = 0.0
-    dropout: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
 
     @model_validator(mode="after")
     def _check_lens(self) -> Self:
@@ -70,8 +64,6 @@ class CameraSensor(Document):
             raise ValueError("the intrinsics are missing: give fx, fy, cx and cy, or fov_deg")
         if self.fov_deg is not None and (any(given) or self.lens != "pinhole"):
             raise ValueError("fov_deg is for a pinhole without fx, fy, cx, cy; give one or the other")
-        if self.min_range_m >= self.max_range_m:
-            raise ValueError(f"min_range_m ({self.min_range_m}) must be below max_range_m ({self.max_range_m})")
         self.camera()
         return self
 

@@ -165,17 +165,17 @@ def explain(error: ValidationError) -> str:
 
 
 def _misspelt(details: Sequence[ErrorDetails]) -> dict[Place, Place]:
-    """Keys that nobody knows -> those that are missing beside them and look like them."""
+    """Unknown keys -> those that are missing at the same place and look like them."""
     missing = [detail["loc"] for detail in details if detail["type"] == "missing"]
     meant: dict[Place, Place] = {}
     for detail in details:
         if detail["type"] != "extra_forbidden":
             continue
         *place, key = detail["loc"]
-        beside = {str(other[-1]): other for other in missing if list(other[:-1]) == place}
-        alike = get_close_matches(str(key)[:MAX_QUOTED], beside, n=1)
-        if alike and beside[alike[0]] not in meant.values():
-            meant[detail["loc"]] = beside[alike[0]]
+        there = {str(other[-1]): other for other in missing if list(other[:-1]) == place}
+        alike = get_close_matches(str(key)[:MAX_QUOTED], there, n=1)
+        if alike and there[alike[0]] not in meant.values():
+            meant[detail["loc"]] = there[alike[0]]
     return meant
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -29,12 +29,13 @@ Float32 = NDArray[np.float32]
 class Scan(NamedTuple):
     """What one sensor saw: `points` (N, 3) float32 in the vehicle frame, and how many rays went where.
 
-    `ray` (N,) says which ray, counted over the tiles, made each point. `body_casts` is the number of pairs of a ray and
-    a moving body at which it was cast: the other pairs could not meet.
+    `ray` (N,) says which ray, counted over the tiles, made each point, and `range_m` (N,) how far it went. `body_casts`
+    is the number of pairs of a ray and a moving body at which it was cast: the other pairs could not meet.
     """
 
     points: Float32
     ray: NDArray[np.int64]
+    range_m: Float32
     rays: int
     self_hits: int
     body_casts: int = 0
@@ -50,7 +51,6 @@ class Instant:
         moving: The bodies that move and are near.
         ego: Number of the ego.
         out_of_range: How many bodies that move are not near, or not there.
-        vehicle_R_level: (3, 3) from axes that do not pitch and roll with the vehicle, x ahead and z up in the world.
     """
 
     static: RayCaster
@@ -58,14 +58,12 @@ class Instant:
     moving: Moving
     ego: int
     out_of_range: int = 0
-    vehicle_R_level: Matrix = field(default_factory=lambda: np.eye(3))
 
     def scan(
         self,
         vehicle_T_sensor: Matrix,
         tiles: Sequence[Tile],
         *,
-        min_range_m: float = 0.0,
         max_range_m: float = np.inf,
         own_m: Sequence[Float32] = (),
         ego_points: bool = False,
@@ -76,7 +74,6 @@ class Instant:
         Args:
             vehicle_T_sensor: (4, 4) pose of the sensor.
             tiles: Its rays, from `into_tiles`.
-            min_range_m: Closer hits give no point; they hide what lies behind all the same.
             max_range_m: Farther hits give no point.
             own_m: Of a sensor that is fixed to the ego: where the ego's body ends the rays of each tile, from
                 `Scene.own_m`. They are not cast at it again. The result is the same.
@@ -88,13 +85,11 @@ class Instant:
         """
         bodies = self.outlines(vehicle_T_sensor[:3, 3])
 
-        def scan_tile(tile: Tile, own_m: Float32 | None) -> tuple[Float32, NDArray[np.bool_], int, int]:
+        def scan_tile(tile: Tile, own_m: Float32 | None) -> tuple[Float32, NDArray[np.bool_], Float32, int, int]:
             directions, hits, casts = self.cast(vehicle_T_sensor, tile, _limit(tile, max_range_m), bodies, own_m)
             seen = (hits.body >= 0) & (ego_points | (hits.body != self.ego))
-            if min_range_m > 0:
-                seen &= hits.range_m >= min_range_m
             points = _points(vehicle_T_sensor[:3, 3], directions, hits.range_m, seen)
-            return points, seen, int(np.count_nonzero(hits.body == self.ego)), casts
+            return points, seen, hits.range_m[seen], int(np.count_nonzero(hits.body == self.ego)), casts
 
         own: Sequence[Float32 | None] = own_m or [None] * len(tiles)
         if threads <= 1 or len(tiles) <= 1:
@@ -103,9 +98,15 @@ class Instant:
             # A pool for each scan: threads do not survive the fork that makes a DataLoader worker.
             with ThreadPoolExecutor(threads) as pool:
                 scans = list(pool.map(scan_tile, tiles, own))
-        points, seen, self_hits, casts = zip(*scans, strict=True)
-        rays = sum(tile.directions.shape[1] for tile in tiles)
-        return Scan(np.concatenate(points), np.flatnonzero(np.concatenate(seen)), rays, sum(self_hits), sum(casts))
+        points, seen, range_m, self_hits, casts = zip(*scans, strict=True)
+        return Scan(
+            points=np.concatenate(points),
+            ray=np.flatnonzero(np.concatenate(seen)),
+            range_m=np.concatenate(range_m),
+            rays=sum(tile.directions.shape[1] for tile in tiles),
+            self_hits=sum(self_hits),
+            body_casts=sum(casts),
+        )
 
     def range_image(
         self, vehicle_T_sensor: Matrix, directions: NDArray[np.float64], *, max_range_m: float = np.inf

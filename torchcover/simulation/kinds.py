@@ -1,9 +1,9 @@
 """The kinds of sensors, of reference sensors and of traffic, by the names that files and options call them."""
 
 from torchcover.simulation.camera_sensor import CameraSensor
-from torchcover.simulation.even_reference import EvenReference
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.paper_reference import PaperReference
+from torchcover.simulation.radar import Radar
 from torchcover.simulation.recorded.traffic import RecordedTraffic
 from torchcover.simulation.reference_sensor import ReferenceSensor
 from torchcover.simulation.sensor import Sensor
@@ -13,9 +13,9 @@ from torchcover.simulation.traffic import Highway, Parking, Urban
 from torchcover.simulation.traffic.kind import Traffic
 
 # By the key `type` in a rig's file.
-SENSORS: dict[str, type[Sensor]] = {"lidar": Lidar, "camera": CameraSensor}
+SENSORS: dict[str, type[Sensor]] = {"lidar": Lidar, "camera": CameraSensor, "radar": Radar}
 REFERENCE_SENSORS: dict[str, type[ReferenceSensor]] = {
-    sensor.name: sensor for sensor in (EvenReference, PaperReference, SurfaceReference)
+    sensor.name: sensor for sensor in (PaperReference, SurfaceReference)
 }
 # By the key `type` of a scenario's `traffic`.
 TRAFFIC: dict[str, type[Traffic]] = {

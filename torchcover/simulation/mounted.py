@@ -1,70 +1,87 @@
 """A sensor at its place on the ego of one scene: what is the same at every step is worked out once."""
 
-from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.simulation.instant import Instant, Scan
-from torchcover.simulation.rays import Tile
+from torchcover.simulation.rays import into_tiles, pixels_in_tiles
 from torchcover.simulation.scene import Scene
-from torchcover.simulation.sensor import Sensor
+from torchcover.simulation.sensor import Draws, RayHits, Sensor
+
+
+class Ends(NamedTuple):
+    """Where n rays end, in the order of the tiles: `range_m` (n,); `is_hit` (n,) whether on something but the ego."""
+
+    range_m: NDArray[np.float32]
+    is_hit: NDArray[np.bool_]
 
 
 class MountedSensor:
-    """What a sensor of a rig would see exactly, without noise and drop-out.
+    """What a sensor of a rig sees.
 
     Its place on the ego is fixed, so the rays that the ego's own body ends are the same at every step: it is not cast
-    at again. Where nothing moves at all, one scan serves for every step.
+    at again. Where nothing moves at all, the rays are cast once for every step.
 
     Args:
         sensor: The sensor.
-        tiles: Its rays, from `into_tiles`.
         scene: Where it is.
     """
 
-    def __init__(self, sensor: Sensor, tiles: Sequence[Tile], scene: Scene) -> None:
+    def __init__(self, sensor: Sensor, scene: Scene) -> None:
         self.sensor = sensor
         self.vehicle_T_sensor = sensor.mount.matrix()
-        self.tiles = tiles
-        self._own_m = scene.own_m(self.vehicle_T_sensor, tiles, max_range_m=sensor.max_range_m)
+        directions = sensor.directions()
+        self.tiles = into_tiles(directions)
+        self.pixel_of_ray = pixels_in_tiles(directions)
+        self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=sensor.max_range_m)
         self._at_rest = not scene.moves
-        self._seen: Scan | None = None
+        self._hits: Scan | None = None
 
-    def scan(self, instant: Instant, *, threads: int = 1) -> Scan:
-        """What it sees at one time of the scene.
+    def scan(self, instant: Instant, draws: Draws, *, threads: int = 1) -> Scan:
+        """What it makes of what its rays hit at one time of the scene.
 
         Args:
             instant: From `Scene.at`.
+            draws: The random numbers of its measuring.
             threads: Number of threads; the result does not depend on it.
         """
-        if self._seen is not None:
-            return self._seen
-        scan = instant.scan(
+        hits = self._cast(instant, threads)
+        hit, error_m = self.sensor.measure(RayHits(hits.ray, hits.range_m, self.pixel_of_ray), draws)
+        if hit is not None:
+            hits = hits._replace(points=hits.points[hit], ray=hits.ray[hit], range_m=hits.range_m[hit])
+        if error_m is None:
+            return hits
+        ways_m = hits.points.astype(np.float64) - self.vehicle_T_sensor[:3, 3]
+        along = error_m[:, None] / np.linalg.norm(ways_m, axis=1, keepdims=True)
+        return hits._replace(points=(hits.points + ways_m * along).astype(np.float32))
+
+    def _cast(self, instant: Instant, threads: int) -> Scan:
+        if self._hits is not None:
+            return self._hits
+        hits = instant.scan(
             self.vehicle_T_sensor,
             self.tiles,
-            min_range_m=self.sensor.min_range_m,
             max_range_m=self.sensor.max_range_m,
             own_m=self._own_m,
             threads=threads,
         )
         if self._at_rest:
-            self._seen = scan
-        return scan
+            self._hits = hits
+        return hits
 
-    def ends_m(self, instant: Instant) -> NDArray[np.float32]:
+    def ends(self, instant: Instant) -> Ends:
         """Where each of its rays ends: at what it hits first, the ego's body included, or at the sensor's range.
 
         Args:
             instant: From `Scene.at`.
-
-        Returns:
-            (n,) metres, in the order of the tiles.
         """
         bodies, own = instant.outlines(self.vehicle_T_sensor[:3, 3]), self._own_m or [None] * len(self.tiles)
-        ends_m = []
+        range_m, is_hit = [], []
         for tile, own_m in zip(self.tiles, own, strict=True):
             limit_m = np.full(tile.directions.shape[1], self.sensor.max_range_m, dtype=np.float32)
             _, hits, _ = instant.cast(self.vehicle_T_sensor, tile, limit_m, bodies, own_m)
-            ends_m.append(hits.range_m)
-        return np.concatenate(ends_m)
+            range_m.append(hits.range_m)
+            is_hit.append((hits.body >= 0) & (hits.body != instant.ego))
+        return Ends(np.concatenate(range_m), np.concatenate(is_hit))

@@ -9,17 +9,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
-from torchcover.simulation.ray_pattern import cast_pattern
 from torchcover.simulation.rays import Tile, into_tiles, unit_directions
-from torchcover.simulation.reference_sensor import PAPER_BANDS_M, Areas, Bands, ReferenceScan, WeightKind, check_reach
-from torchcover.simulation.shell import position_in_shell
-from torchcover.simulation.surroundings import Surroundings
+from torchcover.simulation.reference_sensor import (
+    PAPER_BANDS_M,
+    Areas,
+    Bands,
+    ReferenceScan,
+    Surroundings,
+    check_reach,
+    position_in_shell,
+)
 
 # Pitch and roll of the paper's sensor are uniform between minus this and this.
 MAX_TILT_DEG = 45.0
-# Steps in elevation at which the density of its rays is tabulated, and orientations over which it is averaged.
-ELEVATIONS = 181
-ORIENTATIONS = 48
 
 Float64 = NDArray[np.float64]
 
@@ -52,7 +54,7 @@ class PaperReference:
     """
 
     name: ClassVar[str] = "paper"
-    weight_kind: ClassVar[WeightKind | None] = None
+    square_metres: ClassVar[bool] = False
 
     rows: int = 1024
     columns: int = 1024
@@ -94,20 +96,28 @@ class PaperReference:
 
     def scan(self, surroundings: Surroundings) -> ReferenceScan:
         """What its rays hit at one step; see `ReferenceSensor.scan`."""
-        return cast_pattern(self, surroundings, ego_points=self.ego_points)
+        pose, redrawn = surroundings.free_pose(self.vehicle_T_reference)
+        scan = surroundings.instant.scan(
+            pose,
+            _tiles_of(self),
+            max_range_m=self.max_range_m,
+            ego_points=self.ego_points,
+            threads=surroundings.threads,
+        )
+        return ReferenceScan(
+            points=scan.points,
+            weights=None,
+            rays=scan.rays,
+            self_hits=scan.self_hits,
+            body_casts=scan.body_casts,
+            redrawn=redrawn,
+        )
 
     def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the sensor's frame."""
         elevation = np.linspace(0.0, -90.0, self.rows)
         azimuth = 360.0 * np.arange(self.columns) / self.columns
         return unit_directions(elevation[:, None], azimuth[None, :])
-
-    def tiles(self, vehicle_T_reference: Float64, generator: np.random.Generator) -> tuple[Tile, ...]:
-        """The rays of one step in the sensor's frame: the same at every step."""
-        return _tiles_of(self)
-
-    def weights(self, vehicle_T_reference: Float64, tiles: tuple[Tile, ...], ray: NDArray[np.int64]) -> None:
-        """None: the points of this sensor weigh the same."""
 
     def vehicle_T_reference(self, ego: BoundingBox, generator: np.random.Generator) -> Float64:
         """Draw the pose of one step.
@@ -128,27 +138,3 @@ class PaperReference:
 @lru_cache(maxsize=2)
 def _tiles_of(sensor: PaperReference) -> tuple[Tile, ...]:
     return into_tiles(sensor.directions())
-
-
-def paper_density_at(elevation: Float64) -> Float64:
-    """Rays of the paper's sensor per solid angle at some elevations in radians; see `paper_density`."""
-    density: Float64 = np.interp(elevation, np.linspace(-np.pi / 2, np.pi / 2, ELEVATIONS), paper_density())
-    return density
-
-
-@lru_cache
-def paper_density() -> Float64:
-    """Rays of the paper's sensor per solid angle at elevations from -90 to 90 degrees, averaged over its orientations.
-
-    Its rows are even in elevation below its own horizon: 1 / (pi^2 cos(elevation)) there, and nothing above. Yaw
-    being uniform, what is left of an orientation is the tilt of its axis: pitch and roll uniform in +-45 degrees.
-    """
-    middle = (np.arange(ORIENTATIONS) + 0.5) / ORIENTATIONS
-    tilt = np.deg2rad(MAX_TILT_DEG) * middle
-    cosine = (np.cos(tilt)[:, None] * np.cos(tilt)[None]).reshape(-1, 1, 1)
-    sine = np.sqrt(1 - cosine**2)
-    elevation = np.linspace(-np.pi / 2, np.pi / 2, ELEVATIONS)[:, None]
-    towards_axis = cosine * np.sin(elevation) + sine * np.cos(elevation) * np.cos(np.pi * middle)
-    density = np.where(towards_axis < 0, 1 / np.sqrt(np.maximum(1 - towards_axis**2, 1e-12)), 0.0)
-    average: Float64 = density.mean(axis=(0, 2)) / np.pi**2
-    return average

@@ -1,5 +1,6 @@
 """The directions of a sensor's rays, in tiles: neighbours together, so that a tile is a narrow cone."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -66,12 +67,22 @@ def into_tiles(
     Returns:
         The tiles, row by row; together they hold every ray once; a pixel without one is left out.
     """
-    _, rows, columns = directions.shape
-    return tuple(
-        _tile(directions[:, top : top + tile_rows, left : left + tile_columns])
-        for top in range(0, rows, tile_rows)
-        for left in range(0, columns, tile_columns)
-    )
+    return tuple(_tile(directions[:, *cut]) for cut in _cuts(directions.shape, tile_rows, tile_columns))
+
+
+def pixels_in_tiles(directions: NDArray[np.float64]) -> NDArray[np.int64]:
+    """(rays,) where each ray, counted over the tiles of `into_tiles`, stands in (3, rows, columns), row by row."""
+    has_ray = ~np.isnan(directions[0])
+    pixel = np.arange(has_ray.size).reshape(has_ray.shape)
+    return np.concatenate([pixel[cut][has_ray[cut]] for cut in _cuts(directions.shape, TILE_ROWS, TILE_COLUMNS)])
+
+
+def _cuts(shape: tuple[int, ...], tile_rows: int, tile_columns: int) -> Iterator[tuple[slice, slice]]:
+    """The rows and the columns of each tile."""
+    _, rows, columns = shape
+    for top in range(0, rows, tile_rows):
+        for left in range(0, columns, tile_columns):
+            yield slice(top, top + tile_rows), slice(left, left + tile_columns)
 
 
 def _tile(directions: NDArray[np.float64]) -> Tile:

@@ -1,12 +1,19 @@
-"""What a reference sensor is: another pattern is a class with these members and a line in `kinds.py`."""
+"""What a reference sensor is, and what it finds at one step: the vehicle, the scene, random numbers.
+
+Another pattern is a class with the members of `ReferenceSensor` and a line in `kinds.py`.
+"""
 
 import math
-from typing import ClassVar, Literal, NamedTuple, Protocol, Self
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.simulation.surroundings import Surroundings
+from torchcover.geometry import BoundingBox
+from torchcover.simulation.instant import Instant
+from torchcover.simulation.scene import Scene
 
 # A rectangle of the ground in the vehicle frame in metres: ((x_low, x_high), (y_low, y_high)).
 Area = tuple[tuple[float, float], tuple[float, float]]
@@ -14,12 +21,53 @@ Areas = tuple[Area, ...]
 # Heights in the vehicle frame in metres: (low, high) of each.
 Bands = tuple[tuple[float, float], ...]
 
+# From the ego's bounding box and the random numbers to a (4, 4) pose in the vehicle frame.
+DrawPose = Callable[[BoundingBox, np.random.Generator], NDArray[np.float64]]
+
 # The paper's heights: ground, and what stands on it.
 PAPER_BANDS_M: Bands = ((-0.5, 0.5), (0.5, 2.0))
+# A place inside a body is drawn again, at most this often.
+MAX_DRAWS = 100
 
-# What the weights of points are: "density", a ratio of densities of rays, good for means within a cell of a step; or
-# "m2", the visible square metres that each point stands for, good for sums over any cells and steps.
-WeightKind = Literal["density", "m2"]
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """One step, as the simulator offers it to a reference sensor.
+
+    Args:
+        scene: The geometry of the world.
+        instant: It at the time of the step.
+        generator: Source of all random numbers of the sensor.
+        name: What messages call the step.
+        threads: On how many threads rays may be cast; no result depends on it.
+    """
+
+    scene: Scene
+    instant: Instant
+    generator: np.random.Generator
+    name: str
+    threads: int = 1
+
+    def free_pose(self, draw: DrawPose) -> tuple[NDArray[np.float64], int]:
+        """Draw a pose until it lies inside no body.
+
+        Args:
+            draw: From the ego's bounding box and the random numbers to a (4, 4) pose in the vehicle frame.
+
+        Returns:
+            The pose, and how many were thrown away.
+
+        Raises:
+            ValueError: 100 poses in a row lie inside bodies or below the ground.
+        """
+        for redrawn in range(MAX_DRAWS):
+            vehicle_T_reference = draw(self.scene.ego_box, self.generator)
+            if not self.instant.buried(vehicle_T_reference[:3, 3]):
+                return vehicle_T_reference, redrawn
+        raise ValueError(
+            f"{self.name}: {MAX_DRAWS} places beside and above the ego lie inside other bodies or below the ground; "
+            "does the ego stand on the ground, and do faces point outwards?"
+        )
 
 
 class ReferenceScan(NamedTuple):
@@ -27,8 +75,8 @@ class ReferenceScan(NamedTuple):
 
     Args:
         points: (M, 3) float32 in the vehicle frame, without those on the ego.
-        weights: (M,) float32, positive and finite: what each point counts for; None if all count the same.
-        weight_kind: What the weights are; None if there are none.
+        weights: (M,) float32, positive and finite: the visible square metres that each point stands for; None if all
+            count the same.
         rays: How many rays were cast.
         self_hits: How many of them the ego took.
         body_casts: At how many pairs of a ray and a moving body; the other pairs could not meet.
@@ -39,7 +87,6 @@ class ReferenceScan(NamedTuple):
 
     points: NDArray[np.float32]
     weights: NDArray[np.float32] | None
-    weight_kind: WeightKind | None
     rays: int
     self_hits: int
     body_casts: int
@@ -56,8 +103,8 @@ class ReferenceSensor(Protocol):
 
     name: ClassVar[str]
     """What it is registered as, and what `--reference` and `summary.json` call it."""
-    weight_kind: ClassVar[WeightKind | None]
-    """What the weights of its points are; None if all of them count the same. The same in every scan."""
+    square_metres: ClassVar[bool]
+    """Whether its points have weights, the square metres that they stand for. The same in every scan."""
 
     @classmethod
     def from_rays(cls, areas: Areas, rays: int | None, bands_m: Bands = PAPER_BANDS_M) -> Self:
@@ -126,3 +173,19 @@ def check_reach(shell_m: float, max_range_m: float) -> None:
         raise ValueError(f"shell_m: a positive thickness in metres is needed; got {shell_m}")
     if not max_range_m > 0:
         raise ValueError(f"max_range_m: a positive distance in metres is needed; got {max_range_m}")
+
+
+def position_in_shell(ego: BoundingBox, shell_m: float, generator: np.random.Generator) -> NDArray[np.float64]:
+    """(3,) place in metres, uniform between the ego's bounding box and that box grown sideways and upwards.
+
+    Args:
+        ego: Bounding box of the ego in the vehicle frame.
+        shell_m: How far it is grown.
+        generator: Source of the random numbers.
+    """
+    lower, upper = np.array(ego.lower_m), np.array(ego.upper_m)
+    outer_lower, outer_upper = lower - [shell_m, shell_m, 0.0], upper + shell_m
+    while True:
+        position = generator.uniform(outer_lower, outer_upper)
+        if ((position < lower) | (position > upper)).any():
+            return position

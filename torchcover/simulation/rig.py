@@ -1,15 +1,19 @@
-"""A rig: the sensors of a vehicle and where they are mounted."""
+"""A rig: the sensors of a vehicle, where they are mounted, and what carries them."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationInfo, model_validator
 
 from torchcover.files import as_yaml, write_durably
+from torchcover.simulation.bodies import Shape, VehicleShape, body_called
 from torchcover.simulation.documents import Document, NameOrFile, is_file_name, load_document
 from torchcover.simulation.kinds import SENSORS
 from torchcover.simulation.lidar import Lidar, LidarModel
+from torchcover.simulation.scenario import DEFAULT_EGO, Mover, Scenario
 from torchcover.simulation.sensor import Sensor
+from torchcover.simulation.shapes import MeshFile
 
 
 def read_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whatever stood in the file, or a sensor)
@@ -87,9 +91,58 @@ def _written(sensor: Sensor) -> dict[str, Any]:
     """The keys of a sensor, without those that its model stands for."""
     assert isinstance(sensor, Document)  # as all sensors of a rig
     keys = sensor.model_dump(mode="json", exclude_unset=True)
+    keys = {key: keys[key] for key in ("type", "name", "mount") if key in keys} | keys
     if isinstance(sensor, Lidar) and sensor.model is not None:
         if is_file_name(sensor.model):
             return {key: value for key, value in keys.items() if key != "model"}
         same = LidarModel.load(sensor.model).model_dump(mode="json", exclude={"name", "description"})
         return {key: value for key, value in keys.items() if key not in same or same[key] != value}
     return keys
+
+
+def with_ego(scenario: Scenario, rigs: Mapping[str, Rig], vehicle: str | Path | None = None) -> Scenario:
+    """The scenario with the body of what carries the rigs: the first of these that is given.
+
+    `vehicle`; the shape of the scenario's own ego; the vehicle that the rigs name; an SUV.
+
+    Args:
+        scenario: The scenario.
+        rigs: What is carried; those that name no vehicle go on any.
+        vehicle: A built-in vehicle, the YAML file of one, or a mesh file in metres.
+
+    Raises:
+        ValueError: The rigs name different vehicles, and nothing else decides; or a vehicle that cannot be used.
+        FileNotFoundError: No such vehicle.
+
+    Example:
+        >>> with_ego(Scenario.load("courtyard"), {"roof": Rig.load("nuscenes")}).ego_name
+        'renault_zoe'
+        >>> with_ego(Scenario.load("courtyard"), {"roof": Rig.load("nuscenes")}, "van").ego_name
+        'van'
+    """
+    ego = scenario.ego or Mover()
+    shape = ego.shape if vehicle is None else _body("vehicle", body_called(vehicle))
+    return scenario.model_copy(update={"ego": ego.model_copy(update={"shape": shape or _of_rigs(rigs)})})
+
+
+def _of_rigs(rigs: Mapping[str, Rig]) -> Shape:
+    named = {name: rig.vehicle for name, rig in rigs.items() if rig.vehicle is not None}
+    if len(set(named.values())) > 1:
+        told = ", ".join(f"{name} {vehicle}" for name, vehicle in named.items())
+        raise ValueError(
+            f"the rigs name different vehicles ({told}), but all are compared in the same frames, which have one ego: "
+            "say which by --vehicle (in Python, vehicle=)"
+        )
+    if not named:
+        return DEFAULT_EGO
+    name, vehicle = next(iter(named.items()))
+    return _body(f"rig {name!r}: vehicle", VehicleShape(type="vehicle", vehicle=vehicle))
+
+
+def _body(owner: str, shape: VehicleShape | MeshFile) -> VehicleShape | MeshFile:
+    """The shape, once its file was found."""
+    try:
+        shape.content()
+    except FileNotFoundError as error:
+        raise FileNotFoundError(f"{owner}: {error}") from error
+    return shape

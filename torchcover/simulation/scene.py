@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import BoundingBox, euler_from_rotation, invert, overlap, rotation_from_euler
+from torchcover.geometry import BoundingBox, invert, overlap
+from torchcover.geometry.trajectory import poses_at
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.moving import Moving
@@ -14,8 +15,7 @@ from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import Tile, rotate
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.solids import Solids
-from torchcover.simulation.surface import Surface, bounds_along
-from torchcover.simulation.trajectory import poses_at
+from torchcover.simulation.surface import SceneSurface, bounds_along
 from torchcover.simulation.world import Actor, World
 
 Matrix = NDArray[np.float64]
@@ -66,12 +66,12 @@ class Scene:
         scenery = self._scenery()
         self._static = RayCaster(resting + scenery)
         self._faces = sum(len(mesh.faces) for mesh in resting + scenery)
-        self._surfaces: dict[tuple[float, ...], Surface] = {}
+        self._surfaces: dict[tuple[float, ...], SceneSurface] = {}
 
     def _scenery(self) -> list[Mesh]:
         return [mesh.moved(invert(self._world_T_local)) for mesh in self.world.static]
 
-    def surface(self, lower_m: Matrix, upper_m: Matrix) -> Surface:
+    def surface(self, lower_m: Matrix, upper_m: Matrix) -> SceneSurface:
         """The surface of everything but the ego, for questions about a box that the vehicle carries along.
 
         It is cut when first asked for, once for each box.
@@ -87,7 +87,7 @@ class Scene:
             bounds = bounds_along(invert(self._world_T_local) @ poses, Bounds(lower_m[None], upper_m[None]))
             objects = self.world.objects
             number = {id(actor): k for k, actor in enumerate(objects)}
-            self._surfaces[box] = Surface(
+            self._surfaces[box] = SceneSurface(
                 self._scenery(),
                 [self._solids.of(actor.mesh).patches for actor in objects],
                 {
@@ -126,7 +126,7 @@ class Scene:
         else:
             static_T_vehicle, ego = np.eye(4), 0
         out_of_range = len(self._moving) - len(moving)
-        return Instant(self._static, static_T_vehicle, moving, ego, out_of_range, level_axes(world_T_vehicle))
+        return Instant(self._static, static_T_vehicle, moving, ego, out_of_range)
 
     def check_apart(self, steps: NDArray[np.int64]) -> None:
         """Refuse time steps at which an actor overlaps the ego, as `at` does for one.
@@ -156,7 +156,7 @@ class Scene:
 
     @property
     def bytes(self) -> int:
-        """How much memory it takes, about, beside the solids that it shares with others."""
+        """How much memory it takes, about, without the solids that it shares with others."""
         return (
             self._positions_m.nbytes
             + sum(actor.trajectory.bytes for actor in self._moving)
@@ -225,12 +225,3 @@ class Scene:
         # The ego is where it is, to the last bit: what a sensor sees of it is the same at every step.
         vehicle_T_part[[actor is self.world.ego for actor in actors]] = np.eye(4)
         return Moving.placed(solids, vehicle_T_part, self._first_moving + numbers)
-
-
-def level_axes(world_T_vehicle: Matrix) -> Matrix:
-    """(3, 3) rotation `vehicle_R_level`, from the axes that the vehicle would have if it did not pitch and roll."""
-    yaw_deg, *tilt_deg = euler_from_rotation(world_T_vehicle[:3, :3])
-    if not np.any(tilt_deg):
-        return np.eye(3)
-    vehicle_R_level: Matrix = world_T_vehicle[:3, :3].T @ rotation_from_euler(yaw_deg, 0.0, 0.0)
-    return vehicle_R_level

@@ -1,11 +1,96 @@
-"""What a sensor of a rig is: a third kind is a class with these members and a line in `kinds.py`."""
+"""What a sensor of a rig is: the rays that it casts, and what it makes of their hits.
 
-from typing import Protocol
+Another kind is a class with the members of `Sensor` and a line in `kinds.py`.
+"""
+
+from dataclasses import dataclass
+from threading import Lock
+from typing import Annotated, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
-from torchcover.simulation.documents import Pose
+from torchcover.simulation.documents import Document, Pose
+
+Float64 = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
+
+
+@dataclass(frozen=True, eq=False)
+class RayHits:
+    """N rays of a sensor that ended on something which is not the vehicle that carries it.
+
+    Args:
+        ray: (N,) which ray, counted over the sensor's tiles. The rays of one beam ascend.
+        range_m: (N,) how far it went, up to the sensor's range.
+        pixel_of_ray: (rays,) where each ray stands in `Sensor.directions`, row by row.
+        place: (N,) in which of several worlds, of which a sensor sees each alone; None if there is one.
+    """
+
+    ray: Numbers
+    range_m: NDArray[np.floating]
+    pixel_of_ray: Numbers
+    place: Numbers | None = None
+
+    @property
+    def pixel(self) -> Numbers:
+        """(N,) row * columns + column of each ray in `Sensor.directions`."""
+        pixels: Numbers = self.pixel_of_ray[self.ray]
+        return pixels
+
+
+class Returns(NamedTuple):
+    """The points that a sensor makes of hits: `hit` (K,) of which, ascending; `error_m` (K,) along their rays.
+
+    None for `hit`: of each, in order. None for `error_m`: they are exact.
+    """
+
+    hit: Numbers | None
+    error_m: Float64 | None
+
+
+class Draws:
+    """The random numbers of one sensor at one step.
+
+    A sensor asks for the same kinds in the same order, whatever its rays hit.
+
+    Args:
+        generator: Their source; None for a measurement without errors, in which nothing drops out.
+        rays: How many rays the sensor has, if each is to have its own numbers, however many hits there are: what is
+            placed in front of some rays then changes nothing about the others. Else there is a number for each hit.
+
+    Example:
+        >>> draws = Draws(np.random.default_rng(0), rays=100)
+        >>> bool((draws.normal(np.array([7, 8])) == draws.normal(np.arange(100))[7:9]).all())
+        True
+        >>> Draws(None).uniform(np.arange(2)).tolist()
+        [1.0, 1.0]
+    """
+
+    def __init__(self, generator: np.random.Generator | None, rays: int | None = None) -> None:
+        self._generator, self._rays = generator, rays
+        self._of_rays: dict[str, Float64] = {}
+        self._lock = Lock()
+
+    def normal(self, ray: Numbers) -> Float64:
+        """(N,) of a normal distribution with standard deviation 1, for hits of these rays."""
+        return np.zeros(len(ray)) if self._generator is None else self._drawn("standard_normal", ray)
+
+    def uniform(self, ray: Numbers) -> Float64:
+        """(N,) evenly from [0, 1), for hits of these rays; 1 where there is no source."""
+        return np.ones(len(ray)) if self._generator is None else self._drawn("random", ray)
+
+    def _drawn(self, kind: str, ray: Numbers) -> Float64:
+        draw = getattr(self._generator, kind)
+        if self._rays is None:
+            drawn: Float64 = draw(len(ray))
+            return drawn
+        with self._lock:  # whichever thread asks first draws for all
+            if kind not in self._of_rays:
+                self._of_rays[kind] = draw(self._rays)
+            return self._of_rays[kind][ray]
 
 
 class Sensor(Protocol):
@@ -36,17 +121,12 @@ class Sensor(Protocol):
 
     @property
     def max_range_m(self) -> float:
-        """Farther hits give no point."""
+        """Farther hits give no point; so far its rays are cast."""
         ...
 
     @property
-    def range_noise_m(self) -> float:
-        """Standard deviation of the measured range, along the ray."""
-        ...
-
-    @property
-    def dropout(self) -> float:
-        """Probability that a ray gives no point, from 0 to 1."""
+    def is_exact(self) -> bool:
+        """Whether it measures the same thing alike at any time: its measuring draws no random numbers."""
         ...
 
     @property
@@ -54,9 +134,80 @@ class Sensor(Protocol):
         """How many rays `directions` has, NaN ones included: asked before it is called."""
         ...
 
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the sensor's frame; NaN where there is no ray."""
         ...
+
+    def beams(self) -> Numbers | None:
+        """(rows, columns) the number of the beam that each ray is part of; None if each is a beam of its own.
+
+        What the rays of one beam hit is measured together; what those of others hit changes nothing about it.
+        """
+        ...
+
+    def measure(self, hits: RayHits, draws: Draws) -> Returns:
+        """What it makes of the hits of its rays.
+
+        Args:
+            hits: All hits of each beam that has one.
+            draws: Source of all random numbers.
+        """
+        ...
+
+
+class Ranging(Document):
+    """A sensor within whose ranges every hit gives a point, with noise and drop-out: the keys that such kinds share.
+
+    Args:
+        min_range_m: Closer hits give no point.
+        max_range_m: Farther hits give no point.
+        range_noise_m: Standard deviation of the measured range, along the ray.
+        dropout: Probability that a point is missing, from 0 to 1.
+    """
+
+    min_range_m: NonNegativeFloat = 0.0
+    max_range_m: PositiveFloat
+    range_noise_m: NonNegativeFloat = 0.0
+    dropout: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+
+    @model_validator(mode="after")
+    def _check_ranges(self) -> Self:
+        if self.min_range_m >= self.max_range_m:
+            raise ValueError(f"min_range_m ({self.min_range_m}) must be below max_range_m ({self.max_range_m})")
+        return self
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether it has neither noise nor drop-out."""
+        return not (self.range_noise_m or self.dropout)
+
+    def beams(self) -> Numbers | None:
+        """None: every ray measures alone."""
+        return None
+
+    def measure(self, hits: RayHits, draws: Draws) -> Returns:
+        """A point for each hit that is not too close, with noise along its ray, unless it drops out."""
+        if not self.min_range_m:
+            return self.erring(hits.ray, None, draws)
+        far_enough = hits.range_m >= self.min_range_m
+        return self.erring(hits.ray, None if far_enough.all() else np.flatnonzero(far_enough), draws)
+
+    def erring(self, ray: Numbers, hit: Numbers | None, draws: Draws) -> Returns:
+        """Points at some of N hits, with noise and drop-out.
+
+        Args:
+            ray: (N,) the rays.
+            hit: (K,) which hits would give a point; None for all.
+            draws: Source of the random numbers.
+        """
+        if self.is_exact:
+            return Returns(hit, None)
+        ray = ray if hit is None else ray[hit]
+        error_m = self.range_noise_m * draws.normal(ray) if self.range_noise_m else None
+        if self.dropout:
+            stays = np.flatnonzero(draws.uniform(ray) >= self.dropout)
+            hit, error_m = stays if hit is None else hit[stays], None if error_m is None else error_m[stays]
+        return Returns(hit, error_m)
 
 
 def vertical_fov_deg(sensor: Sensor) -> tuple[float, float]:

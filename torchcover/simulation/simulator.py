@@ -3,29 +3,51 @@
 import copy
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox
-from torchcover.simulation.disturbance import disturb
-from torchcover.simulation.ego import with_ego
 from torchcover.simulation.instant import Instant, Scan
-from torchcover.simulation.labels import Label, labels
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.mounted import MountedSensor
-from torchcover.simulation.observation import Observation, counts_of
-from torchcover.simulation.reference_sensor import ReferenceSensor
-from torchcover.simulation.rig import Rig
+from torchcover.simulation.reference_sensor import ReferenceScan, ReferenceSensor, Surroundings
+from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
+from torchcover.simulation.sensor import Draws
 from torchcover.simulation.stage import Stage, Stages
 from torchcover.simulation.standing import warn_of_floating
-from torchcover.simulation.surroundings import Surroundings
+from torchcover.simulation.world import Label, labels
 
 # What a step takes at its largest: 73 to 246 were measured, for a LiDAR, a camera and the reference sensors.
 BYTES_PER_RAY = 300
+
+Float32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """The clouds of one step in the vehicle frame (x forward, y left, z up, metres), without points of the ego itself.
+
+    Args:
+        clouds: Name of each rig -> (N, 3) float32 points of all its sensors, in their order.
+        sensor_points: Name of each rig -> how many of its points are of each of its sensors.
+        reference: (M, 3) float32 points of the reference sensor.
+        reference_weights: (M,) float32 square metres that each of them stands for; None if they count the same.
+        drawn: (objects,) how many points the reference drew on each of `World.objects`, from `ReferenceScan`.
+        counts: How many rays there were, how many of them the ego took, and what was left out, by name.
+    """
+
+    clouds: Mapping[str, Float32]
+    sensor_points: Mapping[str, Sequence[int]]
+    reference: Float32
+    reference_weights: Float32 | None
+    drawn: NDArray[np.int64] | None
+    counts: Mapping[str, int]
 
 
 class Simulator:
@@ -163,10 +185,9 @@ class Simulator:
             sensor_points={name: [len(scan.points) for scan in of_rig] for name, of_rig in scans.items()},
             reference=reference.points,
             reference_weights=reference.weights,
-            weight_kind=reference.weight_kind,
             drawn=reference.drawn,
             counts={
-                **counts_of(stage.scene, instant, of_all_rigs, reference),
+                **_counts_of(stage.scene, instant, of_all_rigs, reference),
                 "repeated_instants": int(self.distinct_steps is not None and index >= self.distinct_steps),
             },
         )
@@ -247,13 +268,30 @@ class Simulator:
     def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[Scan]:
         scans = []
         for k, mounted in enumerate(sensors, 1):
-            scan = mounted.scan(instant, threads=torch.get_num_threads())
-            generator = np.random.default_rng([self.seed, index, k])
-            origin_m, sensor = mounted.vehicle_T_sensor[:3, 3], mounted.sensor
-            scans.append(disturb(scan, origin_m, sensor.range_noise_m, sensor.dropout, generator))
+            draws = Draws(np.random.default_rng([self.seed, index, k]))
+            scans.append(mounted.scan(instant, draws, threads=torch.get_num_threads()))
         return scans
 
     def _surroundings(self, scene: Scene, instant: Instant, index: int) -> Surroundings:
         generator = np.random.default_rng([self.seed, index])
         name = f"{self.scenario.name} step {index}"
         return Surroundings(scene, instant, generator, name, threads=torch.get_num_threads())
+
+
+def _counts_of(scene: Scene, instant: Instant, scans: Sequence[Scan], reference: ReferenceScan) -> dict[str, int]:
+    """What the rays of all sensors and of the reference met, and what was left out, next to all that there was."""
+    rays, self_hits = sum(scan.rays for scan in scans), sum(scan.self_hits for scan in scans)
+    pairs = (rays + reference.rays) * len(instant.moving)
+    return {
+        "sensor_rays": rays,
+        "sensor_self_hits": self_hits,
+        "reference_rays": reference.rays,
+        "reference_self_hits": reference.self_hits,
+        "reference_poses_redrawn": reference.redrawn,
+        "moving_bodies": len(instant.moving) + instant.out_of_range,
+        "moving_bodies_out_of_range": instant.out_of_range,
+        "ray_body_pairs": pairs,
+        "ray_body_pairs_left_out": pairs - reference.body_casts - sum(scan.body_casts for scan in scans),
+        "sensor_rays_reused": 0 if scene.moves else rays,
+        "sensor_self_hits_reused": self_hits if scene.knows_self_hits else 0,
+    }

@@ -14,7 +14,6 @@ from torch.utils.data import get_worker_info
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.memory import machine_bytes
 from torchcover.simulation.mounted import MountedSensor
-from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
@@ -178,10 +177,7 @@ class Stages:
     def _on(self, scene: Scene) -> Mapping[str, Sequence[MountedSensor]]:
         """The rigs' sensors on the ego of a scene."""
         self._check_mounts(scene)
-        return {
-            name: [MountedSensor(sensor, into_tiles(sensor.directions()), scene) for sensor in rig.sensors]
-            for name, rig in self._rigs.items()
-        }
+        return {name: [MountedSensor(sensor, scene) for sensor in rig.sensors] for name, rig in self._rigs.items()}
 
     def _check_mounts(self, scene: Scene) -> None:
         scenario = self._scenes.scenario

@@ -38,7 +38,7 @@ class Groups(NamedTuple):
         return np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
 
 
-class Surface:
+class SceneSurface:
     """The surface of what never moves, in the order of places on the ground, and of each object that moves.
 
     Args:
@@ -69,7 +69,7 @@ class Surface:
 
     @property
     def bytes(self) -> int:
-        """How much memory it takes, beside the objects' patches, which others share."""
+        """How much memory it takes, without the objects' patches, which others share."""
         return sum(column.nbytes for column in self._static)
 
     def near(self, instant: Instant, boxes: Bounds, objects_within_m: float = -np.inf) -> Patches:

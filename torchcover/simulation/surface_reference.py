@@ -14,14 +14,13 @@ from torchcover.simulation.reference_sensor import (
     Areas,
     Bands,
     ReferenceScan,
-    WeightKind,
+    Surroundings,
     check_areas,
     check_reach,
+    position_in_shell,
 )
-from torchcover.simulation.shell import position_in_shell
 from torchcover.simulation.sight import Sight, sight
 from torchcover.simulation.surface_points import SurfacePoints, SurfaceStrata
-from torchcover.simulation.surroundings import Surroundings
 
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
@@ -67,12 +66,12 @@ class SurfaceReference:
         >>> from torchcover.simulation import Scenario, Simulator
         >>> sensor = SurfaceReference(areas=(((0.0, 20.0), (-5.0, 5.0)),), rays=1024)
         >>> seen = Simulator(Scenario.load("courtyard"), {}, sensor).step(0)
-        >>> seen.weight_kind, bool(100 < seen.reference_weights.sum() < 400)
-        ('m2', True)
+        >>> bool(100 < seen.reference_weights.sum() < 400)  # square metres
+        True
     """
 
     name: ClassVar[str] = "surface"
-    weight_kind: ClassVar[WeightKind | None] = "m2"
+    square_metres: ClassVar[bool] = True
 
     areas: Areas
     rays: int = DEFAULT_RAYS
@@ -157,7 +156,6 @@ class SurfaceReference:
         return ReferenceScan(
             points=np.concatenate([found.points_m[look.seen] for found, look in looks]),
             weights=np.concatenate(weights).astype(np.float32),
-            weight_kind=self.weight_kind,
             rays=sum(len(found.points_m) for found, _ in looks),
             self_hits=sum(look.self_hits for _, look in looks),
             body_casts=sum(look.body_casts for _, look in looks),

@@ -2,16 +2,17 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from torchcover.simulation.culling import outlines
-from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.mounted import Ends, MountedSensor
 from torchcover.simulation.moving import Moving
 from torchcover.simulation.rays import rotate
+from torchcover.simulation.sensor import RayHits
 from torchcover.targets.steps import SensorStep, Step
 from torchcover.targets.surface import Surface
 from torchcover.targets.target import Target
@@ -57,6 +58,54 @@ class _Met(NamedTuple):
     direction: Float32
 
 
+class _Beams(NamedTuple):
+    """The rays of a sensor by the beam in which they are measured together.
+
+    `of_ray` (rays,) the number of each ray's beam; `ray` (rays,) all rays, beam by beam, ascending in each; `first`
+    (beams + 1,) where those of each beam begin in it.
+    """
+
+    of_ray: Numbers
+    ray: Numbers
+    first: Numbers
+
+    @classmethod
+    def of(cls, mounted: MountedSensor) -> Self | None:
+        """Those of a sensor; None if each ray is measured alone."""
+        beams = mounted.sensor.beams()
+        if beams is None:
+            return None
+        of_ray = beams.ravel()[mounted.pixel_of_ray]
+        first = np.concatenate([[0], np.cumsum(np.bincount(of_ray))])
+        return cls(of_ray, np.argsort(of_ray, kind="stable"), first)
+
+    def filled(self, hits: RayHits, ends: Ends) -> tuple[RayHits, Numbers]:
+        """All hits of each beam in which a target has some, at each position.
+
+        Args:
+            hits: N hits on the target, by ascending position and ray.
+            ends: Where the rays end without it.
+
+        Returns:
+            M hits, by position, beam and ray, and (M,) which of the N each is, -1 if it is on something else.
+        """
+        assert hits.place is not None  # the positions
+        rays, beams = len(self.of_ray), len(self.first) - 1
+        place, beam = np.divmod(np.unique(hits.place * beams + self.of_ray[hits.ray]), beams)
+        length = np.diff(self.first)[beam]
+        begins = np.cumsum(length) - length
+        ray = self.ray[np.arange(length.sum()) + (self.first[beam] - begins).repeat(length)]
+        place = place.repeat(length)
+        number, asked = hits.place * rays + hits.ray, place * rays + ray
+        of_target = np.minimum(np.searchsorted(number, asked), len(number) - 1)
+        of_target = np.where(number[of_target] == asked, of_target, -1)
+        range_m = ends.range_m[ray]
+        on_target = of_target >= 0
+        range_m[on_target] = hits.range_m[of_target[on_target]]
+        there = np.flatnonzero(on_target | ends.is_hit[ray])
+        return RayHits(ray[there], range_m[there], hits.pixel_of_ray, place[there]), of_target[there]
+
+
 def count(
     target: Target,
     surface: Surface,
@@ -81,14 +130,15 @@ def count(
     Returns:
         `Sums`, which do not depend on the number of threads.
     """
-    farthest_m = [np.max([step.sensors[k].ends_m for step in steps], axis=0) for k in range(len(mounted))]
+    farthest_m = [np.max([step.sensors[k].ends.range_m for step in steps], axis=0) for k in range(len(mounted))]
+    beams = [_Beams.of(sensor) for sensor in mounted]
 
     def count_some(first: int) -> Sums:
         some = slice(first, first + CHUNK)
         poses = vehicle_T_target[some]
         met = [_meetings(target, poses, *sensor) for sensor in zip(mounted, farthest_m, strict=True)]
         cut = [Step(step.sensors, step.free[some], step.visible[:, some]) for step in steps]
-        return _sums(surface, poses, mounted, met, cut, hits, threshold_m)
+        return _sums(surface, poses, mounted, beams, met, cut, hits, threshold_m)
 
     firsts, threads = range(0, max(len(vehicle_T_target), 1), CHUNK), torch.get_num_threads()
     if threads <= 1 or len(firsts) <= 1:
@@ -114,7 +164,6 @@ def _meetings(target: Target, vehicle_T_target: Float64, mounted: MountedSensor,
     together = _Met._make(np.concatenate(column) for column in zip(*parts, strict=True))
     # A ray that fills up the block of a tile is cast more than once.
     _, once = np.unique(together.position * first + together.ray, return_index=True)
-    once = once[together.range_m[once] >= mounted.sensor.min_range_m]
     return _Met._make(column[once] for column in together)
 
 
@@ -122,6 +171,7 @@ def _sums(
     surface: Surface,
     vehicle_T_target: Float64,
     mounted: Sequence[MountedSensor],
+    beams: Sequence[_Beams | None],
     met: Sequence[_Met],
     steps: Sequence[Step],
     hits: int,
@@ -139,7 +189,7 @@ def _sums(
         least_points=never,
         least_sensors=never.copy(),
     )
-    # Without noise a ray meets the target at the same place in every step.
+    # Without errors a ray meets the target at the same place in every step.
     exact = [
         surface.near(_in_target(sensor, one, vehicle_T_target, None), threshold_m)
         for sensor, one in zip(mounted, met, strict=True)
@@ -148,27 +198,40 @@ def _sums(
         points = np.zeros_like(sums.points)
         near = np.zeros((count, exact[0].shape[1]), dtype=np.uint8)
         for k, (sensor, one, seen) in enumerate(zip(mounted, met, step.sensors, strict=True)):
-            arrived = np.flatnonzero(_arrive(one, seen))
-            points[k] = np.bincount(one.position[arrived], minlength=count)
-            if seen.noise_m is None:
-                bits = exact[k][arrived]
+            measured, error_m = _measured(sensor, beams[k], one, seen)
+            points[k] = np.bincount(one.position[measured], minlength=count)
+            if error_m is None:
+                bits = exact[k][measured]
             else:
-                noisy = _Met._make(column[arrived] for column in one)
-                bits = surface.near(_in_target(sensor, noisy, vehicle_T_target, seen.noise_m), threshold_m)
-            near |= _any_of_each(one.position[arrived], bits, count)
+                erring = _Met._make(column[measured] for column in one)
+                bits = surface.near(_in_target(sensor, erring, vehicle_T_target, error_m), threshold_m)
+            near |= _any_of_each(one.position[measured], bits, count)
         _add(sums, step, points, near, hits)
     return sums
 
 
-def _arrive(met: _Met, seen: SensorStep) -> NDArray[np.bool_]:
-    """(N,) whether nothing is in the way of a ray, and it gives a point."""
-    arrived: NDArray[np.bool_] = met.range_m <= seen.ends_m[met.ray]
-    return arrived if seen.kept is None else arrived & seen.kept[met.ray]
+def _measured(
+    mounted: MountedSensor, beams: _Beams | None, met: _Met, seen: SensorStep
+) -> tuple[Numbers, Float64 | None]:
+    """Which of N meetings give a point, by position, and the errors of these: of rays with nothing else in the way.
+
+    Where the rays of a beam are measured together, the point may be one of what stands next to the target.
+    """
+    arrived = np.flatnonzero(met.range_m <= seen.ends.range_m[met.ray])
+    hits = RayHits(met.ray[arrived], met.range_m[arrived], mounted.pixel_of_ray, met.position[arrived])
+    if beams is None:
+        hit, error_m = mounted.sensor.measure(hits, seen.draws)
+        return (arrived if hit is None else arrived[hit]), error_m
+    hits, of_target = beams.filled(hits, seen.ends)
+    hit, error_m = mounted.sensor.measure(hits, seen.draws)
+    of_target = of_target if hit is None else of_target[hit]
+    on_target = of_target >= 0
+    return arrived[of_target[on_target]], None if error_m is None else error_m[on_target]
 
 
-def _in_target(mounted: MountedSensor, met: _Met, vehicle_T_target: Float64, noise_m: Float64 | None) -> Float64:
+def _in_target(mounted: MountedSensor, met: _Met, vehicle_T_target: Float64, error_m: Float64 | None) -> Float64:
     """(N, 3) the measured points in the frame of the target."""
-    range_m = met.range_m.astype(np.float64) + (0.0 if noise_m is None else noise_m[met.ray])
+    range_m = met.range_m.astype(np.float64) + (0.0 if error_m is None else error_m)
     from_origin_m = mounted.vehicle_T_sensor[:3, 3] + met.direction * range_m[:, None]
     from_origin_m -= vehicle_T_target[met.position, :3, 3]
     hits_m: Float64 = np.einsum("nji,nj->ni", vehicle_T_target[met.position, :3, :3], from_origin_m)

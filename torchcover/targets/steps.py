@@ -8,21 +8,19 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, rigid
-from torchcover.simulation.disturbance import disturb
-from torchcover.simulation.instant import Instant, Scan
-from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.instant import Instant
+from torchcover.simulation.mounted import Ends, MountedSensor
+from torchcover.simulation.reference_sensor import Surroundings, position_in_shell
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
-from torchcover.simulation.shell import position_in_shell
+from torchcover.simulation.sensor import Draws
 from torchcover.simulation.stage import Stages
-from torchcover.simulation.surroundings import Surroundings
 from torchcover.targets.placing import blocked
 from torchcover.targets.surface import SAMPLES, Surface
 from torchcover.targets.target import Target
 
 Bools = NDArray[np.bool_]
-Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 
 # From so many random places in all the visible surface is looked at, and from one at each step at least.
@@ -34,15 +32,10 @@ RIG = "rig"
 
 
 class SensorStep(NamedTuple):
-    """One sensor at one step, ray by ray in the order of its tiles.
+    """One sensor at one step: where its rays end without a target, and the random numbers of each."""
 
-    `ends_m` (n,) is where each ends without a target; `kept` (n,) whether it may give a point, None for all; `noise_m`
-    (n,) what is added to a measured range, None for nothing.
-    """
-
-    ends_m: Float32
-    kept: Bools | None
-    noise_m: Float64 | None
+    ends: Ends
+    draws: Draws
 
 
 class Step(NamedTuple):
@@ -99,19 +92,20 @@ class Steps:
             FileNotFoundError: A mesh, vehicle or trajectory file is missing.
             ValueError: A sensor or an actor that is where none can be.
         """
-        resting: tuple[list[Float32], Bools] | None = None
+        resting: tuple[list[Ends], Bools] | None = None
         for index in range(self._steps):
             run, step = self._scenario.locate(index * self._every_steps)
             stage = self._stages.of_run(run)
             instant = stage.scene.at(step, within_m=self._within_m)
             stage.check_mounts(instant)
             # Where nothing moves, the first answer holds.
-            ends_m, free = resting or ([m.ends_m(instant) for m in stage.mounted[RIG]], self._free(instant))
+            ends, free = resting or ([m.ends(instant) for m in stage.mounted[RIG]], self._free(instant))
             if not stage.scene.moves and self._scenario.repeats:
-                resting = ends_m, free
+                resting = ends, free
+            # The numbers of each ray: all places see the same rays err and drop out.
             sensors = [
-                self._disturbed(m, ends, index, k)
-                for k, (m, ends) in enumerate(zip(stage.mounted[RIG], ends_m, strict=True), 1)
+                SensorStep(one, Draws(np.random.default_rng([self._seed, index, k]), rays=len(one.range_m)))
+                for k, one in enumerate(ends, 1)
             ]
             yield Step(sensors, free, self._visible(stage.scene, instant, index))
 
@@ -137,20 +131,6 @@ class Steps:
         # Some of none, where the vehicle is everywhere.
         none = np.empty((0, SAMPLES // 8), dtype=np.uint8)
         return np.stack([np.concatenate([none, *of_place]) for of_place in seen])
-
-    def _disturbed(self, mounted: MountedSensor, ends_m: Float32, index: int, number: int) -> SensorStep:
-        """Let the simulator's own noise and drop-out fall on a point a metre along every ray."""
-        sensor, rays = mounted.sensor, len(ends_m)
-        if not (sensor.range_noise_m or sensor.dropout):
-            return SensorStep(ends_m, None, None)
-        generator = np.random.default_rng([self._seed, index, number])
-        ahead = np.tile(np.array([[1.0, 0.0, 0.0]], dtype=np.float32), (rays, 1))
-        scan = disturb(
-            Scan(ahead, np.arange(rays), rays, 0), np.zeros(3), sensor.range_noise_m, sensor.dropout, generator
-        )
-        kept, noise_m = np.zeros(rays, dtype=bool), np.zeros(rays)
-        kept[scan.ray], noise_m[scan.ray] = True, scan.points[:, 0].astype(np.float64) - 1.0
-        return SensorStep(ends_m, kept, noise_m if sensor.range_noise_m else None)
 
 
 def _pose_in_shell(ego: BoundingBox, generator: np.random.Generator) -> Float64:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
-from torchcover.simulation.outward import outward_faces
+from torchcover.simulation.patches import outward_faces
 from torchcover.simulation.sight import SHORTER, sight
 from torchcover.simulation.surface_points import PLANE_STEPS
 from torchcover.simulation.surface_reference import ABOVE_M

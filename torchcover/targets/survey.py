@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.simulation.ego import with_ego
 from torchcover.simulation.memory import check_fits
-from torchcover.simulation.rig import Rig
+from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.targets.counting import Sums, count
 from torchcover.targets.placing import Heading, holding, overlapping, poses, yaws
@@ -20,8 +19,8 @@ from torchcover.targets.target import Target
 
 Float64 = NDArray[np.float64]
 
-# Of one step: where each ends, whether it is kept, and noise. Of one cell: poses, sums, and what is made on the way.
-BYTES_PER_RAY = 13
+# Of one step: where each ends, on what, two random numbers. Of one cell: poses, sums, and what is made on the way.
+BYTES_PER_RAY = 21
 BYTES_PER_CELL = 500
 
 HITS = 5
@@ -43,9 +42,10 @@ def survey(
 ) -> TargetMap:
     """What a rig sees of a target, for every place around the vehicle.
 
-    Rays are those of `Simulator`: a target gives a point for every ray of a sensor that meets it before anything else,
-    the vehicle's own body included, within the sensor's ranges, less those that drop out. All places see the same rays
-    drop out.
+    Rays are those of `Simulator`, and points what a sensor makes of their hits. Of a LiDAR or a camera, each ray that
+    meets the target before anything else, the vehicle's own body included, gives one, within the sensor's ranges, less
+    those that drop out. Of a radar, a cell gives one if the hit in the middle of its hits is on the target. All places
+    see the same rays drop out.
 
     Args:
         rig: The sensors.

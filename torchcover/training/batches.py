@@ -2,7 +2,7 @@
 
 from torch import Tensor
 
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.geometry import transform_tensor
 
 # In place of the index of a frame that only has a name, or not even that.

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import torch
 from torch.utils.data.distributed import DistributedSampler
 
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.training.batches import UNKNOWN_INDEX
 
 

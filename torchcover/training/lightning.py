@@ -12,7 +12,7 @@ except ImportError as error:
 from lightning.pytorch.utilities import CombinedLoader, rank_zero_warn
 
 from torchcover.coverage import Coverage, CoverageMetric, Region
-from torchcover.data import FrameBatch
+from torchcover.frames import FrameBatch
 from torchcover.training.batches import UNKNOWN_INDEX, frames_in, sensor_of
 from torchcover.training.counting import CountOnce, Shard, is_distributed, shard_of
 
@@ -130,15 +130,13 @@ class CoverageCallback(Callback):
         new = FrameBatch(tuple(self._once.new(frames, self._shard(trainer, loader_index), loader_index)))
         if not new.frames:
             return
-        for frame in new.frames:
-            frame.check_weights(square_metres=self.metric.square_metres)
         self._added = True
         indices = [frame.index for frame in new.frames]
         self.metric.update(
             [sensor_of(frame, self.rig) for frame in new.frames],
             new.reference,
             weights=new.weights,
-            index=None if UNKNOWN_INDEX in indices else new.index,
+            place_in_time=None if UNKNOWN_INDEX in indices else new.place_in_time,
         )
 
     def _shard(self, trainer: Trainer, loader_index: int) -> Shard | None:

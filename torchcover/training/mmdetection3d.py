@@ -6,7 +6,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcover.data import FrameBatch
+from torchcover.frames import FrameBatch
 from torchcover.training.batches import frame_of
 
 

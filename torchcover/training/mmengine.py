@@ -14,7 +14,7 @@ except ImportError as error:
 from mmengine.dist import get_comm_device, get_dist_info
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
-from torchcover.data import Frame
+from torchcover.frames import Frame
 from torchcover.training.batches import UNKNOWN_INDEX, frames_in, sensor_of
 from torchcover.training.counting import CountOnce, Shard
 from torchcover.training.mmdetection3d import frames_of_data_batch
@@ -74,12 +74,10 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         self._add(frames_in(self.frames_of(data_batch, data_samples)), size=None)
 
     def _add(self, frames: Sequence[Frame], size: int | None) -> None:
-        for frame in frames:
-            frame.check_weights(square_metres=self.metric.square_metres)
         rank, processes = get_dist_info()
         for frame in self._once.new(frames, Shard(rank, processes, size)):
             index = None if frame.index == UNKNOWN_INDEX else frame.place_in_time
-            self.metric.update(sensor_of(frame), frame.reference, weights=frame.reference_weights, index=index)
+            self.metric.update(sensor_of(frame), frame.reference, weights=frame.reference_weights, place_in_time=index)
 
     def compute_metrics(self, results: list[Any]) -> dict[str, float]:
         """The coverage so far of all processes; `results` stays empty."""

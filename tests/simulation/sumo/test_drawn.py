@@ -12,9 +12,9 @@ from torchcover import Rig, Scenario
 from torchcover.data import SimulatedFrames
 from torchcover.files import BadFileError
 from torchcover.simulation import PaperReference
-from torchcover.simulation.sumo import Sumo, programs
+from torchcover.simulation.sumo import Sumo, simulating
 from torchcover.simulation.sumo.network import read_network
-from torchcover.simulation.sumo.streets import Streets
+from torchcover.simulation.sumo.streets import DrawnStreets
 
 from .towns import XODR, street, write_net
 
@@ -76,7 +76,7 @@ def test_workers_see_the_same_frames_and_each_run_is_another_town():
 
 @pytest.mark.parametrize("network", ["rand", "grid", "spider"])
 def test_drawn_streets_go_on_everywhere_and_have_all_that_was_asked_for(network, tmp_path):
-    streets = Streets(network=network, lanes=3, hills_m=0.0)
+    streets = DrawnStreets(network=network, lanes=3, hills_m=0.0)
     town = read_network(streets.build(tmp_path, np.random.default_rng(2)))
     assert town.flat_at_m == 0.0
     assert {lane.use for lane in town.lanes} == {"road", "turn", "bay", "sidewalk", "crossing", "corner"}
@@ -131,15 +131,15 @@ def test_what_sumo_says_is_passed_on_and_entities_never_get_to_it(tmp_path):
 
 
 def test_a_simulation_that_is_over_before_the_run_begins_is_refused(tmp_path):
-    net, routes = Streets().build(tmp_path, np.random.default_rng(0)), tmp_path / "r.xml"
+    net, routes = DrawnStreets().build(tmp_path, np.random.default_rng(0)), tmp_path / "r.xml"
     routes.write_text("<routes/>")
     with pytest.raises(ValueError, match=r"the simulation is over before t = 60 s, where the run begins: .*begin_s"):
         Sumo(net=net, routes=(routes,), duration_s=2.0).world(0)
 
 
 def test_without_sumo_one_line_says_what_to_install(monkeypatch):
-    monkeypatch.setattr(programs, "find_spec", lambda _: None)
-    monkeypatch.setattr(programs, "which", lambda _: None)
+    monkeypatch.setattr(simulating, "find_spec", lambda _: None)
+    monkeypatch.setattr(simulating, "which", lambda _: None)
     with pytest.raises(ImportError, match=r"^traffic of type 'sumo' needs SUMO: pip install 'torchcover\[sumo\]'$"):
         drawn().world(0)
 

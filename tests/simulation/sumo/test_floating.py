@@ -5,11 +5,11 @@ import pytest
 
 from torchcover.files import BadFileError
 from torchcover.simulation.sumo.crowd import Walker
-from torchcover.simulation.sumo.floating import Window, read_floating, record
+from torchcover.simulation.sumo.floating import TimeWindow, read_floating, record
 
 from .towns import drive, fcd, together, vehicle
 
-ALL = Window(-np.inf, 100.0)
+ALL = TimeWindow(-np.inf, 100.0)
 
 
 def recorded(steps, window=ALL):
@@ -48,8 +48,8 @@ def test_who_is_gone_in_between_or_jumps_has_several_tracks():
 
 def test_a_window_begins_when_it_is_due_or_the_ego_is_there_and_reads_no_further():
     steps = together(drive("a"), {t: row for t, row in drive("ego").items() if t >= 1.0})
-    assert recorded(steps, Window(0.5, 1.0)).begin_s == 0.6
-    found = recorded(steps, Window(0.5, 1.0, "ego"))
+    assert recorded(steps, TimeWindow(0.5, 1.0)).begin_s == 0.6
+    found = recorded(steps, TimeWindow(0.5, 1.0, "ego"))
     assert found.begin_s == 1.0
     assert all(len(track.times_s) == 6 for track in found.tracks)
 
@@ -59,7 +59,7 @@ def test_a_window_begins_when_it_is_due_or_the_ego_is_there_and_reads_no_further
             yield text[start : start + 100].encode()
         raise AssertionError("asked for more than the window needs")
 
-    assert record(pieces(), Window(0.0, 1.0)).last_s == 1.0
+    assert record(pieces(), TimeWindow(0.0, 1.0)).last_s == 1.0
 
 
 def test_rows_may_have_different_attributes():

@@ -5,9 +5,8 @@ import pytest
 import trimesh
 
 from torchcover.simulation.height_field import Plain, Slopes
-from torchcover.simulation.sumo.ground import ground_of, tilts_deg
+from torchcover.simulation.sumo.ground import Pavement, decks, ground_of, tilts_deg
 from torchcover.simulation.sumo.network import read_network
-from torchcover.simulation.sumo.pavement import Pavement, decks
 from torchcover.simulation.sumo.vicinity import Vicinity
 
 from .towns import DRIVE, WALK, edge, street, write_net

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation.traffic.attitude import attitude
+from torchcover.simulation.traffic.assemble import attitude
 
 TIMES_S = np.arange(0.0, 20.0, 0.1)
 

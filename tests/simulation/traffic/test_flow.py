@@ -13,14 +13,13 @@ from torchcover.simulation.traffic.flow import (
     Lane,
     Simulation,
 )
-from torchcover.simulation.traffic.gates import Gate
 from torchcover.simulation.traffic.idm import Driver, acceleration, advance
-from torchcover.simulation.traffic.roads import Line, loop
-from torchcover.simulation.traffic.signals import CROSS, MAIN, Signals
+from torchcover.simulation.traffic.roads import Polyline, loop
+from torchcover.simulation.traffic.signals import CROSS, MAIN, Gate, Signals
 
 TIMES_S = np.arange(0.0, 60.0, 0.1)
 CAR = Driver(14.0)
-LONG = Line.straight((0, 0), 0.0, 2000.0)
+LONG = Polyline.straight((0, 0), 0.0, 2000.0)
 
 
 def car(lane, place, driver=CAR):
@@ -69,7 +68,7 @@ def test_who_cannot_stop_goes_on_and_is_through_before_the_others_get_green():
 def test_waits_for_somebody_left_on_the_junction_in_spite_of_green():
     lanes = [
         Lane(LONG, (Gate(200.0, 225.0, 0, MAIN),)),
-        Lane(Line.straight((0, 0), 90.0, 2000.0), (Gate(200.0, 225.0, 0, CROSS),)),
+        Lane(Polyline.straight((0, 0), 90.0, 2000.0), (Gate(200.0, 225.0, 0, CROSS),)),
     ]
     stuck = car(1, 210.0, Driver(0.5))
     flow = run(lanes, [car(0, 100.0), stuck], green_s=(50.0, 10.0))
@@ -167,7 +166,7 @@ def twin(lanes, agents, lights, times_s):
 def test_all_together_are_that_many_single_ones():
     generator = np.random.default_rng(0)
     gates = [Gate(200.0, 225.0, 0, MAIN), Gate(260.0, 285.0, 1, MAIN, green_needed_s=4.0)]
-    crossing = Line.straight((0, 0), 90.0, 2000.0)
+    crossing = Polyline.straight((0, 0), 90.0, 2000.0)
     lanes = [
         Lane(LONG, tuple(gates)),
         Lane(crossing, (Gate(200.0, 225.0, 0, CROSS),)),

@@ -3,18 +3,18 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation.traffic.roads import Line, loop
+from torchcover.simulation.traffic.roads import Polyline, loop
 
 
 def circle(radius, corners=720):
     angle = np.linspace(0, 2 * np.pi, corners + 1)
-    return Line(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
+    return Polyline(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
 
 
 @pytest.mark.parametrize("place", [-30.0, 0.0, 12.5, 100.0, 130.0])
 def test_a_straight_line_goes_on_beyond_its_ends(place):
     yaw = np.deg2rad(30.0)
-    x, y, yaw_deg = Line.straight((1.0, 2.0), 30.0, 100.0).poses(place)
+    x, y, yaw_deg = Polyline.straight((1.0, 2.0), 30.0, 100.0).poses(place)
     np.testing.assert_allclose([x, y], [1 + place * np.cos(yaw), 2 + place * np.sin(yaw)])
     assert yaw_deg == pytest.approx(30.0)
 

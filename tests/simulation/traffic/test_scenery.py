@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchcover.simulation.traffic.roads import Line
+from torchcover.simulation.traffic.roads import Polyline
 from torchcover.simulation.traffic.scenery import beside, block, box, few, ground, post, prism, rail, rectangle, tree
 
 TREE = tree((1.0, 2.0), 0.15, 2.5, 7.0, 1.5)
-RAIL = rail(Line.straight((0.0, 0.0), 30.0, 100.0), np.array([0.0, 12.0, 24.0]), -5.0, 0.1, (0.4, 0.7))
+RAIL = rail(Polyline.straight((0.0, 0.0), 30.0, 100.0), np.array([0.0, 12.0, 24.0]), -5.0, 0.1, (0.4, 0.7))
 PIECES = {
     "block": (block((1.0, 3.0), (-2.0, 2.0), (0.0, 5.0)), 2 * 4 * 5),
     "box": (box((5.0, 5.0), (2.0, 3.0, 4.0), 1.0, 35.0), 2 * 3 * 4),
@@ -40,7 +40,7 @@ def test_pieces_of_a_rail_join():
 
 
 def test_beside_is_to_the_left():
-    np.testing.assert_allclose(beside(Line.straight((0, 0), 90.0, 10.0), 4.0, 3.0), [-3.0, 4.0, 90.0], atol=1e-12)
+    np.testing.assert_allclose(beside(Polyline.straight((0, 0), 90.0, 10.0), 4.0, 3.0), [-3.0, 4.0, 90.0], atol=1e-12)
 
 
 def test_the_ground_covers_its_corners_and_few_merges_by_kind():

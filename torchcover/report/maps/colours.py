@@ -18,9 +18,9 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.coverage import Quantity
+from torchcover.estimation import Quantity
 from torchcover.report.maps.sheet import Sheet
-from torchcover.report.wording import UNITS, percent
+from torchcover.report.wording import percent, shown_unit
 
 # A few cells far behind an obstacle must not take the colours away from all others.
 ROBUST_PERCENTILE = 98
@@ -83,7 +83,7 @@ def scale_of(quantity: Quantity, values: Tensor) -> ColourScale:
         >>> scale_of(RADIUS, torch.tensor([0.5, 2.04])).label
         'mean blind spot radius (m)'
     """
-    unit = UNITS[quantity.unit]
+    unit = shown_unit(quantity.unit)
     colormap = "viridis_r" if quantity.lower_is_better else "viridis"
     high = unit.highest if math.isfinite(unit.highest) else _robust_end(values)
     return ColourScale(quantity.title, unit.name, colormap, 0.0, high)
@@ -91,7 +91,7 @@ def scale_of(quantity: Quantity, values: Tensor) -> ColourScale:
 
 def error_scale(quantity: Quantity, errors: Tensor) -> ColourScale:
     """Scale for standard errors, from 0 to the 98th percentile of the known; as `scale_of`."""
-    unit = UNITS[quantity.unit].difference_name
+    unit = shown_unit(quantity.unit).difference_name
     return ColourScale(quantity.title, unit, "viridis_r", 0.0, _robust_end(errors))
 
 
@@ -104,7 +104,7 @@ def difference_scale(quantity: Quantity, differences: Tensor) -> ColourScale:
     """
     end = _robust_end(differences.abs())
     colormap = "RdBu_r" if quantity.lower_is_better else "RdBu"
-    return ColourScale(f"difference, {quantity.title}", UNITS[quantity.unit].difference_name, colormap, -end, end)
+    return ColourScale(f"difference, {quantity.title}", shown_unit(quantity.unit).difference_name, colormap, -end, end)
 
 
 def _robust_end(values: Tensor) -> float:

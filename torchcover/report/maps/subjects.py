@@ -1,4 +1,4 @@
-"""What the maps of a run show: the quantities of its measure, and those of the aggregations beside it."""
+"""What the maps of a run show: the quantities of its measure, and those of other aggregations."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchcover.coverage import Coverage, Quantity
+from torchcover.coverage import Coverage
 from torchcover.coverage.blocks import AreaSums
-from torchcover.coverage.errors import MIN_BLOCKS_OF_A_CELL
 from torchcover.coverage.quantity import by_area
+from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Quantity
 from torchcover.report.maps.colours import NEVER_PROBED, ColourScale, error_scale, scale_of
 from torchcover.report.maps.surface import errors_of_ratios, opacity_of, ratios, square_sides
-from torchcover.report.wording import UNITS, steps_and_cell
+from torchcover.report.wording import shown_unit, steps_and_cell
 
 LARGER = ", larger where points are few"
 NOTHING_FOUND = "no visible surface found"
@@ -115,5 +115,5 @@ def _subject(
     opacity: Tensor | None = None,
 ) -> Subject:
     """With the values in the unit that is shown, and one scale for all."""
-    shown = {name: UNITS[quantity.unit].factor * each for name, each in values.items()}
+    shown = {name: shown_unit(quantity.unit).factor * each for name, each in values.items()}
     return Subject(quantity, shown, scale(quantity, torch.stack(list(shown.values()))), unknown, conditions, opacity)

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from torchcover.coverage import Quantity
 from torchcover.coverage.blocks import AreaSums
-from torchcover.coverage.errors import ratio_errors
+from torchcover.estimation import Quantity, ratio_errors
 
 # A detection from 8 points is off by 18 percentage points at most: 1 / sqrt(4 * 8).
 MIN_POINTS = 8

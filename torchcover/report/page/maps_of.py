@@ -12,7 +12,7 @@ from torchcover.report.maps.colours import NEVER_PROBED, difference_scale, scale
 from torchcover.report.maps.subjects import NOTHING_FOUND, quantities_shown
 from torchcover.report.maps.surface import square_sides
 from torchcover.report.page.content import Array, PageMap, Sides
-from torchcover.report.wording import UNITS, span
+from torchcover.report.wording import shown_unit, span
 
 
 def maps_of(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
@@ -50,7 +50,7 @@ def _of_quantity(
     layers: Mapping[str, Layer], errors: Mapping[str, Tensor], weights: Weights, grid: BevGrid
 ) -> Iterator[PageMap]:
     quantity = next(iter(layers.values())).quantity
-    factor = UNITS[quantity.unit].factor
+    factor = shown_unit(quantity.unit).factor
     values = {rig: factor * layer.values for rig, layer in layers.items()}
     scale = scale_of(quantity, torch.stack(list(values.values())))
     expected, *others = values.values()

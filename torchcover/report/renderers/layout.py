@@ -6,8 +6,9 @@ from textwrap import fill
 from types import MappingProxyType
 from typing import NamedTuple
 
-from torchcover.coverage import Quantity, RegionSummary
-from torchcover.coverage.estimate import Measure
+from torchcover.coverage import RegionSummary
+from torchcover.coverage.measures import Measure
+from torchcover.estimation import Quantity
 from torchcover.report.failures import decisive, failure_headings, failure_title, failure_words, sensors_of
 from torchcover.report.table import CoverageTable, Row
 from torchcover.report.wording import (
@@ -138,10 +139,10 @@ def _basis(summary: RegionSummary) -> Words:
 
 
 def _number(row: Row, quantity: Quantity) -> Words:
-    words = number_words(row.summary.numbers[quantity.key], quantity.unit)
+    words = number_words(row.summary.numbers[quantity.key])
     return Words(words, "best" if quantity.key in row.best else "")
 
 
 def _difference(row: Row, quantity: Quantity) -> Words:
     difference = row.differences[quantity.key]
-    return Words(difference_words(difference, quantity.unit), "significant" if difference.significant else "")
+    return Words(difference_words(difference), "significant" if difference.significant else "")

@@ -3,14 +3,13 @@
 import math
 from collections.abc import Callable
 
-from torchcover.coverage import Difference, Number
 from torchcover.coverage.redundancy import redundancy_quantities
+from torchcover.estimation import Difference, Number
 from torchcover.report.failures import sensors_of
 from torchcover.report.table import CoverageTable, Row
 
 Record = dict[str, object]
 Columns = dict[str, Callable[[Row], object]]
-UNKNOWN, NO_CHANGE = Number(math.nan, math.nan), Difference(math.nan, math.nan, None)
 
 
 def records_of(table: CoverageTable) -> list[Record]:
@@ -22,6 +21,7 @@ def records_of(table: CoverageTable) -> list[Record]:
 def columns_of(table: CoverageTable) -> Columns:
     """What each record has, and where it is in a row."""
     keys = [quantity.key for quantity in table.quantities]
+    means = [quantity.key for quantity in table.means]
     columns: Columns = {
         "rig": lambda row: row.rig,
         "region": lambda row: row.summary.region,
@@ -29,7 +29,7 @@ def columns_of(table: CoverageTable) -> Columns:
     }
     for key in keys:
         columns |= _numbers(key)
-    for key in keys if table.measure == "area" else ():
+    for key in means if table.measure == "area" else ():
         columns |= _known(key)
     columns |= _conditions(table)
     for key in keys if len(table.rigs) > 1 else ():
@@ -40,7 +40,7 @@ def columns_of(table: CoverageTable) -> Columns:
         for quantity in redundancy_quantities((), table.thresholds):
             columns |= _seen_by(quantity.key)
     for sensor in sensors:
-        for key in keys:
+        for key in means:
             columns |= _without(sensor, key)
     return columns
 
@@ -75,31 +75,43 @@ def _indispensable(row: Row) -> object:
 
 
 def _seen_by(key: str) -> Columns:
-    def number(row: Row) -> Number:
-        return row.summary.redundancy.seen_by[key] if row.summary.redundancy else UNKNOWN
+    def number(row: Row) -> Number | None:
+        return row.summary.redundancy.seen_by[key] if row.summary.redundancy else None
 
-    return {key: lambda row: number(row).value, f"{key}_error": lambda row: number(row).error}
+    return {key: lambda row: _value(number(row)), f"{key}_error": lambda row: _error(number(row))}
 
 
 def _without(sensor: str, key: str) -> Columns:
     """NaN for a rig that has no such sensor."""
 
-    def number(row: Row) -> Number:
+    def number(row: Row) -> Number | None:
         redundancy = row.summary.redundancy
-        return redundancy.without.get(sensor, {}).get(key, UNKNOWN) if redundancy else UNKNOWN
+        return redundancy.without.get(sensor, {}).get(key) if redundancy else None
 
-    def change(row: Row) -> Difference:
+    def change(row: Row) -> Difference | None:
         redundancy = row.summary.redundancy
-        return redundancy.change.get(sensor, {}).get(key, NO_CHANGE) if redundancy else NO_CHANGE
+        return redundancy.change.get(sensor, {}).get(key) if redundancy else None
+
+    def significant(row: Row) -> bool | None:
+        found = change(row)
+        return None if found is None else found.significant
 
     without = f"{key}_without_{sensor}"
     return {
-        without: lambda row: number(row).value,
-        f"{without}_error": lambda row: number(row).error,
-        f"{without}_change": lambda row: change(row).value,
-        f"{without}_change_error": lambda row: change(row).error,
-        f"{without}_change_significant": lambda row: change(row).significant,
+        without: lambda row: _value(number(row)),
+        f"{without}_error": lambda row: _error(number(row)),
+        f"{without}_change": lambda row: _value(change(row)),
+        f"{without}_change_error": lambda row: _error(change(row)),
+        f"{without}_change_significant": significant,
     }
+
+
+def _value(number: Number | Difference | None) -> float:
+    return math.nan if number is None else number.value
+
+
+def _error(number: Number | Difference | None) -> float:
+    return math.nan if number is None else number.error
 
 
 def _conditions(table: CoverageTable) -> Columns:

@@ -8,7 +8,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from torchcover.simulation.sumo.network import Network
-from torchcover.simulation.sumo.streets import Streets
+from torchcover.simulation.sumo.streets import DrawnStreets
 
 # Nobody is so much faster than what is allowed, nor walks faster.
 FASTER = 1.3
@@ -36,7 +36,7 @@ CLASSES = {"truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist"
 def write_routes(
     path: Path,
     network: Network,
-    streets: Streets,
+    streets: DrawnStreets,
     sizes_m: Mapping[str, tuple[float, float]],
     duration_s: float,
     generator: np.random.Generator,

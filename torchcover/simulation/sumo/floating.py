@@ -22,7 +22,7 @@ PIECE_BYTES = 1 << 18
 TIME_SLACK_S = 1e-6
 
 
-class Track(NamedTuple):
+class SumoTrack(NamedTuple):
     """One vehicle or person, for as long as it was there without a gap.
 
     Args:
@@ -48,7 +48,7 @@ class Track(NamedTuple):
         return bool(self.times_s[0] <= TIME_SLACK_S and self.times_s[-1] >= duration_s - TIME_SLACK_S)
 
 
-class Window(NamedTuple):
+class TimeWindow(NamedTuple):
     """What of the data is meant.
 
     Args:
@@ -69,7 +69,7 @@ class _Enough(Exception):  # noqa: N818  (no error: the window is over)
 class _Collector:
     """Keeps the rows of a window, as start tags come in."""
 
-    def __init__(self, window: Window) -> None:
+    def __init__(self, window: TimeWindow) -> None:
         self._window = window
         self.begin_s, self.last_s, self._end_s = np.nan, -np.inf, np.inf
         self._now: dict[str, list[list[str]]] = {"vehicle": [], "person": []}
@@ -143,12 +143,12 @@ class Recorded(NamedTuple):
         last_s: The last time that was read; minus infinity if there was none.
     """
 
-    tracks: tuple[Track, ...]
+    tracks: tuple[SumoTrack, ...]
     begin_s: float
     last_s: float
 
 
-def record(pieces: Iterable[bytes], window: Window) -> Recorded:
+def record(pieces: Iterable[bytes], window: TimeWindow) -> Recorded:
     """Read floating car data.
 
     Args:
@@ -166,7 +166,7 @@ def record(pieces: Iterable[bytes], window: Window) -> Recorded:
 
 
 @reads("floating car data of SUMO")
-def read_floating(path: Path, window: Window) -> Recorded:
+def read_floating(path: Path, window: TimeWindow) -> Recorded:
     """Read it from a file; see `record`.
 
     Raises:
@@ -180,7 +180,7 @@ def read_floating(path: Path, window: Window) -> Recorded:
     return recorded
 
 
-def _tracks(collector: _Collector) -> Iterator[Track]:
+def _tracks(collector: _Collector) -> Iterator[SumoTrack]:
     times_s = np.array(collector.times_s) - collector.begin_s
     of = np.array(collector.of, dtype=np.int64)
     step = np.repeat(np.arange(len(times_s)), collector.counts)
@@ -202,7 +202,7 @@ def _tracks(collector: _Collector) -> Iterator[Track]:
         breaks = np.flatnonzero((taken_s > MAX_STEPS * usual_s + TIME_SLACK_S) | (way_m > FASTEST_MPS * taken_s)) + 1
         for first, end in pairwise([0, *breaks.tolist(), len(own)]):
             x_m, y_m, angle_deg, z_m, slope_deg = rows[own[first:end]].T
-            yield Track(
+            yield SumoTrack(
                 name=name,
                 kind=collector.kinds[number],
                 on_foot=on_foot,

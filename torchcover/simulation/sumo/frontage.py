@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from torchcover.simulation.height_field import Ground
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sumo.network import Lane
+from torchcover.simulation.sumo.network import NetworkLane
 from torchcover.simulation.sumo.vicinity import Vicinity
-from torchcover.simulation.traffic.roads import Line
+from torchcover.simulation.traffic.roads import Polyline
 from torchcover.simulation.traffic.scenery import few, post, prism, tree
 
 Numbers = NDArray[np.float64]
@@ -28,7 +28,7 @@ CLEAR_M = 0.4
 SUNK_M = 1.0
 
 
-class Frontage:
+class StreetScenery:
     """Draws what stands along the streets.
 
     Args:
@@ -53,23 +53,23 @@ class Frontage:
         gaps = [(side, *gap) for side, (_, open_m) in zip(sides, lots, strict=True) for gap in open_m]
         return few(self._houses(houses_m), [*self._fences(gaps, houses_m), *self._trees_and_lamps(sides, houses_m)])
 
-    def _sides(self) -> Iterator[Line]:
+    def _sides(self) -> Iterator[Polyline]:
         """The outer edges of streets, so that what stands along them is on the right."""
-        of_edge: dict[str, list[Lane]] = {}
+        of_edge: dict[str, list[NetworkLane]] = {}
         for number, lane in enumerate(self._vicinity.lanes):
             if lane.use in ("road", "bay", "shoulder", "sidewalk") and number not in self._vicinity.decks:
                 of_edge.setdefault(lane.edge, []).append(lane)
         inwards = -1 if self._vicinity.left_hand else 1
         for lanes in of_edge.values():
             for lane, left in ((lanes[0], -inwards), (lanes[-1], inwards)):
-                side = Line(lane.line_m[:, :2]).shifted(left * lane.width_m / 2)
+                side = Polyline(lane.line_m[:, :2]).shifted(left * lane.width_m / 2)
                 side = side.reversed() if left > 0 else side
                 # Next to the innermost lane there are those of the other direction, unless it is a one-way street.
                 beside = _right_of(side.poses(side.length_m / 2), 2 * CLEAR_M + 0.5)
                 if lane is lanes[0] or len(self._taken.query(shapely.Point(beside), predicate="intersects")) == 0:
                     yield side
 
-    def _lots(self, side: Line) -> tuple[Numbers, list[tuple[float, float]]]:
+    def _lots(self, side: Polyline) -> tuple[Numbers, list[tuple[float, float]]]:
         """(N, 4, 2) outlines of houses along a side, counter-clockwise; from where to where there is none."""
         lots, open_m, way_m = [], [], self._drawn((0.0, 5.0))
         while way_m < side.length_m:
@@ -88,7 +88,7 @@ class Frontage:
 
     def _free(self, outlines_m: Numbers) -> Numbers:
         """Those that stand neither on a street nor in one that came before."""
-        # Farther away there may be streets that nobody knows of here.
+        # Farther away there may be streets that are unknown here.
         outlines_m = outlines_m[self._vicinity.sees(outlines_m.reshape(-1, 2)).reshape(-1, 4).all(axis=1)]
         polygons = shapely.polygons(outlines_m)
         free = np.ones(len(polygons), dtype=bool)
@@ -106,7 +106,7 @@ class Frontage:
         levels = zip(bottoms_m.tolist(), tops_m.tolist(), strict=True)
         return [prism([outline, outline], level) for outline, level in zip(outlines_m, levels, strict=True)]
 
-    def _fences(self, gaps: list[tuple[Line, float, float]], houses_m: Numbers) -> list[Mesh]:
+    def _fences(self, gaps: list[tuple[Polyline, float, float]], houses_m: Numbers) -> list[Mesh]:
         """Where nobody built, in a town: straight pieces that follow the street."""
         outlines_m, heights_m = [np.empty((0, 4, 2))], []
         for side, from_m, to_m in gaps:
@@ -125,7 +125,7 @@ class Frontage:
         levels = np.stack([on_m.min(axis=1) - SUNK_M, on_m.max(axis=1) + np.array(heights_m)], axis=1)
         return [prism([outlines[k], outlines[k]], levels[k].tolist()) for k in np.flatnonzero(free).tolist()]
 
-    def _trees_and_lamps(self, sides: list[Line], houses_m: Numbers) -> list[Mesh]:
+    def _trees_and_lamps(self, sides: list[Polyline], houses_m: Numbers) -> list[Mesh]:
         """Between the streets and the houses, where there is room."""
         poses, radii = [np.empty((0, 3))], []
         for side in sides:

@@ -1,15 +1,26 @@
-"""The ground: one sheet without seams through all streets, and how whoever stands on it is tilted."""
+"""The ground: one sheet without seams through all streets, and what is raised: sidewalks, medians, decks of bridges."""
+
+from itertools import pairwise
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from torchcover.simulation.height_field import CELL_M, MARGIN_M, Ground, Plain, Slopes, corners_of, middles_m, spread
+from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.vicinity import Vicinity
+from torchcover.simulation.traffic.scenery import PAVEMENT_M
 
 Numbers = NDArray[np.float64]
 
 # Rounds of smoothing between the streets, at each scale; the streets' own heights stay.
 SMOOTHINGS = 4
+# Kerbs go on below the ground, as far as it may rise between two of their corners.
+SUNK_M = 0.3
+DECK_M = 0.8
+# Slivers that are left where outlines nearly meet.
+SMALLEST_M2 = 0.05
+PLACES_ALIKE_M = 1e-6
 
 
 def ground_of(vicinity: Vicinity) -> Plain | Slopes:
@@ -61,3 +72,88 @@ def tilts_deg(ground: Ground, places_m: Numbers, yaw_deg: Numbers, size_m: tuple
     pitch, roll = np.arctan2(-rises[0], 2 * size_m[0] / 3), np.arctan2(rises[1], size_m[1])
     tilts: Numbers = np.rad2deg(np.stack([pitch, roll], axis=1))
     return tilts
+
+
+class Pavement:
+    """All sidewalks and medians, in plan: where neither vehicles nor crossings are.
+
+    Args:
+        vicinity: What is near.
+        ground: What they lie on.
+    """
+
+    def __init__(self, vicinity: Vicinity, ground: Ground) -> None:
+        self._ground = ground
+        walked = shapely.union_all([*vicinity.surfaces("sidewalk", "corner"), *vicinity.medians])
+        driven = shapely.union_all(vicinity.surfaces("road", "turn", "bay", "shoulder", "crossing"))
+        parts = shapely.get_parts(shapely.difference(walked, driven))
+        self.parts = parts[(shapely.get_type_id(parts) == 3) & (shapely.area(parts) > SMALLEST_M2)]
+        self._tree = shapely.STRtree(self.parts)
+
+    def meshes(self) -> list[Mesh]:
+        """One for each piece that is not connected to another."""
+        pieces = self.parts if isinstance(self._ground, Plain) else shapely.segmentize(self.parts, CELL_M)
+        return [_slab(piece, self._ground) for piece in pieces]
+
+    def holds(self, places_m: Numbers) -> NDArray[np.bool_]:
+        """(N,) whether (N, 2) places are on it."""
+        held = np.zeros(len(places_m), dtype=bool)
+        held[self._tree.query(shapely.points(places_m), predicate="intersects")[0]] = True
+        return held
+
+
+def decks(vicinity: Vicinity) -> list[Mesh]:
+    """The decks of bridges: a slab under each lane, a little farther than where another street is below."""
+    found = []
+    for number in sorted(vicinity.decks):
+        own = np.flatnonzero(vicinity.of_lane == number)
+        if vicinity.lanes[number].use == "corner":
+            continue
+        up = np.concatenate([[False], vicinity.on_deck[own], [False]])
+        steps = np.flatnonzero(np.diff(up.astype(np.int8)))
+        for first, end in steps.reshape(-1, 2).tolist():
+            line_m = vicinity.samples_m[own[max(first - 2, 0) : end + 2]]
+            found.append(_strip(line_m, vicinity.lanes[number].width_m))
+    return found
+
+
+def _slab(piece: shapely.Geometry, ground: Ground) -> Mesh:
+    """A closed body between an outline, lifted above the ground, and the same below it."""
+    triangles = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(piece)))
+    corners_m = np.round(triangles.reshape(-1, 4, 2)[:, :3].reshape(-1, 2) / PLACES_ALIKE_M) * PLACES_ALIKE_M
+    places_m, faces = np.unique(corners_m, axis=0, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    first, second, third = places_m[faces].swapaxes(0, 1)
+    turns_left = np.cross(np.pad(second - first, ((0, 0), (0, 1))), np.pad(third - first, ((0, 0), (0, 1))))[:, 2] > 0
+    faces[~turns_left] = faces[~turns_left][:, ::-1]
+    heights_m, count = ground.heights_m(places_m), len(places_m)
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    # Around the outline an edge has a triangle on one side only.
+    key, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
+    here, following = edges[~np.isin(key, back)].T
+    sides = [np.stack([here + count, following + count, following]), np.stack([here + count, following, here])]
+    return Mesh(
+        np.concatenate([
+            np.column_stack([places_m, heights_m + PAVEMENT_M]), np.column_stack([places_m, heights_m - SUNK_M])
+        ]),
+        np.concatenate([faces, faces[:, ::-1] + count, *(side.T for side in sides)]),
+    )  # fmt: skip
+
+
+def _strip(line_m: Numbers, width_m: float) -> Mesh:
+    """A closed slab of a width whose upper side has a line in its middle."""
+    along = np.gradient(line_m[:, :2], axis=0)
+    left = np.stack([-along[:, 1], along[:, 0]], axis=1) / np.linalg.norm(along, axis=1, keepdims=True)
+    right_m, left_m = line_m.copy(), line_m.copy()
+    right_m[:, :2] -= width_m / 2 * left
+    left_m[:, :2] += width_m / 2 * left
+    down = np.array([0.0, 0.0, DECK_M])
+    # Four corners at each place, around the slab: right, left, and below left and right.
+    vertices_m = np.stack([right_m, left_m, left_m - down, right_m - down], axis=1).reshape(-1, 3)
+    faces = []
+    for here, there in pairwise(range(0, len(vertices_m), 4)):
+        for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)):
+            faces += [[here + a, there + a, there + b], [here + a, there + b, here + b]]
+    last = len(vertices_m) - 4
+    faces += [[0, 1, 2], [0, 2, 3], [last + 2, last + 1, last], [last + 3, last + 2, last]]
+    return Mesh(vertices_m, np.array(faces))

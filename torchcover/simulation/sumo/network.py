@@ -25,7 +25,7 @@ KEPT_PER_BYTE = 5
 Use = Literal["road", "turn", "bay", "shoulder", "sidewalk", "crossing", "corner"]
 
 
-class Lane(NamedTuple):
+class NetworkLane(NamedTuple):
     """A lane.
 
     Args:
@@ -62,7 +62,7 @@ class Network(NamedTuple):
         left_hand: Whether people drive on the left.
     """
 
-    lanes: tuple[Lane, ...]
+    lanes: tuple[NetworkLane, ...]
     junctions: tuple[Numbers, ...]
     connections: tuple[tuple[int, int], ...]
     left_hand: bool
@@ -127,7 +127,7 @@ class _Collector:
     """Keeps what is needed of a network, as start tags come in: its file may be larger than a tree of it could be."""
 
     def __init__(self) -> None:
-        self.lanes: dict[LaneName, Lane] = {}
+        self.lanes: dict[LaneName, NetworkLane] = {}
         self.junctions: list[Numbers] = []
         self.connections: list[tuple[LaneName, LaneName]] = []
         self.left_hand = False
@@ -172,7 +172,7 @@ def _named(attributes: list[str]) -> Attributes:
     return dict(zip(attributes[::2], attributes[1::2], strict=True))
 
 
-def _lane(edge: Attributes, item: Attributes) -> Lane | None:
+def _lane(edge: Attributes, item: Attributes) -> NetworkLane | None:
     name = item.get("id", "")
     width_m, speed_mps = _number(item, "width", LANE_WIDTH_M), _number(item, "speed", 0.0)
     if not 0.0 < width_m <= MAX_WIDTH_M:
@@ -186,7 +186,7 @@ def _lane(edge: Attributes, item: Attributes) -> Lane | None:
     use = _use(edge.get("function", "normal"), item.get("type", ""), classes, barred)
     if use is None or len(line_m) < (3 if use == "corner" else 2):
         return None  # a lane without length has no surface either
-    return Lane(edge.get("id", ""), use, width_m, line_m, speed_mps, classes, barred)
+    return NetworkLane(edge.get("id", ""), use, width_m, line_m, speed_mps, classes, barred)
 
 
 def _use(function: str, kind: str, classes: frozenset[str], barred: frozenset[str]) -> Use | None:

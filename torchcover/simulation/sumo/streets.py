@@ -13,7 +13,7 @@ from pydantic import Field
 
 from torchcover.files import parse_xml
 from torchcover.simulation.documents import Document
-from torchcover.simulation.sumo.programs import run
+from torchcover.simulation.sumo.simulating import run
 from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles
 
 Numbers = NDArray[np.float64]
@@ -31,7 +31,7 @@ HILL_WAVELENGTHS_M = (250.0, 700.0)
 HILL_WAVES = 4
 
 
-class Streets(Document):
+class DrawnStreets(Document):
     """Streets and traffic that are drawn from a seed.
 
     Args:

@@ -10,18 +10,15 @@ from pydantic import Field, model_validator
 
 from torchcover.simulation.documents import PathBeside
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sumo.bays import park
-from torchcover.simulation.sumo.crowd import crowd
+from torchcover.simulation.sumo.crowd import crowd, types_of
 from torchcover.simulation.sumo.demand import EGO_TYPE, write_routes
-from torchcover.simulation.sumo.floating import Recorded, Window, read_floating, record
-from torchcover.simulation.sumo.frontage import Frontage
-from torchcover.simulation.sumo.ground import ground_of
+from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
+from torchcover.simulation.sumo.frontage import StreetScenery
+from torchcover.simulation.sumo.ground import Pavement, decks, ground_of
 from torchcover.simulation.sumo.network import Network, read_network
-from torchcover.simulation.sumo.pavement import Pavement, decks
-from torchcover.simulation.sumo.placing import Placing
+from torchcover.simulation.sumo.placing import Placing, park
 from torchcover.simulation.sumo.simulating import from_opendrive, simulate
-from torchcover.simulation.sumo.streets import Streets
-from torchcover.simulation.sumo.types import types_of
+from torchcover.simulation.sumo.streets import DrawnStreets
 from torchcover.simulation.sumo.vicinity import OFF_STREET_M, Vicinity
 from torchcover.simulation.traffic.fleet import EGO, Fleet
 from torchcover.simulation.traffic.procedural import Procedural
@@ -55,7 +52,7 @@ class Sumo(Procedural):
     net: PathBeside | None = None
     routes: tuple[PathBeside, ...] = ()
     fcd: PathBeside | None = None
-    random: Streets | None = None
+    random: DrawnStreets | None = None
     ego_id: str | None = None
     ego_type: str | None = None
     begin_s: Annotated[float, Field(ge=0.0)] | None = None
@@ -97,7 +94,7 @@ class Sumo(Procedural):
             )
         ground = ground_of(vicinity)
         pavement = Pavement(vicinity, ground)
-        frontage = Frontage(vicinity, ground, self.built_share, generator)
+        frontage = StreetScenery(vicinity, ground, self.built_share, generator)
         static = (ground.mesh(), *few(pavement.meshes(), decks(vicinity)), *frontage.meshes())
         park(vicinity, ground, fleet, self.parked_share, generator)
         placing = Placing(ground, pavement, origin_m)
@@ -125,11 +122,11 @@ class Sumo(Procedural):
         self, network_file: Path, routes: tuple[Path, ...], duration_s: float, generator: np.random.Generator
     ) -> Recorded:
         if self.fcd is not None:
-            return read_floating(self.fcd, Window(self.begin_s or -np.inf, duration_s, self.ego_id))
+            return read_floating(self.fcd, TimeWindow(self.begin_s or -np.inf, duration_s, self.ego_id))
         begin_s = WARM_UP_S if self.random is not None else USUAL_BEGIN_S if self.begin_s is None else self.begin_s
         seed, drawn = int(generator.integers(1 << 31)), self.random is not None
         pieces = simulate(network_file, routes, begin_s, seed, around=self.ego_id, drawn=drawn)
-        recorded = record(pieces, Window(begin_s, duration_s, self.ego_id))
+        recorded = record(pieces, TimeWindow(begin_s, duration_s, self.ego_id))
         if not np.isfinite(recorded.last_s):
             raise ValueError(
                 f"the simulation is over before t = {begin_s:g} s, where the run begins: everybody has arrived, "

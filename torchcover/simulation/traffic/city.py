@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic.alignment import SAMPLE_EVERY_M, Territory
 from torchcover.simulation.traffic.fleet import Fleet
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, box, few, ground, post, tree
-from torchcover.simulation.traffic.site import Bounds, Site
+from torchcover.simulation.traffic.site import Bounds, BuildingSite
 from torchcover.simulation.traffic.streets import GUTTER_M, Streets
-from torchcover.simulation.traffic.territory import SAMPLE_EVERY_M, Territory
 
 Numbers = NDArray[np.float64]
 
@@ -94,7 +94,9 @@ class City:
         Args:
             seen_m: First and last station of the main street that matter.
         """
-        site = Site(self._streets.main, self._territory, self._hills, self._streets.kerb_m + BLOCK_DEPTH_M + 10.0)
+        site = BuildingSite(
+            self._streets.main, self._territory, self._hills, self._streets.kerb_m + BLOCK_DEPTH_M + 10.0
+        )
         found = [self._built(site, self._frontages(seen_m))]
         turns = (self._streets.course.turns != 0) & self._territory.covers(self._streets.junctions_m)
         found += [self._built(*self._corner(index)) for index in np.flatnonzero(turns).tolist()]
@@ -124,7 +126,7 @@ class City:
                     turns_m = tuple((starts[k], ends[k]) for k in range(west + 1, east))
                     yield Frontage((ends[west], starts[east]), side, self._streets.kerb_m, turns_m)
 
-    def _corner(self, index: int) -> tuple[Site, list[Frontage]]:
+    def _corner(self, index: int) -> tuple[BuildingSite, list[Frontage]]:
         """The block between the two streets that meet the main street in a turn."""
         street, half_m = self._streets.crossing[index], float(self._streets.cross_kerbs_m[index])
         kerb_m = float(self._streets.cross_lanes_each_way[index]) * self._section.lane_m + GUTTER_M
@@ -134,7 +136,7 @@ class City:
             kerb_m + CORNER_DEPTH_M + 10.0,
             (middle_m - half_m - SAMPLE_EVERY_M, middle_m + half_m + SAMPLE_EVERY_M),
         )
-        site = Site(street, Territory(street, span_m), self._hills, deep_m, self._territory, turn_m)
+        site = BuildingSite(street, Territory(street, span_m), self._hills, deep_m, self._territory, turn_m)
         # As far as it is opposite of the turn, and not of another one.
         x = np.arange(*span_m, 5.0)
         foreign = ~site.is_opposite(x, np.full(len(x), side * kerb_m))
@@ -144,7 +146,7 @@ class City:
         x_m = max([span_m[0], *before.tolist()]) + 5.0, min([span_m[1], *behind.tolist()]) - 5.0
         return site, [Frontage(x_m, side, kerb_m, ((-half_m, half_m),), is_corner=True)]
 
-    def _built(self, site: Site, fronts: Iterable[Frontage]) -> Pieces:
+    def _built(self, site: BuildingSite, fronts: Iterable[Frontage]) -> Pieces:
         """What stands along a street, in the world; cars are parked there."""
         made, parked = Pieces([], [], [], []), []
         for front in fronts:
@@ -169,7 +171,7 @@ class City:
             site.bent(site.owned(made.trees), 0.0),
         )
 
-    def _facade(self, front: Frontage, site: Site) -> list[Mesh]:
+    def _facade(self, front: Frontage, site: BuildingSite) -> list[Mesh]:
         """A row of houses along the street, set back, with gaps between some."""
         buildings = []
         sidewalk = self._section.sidewalk_m
@@ -253,7 +255,7 @@ class City:
             x += length
         return cars
 
-    def _park(self, site: Site, cars: list[tuple[str, float, float, float]]) -> None:
+    def _park(self, site: BuildingSite, cars: list[tuple[str, float, float, float]]) -> None:
         if not cars:
             return
         kinds, x_m, y_m, yaw_deg = zip(*cars, strict=True)

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.traffic.alignment import Beside
-from torchcover.simulation.traffic.gates import Gate, Gates
 from torchcover.simulation.traffic.idm import Driver, Quantity, acceleration_in, advance, tightness
-from torchcover.simulation.traffic.roads import Line
-from torchcover.simulation.traffic.signals import Signals
+from torchcover.simulation.traffic.roads import Polyline
+from torchcover.simulation.traffic.signals import Gate, Gates, Signals
 
 Numbers = NDArray[np.float64]
 
@@ -45,7 +44,7 @@ class Lane:
         limits_mps: (K,) how fast its curves may be driven, at 0 m, `LIMIT_EVERY_M`, ...; any speed if not given.
     """
 
-    line: Line | Beside
+    line: Polyline | Beside
     gates: tuple[Gate, ...] = ()
     limits_mps: Numbers | None = None
 

@@ -12,7 +12,7 @@ from torchcover.simulation.traffic.fleet import EGO, Fleet
 from torchcover.simulation.traffic.flow import Agent, Lane, Simulation, check_crowd
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.procedural import MostVehicles, Procedural
-from torchcover.simulation.traffic.roads import Line
+from torchcover.simulation.traffic.roads import Polyline
 from torchcover.simulation.traffic.roadside import LANE_CENTRES_M, roadside
 from torchcover.simulation.traffic.signals import Signals
 from torchcover.simulation.world import Actor
@@ -71,7 +71,7 @@ class Highway(Procedural):
         """Way on the middle line: the faster ones from behind still start on the line."""
         return 0.4 * FASTEST_MPS * (self.duration_s + WARM_UP_S) + 2 * AHEAD_M
 
-    def _middle_line(self, generator: np.random.Generator) -> Line:
+    def _middle_line(self, generator: np.random.Generator) -> Polyline:
         length = self._ego_starts_m + 2 * FASTEST_MPS * (self.duration_s + WARM_UP_S) + 2 * AHEAD_M
         along = np.arange(0.0, length, CORNER_EVERY_M)
         amplitude, wavelength = np.deg2rad(generator.uniform(*CURVE_DEG)), generator.uniform(*WAVELENGTH_M)
@@ -79,7 +79,7 @@ class Highway(Procedural):
         steps = CORNER_EVERY_M * np.stack([np.cos(heading), np.sin(heading)], axis=1)
         points = np.cumsum(steps, axis=0)
         # World coordinates begin where the ego does.
-        return Line(points - Line(points).poses(self._ego_starts_m)[:2])
+        return Polyline(points - Polyline(points).poses(self._ego_starts_m)[:2])
 
     def _traffic(self, lanes: list[Lane], fleet: Fleet) -> list[Agent]:
         """Everybody; the ego is the first, behind a leader in its lane."""
@@ -102,12 +102,12 @@ class Highway(Procedural):
         return agents
 
 
-def _lanes(middle: Line) -> list[Lane]:
+def _lanes(middle: Polyline) -> list[Lane]:
     """Three lanes of the ego's direction from the median outwards, then three of the other; all keep to the right."""
     own = [Lane(middle.shifted(-offset)) for offset in LANE_CENTRES_M]
     return own + [Lane(middle.shifted(offset).reversed()) for offset in LANE_CENTRES_M]
 
 
-def _nearest(line: Line, position_m: Numbers) -> float:
+def _nearest(line: Polyline, position_m: Numbers) -> float:
     """Way of the corner of a line that is nearest to a position."""
     return float(line.arc_m[np.linalg.norm(line.points_m - position_m, axis=1).argmin()])

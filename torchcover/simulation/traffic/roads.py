@@ -10,7 +10,7 @@ Numbers = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class Polyline:
     """A polyline on the ground that goes on straight beyond its ends, or a loop.
 
     Args:
@@ -19,7 +19,7 @@ class Line:
             straight part.
 
     Example:
-        >>> Line.straight((0.0, 5.0), yaw_deg=90.0, length_m=100.0).poses(20.0).round(6)
+        >>> Polyline.straight((0.0, 5.0), yaw_deg=90.0, length_m=100.0).poses(20.0).round(6)
         array([ 0., 25., 90.])
     """
 
@@ -27,7 +27,7 @@ class Line:
     closed: bool = False
 
     @classmethod
-    def straight(cls, start_m: ArrayLike, yaw_deg: float, length_m: float) -> "Line":
+    def straight(cls, start_m: ArrayLike, yaw_deg: float, length_m: float) -> "Polyline":
         """A straight line from a point in a direction."""
         start, yaw = np.asarray(start_m, dtype=np.float64), np.deg2rad(yaw_deg)
         return cls(np.stack([start, start + length_m * np.array([np.cos(yaw), np.sin(yaw)])]))
@@ -64,14 +64,14 @@ class Line:
         yaw = np.rad2deg(np.interp(place, self.arc_m, self._headings))
         return np.concatenate([position, yaw[..., None]], axis=-1)
 
-    def shifted(self, left_m: float) -> "Line":
+    def shifted(self, left_m: float) -> "Polyline":
         """The line beside this one, with a way of its own."""
         normals = np.stack([-np.sin(self._headings), np.cos(self._headings)], axis=1)
-        return Line(self.points_m + left_m * normals, self.closed)
+        return Polyline(self.points_m + left_m * normals, self.closed)
 
-    def reversed(self) -> "Line":
+    def reversed(self) -> "Polyline":
         """The same line in the other direction."""
-        return Line(self.points_m[::-1], self.closed)
+        return Polyline(self.points_m[::-1], self.closed)
 
     @cached_property
     def _directions(self) -> Numbers:
@@ -85,7 +85,7 @@ class Line:
         return np.concatenate([pieces[:1], (pieces[:-1] + pieces[1:]) / 2, pieces[-1:]])
 
 
-def loop(length_m: float, width_m: float, corner_radius_m: float) -> Line:
+def loop(length_m: float, width_m: float, corner_radius_m: float) -> Polyline:
     """A rounded rectangle about the origin, run counter-clockwise from the middle of its lower side.
 
     Args:
@@ -98,4 +98,4 @@ def loop(length_m: float, width_m: float, corner_radius_m: float) -> Line:
     for quarter, (x, y) in enumerate([(across, -up), (across, up), (-across, up), (-across, -up)]):
         angle = np.linspace(quarter - 1, quarter, 17) * np.pi / 2
         points.append(np.array([x, y]) + corner_radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1))
-    return Line(np.concatenate([*points, points[0]]), closed=True)
+    return Polyline(np.concatenate([*points, points[0]]), closed=True)

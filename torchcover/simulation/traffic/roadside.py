@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.roads import Line
+from torchcover.simulation.traffic.roads import Polyline
 from torchcover.simulation.traffic.scenery import beside, box, few, ground, post, rail, tree
 
 Numbers = NDArray[np.float64]
@@ -29,7 +29,7 @@ NO_TREES_NEAR_BRIDGE_M = 25.0
 
 
 def roadside(
-    middle: Line, span_m: tuple[float, float], everybody_m: Numbers, generator: np.random.Generator
+    middle: Polyline, span_m: tuple[float, float], everybody_m: Numbers, generator: np.random.Generator
 ) -> tuple[Mesh, ...]:
     """The ground, and what stands along the part of the road that the ego gets to see.
 
@@ -54,7 +54,7 @@ def roadside(
     )
 
 
-def _rails(middle: Line, span_m: tuple[float, float]) -> list[Mesh]:
+def _rails(middle: Polyline, span_m: tuple[float, float]) -> list[Mesh]:
     places = np.arange(span_m[0], span_m[1], RAIL_PIECE_M)
     pieces = []
     for left in (-RAIL_M, -MEDIAN_RAIL_M, MEDIAN_RAIL_M, RAIL_M):
@@ -66,7 +66,7 @@ def _rails(middle: Line, span_m: tuple[float, float]) -> list[Mesh]:
     return pieces
 
 
-def _delineators(middle: Line, span_m: tuple[float, float]) -> list[Mesh]:
+def _delineators(middle: Polyline, span_m: tuple[float, float]) -> list[Mesh]:
     places = np.arange(span_m[0], span_m[1], DELINEATOR_EVERY_M)
     return [
         post(pose[:2], 0.06, 0.0, 1.0)
@@ -76,7 +76,7 @@ def _delineators(middle: Line, span_m: tuple[float, float]) -> list[Mesh]:
 
 
 def _structures(
-    middle: Line, span_m: tuple[float, float], generator: np.random.Generator
+    middle: Polyline, span_m: tuple[float, float], generator: np.random.Generator
 ) -> tuple[list[Mesh], list[float]]:
     """Sign gantries and bridges in turn over the whole road; and the places of the bridges."""
     pieces, bridges = [], []
@@ -95,7 +95,7 @@ def _structures(
     return pieces, bridges
 
 
-def _sound_walls(middle: Line, span_m: tuple[float, float], generator: np.random.Generator) -> list[Mesh]:
+def _sound_walls(middle: Polyline, span_m: tuple[float, float], generator: np.random.Generator) -> list[Mesh]:
     """Walls along parts of the road, on either side."""
     pieces = []
     for side in (-1, 1):
@@ -109,7 +109,7 @@ def _sound_walls(middle: Line, span_m: tuple[float, float], generator: np.random
 
 
 def _trees(
-    middle: Line, span_m: tuple[float, float], bridges: list[float], generator: np.random.Generator
+    middle: Polyline, span_m: tuple[float, float], bridges: list[float], generator: np.random.Generator
 ) -> list[Mesh]:
     pieces = []
     for side in (-1, 1):

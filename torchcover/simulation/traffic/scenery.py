@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.roads import Line
+from torchcover.simulation.traffic.roads import Polyline
 
 Numbers = NDArray[np.float64]
 
@@ -124,7 +124,7 @@ def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, 
     return [post(centre, 0.15, bottom_m, clear_m), prism(outlines, levels.tolist())]
 
 
-def rail(line: Line, places_m: Numbers, left_m: float, width_m: float, z_m: tuple[float, float]) -> list[Mesh]:
+def rail(line: Polyline, places_m: Numbers, left_m: float, width_m: float, z_m: tuple[float, float]) -> list[Mesh]:
     """A rail or wall along a line: one straight piece between each two places.
 
     Args:
@@ -142,7 +142,7 @@ def rail(line: Line, places_m: Numbers, left_m: float, width_m: float, z_m: tupl
     return pieces
 
 
-def beside(line: Line, places_m: ArrayLike, left_m: float) -> Numbers:
+def beside(line: Polyline, places_m: ArrayLike, left_m: float) -> Numbers:
     """(..., 3) poses x, y, yaw to the left of a line."""
     poses = line.poses(places_m)
     yaw = np.deg2rad(poses[..., 2])

@@ -7,10 +7,9 @@ from numpy.typing import NDArray
 
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.alignment import Alignment
+from torchcover.simulation.traffic.alignment import Alignment, Territory
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, slab
-from torchcover.simulation.traffic.territory import Territory
 
 Numbers = NDArray[np.float64]
 Bounds = tuple[float, float]
@@ -25,7 +24,7 @@ NARROWEST_M = 0.5
 FOOT_M = 0.5
 
 
-class Site:
+class BuildingSite:
     """The places along a street: x is a station, y how far it lies to the left, z the height above the ground.
 
     Args:

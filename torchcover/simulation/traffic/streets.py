@@ -6,12 +6,10 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.simulation.traffic.alignment import Alignment, Beside
+from torchcover.simulation.traffic.alignment import Alignment, Beside, Territory
 from torchcover.simulation.traffic.course import Course, course
 from torchcover.simulation.traffic.flow import LIMIT_EVERY_M, Lane
-from torchcover.simulation.traffic.gates import Gate
-from torchcover.simulation.traffic.signals import CROSS, MAIN, Signals
-from torchcover.simulation.traffic.territory import Territory
+from torchcover.simulation.traffic.signals import CROSS, MAIN, Gate, Signals
 
 Numbers = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.alignment import Beside
+from torchcover.simulation.traffic.alignment import Beside, Territory
 from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, come_near, ego_actor, paths
 from torchcover.simulation.traffic.city import City
 from torchcover.simulation.traffic.crossing import Footpath, step_height, walk
@@ -25,7 +25,6 @@ from torchcover.simulation.traffic.streets import (
     Streets,
     plan,
 )
-from torchcover.simulation.traffic.territory import Territory
 from torchcover.simulation.world import Actor
 
 Numbers = NDArray[np.float64]

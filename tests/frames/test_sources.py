@@ -1,0 +1,145 @@
+"""What every source of frames promises, and how a recording finds its format."""
+
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover import Scenario
+from torchcover.data import (
+    FORMATS,
+    ChosenRigs,
+    Frame,
+    FrameSource,
+    RecordedFrames,
+    SimulatedFrames,
+    collate_frames,
+    open_recording,
+)
+from torchcover.recordings.formats.folder import FolderRecording
+from torchcover.simulation import PaperReference, SurfaceReference
+
+
+def folder_of(path, places):
+    """Two frames in each of some places of a recording."""
+    for place in places:
+        (path / place).mkdir(parents=True)
+        for frame in range(2):
+            np.save(path / place / f"f{frame}.npy", np.full((3, 3), frame + 1.0, dtype=np.float32))
+    return path
+
+
+def simulated(_):
+    return SimulatedFrames("courtyard", "front_roof_32", steps=2, reference_sensor=PaperReference(16, 16))
+
+
+def recorded(path):
+    return RecordedFrames(folder_of(path, ["sensor", "reference"]))
+
+
+def recorded_rigs(path):
+    return RecordedFrames(folder_of(path, ["rigs/b", "rigs/a", "reference"]))
+
+
+def chosen(path):
+    return ChosenRigs(recorded_rigs(path), {"first": "b"})
+
+
+def by_area(_):
+    reference_sensor = SurfaceReference((((0.0, 20.0), (-5.0, 5.0)),), rays=256)
+    return SimulatedFrames("courtyard", "front_roof_32", steps=2, reference_sensor=reference_sensor)
+
+
+@pytest.mark.parametrize("make", [simulated, by_area, recorded, recorded_rigs, chosen])
+def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_path, make):
+    source = make(tmp_path)
+    assert isinstance(source, FrameSource)
+    assert len(source) == 2
+    for index in range(2):
+        frame = source[index]
+        assert frame.index == index
+        assert list(frame.clouds) == list(source.rigs)
+        assert (frame.reference_weights is not None) == source.square_metres
+        assert all(cloud.dtype == torch.float32 for cloud in (*frame.clouds.values(), frame.reference))
+    assert [frame.index for frame in source] == [frame.index for frame in source] == [0, 1]
+    with pytest.raises(IndexError):
+        source[2]
+    assert set(source.sensors) <= set(source.rigs)
+    assert set(source.description) == {"scenario", "vehicle", "frames", "seed"}
+    simulated = source.description["scenario"] is not None
+    assert {"sensor", "every_s" if simulated else "notes"} == set(source.reference_record)
+    if source.ego_outline_m is not None:
+        assert source.ego_outline_m.shape[1] == 2
+    torch.testing.assert_close(pickle.loads(pickle.dumps(source))[1].reference, source[1].reference)
+
+
+@pytest.mark.parametrize("scenario", ["courtyard", "parking"])
+def test_the_outline_of_a_simulation_is_that_of_its_ego_and_needs_no_world(monkeypatch, scenario):
+    expected = Scenario.load(scenario).world().ego.mesh.vertices_m[:, :2]
+    monkeypatch.setattr(Scenario, "world", lambda *_: pytest.fail("a world was built"))
+    outline_m = SimulatedFrames(scenario, "front_roof_32", steps=1).ego_outline_m
+    np.testing.assert_allclose(outline_m.max(axis=0), expected.max(axis=0))
+    np.testing.assert_allclose(outline_m.min(axis=0), expected.min(axis=0))
+
+
+def test_the_format_of_a_recording_is_recognised_or_named(tmp_path):
+    folder = folder_of(tmp_path / "recording", ["sensor", "reference"])
+    assert isinstance(open_recording(str(folder)), FolderRecording)
+    assert isinstance(open_recording(folder, "folder"), FolderRecording)
+    with pytest.raises(ValueError, match=r"format 'rosbag': no such format of recordings; there are .*folder"):
+        open_recording(folder, "rosbag")
+    with pytest.raises(FileNotFoundError, match="gone: no such recording"):
+        open_recording(tmp_path / "gone")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match=r"empty: a recording of no known format; known are nuscenes: v1"):
+        open_recording(tmp_path / "empty")
+
+
+def test_another_format_is_a_class_and_a_line(tmp_path, monkeypatch):
+    class Single(FolderRecording):
+        layout = "a file that ends in .one"
+
+        def __init__(self, path):
+            super().__init__(path.with_suffix(""))
+
+        @classmethod
+        def recognises(cls, path):
+            return path.suffix == ".one"
+
+    monkeypatch.setitem(FORMATS, "one", Single)
+    folder_of(tmp_path / "drive", ["sensor", "reference"])
+    (tmp_path / "drive.one").write_text("")
+    assert isinstance(open_recording(tmp_path / "drive.one"), Single)
+
+
+def test_rigs_are_chosen_in_any_order_under_any_name_with_what_belongs_to_them():
+    rigs = {"a": "front_roof_32", "b": "front_grille_128"}
+    reference_sensor = PaperReference(16, 16)
+    both = SimulatedFrames("parking", rigs=rigs, steps=1, boxes=True, reference_sensor=reference_sensor)
+    turned = ChosenRigs(both, {"second": "b", "a": "a"})
+    assert list(turned.rigs) == list(turned.sensors) == list(turned[0].clouds) == ["second", "a"]
+    assert turned.sensors["second"] == both.sensors["b"]
+    assert torch.equal(turned[0].cloud_of("second"), both[0].cloud_of("b"))
+    assert torch.equal(turned[0].reference, both[0].reference)
+    assert torch.equal(turned[0].boxes.hits["second"], both[0].boxes.hits["b"])
+    assert list(ChosenRigs(both, {"b": "b"})[0].boxes.hits) == ["b"]
+    with pytest.raises(ValueError, match="no clouds of the rig c; the frames have a, b"):
+        ChosenRigs(both, {"b": "c"})
+
+
+def test_a_batch_without_the_rig_that_is_asked_for_says_what_it_has(tmp_path):
+    batch = collate_frames([recorded_rigs(tmp_path)[0]])
+    with pytest.raises(ValueError, match="frame 'f0' has no rig 'c'; it has a, b"):
+        batch.clouds_of("c")
+
+
+def test_a_batch_has_weights_of_all_its_frames_or_of_none():
+    points, weights = torch.zeros(3, 3), torch.ones(3)
+    area = Frame({"rig": points}, points, 0, "a", reference_weights=weights)
+    none = Frame({"rig": points}, points, 0, "b")
+    assert torch.equal(collate_frames([area, area]).weights[1], weights)
+    assert collate_frames([none, none]).weights is None
+    for mixed in ([area, none], [none, area]):
+        with pytest.raises(ValueError, match=r"weights: frame 'a' has the square metres .*, and 'b' has none; batch"):
+            _ = collate_frames(mixed).weights

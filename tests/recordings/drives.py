@@ -1,0 +1,69 @@
+"""Recordings in memory, of a world that is known exactly."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from torchcover.data import Scan
+from torchcover.detection import Boxes
+from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler, transform
+
+CAR_SIZE_M = (4.0, 2.0, 1.5)
+
+
+@dataclass
+class Drive:
+    """A straight drive past a wall, behind a car that is faster. Points are those of the wall and of the car's sides.
+
+    Sensor `left` sees the wall where x is negative as seen from the vehicle, `right` all of it and the car.
+    """
+
+    steps: int = 5
+    labelled: bool = True
+    named: bool = True
+    origin_m: tuple = (0.0, 0.0, 0.0)
+    body: BoundingBox | None = None
+    sensors = ("left", "right")
+    reference_sensors = ()
+    square_metres = False
+    instants = None
+    path = Path("drive")
+
+    def __post_init__(self):
+        self.names = [f"f{step}" for step in range(self.steps)]
+        self.frames = range(self.steps)
+        self.times_s = 0.1 * np.arange(self.steps)
+        self.rigs = {"both": self.sensors}
+        x, z = np.meshgrid(np.arange(-20.0, 40.0, 0.5) + 0.01, np.arange(0.11, 3.0, 0.5))
+        self.wall_m = np.stack([x.ravel(), np.full(x.size, 5.01), z.ravel()], axis=1) + self.origin_m
+        y, z = np.meshgrid(np.arange(-0.88, 1.0, 0.2), np.arange(-0.58, 0.7, 0.2))
+        self.back_m = np.stack([np.full(y.size, -1.98), y.ravel(), z.ravel()], axis=1)  # in the frame of its box
+
+    def world_T_vehicle(self, index):
+        return rigid(rotation_from_euler(10.0 * index, 0.0, 0.0), self.origin_m + np.array([1.5 * index, 0.0, 0.0]))
+
+    def world_T_car(self, index):
+        place_m = self.origin_m + np.array([10.0 + 2.0 * index, 0.0, 0.75])
+        return rigid(rotation_from_euler(5.0 * index, 0.0, 0.0), place_m)
+
+    def vehicle_T_sensor(self, sensor):
+        return rigid(rotation_from_euler(0.0, 3.0, 0.0), [0.5, 0.3 if sensor == "left" else -0.3, 1.7])
+
+    def scan(self, sensor, index):
+        seen_m = transform(invert(self.world_T_vehicle(index)), self.wall_m)
+        if sensor == "left":
+            seen_m = seen_m[seen_m[:, 0] < 0]
+        else:
+            vehicle_T_car = invert(self.world_T_vehicle(index)) @ self.world_T_car(index)
+            seen_m = np.concatenate([seen_m, transform(vehicle_T_car, self.back_m)])
+        return Scan(transform(invert(self.vehicle_T_sensor(sensor)), seen_m), self.vehicle_T_sensor(sensor), sensor)
+
+    def boxes(self, index):
+        if not self.labelled:
+            return None
+        vehicle_T_car = invert(self.world_T_vehicle(index)) @ self.world_T_car(index)
+        yaw = np.arctan2(vehicle_T_car[1, 0], vehicle_T_car[0, 0])
+        row = torch.tensor([[*vehicle_T_car[:3, 3], *CAR_SIZE_M, yaw]], dtype=torch.float32)
+        return Boxes.from_rows(row, ids=("car",) if self.named else ("",))

@@ -1,0 +1,106 @@
+"""Every reader finds in its layout the world that was written down in it."""
+
+import json
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from tests.recordings.drives import Drive
+from tests.recordings.layouts import LAYOUTS
+from tests.recordings.test_accumulated_reference import distances_m, moving, standing
+from torchcover.data import FORMATS, AccumulatedReference, RecordedFrames, open_recording
+from torchcover.files import BadFileError
+from torchcover.geometry import invert, transform
+from torchcover.recordings.formats.kitti_files import read_timestamps
+
+
+@pytest.fixture(params=LAYOUTS)
+def layout(request):
+    return request.param
+
+
+@pytest.fixture
+def written(layout, tmp_path):
+    """A drive, and the same as its reader gives it."""
+    drive = Drive(steps=5, labelled=not layout.startswith("ros2"))  # bags have no boxes
+    return drive, open_recording(LAYOUTS[layout](drive, tmp_path))
+
+
+def test_a_layout_is_recognised(layout, written):
+    _, recording = written
+    assert isinstance(recording, FORMATS[layout.partition(" ")[0]])
+    assert len(recording.names) == 5 == len(recording.times_s)
+    assert list(recording.frames) == ([0, 2, 4] if layout == "nuscenes" else [0, 1, 2, 3, 4])
+    assert all(set(of) <= set(recording.sensors) for of in recording.rigs.values())
+
+
+def test_clouds_are_where_the_world_is(layout, written):
+    drive, recording = written
+    frames = RecordedFrames(recording, reference=AccumulatedReference(10.0, voxel_m=0.05))
+    for number, index in enumerate(recording.frames):
+        frame = frames[number]
+        wall_m, car_m = standing(drive, index), moving(drive, index)
+        assert distances_m(frame.sensor, np.concatenate([wall_m, car_m])).max() < 1e-3
+        # Moved by poses, and by boxes; without these, the car is wherever it was at another instant.
+        poses = [drive.world_T_car(k) for k in range(5) if k != index]
+        smeared_m = [transform(invert(drive.world_T_vehicle(index)) @ pose, drive.back_m) for pose in poses]
+        world_m = np.concatenate([wall_m, *([car_m] if drive.labelled else smeared_m)])
+        assert distances_m(frame.reference, world_m).max() < 2e-3
+        assert distances_m(world_m, frame.reference).max() < 0.05 * 3**0.5  # nothing is missing
+        assert frame.name == recording.names[index]
+
+
+def test_poses_and_boxes_are_those_of_the_world(layout, written):
+    drive, recording = written
+    for index in range(5):
+        moved = invert(recording.world_T_vehicle(0)) @ recording.world_T_vehicle(index)
+        np.testing.assert_allclose(moved, invert(drive.world_T_vehicle(0)) @ drive.world_T_vehicle(index), atol=1e-6)
+        if not drive.labelled:
+            assert recording.boxes(index) is None
+            continue
+        (row,) = recording.boxes(index).rows
+        between = layout == "nuscenes" and index % 2  # half-way between two headings
+        torch.testing.assert_close(row, drive.boxes(index).rows[0], atol=1e-2 if between else 1e-4, rtol=0)
+        assert recording.boxes(index).ids == recording.boxes(0).ids != ("",)
+        assert "car" in recording.boxes(index).categories[0] or "vehicle" in recording.boxes(index).categories[0]
+
+
+def test_a_recording_survives_pickle(written):
+    _, recording = written
+    copy = RecordedFrames(pickle.loads(pickle.dumps(recording)), reference=AccumulatedReference(0.5))
+    assert torch.equal(copy[1].reference, RecordedFrames(recording, reference=AccumulatedReference(0.5))[1].reference)
+
+
+def test_a_reader_reads_nothing_but_what_is_asked_for(written, monkeypatch):
+    _, recording = written
+    monkeypatch.setattr("torchcover.recordings.clouds.readers.read_cloud", lambda path: pytest.fail("a scan was read"))
+    assert recording.world_T_vehicle(1).shape == (4, 4)
+
+
+@pytest.mark.parametrize(
+    ("table", "change", "named"),
+    [
+        ("sample_data", lambda row: row.pop("timestamp"), "KeyError: 'timestamp'"),
+        ("sample_data", lambda row: row.update(ego_pose_token="gone"), "no row has the token 'gone'"),
+        ("sample_data", lambda row: row.update(filename="x/LIDAR_TOP/../../a.bin"), "which is not within it"),
+        ("ego_pose", lambda row: row.update(rotation=[0, 0, 0, 0]), "norm 0"),
+        ("sample_annotation", lambda row: row.pop("size"), "KeyError: 'size'"),
+    ],
+)
+def test_tables_that_do_not_hold_together_are_bad_files(tmp_path, table, change, named):
+    root = LAYOUTS["nuscenes"](Drive(steps=3), tmp_path)
+    path = root / "v1.0-mini" / f"{table}.json"
+    rows = json.loads(path.read_text())
+    change(rows[0])
+    path.write_text(json.dumps(rows))
+    with pytest.raises(BadFileError, match=named) as told:
+        open_recording(root).boxes(0)
+    assert str(root) in str(told.value)
+
+
+def test_a_time_zone_is_no_time_of_kitti(tmp_path):
+    (tmp_path / "timestamps.txt").write_text("2011-09-26 13:02:25+02\n")
+    with pytest.raises(BadFileError, match="lines of date and time are needed"):
+        read_timestamps(tmp_path / "timestamps.txt")

@@ -1,0 +1,173 @@
+"""What a simulated rig saw, written down and read back."""
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover import Rig
+from torchcover.data import RecordedFrames, SimulatedFrames, open_recording, write_recording
+from torchcover.geometry import rotation_from_euler, rotation_from_quaternion
+from torchcover.geometry.rigid import quaternion_from_rotation
+from torchcover.recordings.formats.kitti_files import BODY, read_calibration, read_labels
+from torchcover.recordings.recorders.kitti import NOTHING
+from torchcover.simulation import SurfaceReference
+
+PATTERN = {"channels": 8, "vertical_fov_deg": (-30, 5), "horizontal_fov_deg": 360, "columns": 60, "max_range_m": 60}
+# Not in the order of their names, and with noise that depends on their order.
+FRONT = {
+    "name": "z front",
+    "mount": {"x_m": 2.6, "z_m": 0.8, "pitch_deg": 3, "yaw_deg": 20},
+    **PATTERN,
+    "range_noise_m": 0.05,
+}
+REAR = {"name": "a rear", "mount": {"x_m": -2.6, "z_m": 0.9, "yaw_deg": 170}, **PATTERN, "dropout": 0.2}
+
+
+def simulated(*sensors, scenario="parking", steps=2, **others):
+    rig = Rig.model_validate({"name": "both", "sensors": sensors})
+    reference_sensor = SurfaceReference((((-20.0, 40.0), (-10.0, 10.0)),), rays=512)
+    others = {"boxes": True, "every_s": 45.0, "reference_sensor": reference_sensor, **others}
+    return SimulatedFrames(scenario, rig, steps=steps, seed=5, **others)
+
+
+@pytest.fixture(scope="module")
+def both():
+    return simulated(FRONT, REAR, steps=3)
+
+
+def in_order(points):
+    return points[np.lexsort(points.numpy().T)]
+
+
+def test_a_plain_folder_gives_the_frames_that_were_written(both, tmp_path):
+    write_recording(both, tmp_path)
+    again = RecordedFrames(tmp_path)
+    assert again.recording.sensors == ("a rear", "z front")
+    assert again.square_metres
+    assert len(again) == 3
+    for written, read in zip(both, again, strict=True):
+        assert len(read.sensor) == len(written.sensor) > 100
+        torch.testing.assert_close(in_order(read.sensor), in_order(written.sensor), rtol=0, atol=1e-12)
+        assert torch.equal(read.reference, written.reference)
+        assert torch.equal(read.reference_weights, written.reference_weights)
+        assert torch.equal(read.boxes.rows, written.boxes.rows)
+        assert written.boxes.velocity_mps.isfinite().all()
+        assert torch.equal(read.boxes.velocity_mps, written.boxes.velocity_mps)
+        assert torch.equal(read.boxes.drawn_points, written.boxes.drawn_points)
+        assert (read.boxes.ids, read.boxes.categories) == (written.boxes.ids, written.boxes.categories)
+        assert torch.equal(*(next(iter(frame.boxes.hits.values())) for frame in (read, written)))
+        assert read.place_in_time == written.place_in_time
+        assert sum(read.counts.values()) == 0  # nothing was lost on the way
+
+
+def test_clouds_are_in_the_frame_of_their_sensor(both, tmp_path):
+    write_recording(both, tmp_path)
+    alone = simulated(FRONT, steps=3)[0].sensor.numpy()
+    points = np.load(tmp_path / "sensors" / "z front" / "000000.npy")
+    assert len(points) == len(alone)
+    range_m = np.linalg.norm(points, axis=1)
+    elevation_deg = np.rad2deg(np.arcsin(points[:, 2] / range_m))
+    rows_deg = np.linspace(-30, 5, 8)
+    assert np.abs(elevation_deg[:, None] - rows_deg).min(axis=1).max() < 1e-3
+    np.testing.assert_allclose(range_m, np.linalg.norm(alone - [2.6, 0.0, 0.8], axis=1), rtol=1e-6)
+
+
+def test_poses_are_those_of_the_ego_and_cities_are_far_apart_in_time(both, tmp_path):
+    write_recording(both, tmp_path)
+    recording = open_recording(tmp_path)
+    for index in range(3):
+        scene, step = both.simulator.scene_of(index)
+        expected = scene.world.ego.trajectory.at(step * scene.world.time_step_s)
+        np.testing.assert_allclose(recording.world_T_vehicle(index), expected, atol=1e-12)
+    apart_s, cities = np.diff(recording.times_s), np.diff(recording.instants)
+    assert set(cities) == {0, 1}
+    np.testing.assert_allclose(apart_s, 45.0 + 1000.0 * cities)
+    body, ego = recording.body, both.scenario.ego_box()
+    assert (body.upper_m, body.lower_m[:2]) == (ego.upper_m, ego.lower_m[:2])
+
+
+@pytest.mark.parametrize("angles", [(0, 0, 0), (180, 0, 0), (33, -20, 170), (0, 90, 0), (-90, 0, 180), (1e-5, 0, 0)])
+def test_a_quaternion_is_that_of_its_rotation(angles):
+    rotation = rotation_from_euler(*map(float, angles))
+    wxyz = quaternion_from_rotation(rotation)
+    assert wxyz[0] >= 0
+    np.testing.assert_allclose(rotation_from_quaternion(wxyz), rotation, atol=1e-14)
+
+
+def test_kittis_layout_is_read_as_kittis(tmp_path):
+    frames = simulated(FRONT, steps=1)
+    write_recording(frames, tmp_path / "training", "kitti")
+    again = RecordedFrames(tmp_path)
+    assert (again.rigs, again.names) == (("kitti",), ("000000",))
+    written, read = frames[0], again[0]
+    # What is drawn in KITTI's own car the reader takes for that car.
+    points = written.sensor.numpy().astype(np.float64)
+    own = ((points > BODY.lower_m) & (points < BODY.upper_m)).all(axis=1)
+    assert read.counts["sensor_own_vehicle"] == own.sum()
+    np.testing.assert_allclose(read.sensor, points[~own], atol=1e-5)
+    np.testing.assert_allclose(read.reference, written.reference, atol=1e-5)
+    torch.testing.assert_close(read.boxes.rows[:, :6], written.boxes.rows[:, :6], rtol=0, atol=1e-4)
+    turned = read.boxes.yaw_rad - written.boxes.yaw_rad
+    assert torch.sin(turned / 2).abs().max() < 1e-5
+    assert read.boxes.categories == written.boxes.categories
+    calibration = read_calibration(tmp_path / "training" / "calib" / "000000.txt")
+    assert {"P2", "R0_rect", "Tr_velo_to_cam", "Tr_imu_to_velo"} <= calibration.keys()
+
+
+def test_labels_of_kitti_are_seen_from_its_camera(tmp_path):
+    frames = simulated(FRONT, steps=1)
+    write_recording(frames, tmp_path, "kitti")
+    labels = read_labels(tmp_path / "label_2" / "000000.txt")
+    assert len(labels) == len(frames[0].boxes) > 5
+    for (category, numbers), row in zip(labels, frames[0].boxes.rows.double().numpy(), strict=True):
+        _, _, alpha, *_, height, width, length, x, y, z, turn = numbers
+        assert category
+        np.testing.assert_allclose([length, width, height], row[3:6], atol=1e-5)
+        # The camera is 0.307 m behind the middle of the vehicle and 1.65 m high; its x points to the right, y down.
+        np.testing.assert_allclose([x, y, z], [-row[1], 1.65 - (row[2] - row[5] / 2), row[0] + 0.307], atol=1e-5)
+        np.testing.assert_allclose(np.exp(1j * alpha), np.exp(1j * (turn - np.arctan2(x, z))), atol=1e-5)
+        assert abs(alpha) <= np.pi
+
+
+def test_a_step_without_objects_has_an_empty_list_of_them(tmp_path):
+    frames = simulated(FRONT, steps=1)
+    frames.simulator.labels = lambda index: []
+    for layout in ("folder", "kitti"):
+        write_recording(frames, tmp_path / layout, layout)
+        assert len(RecordedFrames(tmp_path / layout)[0].boxes) == 0
+    assert (tmp_path / "kitti" / "label_2" / "000000.txt").read_text() == NOTHING + "\n"
+
+
+def test_without_boxes_none_are_written(tmp_path):
+    frames = simulated(FRONT, steps=1, boxes=False)
+    for layout in ("folder", "kitti"):
+        write_recording(frames, tmp_path / layout, layout)
+        assert RecordedFrames(tmp_path / layout)[0].boxes is None
+
+
+def test_what_cannot_be_written_is_refused_before_the_first_step(both, tmp_path, monkeypatch):
+    monkeypatch.setattr(both.simulator, "step", lambda index: pytest.fail("a step was simulated"))
+    with pytest.raises(ValueError, match=r"format 'bag': recordings are written as folder or kitti"):
+        write_recording(both, tmp_path, "bag")
+    with pytest.raises(ValueError, match=r"format kitti: a rig of one LiDAR is needed; both has z front, a rear"):
+        write_recording(both, tmp_path, "kitti")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match=r"not empty; a new or empty folder is needed"):
+        write_recording(both, tmp_path)
+    with pytest.raises(ValueError, match=r"file: a file; a new or empty folder is needed"):
+        write_recording(both, tmp_path / "file")
+    for name in ("a/b", "..", "", "reference"):
+        with pytest.raises(ValueError, match=rf"sensor '{name}': a recording has a folder of this name"):
+            write_recording(simulated({**FRONT, "name": name}), tmp_path / "new")
+    several = SimulatedFrames("courtyard", rigs={"a": "front_roof_32", "b": "front_roof_32"}, steps=1)
+    with pytest.raises(ValueError, match=r"a recording is of one rig; got a, b"):
+        write_recording(several, tmp_path / "new")
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_recording_that_was_cut_short_is_a_shorter_one(both, tmp_path, monkeypatch):
+    step = both.simulator.step
+    monkeypatch.setattr(both.simulator, "step", lambda index: step(index) if index < 2 else 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        write_recording(both, tmp_path)
+    assert len(RecordedFrames(tmp_path)) == 2

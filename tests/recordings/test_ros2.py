@@ -1,0 +1,323 @@
+"""Bags of ROS 2: clouds of all shapes, times of single points, trees of frames, and bags that do not hold together."""
+
+import numpy as np
+import pytest
+
+from tests.recordings import bags
+from tests.recordings.bags import T0_NS, bag, cloud, link, made, odometry, points, posed, tree
+from tests.recordings.drives import Drive
+from torchcover.data import RecordedFrames, open_recording
+from torchcover.files import BadFileError
+from torchcover.geometry import invert, rigid, rotation_from_euler, transform
+from torchcover.recordings.formats.bag import Bag
+from torchcover.recordings.formats.ros2 import Ros2
+from torchcover.recordings.in_vehicle import in_vehicle
+
+CORNERS_M = np.array([[5.0, 1.0, 0.5], [8.0, -2.0, 0.25], [-4.0, 0.5, 1.0], [6.0, 6.0, 2.0]])
+FAR_CORNERS_M = CORNERS_M + np.array([1e5, -4e5, 0.0])
+mount = rigid(rotation_from_euler(25.0, 4.0, -3.0), [1.0, 0.2, 1.6])
+
+
+def static(*links):
+    return "/tf_static", T0_NS, tree(*links)
+
+
+MOUNTED = [static(link("base_link", "lidar", mount))]
+STEP_NS = 100_000_000
+
+
+def clouds(message=None, count=2):
+    """A cloud every 0.1 s."""
+    made_of = message or (lambda time_ns: cloud(points(CORNERS_M), time_ns, "lidar"))
+    return [("/lidar", T0_NS + k * STEP_NS, made_of(T0_NS + k * STEP_NS)) for k in range(count)]
+
+
+def pose_at(seconds):
+    """Fast, and in a bend."""
+    yaw_deg = 30.0 * np.asarray(seconds)
+    flat = np.zeros_like(yaw_deg)
+    return rigid(rotation_from_euler(yaw_deg, flat, flat), np.stack([1e5 + 20.0 * seconds, flat - 4e5, flat], axis=-1))
+
+
+def driven(count=60, every_ns=10_000_000):
+    return [
+        ("/odom", T0_NS + k * every_ns, odometry(pose_at(k * every_ns * 1e-9), T0_NS + k * every_ns))
+        for k in range(count)
+    ]
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("kind", ["f4", "f8"])
+def test_a_cloud_may_have_gaps_rows_and_big_ends(tmp_path, kind, order):
+    columns = {"ring": np.arange(6, dtype="u2"), "x": np.arange(6), "y": -np.arange(6), "z": np.full(6, 0.5)}
+    columns |= {axis: columns[axis].astype(kind) for axis in "xyz"}
+    columns["y"][3] = np.nan
+    for axis in "xyz":
+        columns[axis][5] = 0.0
+
+    def organised(time_ns):
+        return cloud(columns, time_ns, "lidar", height=2, gap=3, end=5, order=order)
+
+    scan = Ros2(bag(tmp_path / "a", MOUNTED + clouds(organised))).scan("lidar", 0)
+    stored_m = np.stack([columns[axis] for axis in "xyz"], axis=1)
+    np.testing.assert_array_equal(scan.points_m, stored_m)
+    assert scan.points_m.dtype == np.dtype(kind)
+    seen = in_vehicle(scan)
+    assert seen.dropped == {"nonfinite": 1, "no_return": 1}
+    np.testing.assert_allclose(seen.points_m, transform(mount, stored_m[[0, 1, 2, 4]]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("field", "stored"),
+    [
+        ("t", lambda offset_ns, _: offset_ns.astype("u4")),
+        ("time", lambda offset_ns, _: (offset_ns * 1e-9).astype("f4")),
+        ("timestamp", lambda offset_ns, time_ns: (offset_ns + time_ns) * 1e-9),
+        ("timestamp", lambda offset_ns, time_ns: (offset_ns + time_ns).astype("f8")),
+        ("time_stamp", lambda offset_ns, _: offset_ns.astype("i4")),
+    ],
+)
+def test_points_with_times_are_moved_to_the_instant(tmp_path, field, stored):
+    world_m = transform(pose_at(0.15), np.repeat(CORNERS_M, 50, axis=0) * np.linspace(0.5, 3.0, 200)[:, None])
+    offset_ns = np.linspace(-20_000_000, 90_000_000, 200).round().astype(np.int64)
+    if field == "t":
+        offset_ns += 20_000_000
+
+    def measured(time_ns):
+        world_T_sensor = pose_at((time_ns - T0_NS + offset_ns) * 1e-9) @ mount
+        seen_m = np.einsum("nij,nj->ni", invert(world_T_sensor), np.c_[world_m, np.ones(200)])[:, :3]
+        seen_m[7] = 0.0
+        return cloud(points(seen_m, **{field: stored(offset_ns, time_ns)}), time_ns, "lidar")
+
+    recording = Ros2(bag(tmp_path / "a", MOUNTED + driven() + clouds(measured, 3)))
+    for index in range(3):
+        scan = recording.scan("lidar", index)
+        assert (scan.points_m[7] == 0).all()  # what never came back is still at the sensor
+        there_m = transform(recording.world_T_vehicle(index) @ scan.vehicle_T_sensor, scan.points_m)
+        np.testing.assert_allclose(np.delete(there_m, 7, axis=0), np.delete(world_m, 7, axis=0), atol=1e-3)
+
+
+def test_clouds_of_other_times_are_moved_to_the_instant(tmp_path):
+    def late(time_ns):
+        world_T_sensor = pose_at((time_ns - T0_NS) * 1e-9 + 0.04) @ mount
+        return cloud(points(transform(invert(world_T_sensor), FAR_CORNERS_M)), time_ns + 40_000_000, "lidar")
+
+    second = [("/b", time_ns + 40_000_000, message) for _, time_ns, message in clouds(late, 4)]
+    recording = Ros2(bag(tmp_path / "a", MOUNTED + driven() + clouds(count=3) + second))
+    assert recording.sensors == ("lidar", "b")
+    frame = RecordedFrames(recording)[2]
+    others_m = transform(invert(recording.world_T_vehicle(2)), FAR_CORNERS_M)
+    np.testing.assert_allclose(frame.sensor.numpy()[4:], others_m, atol=1e-3)
+    np.testing.assert_allclose(recording.world_T_vehicle(2), pose_at(0.2), atol=1e-9)
+    chosen = RecordedFrames(recording, rigs={"b": ("b",)})[2]
+    np.testing.assert_array_equal(chosen.sensor, frame.sensor[4:])
+
+
+def test_odometry_may_be_that_of_another_frame(tmp_path):
+    vehicle_T_imu = rigid(rotation_from_euler(90.0, 0.0, 0.0), [-1.0, 0.5, 0.3])
+    mounted = [static(link("base_link", "/lidar", mount), link("base_link", "imu", vehicle_T_imu))]
+    measured = [
+        ("/odom", T0_NS + k * STEP_NS, odometry(pose_at(0.1 * k) @ vehicle_T_imu, T0_NS + k * STEP_NS, "imu"))
+        for k in range(2)
+    ]
+    recording = Ros2(bag(tmp_path / "a", mounted + measured + clouds()))
+    np.testing.assert_allclose(recording.world_T_vehicle(1), pose_at(0.1), atol=1e-9)
+
+
+def test_a_tree_leads_to_the_frame_that_never_jumps(tmp_path):
+    jump = [link("map", "odom", pose_at(7.0), T0_NS + k * STEP_NS) for k in range(2)]
+    here = [link("odom", "footprint", pose_at(0.1 * k), T0_NS + k * STEP_NS) for k in range(2)]
+    raised = rigid(np.eye(3), [0.0, 0.0, 0.3])
+    mounted = [static(link("base_link", "lidar", mount), link("footprint", "base_link", raised))]
+    moved = [("/tf", T0_NS + k * STEP_NS, tree(jump[k], here[k])) for k in range(2)]
+    recording = Ros2(bag(tmp_path / "a", mounted + moved + clouds()))
+    np.testing.assert_allclose(recording.world_T_vehicle(1), pose_at(0.1) @ raised, atol=1e-9)
+
+
+def test_scans_beyond_the_poses_are_left_out(tmp_path):
+    late = [(topic, time_ns + 5 * STEP_NS, message) for topic, time_ns, message in driven(30)]
+    late = [("/odom", time_ns, odometry(pose_at(0.0), time_ns)) for _, time_ns, _ in late]
+    recording = Ros2(bag(tmp_path / "a", MOUNTED + late + clouds(count=20)))
+    # 0.5 to 0.79 s, and what a vehicle does within 0.15 s more.
+    assert recording.times_s.tolist() == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4, 0.5])
+    assert recording.names[0] == str(T0_NS + 4 * STEP_NS)
+
+
+def test_what_was_chosen_is_said(tmp_path):
+    chart = [("/chart", T0_NS, cloud(points(CORNERS_M), T0_NS, "map"))]
+    lost = [("/b", time_ns, cloud(points(CORNERS_M), time_ns, "nowhere")) for _, time_ns, _ in clouds(count=5)]
+    goal = [("/goal", time_ns, posed(np.eye(4), time_ns)) for _, time_ns, _ in clouds(count=5)]
+    path = bag(tmp_path / "a", MOUNTED + driven() + chart + lost + goal + clouds(count=5))
+    with pytest.warns(UserWarning, match="left out|taken") as told:
+        recording = open_recording(path)
+    assert recording.sensors == ("lidar",)
+    assert [str(one.message).removeprefix(f"{path}: ") for one in told] == [
+        "left out, for they come so rarely: /chart",
+        "left out, for no static transform links to base_link the frame of /b (nowhere)",
+        "poses are taken from /odom (odometry of base_link), not from /goal (poses)",
+    ]
+    with pytest.warns(UserWarning, match="lidar is taken for the vehicle's frame"):
+        recording = Ros2(bag(tmp_path / "b", MOUNTED + clouds()), vehicle_frame="lidar")
+    np.testing.assert_allclose(recording.scan("lidar", 0).vehicle_T_sensor, np.eye(4), atol=1e-12)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_to_open_a_bag_reads_few_clouds(tmp_path, monkeypatch, storage):
+    path = bag(tmp_path / "a", MOUNTED + driven(250) + clouds(count=200), storage)
+    read = []
+    messages = Bag.messages
+
+    def counted(self, topic, *times):
+        found = messages(self, topic, *times)
+        read.extend([topic] * len(found))
+        return found
+
+    monkeypatch.setattr(Bag, "messages", counted)
+    recording = Ros2(path)
+    assert len(recording.names) == 27  # 2.49 s of poses
+    # The first for its frame; those within 1 s of the first pose and of the last for their stamps.
+    assert read.count("/lidar") <= 1 + 11 + 20
+    assert len(Ros2(next(path.glob("a.*"))).names) == 27  # the file alone
+
+
+def other(path, **changes):
+    """A bag whose clouds have other sizes, or other fields."""
+
+    def changed(time_ns):
+        message = cloud(points(CORNERS_M), time_ns, "lidar")
+        for name, value in changes.items():
+            setattr(message, name, value)
+        return message
+
+    return bag(path, MOUNTED + clouds(changed))
+
+
+def fields(*described):
+    return [made("sensor_msgs/msg/PointField", *one, 1) for one in described]
+
+
+XYZ = (("x", 0, 7), ("y", 4, 7))
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"height": 2}, "2 rows of 48 bytes .4 points of 12. do not fit the 48 bytes"),
+        ({"height": 2**31, "row_step": 2**31}, "do not fit the 48 bytes"),
+        ({"width": 5}, "do not fit"),
+        ({"width": 2**31, "row_step": 48, "point_step": 0}, "within the 0 bytes of a point"),
+        ({"data": np.zeros(47, np.uint8)}, "do not fit the 47 bytes"),
+        ({"fields": fields(*XYZ, ("z", 9, 7))}, "within the 12 bytes of a point are needed; one ends at byte 13"),
+        (
+            {"fields": fields(*XYZ, ("z", 8, 5))},
+            r"x, y, z of float32 or float64 are needed; got x \(f4\), y \(f4\), z \(i4\)",
+        ),
+        ({"fields": fields(*XYZ)}, "fields x, y, z of float32"),
+        ({"fields": []}, "got none"),
+        ({"fields": fields(*XYZ, ("z", 8, 7), ("t", 8, 99))}, "within the 12 bytes"),
+        (
+            {"fields": fields(*XYZ, ("z", 8, 7), ("time", 0, 7))},
+            "time: times of points within 1 s of the cloud are needed; got 5",
+        ),
+    ],
+)
+def test_clouds_that_lie_about_themselves(tmp_path, changes, told):
+    recording = Ros2(other(tmp_path / "a", **changes))
+    with pytest.raises(BadFileError, match=told):
+        recording.scan("lidar", 0)
+
+
+LOOP = link("a", "lidar", mount), link("b", "a", mount), link("a", "b", mount)
+RING = link("b", "base_link", mount), link("base_link", "b", mount)
+OTHER = link("base_link", "other", mount)
+OTHER_CLOCK = [("/odom", T0_NS + k, odometry(mount, 5 * 10**9 + k)) for k in range(3)]
+NOT_FINITE = rigid(np.eye(3), [0.0, np.nan, 0.0])
+
+
+@pytest.mark.parametrize(
+    ("messages", "told"),
+    [
+        (MOUNTED, "PointCloud2 with messages is needed; there are /tf_static .tf2_msgs/msg/TFMessage."),
+        (clouds(), "the frame base_link or base_footprint of the vehicle is needed; there are lidar"),
+        ([static(OTHER), *clouds()], r"of /lidar \(lidar\); static ones are of base_link, other"),
+        ([static(*LOOP), *clouds()], "lidar -> a -> b -> a are mounted on each other in a loop"),
+        ([static(link("base_link", "lidar", NOT_FINITE)), *clouds()], "lidar: three finite coordinates are needed"),
+        ([*MOUNTED, *clouds(), ("/odom", T0_NS, odometry(NOT_FINITE, T0_NS))], "/odom: three finite"),
+        ([*MOUNTED, *clouds(), ("/odom", T0_NS, odometry(mount, T0_NS, "wheel"))], r"odometry /odom \(wheel\)"),
+        ([*MOUNTED, *clouds(), ("/tf", T0_NS, tree(*RING))], "/tf: the frames base_link -> b -> base_link are a loop"),
+        (
+            [*MOUNTED, *clouds(), *OTHER_CLOCK],
+            "no scan lies between the first and the last pose of /odom .* clocks match",
+        ),
+        ([*MOUNTED, *clouds(), clouds()[1]], "times have to ascend"),
+    ],
+)
+def test_bags_that_do_not_hold_together(tmp_path, messages, told):
+    path = bag(tmp_path / "a", messages)
+    with pytest.raises(BadFileError, match=told) as error:
+        Ros2(path)
+    assert str(error.value).startswith(f"{path}: ")
+    assert str(error.value).count(str(path)) == 1
+
+
+def test_a_gap_in_the_poses_is_not_bridged(tmp_path):
+    hole = [
+        *driven(2),
+        *[("/odom", T0_NS + 15 * STEP_NS + k, odometry(mount, T0_NS + 15 * STEP_NS + k)) for k in range(2)],
+    ]
+    recording = Ros2(bag(tmp_path / "a", MOUNTED + hole + clouds(count=15)))
+    recording.scan("lidar", 1)
+    with pytest.raises(BadFileError, match=r"the pose nearest to the time .* is 0.590 s off"):
+        recording.scan("lidar", 6)
+
+
+def test_a_sensor_that_pauses_is_missing_there(tmp_path):
+    paused = [
+        ("/b", time_ns, message)
+        for _, time_ns, message in clouds(count=12)
+        if not 3 <= (time_ns - T0_NS) // STEP_NS <= 4
+    ]
+    recording = Ros2(bag(tmp_path / "a", MOUNTED + clouds(count=9) + paused))
+    recording.scan("b", 2)
+    with pytest.raises(BadFileError, match=r"the scan of b nearest to .* is 0.100 s off"):
+        recording.scan("b", 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (("relative_file_paths:", "relative_file_path:"), "relative_file_paths is needed"),
+        (("- a.mcap", "- ../a.mcap"), "beside it are needed; got '../a.mcap'"),
+        (("- a.mcap", "- a.mcap.zstd"), "names of .mcap files beside it are needed"),
+        (("compression_mode: ''", "compression_mode: file"), "use `ros2 bag convert`"),
+        (("storage_identifier: mcap", "storage_identifier: rosbag_v2"), "got 'rosbag_v2'"),
+    ],
+)
+def test_metadata_that_cannot_be(tmp_path, change, told):
+    path = bag(tmp_path / "a", MOUNTED + clouds())
+    text = (path / "metadata.yaml").read_text()
+    assert change[0] in text
+    (path / "metadata.yaml").write_text(text.replace(*change))
+    with pytest.raises(BadFileError, match=told):
+        Ros2(path)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_bag_that_was_cut_off_or_is_gone(tmp_path, storage):
+    path = bag(tmp_path / "a", MOUNTED + clouds(), storage)
+    (file,) = path.glob("a.*")
+    file.write_bytes(file.read_bytes()[: file.stat().st_size // 2])
+    with pytest.raises(BadFileError, match="damaged"):
+        open_recording(path)
+    file.unlink()
+    with pytest.raises(FileNotFoundError, match=f"{file.name}: no such file; .*metadata.yaml names it"):
+        Ros2(path)
+
+
+def test_an_index_that_lies_is_found_out(tmp_path):
+    path = next(bags.ros2(Drive(steps=2), tmp_path).glob("*.mcap"))
+    data = path.read_bytes()
+    count = data.rindex((2).to_bytes(8, "little"))
+    path.write_bytes(data[:count] + (3).to_bytes(8, "little") + data[count + 8 :])
+    with pytest.raises(BadFileError, match="no index of its messages, or only of some"):
+        Ros2(path)

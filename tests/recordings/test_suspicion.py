@@ -1,0 +1,163 @@
+"""Each suspicion fires on its mistake, and none on what is as it should be."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import torchcover
+from tests.recordings.drives import Drive
+from torchcover.data import AccumulatedReference, RecordedFrames, Scan
+from torchcover.detection import Boxes
+from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler, transform
+from torchcover.recordings.suspicion import ground_height_m
+
+MOUNT = rigid(rotation_from_euler(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
+SIZE_M = (4.0, 1.8, 1.5)
+
+
+@dataclass
+class Street:
+    """A LiDAR above a street: ground with a slope and noise, walls, cars on its right, in the frame of the sensor.
+
+    `reference` has its own draw of the same surfaces. The rest are mistakes.
+    """
+
+    mount: np.ndarray = None
+    flipped: bool = False
+    same: bool = False
+    halved: bool = False
+    both_sides: bool = False
+    turned_deg: float = 0.0
+    slope: tuple = (0.03, -0.02)
+    step_s: float = 0.1
+    steps: int = 6
+    body: BoundingBox | None = None
+    bumps_m: float = 0.03
+    path = Path("street")
+    sensors = ("lidar",)
+    reference_sensors = ("reference",)
+    square_metres = False
+    instants = None
+
+    def __post_init__(self):
+        self.names = [f"f{step}" for step in range(self.steps)]
+        self.frames = range(self.steps)
+        self.times_s = self.step_s * np.arange(self.steps)
+        self.rigs = {"one": ("lidar",)}
+
+    def scan(self, sensor, index):
+        seed = index if self.same else [index, sensor == "lidar"]
+        generator = np.random.default_rng(seed)
+        x, y = generator.uniform(-40, 40, (2, 20_000))
+        z = self.slope[0] * x + self.slope[1] * y + generator.normal(0, self.bumps_m, len(x))
+        ground_m = np.stack([x, y, z], axis=1)
+        wall_m = np.stack([x, np.where(y > 0, 9.0, -12.0), generator.uniform(0, 8, len(x))], axis=1)[:4000]
+        beneath_m = generator.uniform([-20, -20, -6], [20, 20, -2], (60, 3))  # what a mirror shows
+        sides_m = [
+            (generator.uniform(-0.5, 0.5, (40, 3)) * [1, 0, 0.9] + [0, 0.5, 0]) * SIZE_M + row[:3].numpy()
+            for row in self.boxes(index).rows
+        ]
+        points_m = np.concatenate([ground_m, wall_m, beneath_m, *sides_m])
+        if self.halved and sensor == "lidar":
+            points_m = points_m[::2]  # every second laser
+        if self.flipped:
+            points_m = points_m * [1.0, -1.0, 1.0]
+        return Scan(transform(invert(MOUNT), points_m), MOUNT if self.mount is None else self.mount, sensor)
+
+    def world_T_vehicle(self, index):
+        return rigid(rotation_from_euler(30.0 + 4.0 * index + self.turned_deg, 0.0, 0.0), self._place_m(index))
+
+    def _place_m(self, index):
+        yaw = np.deg2rad(30.0 + 4.0 * np.arange(index))
+        return np.array([513_248.0 + 1.5 * np.cos(yaw).sum(), 5_403_655.0 + 1.5 * np.sin(yaw).sum(), 260.0])
+
+    def boxes(self, index):
+        x, y = torch.tensor([-15.0, -5.0, 8.0, 16.0]), torch.full((4,), -5.0)
+        if self.both_sides:  # cars on both sides
+            x, y = x.repeat(2), torch.cat([y, -y])
+        z = self.slope[0] * x + self.slope[1] * y + SIZE_M[2] / 2
+        size_m = torch.tensor(SIZE_M).expand(len(x), 3)
+        return Boxes.from_rows(torch.column_stack([x, y, z, size_m, torch.zeros(len(x))]))
+
+
+def doubts(street, **options):
+    return RecordedFrames(street, **options).doubts(None)
+
+
+def test_nothing_is_wrong_with_what_is_right():
+    assert doubts(Street()) == []
+    assert doubts(Street(), reference=AccumulatedReference(1.0)) == []
+    assert doubts(Street(slope=(0.12, 0.0))) == []  # a hill
+    assert doubts(Street(steps=1)) == []
+    assert doubts(Street(both_sides=True)) == doubts(Street(both_sides=True, flipped=True)) == []  # none can tell
+    assert doubts(Street(same=True, halved=True)) == []  # half of the lasers against all
+    assert doubts(Street(turned_deg=180.0)) == []  # it reverses
+    for drive in (
+        Drive(),
+        Drive(steps=8),
+        Drive(named=False),
+        Drive(labelled=False),
+        Drive(origin_m=(5e5, 5e6, 100.0)),
+    ):
+        assert doubts(drive, reference=AccumulatedReference(10.0)) == []
+
+
+@pytest.mark.parametrize(
+    ("mistake", "says"),
+    [
+        (
+            {"mount": np.eye(4)},
+            r"ground lies at z = -1.[78] m \(lidar\), -1.[78] m \(reference\), not near 0: .*vehicle_T",
+        ),
+        ({"mount": rigid(np.eye(3), [0.0, 0.0, 3.4])}, r"ground lies at z = \+1.[67] m \(lidar\), \+1.[67] m \(ref"),
+        ({"flipped": True}, r"20 of 20 labelled boxes have points of (lidar|reference) only if its left and right"),
+        ({"same": True}, r"points of the reference are those of the rig one itself.*--reference accumulated"),
+        ({"turned_deg": 90.0}, r"drives sideways, -90 degrees from its x axis"),
+        ({"turned_deg": -90.0}, r"drives sideways, \+90 degrees from its x axis"),
+        ({"step_s": 1e-4}, r"drives at 15,000 m/s: give both from the same clock"),
+    ],
+)
+def test_each_mistake_is_named(mistake, says):
+    found = doubts(Street(**mistake))
+    assert found
+    for doubt in found:  # and nothing else is
+        assert doubt.startswith("street: ")
+        assert re.search(says, doubt)
+
+
+def test_a_window_that_holds_one_instant():
+    (doubt,) = doubts(Street(step_s=100.0), reference=AccumulatedReference(2.0))
+    assert "instants are 100 s apart, and a window of 2 s" in doubt
+
+
+def test_ground_is_a_plane_of_lowest_points():
+    generator = np.random.default_rng(0)
+    x, y = generator.uniform(-20, 20, (2, 5000))
+    flat_m = np.stack([x, y, np.full(5000, -1.73)], axis=1)
+    assert ground_height_m(flat_m) == pytest.approx(-1.73)
+    assert ground_height_m(transform(rigid(np.eye(3), [0.0, 0.0, 1.73]), flat_m)) == pytest.approx(0.0, abs=1e-9)
+    assert ground_height_m(flat_m[:90]) is None  # too few
+    assert ground_height_m(np.stack([x, y, generator.uniform(2, 12, 5000)], axis=1)) is None  # roofs and trees
+    ahead_m = flat_m[(x > 5) & (np.abs(y) < 0.6 * x)]
+    ahead_m[:, 2] = 0.15 * np.maximum(ahead_m[:, 0] - 10.0, 0.0)  # where a hill begins
+    assert abs(ground_height_m(ahead_m)) < 0.5
+
+
+def test_a_frame_that_cannot_be_read_is_not_looked_at():
+    street = Street(mount=np.eye(4))
+    scan = street.scan
+    street.scan = lambda sensor, index: scan(sensor, index) if index == 5 else Path("gone").read_bytes()
+    assert len(doubts(street)) == 1
+    street.scan = lambda sensor, index: Path("gone").read_bytes()
+    assert doubts(street) == []
+
+
+def test_a_run_warns_before_it_begins():
+    frames = RecordedFrames(Street(mount=np.eye(4), steps=1))
+    with pytest.warns(UserWarning, match=r"^street: the ground lies at z = -1.[78] m \(lidar\)") as caught:
+        torchcover.evaluate(frames=frames, cell_m=8.0)
+    assert [warning.filename for warning in caught] == [__file__]

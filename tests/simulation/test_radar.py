@@ -1,0 +1,175 @@
+"""Laws of the radar: cells, one point in each, on a true surface, whatever the number of rays in it."""
+
+import numpy as np
+import pytest
+
+from torchcover import Rig
+from torchcover.simulation import Draws, PaperReference, Radar, RayHits, Scenario, Simulator
+
+KEYS = {
+    "name": "front", "mount": {"x_m": 2.1, "z_m": 1.0}, "horizontal_fov_deg": 60, "vertical_fov_deg": [-10, 10],
+    "azimuth_cell_deg": 5, "range_cell_m": 0.5, "max_range_m": 40,
+}  # fmt: skip
+EGO = {"shape": {"type": "box", "size_m": [4.0, 2.0, 2.0]}}
+# Its face is at x = 22.1, which is 20 m ahead.
+WALL = {"name": "wall", "shape": {"type": "box", "size_m": [1, 200, 60]}, "poses": [{"x_m": 22.6, "z_m": -20}]}
+
+
+def radar(**keys):
+    return Radar.model_validate(KEYS | keys)
+
+
+def points_of(sensor, *bodies):
+    """What it sees, with the radar as the origin."""
+    scenario = Scenario.model_validate({"name": "s", "ego": EGO, "bodies": [WALL, *bodies]})
+    rig = Rig(name="r", sensors=(sensor,))
+    [scan] = Simulator(scenario, {"r": rig}, PaperReference(2, 2)).scans(0)["r"]
+    return scan.points.astype(np.float64) - [2.1, 0.0, 1.0]
+
+
+def cells_of(sensor, points_m):
+    """(N, 2) the cells of azimuth and of range that points lie in."""
+    azimuth_deg = np.rad2deg(np.arctan2(points_m[:, 1], points_m[:, 0]))
+    across = (azimuth_deg + sensor.horizontal_fov_deg / 2) / sensor.horizontal_fov_deg * sensor.azimuth_cells
+    along = np.linalg.norm(points_m, axis=1) / sensor.range_cell_m
+    return np.floor(np.column_stack([across, along]) + 1e-6).astype(int)
+
+
+def by_cell(sensor, *bodies):
+    """The point of each cell that has one."""
+    points_m = points_of(sensor, *bodies)
+    return dict(zip(map(tuple, cells_of(sensor, points_m).tolist()), points_m, strict=True))
+
+
+def test_a_flat_wall_gives_one_point_a_cell_of_azimuth_at_its_range():
+    """Narrow: no ray is longer than 20 m / cos(4 deg) / cos(1 deg), so that all end in the cell from 20 to 21 m."""
+    sensor = radar(horizontal_fov_deg=8, azimuth_cell_deg=2, vertical_fov_deg=[-1, 1], range_cell_m=1.0)
+    points_m = points_of(sensor)
+    assert cells_of(sensor, points_m).tolist() == [[0, 20], [1, 20], [2, 20], [3, 20]]
+    np.testing.assert_allclose(points_m[:, 0], 20.0, atol=1e-5)
+
+
+def test_a_flat_wall_fills_the_cells_that_it_passes_through():
+    """Wide: of azimuth a, the wall is 20 m / cos(a) away on the horizon, and a little more above and below it."""
+    sensor = radar(vertical_fov_deg=[0, 0], ray_spacing_m=0.02)
+    points_m = points_of(sensor)
+    edges = np.deg2rad(np.linspace(-30, 30, 13))
+    low, high = np.sort(20 / np.cos([edges[:-1], edges[1:]]), axis=0)
+    nearest = np.floor(low / 0.5)  # of the two cells about the middle, 20 m is the low one
+    expected = {(k, n) for k in range(12) for n in np.arange(nearest[k], np.floor(high[k] / 0.5) + 1).astype(int)}
+    assert set(map(tuple, cells_of(sensor, points_m).tolist())) == expected
+    assert len(points_m) == len(expected)
+
+
+def test_there_are_no_more_points_than_cells_and_all_lie_on_what_is_hit():
+    post = {"name": "post", "shape": {"type": "box", "size_m": [0.5, 0.5, 4]}, "poses": [{"x_m": 12.35, "z_m": -1}]}
+    sensor = radar(min_range_m=2.0)
+    points_m = points_of(sensor, post)
+    cells = cells_of(sensor, points_m)
+    assert len(np.unique(cells, axis=0)) == len(points_m) <= sensor.azimuth_cells * sensor.range_cells
+    on_wall, on_post = np.abs(points_m[:, 0] - 20) < 1e-4, np.abs(points_m[:, 0] - 10) < 1e-4
+    assert (on_wall | on_post).all()
+    assert on_post.any()
+
+
+def test_a_point_is_the_hit_in_the_middle_of_its_cell():
+    """Against a slow twin, at random ranges in several places."""
+    sensor, random = radar(min_range_m=3.0, range_cell_m=2.0), np.random.default_rng(3)
+    rays = sensor.rays
+    beams = sensor.beams().ravel()
+    ray, place = np.tile(np.arange(rays), 2), np.repeat([0, 1], rays)
+    there = random.random(2 * rays) < 0.4
+    hits = RayHits(ray[there], random.uniform(2, 12, there.sum()).astype(np.float32), np.arange(rays), place[there])
+    cells = {}
+    for number, (one, range_m, where) in enumerate(zip(hits.ray, hits.range_m, hits.place, strict=True)):
+        if range_m >= 3.0:
+            cells.setdefault((where, beams[one], int(range_m / 2.0)), []).append((range_m, number))
+    expected = sorted(sorted(cell)[(len(cell) - 1) // 2][1] for cell in cells.values())
+    assert sensor.measure(hits, Draws(None)).hit.tolist() == expected
+    assert max(map(len, cells.values())) > 5
+
+
+def test_more_rays_in_a_cell_find_the_same_surfaces():
+    """A box before a wall: no more cells come, and the ranges of their points come to rest."""
+    box = {"name": "box", "shape": {"type": "box", "size_m": [2, 2, 3]}, "poses": [{"x_m": 12.0, "y_m": 2.0}]}
+    finest = by_cell(radar(ray_spacing_m=0.05), box)
+    missing, moved_m = [], []
+    for spacing_m in (2.0, 0.5, 0.1):
+        found = by_cell(radar(ray_spacing_m=spacing_m), box)
+        both = sorted(found.keys() & finest.keys())
+        missing.append(len(finest) - len(both))
+        moved_m.append(np.mean([abs(np.linalg.norm(found[cell]) - np.linalg.norm(finest[cell])) for cell in both]))
+    assert missing[0] > missing[1] > missing[2]
+    assert missing[2] < 0.05 * len(finest)
+    assert moved_m[0] > moved_m[1] > moved_m[2]
+    assert moved_m[2] < 0.01
+
+
+def test_the_road_in_front_of_a_body_does_not_take_its_points():
+    """Where both are in one cell, the point lies on what fills more of its view."""
+    floor = {"name": "floor", "shape": {"type": "plane", "size_m": [200, 200]}}
+    body = {"name": "body", "shape": {"type": "box", "size_m": [0.4, 3, 1.8]}, "poses": [{"x_m": 7.55}]}
+    sensor = radar(horizontal_fov_deg=10, azimuth_cell_deg=5, vertical_fov_deg=[-15, 15])
+    points_m = points_of(sensor, floor, body)
+    # Its face is 5.25 m ahead, the floor before it from 5.0 m on in the same cell.
+    in_its_cell = points_m[cells_of(sensor, points_m)[:, 1] == 10]
+    assert len(in_its_cell) == 2
+    np.testing.assert_allclose(in_its_cell[:, 0], 5.25, atol=1e-4)
+
+
+def test_points_drop_out_and_err_a_cell_at_a_time():
+    exact = points_of(radar())
+    noisy = points_of(radar(range_noise_m=0.05))
+    error_m = np.linalg.norm(noisy, axis=1) - np.linalg.norm(exact, axis=1)
+    np.testing.assert_allclose(np.cross(noisy, exact), 0.0, atol=1e-4)
+    assert 0.035 < error_m.std() < 0.07
+    left = points_of(radar(dropout=0.5))
+    assert 0.3 < len(left) / len(exact) < 0.7
+    assert set(map(tuple, left)) < set(map(tuple, exact))
+
+
+def test_rays_fill_the_opening_and_are_as_close_as_asked_for():
+    sensor = radar(azimuth_cell_deg=7.0)
+    assert sensor.azimuth_cells == 9  # of 6.67 degrees: none is wider
+    x, y, z = sensor.directions()
+    assert sensor.rays == x.size == sensor.beams().size
+    azimuth_deg, elevation_deg = np.rad2deg(np.arctan2(y, x)), np.rad2deg(np.arcsin(z))
+    for angle_deg, axis, opening_deg in ((azimuth_deg, 1, 60), (elevation_deg, 0, 20)):
+        step_deg = np.diff(angle_deg, axis=axis)
+        assert step_deg.min() > 0
+        assert step_deg.max() <= np.rad2deg(0.5 / 40) + 1e-9
+        np.testing.assert_allclose(angle_deg.max() - angle_deg.min() + step_deg.mean(), opening_deg, rtol=1e-6)
+    across = np.floor((azimuth_deg + 30) / 60 * 9).astype(int)
+    np.testing.assert_array_equal(across, sensor.beams())
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        (
+            {"azimuth_cell_deg": 61.0},
+            r"azimuth_cell_deg: a cell within .* horizontal_fov_deg \(60\) wide; got 61",
+        ),
+        ({"range_cell_m": 41.0}, r"range_cell_m: a cell within .* max_range_m \(40\) wide; got 41"),
+        ({"azimuth_cell_deg": 0.0}, r"azimuth_cell_deg\n"),
+        ({"range_cell_m": -1.0}, r"range_cell_m\n"),
+        ({"ray_spacing_m": 0.0}, r"ray_spacing_m\n"),
+        ({"horizontal_fov_deg": 361.0}, r"horizontal_fov_deg\n"),
+        ({"vertical_fov_deg": [5, -5]}, r"vertical_fov_deg: the lower elevation comes first; got \(5.0, -5.0\)"),
+        ({"min_range_m": 40.0}, r"min_range_m \(40.0\) must be below max_range_m \(40.0\)"),
+    ],
+)
+def test_a_radar_that_cannot_be_is_refused_with_its_key(keys, message):
+    with pytest.raises(ValueError, match=message):
+        radar(**keys)
+
+
+def test_the_radars_of_nuscenes_share_the_range_and_look_all_around():
+    sensors = Rig.load("nuscenes_radars").sensors
+    assert len(sensors) == 10
+    for near, far in zip(sensors[::2], sensors[1::2], strict=True):
+        assert far.name == f"{near.name}_far"
+        assert (near.mount, near.max_range_m) == (far.mount, far.min_range_m)
+    yaw_deg = np.sort([sensor.mount.yaw_deg % 360 for sensor in sensors[::2]])
+    gaps = np.diff([*yaw_deg, yaw_deg[0] + 360])
+    assert np.sort(gaps)[-1] < 95

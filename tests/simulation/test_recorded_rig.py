@@ -1,0 +1,274 @@
+"""The rig of a recording: how its LiDARs scan, where they and its cameras are."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from tests.recordings import bags, layouts
+from tests.recordings.drives import Drive
+from torchcover.data import open_recording, rig_document
+from torchcover.files import BadFileError
+from torchcover.geometry import invert, rigid, rotation_from_euler, transform
+from torchcover.recordings.formats import argoverse2, kitti_files, nuscenes
+from torchcover.simulation import Lidar, Rig, builtin_names
+from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
+from torchcover.simulation.scan_estimate import estimate_scan
+
+
+def in_a_room(lidar, seed, dropout=0.2):
+    """What a LiDAR sees in a room, where no ray is lost but by chance: points in its frame."""
+    directions = lidar.directions()
+    random = np.random.default_rng(seed)
+    size_m = np.array([30.0, 12.0, 8.0])[:, None, None]
+    range_m = (size_m / np.maximum(np.abs(directions), 1e-12)).min(axis=0)
+    range_m += random.normal(scale=0.02, size=range_m.shape)
+    return (range_m * directions)[:, random.random(range_m.shape) > dropout].T
+
+
+@pytest.mark.parametrize("model", builtin_names("lidars"))
+def test_the_scan_of_every_model_is_found(model):
+    lidar = Lidar.model_validate({"name": "a", "model": model, "columns": 240})
+    found = estimate_scan([in_a_room(lidar, seed) for seed in range(2)])
+    np.testing.assert_allclose(found.elevations_deg, np.sort(lidar.rows_deg())[::-1], atol=1e-9)
+    step_deg = lidar.horizontal_fov_deg / lidar.columns
+    if lidar.horizontal_fov_deg < 360 and lidar.azimuth_offsets_deg is not None:  # rows that begin at other azimuths
+        assert found.horizontal_fov_deg / found.columns == pytest.approx(step_deg, rel=1e-3)
+        return
+    assert (found.columns, found.centre_deg) == (240, pytest.approx(0.0, abs=0.01))
+    assert found.horizontal_fov_deg == pytest.approx(lidar.horizontal_fov_deg, abs=1e-6)
+
+
+def test_rows_that_shake_are_found_and_rows_that_blend_are_not():
+    lidar = Lidar.model_validate({"name": "a", "model": "velodyne_hdl32e", "columns": 400})
+    points_m = in_a_room(lidar, 0, 0.0)
+
+    def shaken(by_deg):
+        angles = np.random.default_rng(1).normal(scale=np.deg2rad(by_deg), size=len(points_m))
+        flat_m = np.hypot(points_m[:, 0], points_m[:, 1])
+        return points_m + np.c_[0 * flat_m, 0 * flat_m, angles * flat_m]
+
+    found = estimate_scan([shaken(0.15)])
+    spacing_deg = 1.33
+    np.testing.assert_allclose(found.elevations_deg, lidar.rows_deg(), atol=spacing_deg / 10)
+    assert estimate_scan([shaken(0.8)]) is None
+    assert estimate_scan([points_m[:1]]) is None
+    assert estimate_scan([]) is None
+
+
+def test_a_field_of_view_has_its_middle_and_ranges():
+    lidar = Lidar(name="a", channels=4, vertical_fov_deg=(-9, 0), columns=40, horizontal_fov_deg=80, max_range_m=99)
+    turned = rigid(rotation_from_euler(170.0, 0.0, 0.0), np.zeros(3))
+    points_m = transform(turned, in_a_room(lidar, 0, 0.0))
+    found = estimate_scan([points_m])
+    assert (found.columns, found.horizontal_fov_deg) == (40, pytest.approx(80.0))
+    assert found.centre_deg == pytest.approx(170.0)
+    ranges_m = np.linalg.norm(points_m, axis=1)
+    assert (found.min_range_m, found.max_range_m) == (ranges_m.min(), ranges_m.max())
+
+
+def nuscenes_with_camera(drive, root):
+    path = layouts.nuscenes_tables(drive, root)
+    K = [[1266.0, 0.0, 816.0], [0.0, 1250.0, 491.0], [0.0, 0.0, 1.0]]
+    camera = {"token": "cam", "sensor_token": "s", "camera_intrinsic": K, "rotation": [0.5, -0.5, 0.5, -0.5]}
+    tables = {
+        name: json.loads((path / "v1.0-mini" / f"{name}.json").read_text())
+        for name in ("calibrated_sensor", "sample_data")
+    }
+    tables["calibrated_sensor"].append({**camera, "translation": [1.7, 0.1, 1.5]})
+    tables["sensor"] = [{"token": "s", "channel": "CAM_FRONT"}]
+    for row in tables["sample_data"]:
+        if "CAM_FRONT" in row["filename"]:
+            row.update(calibrated_sensor_token="cam", width=1600, height=900)
+    for row in tables["calibrated_sensor"]:
+        row.setdefault("sensor_token", "l")
+    for name, rows in tables.items():
+        (path / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows))
+
+    def pixels(points_m):
+        # In the ego's frame; the camera looks along it.
+        x, y, z = (transform(invert(nuscenes.vehicle_T_ego), points_m) - [1.7, 0.1, 1.5]).T
+        return np.stack([816.0 - 1266.0 * y / x, 491.0 - 1250.0 * z / x], axis=1)
+
+    return path, "CAM_FRONT", (1600, 900), pixels
+
+
+def argoverse2_with_camera(drive, root):
+    import pyarrow as pa
+    from pyarrow import feather
+
+    path = layouts.argoverse2_log(drive, root)
+    (path / "calibration").mkdir()
+    ego_T_camera = rigid(rotation_from_euler(40.0, 3.0, 2.0), [1.5, 0.2, 1.4]) @ MOUNT_T_CAMERA
+    wxyz = bags.quaternion_from_rotation(ego_T_camera[:3, :3])
+    turned = dict(zip(("qw", "qx", "qy", "qz"), map(float, wxyz), strict=True))
+    places = dict(zip(("tx_m", "ty_m", "tz_m"), map(float, ego_T_camera[:3, 3]), strict=True))
+    lidars = [
+        {"sensor_name": f"{one}_lidar", **layouts.posed(rigid(np.eye(3), [1.35, 0.0, z]))}
+        for one, z in (("up", 1.64), ("down", 1.53))
+    ]
+    rows = [{"sensor_name": "ring_front_left", **turned, **places}, *lidars]
+    lens = {"fx_px": 1687.0, "fy_px": 1680.0, "cx_px": 1031.0, "cy_px": 768.0, "k1": -0.28, "k2": -0.04, "k3": 0.1}
+    sizes = {"height_px": 1550, "width_px": 2048}
+    feather.write_feather(pa.Table.from_pylist(rows), str(path / "calibration" / "egovehicle_SE3_sensor.feather"))
+    feather.write_feather(
+        pa.Table.from_pylist([{"sensor_name": "ring_front_left", **lens, **sizes}]),
+        str(path / "calibration" / "intrinsics.feather"),
+    )
+
+    def pixels(points_m):
+        x, y, z = transform(invert(argoverse2.vehicle_T_ego @ ego_T_camera), points_m).T
+        x, y = x / z, y / z
+        r2 = x * x + y * y
+        radial = 1 + r2 * (lens["k1"] + r2 * (lens["k2"] + r2 * lens["k3"]))
+        return np.stack([1031.0 + 1687.0 * x * radial, 768.0 + 1680.0 * y * radial], axis=1)
+
+    return path, "ring_front_left", (2048, 1550), pixels
+
+
+P2 = np.array([[721.5, 0.0, 609.5, 44.8], [0.0, 721.5, 172.8, 0.2], [0.0, 0.0, 1.0, 0.003]])
+camera0_T_velodyne = np.vstack(
+    [np.c_[rotation_from_euler(0.2, -0.5, 0.4) @ MOUNT_T_CAMERA[:3, :3].T, [-0.01, -0.07, -0.29]], [0.0, 0.0, 0.0, 1.0]]
+)
+R0 = rotation_from_euler(0.3, 0.4, -0.5)
+
+
+def by_kitti(points_m):
+    """Pixels of the left colour camera, by the formula of the development kit."""
+    velodyne_m = transform(invert(kitti_files.vehicle_T_velodyne), points_m)
+    rectified = np.c_[transform(camera0_T_velodyne, velodyne_m) @ R0.T, np.ones(len(points_m))]
+    seen = rectified @ P2.T
+    return seen[:, :2] / seen[:, 2:]
+
+
+def numbers(array):
+    return " ".join(repr(float(number)) for number in np.ravel(array))
+
+
+def kitti_raw_with_cameras(drive, root):
+    path = layouts.kitti_raw(drive, root)
+    velodyne = f"R: {numbers(camera0_T_velodyne[:3, :3])}\nT: {numbers(camera0_T_velodyne[:3, 3])}\n"
+    (path.parent / "calib_velo_to_cam.txt").write_text(velodyne)
+    lines = ["calib_time: 09-Jan-2012 13:57:47", f"R_rect_00: {numbers(R0)}"]
+    for name in ("00", "01", "02", "03"):
+        lines += [
+            f"S_rect_{name}: 1242 375",
+            f"P_rect_{name}: {numbers(P2)}",
+            f"R_rect_{name.replace('00', '9')}: {numbers(R0)}",
+        ]
+    (path.parent / "calib_cam_to_cam.txt").write_text("\n".join(lines))
+    return path, "image_02", (1242, 375), by_kitti
+
+
+def kitti_object_with_camera(drive, root):
+    for folder in ("velodyne", "calib", "image_2"):
+        (root / folder).mkdir()
+    (root / "velodyne" / "000001.bin").write_bytes(layouts.records(np.eye(3), 4))
+    rows = {**{f"P{number}": P2 for number in range(4)}, "R0_rect": R0, "Tr_velo_to_cam": camera0_T_velodyne[:3]}
+    (root / "calib" / "000001.txt").write_text("".join(f"{key}: {numbers(row)}\n" for key, row in rows.items()))
+    size = (1224).to_bytes(4, "big") + (370).to_bytes(4, "big")
+    (root / "image_2" / "000001.png").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + size)
+    return root, "P2", (1224, 370), by_kitti
+
+
+CAMERAS = {
+    "nuscenes": nuscenes_with_camera,
+    "argoverse2": argoverse2_with_camera,
+    "kitti_raw": kitti_raw_with_cameras,
+    "kitti_object": kitti_object_with_camera,
+}
+
+
+@pytest.mark.parametrize("layout", CAMERAS)
+def test_cameras_show_points_where_their_data_set_says(layout, tmp_path):
+    path, name, size, pixels = CAMERAS[layout](Drive(steps=3), tmp_path)
+    recording = open_recording(path, layout)
+    rig = Rig.model_validate(rig_document(recording, models=dict.fromkeys(recording.sensors, "velodyne_vlp16")))
+    sensor = next(one for one in rig.sensors if one.name == name)
+    assert (sensor.width, sensor.height) == size
+    ahead_m = (
+        sensor.mount.matrix() @ np.c_[np.random.default_rng(0).uniform([5, -2, -1], [30, 2, 1], (50, 3)), np.ones(50)].T
+    )
+    vehicle_m = ahead_m[:3].T
+    in_camera_m = transform(invert(sensor.mount.matrix() @ MOUNT_T_CAMERA), vehicle_m)
+    found, shown = sensor.camera().project(torch.from_numpy(in_camera_m))
+    assert shown.sum() > 30
+    np.testing.assert_allclose(
+        found[shown].numpy(), pixels(vehicle_m)[shown.numpy()], atol=0.01
+    )  # mounts have 6 decimals
+    assert name in rig.description
+    assert "as calibrated" in rig.description
+
+
+def test_lidars_are_where_calibrations_say(tmp_path):
+    path, *_ = argoverse2_with_camera(Drive(steps=2), tmp_path)
+    rig = rig_document(open_recording(path), sensors=["down_lidar"], models={"down_lidar": "velodyne_vlp32c"})
+    lidar = rig["sensors"][0]
+    assert lidar["mount"] == {"x_m": 0.011, "y_m": 0.0, "z_m": 1.83, "yaw_deg": 0.0, "pitch_deg": 0.0, "roll_deg": 0.0}
+    assert lidar["model"] == "velodyne_vlp32c"
+    drive = Drive(steps=3)
+    rig = rig_document(
+        open_recording(bags.ros2(drive, tmp_path)), models=dict.fromkeys(drive.sensors, "velodyne_vlp16")
+    )
+    for lidar in Rig.model_validate(rig).sensors:
+        np.testing.assert_allclose(lidar.mount.matrix(), drive.vehicle_T_sensor(lidar.name), atol=1e-5)
+    assert "static transforms to base_link" in rig["description"]
+
+
+def test_what_no_rig_can_be_made_of(tmp_path):
+    drive = Drive(steps=2)
+    with pytest.raises(ValueError, match="no LiDAR roof, other; the recording has left, right"):
+        rig_document(drive, sensors=["roof", "left"], models={"other": "velodyne_vlp16"})
+    with pytest.raises(ValueError, match=r"points of left do not lie in rows .* --lidar left=MODEL"):
+        rig_document(drive)
+    with pytest.raises(FileNotFoundError, match=r"neither a .yaml file nor one of the built-in lidars"):
+        rig_document(drive, models={"left": "velodyne"})
+    (tmp_path / "sensor").mkdir()
+    (tmp_path / "sensor" / "a.xyz").write_text("1 2 3\n")
+    with pytest.raises(ValueError, match="where sensor is mounted is not known"):
+        rig_document(open_recording(tmp_path), models={"sensor": "velodyne_vlp16"})
+    with pytest.raises(FileNotFoundError, match=r"egovehicle_SE3_sensor.feather: no such file"):
+        rig_document(open_recording(layouts.argoverse2_log(drive, tmp_path / "av2")))
+
+
+@pytest.mark.parametrize(
+    ("line", "instead", "told"),
+    [
+        (
+            "S_rect_01: 1242 375",
+            "S_rect_01: 1242",
+            "12 numbers of P_rect_01 and 2 of S_rect_01 are needed; got 12 and 1",
+        ),
+        ("P_rect_03", "P_rect_04", "12 numbers of P_rect_03"),
+        ("P_rect_02: 721.5", "P_rect_02: 0.0", "P_rect_02 has no focal length"),
+        ("R_rect_00", "R_rect_07", "R_rect_00 with 12 numbers"),
+    ],
+)
+def test_calibrations_of_kitti_that_cannot_be(tmp_path, line, instead, told):
+    path, *_ = kitti_raw_with_cameras(Drive(steps=2), tmp_path)
+    file = path.parent / "calib_cam_to_cam.txt"
+    assert line in file.read_text()
+    file.write_text(file.read_text().replace(line, instead))
+    with pytest.raises(ValueError, match=told) as error:
+        rig_document(open_recording(path), models={"velodyne": "velodyne_hdl64e"})
+    assert str(file) in str(error.value)
+    file.unlink()
+    rig = rig_document(open_recording(path), models={"velodyne": "velodyne_hdl64e"})
+    assert [sensor["name"] for sensor in rig["sensors"]] == ["velodyne"]
+    assert "no cameras, for there is no calib_cam_to_cam.txt" in rig["description"]
+
+
+def test_cameras_of_others_that_cannot_be(tmp_path):
+    from pyarrow import feather
+
+    path, *_ = argoverse2_with_camera(Drive(steps=2), tmp_path)
+    table = path / "calibration" / "egovehicle_SE3_sensor.feather"
+    feather.write_feather(feather.read_table(table).slice(0, 2), str(table))
+    with pytest.raises(BadFileError, match=r"egovehicle_SE3_sensor.feather has no down_lidar"):
+        rig_document(open_recording(path))
+    (tmp_path / "object").mkdir()
+    path, *_ = kitti_object_with_camera(None, tmp_path / "object")
+    (path / "image_2" / "000001.png").write_bytes(b"JFIF")
+    with pytest.raises(BadFileError, match=r"000001.png: not a PNG image"):
+        rig_document(open_recording(path))

@@ -1,0 +1,13 @@
+from .estimate import Difference as Difference
+from .estimate import Estimate as Estimate
+from .estimate import Number as Number
+from .jackknife import MIN_BLOCKS as MIN_BLOCKS
+from .jackknife import MIN_BLOCKS_OF_A_CELL as MIN_BLOCKS_OF_A_CELL
+from .jackknife import ROUND_OFF as ROUND_OFF
+from .jackknife import jackknife_error as jackknife_error
+from .jackknife import ratio_errors as ratio_errors
+from .quantity import Quantity as Quantity
+from .quantity import Unit as Unit
+from .student import interval95 as interval95
+from .student import student_p as student_p
+from .student import student_t95 as student_t95

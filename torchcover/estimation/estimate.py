@@ -1,0 +1,240 @@
+"""Estimates from sums in blocks, and the numbers and differences that are read from them."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchcover.estimation.jackknife import MIN_BLOCKS, ROUND_OFF, jackknife_error, pseudo_values
+from torchcover.estimation.quantity import Quantity
+from torchcover.estimation.student import interval95, is_significant, student_p, student_t95
+
+
+class Number(NamedTuple):
+    """A number of a rig, with all that decides it; NaN where something is unknown.
+
+    Args:
+        quantity: What it is.
+        value: In the unit of the quantity; NaN if it is unknown.
+        error: Its standard error, over blocks of contiguous steps or worlds.
+        low: Lower end of its 95 % interval, as from `torchcover.estimation.interval95`.
+        high: Upper end.
+        count: How many it is over.
+        count_of: What these are: "known cells", "objects", "voxels", ...
+        parameters: What else it was computed with.
+        warning: What makes it unfit for a comparison, in words.
+
+    Example:
+        >>> number = Number(Quantity("k_cover", "seen by two sensors", "share", lower_is_better=False), 0.25, count=12)
+        >>> number.known, number.error
+        (True, nan)
+    """
+
+    quantity: Quantity
+    value: float
+    error: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    count: int = 0  # type: ignore[assignment]  # hides tuple.count
+    count_of: str = ""
+    parameters: Mapping[str, Any] = {}
+    warning: str | None = None
+
+    @property
+    def known(self) -> bool:
+        """Whether it has a value."""
+        return not math.isnan(self.value)
+
+
+class Difference(NamedTuple):
+    """What a rig has more than another one, in the same steps and against the same reference points.
+
+    Args:
+        quantity: What the two numbers are.
+        value: In its unit, a share in [-1, 1]; NaN if unknown.
+        error: Standard error of `value` itself, which is less than that of the two numbers: what makes a step easy or
+            hard for both rigs cancels out. NaN if there are not enough blocks.
+        low: Lower end of its 95 % interval, Student's t errors below it.
+        high: Upper end.
+        significant: Whether the difference is more than chance, by Student's t at 95 %; None if that is unknown.
+        p: Probability of a t at least as large to either side if there were no difference.
+        blocks: Blocks of contiguous steps, or worlds, that it comes from.
+        better: In how many of them the rig is better than the other.
+    """
+
+    quantity: Quantity
+    value: float
+    error: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    significant: bool | None = None
+    p: float = math.nan
+    blocks: int = 0
+    better: int = 0
+
+    @property
+    def gain(self) -> float:
+        """The difference with the sign turned so that more is better."""
+        return self.quantity.gain(self.value)
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Several numbers at once, with what they become without one block of steps, or one world, after the other.
+
+    Args:
+        quantities: What the Q numbers are.
+        value: (Q,) float64 from all steps; NaN where unknown.
+        left_out: (g, Q) without each block.
+        steps: (g,) int64 steps in these blocks, each above 0.
+        again: From (R, g) how often each block comes to (R, Q) what the numbers were then; None if that is unknown.
+
+    Example:
+        >>> detection = Quantity("detection_0.4m", "detection within 0.4 m", "share", lower_is_better=False)
+        >>> m2 = torch.full((8,), 10.0, dtype=torch.float64)
+        >>> seen, more = (torch.arange(8.0, dtype=torch.float64)[:, None] + shift for shift in (0.0, 0.5))
+        >>> one, other = (Estimate.of_ratios((detection,), m2, each, torch.ones(8)) for each in (seen, more))
+        >>> number, = one.numbers().values()
+        >>> round(number.value, 3), round(number.error, 3)
+        (0.35, 0.087)
+        >>> difference, = other.differences(one).values()
+        >>> round(difference.value, 3), difference.blocks, difference.better
+        (0.05, 8, 8)
+        >>> one.resampled(torch.tensor([[1.0] * 8, [1.0] + [0.0] * 7]))
+        tensor([[0.3500],
+                [0.0000]], dtype=torch.float64)
+    """
+
+    quantities: tuple[Quantity, ...]
+    value: Tensor
+    left_out: Tensor
+    steps: Tensor
+    again: Callable[[Tensor], Tensor] | None = None
+
+    @classmethod
+    def of(cls, quantities: Sequence[Quantity], value: Tensor) -> "Estimate":
+        """Of numbers (Q,) that no block is known of, and so no error."""
+        return cls(tuple(quantities), value, value.new_empty((0, len(value))), value.new_empty(0, dtype=torch.int64))
+
+    @classmethod
+    def of_ratios(cls, quantities: Sequence[Quantity], base: Tensor, sums: Tensor, steps: Tensor) -> "Estimate":
+        """Ratios of sums in blocks, and what they become without each block.
+
+        Args:
+            quantities: What they are.
+            base: (B,) what is divided by; or (B, Q), of each.
+            sums: (B, Q) sums.
+            steps: (B,) steps in each block; 0 in blocks that are not in use.
+        """
+        whole = sums.sum(dim=0) / base.sum(dim=0)
+        used = steps.nonzero().flatten().tolist() if len(steps) > 1 else []
+        left_out = [_without(sums, block).sum(dim=0) / _without(base, block).sum(dim=0) for block in used]
+        without = torch.stack(left_out) if left_out else whole[None][:0]
+        return cls(tuple(quantities), whole, without, steps[used], partial(_ratios_again, base[used], sums[used]))
+
+    @classmethod
+    def of_blocks(cls, quantities: Sequence[Quantity], again: Callable[[Tensor], Tensor], steps: Tensor) -> "Estimate":
+        """Of numbers that say for themselves what they become if blocks come more or less often.
+
+        Args:
+            quantities: What they are.
+            again: As in `Estimate`; float64.
+            steps: (g,) steps in each block, all above 0.
+        """
+        once = torch.ones(1, len(steps), dtype=torch.float64, device=steps.device)
+        values = again(torch.cat([once, 1.0 - torch.diag(once[0])]))
+        return cls(tuple(quantities), values[0], values[1:], steps, again)
+
+    def __getitem__(self, which: slice) -> "Estimate":
+        """Some of the numbers."""
+        again = None if self.again is None else partial(_some_again, self.again, which)
+        return Estimate(self.quantities[which], self.value[which], self.left_out[:, which], self.steps, again)
+
+    def resampled(self, weights: Tensor) -> Tensor | None:
+        """What the numbers were if other worlds had come, for intervals of what is made from numbers of several rigs.
+
+        Args:
+            weights: (R, g) how often each block comes, in each of R draws.
+
+        Returns:
+            (R, Q) float64; None if it is unknown.
+        """
+        return None if self.again is None else self.again(weights.to(self.value))
+
+    @property
+    def error(self) -> Tensor:
+        """(Q,) standard errors; NaN if there are fewer than 8 blocks."""
+        return self.errors()
+
+    def errors(self, least: int = MIN_BLOCKS) -> Tensor:
+        """(Q,) standard errors by the block jackknife.
+
+        Args:
+            least: Fewer blocks than these give none. Errors that are shown need 8; who only races rigs against each
+                other is content with 3 worlds.
+        """
+        return jackknife_error(self.left_out, self.value, self.steps, least)
+
+    def numbers(self, *, intervals: bool = True, count: int = 0, count_of: str = "") -> dict[str, Number]:
+        """The numbers by the keys of their quantities.
+
+        Args:
+            intervals: Whether they have intervals: not where how often such an interval holds the truth has
+                not been measured.
+            count: How many they are over.
+            count_of: What these are.
+        """
+        found, freedom = {}, len(self.steps) - 1
+        for quantity, value, error in zip(self.quantities, self.value.tolist(), self.error.tolist(), strict=True):
+            known = error if error > ROUND_OFF else math.nan  # blocks that all say the same prove nothing
+            low, high = interval95(value, error, freedom, quantity) if intervals else (math.nan, math.nan)
+            found[quantity.key] = Number(quantity, value, known, low, high, count, count_of)
+        return found
+
+    def minus(self, other: "Estimate") -> "Estimate":
+        """The difference to another rig over the same steps: what both share cancels out, block by block."""
+        return Estimate(self.quantities, self.value - other.value, self.left_out - other.left_out, self.steps)
+
+    def differences(self, other: "Estimate", least: int = MIN_BLOCKS) -> dict[str, Difference]:
+        """The differences to another rig over the same steps, by the keys of the quantities.
+
+        Args:
+            other: The same numbers of the other rig.
+            least: As in `errors`.
+        """
+        # Two infinite numbers are equal; their difference would be NaN, which means unknown.
+        values = (self.value - other.value).where(self.value != other.value, 0.0)
+        between, blocks = self.minus(other), len(self.steps)
+        errors, t = between.errors(least).tolist(), student_t95(blocks - 1)
+        each = pseudo_values(between.left_out, between.value, self.steps)
+        found = {}
+        for at, (quantity, value, error) in enumerate(zip(self.quantities, values.tolist(), errors, strict=True)):
+            found[quantity.key] = Difference(
+                quantity=quantity,
+                value=value,
+                error=error,
+                low=value - t * error,
+                high=value + t * error,
+                significant=is_significant(value, error, blocks - 1),
+                p=student_p(value / error, blocks - 1) if error > ROUND_OFF else math.nan,
+                blocks=blocks,
+                better=int((-each[:, at] if quantity.lower_is_better else each[:, at]).gt(ROUND_OFF).sum()),
+            )
+        return found
+
+
+def _without(sums: Tensor, block: int) -> Tensor:
+    # Not by a difference: infinite radii, and what is left of nearly everything, would not survive it.
+    return torch.cat([sums[:block], sums[block + 1 :]])
+
+
+def _ratios_again(base: Tensor, sums: Tensor, weights: Tensor) -> Tensor:
+    return (weights @ sums) / (weights @ base.to(sums)).view(len(weights), -1)
+
+
+def _some_again(again: Callable[[Tensor], Tensor], which: slice, weights: Tensor) -> Tensor:
+    return again(weights)[:, which]

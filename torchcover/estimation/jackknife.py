@@ -1,0 +1,94 @@
+"""Standard errors from blocks of contiguous steps: the block jackknife."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchcover.estimation.quantity import Unit
+
+# With fewer, the error itself is off by more than a quarter: 1 / sqrt(2 (blocks - 1)).
+MIN_BLOCKS = 8
+# Errors below come from rounding in sums of float64: the estimate is the same whichever block is left out.
+ROUND_OFF = 1e-12
+# A cell has an error if it was probed in at least as many blocks.
+MIN_BLOCKS_OF_A_CELL = 8
+# The radius of a cell in a block that was not seen, over its mean radius in those that were.
+IMAGINED_RADIUS = 5.0
+
+
+def jackknife_error(left_out: Tensor, whole: Tensor, steps: Tensor, least: int = MIN_BLOCKS) -> Tensor:
+    """Standard error of an estimate from what it becomes as one block after the other is left out.
+
+    The delete-m_j jackknife for blocks of unequal size (Busing, Meijer & van der Leeden 1999, Statistics and Computing
+    9, 3-8): with h_j = n / m_j and the pseudo-values p_j = h_j whole - (h_j - 1) left_out_j,
+
+        error^2 = 1/g sum_j (p_j - mean of the estimates)^2 / (h_j - 1).
+
+    Args:
+        left_out: (g, ...) estimates without block j.
+        whole: (...) estimate from all blocks.
+        steps: (g,) steps m_j of each block, all above 0.
+        least: Fewer blocks than these give no error; 2 at least.
+
+    Returns:
+        (...) standard errors; NaN for too few blocks, and where an estimate is not finite.
+
+    Example:
+        >>> values = torch.arange(10.0, dtype=torch.float64)           # one step a block: the error of a mean
+        >>> left_out = (values.sum() - values) / 9
+        >>> error = jackknife_error(left_out, values.mean(), torch.ones(10))
+        >>> torch.isclose(error, values.std() / 10**0.5)
+        tensor(True)
+    """
+    blocks = len(steps)
+    if blocks < least:
+        return torch.full_like(whole, math.nan)
+    ratio = (steps.sum() / steps.double()).view(-1, *[1] * whole.dim())
+    pseudo = pseudo_values(left_out, whole, steps)
+    centre = blocks * whole - ((1 - 1 / ratio) * left_out).sum(dim=0)
+    error = (((pseudo - centre) ** 2 / (ratio - 1)).mean(dim=0)).sqrt()
+    return error.where(whole.isfinite(), math.nan)
+
+
+def pseudo_values(left_out: Tensor, whole: Tensor, steps: Tensor) -> Tensor:
+    """(g, ...) the p_j of `jackknife_error`: what each block says by itself, had it been as long as all of them."""
+    ratio = (steps.sum() / steps.double()).view(-1, *[1] * whole.dim())
+    return ratio * whole - (ratio - 1) * left_out
+
+
+def ratio_errors(base: Tensor, sums: Tensor, unit: Unit) -> Tensor:
+    """Standard error of a ratio of sums in each cell: of a mean over steps, or over square metres.
+
+    For R = S / A, sums over blocks of s_j and of a_j, the variance is to first order that of the sum of s_j - R a_j,
+    divided by A^2 (Cochran 1977, Sampling Techniques, section 6.4).
+
+    A few blocks that all say the same do not prove that others would. Therefore two more are imagined, each with as
+    much of A as the others have on average: in one the rig sees all of the cell, in the other next to nothing of it,
+    as Agresti & Coull (1998, The American Statistician 52, 119-126) add successes and failures. No error is 0; how
+    often the ratio plus and minus two errors covers the truth is in docs/measured/error_bars.md.
+
+    Args:
+        base: (B, ...) the a_j: steps that probed the cell in each block, or square metres that were seen in it.
+        sums: (B, ...) the s_j.
+        unit: "share", so that the imagined ratios are 1 and 0; or "m": 0 and five times R.
+
+    Returns:
+        (...) standard errors; NaN in cells that fewer than 8 blocks know, or that nothing is known of but a radius
+        of 0.
+
+    Example:
+        >>> m2 = torch.full((16,), 2.0, dtype=torch.float64)
+        >>> half = torch.tensor([2.0, 0.0] * 8, dtype=torch.float64)
+        >>> [round(float(ratio_errors(m2, sums, "share")), 3) for sums in (half, m2)]
+        [0.121, 0.057]
+    """
+    base = base.double()
+    known = (base > 0).sum(dim=0)
+    whole = base.sum(dim=0).where(known > 0, 1.0)
+    ratio = sums.sum(dim=0) / whole
+    imagined = whole / known.clamp(min=1)
+    seen_or_not = ratio**2 + (1 - ratio) ** 2 if unit == "share" else ratio**2 + (IMAGINED_RADIUS * ratio - ratio) ** 2
+    squares = (sums - ratio * base).square().sum(dim=0) + imagined**2 * seen_or_not
+    variance = squares * (known + 2) / (known + 1) / (whole + 2 * imagined) ** 2
+    return variance.sqrt().where((known >= MIN_BLOCKS_OF_A_CELL) & (variance > 0) & variance.isfinite(), math.nan)

@@ -1,0 +1,128 @@
+"""Student's t: the 95 % interval around a number, and what is more than chance."""
+
+import math
+
+from torchcover.estimation.jackknife import ROUND_OFF
+from torchcover.estimation.quantity import Quantity
+
+# Of the standard normal distribution, exceeded to either side with 5 %.
+NORMAL_QUANTILE = 1.959963984540054
+# Of Student's distribution with 1 to 6 degrees of freedom, likewise; there the expansion below is off.
+FEW = 12.7062047362, 4.3026527297, 3.1824463053, 2.7764451052, 2.5705818356, 2.4469118511
+# Scenes in which a rig is all but blind are rare and missing from most short runs, so that the truth lies far on that
+# side more often than on the other (docs/measured/error_bars.md).
+BLIND_SIDE = 1.75
+# exp of more is no float64.
+MOST = 700.0
+
+
+def interval95(value: float, error: float, degrees_of_freedom: int, quantity: Quantity) -> tuple[float, float]:
+    """The 95 % interval around a number.
+
+    With Student's t, on the scale of the logarithm for a length and of the logit for a share, so that neither leaves
+    its range; on the worse side, of larger radii and lower detections, 1.75 times as long on that scale. Any other
+    unit has no range to leave: value plus and minus t errors.
+
+    Args:
+        value: In the unit of the quantity.
+        error: Its standard error.
+        degrees_of_freedom: Blocks that the error comes from, less one.
+        quantity: Its unit decides the scale, its direction the worse side.
+
+    Returns:
+        Its ends; NaN if the error is, or 0: blocks that all say the same do not prove that others would.
+
+    Example:
+        >>> radius = Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True)
+        >>> detection = Quantity("detection_0.4m", "detection within 0.4 m", "share", lower_is_better=False)
+        >>> [round(end, 3) for end in interval95(2.0, 0.1, 10, radius)]
+        [1.789, 2.431]
+        >>> [round(end, 3) for end in interval95(0.9, 0.02, 10, detection)]
+        [0.791, 0.937]
+    """
+    if math.isnan(error) or error <= ROUND_OFF or (quantity.unit == "m" and value <= 0):
+        return math.nan, math.nan
+    below, above = (1.0, BLIND_SIDE) if quantity.lower_is_better else (BLIND_SIDE, 1.0)
+    t = student_t95(degrees_of_freedom)
+    if quantity.unit == "m":
+        reach = t * error / value
+        return value * math.exp(-below * reach), value * math.exp(min(above * reach, MOST))
+    if quantity.unit != "share":
+        return value - t * error, value + t * error
+    if not 0 < value < 1:  # rounding may have put it there; nothing is known of the other side
+        return 0.0, 1.0
+    against = (1 - value) / value
+    reach = t * error / (value * (1 - value))
+    return 1 / (1 + against * math.exp(min(below * reach, MOST))), 1 / (1 + against * math.exp(-above * reach))
+
+
+def student_t95(degrees_of_freedom: int) -> float:
+    """The t that is exceeded to either side with 5 %; from 7 on by Fisher's expansion around the normal distribution.
+
+    Abramowitz & Stegun 1964, equation 26.7.5; from 7 degrees of freedom on, which 8 blocks have, the error is below
+    0.0001.
+
+    Args:
+        degrees_of_freedom: 1 or more; NaN for fewer.
+
+    Example:
+        >>> round(student_t95(2), 3), round(student_t95(7), 3), round(student_t95(15), 3), round(student_t95(1000), 3)
+        (4.303, 2.365, 2.131, 1.962)
+    """
+    if degrees_of_freedom <= len(FEW):
+        return FEW[degrees_of_freedom - 1] if degrees_of_freedom >= 1 else math.nan
+    z: float = NORMAL_QUANTILE
+    terms: tuple[float, ...] = (
+        z,
+        (z**3 + z) / 4,
+        (5 * z**5 + 16 * z**3 + 3 * z) / 96,
+        (3 * z**7 + 19 * z**5 + 17 * z**3 - 15 * z) / 384,
+        (79 * z**9 + 776 * z**7 + 1482 * z**5 - 1920 * z**3 - 945 * z) / 92160,
+    )
+    return sum(term / float(degrees_of_freedom) ** power for power, term in enumerate(terms))
+
+
+def student_p(t: float, degrees_of_freedom: int) -> float:
+    """Probability that Student's t lies farther from 0 than some value, to either side.
+
+    The finite series of Abramowitz & Stegun 1964, equations 26.7.3 and 26.7.4.
+
+    Args:
+        t: The value; NaN gives NaN.
+        degrees_of_freedom: 1 or more.
+
+    Example:
+        >>> round(student_p(2.131, 15), 3), round(student_p(1.0, 1), 3)
+        (0.05, 0.5)
+    """
+    if math.isnan(t):
+        return math.nan
+    angle = math.atan(abs(t) / math.sqrt(degrees_of_freedom))
+    sine, cosine = math.sin(angle), math.cos(angle)
+    odd = degrees_of_freedom % 2
+    term, total = (cosine, 0.0) if odd else (1.0, 0.0)
+    for power in range(1 if odd else 0, degrees_of_freedom - 1, 2):
+        total += term
+        term *= cosine**2 * (power + 1) / (power + 2)
+    within = 2 / math.pi * (angle + sine * total) if odd else sine * total
+    return max(0.0, 1.0 - within)
+
+
+def is_significant(difference: float, error: float, degrees_of_freedom: int) -> bool | None:
+    """Whether a difference is more than chance, by Student's t at 95 %.
+
+    Args:
+        difference: The difference.
+        error: Its standard error; NaN if unknown.
+        degrees_of_freedom: Blocks that the error comes from, less one.
+
+    Returns:
+        None if the error is unknown.
+
+    Example:
+        >>> is_significant(0.3, 0.1, 15), is_significant(0.2, 0.1, 15), is_significant(0.2, float("nan"), 3)
+        (True, False, None)
+    """
+    if math.isnan(error):
+        return None
+    return abs(difference) > max(student_t95(degrees_of_freedom) * error, ROUND_OFF)

@@ -1,0 +1,12 @@
+from .augmentation import Augmentation as Augmentation
+from .augmentation import flip as flip
+from .augmentation import rotate as rotate
+from .augmentation import scale as scale
+from .frame import Frame as Frame
+from .frame import FrameBatch as FrameBatch
+from .frame import collate_frames as collate_frames
+from .source import BadFrameError as BadFrameError
+from .source import ChosenRigs as ChosenRigs
+from .source import FrameDataset as FrameDataset
+from .source import FrameSource as FrameSource
+from .source import worlds_of as worlds_of

@@ -1,0 +1,138 @@
+"""Augmentations that move the clouds and the boxes of a frame together."""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchcover.detection.boxes import Boxes
+from torchcover.frames.frame import Frame
+
+
+def flip(frame: Frame) -> Frame:
+    """Mirror a frame left to right: y becomes -y.
+
+    Example:
+        >>> frame = Frame({"rig": torch.tensor([[5.0, 2.0, 1.0]])}, torch.zeros(1, 3), index=0, name="a")
+        >>> flip(frame).sensor
+        tensor([[ 5., -2.,  1.]])
+    """
+    return _moved(frame, torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)))
+
+
+def rotate(frame: Frame, yaw_rad: float) -> Frame:
+    """Turn everything about the vehicle's z axis, to the left if positive.
+
+    Example:
+        >>> frame = Frame({"rig": torch.tensor([[5.0, 0.0, 1.0]])}, torch.zeros(1, 3), index=0, name="a")
+        >>> rotate(frame, math.pi / 2).sensor.round(decimals=4).abs()
+        tensor([[0., 5., 1.]])
+    """
+    if not math.isfinite(yaw_rad):
+        raise ValueError(f"yaw_rad: a finite angle is needed; got {yaw_rad}")
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    return _moved(frame, torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64))
+
+
+def scale(frame: Frame, factor: float) -> Frame:
+    """Make everything larger about the vehicle's origin: places, sizes, velocities, weights in square metres.
+
+    Blind spot radii grow as well.
+
+    Example:
+        >>> frame = Frame({"rig": torch.tensor([[5.0, 0.0, 1.0]])}, torch.zeros(1, 3), index=0, name="a")
+        >>> scale(frame, 2.0).sensor
+        tensor([[10.,  0.,  2.]])
+    """
+    if not (math.isfinite(factor) and factor > 0):
+        raise ValueError(f"factor: a finite number > 0 is needed; got {factor}")
+    return _moved(frame, factor * torch.eye(3, dtype=torch.float64))
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """A random flip, then rotation, then scaling of a frame, drawn from the seed, the epoch and the frame's index.
+
+    Nothing else decides: not workers, ranks or the order of access. Use it where the epoch is known, in the training
+    step or in the collate function; coverage metrics are for frames as they are.
+
+    Args:
+        flip: Probability of a flip.
+        max_yaw_rad: The rotation is uniform between this to the right and this to the left.
+        factors: The scaling is uniform between these two.
+        seed: Seed.
+
+    Raises:
+        ValueError: A probability outside [0, 1], a negative angle, or factors that are not positive and ascending.
+
+    Example:
+        >>> frame = Frame({"rig": torch.rand(9, 3)}, torch.rand(9, 3), index=4, name="a")
+        >>> augment = Augmentation(seed=1)
+        >>> torch.equal(augment(frame, epoch=2).sensor, augment(frame, epoch=2).sensor)
+        True
+    """
+
+    flip: float = 0.5
+    max_yaw_rad: float = math.pi / 4
+    factors: tuple[float, float] = (0.95, 1.05)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.flip <= 1:
+            raise ValueError(f"flip: a probability in [0, 1] is needed; got {self.flip}")
+        if not 0 <= self.max_yaw_rad < math.inf:
+            raise ValueError(f"max_yaw_rad: an angle >= 0 is needed; got {self.max_yaw_rad}")
+        if not 0 < self.factors[0] <= self.factors[1] < math.inf:
+            raise ValueError(f"factors: two numbers 0 < lowest <= highest are needed; got {self.factors}")
+        if self.seed < 0:
+            raise ValueError(f"seed: a number >= 0 is needed; got {self.seed}")
+
+    def __call__(self, frame: Frame, epoch: int = 0) -> Frame:
+        """The frame as it is in one epoch.
+
+        Raises:
+            ValueError: A frame without an index (-1), or a negative epoch.
+        """
+        if frame.index < 0 or epoch < 0:
+            raise ValueError(
+                f"frame {frame.name!r}, index {frame.index}, epoch {epoch}: numbers >= 0 are needed, for the draw "
+                "depends on them; use dataclasses.replace(frame, index=...)"
+            )
+        generator = np.random.default_rng([self.seed, epoch, frame.index])
+        flipped = generator.random() < self.flip
+        yaw_rad = float(generator.uniform(-self.max_yaw_rad, self.max_yaw_rad))
+        factor = float(generator.uniform(*self.factors))
+        return scale(rotate(flip(frame) if flipped else frame, yaw_rad), factor)
+
+
+def _moved(frame: Frame, similarity: Tensor) -> Frame:
+    """Apply a (3, 3) float64 matrix that keeps shapes and z upright: a rotation about z, a mirror, a scale."""
+    weights = frame.reference_weights
+    if weights is not None:
+        weights = weights * float(similarity[2, 2]) ** 2
+    return replace(
+        frame,
+        clouds={name: _times(similarity, cloud) for name, cloud in frame.clouds.items()},
+        reference=_times(similarity, frame.reference),
+        reference_weights=weights,
+        boxes=None if frame.boxes is None else _moved_boxes(frame.boxes, similarity),
+    )
+
+
+def _moved_boxes(boxes: Boxes, similarity: Tensor) -> Boxes:
+    heading = torch.stack([boxes.yaw_rad.cos(), boxes.yaw_rad.sin()], dim=1).double()
+    heading = heading @ similarity[:2, :2].T.to(heading.device)
+    factor = float(similarity[2, 2])
+    return replace(
+        boxes,
+        centre_m=_times(similarity, boxes.centre_m),
+        size_m=boxes.size_m * factor,
+        yaw_rad=torch.atan2(heading[:, 1], heading[:, 0]).to(boxes.yaw_rad.dtype),
+        velocity_mps=_times(similarity[:2, :2], boxes.velocity_mps),
+    )
+
+
+def _times(matrix: Tensor, vectors: Tensor) -> Tensor:
+    return (vectors.double() @ matrix.T.to(vectors.device)).to(vectors.dtype)

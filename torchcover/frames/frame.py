@@ -1,0 +1,222 @@
+"""One instant: what the rig saw and what was there to be seen."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from torch import Tensor
+
+from torchcover.detection.boxes import Boxes
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The clouds of one time step, in the vehicle frame (x forward, y left, z up, metres).
+
+    Args:
+        clouds: Name of each rig -> (N, 3) float32 points of all its sensors; one rig, unless several were simulated
+            side by side.
+        reference: (M, 3) float32 points of the reference sensor.
+        index: Position in its dataset.
+        name: What a user calls it: a file stem, or scenario and step.
+        counts: What was left out on the way here, by name (`sensor_self_hits`, `reference_nonfinite`, ...).
+        reference_weights: (M,) float32 visible square metres that each reference point stands for, as a
+            `SurfaceReference` gives them; None if they are unknown, and all points count the same.
+        boxes: The objects of that instant; None if they are unknown, which is not the same as none being there.
+        sensor_points: Name of each rig -> name of each of its sensors -> how many of the rig's points are its own, in
+            their order; None if it is unknown which points are whose.
+        place_in_time: Number of what it shows, for standard errors: frames that share it, as of an instant that is
+            seen again or of one city, do not count as independent. Not given: `index`, every frame is its own.
+    """
+
+    clouds: Mapping[str, Tensor]
+    reference: Tensor
+    index: int
+    name: str
+    counts: Mapping[str, int] = field(default_factory=dict)
+    reference_weights: Tensor | None = None
+    boxes: Boxes | None = None
+    place_in_time: int = None  # type: ignore[assignment]  # filled in at once
+    sensor_points: Mapping[str, Mapping[str, int]] | None = None
+
+    def __post_init__(self) -> None:
+        if self.place_in_time is None:
+            object.__setattr__(self, "place_in_time", self.index)
+
+    @property
+    def sensor(self) -> Tensor:
+        """(N, 3) points of the only rig.
+
+        Raises:
+            ValueError: There are several rigs: say which, `frame.clouds[name]`.
+        """
+        if len(self.clouds) != 1:
+            raise ValueError(f"the frame has clouds of {len(self.clouds)} rigs ({', '.join(self.clouds)}): say which")
+        return next(iter(self.clouds.values()))
+
+    def cloud_of(self, rig: str) -> Tensor:
+        """(N, 3) points of one rig.
+
+        Raises:
+            ValueError: The frame has no such rig.
+        """
+        if rig not in self.clouds:
+            raise ValueError(f"frame {self.name!r} has no rig {rig!r}; it has {', '.join(self.clouds)}")
+        return self.clouds[rig]
+
+    def clouds_by_sensor(self, rig: str | None = None) -> dict[str, Tensor]:
+        """(N, 3) points of each sensor of a rig.
+
+        Args:
+            rig: Which of several rigs; the only one if not given.
+
+        Raises:
+            ValueError: No such rig, or it is unknown which points are whose.
+        """
+        cloud, name = self.sensor if rig is None else self.cloud_of(rig), rig or next(iter(self.clouds))
+        if self.sensor_points is None or name not in self.sensor_points:
+            raise ValueError(
+                f"frame {self.name!r}: it is unknown which points of {name!r} are of which sensor (sensor_points), as "
+                "redundancy needs"
+            )
+        points = self.sensor_points[name]
+        return dict(zip(points, torch.split(cloud, list(points.values())), strict=True))
+
+    def pin_memory(self) -> "Frame":
+        """A copy in page-locked memory; DataLoader calls it when `pin_memory=True`."""
+        return self._each(Tensor.pin_memory, None if self.boxes is None else self.boxes.pin_memory())
+
+    def to(self, device: torch.device | str) -> "Frame":
+        """A copy on another device."""
+        return self._each(lambda cloud: cloud.to(device), None if self.boxes is None else self.boxes.to(device))
+
+    def _each(self, change: Callable[[Tensor], Tensor], boxes: Boxes | None) -> "Frame":
+        clouds = {name: change(cloud) for name, cloud in self.clouds.items()}
+        weights = None if self.reference_weights is None else change(self.reference_weights)
+        return replace(self, clouds=clouds, reference=change(self.reference), reference_weights=weights, boxes=boxes)
+
+
+@dataclass(frozen=True)
+class FrameBatch:
+    """Frames side by side, as `CoverageMetric.update` takes them.
+
+    `metric.update(batch.sensor, batch.reference, weights=batch.weights, place_in_time=batch.place_in_time)`.
+
+    Args:
+        frames: The frames in order.
+    """
+
+    frames: tuple[Frame, ...]
+
+    @property
+    def sensor(self) -> list[Tensor]:
+        """One (N, 3) cloud a frame, of the only rig; N differs."""
+        return [frame.sensor for frame in self.frames]
+
+    def clouds_of(self, rig: str) -> list[Tensor]:
+        """One (N, 3) cloud a frame, of one of several rigs.
+
+        Raises:
+            ValueError: A frame has no such rig.
+        """
+        return [frame.cloud_of(rig) for frame in self.frames]
+
+    @property
+    def reference(self) -> list[Tensor]:
+        """One (M, 3) cloud a frame; M differs."""
+        return [frame.reference for frame in self.frames]
+
+    @property
+    def weights(self) -> list[Tensor] | None:
+        """One (M,) tensor a frame, the square metres of its reference points; None if no frame has any.
+
+        Raises:
+            ValueError: Some frames have them, and others have not.
+        """
+        given = [frame.reference_weights for frame in self.frames if frame.reference_weights is not None]
+        if given and len(given) < len(self.frames):
+            named = {frame.reference_weights is None: frame.name for frame in self.frames}
+            raise ValueError(
+                f"weights: frame {named[False]!r} has the square metres of its reference points, and {named[True]!r} "
+                "has none; batch each kind of frames by itself"
+            )
+        return given or None
+
+    @property
+    def place_in_time(self) -> list[int]:
+        """That of each frame."""
+        return [frame.place_in_time for frame in self.frames]
+
+    @property
+    def boxes(self) -> list[Boxes]:
+        """The objects of each frame.
+
+        Raises:
+            ValueError: A frame has no boxes, not even an empty list of them.
+        """
+        found = [frame.boxes for frame in self.frames if frame.boxes is not None]
+        if len(found) < len(self.frames):
+            without = next(frame.name for frame in self.frames if frame.boxes is None)
+            raise ValueError(
+                f"{len(self.frames) - len(found)} of {len(self.frames)} frames have no boxes, such as {without!r}: "
+                "SimulatedFrames(..., boxes=True) makes them; for a recording use dataclasses.replace(frame, boxes=...)"
+            )
+        return found
+
+    def padded_boxes(self, categories: Sequence[str]) -> Tensor:
+        """The objects as one tensor, as OpenPCDet's detectors take them.
+
+        Args:
+            categories: The classes, from number 1; objects of other categories are left out.
+
+        Returns:
+            (B, most boxes of a frame, 8): x, y, z of the centre, length, width, height, yaw, class; zeros where a frame
+            has fewer.
+        """
+        rows = []
+        for boxes in self.boxes:
+            wanted = boxes.of_category(*categories)
+            numbers = [categories.index(category) + 1 for category in wanted.categories]
+            rows.append(torch.cat([wanted.rows, wanted.rows.new_tensor(numbers)[:, None]], dim=1))
+        return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
+
+    def stacked_points(self, rig: str | None = None) -> Tensor:
+        """The clouds of one rig as one tensor, as voxel and pillar encoders take them.
+
+        Args:
+            rig: Which of several rigs; the only one if not given.
+
+        Returns:
+            (points of all frames, 4): number of the frame in the batch, x, y, z.
+        """
+        clouds = self.sensor if rig is None else self.clouds_of(rig)
+        numbered = [torch.nn.functional.pad(cloud, (1, 0), value=number) for number, cloud in enumerate(clouds)]
+        return torch.cat(numbered)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def pin_memory(self) -> "FrameBatch":
+        """A copy in page-locked memory; DataLoader calls it when `pin_memory=True`."""
+        return FrameBatch(tuple(frame.pin_memory() for frame in self.frames))
+
+    def to(self, device: torch.device | str) -> "FrameBatch":
+        """A copy on another device."""
+        return FrameBatch(tuple(frame.to(device) for frame in self.frames))
+
+
+def collate_frames(frames: Sequence[Frame]) -> FrameBatch:
+    """Batch frames without padding, for `DataLoader(..., collate_fn=collate_frames)`.
+
+    Args:
+        frames: Frames whose clouds may differ in size.
+
+    Returns:
+        A `FrameBatch` of all of them.
+
+    Example:
+        >>> frame = Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=0, name="a")
+        >>> [len(cloud) for cloud in collate_frames([frame, frame]).reference]
+        [9, 9]
+    """
+    return FrameBatch(tuple(frames))

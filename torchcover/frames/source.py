@@ -1,0 +1,273 @@
+"""What every source of frames says of itself, be it a simulation, a recording or another format."""
+
+import re
+from abc import abstractmethod
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+from torch.utils.data import Dataset
+
+from torchcover.frames.frame import Frame
+
+if TYPE_CHECKING:  # what they are is no matter of frames; who draws or measures them knows
+    from torchcover.simulation import Mesh, Sensor
+
+ValueT = TypeVar("ValueT")
+
+
+class BadFrameError(ValueError):
+    """One frame of a recording cannot be used; the others can.
+
+    `name` and `index` say which frame. A caller that skips bad frames catches this around `next`, with and without
+    worker processes.
+
+    Args:
+        message: `NAME (frame INDEX): reason`, or a worker's traceback that ends in it: DataLoader knows no other way to
+            build an exception again than from its text.
+
+    Example:
+        >>> error = BadFrameError("night_7 (frame 6): the reference cloud has no points")
+        >>> error.name, error.index
+        ('night_7', 6)
+    """
+
+    def __init__(self, message: str) -> None:
+        super().__init__(message.rpartition("BadFrameError: ")[2].strip())
+        parts = re.match(r"(?P<name>.*?) \(frame (?P<index>\d+)\): ", str(self))
+        self.name = parts["name"] if parts else ""
+        self.index = int(parts["index"]) if parts else -1
+
+
+@runtime_checkable
+class FrameSource(Protocol):
+    """A map-style torch Dataset of frames that knows whose they are and where they come from.
+
+    A format of recordings is a class like this that is made from a path; see `FORMATS`.
+    """
+
+    @property
+    def rigs(self) -> Collection[str]:
+        """The names under which `Frame.clouds` has the rigs."""
+        ...
+
+    @property
+    def sensors(self) -> Mapping[str, "Sequence[Sensor]"]:
+        """The sensors of the rigs that they are known of, for drawings; may be empty."""
+        ...
+
+    @property
+    def sensor_names(self) -> Mapping[str, Sequence[str]]:
+        """The names of the sensors of those rigs whose `Frame.sensor_points` says which points are of which sensor."""
+        ...
+
+    @property
+    def ego_outline_m(self) -> NDArray[np.float64] | None:
+        """(K, 2) corners x, y of the ego in the vehicle frame in metres; None if unknown."""
+        ...
+
+    @property
+    def description(self) -> Mapping[str, object]:
+        """Where the frames come from, for `summary.json`: `scenario`, `vehicle` and `seed`, or `frames`; else None."""
+        ...
+
+    @property
+    def square_metres(self) -> bool:
+        """Whether all frames have `Frame.reference_weights`, the square metres of reference points; else none has."""
+        ...
+
+    @property
+    def reference_record(self) -> Mapping[str, object] | None:
+        """Where the reference comes from, for `summary.json`: `sensor` and its settings; None if unknown.
+
+        One that was simulated says `every_s`, any other `notes`: sentences that a reader of the numbers has to know.
+        """
+        ...
+
+    @property
+    def content(self) -> Mapping[str, object]:
+        """All that the frames depend on, under the names that a message calls it by; for JSON.
+
+        A checkpoint is of frames of this content: it changes if, and only if, a frame may be another one. What is large
+        may be a hash.
+        """
+        ...
+
+    def world_of(self, index: int, /) -> int:
+        """Which world a frame is of, by any number: frames of one are made by one process, which builds it once.
+
+        The index itself where nothing has to be built, so that any process may make any frame.
+        """
+        ...
+
+    def has_boxes(self) -> bool:
+        """Whether frames have `Frame.boxes`."""
+        ...
+
+    def ego_mesh(self) -> "Mesh | None":
+        """The body of the ego in the vehicle frame; None if unknown."""
+        ...
+
+    def doubts(self, steps: int | None, /) -> Sequence[str]:
+        """What looks wrong about so many frames (None: all), a sentence each: warnings before they are measured."""
+        ...
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        ...
+
+    def __getitem__(self, index: int, /) -> Frame:
+        """One frame.
+
+        Raises:
+            BadFrameError: It cannot be used; the others can.
+        """
+        ...
+
+
+def worlds_of(frames: object) -> Callable[[int], int]:
+    """`FrameSource.world_of` of any map-style dataset or list of frames.
+
+    A list holds what was made before; a torch `Subset` has the worlds of what it is of.
+
+    Raises:
+        TypeError: A dataset that does not say which world a frame is of.
+
+    Example:
+        >>> worlds_of(["a frame", "another one"])(1)
+        1
+    """
+    if hasattr(frames, "world_of"):
+        known: Callable[[int], int] = frames.world_of
+        return known
+    if isinstance(frames, Sequence):
+        return int
+    if hasattr(frames, "dataset") and hasattr(frames, "indices"):
+        whole, indices = worlds_of(frames.dataset), frames.indices
+        return lambda index: whole(indices[index])
+    raise TypeError(
+        f"frames: {type(frames).__name__} does not say which world a frame is of, so that each process would build "
+        "every world; give it world_of(index), see FrameSource, or use a single process"
+    )
+
+
+class FrameDataset(Dataset[Frame]):
+    """A map-style torch Dataset of frames that a `for` loop goes through in order.
+
+    A `FrameSource` that is one of these has to say of the rest of itself only what there is to say.
+    """
+
+    @property
+    def sensor_names(self) -> Mapping[str, Sequence[str]]:
+        """Nothing: which points are of which sensor is unknown."""
+        return {}
+
+    def has_boxes(self) -> bool:
+        """None of them."""
+        return False
+
+    def ego_mesh(self) -> "Mesh | None":
+        """Unknown."""
+        return None
+
+    def doubts(self, steps: int | None) -> Sequence[str]:
+        """None."""
+        return ()
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of frames."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        """The frames, one after the other."""
+        return (self[index] for index in range(len(self)))
+
+
+class ChosenRigs(FrameDataset):
+    """The same frames with the clouds of some rigs only, each under a name of one's own: a `FrameSource` of another.
+
+    Args:
+        frames: Where the frames come from.
+        names: New name of each rig -> its name there, in the order that is wanted.
+
+    Raises:
+        ValueError: The source has no such rig.
+    """
+
+    def __init__(self, frames: FrameSource, names: Mapping[str, str]) -> None:
+        unknown = [name for name in names.values() if name not in frames.rigs]
+        if unknown:
+            raise ValueError(f"no clouds of the rig {', '.join(unknown)}; the frames have {', '.join(frames.rigs)}")
+        self.frames = frames
+        self.names = dict(names)
+
+    @property
+    def rigs(self) -> tuple[str, ...]:
+        """The new names."""
+        return tuple(self.names)
+
+    @property
+    def sensors(self) -> Mapping[str, "Sequence[Sensor]"]:
+        """The sensors of these rigs that they are known of."""
+        return self._chosen(self.frames.sensors)
+
+    @property
+    def sensor_names(self) -> Mapping[str, Sequence[str]]:
+        """Those of these rigs, as far as they are known."""
+        return self._chosen(self.frames.sensor_names)
+
+    @property
+    def ego_outline_m(self) -> NDArray[np.float64] | None:
+        """As there."""
+        return self.frames.ego_outline_m
+
+    def world_of(self, index: int) -> int:
+        """As there."""
+        return self.frames.world_of(index)
+
+    def has_boxes(self) -> bool:
+        """As there."""
+        return self.frames.has_boxes()
+
+    def ego_mesh(self) -> "Mesh | None":
+        """As there."""
+        return self.frames.ego_mesh()
+
+    def doubts(self, steps: int | None) -> Sequence[str]:
+        """As there."""
+        return self.frames.doubts(steps)
+
+    @property
+    def description(self) -> Mapping[str, object]:
+        """As there."""
+        return self.frames.description
+
+    @property
+    def square_metres(self) -> bool:
+        """As there."""
+        return self.frames.square_metres
+
+    @property
+    def reference_record(self) -> Mapping[str, object] | None:
+        """As there."""
+        return self.frames.reference_record
+
+    @property
+    def content(self) -> Mapping[str, object]:
+        """As there, and which rigs."""
+        return {**self.frames.content, "rigs of the recording": self.names}
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: int) -> Frame:
+        frame = self.frames[index]
+        boxes = None if frame.boxes is None else replace(frame.boxes, hits=self._chosen(frame.boxes.hits))
+        points = None if frame.sensor_points is None else self._chosen(frame.sensor_points)
+        clouds = {name: frame.cloud_of(of) for name, of in self.names.items()}
+        return replace(frame, clouds=clouds, boxes=boxes, sensor_points=points)
+
+    def _chosen(self, by_rig: Mapping[str, ValueT]) -> dict[str, ValueT]:
+        return {name: by_rig[of] for name, of in self.names.items() if of in by_rig}

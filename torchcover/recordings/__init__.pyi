@@ -1,0 +1,14 @@
+from .accumulated_reference import AccumulatedReference as AccumulatedReference
+from .clouds.readers import read_cloud as read_cloud
+from .formats import FORMATS as FORMATS
+from .formats import RecordingFormat as RecordingFormat
+from .formats import open_recording as open_recording
+from .formats import read_objects as read_objects
+from .recorded_frames import RecordedFrames as RecordedFrames
+from .recorded_frames import reference_of_recording as reference_of_recording
+from .recorded_reference import RecordedReference as RecordedReference
+from .recorded_reference import Reference as Reference
+from .recorders import RECORDERS as RECORDERS
+from .recording import Recording as Recording
+from .recording import Scan as Scan
+from .suspicion import suspicions as suspicions

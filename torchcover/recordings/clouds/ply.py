@@ -1,0 +1,142 @@
+"""Clouds in Stanford's `.ply`: the vertices, ascii or binary.
+
+NumPy reads them, not trimesh, which reads meshes: it returns a truncated ascii file without a word, refuses a
+binary one with triangles beside quads although its vertices are sound, and rounds ascii coordinates to float32.
+"""
+
+from dataclasses import dataclass, field
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from torchcover.files import check_memory
+from torchcover.recordings.clouds.arrays import Points
+from torchcover.recordings.clouds.binary import check_rest
+from torchcover.recordings.clouds.text import AXES, parse_rows, read_lines
+
+# Bounds the search for end_header in a file that is no PLY.
+MAX_HEADER_BYTES = 65536
+MAX_DIGITS = 18
+BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+# The names of the first specification and the ones with a size in them (CARLA writes float32).
+TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+
+
+@dataclass
+class _Element:
+    name: str
+    rows: int
+    types: dict[str, str] = field(default_factory=dict)
+    has_list: bool = False
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of one row; of a list only its length, so a lower bound where there is one."""
+        return sum(np.dtype(kind).itemsize for kind in self.types.values())
+
+
+def read_ply(path: Path) -> Points:
+    """Read x y z of the element `vertex` of a PLY file."""
+    check_memory(4 * path.stat().st_size)
+    encoding, elements, body = _parse_header(path.read_bytes())
+    names = [element.name for element in elements]
+    if "vertex" not in names:
+        raise ValueError(f"no element vertex among the elements: {', '.join(names) or 'none'}")
+    before, vertex = elements[: names.index("vertex")], elements[names.index("vertex")]
+    _check_vertex(vertex)
+    if encoding == "ascii":
+        return _parse_ascii(elements, before, vertex, body)
+    if any(element.has_list for element in before):
+        raise ValueError("a binary element with a list stands before the vertices; store the vertices first")
+    _check_size(elements, sum(element.rows * element.row_bytes for element in elements), len(body), "bytes")
+    if not any(element.has_list for element in elements):
+        check_rest(body[sum(element.rows * element.row_bytes for element in elements) :])
+    dtype = np.dtype([(name, BYTE_ORDERS[encoding] + kind) for name, kind in vertex.types.items()])
+    offset_bytes = sum(element.rows * element.row_bytes for element in before)
+    table = np.frombuffer(body, dtype, vertex.rows, offset_bytes)
+    return np.column_stack([table[axis] for axis in AXES])
+
+
+def _parse_ascii(elements: list[_Element], before: list[_Element], vertex: _Element, body: bytes) -> Points:
+    rows, claimed = sum(1 for _ in read_lines(body)), sum(element.rows for element in elements)
+    _check_size(elements, claimed, rows, "rows")
+    if rows > claimed:
+        raise ValueError(f"the header claims {claimed} rows; {rows} rows follow it")
+    if vertex.rows == 0:
+        return np.empty((0, 3))
+    first = sum(element.rows for element in before)
+    properties = list(vertex.types)
+    columns = [properties.index(axis) for axis in AXES]
+    return parse_rows(islice(read_lines(body), first, first + vertex.rows), columns, len(properties))
+
+
+def _parse_header(data: bytes) -> tuple[str, list[_Element], bytes]:
+    if data[:5].split()[:1] != [b"ply"]:
+        raise ValueError(f"not a PLY file: it starts with {data[:12]!r}, not with a line ply")
+    encoding = ""
+    elements: list[_Element] = []
+    end = data.find(b"\n") + 1
+    while True:
+        start, end = end, data.find(b"\n", end, MAX_HEADER_BYTES) + 1
+        if end == 0:
+            raise ValueError("the PLY header has no end: a line end_header is missing")
+        words = data[start:end].decode("ascii", "replace").split()
+        match words:
+            case ["end_header"]:
+                break
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", encoding, _]:
+                pass
+            case ["element", name, rows] if rows.isascii() and rows.isdigit() and len(rows) <= MAX_DIGITS:
+                elements.append(_Element(name, int(rows)))
+            case ["property", *declaration] if elements:
+                _add_property(elements[-1], declaration)
+            case _:
+                raise ValueError(f"not a line of a PLY header: {' '.join(words)[:80]!r}")
+    if encoding not in BYTE_ORDERS:
+        raise ValueError(f"the PLY format is {encoding!r}; allowed are {', '.join(BYTE_ORDERS)}")
+    return encoding, elements, data[end:]
+
+
+def _add_property(element: _Element, declaration: list[str]) -> None:
+    match declaration:
+        case ["list", length_kind, kind, name] if length_kind in TYPES and kind in TYPES:
+            element.types[name] = TYPES[length_kind]
+            element.has_list = True
+        case [kind, name] if kind in TYPES and name not in element.types:
+            element.types[name] = TYPES[kind]
+        case _:
+            raise ValueError(
+                f"element {element.name}: property {' '.join(declaration)[:80]!r} is repeated or of no known type; "
+                f"types are {', '.join(TYPES)}"
+            )
+
+
+def _check_vertex(vertex: _Element) -> None:
+    missing = [axis for axis in AXES if axis not in vertex.types]
+    if missing:
+        raise ValueError(f"the vertices have no {', '.join(missing)}; got {', '.join(vertex.types) or 'nothing'}")
+    if vertex.has_list:
+        raise ValueError("the vertices have a list property; only single values are read")
+    kinds = {vertex.types[axis] for axis in AXES}
+    if not kinds <= {"f4", "f8"}:
+        raise ValueError(f"x y z have to be float or double; got {', '.join(sorted(kinds))}")
+
+
+def _check_size(elements: list[_Element], claimed: int, available: int, unit: str) -> None:
+    if claimed > available:
+        counts = ", ".join(f"{element.rows} of {element.name}" for element in elements)
+        raise ValueError(
+            f"truncated: the header claims {counts}, at least {claimed} {unit}; {available} {unit} follow it"
+        )

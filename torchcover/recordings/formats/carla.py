@@ -1,0 +1,210 @@
+"""LiDARs and depth cameras of CARLA (Dosovitskiy et al., CoRL 2017), as `save_to_disk` writes them."""
+
+import math
+import os
+import warnings
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.cameras import read_depth
+from torchcover.cameras.calibration import LOOKING_FORWARD
+from torchcover.detection.boxes import Boxes
+from torchcover.files import naming, read_csv
+from torchcover.geometry import invert, transform
+from torchcover.geometry.rigid import Matrix
+from torchcover.recordings.clouds.readers import read_cloud
+from torchcover.recordings.formats.carla_files import (
+    POSE,
+    REFERENCE,
+    CarlaSensor,
+    read_carla_boxes,
+    read_carla_sensors,
+    read_carla_vehicle,
+    right_handed,
+)
+from torchcover.recordings.formats.file_names import check_frames, check_same_names, frame_files
+from torchcover.recordings.recording import Scan, check_times
+
+SENSORS_FILES = ("sensors.json", "sensors.yaml")
+VEHICLE_FILE, POSES_FILE, BOXES = "vehicle.json", "poses.csv", "boxes"
+# Times are a little off; so much of a file is no part of a turn of its own.
+OF_A_FILE = 0.02
+# Where a LiDAR that turns saw nothing over so wide an angle, it has probably not been there.
+SECTOR_DEG = 60.0
+
+
+class Carla:
+    """A folder with `sensors.json` and `ID/FRAME.ply` (or `.npy`; `.png` of a depth camera) of each sensor in it.
+
+    All of it is in CARLA's left-handed axes. `sensors.json` (or `.yaml`) is the list that an agent of CARLA's
+    leaderboard returns: `id`, `type`, `x`, `y`, `z`, `roll`, `pitch`, `yaw` of each sensor on its vehicle, `width`,
+    `height` and `fov` of cameras, and any attributes of its blueprint; what is neither a LiDAR nor a depth camera is
+    left out. A sensor whose `id` is `reference` is the reference. All that follows is optional:
+
+    * `vehicle.json`, the `bounding_box` of the vehicle: points in it are its own, and the vehicle frame lies under its
+      middle. Without it the actor's frame is taken for that, and own points are taken for the world;
+    * `ID/poses.csv`, with the columns `frame, x, y, z, roll, pitch, yaw`: where a sensor was on the vehicle;
+    * `poses.csv`, also with `time_s`: where the vehicle was;
+    * `boxes/FRAME.csv`, the objects, see `read_carla_boxes`; they need `poses.csv`.
+
+    Where frames come faster than a LiDAR turns, as `poses.csv` and `rotation_frequency` say, an instant is as many
+    frames as make a turn of all LiDARs. It bears name, time and pose of the last; the parts before are moved by the
+    poses of the vehicle, without whatever else moved meanwhile. Frames at the end that make no turn are left out.
+
+    Args:
+        path: The folder.
+
+    Raises:
+        FileNotFoundError: No `sensors.json`, or no clouds of a LiDAR in it.
+        ValueError: Not such a list, no LiDAR or depth camera in it, places with other frames, too few for a turn, or a
+            bad table.
+
+    Warns:
+        UserWarning: How long a turn takes is unknown, and the first file of a LiDAR looks like a part of one.
+    """
+
+    layout: ClassVar[str] = "sensors.json, ID/FRAME.ply of each LiDAR and ID/FRAME.png of each depth camera in it"
+    square_metres = False
+    instants = None
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        listed = read_carla_sensors(next(filter(Path.exists, _lists(self.path)), self.path / SENSORS_FILES[0]))
+        vehicle = read_carla_vehicle(self.path / VEHICLE_FILE) if (self.path / VEHICLE_FILE).exists() else None
+        self.body = None if vehicle is None else vehicle.body
+        self._vehicle_T_actor = np.eye(4) if vehicle is None else vehicle.vehicle_T_actor
+        self._mounts = {one.id: self._vehicle_T_actor @ one.parent_T_sensor for one in listed}
+        self._cameras = {one.id: one.camera for one in listed if one.camera is not None}
+        self.sensors = tuple(name for name in self._mounts if name != REFERENCE)
+        self.rigs = {"carla": self.sensors}
+        self.reference_sensors = (REFERENCE,) if REFERENCE in self._mounts else ()
+        self._files = {name: self._files_of(name) for name in self._mounts}
+        self._labelled = (self.path / BOXES).is_dir()
+        boxes = {BOXES: {file.stem: file for file in (self.path / BOXES).glob("*.csv")}} if self._labelled else {}
+        check_same_names(self.path, {**self._files, **boxes})
+        self._ticks = tuple(next(iter(self._files.values())))
+        moving = {name: self.path / name / POSES_FILE for name in self._mounts}
+        self._moving = {name: self._table(path, ())[1] for name, path in moving.items() if path.exists()}
+        self.times_s, self._poses = None, None
+        self._parts = dict.fromkeys(self._mounts, 1)
+        if (self.path / POSES_FILE).exists():
+            self.times_s, self._poses = self._table(self.path / POSES_FILE, ("time_s",))
+            check_times(self.times_s, len(self._ticks), str(self.path / POSES_FILE))
+            self._parts = {one.id: _parts_of_a_turn(one, self.times_s) for one in listed}
+        elif self._labelled:
+            raise ValueError(f"{self.path}: {BOXES}/ are in the world; {POSES_FILE} is needed, which is not there")
+        if self.times_s is None or len(self.times_s) == 1:
+            self._warn_of_sectors(listed)
+        turn = max(self._parts.values())
+        if len(self._ticks) < turn:
+            raise ValueError(f"{self.path}: a turn of its LiDARs takes {turn} frames; there are {len(self._ticks)}")
+        self._lasts = range(turn - 1, len(self._ticks), turn)
+        self.names = tuple(self._ticks[last] for last in self._lasts)
+        if self.times_s is not None:
+            self.times_s = self.times_s[self._lasts.start :: turn]
+
+    @property
+    def frames(self) -> range:
+        """All of them."""
+        return range(len(self.names))
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether there is a list of sensors."""
+        return any(file.is_file() for file in _lists(path))
+
+    def scan(self, sensor: str, index: int) -> Scan:
+        """Read a cloud, its y turned to the left, or a depth image; all parts of a turn."""
+        last = self._lasts[index]
+        cloud_m, vehicle_T_sensor, source = self._read(sensor, last)
+        if self._parts[sensor] == 1:
+            return Scan(cloud_m, vehicle_T_sensor, source)
+        parts = [transform(vehicle_T_sensor, cloud_m)]
+        for tick in range(last - self._parts[sensor] + 1, last):
+            cloud_m, vehicle_T_sensor, _ = self._read(sensor, tick)
+            parts.append(self._moved(transform(vehicle_T_sensor, cloud_m), tick, last))
+        return Scan(np.concatenate(parts), None, source)
+
+    def world_T_vehicle(self, index: int) -> Matrix | None:
+        """Where the vehicle was, if there is a `poses.csv`."""
+        return self._pose(self._lasts[index])
+
+    def boxes(self, index: int) -> Boxes | None:
+        """The objects of a frame; None without the folder.
+
+        Raises:
+            ValueError: A file that is not what it is meant to be.
+        """
+        pose = self.world_T_vehicle(index)
+        if pose is None or not self._labelled:
+            return None
+        return read_carla_boxes(self.path / BOXES / f"{self.names[index]}.csv", invert(pose))
+
+    def _read(self, sensor: str, tick: int) -> tuple[NDArray[np.floating], Matrix, str]:
+        """Points of a file in right-handed axes, where their sensor was, and the file."""
+        path = self._files[sensor][self._ticks[tick]]
+        mount = self._mounts[sensor]
+        if sensor in self._moving:
+            mount = self._vehicle_T_actor @ self._moving[sensor][tick]
+        if sensor in self._cameras:
+            with naming(path, "a depth image"):
+                points = self._cameras[sensor].unproject(read_depth(path))
+            return points.numpy(), mount @ LOOKING_FORWARD, str(path)  # type: ignore[union-attr]  # one image
+        points_m = read_cloud(path)
+        points_m[:, 1] *= -1
+        return points_m, mount, str(path)
+
+    def _moved(self, points_m: Matrix, tick: int, last: int) -> Matrix:
+        """Points of the world as the vehicle finds them later; its own go with it."""
+        before, after = self._pose(tick), self._pose(last)
+        assert before is not None  # without times there are no parts
+        assert after is not None
+        moved_m = transform(invert(after) @ before, points_m)
+        if self.body is None:
+            return moved_m
+        own = ((points_m > self.body.lower_m) & (points_m < self.body.upper_m)).all(axis=1, keepdims=True)
+        return np.where(own, points_m, moved_m)
+
+    def _pose(self, tick: int) -> Matrix | None:
+        return None if self._poses is None else self._poses[tick] @ invert(self._vehicle_T_actor)
+
+    def _files_of(self, sensor: str) -> dict[str, Path]:
+        return frame_files(self.path / sensor, beside=(POSES_FILE,), images=sensor in self._cameras)
+
+    def _warn_of_sectors(self, listed: list[CarlaSensor]) -> None:
+        for one in listed:
+            if one.rotation_frequency is None or one.horizontal_fov < 360 - SECTOR_DEG:
+                continue
+            points_m, _, source = self._read(one.id, 0)
+            azimuth_deg = np.sort(np.rad2deg(np.arctan2(points_m[:, 1], points_m[:, 0])))
+            gap_deg = float(np.diff(azimuth_deg, append=azimuth_deg[:1] + 360).max(initial=0.0))
+            if gap_deg > SECTOR_DEG:
+                warnings.warn(
+                    f"{source}: {one.id}: nothing in {gap_deg:.0f} degrees; if a file holds a part of a turn, add "
+                    f"{POSES_FILE}, by which parts are joined, or record with a rotation_frequency of "
+                    "1 / fixed_delta_seconds",
+                    stacklevel=4,
+                )
+
+    def _table(self, path: Path, timed: tuple[str, ...]) -> tuple[NDArray[np.float64], Matrix]:
+        """(F,) times, or nothing, and (F, 4, 4) poses of the frames of a table."""
+        table = read_csv(path, (*timed, *POSE), ("frame",))
+        with naming(path, "a table of poses"):
+            order = check_frames(table.words["frame"], self._ticks)
+        poses = right_handed([table.numbers[name][order] for name in POSE])
+        return (table.numbers["time_s"][order] if timed else np.empty(0)), poses
+
+
+def _lists(folder: Path) -> list[Path]:
+    return [folder / name for name in SENSORS_FILES]
+
+
+def _parts_of_a_turn(sensor: CarlaSensor, times_s: NDArray[np.float64]) -> int:
+    """How many files make a turn; 1 where that is unknown, as of a camera."""
+    if sensor.rotation_frequency is None or sensor.camera is not None or len(times_s) < 2:
+        return 1
+    turns_in_a_file = sensor.rotation_frequency * float(np.median(np.diff(times_s)))
+    return max(1, math.ceil(1 / turns_in_a_file - OF_A_FILE))

@@ -1,0 +1,156 @@
+"""A recording in a folder: clouds of one or several sensors or rigs, and what else is known, in files beside them."""
+
+import os
+from pathlib import Path
+from typing import ClassVar
+
+from torchcover.detection.boxes import Boxes
+from torchcover.geometry.rigid import Matrix
+from torchcover.recordings.clouds.readers import read_cloud, read_weighted_cloud
+from torchcover.recordings.formats.file_names import check_same_names, frame_files, natural
+from torchcover.recordings.formats.folder_settings import FolderSettings, PlaceSettings, read_folder_settings
+from torchcover.recordings.formats.folder_tables import PoseTable, read_boxes
+from torchcover.recordings.recording import Scan, check_times
+
+SETTINGS_FILE = "frames.yaml"
+POSES_FILE = "poses.csv"
+REFERENCE, BOXES = "reference", "boxes"
+# What the clouds of the only rig are called.
+ONLY_RIG = "recording"
+
+
+class FolderRecording:
+    """A folder with `sensor/FRAME.*`, in natural order (frame2 before frame10), and whatever else is known.
+
+    Several sensors of one rig have `sensors/NAME/FRAME.*` each, several rigs `rigs/NAME/FRAME.*`. Any format of
+    `read_cloud` will do, and places may differ. All that follows is optional:
+
+    * `reference/FRAME.*`, what the reference sensor saw;
+    * `poses.csv`, time and place of the vehicle in each frame, see `PoseTable`: `world_T_vehicle`;
+    * `PLACE/poses.csv`, where that sensor was on the vehicle in each frame: `vehicle_T_sensor`;
+    * `boxes/FRAME.csv`, the objects of each frame, see `read_boxes`;
+    * `frames.yaml`. Clouds are in the vehicle frame, unless it says where their sensor is:
+
+          sensor:                      # or sensors: {NAME: ...}, or rigs: {NAME: ...}; reference likewise
+            vehicle_T_sensor:          # 4x4, metres
+              - [1, 0, 0, 1.2]
+              - [0, 1, 0, 0.0]
+              - [0, 0, 1, 1.73]
+              - [0, 0, 0, 1]
+            flip_y: true               # the cloud has y to the right, as CARLA's: turned before anything else
+            min_range_m: 0.5           # nearer to the sensor is no return
+          reference:
+            square_metres: true        # its files are .npz with points and weights
+          vehicle:                     # what lies in it is the vehicle itself
+            lower_m: [-2.4, -0.9, 0.05]
+            upper_m: [2.4, 0.9, 1.6]
+
+    Args:
+        path: The folder.
+
+    Raises:
+        FileNotFoundError: The folder, or clouds of a sensor in it, are missing.
+        ValueError: No frames, a file that is no cloud, two files of one name, names in one place only, two of
+            `sensor`, `sensors` and `rigs`, or a bad `frames.yaml` or `poses.csv`.
+    """
+
+    layout: ClassVar[str] = (
+        "sensor/FRAME.*, or sensors/NAME/FRAME.* or rigs/NAME/FRAME.* for several; reference/FRAME.*"
+    )
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        if not self.path.is_dir():
+            raise FileNotFoundError(f"{self.path}: no such folder; a recording holds {self.layout}")
+        self._places = _places(self.path)
+        self.sensors = tuple(self._places)
+        several_rigs = (self.path / "rigs").is_dir()
+        self.rigs = {name: (name,) for name in self.sensors} if several_rigs else {ONLY_RIG: self.sensors}
+        self.reference_sensors = (REFERENCE,) if (self.path / REFERENCE).is_dir() else ()
+        self._places |= {name: name for name in self.reference_sensors}
+        files = {place: frame_files(self.path / place, beside=(POSES_FILE,)) for place in self._places.values()}
+        self._labelled = (self.path / BOXES).is_dir()
+        boxes = {BOXES: {path.stem: path for path in (self.path / BOXES).glob("*.csv")}} if self._labelled else {}
+        check_same_names(self.path, {**files, **boxes})
+        self._files = files
+        self.names = tuple(next(iter(files.values())))
+        self._settings = read_folder_settings(self.path / SETTINGS_FILE)
+        self.body, self.square_metres = self._settings.body, self._settings.square_metres
+        self._poses = self._table(self.path, timed=True)
+        self.instants = None if self._poses is None else self._poses.instants
+        times_s = None if self._poses is None else self._poses.times_s
+        self.times_s = None if times_s is None else check_times(times_s, len(self.names), str(self.path / POSES_FILE))
+        self._moving = {place: self._table(self.path / place, timed=False) for place in files}
+        self._check(self._settings)
+
+    @property
+    def frames(self) -> range:
+        """All of them."""
+        return range(len(self.names))
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether it is a folder with clouds of a sensor, of sensors, of rigs or of a reference in it."""
+        return any((path / place).is_dir() for place in ("sensor", "sensors", "rigs", REFERENCE))
+
+    def scan(self, sensor: str, index: int) -> Scan:
+        """Read a file."""
+        place = self._places[sensor]
+        path = self._files[place][self.names[index]]
+        weights = None
+        if sensor == REFERENCE and self.square_metres:
+            points_m, weights = read_weighted_cloud(path)
+        else:
+            points_m = read_cloud(path)
+        settings, moving = self._settings.places.get(place, PlaceSettings()), self._moving[place]
+        if settings.flip_y:
+            points_m[:, 1] *= -1
+        vehicle_T_sensor = settings.vehicle_T_sensor if moving is None else moving[index]
+        return Scan(points_m, vehicle_T_sensor, str(path), min_range_m=settings.min_range_m, weights=weights)
+
+    def world_T_vehicle(self, index: int) -> Matrix | None:
+        """Where the vehicle was, if there is a `poses.csv`."""
+        return None if self._poses is None else self._poses[index]
+
+    def boxes(self, index: int) -> Boxes | None:
+        """The objects of a frame; None without the folder.
+
+        Raises:
+            FileNotFoundError: This frame has none, while the folder is there.
+            ValueError: A file that is not what it is meant to be.
+        """
+        return read_boxes(self.path / BOXES / f"{self.names[index]}.csv") if self._labelled else None
+
+    def _table(self, folder: Path, *, timed: bool) -> PoseTable | None:
+        path = folder / POSES_FILE
+        return PoseTable(path, self.names, timed=timed) if path.exists() else None
+
+    def _check(self, settings: FolderSettings) -> None:
+        file = self.path / SETTINGS_FILE
+        for place, said in settings.places.items():
+            name = place.replace("/", ".")
+            if place not in self._files:
+                raise ValueError(f"{file}: {name}: there is no {place}/ beside it")
+            moving = self._moving[place] is not None
+            if moving and said.vehicle_T_sensor is not None:
+                raise ValueError(f"{file}: {name}.vehicle_T_sensor: {place}/{POSES_FILE} says it too; keep one of them")
+            if said.min_range_m and not moving and said.vehicle_T_sensor is None:
+                raise ValueError(f"{file}: {name}.min_range_m: it needs vehicle_T_sensor, to say where the sensor is")
+
+
+def _places(folder: Path) -> dict[str, str]:
+    """Name of each sensor of the vehicle -> its folder within the recording; its settings are under the same path."""
+    found = [kind for kind in ("sensor", "sensors", "rigs") if (folder / kind).exists()]
+    if len(found) > 1:
+        raise ValueError(
+            f"{folder}: both {found[0]}/ and {found[1]}/; sensor/ is for one sensor, sensors/NAME/ for several of one "
+            "rig, rigs/NAME/ for several rigs"
+        )
+    if not found or found == ["sensor"]:
+        return {"sensor": "sensor"}
+    (kind,) = found
+    names = [path.name for path in (folder / kind).iterdir() if not path.name.startswith(".")]
+    if not names or REFERENCE in names:
+        wrong = f"a {kind[:-1]} called reference" if names else f"no {kind[:-1]}"
+        raise ValueError(f"{folder / kind}: {wrong}; each has a folder {kind}/NAME/ of its own")
+    return {name: f"{kind}/{name}" for name in sorted(names, key=natural)}

@@ -1,0 +1,165 @@
+"""A drive of KITTI's raw data: scans with the poses of the GPS and IMU, and tracklets."""
+
+import os
+from functools import cached_property
+from pathlib import Path
+from typing import ClassVar
+from xml.etree import ElementTree
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchcover.detection.boxes import Boxes
+from torchcover.files import parse_xml, reads
+from torchcover.geometry.rigid import Matrix, euler_from_rotation, invert, rotation_from_euler, transform
+from torchcover.recordings.clouds.readers import read_cloud
+from torchcover.recordings.formats.file_names import check_same_names, frame_files
+from torchcover.recordings.formats.kitti_files import (
+    BODY,
+    read_oxts,
+    read_rectified,
+    read_rigid,
+    read_timestamps,
+    vehicle_T_velodyne,
+    world_T_imu,
+)
+from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
+
+
+class KittiRaw:
+    """A folder `DATE/DATE_drive_NUMBER_sync` with `velodyne_points` and `oxts`; calibrations are in `DATE`.
+
+    Boxes are those of `tracklet_labels.xml`, if it is there.
+
+    Args:
+        path: The folder of the drive.
+
+    Raises:
+        FileNotFoundError: A part is missing.
+        ValueError: No frames, another number of times than of scans, times out of order, a bad calibration.
+    """
+
+    layout: ClassVar[str] = "DATE/DRIVE/velodyne_points/data/FRAME.bin, oxts/data/FRAME.txt"
+    sensors = ("velodyne",)
+    reference_sensors = ()
+    square_metres = False
+    instants = None
+    body = BODY
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        self._clouds = frame_files(self.path / "velodyne_points" / "data")
+        check_same_names(self.path, {"velodyne_points/data": self._clouds})
+        self.names = tuple(self._clouds)
+        self.rigs = {"kitti": self.sensors}
+        times = self.path / "velodyne_points" / "timestamps.txt"
+        self.times_s = check_times(read_timestamps(times), len(self.names), str(times))
+        self._imu_T_vehicle = self._calibrated()
+        self._tracklets = self.path / "tracklet_labels.xml"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether it has scans and records of the GPS and IMU."""
+        return all((path / place).is_dir() for place in ("velodyne_points", "oxts"))
+
+    @property
+    def frames(self) -> range:
+        """All of them."""
+        return range(len(self.names))
+
+    def scan(self, sensor: str, index: int) -> Scan:
+        """Read a cloud, which the development kit has corrected for the motion within a turn."""
+        path = self._clouds[self.names[index]]
+        return Scan(read_cloud(path), vehicle_T_velodyne, str(path))
+
+    def world_T_vehicle(self, index: int) -> Matrix:
+        """Where the vehicle was, by the GPS and IMU.
+
+        Raises:
+            FileNotFoundError: There is no record of that instant.
+            ValueError: It is not what it is meant to be.
+        """
+        return world_T_imu(self._oxts(index), self._latitude_deg) @ self._imu_T_vehicle
+
+    def calibrations(self) -> SensorCalibrations:
+        """The rectified cameras of the day, where its `calib_cam_to_cam.txt` is there.
+
+        Raises:
+            FileNotFoundError: `calib_velo_to_cam.txt` is missing beside it.
+            ValueError: They are not what they are meant to be.
+        """
+        day = self.path.parent
+        cameras = day / "calib_cam_to_cam.txt"
+        mounts = {"velodyne": vehicle_T_velodyne}
+        if not cameras.exists():
+            return SensorCalibrations(f"the LiDAR where KITTI's is; no cameras, for there is no {cameras.name}", mounts)
+        camera_T_velodyne = read_rigid(day / "calib_velo_to_cam.txt")
+        placed = read_rectified(cameras, vehicle_T_velodyne @ invert(camera_T_velodyne))
+        return SensorCalibrations(f"the LiDAR where KITTI's is, {cameras.name}", mounts, placed)
+
+    def boxes(self, index: int) -> Boxes | None:
+        """The tracklets of that instant; None without the file."""
+        if not self._tracklets.exists():
+            return None
+        return self._tracked.get(index, Boxes.from_rows(torch.empty(0, 7)))
+
+    def _oxts(self, index: int) -> NDArray[np.float64]:
+        return read_oxts(self.path / "oxts" / "data" / f"{self.names[index]}.txt")
+
+    @cached_property
+    def _latitude_deg(self) -> float:
+        return float(self._oxts(0)[0])
+
+    @cached_property
+    def _tracked(self) -> dict[int, Boxes]:
+        return read_tracklets(self._tracklets, vehicle_T_velodyne)
+
+    def _calibrated(self) -> Matrix:
+        return invert(read_rigid(self.path.parent / "calib_imu_to_velo.txt")) @ invert(vehicle_T_velodyne)
+
+
+@reads("KITTI tracklets")
+def read_tracklets(path: Path, vehicle_T_velodyne: Matrix) -> dict[int, Boxes]:
+    """Read the boxes of every frame that has any.
+
+    The origin of a tracklet is the middle of the bottom of its box, in the frame of the LiDAR. Its name is its number
+    in the file.
+
+    Args:
+        path: The file.
+        vehicle_T_velodyne: (4, 4) where the LiDAR is; its z axis is upright.
+
+    Raises:
+        BadFileError: Not such a file, or numbers that are no boxes.
+    """
+    root = parse_xml(path)
+    frames: dict[int, list[tuple[list[float], str, str]]] = {}
+    for number, item in enumerate(root.findall("./tracklets/item")):
+        category = (item.findtext("objectType") or "").strip().lower()
+        length, width, height = (_number(item, name) for name in "lwh")
+        start = int(_number(item, "first_frame"))
+        for step, pose in enumerate(item.findall("./poses/item")):
+            x, y, z = (_number(pose, f"t{axis}") for axis in "xyz")
+            row = [x, y, z + height / 2, length, width, height, _number(pose, "rz")]
+            frames.setdefault(start + step, []).append((row, str(number), category))
+    return {frame: _boxes(found, vehicle_T_velodyne) for frame, found in frames.items()}
+
+
+def _boxes(found: list[tuple[list[float], str, str]], vehicle_T_velodyne: Matrix) -> Boxes:
+    rows = np.array([row for row, _, _ in found])
+    rows[:, :3] = transform(vehicle_T_velodyne, rows[:, :3])
+    turned = [vehicle_T_velodyne[:3, :3] @ rotation_from_euler(np.rad2deg(yaw), 0.0, 0.0) for yaw in rows[:, 6]]
+    rows[:, 6] = np.deg2rad(euler_from_rotation(np.stack(turned))[:, 0])
+    return Boxes.from_rows(
+        torch.from_numpy(rows).float(),
+        ids=tuple(name for _, name, _ in found),
+        categories=tuple(category for _, _, category in found),
+    )
+
+
+def _number(element: ElementTree.Element, name: str) -> float:
+    text = element.findtext(name)
+    if text is None:
+        raise ValueError(f"a tracklet without <{name}>")
+    return float(text)

@@ -1,0 +1,241 @@
+"""Bags of ROS 2: clouds of all LiDARs, where they are mounted, where the vehicle was."""
+
+import os
+import warnings
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.files import naming
+from torchcover.geometry import invert
+from torchcover.geometry.rigid import Matrix
+from torchcover.recordings.formats.bag import METADATA, SUFFIXES, Bag
+from torchcover.recordings.formats.frame_tree import FrameTree, frame_name
+from torchcover.recordings.formats.point_cloud2 import CloudMessage, cloud_of
+from torchcover.recordings.formats.ros_poses import TF, WINDOW_NS, VehiclePoses, vehicle_poses
+from torchcover.recordings.recording import NO_RETURN_M, Scan, SensorCalibrations, check_times
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+VEHICLE_FRAMES = ("base_link", "base_footprint")
+# Clouds that come so much more rarely than those of the fastest sensor are maps and the like.
+RAREST = 0.25
+# Scans of one instant: none is farther from the first sensor's than this share of the time from one to the next.
+FARTHEST_SCAN = 0.75
+# Points of so short a time are moved together: 0.4 mm at 40 m/s.
+TICK_S = 1e-5
+
+
+class Ros2:
+    """A bag: a folder with `metadata.yaml` and `.db3` or `.mcap` files, or one such file. Needs `torchcover[ros]`.
+
+    The sensors are the topics of `PointCloud2`, named without the first slash, whose frame static transforms link to
+    the vehicle's; an instant is a scan of the one that has fewest, with the nearest of each other. Times are those of
+    recording, poses belong to the stamps of the clouds. Points with a time of their own (a field `t`, `time`,
+    `timestamp`, `time_stamp`, `offset_time` or `time_offset`) are taken as measured and moved to the stamp of
+    their instant; those without as one, too. Scans beyond the first and last pose are left out.
+
+    Args:
+        path: The folder or the file.
+        vehicle_frame: The frame that is the vehicle's: x forward, y left, z up, on the ground. If not given it is
+            `base_link`, or else `base_footprint`.
+
+    Raises:
+        FileNotFoundError: A file is missing.
+        ValueError: A damaged bag; no cloud, none with a mount; frames in a loop; poses that are none.
+        ImportError: rosbags is not installed.
+
+    Warns:
+        UserWarning: What was chosen where there was a choice, and clouds that were left out.
+    """
+
+    layout: ClassVar[str] = "metadata.yaml and *.db3 or *.mcap, or such a file, with topics of PointCloud2"
+    reference_sensors = ()
+    square_metres = False
+    instants = None
+    body = None
+
+    def __init__(self, path: str | os.PathLike[str], vehicle_frame: str | None = None) -> None:
+        self.path = Path(path)
+        self._bag = Bag(self.path)
+        with naming(self.path, "a ROS 2 bag"):
+            statics = [topic for topic in self._bag.topics(TF) if topic.endswith("tf_static")]
+            messages = [message for topic in statics for message in self._bag.messages(topic)]
+            tree = FrameTree(one for message in messages for one in message.transforms)
+            frames = self._frames_of_clouds()
+            self.vehicle_frame = vehicle_frame or _vehicle_frame({*tree.frames, *frames.values()})
+            self._mounts = self._mounted(frames, tree)
+            self.sensors = tuple(self._mounts)
+            self.rigs = {"ros2": self.sensors}
+            found = vehicle_poses(self._bag, tree, self.vehicle_frame)
+            self._poses = found[0] if found else None
+            self._logged_ns = self._together()
+            self._stamps_ns: dict[int, int] = {}
+            self._leave_out_ends()
+            self._say_what_was_chosen([poses.source for poses in found])
+            logged_ns = self._logged_ns[self.sensors[0]]
+            self.names = tuple(map(str, logged_ns))
+            self.times_s = check_times(
+                np.asarray((logged_ns - logged_ns[0]) * 1e-9), len(self.names), "recorded clouds"
+            )
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether it is such a folder or file."""
+        if path.is_dir():
+            return (path / METADATA).exists() and any(any(path.glob(f"*{suffix}*")) for suffix in SUFFIXES.values())
+        return path.suffix in SUFFIXES.values()
+
+    @property
+    def frames(self) -> range:
+        """All instants."""
+        return range(len(self.names))
+
+    def scan(self, sensor: str, index: int) -> Scan:
+        """Read a cloud; where the vehicle's poses are known, it is moved to the instant.
+
+        Raises:
+            BadFileError: It is damaged, there is none near the instant, or no pose near a point's time.
+        """
+        cloud, stamp_ns = self._cloud(sensor, index)
+        source, mount = f"{self.path}: {sensor} at {self._logged_ns[sensor][index]}", self._mounts[sensor]
+        if self._poses is None:
+            return Scan(cloud.points_m, mount, source)
+        vehicle_T_world = invert(self._world_T_vehicle(self._poses, index))
+        logged_ns = int(self._logged_ns[sensor][index])
+        if cloud.offsets_s is None:
+            world_T_then = self._poses.at(np.array([stamp_ns]), logged_ns)[0]
+            return Scan(cloud.points_m, vehicle_T_world @ world_T_then @ mount, source)
+        # Only what came back: zeros stay zeros, which say that nothing did.
+        came = np.flatnonzero((np.abs(cloud.points_m) > NO_RETURN_M).any(axis=1))
+        tick, of_point = np.unique(np.rint(cloud.offsets_s[came] / TICK_S).astype(np.int64), return_inverse=True)
+        times_ns = stamp_ns + np.rint(tick * TICK_S * 1e9).astype(np.int64)
+        sensor_T_then = (invert(mount) @ vehicle_T_world @ self._poses.at(times_ns, logged_ns) @ mount)[of_point]
+        points_m = cloud.points_m.astype(np.float64)
+        points_m[came] = np.einsum("nij,nj->ni", sensor_T_then[:, :3, :3], points_m[came]) + sensor_T_then[:, :3, 3]
+        return Scan(points_m, mount, source)
+
+    def world_T_vehicle(self, index: int) -> Matrix | None:
+        """Where the vehicle was at the stamp of the instant; None in a bag without poses.
+
+        Raises:
+            BadFileError: The messages are damaged, or there is no pose near that time.
+        """
+        return None if self._poses is None else self._world_T_vehicle(self._poses, index)
+
+    def calibrations(self) -> SensorCalibrations:
+        """The mounts."""
+        return SensorCalibrations(f"static transforms to {self.vehicle_frame}", self._mounts)
+
+    def boxes(self, index: int) -> None:
+        """None: there are no labels."""
+
+    def _frames_of_clouds(self) -> dict[str, str]:
+        """Topic of each cloud that comes often -> its frame."""
+        topics = self._bag.topics(CLOUD)
+        if not topics:
+            told = ", ".join(f"{topic} ({kind})" for topic, kind in sorted(self._bag.types.items()))
+            raise ValueError(f"a topic of {CLOUD} with messages is needed; there are {told or 'none'}")
+        counts = {topic: len(self._bag.times_ns(topic)) for topic in topics}
+        rare = [topic for topic, count in counts.items() if count < RAREST * max(counts.values())]
+        if rare:
+            self._warn(f"left out, for they come so rarely: {', '.join(rare)}")
+        often = sorted((topic for topic in topics if topic not in rare), key=lambda topic: (counts[topic], topic))
+        return {
+            topic: frame_name(self._bag.message(topic, int(self._bag.times_ns(topic)[0])).header.frame_id)
+            for topic in often
+        }
+
+    def _mounted(self, frames: Mapping[str, str], tree: FrameTree) -> dict[str, Matrix]:
+        """Name of each sensor, the one of the fewest scans first -> `vehicle_T_sensor`."""
+        found = {topic: tree.between(self.vehicle_frame, frame) for topic, frame in frames.items()}
+        lost = [f"{topic} ({frames[topic]})" for topic, mount in found.items() if mount is None]
+        told = f"no static transform links to {self.vehicle_frame} the frame of {', '.join(lost)}"
+        if len(lost) == len(found):
+            raise ValueError(f"{told}; static ones are of {', '.join(sorted(tree.frames)) or 'no frames'}")
+        if lost:
+            self._warn(f"left out, for {told}")
+        return {topic.removeprefix("/"): mount for topic, mount in found.items() if mount is not None}
+
+    def _together(self) -> dict[str, NDArray[np.int64]]:
+        """Sensor -> when its scan of each instant was recorded."""
+        times = {sensor: self._bag.times_ns(self._topic(sensor)) for sensor in self.sensors}
+        first_ns = times[self.sensors[0]]
+        return {sensor: times_ns[nearest_of(times_ns, first_ns)] for sensor, times_ns in times.items()}
+
+    def _leave_out_ends(self) -> None:
+        """Keep the instants between the first pose and the last."""
+        if self._poses is None:
+            return
+        first_ns, logged_ns = self._logged_ns[self.sensors[0]], self._poses.logged_ns
+        inside = (first_ns >= logged_ns[0] - WINDOW_NS) & (first_ns <= logged_ns[-1] + WINDOW_NS)
+        # Scans are recorded a little after their stamp: the few at the ends are asked for it.
+        at_ends = inside & ((first_ns < logged_ns[0] + WINDOW_NS) | (first_ns > logged_ns[-1] - WINDOW_NS))
+        for index in np.flatnonzero(at_ends):
+            inside[index] = self._poses.covers(self._stamp_ns(int(index)))
+        if not inside.any():
+            raise ValueError(
+                f"no scan lies between the first and the last pose of {self._poses.source}; do the clocks match?"
+            )
+        self._logged_ns = {sensor: times_ns[inside] for sensor, times_ns in self._logged_ns.items()}
+        self._stamps_ns = {}
+
+    def _say_what_was_chosen(self, sources: Sequence[str]) -> None:
+        if len(sources) > 1:
+            self._warn(f"poses are taken from {sources[0]}, not from {', '.join(sources[1:])}")
+        if self.vehicle_frame != VEHICLE_FRAMES[0]:
+            self._warn(f"{self.vehicle_frame} is taken for the vehicle's frame")
+
+    def _warn(self, what: str) -> None:
+        warnings.warn(f"{self.path}: {what}", stacklevel=5)
+
+    def _topic(self, sensor: str) -> str:
+        return sensor if sensor in self._bag.types else f"/{sensor}"
+
+    def _world_T_vehicle(self, poses: VehiclePoses, index: int) -> Matrix:
+        logged_ns = int(self._logged_ns[self.sensors[0]][index])
+        pose: Matrix = poses.at(np.array([self._stamp_ns(index)]), logged_ns)[0]
+        return pose
+
+    def _stamp_ns(self, index: int) -> int:
+        """When the first sensor's scan was made, which is the time of the instant."""
+        if index not in self._stamps_ns:
+            self._cloud(self.sensors[0], index)
+        return self._stamps_ns[index]
+
+    def _cloud(self, sensor: str, index: int) -> tuple[CloudMessage, int]:
+        """The cloud, and when it was made."""
+        logged_ns, first_ns = int(self._logged_ns[sensor][index]), self._logged_ns[self.sensors[0]]
+        apart_s = abs(logged_ns - int(first_ns[index])) * 1e-9
+        every_s = float(np.median(np.diff(first_ns))) * 1e-9 if len(first_ns) > 1 else np.inf
+        with naming(self.path, f"a cloud of {sensor}"):
+            if apart_s > FARTHEST_SCAN * every_s:
+                raise ValueError(f"the scan of {sensor} nearest to {first_ns[index]} is {apart_s:.3f} s off")
+            cloud = cloud_of(self._bag.message(self._topic(sensor), logged_ns))
+        stamp_ns = cloud.stamp_ns or logged_ns
+        if sensor == self.sensors[0]:
+            self._stamps_ns[index] = stamp_ns
+        return cloud, stamp_ns
+
+
+def nearest_of(times_ns: NDArray[np.int64], wanted_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """For each wanted time the number of the nearest, of ascending ones.
+
+    Example:
+        >>> nearest_of(np.array([0, 10, 20]), np.array([-5, 4, 6, 99]))
+        array([0, 0, 1, 2])
+    """
+    after = np.searchsorted(times_ns, wanted_ns).clip(1, max(len(times_ns) - 1, 1)).clip(max=len(times_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(wanted_ns - times_ns[before] <= times_ns[after] - wanted_ns, before, after)
+
+
+def _vehicle_frame(frames: Collection[str]) -> str:
+    for frame in VEHICLE_FRAMES:
+        if frame in frames:
+            return frame
+    raise ValueError(
+        f"the frame {' or '.join(VEHICLE_FRAMES)} of the vehicle is needed; there are {', '.join(sorted(frames))}"
+    )

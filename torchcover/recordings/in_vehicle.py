@@ -1,0 +1,120 @@
+"""Scans as frames need them: in the vehicle frame, without what is no return from the world."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import BoundingBox, transform
+from torchcover.geometry.rigid import blocks
+from torchcover.recordings.clouds.arrays import Points
+from torchcover.recordings.recording import NO_RETURN_M, Scan
+
+# float32 resolves 8 mm here; clouds in world coordinates lie far beyond and would lose decimetres without a word.
+MAX_COORDINATE_M = 1e5
+
+
+class InVehicle(NamedTuple):
+    """A cloud in the vehicle frame.
+
+    Args:
+        points_m: (N, 3) float32.
+        dropped: How many points were left out: `nonfinite`, `no_return`, `own_vehicle`; of an accumulated reference
+            also `gone`, those of objects that are not labelled at the instant.
+        weights: (N,) float32 what each point counts for; None if all count the same.
+    """
+
+    points_m: NDArray[np.float32]
+    dropped: Counter[str]
+    weights: NDArray[np.float32] | None = None
+
+
+def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
+    """Move a scan into the vehicle frame; leave out what no surface of the world has returned.
+
+    Args:
+        scan: What was stored.
+        body: The vehicle itself: points in it are its own. None: its size is unknown.
+
+    Raises:
+        ValueError: A coordinate beyond 1e5 m, as in a world frame.
+
+    Example:
+        >>> scan = Scan(np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]), None, "a.npy")
+        >>> in_vehicle(scan)
+        InVehicle(points_m=array([[5., 0., 0.]], dtype=float32), dropped=Counter({...}), weights=None)
+    """
+    points_m, weights = scan.points_m, scan.weights
+    finite, returned = _finite(points_m), _returned(points_m)
+    if scan.min_range_m:
+        returned &= ~(np.linalg.norm(points_m, axis=1) < scan.min_range_m)
+    kept = np.flatnonzero(finite & returned)
+    dropped = Counter({"nonfinite": int((~finite).sum()), "no_return": int((finite & ~returned).sum())})
+    if len(kept) < len(points_m):
+        points_m, weights = points_m[kept], None if weights is None else weights[kept]
+    moved_m, count = np.empty(points_m.shape, np.float32), 0
+    farthest_m, own = 0.0, [np.empty(0, np.intp)]
+    for rows in blocks(len(points_m)):
+        part_m = points_m[rows]
+        if scan.vehicle_T_sensor is not None:
+            part_m = transform(scan.vehicle_T_sensor, part_m)
+        farthest_m = max(farthest_m, float(part_m.max()), -float(part_m.min()))
+        if body is not None:
+            inside = within(part_m, body)
+            part_m = np.delete(part_m, inside, axis=0) if len(inside) else part_m
+            own.append(rows.start + inside)
+        with np.errstate(over="ignore"):  # see _check_range
+            moved_m[count : count + len(part_m)] = part_m
+        count += len(part_m)
+    _check_range(farthest_m, scan.source)
+    if body is not None:
+        dropped["own_vehicle"] = len(points_m) - count
+    of_points = None if weights is None else np.delete(weights, np.concatenate(own)).astype(np.float32)
+    return InVehicle(moved_m[:count], dropped, of_points)
+
+
+def joined(clouds: Sequence[InVehicle]) -> InVehicle:
+    """Several clouds as one."""
+    if len(clouds) == 1:
+        return clouds[0]
+    dropped = sum((cloud.dropped for cloud in clouds), Counter[str]())
+    weights = [cloud.weights for cloud in clouds if cloud.weights is not None]
+    return InVehicle(
+        np.concatenate([np.empty((0, 3), np.float32), *(cloud.points_m for cloud in clouds)]),
+        dropped,
+        np.concatenate(weights) if weights else None,
+    )
+
+
+def _finite(points_m: Points) -> NDArray[np.bool_]:
+    """Where all three numbers are; to combine them point by point takes NumPy long, and is seldom needed."""
+    finite: NDArray[np.bool_] = np.isfinite(points_m)
+    return np.ones(len(points_m), np.bool_) if finite.all() else np.logical_and.reduce(finite, axis=1)
+
+
+def _returned(points_m: Points) -> NDArray[np.bool_]:
+    """Where a point is off its origin; NaN is not."""
+    returned = np.abs(points_m[:, 0]) > NO_RETURN_M
+    doubtful = np.flatnonzero(~returned)
+    returned[doubtful] = (np.abs(points_m[doubtful]) > NO_RETURN_M).any(axis=1)
+    return returned
+
+
+def within(points_m: Points, box: BoundingBox) -> NDArray[np.intp]:
+    """Numbers of the (N, 3) points in a box; across a vehicle there are the fewest to look at again."""
+    x, y, z = points_m.T
+    inside = np.flatnonzero((box.lower_m[1] < y) & (y < box.upper_m[1]))
+    for axis, along_m in ((0, x), (2, z)):
+        chosen_m = along_m[inside]
+        inside = inside[(box.lower_m[axis] < chosen_m) & (chosen_m < box.upper_m[axis])]
+    return inside
+
+
+def _check_range(farthest_m: float, source: str) -> None:
+    if farthest_m > MAX_COORDINATE_M:
+        raise ValueError(
+            f"{source}: a coordinate of {farthest_m:.6g} m in the vehicle frame, at most {MAX_COORDINATE_M:g} m is "
+            "allowed; for world coordinates give the pose of the sensor (vehicle_T_sensor in frames.yaml)"
+        )

@@ -1,0 +1,249 @@
+"""Frames of a recording."""
+
+import operator
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchcover.detection.inside import with_hits
+from torchcover.frames.frame import Frame
+from torchcover.frames.source import BadFrameError, FrameDataset
+from torchcover.recordings.accumulated_reference import AccumulatedReference
+from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, joined
+from torchcover.recordings.recorded_reference import RecordedReference, Reference
+from torchcover.recordings.recording import Recording
+
+# What a folder of results holds, during the run or after it.
+RESULTS = frozenset({".lock", "summary.json", "checkpoint.npz"})
+
+
+class RecordedFrames(FrameDataset):
+    """What the sensors of a recording saw compared with a reference, instant by instant. A map-style torch Dataset.
+
+    Points that are not finite, never came back (they lie in the sensor) or lie on the vehicle itself are in neither
+    cloud; `Frame.counts` says how many (`sensor_nonfinite`, `reference_no_return`, ...). An empty sensor cloud is a
+    blind step; an empty reference cloud is an error, for nothing was measured.
+
+    Args:
+        recording: A recording, or the path of one; see `open_recording`.
+        rigs: Names of rigs -> names of their sensors; those of the recording if not given.
+        reference: Where the reference clouds come from. Not given: the sensors that were recorded for it, or
+            else an `AccumulatedReference`.
+
+    Raises:
+        FileNotFoundError: There is no such recording, or a part of it is missing.
+        ValueError: What is no recording, sensors that it does not have, no reference. From indexing: `BadFrameError`.
+
+    Example:
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     for source in ("sensor", "reference"):
+        ...         Path(folder, source).mkdir()
+        ...         _ = Path(folder, source, "frame7.xyz").write_text("1 2 3")
+        ...     [(frame.name, frame.sensor.tolist()) for frame in RecordedFrames(folder)]
+        [('frame7', [[1.0, 2.0, 3.0]])]
+    """
+
+    def __init__(
+        self,
+        recording: Recording | str | os.PathLike[str],
+        *,
+        rigs: Mapping[str, Sequence[str]] | None = None,
+        reference: Reference | None = None,
+    ) -> None:
+        if isinstance(recording, str | os.PathLike):
+            from torchcover.recordings.formats import open_recording  # all formats, for a path only
+
+            recording = open_recording(recording)
+        self.recording = recording
+        self.sensors_of_rigs = {name: tuple(of) for name, of in (rigs or self.recording.rigs).items()}
+        self._check_sensors()
+        if reference is None:
+            reference = RecordedReference() if self.recording.reference_sensors else AccumulatedReference()
+        self.reference = reference
+        self.reference.check(self.recording, self._judged)
+
+    @property
+    def names(self) -> Sequence[str]:
+        """What a user calls the frames."""
+        return tuple(self.recording.names[instant] for instant in self.recording.frames)
+
+    @property
+    def rigs(self) -> tuple[str, ...]:
+        """Names of the rigs."""
+        return tuple(self.sensors_of_rigs)
+
+    @property
+    def sensors(self) -> Mapping[str, tuple[()]]:
+        """Nothing: a recording does not say how its sensors scan."""
+        return {}
+
+    @property
+    def sensor_names(self) -> Mapping[str, tuple[str, ...]]:
+        """The names of the sensors of each rig."""
+        return self.sensors_of_rigs
+
+    def world_of(self, index: int) -> int:
+        """The index: nothing has to be built."""
+        return index
+
+    def has_boxes(self) -> bool:
+        """Whether the first frame whose boxes can be read has any, or says that there are none."""
+        for instant in self.recording.frames:
+            try:
+                return self.recording.boxes(instant) is not None
+            except (OSError, ValueError):
+                continue  # whoever measures it will say so
+        return False
+
+    def doubts(self, steps: int | None) -> Sequence[str]:
+        """As `torchcover.recordings.suspicion` says."""
+        from torchcover.recordings.suspicion import suspicions  # only before a measurement
+
+        many = len(self) if steps is None else min(steps, len(self))
+        return suspicions(self.recording, self.reference, self.sensors_of_rigs, many)
+
+    @property
+    def ego_outline_m(self) -> NDArray[np.float64] | None:
+        """The outline of the vehicle, if the recording says how large it is."""
+        body = self.recording.body
+        return None if body is None else body.outline_m
+
+    @property
+    def description(self) -> Mapping[str, object]:
+        """Where the recording is."""
+        return {"scenario": None, "vehicle": None, "frames": str(self.recording.path), "seed": None}
+
+    @property
+    def square_metres(self) -> bool:
+        """Whether the reference has the square metres of its points."""
+        return self.reference.square_metres(self.recording)
+
+    @property
+    def reference_record(self) -> Mapping[str, object]:
+        """Where the reference comes from."""
+        return self.reference.record(self.recording, self._judged)
+
+    @property
+    def content(self) -> Mapping[str, object]:
+        """Names, sizes and times of change of its files, which are not read for it, and what is made of them.
+
+        Raises:
+            OSError: A file is gone.
+        """
+        reference = {name: value for name, value in vars(self.reference).items() if not name.startswith("_")}
+        return {
+            "recording": list(_stamps(self.recording.path)),
+            "instants": [list(self.recording.names), list(self.recording.frames)],
+            "sensors": self.sensors_of_rigs,
+            "reference": [type(self.reference).__name__, reference],
+        }
+
+    def __len__(self) -> int:
+        return len(self.recording.frames)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Read one frame.
+
+        Raises:
+            IndexError: There are fewer frames.
+            BadFrameError: One of its files cannot be used.
+        """
+        position = operator.index(index)
+        if not -len(self) <= position < len(self):
+            raise IndexError(f"frame {position} of {len(self)} in {self.recording.path}")
+        position %= len(self)
+        instant = self.recording.frames[position]
+        name = self.recording.names[instant]
+        try:
+            scans = {sensor: self._read(sensor, instant) for sensor in self._judged}
+            reference = self.reference.cloud(self.recording, instant, self._judged)
+            boxes = self.recording.boxes(instant)
+        except (OSError, ValueError) as error:
+            raise BadFrameError(f"{name} (frame {position}): {error}") from error
+        dropped = sum((scan.dropped for scan in scans.values()), Counter[str]())
+        clouds = {rig: joined([scans[sensor] for sensor in of]) for rig, of in self.sensors_of_rigs.items()}
+        counts = {
+            f"{side}_{why}": number[why]
+            for side, number in (("sensor", dropped), ("reference", reference.dropped))
+            for why in sorted({"nonfinite", "no_return", "own_vehicle", *number})
+        }
+        tensors = {rig: torch.from_numpy(cloud.points_m) for rig, cloud in clouds.items()}
+        if boxes is not None:
+            boxes = with_hits(boxes, tensors)
+        return Frame(
+            tensors,
+            torch.from_numpy(reference.points_m),
+            position,
+            name,
+            counts=counts,
+            reference_weights=None if reference.weights is None else torch.from_numpy(reference.weights),
+            boxes=boxes,
+            place_in_time=position if self.recording.instants is None else self.recording.instants[instant],
+            sensor_points={
+                rig: {sensor: len(scans[sensor].points_m) for sensor in of} for rig, of in self.sensors_of_rigs.items()
+            },
+        )
+
+    @property
+    def _judged(self) -> tuple[str, ...]:
+        """The sensors of all rigs, each once."""
+        return tuple(dict.fromkeys(sensor for of in self.sensors_of_rigs.values() for sensor in of))
+
+    def _read(self, sensor: str, instant: int) -> InVehicle:
+        return in_vehicle(self.recording.scan(sensor, instant), self.recording.body)
+
+    def _check_sensors(self) -> None:
+        there = (*self.recording.sensors, *self.recording.reference_sensors)
+        for rig, sensors in self.sensors_of_rigs.items():
+            unknown = [sensor for sensor in sensors if sensor not in there]
+            if unknown or not sensors:
+                raise ValueError(
+                    f"rig {rig!r}: sensors of the recording {self.recording.path} are needed, which has "
+                    f"{', '.join(there)}; got {', '.join(unknown) or 'none'}"
+                )
+
+
+def _stamps(place: Path) -> Iterator[tuple[str, int, int]]:
+    """Path, size and time of change of every file; those of results that are kept in its folder are no part of it."""
+    if place.is_file():
+        yield place.name, place.stat().st_size, place.stat().st_mtime_ns
+    for folder, folders, names in os.walk(place):
+        if not RESULTS.isdisjoint(names):
+            folders.clear()
+            continue
+        folders.sort()
+        for name in sorted(names):
+            status = Path(folder, name).stat()
+            yield Path(folder, name).relative_to(place).as_posix(), status.st_size, status.st_mtime_ns
+
+
+def reference_of_recording(name: str | None = None, window_s: float | None = None) -> Reference | None:
+    """The reference of a recording by its name.
+
+    Args:
+        name: "recorded" or "accumulated"; None for what the recording has.
+        window_s: Time over which one is accumulated, in seconds.
+
+    Raises:
+        ValueError: Another name, or a time for one that was recorded.
+
+    Example:
+        >>> reference_of_recording("accumulated", 1.0).window_s
+        1.0
+    """
+    if name not in (None, "recorded", "accumulated"):
+        raise ValueError(f"reference {name}: for a recording `recorded` or `accumulated` is needed")
+    if name == "accumulated" or window_s is not None:
+        if name == "recorded":
+            raise ValueError(
+                f"window: a recorded reference has none; got {window_s:g} s; leave it out, or accumulate one"
+            )
+        return AccumulatedReference() if window_s is None else AccumulatedReference(window_s)
+    return RecordedReference() if name == "recorded" else None

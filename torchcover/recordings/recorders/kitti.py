@@ -1,0 +1,80 @@
+"""A recording in the layout of KITTI's 3D object benchmark, which `KittiObject` reads."""
+
+from pathlib import Path
+
+import numpy as np
+
+from torchcover.detection.boxes import Boxes
+from torchcover.files import write_npz
+from torchcover.geometry import invert, transform
+from torchcover.recordings.formats.kitti_files import vehicle_T_velodyne
+from torchcover.recordings.recorders.recorder import RecordedStep, RecordingSetup
+
+# About KITTI's own camera, 0.27 m before the LiDAR and 0.08 m below it: x right, y down, z ahead. There are no images.
+camera_T_velodyne = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, -0.08], [1.0, 0.0, 0.0, -0.27], [0, 0, 0, 1]])
+PROJECTION = "721.5377 0 609.5593 0 0 721.5377 172.854 0 0 0 1 0"  # of 2011_09_26, which tools ask for
+# What a file says in which there is no object: it must not be empty.
+NOTHING = "DontCare -1 -1 -10 -1 -1 -1 -1 -1 -1 -1 -1000 -1000 -1000 -10"
+UNKNOWN = "-1 -1 -1 -1"
+
+
+class KittiRecorder:
+    """Writes `velodyne/FRAME.bin`, `calib/FRAME.txt`, `label_2/FRAME.txt` and `reference/FRAME.npz`.
+
+    The layout has no mount: the frame of its clouds is that of KITTI's LiDAR, 1.73 m above the ground and 0.58 m behind
+    the vehicle's middle, wherever the rig has its own. Clouds are float32, intensities 0.
+
+    Args:
+        folder: An empty or a new folder.
+        setup: What is to be written.
+
+    Raises:
+        ValueError: Another rig than of one LiDAR.
+    """
+
+    def __init__(self, folder: Path, setup: RecordingSetup) -> None:
+        if len(setup.mounts) != 1 or not setup.lidars:
+            names = ", ".join(setup.mounts)
+            raise ValueError(
+                f"format kitti: a rig of one LiDAR is needed; {setup.rig} has {names}; use the format folder"
+            )
+        self._folder = folder
+        for place in ("velodyne", "calib", "reference", *(("label_2",) if setup.boxes else ())):
+            (folder / place).mkdir(parents=True)
+        rows = {f"P{camera}": PROJECTION for camera in range(4)}
+        rows["R0_rect"] = "1 0 0 0 1 0 0 0 1"
+        rows["Tr_velo_to_cam"] = " ".join(f"{number:g}" for number in camera_T_velodyne[:3].ravel())
+        rows["Tr_imu_to_velo"] = "1 0 0 0 0 1 0 0 0 0 1 0"
+        self._calibration = "".join(f"{key}: {numbers}\n" for key, numbers in rows.items())
+
+    def write(self, step: RecordedStep) -> None:
+        """Write a step; its LiDAR cloud comes last."""
+        frame, velodyne_T_vehicle = step.frame, invert(vehicle_T_velodyne)
+        (self._folder / "calib" / f"{step.name}.txt").write_text(self._calibration, encoding="utf-8")
+        if frame.boxes is not None:
+            (self._folder / "label_2" / f"{step.name}.txt").write_text(_labels(frame.boxes), encoding="utf-8")
+        arrays = {"points": transform(velodyne_T_vehicle, frame.reference.numpy())}
+        if frame.reference_weights is not None:
+            arrays["weights"] = frame.reference_weights.numpy()
+        write_npz(self._folder / "reference" / f"{step.name}.npz", arrays)
+        (cloud,) = step.clouds.values()
+        records = np.zeros((len(cloud), 4), dtype="<f4")
+        records[:, :3] = transform(velodyne_T_vehicle, cloud)
+        (self._folder / "velodyne" / f"{step.name}.bin").write_bytes(records.tobytes())
+
+
+def _labels(boxes: Boxes) -> str:
+    """A line an object: what is not known of an image is -1."""
+    rows = boxes.rows.double().numpy()
+    camera_T_vehicle = camera_T_velodyne @ invert(vehicle_T_velodyne)
+    centre_m = transform(camera_T_vehicle, rows[:, :3])
+    lines = []
+    for (x, y, z), (_, _, _, length, width, height, yaw), category in zip(
+        centre_m, rows, boxes.categories, strict=True
+    ):
+        turn = np.arctan2(-np.cos(yaw), -np.sin(yaw))  # about the camera's y
+        seen = np.angle(np.exp(1j * (turn - np.arctan2(x, z))))
+        numbers = [height, width, length, x, y + height / 2, z, turn]
+        name = "_".join(category.split()).capitalize() or "Misc"
+        lines.append(f"{name} -1 -1 {seen:.6f} {UNKNOWN} {' '.join(f'{number:.6f}' for number in numbers)}")
+    return "\n".join(lines or [NOTHING]) + "\n"

@@ -1,0 +1,164 @@
+"""What every reader of recordings gives: scans of named sensors at instants, and where the vehicle was."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.cameras.calibration import Calibration
+from torchcover.detection.boxes import Boxes
+from torchcover.geometry import BoundingBox
+from torchcover.geometry.rigid import Matrix
+from torchcover.recordings.clouds.arrays import Points
+
+# A return from so near to the origin of its frame is one that never came, which drivers store as zeros.
+NO_RETURN_M = 1e-3
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What a sensor recorded at one instant, as it was stored.
+
+    Args:
+        points_m: (N, 3) points in the frame of the sensor; those that are not finite or lie in the sensor itself are
+            returns that never came.
+        vehicle_T_sensor: (4, 4) where the sensor was; None: the points are in the vehicle frame already.
+        source: Where it was read from, for messages.
+        min_range_m: What is nearer to the sensor is a return that never came.
+        weights: (N,) what each point of a reference counts for, positive; None if all count the same.
+    """
+
+    points_m: Points
+    vehicle_T_sensor: Matrix | None
+    source: str
+    min_range_m: float = 0.0
+    weights: NDArray[np.float64] | None = None
+
+
+def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArray[np.float64]:
+    """Return the times of instants, if they can be those.
+
+    Args:
+        times_s: (F,) in seconds.
+        count: How many instants there are.
+        source: Where they were read from, for messages.
+
+    Raises:
+        ValueError: Another number of them, or two that do not follow each other.
+    """
+    if len(times_s) != count:
+        raise ValueError(f"{source}: {len(times_s):,} times for {count:,} scans; one each is needed")
+    bad = np.flatnonzero(~(np.diff(times_s) > 0))
+    if len(bad):
+        first = int(bad[0])
+        raise ValueError(
+            f"{source}: times have to ascend; {len(bad)} do not, the first after instant {first}: "
+            f"{times_s[first]:.6f} s, then {times_s[first + 1]:.6f} s"
+        )
+    return times_s
+
+
+class Recording(Protocol):
+    """A drive as somebody recorded it. A reader of a layout is a class like this, made from a path; see `FORMATS`.
+
+    Instants are numbered in time. What a reader opens at once is small: names, times, calibrations. Scans are read one
+    by one.
+    """
+
+    @property
+    def path(self) -> Path:
+        """Where it is."""
+        ...
+
+    @property
+    def names(self) -> Sequence[str]:
+        """What a user calls the instants; so many there are."""
+        ...
+
+    @property
+    def frames(self) -> Sequence[int]:
+        """Numbers of the instants that are meant to be looked at, ascending; the others serve a reference only."""
+        ...
+
+    @property
+    def times_s(self) -> NDArray[np.float64] | None:
+        """(F,) when they were, ascending; None if unknown."""
+        ...
+
+    @property
+    def sensors(self) -> Sequence[str]:
+        """Names of the sensors that belong to the vehicle."""
+        ...
+
+    @property
+    def rigs(self) -> Mapping[str, Sequence[str]]:
+        """Name of each rig -> its sensors, unless others are asked for."""
+        ...
+
+    @property
+    def reference_sensors(self) -> Sequence[str]:
+        """Sensors that were recorded to be the reference; empty where there was none."""
+        ...
+
+    @property
+    def body(self) -> BoundingBox | None:
+        """The vehicle itself, in its own frame; None if unknown."""
+        ...
+
+    @property
+    def square_metres(self) -> bool:
+        """Whether the scans of the reference sensors have weights, the square metres that their points stand for."""
+        ...
+
+    @property
+    def instants(self) -> Sequence[int] | None:
+        """`Frame.place_in_time` of each instant, for standard errors; None: no two of them are known to be alike."""
+        ...
+
+    def scan(self, sensor: str, index: int, /) -> Scan:
+        """Read what a sensor recorded at an instant.
+
+        Raises:
+            OSError: It is not there.
+            ValueError: It is not what it is meant to be.
+        """
+        ...
+
+    def world_T_vehicle(self, index: int, /) -> Matrix | None:
+        """(4, 4) where the vehicle was, in a world that does not move; None if unknown."""
+        ...
+
+    def boxes(self, index: int, /) -> Boxes | None:
+        """The labelled objects of an instant in the vehicle frame; None where it is not labelled."""
+        ...
+
+
+class SensorCalibrations(NamedTuple):
+    """Mounts of LiDARs, and cameras.
+
+    Args:
+        source: Where it is from, for people.
+        mounts: Name of a LiDAR -> (4, 4) `vehicle_T_lidar`, where its scans do not say it.
+        cameras: With their places in the vehicle frame.
+    """
+
+    source: str
+    mounts: Mapping[str, Matrix]
+    cameras: tuple[Calibration, ...] = ()
+
+
+@runtime_checkable
+class CalibratedRecording(Protocol):
+    """A recording that knows more of its sensors."""
+
+    def calibrations(self) -> SensorCalibrations:
+        """Read them.
+
+        Raises:
+            OSError: They are not there.
+            ValueError: They are not what they are meant to be.
+        """
+        ...

@@ -1,0 +1,224 @@
+"""What looks wrong about a recording before it is measured: mistakes that would otherwise give an ordinary table."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchcover.detection import Boxes, points_in_boxes
+from torchcover.geometry import invert
+from torchcover.neighbors import nearest
+from torchcover.recordings.accumulated_reference import AccumulatedReference
+from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.recorded_reference import RecordedReference, Reference
+from torchcover.recordings.recording import Recording
+
+# What is looked at, evenly spread over what will be measured.
+FRAMES, POSES = 5, 64
+# The ground is the plane that leaves a quarter of the lowest points of these squares around the vehicle beneath it, for
+# what stands on it is above. Where it does not hold a share of them, it is no ground.
+GROUND_WITHIN_M, SQUARE_M, GROUND_SQUARES = 20.0, 1.0, 100
+BENEATH, ON_PLANE_M, ON_PLANE = 0.25, 0.2, 0.3
+# Half of the lowest band: beyond, the ground is in another one, or in none.
+GROUND_OFF_M = 0.5
+# Clouds of fewer points may be alike; so near, a point is the other one.
+ALIKE_POINTS, ALIKE_QUERIES, ALIKE_M = 100, 1000, 1e-3
+# Objects this near are seen; what lies lower in their boxes may be the ground.
+BOXES_WITHIN_M, BOX_FOOT_M = 40.0, 0.3
+# A box is fuller one way if it has so many points, and so many times as many as the other way. So many boxes decide, if
+# they are so many times as many as the others, and a share of all.
+BOX_POINTS, FULLER, BOXES, MORE, MOST_BOXES = 5, 5, 5, 4, 0.6
+# Steps that say where the vehicle goes; in a bend it points elsewhere by far less than this.
+STEP_M, WAY_M, SIDEWAYS_DEG, MOST_OF_WAY = (0.05, 20.0), 5.0, (45.0, 135.0), 0.8
+FASTEST_MPS = 100.0
+
+
+@dataclass(frozen=True)
+class RecordedInstant:
+    """One instant: name of each sensor -> (N, 3) float32 its points in the vehicle frame; the boxes."""
+
+    clouds: dict[str, NDArray[np.float32]]
+    boxes: Boxes | None
+
+
+def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Sequence[str]], many: int) -> list[str]:
+    """What looks wrong about a recording, a sentence each with what to do; it looks at a few frames only.
+
+    A frame that cannot be read is not looked at: whoever measures it will say so.
+
+    Args:
+        recording: The recording.
+        reference: Where its reference clouds come from.
+        rigs: Name of each rig -> its sensors.
+        many: How many of its frames will be measured, from the first on.
+    """
+    judged = dict.fromkeys(sensor for of in rigs.values() for sensor in of)
+    recorded = recording.reference_sensors if isinstance(reference, RecordedReference) else ()
+    sensors = tuple(dict.fromkeys((*judged, *recorded)))
+    looks = [
+        look
+        for position in _spread(many, FRAMES)
+        if (look := _look(recording, sensors, recording.frames[position])) is not None
+    ]
+    doubts = [
+        ground_is_elsewhere({sensor: [look.clouds[sensor] for look in looks] for sensor in sensors}),
+        *(mirrored(sensor, [(look.clouds[sensor], look.boxes) for look in looks]) for sensor in sensors),
+        *(
+            same_clouds(rig, [(_joined(look, of), _joined(look, recorded)) for look in looks])
+            for rig, of in rigs.items()
+        ),
+        *wrong_motion(recording),
+        alone_in_window(recording, reference) if isinstance(reference, AccumulatedReference) else None,
+    ]
+    return [f"{recording.path}: {doubt}" for doubt in doubts if doubt is not None]
+
+
+def ground_is_elsewhere(clouds: Mapping[str, Sequence[NDArray[np.float32]]]) -> str | None:
+    """Whether the ground that sensors see is not at z = 0."""
+    off = []
+    for sensor, of in clouds.items():
+        heights_m = [height_m for cloud in of if (height_m := ground_height_m(cloud)) is not None]
+        height_m = float(np.median(heights_m)) if heights_m else 0.0
+        if abs(height_m) > GROUND_OFF_M:
+            off.append(f"{height_m:+.1f} m ({sensor})")
+    if not off:
+        return None
+    return (
+        f"the ground lies at z = {', '.join(off)}, not near 0: give the pose of the sensor in the vehicle frame, whose "
+        "origin is on the ground (vehicle_T_sensor)"
+    )
+
+
+def ground_height_m(points_m: NDArray[np.floating]) -> float | None:
+    """The height of the ground beneath the vehicle: 0 where slopes leave that open, None where no ground is seen.
+
+    Example:
+        >>> x, y = np.meshgrid(np.arange(-20, 20, 0.5), np.arange(-20, 20, 0.5))
+        >>> round(ground_height_m(np.stack([x.ravel(), y.ravel(), 0.05 * x.ravel() - 1.7], axis=1)), 1)
+        -1.7
+    """
+    near_m = points_m[(np.abs(points_m) < GROUND_WITHIN_M).all(axis=1)].astype(np.float64)
+    numbers = np.floor(near_m[:, :2] / SQUARE_M).astype(np.int64) + round(GROUND_WITHIN_M / SQUARE_M)
+    order = np.lexsort((near_m[:, 2], numbers[:, 0], numbers[:, 1]))
+    new = (np.diff(numbers[order], axis=0, prepend=-1) != 0).any(axis=1)
+    lowest_m = near_m[order[new]]
+    if len(lowest_m) < GROUND_SQUARES:
+        return None
+    sides = np.column_stack([lowest_m[:, :2], np.ones(len(lowest_m))])
+    around_m = float(np.quantile(lowest_m[:, 2], BENEATH))
+    off_m = lowest_m[:, 2] - around_m
+    for _ in range(20):  # a quantile by weighted squares: how far off walls and holes are does not matter
+        weights = np.sqrt(np.where(off_m > 0, BENEATH, 1 - BENEATH) / np.maximum(np.abs(off_m), ON_PLANE_M / 4))
+        plane = np.linalg.lstsq(sides * weights[:, None], lowest_m[:, 2] * weights, rcond=None)[0]
+        off_m = lowest_m[:, 2] - sides @ plane
+    if (np.abs(off_m) < ON_PLANE_M).mean() < ON_PLANE:
+        return None
+    beneath_m = float(plane[2])
+    # Far ahead a hill may begin; only where the lowest points are as low (or as high), so is the ground.
+    return beneath_m if 0.0 < beneath_m / 2 < around_m or 0.0 > beneath_m / 2 > around_m else 0.0
+
+
+def same_clouds(rig: str, pairs: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> str | None:
+    """Whether all points of the reference are points of the rig: then every radius is 0 m."""
+    pairs = [(cloud, reference) for cloud, reference in pairs if len(reference) >= ALIKE_POINTS]
+    for cloud, reference in pairs:
+        # Drawn by chance: every so many points may be those of the same lasers.
+        some = reference[np.random.default_rng(0).integers(len(reference), size=ALIKE_QUERIES)]
+        found = nearest(torch.from_numpy(some), torch.from_numpy(cloud), max_distance=ALIKE_M)
+        if not bool(found.distance.isfinite().all()):
+            return None
+    if not pairs:
+        return None
+    return (
+        f"the points of the reference are those of the rig {rig} itself, so that it must look perfect: give another "
+        "sensor as the reference, or accumulate one (--reference accumulated)"
+    )
+
+
+def mirrored(sensor: str, looks: Iterable[tuple[NDArray[np.float32], Boxes | None]]) -> str | None:
+    """Whether boxes hold points only where left and right are exchanged."""
+    sightings = fuller = fuller_mirrored = 0
+    for points_m, boxes in looks:
+        if boxes is None:
+            continue
+        rows = boxes.rows[torch.linalg.vector_norm(boxes.centre_m[:, :2], dim=1) < BOXES_WITHIN_M].clone()
+        rows[:, 2] += BOX_FOOT_M / 2
+        rows[:, 5] -= BOX_FOOT_M
+        wanted = Boxes.from_rows(rows[rows[:, 5] > 0])
+        sightings += len(wanted)
+        points = _points_in_each(points_m, wanted)
+        points_mirrored = _points_in_each(points_m * np.array([1, -1, 1], np.float32), wanted)
+        fuller += int((points >= (FULLER * points_mirrored).clamp(min=BOX_POINTS)).sum())
+        fuller_mirrored += int((points_mirrored >= (FULLER * points).clamp(min=BOX_POINTS)).sum())
+    if fuller_mirrored < max(BOXES, MORE * fuller, MOST_BOXES * sightings):
+        return None
+    return (
+        f"{fuller_mirrored} of {sightings} labelled boxes have points of {sensor} only if its left and right are "
+        f"exchanged, and {fuller} the way it is: turn its y axis round (flip_y), as for a left-handed simulator"
+    )
+
+
+def wrong_motion(recording: Recording) -> list[str]:
+    """Whether the vehicle drives sideways, or faster than any does."""
+    places = _spread(max(len(recording.names) - 1, 0), POSES)
+    try:
+        pairs = [(recording.world_T_vehicle(place), recording.world_T_vehicle(place + 1)) for place in places]
+    except (OSError, ValueError):
+        return []
+    way_m = np.array([(invert(one) @ two)[:2, 3] for one, two in pairs if one is not None and two is not None])
+    if len(way_m) < len(pairs) or not pairs:
+        return []
+    found, length_m = [], np.linalg.norm(way_m, axis=1)
+    if recording.times_s is not None:
+        speed_mps = float(np.median(length_m / np.diff(recording.times_s)[places]))
+        if speed_mps > FASTEST_MPS:
+            found.append(
+                f"by its poses and times the vehicle drives at {speed_mps:,.0f} m/s: give both from the same clock, in "
+                "seconds, and places in metres"
+            )
+    steps = (length_m > STEP_M[0]) & (length_m < STEP_M[1])
+    aside_deg = np.rad2deg(np.arctan2(way_m[:, 1], way_m[:, 0]))
+    aside = steps & (np.abs(aside_deg) > SIDEWAYS_DEG[0]) & (np.abs(aside_deg) < SIDEWAYS_DEG[1])
+    if length_m[steps].sum() >= WAY_M and length_m[aside].sum() > MOST_OF_WAY * length_m[steps].sum():
+        found.append(
+            f"by its poses the vehicle drives sideways, {np.median(aside_deg[aside]):+.0f} degrees from its x axis: "
+            "x has to point forward, y to the left"
+        )
+    return found
+
+
+def alone_in_window(recording: Recording, reference: AccumulatedReference) -> str | None:
+    """Whether the time over which a reference is accumulated holds one instant only."""
+    times_s = recording.times_s
+    if times_s is None or len(times_s) < 2 or not reference.window_s:
+        return None
+    apart_s = float(np.median(np.diff(times_s)))
+    if apart_s <= reference.window_s / 2:
+        return None
+    return (
+        f"its instants are {apart_s:g} s apart, and a window of {reference.window_s:g} s reaches none but its own: are "
+        "the times in seconds? Else ask for a longer window (--window-s)"
+    )
+
+
+def _look(recording: Recording, sensors: Sequence[str], instant: int) -> RecordedInstant | None:
+    try:
+        clouds = {sensor: in_vehicle(recording.scan(sensor, instant), recording.body).points_m for sensor in sensors}
+        return RecordedInstant(clouds, recording.boxes(instant))
+    except (OSError, ValueError):
+        return None
+
+
+def _joined(look: RecordedInstant, sensors: Sequence[str]) -> NDArray[np.float32]:
+    return np.concatenate([np.empty((0, 3), np.float32), *(look.clouds[sensor] for sensor in sensors)])
+
+
+def _points_in_each(points_m: NDArray[np.float32], boxes: Boxes) -> torch.Tensor:
+    return torch.bincount(points_in_boxes(torch.from_numpy(points_m), boxes).box, minlength=len(boxes))
+
+
+def _spread(count: int, most: int) -> list[int]:
+    """At most so many numbers below `count`, from the first to the last."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist() if count else []

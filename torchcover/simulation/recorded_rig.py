@@ -1,0 +1,129 @@
+"""The rig of a recording, as a document that can be drawn and simulated."""
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from torchcover.cameras.calibration import Calibration
+from torchcover.geometry import euler_from_rotation, invert, rigid, rotation_from_euler, transform
+from torchcover.geometry.rigid import Matrix
+from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.recording import CalibratedRecording, Recording, SensorCalibrations
+from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
+from torchcover.simulation.lidar import LidarModel
+from torchcover.simulation.rig import Rig
+from torchcover.simulation.scan_estimate import ScanEstimate, estimate_scan
+
+# Scans that are looked at, evenly spread.
+SCANS = 5
+# As in the built-in rigs of cameras; no data set tells the depth that a camera gives.
+CAMERA = {"stride": 4, "min_range_m": 0.1, "max_range_m": 200.0}
+ASSUMED = "assumed: depth from 0.1 to 200 m in every fourth pixel"
+
+
+def rig_document(
+    recording: Recording, *, sensors: Sequence[str] | None = None, models: Mapping[str, str] | None = None
+) -> dict[str, Any]:
+    """Make a rig of what a recording knows of its sensors, and of what these saw.
+
+    Mounts and cameras are those of its calibrations. A LiDAR scans as its model does, or as its scans look.
+
+    Args:
+        recording: The recording.
+        sensors: LiDARs that are wanted; all if not given.
+        models: Name of a LiDAR -> a built-in `LidarModel`, or the path of one.
+
+    Returns:
+        The keys of a valid rig; its description says where each number is from.
+
+    Raises:
+        OSError: A file is missing.
+        ValueError: An unknown sensor or model, a LiDAR whose place is not known or whose points do not lie in rows.
+    """
+    models = models or {}
+    wanted = tuple(recording.sensors) if sensors is None else tuple(sensors)
+    unknown = [name for name in (*wanted, *models) if name not in recording.sensors]
+    if unknown:
+        raise ValueError(
+            f"{recording.path}: no LiDAR {', '.join(unknown)}; the recording has {', '.join(recording.sensors)}"
+        )
+    known = recording.calibrations() if isinstance(recording, CalibratedRecording) else SensorCalibrations("", {})
+    told, documents = [], []
+    for name in wanted:
+        document, said = _lidar(recording, name, known, models.get(name))
+        documents.append(document)
+        told.append(f"{name}: {said}.")
+    documents += [_camera(camera) for camera in known.cameras]
+    if known.cameras:
+        told.append(f"{', '.join(one.name for one in known.cameras)}: lenses and mounts as calibrated; {ASSUMED}.")
+    source = f" Calibrations: {known.source}." if known.source else ""
+    rig = {
+        "name": re.sub(r"\W+", "_", recording.path.resolve().stem).strip("_") or "recording",
+        "description": f"The sensors of the recording {recording.path}.{source} {' '.join(told)}",
+        "sensors": documents,
+    }
+    Rig.model_validate(rig)
+    return rig
+
+
+def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: str | None) -> tuple[dict[str, Any], str]:
+    """The keys of a LiDAR, and where they are from."""
+    count = min(SCANS, len(recording.frames))
+    chosen = [recording.frames[position] for position in np.linspace(0, len(recording.frames) - 1, count, dtype=int)]
+    mount = known.mounts.get(name)
+    mounted = "mount as calibrated"
+    if mount is None:
+        mount, mounted = recording.scan(name, chosen[0]).vehicle_T_sensor, "mount as recorded"
+    if mount is None:
+        raise ValueError(
+            f"{recording.path}: where {name} is mounted is not known, for its clouds are in the vehicle frame; a plain "
+            "folder says it in frames.yaml (vehicle_T_sensor)"
+        )
+    if model is not None:
+        LidarModel.load(model)
+        return {"type": "lidar", "name": name, "mount": _pose(mount), "model": model}, f"{mounted}; scans as {model}"
+    clouds = [in_vehicle(recording.scan(name, index), recording.body).points_m for index in chosen]
+    found = estimate_scan([transform(invert(mount), cloud) for cloud in clouds])
+    if found is None:
+        raise ValueError(
+            f"{recording.path}: the points of {name} do not lie in rows that can be told apart; name its model (see "
+            f"`torchcover list`): --lidar {name}=MODEL"
+        )
+    mount = mount @ rigid(rotation_from_euler(found.centre_deg, 0.0, 0.0), np.zeros(3))
+    return {"type": "lidar", "name": name, "mount": _pose(mount), **_pattern(found)}, (
+        f"{mounted}; estimated from {count} scan{'s' * (count > 1)}: {len(found.elevations_deg)} rows (those that "
+        f"returned anything), {found.columns:,} columns, ranges of the nearest and the farthest return"
+    )
+
+
+def _pattern(found: ScanEstimate) -> dict[str, Any]:
+    return {
+        "elevations_deg": [round(float(elevation), 3) + 0.0 for elevation in found.elevations_deg],
+        "horizontal_fov_deg": round(found.horizontal_fov_deg, 3),
+        "columns": found.columns,
+        "min_range_m": math.floor(found.min_range_m * 100) / 100,
+        "max_range_m": math.ceil(found.max_range_m * 10) / 10,
+    }
+
+
+def _camera(camera: Calibration) -> dict[str, Any]:
+    assert camera.vehicle_T_camera is not None  # recordings give it
+    lens = {} if camera.model == "pinhole" else {"lens": camera.model, "coefficients": list(camera.coefficients)}
+    return {
+        "type": "camera",
+        "name": camera.name,
+        "mount": _pose(np.asarray(camera.vehicle_T_camera) @ invert(MOUNT_T_CAMERA)),
+        **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
+        **lens,
+        **CAMERA,
+    }
+
+
+def _pose(vehicle_T_sensor: Matrix) -> dict[str, float]:
+    yaw, pitch, roll = euler_from_rotation(vehicle_T_sensor[:3, :3])
+    x, y, z = vehicle_T_sensor[:3, 3]
+    keys = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
+    return {key: round(float(value), 6) + 0.0 for key, value in zip(keys, (x, y, z, yaw, pitch, roll), strict=True)}

@@ -1,0 +1,206 @@
+"""What is asked about: regions, height bands and the grid, as YAML or in Python, and what follows for one vehicle."""
+
+import math
+import warnings
+from pathlib import Path
+from typing import Annotated, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field, PositiveFloat, model_validator
+
+from torchcover.coverage import BevGrid, Region, check_regions, forward_regions, near_field_regions
+from torchcover.coverage.grid import PAPER_HEIGHTS
+from torchcover.simulation.documents import Coordinate, Document, read_document
+from torchcover.simulation.reference_sensor import Areas, Bands
+
+# Holds the paper's regions, and the space beside and behind the vehicle.
+GRID_X_M = (-40.0, 160.0)
+GRID_Y_M = (-40.0, 40.0)
+CELL_M = 0.25
+
+
+def _checked(bounds: tuple[float, float]) -> tuple[float, float]:
+    if not bounds[0] < bounds[1]:
+        raise ValueError(f"the lower bound must be below the upper one; got {bounds[0]:g} to {bounds[1]:g} m")
+    return bounds
+
+
+Bounds = Annotated[tuple[Coordinate, Coordinate], AfterValidator(_checked)]
+Name = Annotated[str, Field(min_length=1)]
+
+
+class RegionOfInterest(Document):
+    """A rectangle or a polygon on the ground, in the vehicle frame.
+
+    Args:
+        x_m: Lower and upper bound forward.
+        y_m: Lower and upper bound to the left.
+        polygon_m: Corners x, y of a polygon instead, one after the other around it.
+    """
+
+    x_m: Bounds | None = None
+    y_m: Bounds | None = None
+    polygon_m: tuple[tuple[Coordinate, Coordinate], ...] | None = None
+
+    @model_validator(mode="after")
+    def _check_one_of(self) -> Self:
+        if (self.x_m is None) != (self.y_m is None) or (self.x_m is None) == (self.polygon_m is None):
+            raise ValueError("give x_m and y_m, two bounds each, or the corners of polygon_m")
+        self.called("region")
+        return self
+
+    def called(self, name: str) -> Region:
+        """The region under a name."""
+        if self.x_m is not None and self.y_m is not None:
+            return Region(name, self.x_m, self.y_m)
+        assert self.polygon_m is not None  # checked in _check_one_of
+        return Region.polygon(name, self.polygon_m)
+
+
+class GridOfInterest(Document):
+    """What of the grid is not to be as usual.
+
+    Args:
+        x_m: Lower and upper bound forward.
+        y_m: Lower and upper bound to the left.
+        cell_m: Side of a cell.
+    """
+
+    x_m: Bounds | None = None
+    y_m: Bounds | None = None
+    cell_m: PositiveFloat | None = None
+
+
+class RegionsOfInterest(Document):
+    """What a run is asked about, for any vehicle; with nothing given, the usual table.
+
+    Args:
+        regions: By name. Not given: the paper's three in front of the vehicle, and the near field on its four sides
+            (`near_field_regions`), as far as the grid holds them.
+        heights: Name of each height band -> lower and upper bound of z in metres; they may overlap. Not given: the
+            paper's, ground and obstacle.
+        grid: Extent and cell. Not given: x from -40 to 160 m, y from -40 to 40 m, more if regions need it, and cells
+            of 0.25 m.
+
+    Raises:
+        ValueError: Bounds that are inverted, equal or not finite, a polygon that crosses itself.
+
+    Example:
+        >>> behind = {"behind": {"x_m": (-4.0, -2.5), "y_m": (-1.0, 1.0)}}
+        >>> asked = RegionsOfInterest(regions=behind, heights={"child": (0.1, 1.1)}).around()
+        >>> asked.regions[0].x, asked.grid.heights, asked.areas[0]
+        ((-4.0, -2.5), {'child': (0.1, 1.1)}, ((-4.0, -2.5), (-1.0, 1.0)))
+    """
+
+    regions: dict[Name, RegionOfInterest] = Field(default_factory=dict)
+    heights: dict[Name, Bounds] = Field(default_factory=dict)
+    grid: GridOfInterest = GridOfInterest()
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read them from a YAML file.
+
+        Raises:
+            FileNotFoundError: No such file.
+            BadFileError: Not YAML, or a wrong key or value; the message names the file and the key.
+        """
+        return read_document(cls, Path(path))
+
+    def around(self, ego_outline_m: NDArray[np.float64] | None = None, cell_m: float | None = None) -> "Asked":
+        """What follows for one vehicle.
+
+        Args:
+            ego_outline_m: (K, 2) corners x, y of the vehicle; None if unknown: then there is no near field.
+            cell_m: Side of a cell, whatever `grid` says.
+
+        Raises:
+            ValueError: A region that the grid does not hold, or that holds no cell centre; a grid that cannot be.
+
+        Warns:
+            UserWarning: A region that lies within the vehicle.
+        """
+        vehicle = None if ego_outline_m is None else _bounds(ego_outline_m)
+        cell_m = cell_m or self.grid.cell_m or CELL_M
+        named = tuple(region.called(name) for name, region in self.regions.items())
+        grid = self._grid(named, cell_m)
+        if named:
+            check_regions(named, grid)
+            _warn_of_hidden(named, vehicle)
+            return Asked(grid, named, (*(_area(region) for region in named), (grid.x, grid.y)), named)
+        forward = tuple(region for region in forward_regions() if region.fits(grid))
+        check_regions(forward, grid)
+        near = () if vehicle is None else near_field_regions(*vehicle)
+        # Cells may be larger than the near field.
+        near = tuple(region for region in near if region.fits(grid) and region.mask(grid).any())
+        around = (_around(near),) if near else ()
+        usual = (*forward, *near) or (Region("grid", grid.x, grid.y),)
+        return Asked(grid, usual, (*map(_area, forward), *around, (grid.x, grid.y)), forward or usual)
+
+    def _grid(self, regions: tuple[Region, ...], cell_m: float) -> BevGrid:
+        x = self.grid.x_m or _holding(GRID_X_M, [region.x for region in regions], cell_m)
+        y = self.grid.y_m or _holding(GRID_Y_M, [region.y for region in regions], cell_m)
+        return BevGrid(x, y, cell_m, self.heights or PAPER_HEIGHTS)
+
+
+class Asked(NamedTuple):
+    """What a run is asked about.
+
+    Args:
+        grid: Cells and height bands.
+        regions: Those that numbers are given for.
+        areas: The rectangles that the reference sensor is aimed at, which hold them and the grid.
+        awaited: The regions whose errors a target error waits for: all that were asked for by name; in the usual table
+            not the near field, of which in traffic many steps see nothing that stands.
+    """
+
+    grid: BevGrid
+    regions: tuple[Region, ...]
+    areas: Areas
+    awaited: tuple[Region, ...]
+
+    @property
+    def bands_m(self) -> Bands:
+        """The height bands that the reference sensor is aimed at."""
+        return tuple(self.grid.heights.values())
+
+
+def _bounds(outline_m: NDArray[np.float64]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The bounds x and y of a vehicle, to the millimetre."""
+    lower, upper = outline_m.min(axis=0).round(3).tolist(), outline_m.max(axis=0).round(3).tolist()
+    return (lower[0], upper[0]), (lower[1], upper[1])
+
+
+def _area(region: Region) -> tuple[tuple[float, float], tuple[float, float]]:
+    return region.x, region.y
+
+
+def _around(regions: tuple[Region, ...]) -> tuple[tuple[float, float], tuple[float, float]]:
+    """One rectangle around all of them: it takes fewer rays from the others than each would for itself."""
+    x, y = zip(*map(_area, regions), strict=True)
+    return (
+        (min(low for low, _ in x), max(high for _, high in x)),
+        (min(low for low, _ in y), max(high for _, high in y)),
+    )
+
+
+def _holding(usual: tuple[float, float], wanted: list[tuple[float, float]], cell_m: float) -> tuple[float, float]:
+    """The usual bounds, with as many whole cells more as regions need."""
+    below = max(0.0, usual[0] - min([low for low, _ in wanted], default=usual[0]))
+    above = max(0.0, max([high for _, high in wanted], default=usual[1]) - usual[1])
+    return usual[0] - math.ceil(below / cell_m) * cell_m, usual[1] + math.ceil(above / cell_m) * cell_m
+
+
+def _warn_of_hidden(
+    regions: tuple[Region, ...], vehicle: tuple[tuple[float, float], tuple[float, float]] | None
+) -> None:
+    for region in regions:
+        if vehicle and all(
+            low <= own[0] and own[1] <= high for own, (low, high) in zip(_area(region), vehicle, strict=True)
+        ):
+            warnings.warn(
+                f"region {region.name!r} lies within the vehicle (x = {vehicle[0][0]:g} to {vehicle[0][1]:g} m, y = "
+                f"{vehicle[1][0]:g} to {vehicle[1][1]:g} m): only what can be seen beneath it counts, and a number "
+                "that nothing counts for is unknown",
+                stacklevel=3,
+            )

@@ -1,0 +1,292 @@
+"""Frames of a simulated world, and the reference sensor that a rig is measured against in it."""
+
+import copy
+import hashlib
+import pickle
+from collections.abc import Mapping, Sequence
+from dataclasses import is_dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from torchcover.detection.boxes import Boxes
+from torchcover.detection.inside import with_hits
+from torchcover.frames.frame import Frame
+from torchcover.frames.source import FrameDataset
+from torchcover.simulation.kinds import REFERENCE_SENSORS
+from torchcover.simulation.reference_sensor import ReferenceSensor
+from torchcover.simulation.regions_of_interest import Asked, RegionsOfInterest
+from torchcover.simulation.rig import Rig, with_ego
+from torchcover.simulation.scenario import Scenario
+from torchcover.simulation.sensor import Sensor
+from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.simulator import Observation, Simulator
+from torchcover.simulation.surface_reference import SurfaceReference
+from torchcover.simulation.world import Label
+
+DEFAULT_REFERENCE = "surface"
+# With so many points on an object, of which half are seen, its visibility has a standard error of 0.09 at most.
+OBJECT_POINTS = 64
+# What takes years.
+MAX_STEPS = 1_000_000_000
+
+
+class SimulatedFrames(FrameDataset):
+    """What a rig and the random reference sensor see of a scenario, step by step. A map-style torch Dataset.
+
+    A frame depends on the scenario, the rig, the seed and its index, and on nothing else: not on workers, threads or
+    the order of access. Frames are cast on as many threads as torch uses (`torch.set_num_threads`; one in a
+    DataLoader worker). The points of the ego itself are in neither cloud; `Frame.counts` says how many rays they took.
+
+    With `rigs` the reference is cast once a step, and every rig sees the same instant: comparisons are paired.
+
+    Args:
+        scenario: The world, the name of a built-in one, or the path of a YAML file.
+        rig: The sensors, the name of a built-in rig, or the path of a YAML file.
+        rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds.
+        steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
+            traffic, the same instants are seen again, which `Frame.place_in_time` and `Frame.counts` say.
+        seed: Seed of the traffic and of the reference sensor's poses.
+        reference_sensor: The reference sensor, such as `PaperReference()`. If not given, a `SurfaceReference` that is
+            aimed at the usual regions: `reference_called`, and `reference_of_objects` with boxes, at up to twice the
+            time.
+        every_s: Time between one frame and the next, a multiple of the scenario's time step; that step if not given.
+            Steps that follow each other are alike: with the same number of frames, a longer time shows more, and in
+            traffic, which starts anew, the frames are spread over more cities.
+        boxes: Whether frames have `boxes`: one for each object within the reference's range, with how many points each
+            rig has in it, and how many the reference drew on it. An object's name is its own within a run of the
+            scenario.
+        vehicle: What carries the rigs: a built-in vehicle, the YAML file of one, or a mesh file. Not given: the
+            scenario's own ego, else the vehicle that the rigs name, else an SUV.
+
+    Raises:
+        FileNotFoundError: An unknown name or file.
+        ValueError: A document that is not valid, neither or both of `rig` and `rigs`, rigs that name different vehicles
+            in a scenario that leaves it to them, a number of steps below 1, a negative seed, a time that is no multiple
+            of the time step. From indexing: a sensor inside a body or below the ground, an actor that overlaps the ego.
+
+    Example:
+        >>> frames = SimulatedFrames("courtyard", "front_roof_128", steps=2, seed=0)
+        >>> len(frames), frames[0].sensor.shape[1], frames[0].reference.dtype, frames.square_metres
+        (2, 3, torch.float32, True)
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario | str | Path,
+        rig: Rig | str | Path | None = None,
+        *,
+        rigs: Mapping[str, Rig | str | Path] | None = None,
+        steps: int,
+        seed: int = 0,
+        reference_sensor: ReferenceSensor | None = None,
+        every_s: float | None = None,
+        boxes: bool = False,
+        vehicle: str | Path | None = None,
+    ) -> None:
+        if not 1 <= steps <= MAX_STEPS:
+            raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
+        carried = _rigs(rig, rigs)
+        world = with_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), carried, vehicle)
+        if reference_sensor is None:
+            asked = RegionsOfInterest().around(world.ego_box().outline_m)
+            reference_sensor = reference_of_objects(asked) if boxes else reference_called(asked=asked)
+        self.simulator = Simulator(
+            world,
+            carried,
+            reference_sensor,
+            seed=seed,
+            every_s=every_s,
+        )
+        self.steps = steps
+        self.boxes = boxes
+
+    @property
+    def scenario(self) -> Scenario:
+        """The world."""
+        return self.simulator.scenario
+
+    @property
+    def rigs(self) -> Mapping[str, Rig]:
+        """The sensors, by the name under which `Frame.clouds` has their clouds."""
+        return self.simulator.rigs
+
+    @property
+    def reference_sensor(self) -> ReferenceSensor:
+        """The reference sensor."""
+        return self.simulator.reference_sensor
+
+    @property
+    def seed(self) -> int:
+        """Seed of the traffic and of the reference sensor's poses."""
+        return self.simulator.seed
+
+    @property
+    def every_s(self) -> float:
+        """Time between one frame and the next."""
+        return self.simulator.every_s
+
+    @property
+    def sensors(self) -> Mapping[str, Sequence[Sensor]]:
+        """The sensors of each rig."""
+        return {name: rig.sensors for name, rig in self.rigs.items()}
+
+    @property
+    def sensor_names(self) -> Mapping[str, Sequence[str]]:
+        """The names of the sensors of each rig."""
+        return {name: [sensor.name for sensor in rig.sensors] for name, rig in self.rigs.items()}
+
+    def world_of(self, index: int) -> int:
+        """Which world a frame is of; of one that plays again and again every process has it whole: the index."""
+        return index if self.scenario.repeats else self.simulator.run_of(index)
+
+    def has_boxes(self) -> bool:
+        """Whether they were asked for."""
+        return self.boxes
+
+    def ego_mesh(self) -> Mesh:
+        """What carries the rigs, in the vehicle frame; no world is built for it."""
+        return self.scenario.ego_mesh()
+
+    @property
+    def ego_outline_m(self) -> NDArray[np.float64]:
+        """(4, 2) corners x, y of the ego as seen from above, counter-clockwise; no world is built for it."""
+        return self.scenario.ego_box().outline_m
+
+    @property
+    def description(self) -> Mapping[str, object]:
+        """The names of the scenario and of the vehicle, and the seed."""
+        return {
+            "scenario": self.scenario.name,
+            "vehicle": self.scenario.ego_name,
+            "frames": None,
+            "seed": self.seed,
+        }
+
+    @property
+    def square_metres(self) -> bool:
+        """Whether the reference sensor gives the square metres of its points."""
+        return self.reference_sensor.square_metres
+
+    @property
+    def reference_record(self) -> Mapping[str, object]:
+        """The name of the reference sensor and the time between two frames."""
+        return {"sensor": self.reference_sensor.name, "every_s": self.every_s}
+
+    @property
+    def content(self) -> Mapping[str, object]:
+        """What stands in the documents and in the files that they name, and the settings.
+
+        Raises:
+            FileNotFoundError: A file is missing.
+        """
+        sensor = self.reference_sensor
+        pattern = repr(sensor) if is_dataclass(sensor) else hashlib.sha256(pickle.dumps(sensor)).hexdigest()
+        return {
+            "scenario": self.scenario.content(),
+            **{f"rig {name}": rig.content() for name, rig in self.rigs.items()},
+            "reference sensor": pattern,
+            "seed": self.seed,
+            "every_s": self.every_s,
+            "boxes": self.boxes,
+        }
+
+    def with_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
+        """The same instants as another reference sensor sees them; the geometry is built once for both."""
+        other = copy.copy(self)
+        other.simulator = self.simulator.with_reference_sensor(reference_sensor)
+        return other
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def __getitem__(self, index: int) -> Frame:
+        if not 0 <= index < self.steps:
+            raise IndexError(f"frame {index} of {self.steps}")
+        return self.frame_of(self.simulator.step(index), index)
+
+    def frame_of(self, seen: Observation, index: int) -> Frame:
+        """The frame of what the simulator saw at a step."""
+        clouds = {name: torch.from_numpy(points) for name, points in seen.clouds.items()}
+        weights = seen.reference_weights
+        return Frame(
+            clouds=clouds,
+            reference=torch.from_numpy(seen.reference),
+            reference_weights=None if weights is None else torch.from_numpy(weights),
+            index=index,
+            name=f"{self.scenario.name} step {index}",
+            counts=seen.counts,
+            boxes=_boxes(self.simulator.labels(index), clouds, seen.drawn) if self.boxes else None,
+            place_in_time=self.simulator.place_in_time(index),
+            sensor_points={
+                name: dict(zip((sensor.name for sensor in self.rigs[name].sensors), points, strict=True))
+                for name, points in seen.sensor_points.items()
+            },
+        )
+
+
+def reference_called(name: str | None = None, rays: int | None = None, asked: Asked | None = None) -> ReferenceSensor:
+    """A reference sensor by its name, aimed at what is asked about.
+
+    Args:
+        name: One of `torchcover.simulation.REFERENCE_SENSORS`; "surface" if not given.
+        rays: About how many rays at each step; the sensor's own number if not given.
+        asked: Regions, height bands and grid, as `RegionsOfInterest.around` gives them; those of `torchcover.evaluate`
+            without the near field, for the vehicle is unknown, if not given.
+
+    Raises:
+        ValueError: Another name, or too few rays.
+
+    Example:
+        >>> sensor = reference_called()
+        >>> sensor.name, sensor.rays, sensor.square_metres
+        ('surface', 16384, True)
+    """
+    kind = REFERENCE_SENSORS.get(DEFAULT_REFERENCE if name is None else name)
+    if kind is None:
+        raise ValueError(f"reference {name}: {' or '.join(f'`{known}`' for known in REFERENCE_SENSORS)} is needed")
+    asked = asked or RegionsOfInterest().around()
+    return kind.from_rays(asked.areas, rays, asked.bands_m)
+
+
+def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
+    """The default reference sensor with 64 points for each object in range: one that knows how visible they are.
+
+    Args:
+        asked: As in `reference_called`.
+
+    Example:
+        >>> reference_of_objects().object_points
+        64
+    """
+    asked = asked or RegionsOfInterest().around()
+    return SurfaceReference(asked.areas, bands_m=asked.bands_m, object_points=OBJECT_POINTS)
+
+
+def _rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | None) -> dict[str, Rig]:
+    """One rig by its own name, or several by the names that they are given."""
+    if (rig is None) == (not rigs):
+        raise ValueError("give one rig, or several as rigs={name: rig}")
+    if rig is not None:
+        only = _load(rig)
+        return {only.name: only}
+    return {name: _load(given) for name, given in (rigs or {}).items()}
+
+
+def _load(rig: Rig | str | Path) -> Rig:
+    return rig if isinstance(rig, Rig) else Rig.load(rig)
+
+
+def _boxes(found: Sequence[Label], clouds: Mapping[str, torch.Tensor], drawn: NDArray[np.int64] | None) -> Boxes:
+    rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
+    boxes = Boxes.from_rows(
+        torch.tensor(rows, dtype=torch.float32).view(-1, 7),
+        velocity_mps=torch.tensor(np.array([label.velocity_mps for label in found]), dtype=torch.float32).view(-1, 2),
+        ids=tuple(label.name for label in found),
+        categories=tuple(label.category for label in found),
+        drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
+    )
+    return with_hits(boxes, clouds)

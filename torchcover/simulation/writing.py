@@ -1,0 +1,88 @@
+"""Write what a simulated rig saw as a recording, for any tool that reads its layout."""
+
+import os
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.recordings.recorders import RECORDERS
+from torchcover.recordings.recorders.recorder import RecordedStep, RecordingSetup
+from torchcover.simulation.lidar import Lidar
+from torchcover.simulation.simulated_frames import SimulatedFrames
+
+# Between the last step of a city and the first of the next, or of the same world again: no reference of a recording is
+# accumulated over so long a time.
+APART_S = 1000.0
+
+
+def write_recording(
+    frames: SimulatedFrames,
+    folder: str | os.PathLike[str],
+    layout: str = "folder",
+    *,
+    progress: Callable[[range], Iterable[int]] = iter,
+) -> None:
+    """Write what a simulated rig saw: clouds, the reference, boxes where the frames have them, mounts and poses.
+
+    Args:
+        frames: A simulation of one rig.
+        folder: Where to; made if it does not exist.
+        layout: A name in `RECORDERS`: "folder" (`FolderRecording` reads it, with the numbers of the simulation), or
+            "kitti" (KITTI's object layout, of one LiDAR).
+        progress: Is given the numbers of the steps and passes them on, as `tqdm.tqdm` does.
+
+    Raises:
+        ValueError: An unknown layout, a folder that is not empty, several rigs, or sensors that the layout cannot hold.
+
+    Example:
+        >>> import tempfile
+        >>> from torchcover.data import RecordedFrames, SimulatedFrames
+        >>> frames = SimulatedFrames("courtyard", "front_roof_32", steps=1)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     write_recording(frames, folder)
+        ...     again = RecordedFrames(folder)[0]
+        >>> len(again.sensor) == len(frames[0].sensor), again.reference_weights is None
+        (True, False)
+    """
+    folder = Path(folder)
+    if layout not in RECORDERS:
+        raise ValueError(f"format {layout!r}: recordings are written as {' or '.join(RECORDERS)}")
+    if len(frames.rigs) != 1:
+        raise ValueError(f"a recording is of one rig; got {', '.join(frames.rigs)}")
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ValueError(f"{folder}: {'not empty' if folder.is_dir() else 'a file'}; a new or empty folder is needed")
+    recorder = RECORDERS[layout](folder, _setup(frames))
+    for index in progress(range(len(frames))):
+        recorder.write(_step(frames, index))
+
+
+def _setup(frames: SimulatedFrames) -> RecordingSetup:
+    (rig,) = frames.rigs.values()
+    return RecordingSetup(
+        rig.name,
+        {sensor.name: sensor.mount.matrix() for sensor in rig.sensors},
+        [sensor.name for sensor in rig.sensors if isinstance(sensor, Lidar)],
+        frames.scenario.ego_box(),
+        frames.square_metres,
+        frames.boxes,
+    )
+
+
+def _step(frames: SimulatedFrames, index: int) -> RecordedStep:
+    """Simulate a step of the only rig."""
+    ((name, rig),) = frames.rigs.items()
+    seen = frames.simulator.step(index)
+    ends = np.cumsum(seen.sensor_points[name])
+    clouds: list[NDArray[np.float32]] = np.split(seen.clouds[name], ends[:-1])
+    scene, step = frames.simulator.scene_of(index)
+    world = scene.world
+    played = round(index * frames.every_s / world.time_step_s) // world.steps if world.steps > 1 else 0
+    return RecordedStep(
+        f"{index:06d}",
+        index * frames.every_s + played * APART_S,
+        world.ego.trajectory.at(step * world.time_step_s),
+        {sensor.name: cloud for sensor, cloud in zip(rig.sensors, clouds, strict=True)},
+        frames.frame_of(seen, index),
+    )
