@@ -122,5 +122,5 @@ def test_a_small_run_is_a_page_with_boards_among_the_metrics(example, tmp_path, 
     assert "| lob_10m * | -0.64 [" in page
     assert "| lob_50m * | +0.90 [" in page
     assert {path.name for path in tmp_path.iterdir()} == {
-        "agreement.csv", "scores.csv", "agreement.json", "agreement.md",
+        "agreement.csv", "scores.csv", "summary.json", "agreement.md",
     }  # fmt: skip

@@ -1,21 +1,43 @@
 """The command in this process, and worlds small enough to be cast at once."""
 
+import os
 import sys
+from pathlib import Path
 
 import pytest
 
 from torchcover.cli import app
 
+# Of a file that is aside, or is no result.
+ASIDE = (".partial_", ".unfinished_", ".lock")
+# Lines that are added, each on the disk before the next one.
+JOURNAL = "evaluations.jsonl"
+opened = []
+
+
+def _told(event, arguments):
+    if event == "open" and isinstance(arguments[0], str | os.PathLike):
+        path, mode, flags = arguments
+        if any(letter in (mode or "") for letter in "wax+") or flags & (os.O_WRONLY | os.O_RDWR):
+            opened.append(Path(path).absolute())
+
+
+sys.addaudithook(_told)
+
 
 @pytest.fixture
-def torchcover(monkeypatch, capsys):
-    """Run the command in this process; returns exit code, stdout, stderr."""
+def torchcover(monkeypatch, capsys, tmp_path):
+    """Run the command in this process, which may write nothing in place; returns exit code, stdout, stderr."""
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["torchcover", *map(str, arguments)])
+        opened.clear()
         with pytest.raises(SystemExit) as stop:
             app.main()
         captured = capsys.readouterr()
+        results = [path.relative_to(tmp_path) for path in opened if path.is_relative_to(tmp_path)]
+        in_place = [path for path in results if not any(part.startswith(ASIDE) for part in path.parts)]
+        assert [path for path in in_place if path.name != JOURNAL] == []
         return stop.value.code, captured.out, captured.err
 
     return run

@@ -273,7 +273,7 @@ def test_a_folder_may_be_called_what_rich_takes_for_markup(torchcover, recording
     monkeypatch.chdir(recording.parent)
     code, printed, _ = torchcover("evaluate", "--frames", recording, "--out", "[/x]")
     assert code == 0
-    assert "maps to [/x]" in printed
+    assert "summary.json to [/x]" in printed
 
 
 def test_an_output_without_the_signs_of_the_tables_gets_question_marks_not_an_error(torchcover, monkeypatch):

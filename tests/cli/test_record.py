@@ -1,10 +1,12 @@
 """`torchcover record`: what it writes measures as the simulation does."""
 
 import json
+import signal
 
 import numpy as np
 
 from torchcover import Coverage
+from torchcover.simulation import writing
 
 
 def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_path):
@@ -37,3 +39,19 @@ def test_what_record_refuses(torchcover, worlds, tmp_path):
     code, _, error = torchcover("record", both, *yard, "--out", tmp_path / "new", "--format", "kitti")
     assert code == 2
     assert "format kitti: a rig of one LiDAR is needed; both has front, rear; use the format folder" in error
+
+
+def test_a_recording_that_was_ended_is_not_evaluated_and_gone_on_with(torchcover, worlds, monkeypatch):
+    out, step = worlds / "drive", writing._step
+    command = ("record", worlds / "low.yaml", "--scenario", worlds / "yard.yaml", "--steps", 3, "--rays", 64)
+    monkeypatch.setattr(writing, "_step", lambda *given: (given[1] == 1 and signal.raise_signal(2)) or step(*given))
+    code, _, said = torchcover(*command, "--out", out)
+    assert code == 130
+    assert said.endswith("torchcover: 1 of 3 frames are kept; go on by --resume\ntorchcover: interrupted\n")
+    code, _, said = torchcover("evaluate", "--frames", out, "--cell-m", 8, "--out", worlds / "out")
+    assert code == 2
+    assert f"{out}: a part of a recording, 1 frames: whatever wrote it was ended; go on with `torchcover record" in said
+    monkeypatch.setattr(writing, "_step", step)
+    code, printed, _ = torchcover(*command, "--out", out, "--resume")
+    assert (code, printed.startswith("Wrote 3 frames to ")) == (0, True)
+    assert torchcover("evaluate", "--frames", out, "--cell-m", 8, "--out", worlds / "out")[0] == 0

@@ -26,6 +26,7 @@ def test_a_run_goes_on_to_the_same_files(torchcover, worlds, monkeypatch, comman
     code, _, said = torchcover(*arguments, "--steps", 5, "--out", "parts", "--resume")
     assert (code, "is not there" in said, "replaced" in said) == (0, False, False)
     assert files_of(worlds / "parts") == files_of(worlds / "whole")
+    assert [path.parent.name for path in worlds.glob("*/checkpoint.npz")] == ["parts"]
     code, _, said = torchcover(*arguments, "--steps", 5, "--out", "parts", "--resume", "--seed", 1)
     assert code == 2
     assert "parts/checkpoint.npz: a checkpoint of another run: seed (0 there, 1 here); resume with the" in said
@@ -35,3 +36,5 @@ def test_a_run_goes_on_to_the_same_files(torchcover, worlds, monkeypatch, comman
     code, _, said = torchcover(*arguments, "--steps", 1, "--out", "parts")
     assert (code, "will be replaced" in said) == (0, False)  # the one before was complete
     assert files_of(worlds / "parts") != files_of(worlds / "whole")
+    # A run that has come to its end keeps none, unless going on was asked for.
+    assert not list(worlds.glob("*/checkpoint.npz"))

@@ -139,7 +139,7 @@ def test_ctrl_c_again_ends_at_once_and_says_what_is_kept(worlds, at_update, monk
     monkeypatch.setattr(figures, "draw_side_by_side", lambda *_, **__: (send(signal.SIGINT), time.sleep(60)))
     code, said = in_a_fork(worlds, worlds / "log")
     out = worlds / "out"
-    kept = ", ".join(str(out / name) for name in ("checkpoint.npz", "summary.csv", "summary.json"))
+    kept = ", ".join(str(out / name) for name in ("checkpoint.npz", "coverage", "summary.csv", "summary.json"))
     assert code == 130
     assert said.splitlines()[-1] == f"torchcover: ended at once: kept is {kept}"
     assert steps_of(out) == ([2, 2], False, 0)

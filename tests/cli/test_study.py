@@ -18,7 +18,7 @@ def test_a_small_study_writes_a_table_a_diagram_and_an_advice(torchcover, tmp_pa
     assert "…" not in text
     assert (out / "work_precision.png").read_bytes()[:4] == b"\x89PNG"
     assert (out / "long_run.npz").is_file()
-    study = json.loads((out / "study.json").read_text())
+    study = json.loads((out / "summary.json").read_text())
     assert [(row["rays"], row["steps"]) for row in study["points"]] == [(64, 1), (64, 2), (256, 1), (256, 2)]
     # A real command was timed, which has to import all this.
     assert all(row["seconds"] > study["start_s"] > 0.5 for row in study["points"])

@@ -66,7 +66,7 @@ def test_the_notes_say_what_the_data_say(study):
 
 def test_the_files_hold_every_number(study, tmp_path):
     files = study.save(tmp_path / "out")
-    assert [path.name for path in files] == ["agreement.csv", "scores.csv", "agreement.json"]
+    assert [path.name for path in files] == ["agreement.csv", "scores.csv", "summary.json"]
     with files[0].open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == sum(len(found.ranked) for found in study.found.values())

@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 
 from tests.killing import operations_of
-from torchcover.files import Publication, claimed, reads, settled, write_durably
+from torchcover.files import RECORDING, Publication, claimed, noted, reads, settled, write_durably
 
 # Of two publications by the name of each file: what is in it. `mine.txt` and `maps/mine.png` are a user's.
 EARLIER = {"a.txt": "earlier", "gone.txt": "earlier", "maps/m.png": "earlier", "maps/gone.png": "earlier"}
@@ -330,7 +330,7 @@ def test_where_there_is_no_room_the_file_is_named_and_all_stays_as_it_was(tmp_pa
     earlier, *_ = with_earlier(tmp_path)
     said = limited(lambda: publish(tmp_path, {"a.txt": "new", "maps/m.png": "x" * 2000}))
     assert said == f"[Errno 27] File too large: '{tmp_path}/maps/m.png'"
-    said = limited(lambda: write_durably(tmp_path / "a.txt", lambda file: file.write(b"x" * 2000)))
+    said = limited(lambda: write_durably(tmp_path / "a.txt", lambda path: path.write_text("x" * 2000)))
     assert said == f"[Errno 27] File too large: '{tmp_path}/a.txt'"
     assert found(tmp_path) == earlier
     assert in_place(tmp_path) == {*earlier[0], "summary.json"}
@@ -357,3 +357,54 @@ def test_all_is_on_the_disk_before_it_is_the_new_content(tmp_path, monkeypatch):
     publish(tmp_path, NUMBERS, MAPS)
     assert seen == [set(), set()]
     assert {path.stat().st_ino for path in (tmp_path, tmp_path / "maps")} <= synced
+
+
+def parts(folder, count, then=None):
+    """Write so many parts, those that are there left out; publish them, or do something else."""
+    with Publication(folder, RECORDING, goes_on=True) as files:
+        for part in range(len(files.notes), count):
+            for name in (f"a/{part}.txt", f"a/b/{part}.txt"):
+                files.add(name, lambda path, part=part: path.write_text(str(part)))
+            files.note({"part": part})
+        assert [note["part"] for note in files.notes] == list(range(len(files.notes)))
+        then() if then else files.publish({"parts": count})
+
+
+def all_parts(folder, count):
+    assert json.loads((folder / "recording.json").read_text())["parts"] == count
+    names = {f"{place}/{part}.txt" for place in ("a", "a/b") for part in range(count)}
+    assert in_place(folder) == {*names, "recording.json"}
+    assert {(folder / name).read_text() for name in names} == set(map(str, range(count)))
+
+
+def test_what_was_noted_is_gone_on_with(tmp_path):
+    with pytest.raises(ZeroDivisionError):
+        parts(tmp_path, 2, then=lambda: 1 / 0)
+    assert [(note["part"], note["files"]) for note in noted(tmp_path)] == [
+        (part, [f"a/{part}.txt", f"a/b/{part}.txt"]) for part in range(2)
+    ]
+    assert not (tmp_path / "recording.json").exists()
+    publish(tmp_path, {})  # another one leaves it alone
+    (tmp_path / "summary.json").unlink()
+    parts(tmp_path, 3)
+    all_parts(tmp_path, 3)
+    assert noted(tmp_path) == []
+
+
+def test_a_kill_at_any_file_operation_costs_a_part_at_most(tmp_path):
+    count, _ = operations_of(lambda: parts(tmp_path / "counted", 2))
+    all_parts(tmp_path / "counted", 2)
+    kept = []
+    for at in range(count):
+        folder = tmp_path / str(at)
+        operations_of(lambda folder=folder: parts(folder, 2), at)
+        kept.append(len(noted(folder)))
+        with claimed(folder):
+            is_whole = (folder / "recording.json").exists()
+        if kept[-1] and not is_whole:
+            with (folder / ".partial_to_go_on_with" / ".notes.jsonl").open("a") as lines:
+                lines.write('{"part": 9')  # what a kill within the line leaves
+        if not is_whole:
+            parts(folder, 2)
+        all_parts(folder, 2)
+    assert set(kept) == {0, 1, 2}

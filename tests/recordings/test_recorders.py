@@ -1,16 +1,22 @@
 """What a simulated rig saw, written down and read back."""
 
+import contextlib
+import shutil
+import signal
+
 import numpy as np
 import pytest
 import torch
 
+from tests.killing import operations_of
 from torchcover import Rig
 from torchcover.data import RecordedFrames, SimulatedFrames, open_recording, write_recording
+from torchcover.files import BadFileError, noted
 from torchcover.geometry import rotation_from_euler, rotation_from_quaternion
 from torchcover.geometry.rigid import quaternion_from_rotation
 from torchcover.recordings.formats.kitti_files import BODY, read_calibration, read_labels
-from torchcover.recordings.recorders.kitti import NOTHING
-from torchcover.simulation import SurfaceReference
+from torchcover.recordings.recorders.kitti import NOTHING, KittiRecorder
+from torchcover.simulation import SurfaceReference, writing
 
 PATTERN = {"channels": 8, "vertical_fov_deg": (-30, 5), "horizontal_fov_deg": 360, "columns": 60, "max_range_m": 60}
 # Not in the order of their names, and with noise that depends on their order.
@@ -165,9 +171,105 @@ def test_what_cannot_be_written_is_refused_before_the_first_step(both, tmp_path,
     assert not (tmp_path / "new").exists()
 
 
-def test_a_recording_that_was_cut_short_is_a_shorter_one(both, tmp_path, monkeypatch):
-    step = both.simulator.step
-    monkeypatch.setattr(both.simulator, "step", lambda index: step(index) if index < 2 else 1 / 0)
+@pytest.fixture
+def simulated_once(both, monkeypatch):
+    """The steps of `both`, which are not simulated again; which of them were asked for."""
+    made, asked = [writing._step(both, index) for index in range(len(both))], []
+    monkeypatch.setattr(writing, "_step", lambda _, index: (asked.append(index), made[index])[1])
+    return asked
+
+
+def until(step, stop):
+    """Passes on the numbers of steps, and does something before one of them."""
+
+    def progress(steps):
+        for index in steps:
+            if index == step:
+                stop()
+            yield index
+
+    return progress
+
+
+def texts(folder):
+    """Its files by name; what is in those that say no time."""
+    files = [path for path in folder.rglob("[!.]*") if path.is_file() and ".whole" not in path.parts]
+    return {path.relative_to(folder): path.suffix == ".npz" or path.read_bytes() for path in files}
+
+
+@pytest.mark.parametrize("layout", ["folder", "kitti"])
+def test_a_part_of_a_recording_is_never_read_and_gone_on_with(both, simulated_once, tmp_path, monkeypatch, layout):
+    if layout == "kitti":
+        monkeypatch.setattr(KittiRecorder, "__init__", anything)
+    write_recording(both, tmp_path / "whole", layout)
+    simulated_once.clear()
     with pytest.raises(ZeroDivisionError):
-        write_recording(both, tmp_path)
-    assert len(RecordedFrames(tmp_path)) == 2
+        write_recording(both, tmp_path / "part", layout, progress=until(2, lambda: 1 / 0))
+    with pytest.raises(ValueError, match=r"part: a part of a recording, 2 frames: .* `torchcover record --resume`"):
+        open_recording(tmp_path / "part")
+    with pytest.raises(ValueError, match=r"holds a part of a recording, 2 frames; go on with it \(--resume\), or"):
+        write_recording(both, tmp_path / "part", layout)
+    write_recording(both, tmp_path / "part", layout, resume=True)
+    write_recording(both, tmp_path / "part", layout, resume=True)  # there is nothing left to do
+    assert simulated_once == [0, 1, 2]
+    assert texts(tmp_path / "part") == texts(tmp_path / "whole")
+    assert len(open_recording(tmp_path / "part").names) == 3
+
+
+def anything(recorder, add, setup, init=KittiRecorder.__init__):
+    """Two sensors in a layout of one, whose clouds are the first's."""
+    name = setup.lidars[0]
+    init(recorder, add, setup._replace(mounts={name: setup.mounts[name]}, lidars=[name]))
+    write = recorder.write
+    recorder.write = lambda step: write(step._replace(clouds={name: step.clouds[name]}))
+
+
+def test_another_recording_is_not_gone_on_with(both, simulated_once, tmp_path):
+    with pytest.raises(ZeroDivisionError):
+        write_recording(both, tmp_path / "part", progress=until(2, lambda: 1 / 0))
+    write_recording(both, tmp_path / "whole")
+    for folder in (tmp_path / "part", tmp_path / "whole"):
+        with pytest.raises(ValueError, match=rf"{folder.name}: of another recording, with another rig both, boxes; ch"):
+            write_recording(simulated(REAR, steps=3, boxes=False), folder, resume=True)
+        with pytest.raises(ValueError, match=rf"{folder.name}: . frames are there; got 1 steps; choose another folder"):
+            write_recording(simulated(FRONT, REAR, steps=1), folder, resume=True)
+
+
+def test_a_recording_has_the_frames_that_were_written(tmp_path):
+    frames = simulated(FRONT, steps=2)
+    write_recording(frames, tmp_path / "training", "kitti")
+    for path in list(tmp_path.glob("training/*/000001.*")):
+        shutil.copy(path, path.with_stem("000009"))
+    with pytest.raises(ValueError, match=r"of 2 frames \(recording.json\), and 1 more are there, such as 000009; copy"):
+        RecordedFrames(tmp_path)
+    for path in tmp_path.glob("training/*/000001.*"):
+        path.unlink()
+    with pytest.raises(ValueError, match=r"of 2 frames \(recording.json\), and 1 are missing, such as 000001; copy or"):
+        RecordedFrames(tmp_path)
+    (tmp_path / "training" / "recording.json").write_text("[]")
+    with pytest.raises(BadFileError, match=r"recording.json: frames are needed, by their names; it says none"):
+        RecordedFrames(tmp_path)
+    (tmp_path / "training" / "recording.json").unlink()  # as if another tool had written it
+    assert len(open_recording(tmp_path).names) == 2
+
+
+def test_a_kill_at_any_file_operation_costs_a_frame_at_most(tmp_path, monkeypatch):
+    frames = simulated(FRONT, scenario="courtyard", steps=2, every_s=0.1, boxes=False)
+    made, content = [writing._step(frames, index) for index in range(2)], frames.content
+    monkeypatch.setattr(writing, "_step", lambda _, index: made[index])
+    monkeypatch.setattr(SimulatedFrames, "content", content)
+    count, code = operations_of(lambda: write_recording(frames, tmp_path / "whole"))
+    assert (count > 40, code) == (True, 0)
+    kept = set()
+    for at in range(count):
+        folder = tmp_path / str(at)
+        assert operations_of(lambda folder=folder: write_recording(frames, folder), at)[1] == -signal.SIGKILL
+        if noted(folder):
+            with pytest.raises(ValueError, match="a part of a recording"):
+                open_recording(folder)
+            kept.add(len(noted(folder)) - 1)
+        with contextlib.suppress(ValueError, FileNotFoundError):  # of nothing that is known: it had not begun
+            assert len(open_recording(folder).names) == 2
+        write_recording(frames, folder, resume=True)
+        assert texts(folder) == texts(tmp_path / "whole")
+    assert kept == {0, 1, 2}

@@ -36,7 +36,8 @@ def study(
 ) -> None:
     """Measure error against run time for numbers of rays and of steps, and recommend a setting."""
     from torchcover.cli.printing import print_study
-    from torchcover.evaluation import Settings, StudyPlan, claimed, error_against_time, rank_count
+    from torchcover.evaluation import Settings, StudyPlan, error_against_time, rank_count
+    from torchcover.files import claimed
 
     if rank_count() > 1:
         raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
@@ -49,8 +50,8 @@ def study(
     )
     with claimed(out):
         found = error_against_time(plan, progress=True)
-        found.save(out)
-        print_study(found, out)
+        files = found.save(out)
+    print_study(found, files, out)
 
 
 @with_options(of_evaluate("scenario", "seed", "vehicle", "reference", "rays", "every_s"))
@@ -63,25 +64,34 @@ def record(
     layout: Annotated[
         str, typer.Option("--format", help="`folder`, or `kitti`: KITTI's object layout, of a rig of one LiDAR.")
     ] = "folder",
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on after the last frame in --out, whatever ended that command.")
+    ] = False,
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """Write what a simulated rig sees as a recording, for other tools and for `evaluate --frames`."""
     from torchcover.evaluation import Settings
     from torchcover.evaluation.task import simulation
+    from torchcover.files import noted
     from torchcover.simulation import Rig, write_recording
 
     frames = simulation(Settings(Rig.load(rig), steps=steps, **settings), boxes=True).frames
-    write_recording(frames, out, layout, progress=_with_a_bar)
+    try:
+        write_recording(frames, out, layout, resume=resume, progress=_with_a_bar)
+    except BaseException:
+        if kept := noted(out)[1:]:
+            typer.echo(f"torchcover: {len(kept):,} of {len(frames):,} frames are kept; go on by --resume", err=True)
+        raise
     typer.echo(f"Wrote {len(frames)} frames to {out}; read them with: torchcover evaluate --frames {out}")
 
 
 def _with_a_bar(steps: range) -> Iterator[int]:
     from torchcover.evaluation.progress import progress_of
 
-    with progress_of(len(steps), "record", shown=True) as bar:
+    with progress_of(steps.stop, "record", done=steps.start, shown=True) as bar:
         for step in steps:
             yield step
-            bar.advance(len(steps))
+            bar.advance(steps.stop)
 
 
 def rig(
@@ -168,6 +178,7 @@ def targets(
         Path | None, typer.Option(help="Write the map to this .rrd file, for the Rerun viewer (extra `rerun`).")
     ] = None,
     out: options.Out = Path("out/targets"),
+    files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
 ) -> None:
     """Put a body at every place around the vehicle: how much of it is seen, where not, and whether that is enough."""
@@ -185,6 +196,7 @@ def targets(
         require=require,
         rerun=rerun,
         out=out,
+        files=files,
         **settings,
     )
     raise typer.Exit(code)
@@ -271,7 +283,8 @@ def agree(
 ) -> None:
     """Rank published placements by metrics, and by the detectors that were trained on them; say what that is worth."""
     from torchcover.cli.printing import print_agreement
-    from torchcover.evaluation import agree, claimed, rank_count
+    from torchcover.evaluation import agree, rank_count
+    from torchcover.files import claimed
     from torchcover.published import metric_names
 
     if rank_count() > 1:

@@ -56,6 +56,7 @@ def _measure(
         typer.Option(help="Extent x0,x1,y0,y1 of the grid in metres (-40,160,-40,40, more if regions need it)."),
     ] = None,
     out: options.Out = Path("out"),
+    files: options.Files = options.ALL_FILES,
     error_maps: Annotated[bool, typer.Option("--error-maps", help="Draw maps of the standard errors too.")] = False,
     rerun: Annotated[
         Path | None,
@@ -68,7 +69,8 @@ def _measure(
         bool,
         typer.Option(
             "--resume",
-            help="Go on from the checkpoint in --out, whatever ended that run; from a complete one with more --steps.",
+            help="Go on from the checkpoint in --out, whatever ended that run, and keep it at the end, so that more "
+            "--steps can follow.",
         ),
     ] = False,
     **settings: Any,  # noqa: ANN401
@@ -88,17 +90,17 @@ def _measure(
     if (asked := options.asked(settings.get("ask"), region, height, grid)) is not None:
         settings["ask"] = asked
     with sharing(out) as ranks:
-        log = logged(rerun, ranks)
+        log, checkpoint = logged(rerun, ranks), checkpoint_in(out, resume=resume)
         result = evaluate_(
             rigs,
             frames=recording,
-            checkpoint=checkpoint_in(out, resume=resume),
+            checkpoint=checkpoint,
             ranks=ranks,
             observers={} if log is None else {"rerun": log},
             progress=True,
             **settings,
         )
-        finish(result, out, ranks, log, error_maps=error_maps, explain=explain)
+        finish(result, out, ranks, log, checkpoint, files=files, error_maps=error_maps, explain=explain)
 
 
 MEASURING = [
@@ -106,6 +108,8 @@ MEASURING = [
     *of_evaluate(*OPTIONS),
 ]
 USUAL = {each.name: each.default for each in MEASURING}
+# Options that measure nothing.
+SAVING = ("out", "files", "error_maps", "explain")
 
 
 @with_options(MEASURING)
@@ -147,9 +151,7 @@ def _compare_saved(files: list[str], given: dict[str, Any], *, only: bool) -> No
     from torchcover.evaluation import compare
 
     changed = [
-        f"--{name.replace('_', '-')}"
-        for name, value in USUAL.items()
-        if given[name] != value and name not in ("out", "error_maps", "explain")
+        f"--{name.replace('_', '-')}" for name, value in USUAL.items() if given[name] != value and name not in SAVING
     ]
     if changed or not only:
         raise ValueError(
@@ -158,7 +160,7 @@ def _compare_saved(files: list[str], given: dict[str, Any], *, only: bool) -> No
         )
     with sharing(given["out"]) as ranks:
         result = compare(files)
-        finish(result, given["out"], ranks, error_maps=given["error_maps"], explain=given["explain"])
+        finish(result, ranks=ranks, **{name: given[name] for name in SAVING})
 
 
 def opened(
@@ -201,7 +203,7 @@ def checkpoint_in(out: Path, *, resume: bool) -> "Checkpoint":
         typer.echo(f"torchcover: {path} is not there: the run starts with its first step", err=True)
     elif path.exists() and not resume and not _complete(out):
         typer.echo(f"torchcover: {path} will be replaced; to go on from it, stop now and add --resume", err=True)
-    return Checkpoint(path, resume)
+    return Checkpoint(path, resume, keep=resume)
 
 
 def _complete(out: Path) -> bool:
@@ -215,7 +217,8 @@ def _complete(out: Path) -> bool:
 @contextmanager
 def sharing(out: Path) -> "Iterator[Ranks | None]":
     """The folder, kept for this run; and the processes that share it, the first of which writes."""
-    from torchcover.evaluation import claimed, joined_ranks
+    from torchcover.evaluation import joined_ranks
+    from torchcover.files import claimed
 
     with joined_ranks() as ranks, claimed(out) if ranks is None or ranks.rank == 0 else nullcontext():
         yield ranks
@@ -244,7 +247,9 @@ def finish(
     out: Path,
     ranks: "Ranks | None",
     log: "RerunLog | None" = None,
+    checkpoint: "Checkpoint | None" = None,
     *,
+    files: str,
     error_maps: bool,
     explain: bool,
 ) -> None:
@@ -252,9 +257,12 @@ def finish(
     from torchcover.cli.printing import print_result
 
     if ranks is None or ranks.rank == 0:
-        files = result.save(out, error_maps=error_maps)
-        print_result(result, files, out, explain=explain)
+        written = result.save(out, files=files, error_maps=error_maps)
+        print_result(result, written, out, explain=explain)
         if log is not None:
             log.finish(result)
-    if result.run is not None:
-        result.run.raise_failure()
+    if result.run is None:
+        return
+    if checkpoint and result.run.complete and not checkpoint.keep:
+        checkpoint.of(ranks).path.unlink(missing_ok=True)
+    result.run.raise_failure()

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
 
-from torchcover.evaluation.settings import OPTIONS, Settings
+from torchcover.evaluation.settings import FILES, OPTIONS, Settings, wanted_files
 
 if TYPE_CHECKING:
     from torchcover.simulation import RegionsOfInterest
@@ -76,9 +76,18 @@ def check_out(folder: Path) -> Path:
     return folder
 
 
+def _check_files(files: str) -> str:
+    wanted_files(files)
+    return files
+
+
 Rig = Annotated[str, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file.")]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
 Out = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
+ALL_FILES = ",".join(FILES)
+Files = Annotated[
+    str, typer.Option(help="What to write beside `summary.json`: any of numbers, maps, page.", callback=_check_files)
+]
 
 
 def asked(

@@ -1,5 +1,6 @@
 """What the commands print."""
 
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -38,17 +39,20 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
         console.print(f"skipped: {line}", style="yellow", markup=False)
     for line in result.target_lines:
         console.print(line, markup=False, soft_wrap=True)
-    maps = sum(path.suffix == ".png" for path in files)
-    coverages = f"{len(result.coverages)} coverage files" if result.is_comparison else "coverage.npz"
-    metrics = "metrics.csv, metrics_tau.csv, " if result.metrics else ""
-    console.print(
-        f"Wrote report.html, summary.json, summary.csv, {metrics}{coverages} and {maps} maps to {out}",
-        markup=False,
-        soft_wrap=True,
-    )
+    print_files(files, out, console)
 
 
-def print_study(study: Study, out: Path) -> None:
+def print_files(files: Sequence[Path], out: Path, console: Console) -> None:
+    """Which files were written: in folders, how many."""
+    inside = Counter(path.parent.name for path in files if path.parent != out)
+    words = [
+        *(f"{count} files in {name}/" for name, count in inside.items()),
+        *(path.name for path in files if path.parent == out),
+    ]
+    console.print(f"Wrote {', '.join(words)} to {out}", markup=False, soft_wrap=True)
+
+
+def print_study(study: Study, files: Sequence[Path], out: Path) -> None:
     """The tables, and the settings that are recommended."""
     console, quantities = Console(), study.quantities
     tables = study_table(study.points, quantities), stage_table(study.stages)
@@ -67,7 +71,7 @@ def print_study(study: Study, out: Path) -> None:
     )
     for wanted, point in study.recommended.items():
         console.print(advice(wanted, point, study.plan), soft_wrap=True)
-    console.print(f"Wrote study.json, long_run.npz and work_precision.png to {out}", markup=False, soft_wrap=True)
+    print_files(files, out, console)
 
 
 DETECTORS_ONLY = "* an interval over detectors only: of worlds there are none, or too few"
@@ -94,7 +98,7 @@ def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> 
         console.print(verdict(truth, {one: study.found[truth, one] for one in readings}), markup=False, soft_wrap=True)
     for note in NOTES:
         console.print(note, markup=False, soft_wrap=True)
-    console.print(f"Wrote {', '.join(path.name for path in files)} to {out}", markup=False, soft_wrap=True)
+    print_files(files, out, console)
 
 
 def advice(wanted: float, point: WorkPoint | None, plan: StudyPlan) -> str:

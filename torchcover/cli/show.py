@@ -1,6 +1,7 @@
 """`torchcover show`: what is meant, a rig, a scenario or a vehicle; its pictures."""
 
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from rich.progress import track
 from torchcover.evaluation import cameras_of, rig_pictures, scenario_pictures, vehicle_picture
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
 from torchcover.evaluation.task import as_called
-from torchcover.files import BadFileError
+from torchcover.files import BadFileError, write_durably
 from torchcover.report import check_film, write_film
 from torchcover.simulation import Scenario, builtin_names
 from torchcover.simulation.bodies import Vehicle
@@ -73,7 +74,6 @@ def run(
     if film is None:
         _write(console, out / Path(name).stem, (("", figure) for figure in figures))
         return
-    film.parent.mkdir(parents=True, exist_ok=True)
     drawn = track(figures, "pictures", total=len(steps), console=console)
     write_film(film, drawn, per_s=1 / (world.step_s * steps.step))
     console.print(f"Wrote {film}", markup=False, soft_wrap=True)
@@ -87,8 +87,7 @@ def _say(console: Console, description: str) -> None:
 def _write(console: Console, stem: Path, figures: Iterable[tuple[str, Figure]]) -> None:
     for suffix, figure in figures:
         path = stem.with_name(f"{stem.name}{suffix}.png")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=figure.dpi)
+        write_durably(path, partial(figure.savefig, dpi=figure.dpi))
         console.print(f"Wrote {path}", markup=False, soft_wrap=True)
 
 

@@ -7,8 +7,10 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from torchcover.evaluation import claimed, save_targets, survey_target
+from torchcover.cli.printing import print_files
+from torchcover.evaluation import save_targets, survey_target
 from torchcover.evaluation.rerun_log import write_target
+from torchcover.files import claimed
 from torchcover.report import percent, text_table
 from torchcover.simulation import Rig
 from torchcover.targets import Heading, Place, Raster, Requirements, TargetMap, Verdict, check
@@ -32,6 +34,7 @@ def run(
     require: Path | None,
     rerun: Path | None,
     out: Path,
+    files: str,
 ) -> int:
     """Survey a target, write and print what is seen, judge it.
 
@@ -61,11 +64,11 @@ def run(
         sensors = Rig.load(rig).sensors
         others = () if requirements is None else requirements.requirements
         not_checked = [other.words for other in others if not other.is_about(seen.target)]
-        files = save_targets(seen, out, verdicts, sensors, not_checked=not_checked)
+        written = save_targets(seen, out, verdicts, sensors, not_checked=not_checked, files=files)
         if rerun is not None:
             write_target(seen, sensors, rerun)
     _print(seen, verdicts, not_checked)
-    Console().print(f"Wrote {', '.join(path.name for path in files)} to {out}", markup=False, soft_wrap=True)
+    print_files(written, out, Console())
     return 0 if all(verdict.passed for verdict in verdicts) else FAILED
 
 

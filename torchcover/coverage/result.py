@@ -22,6 +22,7 @@ from torchcover.coverage.region_sums import PlaceNumbers
 from torchcover.coverage.regions import Region, check_regions, regions_within
 from torchcover.coverage.summary import RegionRedundancy, RegionSummary, estimate_redundancy, region_redundancy
 from torchcover.estimation import Estimate, Quantity
+from torchcover.files import write_durably
 
 
 class Coverage:
@@ -264,7 +265,7 @@ class Coverage:
         """
         given = {name: getattr(self, name) for name in CoverageParts.__annotations__}
         parts = cast("CoverageParts", given | {"layers": list(self.layers.values())})
-        write_coverage(parts, self.errors, Path(path))
+        write_durably(Path(path), partial(write_coverage, parts, self.errors))
 
     @classmethod
     def load(cls, path: str | Path) -> "Coverage":

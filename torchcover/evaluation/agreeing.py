@@ -2,16 +2,13 @@
 
 import csv
 import io
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import IO
 
 from torchcover.evaluation.placement_scores import PlacementScores, score_placements
-from torchcover.files import write_durably
+from torchcover.files import Publication
 from torchcover.published import Agreement, Judged, Ranked, Relation, agreement_of, read_results
 from torchcover.published.agreement import kind_of
 from torchcover.simulation import Scenario, builtin_folder, builtin_names
@@ -85,23 +82,19 @@ class AgreementStudy:
             for row in one.ranked
         ]
 
-    def save(self, folder: Path) -> list[Path]:
+    def save(self, folder: str | Path) -> list[Path]:
         """Write the files.
 
         Returns:
             `agreement.csv`, a row for each metric, truth and reading of the rolls; `scores.csv`, what each metric says
-            of each rig; `agreement.json`, everything.
+            of each rig; `summary.json`, everything.
         """
-        folder.mkdir(parents=True, exist_ok=True)
         scores = [(one.name, kind_of(one), *map(_known, one.gains.tolist())) for one in self.scores.rankings]
-        texts = {
-            "agreement.csv": _csv([COLUMNS, *self.rows]),
-            "scores.csv": _csv([("metric", "kind", *self.scores.rigs), *scores]),
-            "agreement.json": json.dumps(self.record, indent=1, allow_nan=False),
-        }
-        for name, text in texts.items():
-            write_durably(folder / name, partial(_write, text))
-        return [folder / name for name in texts]
+        with Publication(Path(folder)) as files:
+            files.add_text("agreement.csv", _csv([COLUMNS, *self.rows]))
+            files.add_text("scores.csv", _csv([("metric", "kind", *self.scores.rigs), *scores]))
+            files.publish(self.record)
+        return files.paths
 
 
 def agree(
@@ -201,7 +194,3 @@ def _csv(rows: Sequence[Sequence[object]]) -> str:
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
-
-
-def _write(text: str, file: IO[bytes]) -> None:
-    file.write(text.encode())

@@ -11,10 +11,10 @@ import warnings
 import zipfile
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import IO, TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 import torch
@@ -24,6 +24,9 @@ from torch import Tensor
 from torchcover.evaluation.observers import CoverageObserver, Stateful
 from torchcover.evaluation.transport import Bits, spread, words_of
 from torchcover.files import NpyHeader, check_memory, read_npz, reads, write_durably
+
+if TYPE_CHECKING:
+    from torchcover.evaluation.ranks import Ranks
 
 EVERY_S = 60.0
 # Writing takes at most this share of the time, though it may take seconds.
@@ -52,15 +55,22 @@ class Progressing(Protocol):
 class Checkpoint:
     """A file that a run is saved to every minute and at its end, and from which it goes on after whatever ended it.
 
-    The file stays when the run is complete: with more steps it goes on from there, too.
-
     Args:
         path: The file, in a folder that no other run writes to.
         resume: Whether to go on from it, if it is there; else the run starts with its first step, and replaces it.
+        keep: Whether a complete run is saved, too, so that it goes on from there with more steps; else only what was
+            cut short.
     """
 
     path: Path
     resume: bool = True
+    keep: bool = True
+
+    def of(self, ranks: "Ranks | None") -> Self:
+        """Where this process keeps it: every rank has a file of its own."""
+        if ranks is None or ranks.rank == 0:
+            return self
+        return replace(self, path=self.path.with_stem(f"{self.path.stem}_rank{ranks.rank}"))
 
 
 class Journal:
@@ -78,6 +88,7 @@ class Journal:
     def __init__(self, checkpoint: Checkpoint, identity: Mapping[str, str], states: Mapping[str, object]) -> None:
         self.path = checkpoint.path
         self.resume = checkpoint.resume
+        self.keep = checkpoint.keep
         self.identity = dict(identity)
         self._states: dict[str, Stateful] = {name: _checked(name, one) for name, one in states.items()}
         self._due_s = time.monotonic() + EVERY_S
@@ -206,7 +217,7 @@ def read_state(path: Path, header: Mapping[str, Any], name: str) -> dict[str, An
     return state
 
 
-def write_states(file: IO[bytes], header: Mapping[str, Any], states: Mapping[str, State]) -> None:
+def write_states(file: Path | IO[bytes], header: Mapping[str, Any], states: Mapping[str, State]) -> None:
     """The content of the file."""
     # One array after the other: together they would take as much memory again as the states.
     with zipfile.ZipFile(file, "w") as archive:

@@ -105,7 +105,8 @@ def _observed(task: Task[FrameSource], settings: Settings, others: Observers) ->
     with ExitStack() as stack:
         journal = None
         if checkpoint is not None:
-            place = _place(checkpoint, ranks)
+            place = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
+            place = place.of(ranks)
             if ranks is None or ranks.rank == 0:
                 stack.enter_context(claimed(place.path.parent))
             journal = Journal(place, identity, _states(coverage, others, watch))
@@ -151,15 +152,6 @@ def _whole(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Ru
         whole.raise_failure()
         raise ValueError("no frame could be used, so there is no result")
     return whole, observers
-
-
-def _place(checkpoint: Checkpoint | str | Path, ranks: Ranks | None) -> Checkpoint:
-    """Where this process keeps it: every rank has a file of its own."""
-    place = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
-    if ranks is None or ranks.rank == 0:
-        return place
-    place.path.parent.mkdir(parents=True, exist_ok=True)
-    return replace(place, path=place.path.with_stem(f"{place.path.stem}_rank{ranks.rank}"))
 
 
 def _states(coverage: Observers, others: Observers, watch: TargetWatch | None) -> dict[str, object]:

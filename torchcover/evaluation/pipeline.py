@@ -171,7 +171,7 @@ def observe(
             run.failure = KeyboardInterrupt() if killed and not set(signals).isdisjoint(ENDS) else killed or error
             signals.clear()
     run.seconds = time.perf_counter() - start
-    if journal and run.steps and consistent:
+    if journal and run.steps and consistent and (run.failure or journal.keep):
         with held_back():
             journal.write(run)
     if not (keep_partial and (run.steps or ranks)):

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchcover.coverage.quantity import RADIUS, by_area
 from torchcover.detection import Boxes
+from torchcover.files import write_durably
 from torchcover.frames import Frame
 from torchcover.neighbors import blind_spot_radius
 from torchcover.report import ColourScale, SensorView, scale_of
@@ -41,7 +42,9 @@ class RerunLog:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self._stream = opened(path)
+        self._path = Path(path)
+        self._unfinished = self._path.with_name(f".unfinished_{self._path.name}")
+        self._stream = opened(self._path, self._unfinished)
 
     def update(self, frame: Frame) -> None:
         """Write the clouds of a frame, the reference coloured by the radius of each rig, and the boxes."""
@@ -88,6 +91,7 @@ class RerunLog:
             for name, values in zip(grid.heights, layer.values.cpu().numpy(), strict=True):
                 log_cells(self._stream, [rig, "radius", name], values, (grid.x[0], grid.y[0]), grid.cell, scale)
         self._stream.disconnect()
+        write_durably(self._path, self._unfinished.replace)
 
 
 def write_target(seen: "TargetMap", sensors: Sequence[Sensor], path: str | Path) -> None:
@@ -102,9 +106,14 @@ def write_target(seen: "TargetMap", sensors: Sequence[Sensor], path: str | Path)
         ImportError: rerun-sdk is not installed.
         ValueError: Another suffix.
     """
+    path = Path(path)
+    write_durably(path, lambda aside: _log_target(seen, sensors, opened(path, aside)))
+
+
+def _log_target(seen: "TargetMap", sensors: Sequence[Sensor], stream: Any) -> None:  # noqa: ANN401
     import rerun as rr
 
-    stream, corner = opened(path), (seen.raster.x[0], seen.raster.y[0])
+    corner = seen.raster.x[0], seen.raster.y[0]
     log_outline(stream, "ego", seen.vehicle_outline_m)
     log_sensors(stream, seen.rig, sensors)
     scale = ColourScale("steps with enough points", "%", "viridis", 0.0, 1.0)
@@ -116,14 +125,13 @@ def write_target(seen: "TargetMap", sensors: Sequence[Sensor], path: str | Path)
     stream.disconnect()
 
 
-def opened(path: str | Path) -> Any:  # noqa: ANN401  (rerun is optional, so its types are not known)
-    """A stream into a new file.
+def opened(path: Path, aside: Path) -> Any:  # noqa: ANN401  (rerun is optional, so its types are not known)
+    """A stream into what is to be a file, and lies aside until it is whole.
 
     Raises:
         ImportError: rerun-sdk is not installed.
         ValueError: Another suffix.
     """
-    path = Path(path)
     if path.suffix != ".rrd":
         raise ValueError(f"rerun: a file that ends in .rrd is needed; got {path}")
     try:
@@ -132,7 +140,7 @@ def opened(path: str | Path) -> Any:  # noqa: ANN401  (rerun is optional, so its
         raise ImportError(f"{path}: rerun-sdk is needed: pip install 'torchcover[rerun]'") from error
     path.parent.mkdir(parents=True, exist_ok=True)
     stream = rr.RecordingStream("torchcover")
-    stream.save(path)
+    stream.save(aside)
     stream.log("", rr.ViewCoordinates.FLU, static=True)
     return stream
 

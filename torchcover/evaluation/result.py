@@ -1,6 +1,6 @@
 """What an evaluation gives: numbers, maps and files of one rig or several. All that `report` is asked for is here."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from torchcover.evaluation.result_page import (
     rig_document,
     sensor_views,
 )
+from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.evaluation.target_error import TargetError, outcome
 from torchcover.files import Publication
 from torchcover.published.comparison import MetricComparison, numbers_csv, record, tau_csv
@@ -173,7 +174,7 @@ class Result:
             errors=errors,
         )
 
-    def save(self, folder: str | Path, *, error_maps: bool = False) -> list[Path]:
+    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES, error_maps: bool = False) -> list[Path]:
         """Write the files of the command line: first the numbers, then the maps.
 
         At any time `summary.json` lists files of one run; those of an earlier one stay until the new numbers are there.
@@ -183,40 +184,44 @@ class Result:
                 `maps/STEM.png`, `summary.json`; with metrics of others `metrics.csv` and `metrics_tau.csv`. Made if it
                 does not exist. Files of an earlier run that this one does not write are deleted: those that its
                 `summary.json` lists.
+            files: What to write beside `summary.json`: "numbers", "maps", "page", or a text as in "numbers,page".
             error_maps: Whether to draw maps of the standard errors too.
 
         Returns:
             The files.
 
         Raises:
-            ValueError: The folder is that of a file which is compared.
+            ValueError: The folder is that of a file which is compared, or files that there are not.
         """
+        wanted = wanted_files(files)
         for path in self.inputs:
             if path.resolve().parent in (Path(folder).resolve(), Path(folder).resolve() / "coverage"):
                 raise ValueError(f"{folder}: holds {path}, which is compared, and would lose it; choose another folder")
-        with Publication(Path(folder)) as files:
+        with Publication(Path(folder)) as written:
             with held_back():  # the numbers are safe before anything ends this, and before the maps are drawn
-                for name, coverage in self._coverage_files.items():
-                    files.add(name, coverage.save)
-                files.add("summary.csv", partial(_write, RENDERERS["csv"](self.table)))
-                if self.metrics is not None:
-                    files.add("metrics.csv", partial(_write, numbers_csv(self.metrics)))
-                    files.add("metrics_tau.csv", partial(_write, tau_csv(self.metrics)))
+                for name, write in self._number_files.items() if "numbers" in wanted else ():
+                    written.add(name, write)
                 summary = self.record
-                files.publish(summary)
-            files.add("report.html", partial(_write, page_html(self.page)))
-            for stem, figure in self.maps(errors=error_maps):
-                files.add(f"maps/{stem}.png", partial(_draw, figure))
-            files.publish(summary)
-        return files.paths
+                written.publish(summary)
+            if "page" in wanted:
+                written.add_text("report.html", page_html(self.page))
+            for stem, figure in self.maps(errors=error_maps) if "maps" in wanted else ():
+                written.add(f"maps/{stem}.png", partial(figure.savefig, dpi=figure.dpi))
+            written.publish(summary)
+        return written.paths
 
     @property
-    def _coverage_files(self) -> dict[str, Coverage]:
-        """By their paths in the folder; a rig may be called what no file can be."""
-        if not self.is_comparison:
-            return {"coverage.npz": self.coverage}
+    def _number_files(self) -> dict[str, Callable[[Path], object]]:
+        """What writes each file of numbers, by its path in the folder; a rig may be called what no file can be."""
         stems = file_stems(list(self.coverages))
-        return {f"coverage/{stem}.npz": coverage for stem, coverage in zip(stems, self.coverages.values(), strict=True)}
+        of_rigs = {f"coverage/{stem}.npz": each.save for stem, each in zip(stems, self.coverages.values(), strict=True)}
+        texts = {"summary.csv": RENDERERS["csv"](self.table)}
+        if self.metrics is not None:
+            texts |= {"metrics.csv": numbers_csv(self.metrics), "metrics_tau.csv": tau_csv(self.metrics)}
+        return {
+            **(of_rigs if self.is_comparison else {"coverage.npz": self.coverage.save}),
+            **{name: partial(_write, text) for name, text in texts.items()},
+        }
 
     @property
     def _outcome(self) -> tuple[dict[str, Any] | None, list[str]]:
@@ -295,7 +300,3 @@ class Result:
 
 def _write(text: str, path: Path) -> None:
     path.write_text(text, encoding="utf-8")
-
-
-def _draw(figure: Figure, path: Path) -> None:
-    figure.savefig(path, dpi=figure.dpi)

@@ -31,6 +31,27 @@ DEFAULT_STEPS = 64
 MAX_STEPS = 4096
 # A process with torch and the geometry of a small scenario.
 BYTES_PER_WORKER = 300e6
+# Beside `summary.json`.
+FILES = ("numbers", "maps", "page")
+
+
+def wanted_files(given: str | Iterable[str]) -> frozenset[str]:
+    """What is to be written of a result.
+
+    Args:
+        given: Of `FILES`: names, or a text as in `numbers,page`.
+
+    Raises:
+        ValueError: Another name, or none.
+
+    Example:
+        >>> sorted(wanted_files("page, numbers"))
+        ['numbers', 'page']
+    """
+    names = [name.strip() for name in given.split(",")] if isinstance(given, str) else list(given)
+    if not names or not set(names).issubset(FILES):
+        raise ValueError(f"files: {', '.join(FILES)}, one or more of them, are needed; got {given!r}")
+    return frozenset(names)
 
 
 def _rigs(given: "AnyRig | Sequence[AnyRig] | None") -> "tuple[AnyRig, ...]":

@@ -1,6 +1,5 @@
 """Error against run time, and the setting to use for a wanted error."""
 
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from rich.table import Table
 from torchcover import __version__
 from torchcover.estimation import Quantity
 from torchcover.evaluation.study_runs import StudyPlan, Truth, command_s, long_run, tried
+from torchcover.files import Publication
 from torchcover.report import (
     WorkPanel,
     difference_heading,
@@ -175,7 +175,7 @@ class Study:
 
     @property
     def record(self) -> dict[str, Any]:
-        """All of it: what stands in `study.json`."""
+        """All of it: what stands in `summary.json`."""
         plan = self.plan
         return {
             "torchcover": __version__,
@@ -204,14 +204,18 @@ class Study:
         panels = work_panels(self.points, self.quantities, self.truth.errors)
         return draw_work_precision(panels, title=title, legend_title="rays a step")
 
-    def save(self, folder: str | Path) -> None:
-        """Write `work_precision.png`, `long_run.npz` and `study.json` into a folder, which is made if need be."""
-        folder = Path(folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        self.draw().savefig(folder / "work_precision.png")
-        self.truth.coverage.save(folder / "long_run.npz")
-        text = json.dumps(self.record, indent=2, allow_nan=False) + "\n"
-        (folder / "study.json").write_text(text, encoding="utf-8")
+    def save(self, folder: str | Path) -> list[Path]:
+        """Write `long_run.npz`, `work_precision.png` and `summary.json` into a folder, which is made if need be.
+
+        Returns:
+            The files.
+        """
+        figure = self.draw()
+        with Publication(Path(folder)) as files:
+            files.add("long_run.npz", self.truth.coverage.save)
+            files.add("work_precision.png", figure.savefig)
+            files.publish(self.record)
+        return files.paths
 
 
 def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:

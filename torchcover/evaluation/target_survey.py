@@ -1,6 +1,6 @@
 """What a rig sees of a target: names and defaults in, a map and its files out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from torchcover import __version__
 from torchcover.coverage import BevGrid
 from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_page import rig_document, sensor_views, words_of
+from torchcover.evaluation.settings import FILES, wanted_files
 from torchcover.evaluation.task import AnyRig, as_called, spread_s
 from torchcover.files import Publication
 from torchcover.report import (
@@ -138,6 +139,7 @@ def save_targets(
     sensors: Sequence[Sensor] = (),
     *,
     not_checked: Sequence[str] = (),
+    files: str | Iterable[str] = FILES,
 ) -> list[Path]:
     """Write the files of the command line: the numbers first, then the page and the picture.
 
@@ -148,22 +150,26 @@ def save_targets(
         verdicts: From `torchcover.targets.check`, for `summary.json` and the page.
         sensors: Those of the rig, for the page.
         not_checked: Requirements that are about other targets, in words.
+        files: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
 
     Returns:
         The files.
     """
+    wanted = wanted_files(files)
     record = {**target_record(seen, verdicts), "not_checked": list(not_checked)}
-    with Publication(Path(folder)) as files:
+    with Publication(Path(folder)) as written:
         with held_back():  # the numbers are safe before anything ends this
-            files.add("targets.csv", lambda path: write_csv(seen, path))
-            files.add("targets.npz", lambda path: write_arrays(seen, path))
-            files.publish(record)
-        page = target_page(seen, verdicts, sensors, not_checked)
-        files.add("report.html", lambda path: path.write_text(page_html(page), encoding="utf-8"))
-        figure = target_picture(seen)
-        files.add("targets.png", lambda path: figure.savefig(path, dpi=figure.dpi))
-        files.publish(record)
-    return files.paths
+            if "numbers" in wanted:
+                written.add("targets.csv", lambda path: write_csv(seen, path))
+                written.add("targets.npz", lambda path: write_arrays(seen, path))
+            written.publish(record)
+        if "page" in wanted:
+            written.add_text("report.html", page_html(target_page(seen, verdicts, sensors, not_checked)))
+        if "maps" in wanted:
+            figure = target_picture(seen)
+            written.add("targets.png", lambda path: figure.savefig(path, dpi=figure.dpi))
+        written.publish(record)
+    return written.paths
 
 
 def target_record(seen: TargetMap, verdicts: Sequence[Verdict] = ()) -> dict[str, Any]:

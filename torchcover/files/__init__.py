@@ -6,12 +6,22 @@ from torchcover.files.feather import read_feather
 from torchcover.files.json_tables import read_json_table
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, npz_headers, read_npy, read_npz, write_npz
 from torchcover.files.processes import end_with_parent
-from torchcover.files.publishing import SUMMARY, Publication, claimed, settled, write_durably, written_since
+from torchcover.files.publishing import (
+    RECORDING,
+    SUMMARY,
+    Publication,
+    claimed,
+    noted,
+    settled,
+    write_durably,
+    written_since,
+)
 from torchcover.files.xml_text import feed_xml, parse_xml
 from torchcover.files.yaml_text import as_yaml, parse_yaml
 
 __all__ = [
     "DEFLATE_MAX_RATIO",
+    "RECORDING",
     "SUMMARY",
     "BadFileError",
     "NpyHeader",
@@ -24,6 +34,7 @@ __all__ = [
     "end_with_parent",
     "feed_xml",
     "naming",
+    "noted",
     "npz_headers",
     "parse_xml",
     "parse_yaml",

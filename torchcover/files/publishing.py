@@ -12,33 +12,37 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path, PurePosixPath
-from shutil import copyfileobj, rmtree
+from shutil import copyfile, rmtree
 from types import TracebackType
-from typing import IO, Any, Self
+from typing import Any, Self
 from uuid import uuid4
 
-# Lists the files of a folder. Put in its place last, and taken away first: without it a folder is not complete.
-SUMMARY = "summary.json"
+# List the files of a result, and of a recording. Put in their places last, and taken away first: without one of them a
+# folder is not complete.
+SUMMARY, RECORDING = MARKERS = "summary.json", "recording.json"
 LOCK = ".lock"
 # What a file or a folder begins with that is not complete yet.
 PARTIAL = ".partial_"
-# Where files are that are the new content of their folder, and not yet in their places; and the summary before theirs.
+# Where files are that are the new content of their folder, and not yet in their places; and the marker before theirs.
 WHOLE = ".whole"
 BEFORE = ".before.json"
+# What is aside of a publication that may be gone on with, and how far it is.
+PART = ".partial_to_go_on_with"
+NOTES = ".notes.jsonl"
 
 # Folders that this process has claimed.
 _claims: list[Path] = []
 
 
-def write_durably(path: Path, write: Callable[[IO[bytes]], object]) -> None:
+def write_durably(path: Path, write: Callable[[Path], object]) -> None:
     """Write a file aside, see it onto the disk, and put it in the place of the one that is there.
 
     Whatever happens meanwhile, `path` is what it was before, or all of what it is to be. A process that is killed
     leaves the file aside, which the next one writes over.
 
     Args:
-        path: The file; no other process may be writing it.
-        write: Writes its content.
+        path: The file, in a folder that is made if it does not exist; no other process may be writing it.
+        write: Writes it to the path that it is given.
 
     Raises:
         OSError: It cannot be written, for want of room for example; the file aside is taken away.
@@ -46,21 +50,18 @@ def write_durably(path: Path, write: Callable[[IO[bytes]], object]) -> None:
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     write_durably(Path(folder, "a.txt"), lambda file: file.write(b"all of it"))
+        ...     write_durably(Path(folder, "a.txt"), lambda path: path.write_text("all of it"))
         ...     Path(folder, "a.txt").read_text()
         'all of it'
     """
     aside = path.with_name(f"{PARTIAL}{path.name}")
-    try:
-        with _naming(path):
-            with aside.open("wb") as file:
-                write(file)
-                file.flush()
-                os.fsync(file.fileno())
+    with _naming(path):
+        try:
+            _write_synced(aside, write)
             os.replace(aside, path)
-    except BaseException:
-        aside.unlink(missing_ok=True)
-        raise
+        except BaseException:
+            aside.unlink(missing_ok=True)
+            raise
     _sync_folder(path.parent)
 
 
@@ -113,41 +114,57 @@ def written_since(start_s: float) -> list[Path]:
         folder / path.name
         for folder in dict.fromkeys(_claims)
         for place in (folder, folder / WHOLE)
-        for path in sorted(place.glob("[!.]*"))
-        if path.is_file() and path.stat().st_mtime >= start_s
+        for path in sorted((*place.glob("[!.]*"), *place.glob(PART)))
+        if path.stat().st_mtime >= start_s
     ]
 
 
 class Publication:
     """Makes files the content of a folder, all at once. A context manager, which claims the folder.
 
-    Until `publish`, what an earlier one has published stays as it is; from then on it is gone, as its `summary.json`
-    lists it. Other files stay. There is no moment in which a kill leaves neither; see `settled`, too.
+    Until `publish`, what an earlier one has published stays as it is; from then on it is gone, as its marker lists it.
+    Other files stay. There is no moment in which a kill leaves neither; see `settled`, too.
 
     Args:
         folder: Where to write; made if it does not exist.
+        marker: The file that lists the others: `SUMMARY` or `RECORDING`.
+        goes_on: Whether what was added until a `note` is kept if this ends without `publish`, and gone on with.
+
+    Attributes:
+        paths: The files that are published, last the marker.
+        notes: What was noted, by the processes that this one goes on for too, each with its `files`.
 
     Example:
         >>> import tempfile
         >>> with tempfile.TemporaryDirectory() as folder, Publication(Path(folder, "out")) as files:
-        ...     files.add("a.txt", lambda path: path.write_text("a"))
+        ...     files.add_text("a.txt", "a")
         ...     files.publish({"complete": True})
         ...     [path.name for path in files.paths]
         ['a.txt', 'summary.json']
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, marker: str = SUMMARY, *, goes_on: bool = False) -> None:
         self.folder = folder
         self.paths: list[Path] = []
+        self.notes: list[dict[str, Any]] = []
+        self._marker = marker
+        self._goes_on = goes_on
+        # In the folder itself, which may be of another file system than what it lies in.
+        self._aside = folder / (PART if goes_on else f"{PARTIAL}{uuid4().hex}")
         self._names: dict[str, None] = {}
+        self._noted = 0
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             stack.enter_context(claimed(self.folder))
             for left in self.folder.glob(f"{PARTIAL}*"):  # by a process that was killed
-                rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink()
-            # In the folder itself, which may be of another file system than what it lies in.
-            self._aside = self.folder / f"{PARTIAL}{uuid4().hex}"
+                if left.name != PART:
+                    rmtree(left, ignore_errors=True) if left.is_dir() else left.unlink()
+            if self._goes_on and (lines := self._aside / NOTES).exists():
+                self.notes = noted(self.folder)
+                os.truncate(lines, len(_whole_lines(lines)))
+                self._names = dict.fromkeys(name for note in self.notes for name in note["files"])
+                self._noted = len(self._names)
             self._until_exit = stack.pop_all()
         return self
 
@@ -155,41 +172,61 @@ class Publication:
         """Write a file aside.
 
         Args:
-            name: Its path within the folder, which may have one folder in it.
+            name: Its path within the folder.
             write: Writes it to the path that it is given.
 
         Raises:
             OSError: It cannot be written, for want of room for example.
         """
-        path = self._aside / name
         with _naming(self.folder / name):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write(path)
-            with path.open("r+b") as file:
-                os.fsync(file.fileno())
+            _write_synced(self._aside / name, write)
         self._names[name] = None
 
+    def add_text(self, name: str, text: str) -> None:
+        """Write a file of text aside."""
+        self.add(name, lambda path: path.write_text(text, encoding="utf-8"))
+
+    def note(self, record: Mapping[str, Any]) -> None:
+        """Note that what was added until now is kept, and what else is to be known when this is gone on with."""
+        note = {**record, "files": list(self._names)[self._noted :]}
+        self._aside.mkdir(exist_ok=True)
+        with (self._aside / NOTES).open("ab") as file:
+            file.write(f"{json.dumps(note, allow_nan=False)}\n".encode())
+            file.flush()
+            os.fsync(file.fileno())
+        self.notes.append(note)
+        self._noted = len(self._names)
+
     def publish(self, record: Mapping[str, Any]) -> None:
-        """Make what was added content of the folder, in `summary.json` the record and the names of all its files.
+        """Make what was added content of the folder, in the marker the record and the names of all its files.
 
         More may be added, and published, after it.
         """
-        names = [name for name in self._names if name != SUMMARY]
+        names = [name for name in self._names if name != self._marker]
         text = json.dumps({**record, "files": names}, indent=2, allow_nan=False) + "\n"
-        self.add(SUMMARY, lambda path: path.write_text(text, encoding="utf-8"))
+        self.add_text(self._marker, text)
         for place in {path.parent for path in self._aside.rglob("*")}:
             _sync_folder(place)
         os.rename(self._aside, self.folder / WHOLE)  # from here on nothing is lost
         _sync_folder(self.folder)
         _finish(self.folder)
-        self.paths = [self.folder / name for name in (*names, SUMMARY)]
+        self.paths = [self.folder / name for name in (*names, self._marker)]
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, where: TracebackType | None
     ) -> None:
         with self._until_exit:
-            rmtree(self._aside, ignore_errors=True)
+            if not self._goes_on:
+                rmtree(self._aside, ignore_errors=True)
             _finish(self.folder)  # if Ctrl-C has come in between
+
+
+def noted(folder: Path) -> list[dict[str, Any]]:
+    """What was noted of a publication that may be gone on with; nothing where there is none, or nothing noted."""
+    try:
+        return [json.loads(line) for line in _whole_lines(folder / PART / NOTES).splitlines()]
+    except FileNotFoundError:
+        return []
 
 
 def settled(path: Path) -> Path:
@@ -205,7 +242,7 @@ def settled(path: Path) -> Path:
         FileNotFoundError: It was one of the publication before.
     """
     for folder in path.absolute().parents[:2]:
-        if not (listed := _waiting(folder)):
+        if (listed := _waiting(folder)) is None:
             continue
         with suppress(OSError, ValueError), claimed(folder):
             return path
@@ -220,13 +257,13 @@ def settled(path: Path) -> Path:
 def _finish(folder: Path) -> None:
     """Put in their places the files that are the new content of a folder; done again, it does what is left to do."""
     whole = folder / WHOLE
-    if listed := _waiting(folder):
-        names = [path.relative_to(whole).as_posix() for path in whole.rglob("*") if path.is_file()]
-        names = [name for name in names if name not in (SUMMARY, BEFORE)]
-        earlier, outdated = _listed(folder / SUMMARY), _outdated(folder, listed)
+    if (listed := _waiting(folder)) is not None:
+        marker = _marker(whole)
+        names = [name for name in listed if (whole / name).is_file()]
+        earlier, outdated = _listed(folder / marker) or set(), _outdated(folder, listed)
         if not earlier or outdated or not earlier.isdisjoint(names):  # else what it says holds until it is replaced
             with suppress(FileNotFoundError):
-                os.replace(folder / SUMMARY, whole / BEFORE)
+                os.replace(folder / marker, whole / BEFORE)
         for name in names:
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
             _move(whole / name, folder / name)
@@ -234,16 +271,22 @@ def _finish(folder: Path) -> None:
             (folder / name).unlink(missing_ok=True)
         for place in {(folder / name).parent for name in names}:
             _sync_folder(place)
-        os.replace(whole / SUMMARY, folder / SUMMARY)
+        os.replace(whole / marker, folder / marker)
         _sync_folder(folder)
     rmtree(whole, ignore_errors=True)
 
 
-def _waiting(folder: Path) -> set[str]:
-    """What a publication lists that is to be finished; nothing where somebody has taken away some of it."""
+def _marker(whole: Path) -> str:
+    return next((name for name in MARKERS if (whole / name).is_file()), SUMMARY)
+
+
+def _waiting(folder: Path) -> set[str] | None:
+    """What a publication lists that is to be finished; None where there is none, or somebody has taken away some."""
     whole = folder / WHOLE
-    listed = _listed(whole / SUMMARY)
-    return listed if all((whole / name).is_file() or (folder / name).is_file() for name in listed) else set()
+    listed = _listed(whole / _marker(whole))
+    if listed is None or not all((whole / name).is_file() or (folder / name).is_file() for name in listed):
+        return None
+    return listed
 
 
 def _move(source: Path, target: Path) -> None:
@@ -252,25 +295,42 @@ def _move(source: Path, target: Path) -> None:
     except OSError as error:
         if error.errno != errno.EXDEV:  # what a folder in the folder leads to may be of another file system
             raise
-        with source.open("rb") as file:
-            write_durably(target, partial(copyfileobj, file))
+        write_durably(target, partial(copyfile, source))
         source.unlink()
 
 
 def _outdated(folder: Path, listed: set[str]) -> set[str]:
     """Files of an earlier publication that are not among those of the one which is to be finished."""
-    earlier = _listed(folder / SUMMARY) | _listed(folder / WHOLE / BEFORE)
+    marker, before = folder / _marker(folder / WHOLE), folder / WHOLE / BEFORE
+    earlier = (_listed(marker) or set()) | (_listed(before) or set())
     return {name for name in earlier - listed if (folder / name).is_file()}
 
 
-def _listed(summary: Path) -> set[str]:
-    """The files that a summary lists; none where there is no such list. Nothing outside of the folder is in it."""
+def _listed(marker: Path) -> set[str] | None:
+    """The files that a marker lists; None where there is no such list. Nothing outside of the folder is in it."""
     try:
-        names = json.loads(summary.read_text(encoding="utf-8"))["files"]
+        names = json.loads(marker.read_text(encoding="utf-8"))["files"]
     except (OSError, ValueError, KeyError, TypeError):
-        return set()
-    paths = [PurePosixPath(name) for name in names if isinstance(name, str)] if isinstance(names, list) else []
-    return {str(path) for path in paths if not path.is_absolute() and ".." not in path.parts and path.name != SUMMARY}
+        return None
+    if not isinstance(names, list):
+        return None
+    paths = [PurePosixPath(name) for name in names if isinstance(name, str)]
+    return {
+        str(path) for path in paths if not path.is_absolute() and ".." not in path.parts and str(path) not in MARKERS
+    }
+
+
+def _whole_lines(path: Path) -> bytes:
+    """What a file has but for a line without an end, which was being written when the process was killed."""
+    content = path.read_bytes()
+    return content[: content.rfind(b"\n") + 1]
+
+
+def _write_synced(path: Path, write: Callable[[Path], object]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write(path)
+    with path.open("r+b") as file:
+        os.fsync(file.fileno())
 
 
 @contextmanager

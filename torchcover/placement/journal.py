@@ -26,7 +26,7 @@ class Journal:
     def __init__(self, path: Path, settings: Mapping[str, Any]) -> None:
         self.path = path
         text = json.dumps(dict(settings), allow_nan=False) + "\n"
-        write_durably(path, lambda file: file.write(text.encode()))
+        write_durably(path, lambda aside: aside.write_text(text, encoding="utf-8"))
 
     @classmethod
     def resumed(cls, path: Path, settings: Mapping[str, Any], like: Scores) -> tuple[Self, list[Evaluation]]:

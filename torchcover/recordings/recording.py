@@ -1,15 +1,17 @@
 """What every reader of recordings gives: scans of named sensors at instants, and where the vehicle was."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import Calibration
 from torchcover.detection.boxes import Boxes
+from torchcover.files import RECORDING, decode, reads, settled
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import Points
@@ -162,3 +164,27 @@ class CalibratedRecording(Protocol):
             ValueError: They are not what they are meant to be.
         """
         ...
+
+
+def whole_recording(folder: Path) -> dict[str, Any] | None:
+    """What `recording.json` says of a recording that torchcover has written: `frames`, by name, and `content`.
+
+    Returns:
+        It; None where another tool has written the recording, or there is none.
+
+    Raises:
+        ValueError: Its files are not in their places, and may not be put there.
+        BadFileError: A `recording.json` that cannot be read.
+    """
+    marker = folder / RECORDING
+    if settled(marker) != marker:
+        raise ValueError(f"{folder}: files of this recording are not in their places, and the folder is not writable")
+    return _read_marker(marker) if marker.exists() else None
+
+
+@reads("the frames of a recording")
+def _read_marker(path: Path) -> dict[str, Any]:
+    said = json.loads(decode(path.read_bytes()))
+    if not isinstance(said, dict) or not isinstance(said.get("frames"), list):
+        raise ValueError("frames are needed, by their names; it says none")
+    return {"content": {}, **said}

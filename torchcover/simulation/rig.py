@@ -80,7 +80,7 @@ class Rig(Document):
         if self.vehicle is not None and is_file_name(self.vehicle):
             keys["vehicle"] = str(Path(self.vehicle).resolve())
         keys["sensors"] = [_written(sensor) for sensor in self.sensors]
-        write_durably(Path(path), lambda file: file.write(as_yaml(keys).encode()))
+        write_durably(Path(path), lambda aside: aside.write_text(as_yaml(keys), encoding="utf-8"))
 
     def content(self) -> dict[str, Any]:
         """Its sensors; the vehicle is in the scenario that it is simulated in, if it is the one."""

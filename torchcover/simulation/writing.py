@@ -1,14 +1,19 @@
 """Write what a simulated rig saw as a recording, for any tool that reads its layout."""
 
+import hashlib
+import json
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover import __version__
+from torchcover.files import RECORDING, Publication, noted
 from torchcover.recordings.recorders import RECORDERS
 from torchcover.recordings.recorders.recorder import RecordedStep, RecordingSetup
+from torchcover.recordings.recording import whole_recording
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.simulated_frames import SimulatedFrames
 
@@ -22,19 +27,24 @@ def write_recording(
     folder: str | os.PathLike[str],
     layout: str = "folder",
     *,
+    resume: bool = False,
     progress: Callable[[range], Iterable[int]] = iter,
 ) -> None:
     """Write what a simulated rig saw: clouds, the reference, boxes where the frames have them, mounts and poses.
+
+    It is a recording once all of it is there; until then it lies aside, and `recording.json` lists what belongs to it.
 
     Args:
         frames: A simulation of one rig.
         folder: Where to; made if it does not exist.
         layout: A name in `RECORDERS`: "folder" (`FolderRecording` reads it, with the numbers of the simulation), or
             "kitti" (KITTI's object layout, of one LiDAR).
+        resume: Whether to go on after the last step that is there, whatever ended the process that wrote it.
         progress: Is given the numbers of the steps and passes them on, as `tqdm.tqdm` does.
 
     Raises:
-        ValueError: An unknown layout, a folder that is not empty, several rigs, or sensors that the layout cannot hold.
+        ValueError: An unknown layout, a folder that is not empty, several rigs, or sensors that the layout cannot hold;
+            a part of another recording.
 
     Example:
         >>> import tempfile
@@ -51,11 +61,48 @@ def write_recording(
         raise ValueError(f"format {layout!r}: recordings are written as {' or '.join(RECORDERS)}")
     if len(frames.rigs) != 1:
         raise ValueError(f"a recording is of one rig; got {', '.join(frames.rigs)}")
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    files = Publication(folder, RECORDING, goes_on=True)
+    recorder = RECORDERS[layout](files.add, _setup(frames))
+    content = {"layout": layout, **_hashes(frames.content)}
+    names = [_name(index) for index in range(len(frames))]
+    if resume and (whole := whole_recording(folder)) is not None:
+        _check_same(folder, whole["content"], content, whole["frames"], names)
+        return
+    if folder.exists() and (not folder.is_dir() or any(folder.glob("[!.]*"))):
         raise ValueError(f"{folder}: {'not empty' if folder.is_dir() else 'a file'}; a new or empty folder is needed")
-    recorder = RECORDERS[layout](folder, _setup(frames))
-    for index in progress(range(len(frames))):
-        recorder.write(_step(frames, index))
+    if (part := noted(folder)) and not resume:
+        raise ValueError(
+            f"{folder}: holds a part of a recording, {len(part) - 1:,} frames; go on with it (--resume), or choose "
+            "another folder"
+        )
+    with files:
+        if not files.notes:
+            files.note({"content": content})
+        begun, *notes = files.notes
+        steps = [note["step"] for note in notes]
+        _check_same(folder, begun["content"], content, steps, names[: len(steps)])
+        for index in progress(range(len(steps), len(frames))):
+            steps.append(recorder.write(_step(frames, index)))
+            files.note({"step": steps[-1]})
+        recorder.finish(steps)
+        files.publish({"torchcover": __version__, "content": content, "frames": names})
+
+
+def _check_same(
+    folder: Path, there: Mapping[str, str], here: Mapping[str, str], frames: Sequence[object], wanted: Sequence[str]
+) -> None:
+    """Find out whether what is there is a part, or the whole, of what is to be written."""
+    if other := [name for name in here if there.get(name) != here[name]]:
+        raise ValueError(f"{folder}: of another recording, with another {', '.join(other)}; choose another folder")
+    if len(frames) != len(wanted):
+        raise ValueError(
+            f"{folder}: {len(frames):,} frames are there; got {len(wanted):,} steps; choose another folder"
+        )
+
+
+def _hashes(content: Mapping[str, object]) -> dict[str, str]:
+    texts = {name: json.dumps(value, sort_keys=True, default=repr) for name, value in content.items()}
+    return {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
 
 
 def _setup(frames: SimulatedFrames) -> RecordingSetup:
@@ -80,9 +127,13 @@ def _step(frames: SimulatedFrames, index: int) -> RecordedStep:
     world = scene.world
     played = round(index * frames.every_s / world.time_step_s) // world.steps if world.steps > 1 else 0
     return RecordedStep(
-        f"{index:06d}",
+        _name(index),
         index * frames.every_s + played * APART_S,
         world.ego.trajectory.at(step * world.time_step_s),
         {sensor.name: cloud for sensor, cloud in zip(rig.sensors, clouds, strict=True)},
         frames.frame_of(seen, index),
     )
+
+
+def _name(index: int) -> str:
+    return f"{index:06d}"

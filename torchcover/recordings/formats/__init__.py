@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
+from torchcover.files import RECORDING, noted
 from torchcover.recordings.formats import argoverse2, commonroad, nuscenes
 from torchcover.recordings.formats.argoverse2 import Argoverse2
 from torchcover.recordings.formats.carla import Carla
@@ -15,7 +16,7 @@ from torchcover.recordings.formats.nuscenes import NuScenes
 from torchcover.recordings.formats.ros2 import Ros2
 from torchcover.recordings.formats.track_tables import read_box_tracks
 from torchcover.recordings.objects import RecordedObjects, objects_of
-from torchcover.recordings.recording import Recording
+from torchcover.recordings.recording import Recording, whole_recording
 
 
 class RecordingFormat(Protocol):
@@ -61,15 +62,39 @@ def open_recording(path: str | os.PathLike[str], format_name: str | None = None)
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such recording")
-    if format_name is not None:
-        if format_name not in FORMATS:
-            raise ValueError(f"format {format_name!r}: no such format of recordings; there are {', '.join(FORMATS)}")
-        return FORMATS[format_name](path)
-    for recording_format in FORMATS.values():
-        if recording_format.recognises(path):
-            return recording_format(path)
+    if format_name is not None and format_name not in FORMATS:
+        raise ValueError(f"format {format_name!r}: no such format of recordings; there are {', '.join(FORMATS)}")
+    names = _frames_written(path)
+    for name, recording_format in FORMATS.items():
+        if name == format_name or (format_name is None and recording_format.recognises(path)):
+            return _checked(recording_format(path), names)
     known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in FORMATS.items())
     raise ValueError(f"{path}: a recording of no known format; known are {known}")
+
+
+def _frames_written(path: Path) -> set[str] | None:
+    """The frames of a recording that torchcover has written; None of any other one."""
+    for folder in (path, path / "training"):  # which is KITTI's
+        if notes := noted(folder):
+            raise ValueError(
+                f"{folder}: a part of a recording, {len(notes) - 1:,} frames: whatever wrote it was ended; go on with "
+                "`torchcover record --resume`"
+            )
+        if whole := whole_recording(folder):
+            return set(whole["frames"])
+    return None
+
+
+def _checked(recording: Recording, names: set[str] | None) -> Recording:
+    there = set(recording.names)
+    if names is None or names == there:
+        return recording
+    missing, others = names - there, there - names
+    what = f"{len(missing):,} are missing" if missing else f"{len(others):,} more are there"
+    raise ValueError(
+        f"{recording.path}: a recording of {len(names):,} frames ({RECORDING}), and {what}, such as "
+        f"{min(missing or others)}; copy or record it again"
+    )
 
 
 class ObjectFormat(NamedTuple):
@@ -123,7 +148,7 @@ def read_objects(path: str | os.PathLike[str], scene: str | None = None) -> Reco
             return one.read(path)
     for recording_format in FORMATS.values():
         if recording_format.recognises(path):
-            return objects_of(recording_format(path))
+            return objects_of(open_recording(path))
     raise ValueError(
         f"{path}: recorded tracks are {'; '.join(OBJECT_FORMATS)}; or a recording with poses and boxes "
         f"({', '.join(FORMATS)})"

@@ -1,6 +1,8 @@
 """A recording in the layout of KITTI's 3D object benchmark, which `KittiObject` reads."""
 
-from pathlib import Path
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -8,7 +10,7 @@ from torchcover.detection.boxes import Boxes
 from torchcover.files import write_npz
 from torchcover.geometry import invert, transform
 from torchcover.recordings.formats.kitti_files import vehicle_T_velodyne
-from torchcover.recordings.recorders.recorder import RecordedStep, RecordingSetup
+from torchcover.recordings.recorders.recorder import Add, RecordedStep, RecordingSetup
 
 # About KITTI's own camera, 0.27 m before the LiDAR and 0.08 m below it: x right, y down, z ahead. There are no images.
 camera_T_velodyne = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, -0.08], [1.0, 0.0, 0.0, -0.27], [0, 0, 0, 1]])
@@ -25,42 +27,47 @@ class KittiRecorder:
     the vehicle's middle, wherever the rig has its own. Clouds are float32, intensities 0.
 
     Args:
-        folder: An empty or a new folder.
+        add: Writes a file.
         setup: What is to be written.
 
     Raises:
         ValueError: Another rig than of one LiDAR.
     """
 
-    def __init__(self, folder: Path, setup: RecordingSetup) -> None:
+    def __init__(self, add: Add, setup: RecordingSetup) -> None:
         if len(setup.mounts) != 1 or not setup.lidars:
             names = ", ".join(setup.mounts)
             raise ValueError(
                 f"format kitti: a rig of one LiDAR is needed; {setup.rig} has {names}; use the format folder"
             )
-        self._folder = folder
-        for place in ("velodyne", "calib", "reference", *(("label_2",) if setup.boxes else ())):
-            (folder / place).mkdir(parents=True)
+        self._add = add
         rows = {f"P{camera}": PROJECTION for camera in range(4)}
         rows["R0_rect"] = "1 0 0 0 1 0 0 0 1"
         rows["Tr_velo_to_cam"] = " ".join(f"{number:g}" for number in camera_T_velodyne[:3].ravel())
         rows["Tr_imu_to_velo"] = "1 0 0 0 0 1 0 0 0 0 1 0"
         self._calibration = "".join(f"{key}: {numbers}\n" for key, numbers in rows.items())
 
-    def write(self, step: RecordedStep) -> None:
-        """Write a step; its LiDAR cloud comes last."""
+    def write(self, step: RecordedStep) -> Sequence[Any]:
+        """Write a step."""
         frame, velodyne_T_vehicle = step.frame, invert(vehicle_T_velodyne)
-        (self._folder / "calib" / f"{step.name}.txt").write_text(self._calibration, encoding="utf-8")
+        self._add_text(f"calib/{step.name}.txt", self._calibration)
         if frame.boxes is not None:
-            (self._folder / "label_2" / f"{step.name}.txt").write_text(_labels(frame.boxes), encoding="utf-8")
+            self._add_text(f"label_2/{step.name}.txt", _labels(frame.boxes))
         arrays = {"points": transform(velodyne_T_vehicle, frame.reference.numpy())}
         if frame.reference_weights is not None:
             arrays["weights"] = frame.reference_weights.numpy()
-        write_npz(self._folder / "reference" / f"{step.name}.npz", arrays)
+        self._add(f"reference/{step.name}.npz", partial(write_npz, arrays=arrays))
         (cloud,) = step.clouds.values()
         records = np.zeros((len(cloud), 4), dtype="<f4")
         records[:, :3] = transform(velodyne_T_vehicle, cloud)
-        (self._folder / "velodyne" / f"{step.name}.bin").write_bytes(records.tobytes())
+        self._add(f"velodyne/{step.name}.bin", lambda path: path.write_bytes(records.tobytes()))
+        return ()
+
+    def finish(self, steps: Sequence[Sequence[Any]]) -> None:
+        """Nothing: the layout has no file about all steps."""
+
+    def _add_text(self, name: str, text: str) -> None:
+        self._add(name, lambda path: path.write_text(text, encoding="utf-8"))
 
 
 def _labels(boxes: Boxes) -> str:

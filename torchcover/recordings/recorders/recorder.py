@@ -1,8 +1,8 @@
 """What a recorder is: another layout is a class with these members and a line in `RECORDERS`."""
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from torchcover.frames.frame import Frame
 from torchcover.geometry import BoundingBox
@@ -48,17 +48,25 @@ class RecordedStep(NamedTuple):
     frame: Frame
 
 
-class Recorder(Protocol):
-    """Writes a recording step by step."""
+# Writes a file: its path within the folder, and what writes it to the path that it is given; see `Publication.add`.
+Add = Callable[[str, Callable[[Path], object]], None]
 
-    def __init__(self, folder: Path, setup: RecordingSetup, /) -> None:
-        """Begin one in an empty or a new folder.
+
+class Recorder(Protocol):
+    """Writes a recording step by step; another process may go on where one has ended."""
+
+    def __init__(self, add: Add, setup: RecordingSetup, /) -> None:
+        """Begin one.
 
         Raises:
             ValueError: A rig that the layout cannot hold.
         """
         ...
 
-    def write(self, step: RecordedStep, /) -> None:
-        """Write a step; what was written before stays good if this one fails."""
+    def write(self, step: RecordedStep, /) -> Sequence[Any]:
+        """Write the files of a step; returns what `finish` has to know of it, as JSON takes it."""
+        ...
+
+    def finish(self, steps: Sequence[Sequence[Any]], /) -> None:
+        """Write the files that are about all steps, of each of which `write` said this."""
         ...

@@ -1,6 +1,7 @@
 """Figures one after the other, as a film."""
 
 from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,8 @@ from matplotlib.animation import AbstractMovieWriter, FFMpegWriter, PillowWriter
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+
+from torchcover.files import write_durably
 
 WRITERS: dict[str, type[FFMpegWriter] | type[PillowWriter]] = {".gif": PillowWriter, ".mp4": FFMpegWriter}
 
@@ -44,6 +47,10 @@ def write_film(path: Path, figures: Iterable[Figure], *, per_s: float) -> None:
         figures: At least one, each drawn when it is its turn.
         per_s: How many of them a second shows.
     """
+    write_durably(path, partial(_write, figures, per_s))
+
+
+def _write(figures: Iterable[Figure], per_s: float, path: Path) -> None:
     writer: AbstractMovieWriter = WRITERS[path.suffix](fps=per_s)  # type: ignore[arg-type]  # any number will do
     screen: Figure | None = None
     for figure in figures:

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage, check_paired
+from torchcover.files import write_durably
 from torchcover.report.maps.arrays import draw_map, draw_side_by_side
 from torchcover.report.maps.colours import difference_scale, scale_of
 from torchcover.report.maps.overlay import SensorView
@@ -99,12 +101,10 @@ def write_figures(figures: Iterable[Named], folder: str | Path) -> list[Path]:
     Returns:
         The files.
     """
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for name, figure in figures:
-        paths.append(folder / f"{name}.png")
-        figure.savefig(paths[-1], dpi=figure.dpi)
+        paths.append(Path(folder, f"{name}.png"))
+        write_durably(paths[-1], partial(figure.savefig, dpi=figure.dpi))
     return paths
 
 

@@ -1,0 +1,41 @@
+"""What is written: what was asked for, at once, and nothing in place."""
+
+import pytest
+
+SMALL = ("--cell-m", 8, "--rays", 256, "--steps", 1)
+NUMBERS = {"coverage.npz", "summary.csv"}
+
+
+def written(folder):
+    return {path.name for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [("numbers", NUMBERS), ("page", {"report.html"}), ("page, numbers", {*NUMBERS, "report.html"}), ("maps", set())],
+)
+def test_a_result_has_the_files_that_were_asked_for(torchcover, worlds, files, expected):
+    out = worlds / "out"
+    code, printed, _ = torchcover(
+        "evaluate", worlds / "low.yaml", "--scenario", worlds / "yard.yaml", *SMALL, "--files", files, "--out", out
+    )
+    assert code == 0
+    maps = {name for name in written(out) if name.endswith(".png")}
+    assert written(out) - maps == {*expected, "summary.json"}
+    assert bool(maps) == (files == "maps")
+    assert ("maps/" in printed) == (files == "maps")
+
+
+def test_targets_have_the_files_that_were_asked_for(torchcover, worlds):
+    raster = ["--raster", "3,5,-1,1,1", "--out", worlds / "out"]
+    for files, expected in (("numbers", {"targets.csv", "targets.npz"}), ("maps", {"targets.png"})):
+        assert torchcover("targets", worlds / "low.yaml", *raster, "--files", files)[0] == 0
+        assert written(worlds / "out") == {*expected, "summary.json"}
+
+
+@pytest.mark.parametrize("files", ["", "number", "numbers,", "numbers;maps"])
+def test_files_that_there_are_not_are_refused_before_the_run(torchcover, worlds, files):
+    code, _, said = torchcover("evaluate", worlds / "low.yaml", "--files", files, "--out", worlds / "out")
+    assert code == 2
+    assert said == f"torchcover: files: numbers, maps, page, one or more of them, are needed; got {files!r}\n"
+    assert not (worlds / "out").exists()
