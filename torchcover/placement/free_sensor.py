@@ -169,7 +169,7 @@ class FreeSensor(Document):
     def start_values(self, start: Sensor, carrier: Carrier) -> dict[str, Value]:
         """What the variables are in the rig that the search starts from, whether they may be that or not.
 
-        On a region nobody knows: the sensor may be anywhere.
+        On an unknown region: the sensor may be anywhere.
 
         Args:
             start: The sensor in that rig.
