@@ -223,7 +223,7 @@ def test_frames_that_cannot_say_it_are_refused_and_add_nothing():
     without = frame(1, None)
     nobody = replace(frame(1, NONE), sensor_points=None)
     other = frame(1, NONE, clouds={"rear": torch.ones(1, 3)})
-    for given, message in ((without, "has no boxes"), (nobody, "nobody knows which points"), (other, "sensor 'rear'")):
+    for given, message in ((without, "has no boxes"), (nobody, "it is unknown which points"), (other, "sensor 'rear'")):
         with pytest.raises(ValueError, match=message):
             metric.update(given)
     assert (int(metric.steps), len(metric.boxes), int(metric.crossings.sum())) == (1, 1, 0)

@@ -1,14 +1,12 @@
 """Blocks of contiguous steps: what standard errors are estimated from."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import torch
 from torch import Tensor
-
-from torchcover.estimation import MIN_BLOCKS
 
 
 @dataclass(frozen=True)
@@ -125,28 +123,3 @@ class AreaSums(BlockSums):
     def m2(self) -> Tensor:
         """(B, H, Y, X) float64 square metres of the points in the cell."""
         return self._spread(self.base)
-
-
-def check_blocks(blocks: int) -> None:
-    """Refuse a number of blocks that gives no error to believe.
-
-    Raises:
-        ValueError: Neither 1 nor an even number from 8 on.
-    """
-    if blocks != 1 and (blocks < MIN_BLOCKS or blocks % 2):
-        raise ValueError(f"blocks: 1, or an even number from {MIN_BLOCKS} on, is needed; got {blocks}")
-
-
-def pair_up(state: dict[str, Any], in_blocks: Sequence[str]) -> None:
-    """Add up neighbouring blocks in place: half as many of twice the length, and room for as many again.
-
-    Args:
-        state: The states of a `CoverageMetric`, `block_length` among them.
-        in_blocks: Names of those whose first dimension is the blocks.
-    """
-    for name in in_blocks:
-        sums = state[name]
-        half = len(sums) // 2
-        sums[:half] = sums[0::2] + sums[1::2]
-        sums[half:] = 0
-    state["block_length"] *= 2

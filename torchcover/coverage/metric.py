@@ -1,16 +1,15 @@
 """The coverage metric: clouds in, fixed-size sums, coverage out."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
-from torchmetrics.utilities.distributed import gather_all_tensors
 
 from torchcover.coverage.aggregations import Aggregation, BinnedStep, MeanOfMeans, VisibleArea
 from torchcover.coverage.binning import mean_per_cell
-from torchcover.coverage.blocks import AreaSums, Blocks, check_blocks, pair_up
+from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.plotting import draw_coverage
@@ -18,18 +17,15 @@ from torchcover.coverage.redundancy import PlaceSums, Redundancy, SensorFailures
 from torchcover.coverage.regions import Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.steps import Clouds, SensorClouds, Step, as_list, check_parameters, checked_steps
-from torchcover.metrics import MergeableMetric, figure_of
+from torchcover.metrics import SumsInBlocks, figure_of
 from torchcover.neighbors import nearest
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# The states that have a row for each block, beside those of aggregations.
-PROBED_IN_BLOCKS = ("probed_steps", "block_steps")
 
-
-class CoverageMetric(MergeableMetric):
+class CoverageMetric(SumsInBlocks):
     """Blind spot radius and detection over a grid, as a mean over steps of means over reference points.
 
         radius[h, y, x]    = E_t[ E_q in cell [ r(q) ] ]
@@ -41,8 +37,7 @@ class CoverageMetric(MergeableMetric):
 
     With `blocks` the sums are kept in as many blocks of contiguous steps, and the result has standard errors. Steps
     that follow each other are alike, so that their number says little about the error; blocks that are longer than
-    the likeness lasts are independent. Blocks start with one step each; whenever a step comes that is past the last
-    one, neighbours are added up in pairs and blocks become twice as long.
+    the likeness lasts are independent.
 
     The state is part of `state_dict()`; `metric.persistent(False)` takes it out.
 
@@ -84,8 +79,6 @@ class CoverageMetric(MergeableMetric):
     mean_sums: Tensor
     area_m2: Tensor
     area_sums: Tensor
-    block_length: Tensor
-    block_steps: Tensor
     empty_sensor_steps: Tensor
     empty_reference_steps: Tensor
     saturated_points: Tensor
@@ -108,7 +101,6 @@ class CoverageMetric(MergeableMetric):
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         check_parameters(thresholds, max_radius, aggregations)
-        check_blocks(blocks)
         regions = regions_within(grid) if regions is None else tuple(regions)
         check_regions(regions, grid)
         meaning = {
@@ -120,13 +112,12 @@ class CoverageMetric(MergeableMetric):
             "square_metres": square_metres,
             **({"sensors": tuple(sensors), "regions": regions} if sensors else {}),
         }
-        super().__init__(meaning, **kwargs)
+        super().__init__(blocks, meaning, **kwargs)
         self.grid = grid
         self.regions = regions
         self.sensors = tuple(sensors)
         self.thresholds: tuple[float, ...] = tuple(float(threshold) for threshold in thresholds)
         self.max_radius = float(max_radius)
-        self.blocks = blocks
         self.square_metres = square_metres
         over_area = [VisibleArea(self.thresholds, blocks)] if square_metres else []
         self._failures = SensorFailures(
@@ -140,14 +131,11 @@ class CoverageMetric(MergeableMetric):
         self._add_states()
 
     def _add_states(self) -> None:
-        self.add_sum("probed_steps", (self.blocks, self.grid.cells), torch.int64)
+        self.add_block_sum("probed_steps", (self.grid.cells,), torch.int64)
         self.add_sum("points", (self.grid.cells,), torch.int64)
-        self.add_sum("block_steps", (self.blocks,), torch.int64)
-        self.add_state("block_length", torch.tensor(1), dist_reduce_fx="max", persistent=True)
         for name in Coverage.COUNTS:
             if name != "steps":
                 self.add_sum(name, (), torch.int64)
-        self._in_blocks = list(PROBED_IN_BLOCKS)
         self._state_names: dict[str, list[str]] = {}
         for aggregation in self.aggregations:
             states = aggregation.states(self.grid.cells)
@@ -155,7 +143,7 @@ class CoverageMetric(MergeableMetric):
             for name, state in states.items():
                 full_name = f"{aggregation.name}_{name}"
                 self.add_state(full_name, state.initial, dist_reduce_fx=state.reduction, persistent=True)
-                self._in_blocks += [full_name] * state.in_blocks
+                self._in_blocks = (*self._in_blocks, *[full_name] * state.in_blocks)
 
     def _sums_of(self, aggregation: Aggregation) -> dict[str, Tensor]:
         return {name: getattr(self, f"{aggregation.name}_{name}") for name in self._state_names[aggregation.name]}
@@ -223,7 +211,6 @@ class CoverageMetric(MergeableMetric):
         block = self._block_of(index)
         of_sensors = None if of_sensors is None else of_sensors[:, of].to(device)
         self._accumulate(block, cell.to(device), distance[of].to(device), weights, of_sensors)
-        self.block_steps[block] += 1
         self.steps += 1
         self.empty_sensor_steps += not any(map(len, sensors.values()))
         self.empty_reference_steps += len(reference) == 0
@@ -234,14 +221,6 @@ class CoverageMetric(MergeableMetric):
     def _distance(self, reference: Tensor, cloud: Tensor) -> Tensor:
         found = nearest(reference, cloud, max_distance=self.max_radius, backend=self.backend, memory_mb=self.memory_mb)
         return found.distance
-
-    def _block_of(self, index: int) -> int:
-        """The block of a step; makes room for it."""
-        if self.blocks == 1:
-            return 0
-        while index >= self.blocks * int(self.block_length):
-            pair_up(self.metric_state, self._in_blocks)
-        return index // int(self.block_length)
 
     def _accumulate(
         self, block: int, cell: Tensor, distance: Tensor, weights: Tensor | None, of_sensors: Tensor | None
@@ -319,16 +298,3 @@ class CoverageMetric(MergeableMetric):
         return AreaSums.of(
             self.block_steps, self.area_m2.view(-1, *shape), self.area_sums.view(self.blocks, -1, *shape)
         )
-
-    def _align_with(self, incoming: dict[str, Any]) -> None:
-        # Blocks of the same length only can be added up.
-        longest = max(int(self.block_length), int(incoming["block_length"]))
-        states: tuple[dict[str, Any], ...] = (self.metric_state, incoming)
-        for state in states:
-            while int(state["block_length"]) < longest:
-                pair_up(state, self._in_blocks)
-
-    def _align_ranks(self, dist_sync_fn: Callable[..., Any] = gather_all_tensors, process_group: Any = None) -> None:  # noqa: ANN401
-        lengths = dist_sync_fn(self.block_length, group=process_group or self.process_group)
-        while int(self.block_length) < max(map(int, lengths)):
-            pair_up(self.metric_state, self._in_blocks)

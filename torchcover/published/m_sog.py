@@ -95,7 +95,7 @@ class MSog(WorldBlocks):
     def _add_frame(self, frame: Frame) -> None:
         check_cloud(frame.reference, "reference")
         labels = self.sights.once(frame, ("labels", self.category, self.grid), lambda: self._labels(frame))
-        block = self._block_of(frame)
+        block = self._block_of(frame.place_in_time)
         for label, voxels in enumerate(labels):
             self.labelled[block, label, voxels.to(self.labelled.device)] += 1
 

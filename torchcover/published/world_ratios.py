@@ -62,7 +62,7 @@ class WorldRatios(WorldBlocks):
 
     def _add_frame(self, frame: Frame) -> None:
         base, sums, counts = self._of_frame(frame)  # before anything is added
-        block = self._block_of(frame)
+        block = self._block_of(frame.place_in_time)
         self.base[block] += base.to(self.base)
         self.sums[block] += sums.to(self.sums)
         self.counts += counts.to(self.counts)
