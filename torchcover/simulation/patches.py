@@ -1,5 +1,6 @@
 """Patches: triangles of surfaces, cut small, so that they are drawn from by place; and which faces are outward."""
 
+from collections.abc import Callable
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -46,15 +47,10 @@ def outward_faces(mesh: Mesh) -> NDArray[np.bool_]:
         >>> outward_faces(Plane(type="plane", size_m=(1, 1)).mesh()).tolist()
         [False, False]
     """
-    corners = _welded(mesh.vertices_m)[mesh.faces]
-    start, end = corners.ravel(), corners[:, [1, 2, 0]].ravel()
-    lower, upper = np.minimum(start, end), np.maximum(start, end)
-    _, edge = np.unique(lower * len(mesh.vertices_m) + upper, return_inverse=True)
-    edge = edge.reshape(-1)
+    edge, way = edges_of(mesh)
     face = np.repeat(np.arange(len(mesh.faces)), 3)
-    surface = _connected(edge, face, len(mesh.faces))
-    # An edge from a corner to itself goes no way.
-    turns = np.bincount(edge, weights=np.sign(end - start))
+    surface = connected(edge, face, len(mesh.faces))
+    turns = np.bincount(edge, weights=way)
     open_edges = np.bincount(surface[face], weights=turns[edge] != 0, minlength=len(mesh.faces))
     first, second, third = (mesh.vertices_m - mesh.vertices_m.mean(axis=0))[mesh.faces].transpose(1, 0, 2)
     volumes = np.einsum("fc,fc->f", first, np.cross(second, third))
@@ -62,6 +58,18 @@ def outward_faces(mesh: Mesh) -> NDArray[np.bool_]:
     rounding = VOLUME_ROUNDING * np.bincount(surface, weights=np.abs(volumes), minlength=len(mesh.faces))
     outward: NDArray[np.bool_] = ((open_edges == 0) & (volume >= -rounding))[surface]
     return outward
+
+
+def edges_of(mesh: Mesh) -> tuple[Int64, Int64]:
+    """(3 F,) the number of each edge of each face, shared by the faces that it borders, and (3 F,) which way it runs.
+
+    The ways are 1 and -1, and 0 from a corner to itself. Vertices at the same place are one.
+    """
+    corners = _welded(mesh.vertices_m)[mesh.faces]
+    start, end = corners.ravel(), corners[:, [1, 2, 0]].ravel()
+    lower, upper = np.minimum(start, end), np.maximum(start, end)
+    _, edge = np.unique(lower * len(mesh.vertices_m) + upper, return_inverse=True)
+    return edge.reshape(-1), np.sign(end - start)
 
 
 def _welded(vertices_m: NDArray[np.float64]) -> Int64:
@@ -73,8 +81,8 @@ def _welded(vertices_m: NDArray[np.float64]) -> Int64:
     return number
 
 
-def _connected(edge: Int64, face: Int64, faces: int) -> Int64:
-    """(faces,) number of the surface of each face: the smallest number of a face of it."""
+def connected(edge: Int64, face: Int64, faces: int) -> Int64:
+    """(faces,) number of the surface of each face, of those that share edges: the smallest number of a face of it."""
     order = np.argsort(edge, kind="stable")
     shared = np.flatnonzero(np.diff(edge[order]) == 0)
     one, other = face[order[shared]], face[order[shared + 1]]
@@ -111,6 +119,8 @@ class Patches(NamedTuple):
     `corner_m`, `first_m` and `second_m` (3, N) float32: one corner, and the edges from there to the other two; float64
     would say no more, for rays meet float32 triangles. `outward` (N,): whether they are seen from the side only to
     which first x second points. `of_object` (N,) int32: number of the object that they belong to, -1 for none.
+    `heights_m` (2, N) float32: between which heights above the local ground all of their points lie; (0, N) where that
+    was not asked.
     """
 
     corner_m: Float32
@@ -118,27 +128,47 @@ class Patches(NamedTuple):
     second_m: Float32
     outward: Bools
     of_object: Int32
+    heights_m: Float32
 
     @classmethod
-    def of(cls, mesh: Mesh, bounds: Bounds | None = None) -> Self:
-        """Cut a mesh.
+    def of(cls, mesh: Mesh) -> Self:
+        """Those of all of a mesh, of no object; faces without an area are left out."""
+        return cls.cut(mesh)[0]
+
+    @classmethod
+    def cut(
+        cls,
+        mesh: Mesh,
+        bounds: Bounds | None = None,
+        wanted: Callable[[Float64], Bools] | None = None,
+        outward: Bools | None = None,
+    ) -> tuple[Self, Int64]:
+        """Cut a mesh, or what is wanted of it.
 
         Args:
             mesh: Any, of no object; faces without an area are left out.
             bounds: What lies outside of these boxes is left out; all is wanted if not given.
+            wanted: Of (3, 3, N) corners, coordinates, triangles, whether any point of each may be wanted, (N,).
+            outward: (F,) what `outward_faces` says of it, if that is known.
+
+        Returns:
+            The patches, and (N,) of which face of the mesh each is a part.
         """
         extent_m = 0.0 if bounds is not None else float(np.ptp(mesh.vertices_m, axis=0).max())
         corners_m = np.ascontiguousarray(mesh.vertices_m[mesh.faces].transpose(1, 2, 0))
-        (corner, second, third), face = _cut(corners_m, bounds, max(LONGEST_M, LONGEST_SHARE * extent_m))
+        longest_m = max(LONGEST_M, LONGEST_SHARE * extent_m)
+        (corner, second, third), face = _cut(corners_m, bounds, longest_m, wanted)
         first_m, second_m = (second - corner).astype(np.float32), (third - corner).astype(np.float32)
-        nobodys = np.full(len(face), -1, dtype=np.int32)
-        return cls(corner.astype(np.float32), first_m, second_m, outward_faces(mesh)[face], nobodys)
+        nobodys, unasked = np.full(len(face), -1, dtype=np.int32), np.empty((0, len(face)), dtype=np.float32)
+        outward = outward_faces(mesh) if outward is None else outward
+        return cls(corner.astype(np.float32), first_m, second_m, outward[face], nobodys, unasked), face
 
     @classmethod
     def joined(cls, parts: "list[Patches]") -> Self:
         """Those of several, one after the other."""
-        none = np.empty((3, 0), dtype=np.float32)
-        parts = [Patches(none, none, none, np.empty(0, dtype=bool), np.empty(0, dtype=np.int32)), *parts]
+        none, rows = np.empty((3, 0), dtype=np.float32), len(parts[0].heights_m) if parts else 0
+        nobodys = np.empty(0, dtype=np.int32)
+        parts = [Patches(none, none, none, np.empty(0, dtype=bool), nobodys, none[:rows]), *parts]
         return cls._make(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
 
     def taken(self, numbers: NDArray[np.int64]) -> Self:
@@ -156,6 +186,11 @@ class Patches(NamedTuple):
     def given_to(self, number: int) -> Self:
         """Them as those of an object."""
         return self._replace(of_object=np.full_like(self.of_object, number))
+
+    @property
+    def corners_m(self) -> Float32:
+        """(3, 3, N) corners, coordinates, patches."""
+        return np.stack([self.corner_m, self.corner_m + self.first_m, self.corner_m + self.second_m])
 
     @property
     def lower_m(self) -> Float32:
@@ -177,7 +212,9 @@ class Patches(NamedTuple):
         return normals
 
 
-def _cut(triangles: Float64, bounds: Bounds | None, longest_m: float) -> tuple[Float64, Int64]:
+def _cut(
+    triangles: Float64, bounds: Bounds | None, longest_m: float, wanted: Callable[[Float64], Bools] | None
+) -> tuple[Float64, Int64]:
     """(3, 3, N) triangles with short edges, and (N,) of which one of those given, (3, 3, M), each is a part.
 
     Axes are the corner, the coordinate, the triangle: NumPy is quick along the last one.
@@ -188,6 +225,8 @@ def _cut(triangles: Float64, bounds: Bounds | None, longest_m: float) -> tuple[F
         kept = area_m2 >= SMALLEST_M2
         if bounds is not None:
             kept &= bounds.meet(triangles.min(axis=0).T, triangles.max(axis=0).T)
+        if wanted is not None:
+            kept &= wanted(triangles)
         edges_m = np.linalg.norm(triangles[[1, 2, 0]] - triangles, axis=1)
         small = edges_m.max(axis=0) <= longest_m
         ready, large = np.flatnonzero(kept & small), np.flatnonzero(kept & ~small)

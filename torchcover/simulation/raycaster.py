@@ -13,6 +13,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
+from torchcover.simulation.patches import outward_faces
 from torchcover.simulation.shapes import Mesh
 
 Float32 = NDArray[np.float32]
@@ -103,6 +104,8 @@ class RayCaster:
             )
         self._faces = Faces(bodies, reach_m)
         self._first_face = np.cumsum([0] + [len(body.faces) for body in bodies])
+        self._bodies = bodies
+        self._closed: dict[int, NDArray[np.bool_]] = {}  # asked of few: hardly any ray meets a face from behind
         self._last_asked: tuple[bytes, NDArray[np.int64]] = b"", np.empty(0, dtype=np.int64)
         # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
         self._scene = EmbreeScene(robust=True)
@@ -194,18 +197,24 @@ class RayCaster:
             rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
 
     def met_from_behind(self, origin_m: NDArray[np.floating], directions: Float32) -> NDArray[np.int32]:
-        """Which bodies rays first meet from behind, as rays that start inside a closed body do.
+        """Which closed bodies rays first meet from behind, as those do that start inside: a sheet has no inside.
 
         Args:
             origin_m: (3,) common origin of the rays, or (N, 3) of each.
             directions: (3, N) unit directions.
 
         Returns:
-            (N,) number of the body of which a ray first hits the back of a face; -1 if it hits a front, or nothing.
+            (N,) number of the body of which a ray first hits the back of a face, if that face is one of a closed
+            surface that is turned outwards; else -1.
         """
         origins = np.ascontiguousarray(np.broadcast_to(origin_m.astype(np.float32), (directions.shape[1], 3)))
         answer = self._scene.run(origins, directions.T, output=True)
         # Embree's Ng points to where the corners of the face turn counter-clockwise.
         behind = (answer["Ng"] * directions.T).sum(axis=1) > 0
         bodies: NDArray[np.int32] = np.where(behind, answer["geomID"], -1)
+        for number in np.unique(bodies[behind]).tolist():
+            if number not in self._closed:
+                self._closed[number] = outward_faces(self._bodies[number])
+            of_body = np.flatnonzero(bodies == number)
+            bodies[of_body[~self._closed[number][answer["primID"][of_body]]]] = -1
         return bodies

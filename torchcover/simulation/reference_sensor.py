@@ -83,6 +83,7 @@ class ReferenceScan(NamedTuple):
         redrawn: How often its place was drawn again, because it lay inside a body.
         drawn: (objects,) int64 how many points were drawn on each of `World.objects`, be they seen or not; None from a
             sensor that draws none.
+        heights_m: (M,) heights of the points above the local ground, from a sensor that has asked for them.
     """
 
     points: NDArray[np.float32]
@@ -92,6 +93,7 @@ class ReferenceScan(NamedTuple):
     body_casts: int
     redrawn: int
     drawn: NDArray[np.int64] | None = None
+    heights_m: NDArray[np.float32] | None = None
 
 
 class ReferenceSensor(Protocol):

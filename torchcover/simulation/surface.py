@@ -8,10 +8,13 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import invert, transform
 from torchcover.simulation.instant import Instant
+from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
+from torchcover.simulation.local_ground import TOLERANCE_M, GroundSquares
 from torchcover.simulation.patches import Bounds, Patches
 from torchcover.simulation.rays import rotate_each
 from torchcover.simulation.shapes import Mesh
 
+Bools = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
@@ -38,6 +41,34 @@ class Groups(NamedTuple):
         return np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
 
 
+class AboveGround(NamedTuple):
+    """What is asked about the surface by height above the local ground.
+
+    `squares` of the ground; `squares_T_static` (4, 4) from the frame of what never moves to theirs; `ground` for each
+    mesh that never moves (F,) which of its faces are ground; `lowest_m` and `highest_m` of all heights that are wanted.
+    """
+
+    squares: GroundSquares
+    squares_T_static: Float64
+    ground: Sequence[Bools]
+    lowest_m: float
+    highest_m: float
+
+    def wanted(self, triangles_m: Float64) -> Bools:
+        """(N,) whether any point of (3, 3, N) triangles in the frame of what never moves may have such a height."""
+        low_m, high_m = self.squares.heights_m(_moved_corners(self.squares_T_static, triangles_m))
+        wanted: Bools = (high_m >= self.lowest_m) & (low_m <= self.highest_m)
+        return wanted
+
+    def known(self, patches: Patches, static_T_patches: Float64, is_ground: Bools | None = None) -> Patches:
+        """Patches with their heights: the ground's own is none but that of ground a few centimetres above it."""
+        squares_T_patches = self.squares_T_static @ static_T_patches
+        heights_m = self.squares.heights_m(_moved_corners(squares_T_patches, patches.corners_m))
+        if is_ground is not None:
+            heights_m[:, is_ground] = np.float32([[-TOLERANCE_M - HEIGHT_SLACK_M], [HEIGHT_SLACK_M]])
+        return patches._replace(heights_m=heights_m)
+
+
 class SceneSurface:
     """The surface of what never moves, in the order of places on the ground, and of each object that moves.
 
@@ -47,6 +78,7 @@ class SceneSurface:
         resting: By number, `static_T_object` of those that never move.
         moving: Of the others the number of the object, by that of the body in an instant.
         bounds: Boxes in the frame of what never moves, outside of which no scenery is ever asked for.
+        above: What is asked by height above the local ground; None if nothing is.
     """
 
     def __init__(
@@ -56,10 +88,19 @@ class SceneSurface:
         resting: Mapping[int, Float64],
         moving: Mapping[int, int],
         bounds: Bounds,
+        above: AboveGround | None = None,
     ) -> None:
+        self._above = above
         self._moving = {body: (objects[number], number) for body, number in moving.items()}
         placed = [objects[number].moved(pose).given_to(number) for number, pose in resting.items()]
-        patches = Patches.joined([Patches.of(mesh, bounds) for mesh in scenery] + placed)
+        cut = [Patches.cut(mesh, bounds, above and above.wanted) for mesh in scenery]
+        parts = [patches for patches, _ in cut]
+        if above is not None:
+            static = np.eye(4)
+            grounds = [ground[face] for ground, (_, face) in zip(above.ground, cut, strict=True)]
+            parts = [above.known(part, static, ground) for part, ground in zip(parts, grounds, strict=True)]
+            placed = [above.known(patches, static) for patches in placed]
+        patches = Patches.joined(parts + placed)
         order, cell = _by_place(patches)
         self._static = patches.taken(order)
         self._cells = _groups(self._static, cell)
@@ -95,6 +136,8 @@ class SceneSurface:
         bodies = np.flatnonzero(meets & (moving.body != instant.ego))
         placed = [self._moving[number] for number in moving.body[bodies].tolist()]
         near.append(placed_each(placed, moving.vehicle_T_part[bodies]))
+        if self._above is not None:
+            near[1] = self._above.known(near[1], instant.static_T_vehicle)
         return Patches.joined(near)
 
 
@@ -111,6 +154,7 @@ def placed_each(kinds: Sequence[tuple[Patches, int]], destination_T_source: Floa
         second_m=rotate_each(rotation, all_parts.second_m),
         outward=all_parts.outward,
         of_object=np.array([number for _, number in kinds], dtype=np.int32).repeat(count),
+        heights_m=all_parts.heights_m,
     )
 
 
@@ -161,6 +205,13 @@ def _groups(patches: Patches, group: Numbers | NDArray[np.int32]) -> Groups:
     lower_m = np.minimum.reduceat(patches.lower_m, first, axis=1).T.astype(np.float64)
     upper_m = np.maximum.reduceat(patches.upper_m, first, axis=1).T.astype(np.float64)
     return Groups(np.append(first, len(group)), Bounds(lower_m - SLACK_M, upper_m + SLACK_M))
+
+
+def _moved_corners(destination_T_source: Float64, corners_m: NDArray[np.floating]) -> Float64:
+    """(3, 3, N) corners, coordinates, triangles in another frame."""
+    moved_m: Float64 = np.einsum("ij,cjn->cin", destination_T_source[:3, :3], corners_m, dtype=np.float64)
+    moved_m += destination_T_source[:3, 3:]
+    return moved_m
 
 
 def _moved_bounds(destination_T_source: Float64, bounds: Bounds) -> tuple[Float64, Float64]:

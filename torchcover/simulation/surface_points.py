@@ -1,5 +1,6 @@
 """Points drawn evenly over a surface, stratified by boxes and by objects."""
 
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -24,12 +25,13 @@ MOST_DRAWN = 16.0
 class SurfacePoints(NamedTuple):
     """K points of a surface.
 
-    `points_m` (K, 3) where; `normals` (K, 3) of length one on the side from which they are looked at; `per_m2` (K,) how
-    many points a square metre was given there, from all strata together; `of_object` (K,) number of the object that
-    they are on, -1 for none.
+    `points_m` (K, 3) where; `heights_m` (K,) above what bands are measured from; `normals` (K, 3) of length one on the
+    side from which they are looked at; `per_m2` (K,) how many points a square metre was given there, from all strata
+    together; `of_object` (K,) number of the object that they are on, -1 for none.
     """
 
     points_m: Float32
+    heights_m: Float32
     normals: Float32
     per_m2: Float64
     of_object: Int32
@@ -64,16 +66,21 @@ class SurfaceStrata:
     Args:
         patches: The surface in the frame of the boxes.
         boxes: Strata, half-open: lower bounds belong to them.
+        heights_m: From (K, 3) points to (K,) heights, NaN for none, which the third bounds of the boxes are about, as
+            `Patches.heights_m` are; their z if not given.
     """
 
-    def __init__(self, patches: Patches, boxes: Bounds) -> None:
+    def __init__(self, patches: Patches, boxes: Bounds, heights_m: Callable[[Float32], Float32] | None = None) -> None:
         self._patches = patches
         self._boxes = boxes
+        self._heights_m = heights_m
         normals = patches.normals_m2
         twice_m2 = np.sqrt((normals**2).sum(axis=0))
         self._normals = normals / np.maximum(twice_m2, np.finfo(np.float32).tiny)
         self._plane_m = (self._normals * patches.corner_m).sum(axis=0)
         lower_m, upper_m = patches.lower_m - np.float32(SLACK_M), patches.upper_m + np.float32(SLACK_M)
+        if heights_m is not None:
+            lower_m[2], upper_m[2] = patches.heights_m
         self._strata = _strata(twice_m2 / 2, lower_m, upper_m, boxes)
         self._objects = _objects(patches.of_object, twice_m2 / 2)
 
@@ -97,7 +104,9 @@ class SurfaceStrata:
         of_objects, object_per_m2 = _drawn_on_objects(self._objects, front, on_objects, generator)
         patch = np.concatenate([*(patch for patch, _ in drawn), of_objects])
         points_m = self._points(patch, generator)
-        inside = np.stack([_inside(points_m, low, high) for low, high in zip(*self._boxes, strict=True)])
+        heights_m = points_m[2] if self._heights_m is None else self._heights_m(points_m.T)
+        placed_m = points_m[0], points_m[1], heights_m
+        inside = np.stack([_inside(placed_m, low, high) for low, high in zip(*self._boxes, strict=True)])
         kept = np.ones(len(patch), dtype=bool)
         kept[: len(number)] = inside[number, np.arange(len(number))]
         patch, of_object = patch[kept], self._patches.of_object[patch[kept]]
@@ -105,6 +114,7 @@ class SurfaceStrata:
         side = np.where(self._patches.outward[patch], np.float32(1), np.sign(height_m[patch]))
         return SurfacePoints(
             np.ascontiguousarray(points_m[:, kept].T),
+            heights_m[kept],
             (self._normals[:, patch] * side).T,
             np.array([density for _, density in drawn]) @ inside[:, kept] + object_per_m2[of_object],
             of_object,
@@ -121,10 +131,10 @@ class SurfaceStrata:
         return points_m
 
 
-def _inside(points_m: Float32, low: Float64, high: Float64) -> Bools:
-    inside = np.ones(points_m.shape[1], dtype=bool)
-    for axis in range(3):
-        inside &= (points_m[axis] >= low[axis]) & (points_m[axis] < high[axis])
+def _inside(placed_m: Sequence[Float32], low: Float64, high: Float64) -> Bools:
+    inside = np.ones(len(placed_m[0]), dtype=bool)
+    for along_m, least_m, most_m in zip(placed_m, low, high, strict=True):
+        inside &= (along_m >= least_m) & (along_m < most_m)
     return inside
 
 

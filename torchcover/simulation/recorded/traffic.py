@@ -101,7 +101,7 @@ class RecordedTraffic(Traffic):
         driver = Actor(EGO, "car", mesh, Trajectory(drive.times_s, drive.positions_m, drive.angles_deg))
         others = self._apart(driver, list(self._actors(driver.trajectory, Bodies(bodies))))
         ground = self._fitted(driver) if self.ground is None else MeshFile(type="mesh", path=self.ground).mesh()
-        return World((ground,), driver, tuple(others), self.time_step_s, run.duration_s)
+        return World((ground,), driver, tuple(others), self.time_step_s, run.duration_s, ground=(0,))
 
     @cached_property
     def _run(self) -> Run:
