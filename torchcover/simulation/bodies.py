@@ -107,11 +107,15 @@ class Body(Document):
         name: What messages call it.
         shape: Its form, in its own frame.
         poses: Where its frame lies in that of the document; one copy for each.
+        ground: In a scenario: whether one drives or walks on it, so that heights are measured from its level faces. If
+            no body of a scenario is, the ground is what is level under the ego and connected with that by steps of at
+            most 0.3 m.
     """
 
     name: str
     shape: Shape
     poses: tuple[Pose, ...] = Field(default=(Pose(),), min_length=1)
+    ground: bool = False
 
     def meshes(self) -> list[Mesh]:
         """One mesh for each pose."""
@@ -141,6 +145,8 @@ class Vehicle(Document):
     @model_validator(mode="after")
     def _check_parts(self) -> Self:
         for part in self.parts:
+            if part.ground:
+                raise ValueError(f"part {part.name!r} is ground; only the bodies of a scenario can be, for they rest")
             if isinstance(part.shape, VehicleShape):
                 raise ValueError(
                     f"part {part.name!r} is the vehicle {part.shape.vehicle!r}; a vehicle is put together from other "

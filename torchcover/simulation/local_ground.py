@@ -33,10 +33,12 @@ PROBES = np.array([0.1, 0.5, 0.9])
 # Whoever stands on the ground has it so near above or below.
 NEAR_M = 1.0
 # Side of the smallest squares in which the height of the ground is known roughly, of how many at most.
-SQUARE_M = 4.0
+SQUARE_M = 8.0
 MOST_SQUARES = 1_000_000
-# Heights are rounded to float32, and so are the points that they belong to.
-SLACK_M = 0.005
+# Points are rounded to float32, and so are their heights: so little above or below the ground they lie on it.
+ROUNDING_M = 5e-4
+# Bounds of heights are so much wider.
+SLACK_M = 1e-3
 
 
 def level_faces(mesh: Mesh, outward: Bools | None = None) -> Bools:
@@ -67,7 +69,7 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
     """Which faces of some meshes are ground: the level ones below some places, and all connected with them by steps.
 
     Two level surfaces are connected that share an edge, or of which one goes on where the other ends, at most 0.3 m
-    higher or lower.
+    higher or lower. Where no place has any within a metre, the level face below counts, however far; then a sheet above.
 
     Args:
         meshes: What never moves.
@@ -89,12 +91,27 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
     one, other = surface[face[border]].repeat(len(PROBES)), _met(caster, _probes_m(corners_m, border), STEP_M)
     joined = np.stack([one, other])[:, other >= 0]
     root = connected(np.tile(np.arange(joined.shape[1]), 2), joined.ravel(), surface.max() + 1)
-    under = _met(caster, places_m, NEAR_M)
-    is_ground = np.isin(root, root[under[under >= 0]])[surface]
+    outward = np.concatenate([outward_faces(mesh)[mask] for mesh, mask in zip(meshes, level, strict=True)])
+    is_sheet = np.bincount(surface, weights=outward) == 0
+    is_ground = np.isin(root, root[_stood_on(caster, places_m, is_sheet)])[surface]
     ends = np.cumsum([np.count_nonzero(mask) for mask in level])[:-1]
     for mask, found in zip(level, np.split(is_ground, ends), strict=True):
         mask[mask] = found
     return level
+
+
+def _stood_on(caster: RayCaster, places_m: Float64, is_sheet: Bools) -> Numbers:
+    """Numbers of the bodies that places stand on; if none is near, of those far below, or of sheets above them."""
+    near = _met(caster, places_m, NEAR_M)
+    if (near >= 0).any():
+        return near[near >= 0]
+    for up in (-1.0, 1.0):
+        limit_m = np.full(len(places_m), np.inf, dtype=np.float32)
+        met = caster.cast_from_each(places_m.astype(np.float32), _vertical(len(places_m), up), limit_m).body
+        met = met[(met >= 0) & ((up < 0) | is_sheet[np.maximum(met, 0)])]
+        if len(met):
+            return met.astype(np.int64)
+    return np.empty(0, dtype=np.int64)
 
 
 def _probes_m(corners_m: Float64, border: Numbers) -> Float64:
@@ -112,7 +129,7 @@ def _probes_m(corners_m: Float64, border: Numbers) -> Float64:
 
 def _met(caster: RayCaster, places_m: Float64, near_m: float) -> Numbers:
     """(N,) number of the highest body no farther above or below each place than this, -1 for none."""
-    starts_m = (places_m + [0.0, 0.0, near_m]).astype(np.float32)
+    starts_m = (places_m + np.array([0.0, 0.0, near_m])).astype(np.float32)
     limit_m = np.full(len(starts_m), 2 * near_m, dtype=np.float32)
     return caster.cast_from_each(starts_m, _vertical(len(starts_m), -1.0), limit_m).body.astype(np.int64)
 
@@ -156,12 +173,13 @@ class LocalGround:
             world_T_points: (4, 4) where their frame lies in the world; they are in its own frame if not given.
 
         Returns:
-            (N,) metres, not less than -0.05; NaN where there is no ground at or below.
+            (N,) metres, not less than -0.05, 0 where rounding alone tells; NaN where there is no ground at or below.
         """
         places_m = self._local(points_m, world_T_points)
         places_m[:, 2] += TOLERANCE_M
         range_m = self._cast(places_m, -1.0)
         range_m -= np.float32(TOLERANCE_M)
+        range_m[np.abs(range_m) < ROUNDING_M] = 0.0
         return range_m
 
     def is_above(self, place_m: Float64, world_T_place: Float64 | None = None) -> bool:
@@ -219,19 +237,18 @@ class GroundSquares(NamedTuple):
         from_square = ((lower_m[:2] - first_m[:, None]) / square_m).astype(np.int64)
         to_square = ((upper_m[:2] - first_m[:, None]) / square_m).astype(np.int64)
         columns, rows = (to_square.max(axis=1) + 1).tolist()
-        raster = np.empty((2, columns, rows), dtype=np.float32)
-        raster[0], raster[1] = np.inf, -np.inf
-        count = to_square - from_square + 1
-        for triangles, column, row in _squares_of(from_square, count):
-            low_m, high_m = lower_m[2, triangles], upper_m[2, triangles]
-            sloped = high_m - low_m > SLACK_M
-            if sloped.any():
-                middle_m = first_m + square_m * (np.stack([column, row], axis=1)[sloped] + 0.5)
-                between = _planes_between(corners_m[..., triangles[sloped]], middle_m, square_m / 2)
-                low_m[sloped], high_m[sloped] = between
-            np.minimum.at(raster[0], (column, row), low_m.astype(np.float32) - np.float32(SLACK_M))
-            np.maximum.at(raster[1], (column, row), high_m.astype(np.float32) + np.float32(SLACK_M))
-        levels = [raster]
+        lowest, highest = np.full(columns * rows, np.inf), np.full(columns * rows, -np.inf)
+        slopes, at_zero_m = _planes(corners_m - np.append(first_m, 0.0)[None, :, None])
+        # The plane of a triangle in a square, but nowhere beyond the triangle.
+        reach_m = square_m / 2 * np.abs(slopes).sum(axis=0)
+        for triangle, column, row in _squares_of(from_square, to_square - from_square + 1):
+            x_slope, y_slope = slopes.take(triangle, axis=1) * square_m
+            at_middle_m = at_zero_m[triangle] + x_slope * (column + 0.5) + y_slope * (row + 0.5)
+            square, reach = column * rows + row, reach_m[triangle]
+            np.minimum.at(lowest, square, np.maximum(at_middle_m - reach, lower_m[2].take(triangle)))
+            np.maximum.at(highest, square, np.minimum(at_middle_m + reach, upper_m[2].take(triangle)))
+        raster = np.stack([lowest - SLACK_M, highest + SLACK_M]).astype(np.float32)
+        levels = [raster.reshape(2, columns, rows)]
         while max(levels[-1].shape) > 2:
             levels.append(_halved(levels[-1]))
         return cls(first_m, square_m, levels)
@@ -275,9 +292,13 @@ class GroundSquares(NamedTuple):
         """
         lower_m, upper_m = triangles_m.min(axis=0), triangles_m.max(axis=0)
         lowest_m, highest_m = self.between_m(lower_m[:2], upper_m[:2])
-        # No height is less than that: below it there is other ground, or none.
-        low_m = np.maximum(lower_m[2] - highest_m, -TOLERANCE_M)
-        return np.stack([low_m - SLACK_M, upper_m[2] - lowest_m + SLACK_M]).astype(np.float32)
+        return height_bounds(lower_m[2] - highest_m, upper_m[2] - lowest_m)
+
+
+def height_bounds(low_m: Float64, high_m: Float64) -> Float32:
+    """(2, N) bounds of heights that float32 does not break; none is less than what counts as the ground below."""
+    bounds_m: Float32 = np.stack([np.maximum(low_m, -TOLERANCE_M) - SLACK_M, high_m + SLACK_M]).astype(np.float32)
+    return bounds_m
 
 
 def _squares_of(first: Numbers, count: Numbers, at_once: int = 2_000_000) -> list[tuple[Numbers, Numbers, Numbers]]:
@@ -292,21 +313,12 @@ def _squares_of(first: Numbers, count: Numbers, at_once: int = 2_000_000) -> lis
     return found
 
 
-def _planes_between(triangles_m: Float64, middle_m: Float64, half_m: float) -> tuple[Float64, Float64]:
-    """(N,) and (N,) between which heights the plane of each triangle lies in a square, and the triangle itself.
-
-    Args:
-        triangles_m: (3, 3, N) corners, coordinates, triangles.
-        middle_m: (N, 2) of each square.
-        half_m: Half of its side.
-    """
+def _planes(triangles_m: Float64) -> tuple[Float64, Float64]:
+    """(2, N) slopes along x and y of (3, 3, N) triangles that are not upright; (N,) heights of their planes at 0."""
     first, second, third = triangles_m
     normals = np.cross(second - first, third - first, axis=0)
     slopes = -normals[:2] / normals[2]
-    at_middle_m = first[2] + (slopes * (middle_m.T - first[:2])).sum(axis=0)
-    reach_m = half_m * np.abs(slopes).sum(axis=0)
-    lowest, highest = triangles_m[:, 2].min(axis=0), triangles_m[:, 2].max(axis=0)
-    return np.clip(at_middle_m - reach_m, lowest, highest), np.clip(at_middle_m + reach_m, lowest, highest)
+    return slopes, first[2] - (slopes * first[:2]).sum(axis=0)
 
 
 def _halved(raster: Float32) -> Float32:

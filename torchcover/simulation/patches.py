@@ -133,35 +133,30 @@ class Patches(NamedTuple):
     @classmethod
     def of(cls, mesh: Mesh) -> Self:
         """Those of all of a mesh, of no object; faces without an area are left out."""
-        return cls.cut(mesh)[0]
+        return cls.cut(mesh)
 
     @classmethod
     def cut(
         cls,
         mesh: Mesh,
         bounds: Bounds | None = None,
-        wanted: Callable[[Float64], Bools] | None = None,
-        outward: Bools | None = None,
-    ) -> tuple[Self, Int64]:
+        heights: Callable[[Float64, Int64], tuple[Float32, Bools]] | None = None,
+    ) -> Self:
         """Cut a mesh, or what is wanted of it.
 
         Args:
             mesh: Any, of no object; faces without an area are left out.
             bounds: What lies outside of these boxes is left out; all is wanted if not given.
-            wanted: Of (3, 3, N) corners, coordinates, triangles, whether any point of each may be wanted, (N,).
-            outward: (F,) what `outward_faces` says of it, if that is known.
-
-        Returns:
-            The patches, and (N,) of which face of the mesh each is a part.
+            heights: Of (3, 3, N) corners, coordinates, triangles and (N,) the faces that they are parts of: their
+                `heights_m`, and (N,) whether any of that is wanted.
         """
         extent_m = 0.0 if bounds is not None else float(np.ptp(mesh.vertices_m, axis=0).max())
         corners_m = np.ascontiguousarray(mesh.vertices_m[mesh.faces].transpose(1, 2, 0))
         longest_m = max(LONGEST_M, LONGEST_SHARE * extent_m)
-        (corner, second, third), face = _cut(corners_m, bounds, longest_m, wanted)
+        (corner, second, third), face, heights_m = _cut(corners_m, bounds, longest_m, heights)
         first_m, second_m = (second - corner).astype(np.float32), (third - corner).astype(np.float32)
-        nobodys, unasked = np.full(len(face), -1, dtype=np.int32), np.empty((0, len(face)), dtype=np.float32)
-        outward = outward_faces(mesh) if outward is None else outward
-        return cls(corner.astype(np.float32), first_m, second_m, outward[face], nobodys, unasked), face
+        nobodys = np.full(len(face), -1, dtype=np.int32)
+        return cls(corner.astype(np.float32), first_m, second_m, outward_faces(mesh)[face], nobodys, heights_m)
 
     @classmethod
     def joined(cls, parts: "list[Patches]") -> Self:
@@ -213,30 +208,37 @@ class Patches(NamedTuple):
 
 
 def _cut(
-    triangles: Float64, bounds: Bounds | None, longest_m: float, wanted: Callable[[Float64], Bools] | None
-) -> tuple[Float64, Int64]:
-    """(3, 3, N) triangles with short edges, and (N,) of which one of those given, (3, 3, M), each is a part.
+    triangles: Float64,
+    bounds: Bounds | None,
+    longest_m: float,
+    heights: Callable[[Float64, Int64], tuple[Float32, Bools]] | None,
+) -> tuple[Float64, Int64, Float32]:
+    """(3, 3, N) triangles with short edges, (N,) of which one of those given, (3, 3, M), each is a part, and heights.
 
     Axes are the corner, the coordinate, the triangle: NumPy is quick along the last one.
     """
     face, area_m2 = np.arange(triangles.shape[2]), _areas(triangles)
     done, done_face = [np.empty((3, 3, 0))], [np.empty(0, dtype=np.int64)]
+    done_heights_m = [np.empty((0 if heights is None else 2, 0), dtype=np.float32)]
     while len(face):
         kept = area_m2 >= SMALLEST_M2
         if bounds is not None:
             kept &= bounds.meet(triangles.min(axis=0).T, triangles.max(axis=0).T)
-        if wanted is not None:
-            kept &= wanted(triangles)
+        heights_m = np.empty((0, len(face)), dtype=np.float32)
+        if heights is not None:
+            triangles, face, area_m2 = triangles[..., kept], face[kept], area_m2[kept]
+            heights_m, kept = heights(triangles, face)
         edges_m = np.linalg.norm(triangles[[1, 2, 0]] - triangles, axis=1)
         small = edges_m.max(axis=0) <= longest_m
         ready, large = np.flatnonzero(kept & small), np.flatnonzero(kept & ~small)
         done.append(triangles.take(ready, axis=2))
         done_face.append(face[ready])
+        done_heights_m.append(heights_m.take(ready, axis=1))
         triangles = _halved(triangles.take(large, axis=2), edges_m.take(large, axis=1).argmax(axis=0))
         face, area_m2 = np.tile(face[large], 2), np.tile(area_m2[large] / 2, 2)
         unsure = np.flatnonzero(area_m2 < SURE_M2)
         area_m2[unsure] = _areas(triangles[..., unsure])
-    return np.concatenate(done, axis=2), np.concatenate(done_face)
+    return np.concatenate(done, axis=2), np.concatenate(done_face), np.concatenate(done_heights_m, axis=1)
 
 
 def _halved(triangles: Float64, longest: Int64) -> Float64:

@@ -78,7 +78,8 @@ class Scene:
     @cached_property
     def ground(self) -> LocalGround:
         """The ground of the world; what is level and connected with that under the ego, if the world does not say."""
-        meshes = [Mesh(mesh.vertices_m, mesh.faces[mask]) for mesh, mask in zip(self.world.static, self.is_ground)]
+        faces = zip(self.world.static, self.is_ground, strict=True)
+        meshes = [Mesh(mesh.vertices_m, mesh.faces[mask]) for mesh, mask in faces]
         return LocalGround(meshes, self._world_T_local[:3, 3])
 
     @cached_property
@@ -94,9 +95,7 @@ class Scene:
             for number, mesh in enumerate(static)
         ]
 
-    def surface(
-        self, lower_m: Matrix, upper_m: Matrix, heights_m: tuple[float, float] | None = None
-    ) -> SceneSurface:
+    def surface(self, lower_m: Matrix, upper_m: Matrix, heights_m: tuple[float, float] | None = None) -> SceneSurface:
         """The surface of everything but the ego, for questions about a box that the vehicle carries along.
 
         It is cut when first asked for, once for each box.

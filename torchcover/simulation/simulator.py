@@ -219,10 +219,39 @@ class Simulator:
             stage.check_mounts(stage.scene.at(0))
             warn_of_floating(self.scenario.name, stage.scene, seen)
 
+    @property
+    def ground_words(self) -> str:
+        """What is taken for the ground of a scenario that does not say it; no words if it does.
+
+        Example:
+            >>> from torchcover.simulation import PaperReference
+            >>> Simulator(Scenario.load("urban"), {}, PaperReference(rows=16, columns=16)).ground_words
+            ''
+        """
+        if self.scenario.says_ground:
+            return ""
+        names = [body.name for body in self.scenario.bodies for _ in body.poses]
+        found = zip(names, self.scene_of(0)[0].is_ground, strict=True)
+        taken = dict.fromkeys(repr(name) for name, is_ground in found if is_ground.any())
+        if not taken:
+            return (
+                "Ground: none was found under the ego, so that no point has a height above it; mark bodies as ground."
+            )
+        what = "level faces under the ego, and what is level and connected with them"
+        return f"Ground: {what}, of {', '.join(taken)}; bodies with `ground: true` say it otherwise."
+
     def labels(self, index: int) -> list[Label]:
         """The objects within the reference sensor's range at one step; names are an object's own within a run."""
         scene, step = self.scene_of(index)
         return labels(scene.world, step, self.reference_sensor.max_range_m)
+
+    def bottom_heights_m(self, index: int, found: Sequence[Label]) -> Float32:
+        """(K,) height of the bottom of each label's box at a step above the highest ground below its centre."""
+        scene, step = self.scene_of(index)
+        world_T_vehicle = scene.world.ego.trajectory.at(step * scene.world.time_step_s)
+        centres_m = np.array([label.centre_m for label in found]).reshape(-1, 3)
+        halves_m = np.array([label.size_m[2] / 2 for label in found], dtype=np.float32)
+        return scene.ground.heights_m(centres_m, world_T_vehicle) - halves_m
 
     def scene_of(self, index: int) -> tuple[Scene, int]:
         """The geometry of the world in which a step plays, and the time step in it.
@@ -293,6 +322,7 @@ def _counts_of(scene: Scene, instant: Instant, scans: Sequence[Scan], reference:
         "sensor_self_hits": self_hits,
         "reference_rays": reference.rays,
         "reference_self_hits": reference.self_hits,
+        "reference_poses": reference.places + reference.redrawn,
         "reference_poses_redrawn": reference.redrawn,
         "moving_bodies": len(instant.moving) + instant.out_of_range,
         "moving_bodies_out_of_range": instant.out_of_range,

@@ -1,6 +1,6 @@
 """The surface of a world, cut small once; what is near the vehicle is looked up at every step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -9,15 +9,18 @@ from numpy.typing import NDArray
 from torchcover.geometry import invert, transform
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
-from torchcover.simulation.local_ground import TOLERANCE_M, GroundSquares
+from torchcover.simulation.local_ground import TOLERANCE_M, GroundSquares, height_bounds
 from torchcover.simulation.patches import Bounds, Patches
 from torchcover.simulation.rays import rotate_each
 from torchcover.simulation.shapes import Mesh
 
 Bools = NDArray[np.bool_]
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
+# Between which heights above the ground the ground itself lies.
+OF_GROUND_M = np.float32([[-TOLERANCE_M - HEIGHT_SLACK_M], [HEIGHT_SLACK_M]])
 # Side of the squares of the ground by which patches are looked up.
 CELL_M = 16  # a power of two
 # A drive is followed by boxes around stretches of it of this length.
@@ -54,19 +57,39 @@ class AboveGround(NamedTuple):
     lowest_m: float
     highest_m: float
 
-    def wanted(self, triangles_m: Float64) -> Bools:
-        """(N,) whether any point of (3, 3, N) triangles in the frame of what never moves may have such a height."""
-        low_m, high_m = self.squares.heights_m(_moved_corners(self.squares_T_static, triangles_m))
-        wanted: Bools = (high_m >= self.lowest_m) & (low_m <= self.highest_m)
-        return wanted
+    def of_scenery(self, number: int) -> Callable[[Float64, Numbers], tuple[Float32, Bools]]:
+        """From triangles of a mesh that never moves and their faces to (2, N) heights, and (N,) whether any is wanted.
 
-    def known(self, patches: Patches, static_T_patches: Float64, is_ground: Bools | None = None) -> Patches:
-        """Patches with their heights: the ground's own is none but that of ground a few centimetres above it."""
+        That of the ground itself is none, but for other ground a few centimetres above it.
+        """
+
+        def heights(triangles_m: Float64, face: Numbers) -> tuple[Float32, Bools]:
+            heights_m = OF_GROUND_M.repeat(len(face), axis=1)
+            others = np.flatnonzero(~self.ground[number][face])
+            corners_m = _moved_corners(self.squares_T_static, triangles_m.take(others, axis=2))
+            heights_m[:, others] = self.squares.heights_m(corners_m)
+            low_m, high_m = heights_m
+            return heights_m, (high_m >= self.lowest_m) & (low_m <= self.highest_m)
+
+        return heights
+
+    def of_objects(self, patches: Patches, static_T_patches: Float64, corners_m: Float64, count: Numbers) -> Patches:
+        """Patches of objects with their heights above the ground that is anywhere below the object.
+
+        Args:
+            patches: All of one object, then all of the next.
+            static_T_patches: Where their frame is.
+            corners_m: (J, 8, 3) of boxes around the objects in that frame.
+            count: (J,) how many patches each has.
+        """
         squares_T_patches = self.squares_T_static @ static_T_patches
-        heights_m = self.squares.heights_m(_moved_corners(squares_T_patches, patches.corners_m))
-        if is_ground is not None:
-            heights_m[:, is_ground] = np.float32([[-TOLERANCE_M - HEIGHT_SLACK_M], [HEIGHT_SLACK_M]])
-        return patches._replace(heights_m=heights_m)
+        corners_m = transform(squares_T_patches, corners_m.reshape(-1, 3)).reshape(-1, 8, 3)
+        lowest_m, highest_m = self.squares.between_m(corners_m.min(axis=1).T[:2], corners_m.max(axis=1).T[:2])
+        up, columns = squares_T_patches[2], (patches.corner_m, patches.first_m, patches.second_m)
+        corner_m, first_m, second_m = (up[:3] @ column for column in columns)
+        low_m = corner_m + np.minimum(np.minimum(first_m, second_m), 0.0) + up[3] - highest_m.repeat(count)
+        high_m = corner_m + np.maximum(np.maximum(first_m, second_m), 0.0) + up[3] - lowest_m.repeat(count)
+        return patches._replace(heights_m=height_bounds(low_m, high_m))
 
 
 class SceneSurface:
@@ -93,14 +116,10 @@ class SceneSurface:
         self._above = above
         self._moving = {body: (objects[number], number) for body, number in moving.items()}
         placed = [objects[number].moved(pose).given_to(number) for number, pose in resting.items()]
-        cut = [Patches.cut(mesh, bounds, above and above.wanted) for mesh in scenery]
-        parts = [patches for patches, _ in cut]
         if above is not None:
-            static = np.eye(4)
-            grounds = [ground[face] for ground, (_, face) in zip(above.ground, cut, strict=True)]
-            parts = [above.known(part, static, ground) for part, ground in zip(parts, grounds, strict=True)]
-            placed = [above.known(patches, static) for patches in placed]
-        patches = Patches.joined(parts + placed)
+            placed = [above.of_objects(patches, np.eye(4), *_box_of(patches)) for patches in placed]
+        cut = [Patches.cut(mesh, bounds, above and above.of_scenery(number)) for number, mesh in enumerate(scenery)]
+        patches = Patches.joined(cut + placed)
         order, cell = _by_place(patches)
         self._static = patches.taken(order)
         self._cells = _groups(self._static, cell)
@@ -135,10 +154,12 @@ class SceneSurface:
         meets |= np.linalg.norm(moving.centre_m, axis=1) - moving.radius_m <= objects_within_m
         bodies = np.flatnonzero(meets & (moving.body != instant.ego))
         placed = [self._moving[number] for number in moving.body[bodies].tolist()]
-        near.append(placed_each(placed, moving.vehicle_T_part[bodies]))
+        of_moving = placed_each(placed, moving.vehicle_T_part[bodies])
         if self._above is not None:
-            near[1] = self._above.known(near[1], instant.static_T_vehicle)
-        return Patches.joined(near)
+            count = np.array([len(patches.outward) for patches, _ in placed], dtype=np.int64)
+            corners_m = moving.corners_m[bodies]
+            of_moving = self._above.of_objects(of_moving, instant.static_T_vehicle, corners_m, count)
+        return Patches.joined([*near, of_moving])
 
 
 def placed_each(kinds: Sequence[tuple[Patches, int]], destination_T_source: Float64) -> Patches:
@@ -207,10 +228,16 @@ def _groups(patches: Patches, group: Numbers | NDArray[np.int32]) -> Groups:
     return Groups(np.append(first, len(group)), Bounds(lower_m - SLACK_M, upper_m + SLACK_M))
 
 
+def _box_of(patches: Patches) -> tuple[Float64, Numbers]:
+    """(1, 8, 3) corners of a box around all of some patches, and (1,) how many there are."""
+    sides = np.stack([patches.lower_m.min(axis=1), patches.upper_m.max(axis=1)]).astype(np.float64)
+    corner = np.indices((2, 2, 2)).reshape(3, -1).T
+    return sides[corner, np.arange(3)][None], np.array([len(patches.outward)])
+
+
 def _moved_corners(destination_T_source: Float64, corners_m: NDArray[np.floating]) -> Float64:
     """(3, 3, N) corners, coordinates, triangles in another frame."""
-    moved_m: Float64 = np.einsum("ij,cjn->cin", destination_T_source[:3, :3], corners_m, dtype=np.float64)
-    moved_m += destination_T_source[:3, 3:]
+    moved_m: Float64 = destination_T_source[:3, :3] @ corners_m.astype(np.float64) + destination_T_source[:3, 3:]
     return moved_m
 
 

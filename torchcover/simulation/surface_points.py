@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
 from torchcover.simulation.patches import Bounds, Patches
 
 Bools = NDArray[np.bool_]
@@ -104,7 +105,7 @@ class SurfaceStrata:
         of_objects, object_per_m2 = _drawn_on_objects(self._objects, front, on_objects, generator)
         patch = np.concatenate([*(patch for patch, _ in drawn), of_objects])
         points_m = self._points(patch, generator)
-        heights_m = points_m[2] if self._heights_m is None else self._heights_m(points_m.T)
+        heights_m = self._heights_of(points_m, patch)
         placed_m = points_m[0], points_m[1], heights_m
         inside = np.stack([_inside(placed_m, low, high) for low, high in zip(*self._boxes, strict=True)])
         kept = np.ones(len(patch), dtype=bool)
@@ -119,6 +120,15 @@ class SurfaceStrata:
             np.array([density for _, density in drawn]) @ inside[:, kept] + object_per_m2[of_object],
             of_object,
         )
+
+    def _heights_of(self, points_m: Float32, patch: Numbers) -> Float32:
+        """(K,) what the third bounds of the boxes are about, of (3, K) points on the patches."""
+        if self._heights_m is None:
+            return points_m[2]
+        asked = np.flatnonzero(self._patches.heights_m[1].take(patch) > HEIGHT_SLACK_M)  # the others are the ground
+        heights_m = np.zeros(len(patch), dtype=np.float32)
+        heights_m[asked] = self._heights_m(points_m.take(asked, axis=1).T)
+        return heights_m
 
     def _points(self, patch: Numbers, generator: np.random.Generator) -> Float32:
         """(3, K) one point on each of the patches."""

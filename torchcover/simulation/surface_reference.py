@@ -184,5 +184,6 @@ class SurfaceReference:
             body_casts=sum(look.body_casts for _, look in looks),
             redrawn=redrawn,
             drawn=np.bincount(of_object[of_object >= 0], minlength=objects),
+            places=self.places,
             heights_m=heights_m if self.band_frame == "ground" else None,
         )

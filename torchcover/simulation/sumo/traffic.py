@@ -99,7 +99,8 @@ class Sumo(Procedural):
         park(vicinity, ground, fleet, self.parked_share, generator)
         placing = Placing(ground, pavement, origin_m)
         driver = placing.ego(found.ego, times_s, fleet.meshes[EGO], generator)
-        return Scenery(static, tuple(range(1 + len(raised)))), driver, placing.actors(found.others, fleet, float(times_s[-1]))
+        scenery = Scenery(static, tuple(range(1 + len(raised))))
+        return scenery, driver, placing.actors(found.others, fleet, float(times_s[-1]))
 
     def _network_file(self, folder: Path, generator: np.random.Generator) -> Path:
         """The network in SUMO's own format."""
