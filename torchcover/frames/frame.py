@@ -22,8 +22,8 @@ class Frame:
         counts: What was left out on the way here, by name (`sensor_self_hits`, `reference_nonfinite`, ...).
         reference_weights: (M,) float32 visible square metres that each reference point stands for, as a
             `SurfaceReference` gives them; None if they are unknown, and all points count the same.
-        reference_heights_m: (M,) float32 heights of the reference points above the local ground, NaN where none is at or
-            below; None if they are unknown: then height bands are those of the vehicle frame.
+        reference_heights_m: (M,) float32 heights of the reference points above the local ground, NaN where there is
+            none at or below; None if they are unknown: then height bands are those of the vehicle frame.
         boxes: The objects of that instant; None if they are unknown, which is not the same as none being there.
         sensor_points: Name of each rig -> name of each of its sensors -> how many of the rig's points are its own, in
             their order; None if it is unknown which points are whose.

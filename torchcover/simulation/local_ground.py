@@ -69,7 +69,7 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
     """Which faces of some meshes are ground: the level ones below some places, and all connected with them by steps.
 
     Two level surfaces are connected that share an edge, or of which one goes on where the other ends, at most 0.3 m
-    higher or lower. Where no place has any within a metre, the level face below counts, however far; then a sheet above.
+    higher or lower. If no place has any within a metre, a level face below counts, however far; else a sheet above.
 
     Args:
         meshes: What never moves.
