@@ -29,7 +29,7 @@ ROOMS = (
 # Where the classes of documents are defined.
 DOCUMENTS = (
     "torchcover.simulation",
-    "torchcover.data",
+    "torchcover.recordings",
     "torchcover.targets",
     "torchcover.coverage",
     "torchcover.placement",
@@ -172,6 +172,8 @@ def api():
             one = getattr(module, name)
             if inspect.isclass(one) or inspect.isfunction(one):
                 lines += ["", f"::: {one.__module__}.{one.__qualname__}"]
+                if hasattr(one, "__wrapped__"):  # whose arguments are the fields of a document: not in its source
+                    lines += ["    options:", "      force_inspection: true"]
     return "\n".join(lines)
 
 

@@ -22,23 +22,23 @@ from tests.simulation.sumo.towns import XODR, drive, fcd, street, together, writ
 from torchcover.cameras import Camera, read_depth
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.data import read_cloud
-from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
+from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
 from torchcover.files import read_feather, read_json_table
-from torchcover.recordings.formats import kitti_files
+from torchcover.recordings.formats import kitti_files, read_objects
 from torchcover.recordings.formats.carla_files import read_carla_sensors
 from torchcover.recordings.formats.folder_settings import read_folder_settings
 from torchcover.recordings.formats.folder_tables import PoseTable
 from torchcover.recordings.formats.folder_tables import read_boxes as read_labels
+from torchcover.recordings.formats.kitti_raw import read_tracklets
 from torchcover.recordings.formats.ros2 import Ros2
-from torchcover.recordings.formats.tracklets import read_tracklets
+from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.simulation import Rig, Scenario
-from torchcover.simulation.recorded.formats import format_of
+from torchcover.simulation.recorded.bodies import read_boxes
 from torchcover.simulation.shapes import MeshFile
 from torchcover.simulation.sumo.crowd import read_types
 from torchcover.simulation.sumo.floating import TimeWindow, read_floating
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.simulating import from_opendrive
-from torchcover.simulation.tracks import read_boxes, read_trajectory
 
 
 @dataclass(frozen=True)
@@ -224,7 +224,7 @@ def track_files(folder):
         yield Kind(path.name, path.read_bytes(), in_folder, tuple(others))
     commonroad = write_commonroad(Path(folder) / "commonroad.xml", OTHERS[:2])
     for path in (commonroad, table / "boxes.csv"):
-        yield Kind(f"tracks_{path.name}", path.read_bytes(), lambda path: format_of(path).read(path, None))
+        yield Kind(f"tracks_{path.name}", path.read_bytes(), read_objects)
     yield Kind("town.net.xml", write_net(Path(folder) / "a.net.xml", street()).read_bytes(), read_network)
     driven = fcd(together(drive(until=2.0), drive("b", start=90.0, until=2.0))).encode()
     yield Kind("fcd.xml", driven, lambda path: read_floating(path, TimeWindow(0.0, 1.0)))
@@ -234,7 +234,7 @@ def track_files(folder):
 
 def in_folder(path):
     """Read the tracks that a file belongs to."""
-    return format_of(path.parent).read(path.parent, None)
+    return read_objects(path.parent)
 
 
 ROUTES = b"""<routes><vType id="taxi" vClass="taxi" length="4.6"/><vType id="bike" vClass="bicycle"/>

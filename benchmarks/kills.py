@@ -34,7 +34,7 @@ SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
 # Of Python's audit events.
 TOUCHES = ("open", "os.rename", "os.remove", "os.rmdir")
 EARLIER_STEPS, STEPS = 2, 12
-COMMAND = ("torchcover", "evaluate", "rig.yaml", "--scenario", "yard.yaml", "--rays", "64", "--cell", "8")
+COMMAND = ("torchcover", "evaluate", "rig.yaml", "--scenario", "yard.yaml", "--rays", "64", "--cell-m", "8")
 # What a run imports late; a fork has it already.
 IMPORTED = ("torchcover.evaluation.study", "torchcover.cli.printing", "pykdtree.kdtree")
 # Blank ones: drawing takes most of the time.

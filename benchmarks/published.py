@@ -7,6 +7,7 @@ import torch
 
 from benchmarks.timing import table
 from torchcover.evaluation import CoverageObserver
+from torchcover.evaluation.measuring import metric_of
 from torchcover.evaluation.other_metrics import metrics_of
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import task_of
@@ -45,12 +46,14 @@ def main():
 def seconds_of(rigs):
     """Median over the steps of the processor time that each part takes."""
     plain, settings = (
-        Settings(steps=STEPS + 1, metrics=names, vehicle="suv", cell_m=CELL_M) for names in ((), FRAME_METRICS)
+        Settings(rigs, "urban", steps=STEPS + 1, metrics=names, vehicle="suv", cell_m=CELL_M)
+        for names in ((), FRAME_METRICS)
     )
-    task, with_boxes = (task_of(rigs, "urban", None, each) for each in (plain, settings))
+    task, with_boxes = (task_of(each) for each in (plain, settings))
     metrics = metrics_of(with_boxes, settings).of_rigs
     coverage = [
-        CoverageObserver(plain.metric(task.asked, square_metres=task.frames.square_metres), rig) for rig in task.rigs
+        CoverageObserver(metric_of(plain, task.asked, square_metres=task.frames.square_metres), rig)
+        for rig in task.rigs
     ]
     spent = []
     for step in range(STEPS + 1):

@@ -18,7 +18,7 @@ from pathlib import Path
 from benchmarks.timing import table
 
 STEPS = 150
-COMMAND = ("evaluate", "front_roof_32", "--rays", "256", "--cell", "8", "--resume", "--steps", str(STEPS))
+COMMAND = ("evaluate", "front_roof_32", "--rays", "256", "--cell-m", "8", "--resume", "--steps", str(STEPS))
 OFTEN = """
 import sys
 from torchcover.evaluation import checkpoint

@@ -3,7 +3,8 @@
 Short runs of `evaluate` and `compare` in the courtyard, in traffic and over a recording. Every number of summary.json
 and every array of the coverage files of OLD has to be in NEW, the same to the last bit; `--renamed OLD=NEW` says what
 a key or an array is called now. A name of NEW with a `*` stands for all arrays like it, one on top of the other:
-`--renamed 'detection=detection_*m'`. Times, versions and what was left out are not compared.
+`--renamed 'detection=detection_*m'`. `--called thresholds-m=threshold`: what OLD calls an option.
+Times, versions and what was left out are not compared.
 """
 
 import argparse
@@ -21,11 +22,11 @@ ROOT = Path(__file__).parents[1]
 RUNS = {
     "courtyard": ["evaluate", "front_roof_128", "--scenario", "courtyard", "--steps", "9"],
     "paper_pattern": ["evaluate", "front_grille_128", "--steps", "2", "--reference", "paper", "--rays", "65536"],
-    "urban": ["evaluate", "front_roof_32", "--scenario", "urban", "--steps", "10", "--threshold", "1"],
+    "urban": ["evaluate", "front_roof_32", "--scenario", "urban", "--steps", "10", "--thresholds-m", "1"],
     "workers": ["evaluate", "nuscenes_cameras", "--scenario", "highway", "--steps", "2", "--workers", "2"],
     "recording": ["evaluate", "--frames", "recording"],
     "comparison": ["compare", "front_roof_32", "front_grille_128", "--scenario", "urban", "--steps", "9"],
-    "thresholds": ["compare", "kitti", "hu2022_line", "--steps", "8", "--threshold", "0.4", "--threshold", "0.1"],
+    "thresholds": ["compare", "kitti", "hu2022_line", "--steps", "8", "--thresholds-m", "0.4", "--thresholds-m", "0.1"],
 }
 NOT_COMPARED = ("seconds", "torchcover", "left_out", "complete", "frames")
 # What the whole program starts with, in either checkout.
@@ -37,16 +38,19 @@ def main():
     parser.add_argument("old", type=Path)
     parser.add_argument("new", type=Path, nargs="?", default=ROOT)
     parser.add_argument("--renamed", action="append", default=[], metavar="OLD=NEW")
+    parser.add_argument("--called", action="append", default=[], metavar="NEW=OLD")
     parser.add_argument("--runs", nargs="+", choices=RUNS, default=list(RUNS))
     options = parser.parse_args()
     renamed = dict(pair.split("=") for pair in options.renamed)
+    called = {f"--{new}": f"--{old}" for new, old in (pair.split("=") for pair in options.called)}
     different = 0
     with tempfile.TemporaryDirectory() as folder:
         record(Path(folder, "recording"))
         for name in options.runs:
             outs = [Path(folder, side, name) for side in ("old", "new")]
-            for checkout, out in zip((options.old, options.new), outs, strict=True):
-                run(checkout.resolve(), [*RUNS[name], "--out", str(out)], folder)
+            of_old = [called.get(word, word) for word in RUNS[name]]
+            for checkout, words, out in zip((options.old, options.new), (of_old, RUNS[name]), outs, strict=True):
+                run(checkout.resolve(), [*words, "--out", str(out)], folder)
             compared, complaints = compare(*outs, renamed)
             different += len(complaints)
             print(f"{name}: {compared:,} numbers compared, {len(complaints)} complaints", flush=True)

@@ -23,13 +23,41 @@ def python(code):
 def test_arrows_in_the_house_go_one_way():
     """The contracts of `[tool.importlinter]` in pyproject.toml."""
     report = python("from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))")
-    assert "2 kept, 0 broken" in report
+    assert "3 kept, 0 broken" in report
 
 
 def test_importing_torchcover_imports_nothing_heavy():
     loaded = set(python("import sys, torchcover; print(*sys.modules)").split())
     assert "torchcover" in loaded
     assert not loaded & HEAVY
+
+
+CORE = ["geometry", "files", "neighbors", "metrics", "coverage", "detection", "frames"]
+SIMULATING = {"torchcover.simulation", "embreex", "trimesh", "shapely", "pydantic", "numba", "matplotlib"}
+
+
+@pytest.mark.parametrize(
+    "imports",
+    [
+        "\n".join(f"from torchcover.{room} import *" for room in CORE),
+        "from torchcover.training import CoverageCallback",
+        "from torchcover.data import RecordedFrames; from torchcover import Camera",
+    ],
+)
+def test_what_measures_needs_nothing_that_simulates_or_draws(imports):
+    # torchmetrics imports matplotlib for itself, and is what shall not hide it here.
+    code = "import sys, torchmetrics\nfor name in [*sys.modules]:\n    if 'matplotlib' in name: del sys.modules[name]\n"
+    assert not set(python(f"{code}{imports}\nprint(*sys.modules)").split()) & SIMULATING
+
+
+def test_a_name_of_the_door_to_the_data_loads_its_own_room():
+    rooms = {f"torchcover.{room}" for room in ("frames", "recordings", "simulation")}
+    for name, needed in (("Frame", 1), ("Scan", 2)):
+        loaded = set(python(f"import sys; from torchcover.data import {name}; print(*sys.modules)").split())
+        assert len(loaded & rooms) <= needed, name
+    with pytest.raises(AttributeError, match="no attribute 'frame'"):
+        _ = torchcover.data.frame
+    assert {name for name in torchcover.data.__all__ if getattr(torchcover.data, name) is None} == set()
 
 
 def test_searching_imports_neither_the_metric_nor_the_tree_before_they_are_needed():

@@ -140,12 +140,12 @@ def values() -> Iterator[Case]:
 def options() -> Iterator[Case]:
     """Options with values that make no sense or have no room."""
     refused = {
-        "--cell": ("20", "1e-310", "0.001", "nan", "inf", "-1", "1e300", "x"),
-        "--threshold": ("inf", "nan", "-1", "1e9", "x"),
+        "--cell-m": ("20", "1e-310", "0.001", "nan", "inf", "-1", "1e300", "x"),
+        "--thresholds-m": ("inf", "nan", "-1", "1e9", "x"),
         "--rays": ("99999999999", "9" * 30, "0", "-1", "1e9"),
         "--steps": ("9" * 20, "0", "1.5"),
         "--seed": ("-1", "x"),
-        "--every": ("1e308", "nan", "inf", "0", "1e-300", "-1"),
+        "--every-s": ("1e308", "nan", "inf", "0", "1e-300", "-1"),
         "--device": ("meta", "abacus", "cuda:99", ""),
         "--workers": ("-1", "1000000", "9" * 20),
         "--target-error": ("0%", "nan%", "infm", "1e400%", "5", ""),
@@ -179,7 +179,7 @@ def _files(changed: dict[str, str]) -> dict[str, str]:
 
 
 def _evaluate(rig: str, *more: str) -> tuple[str, ...]:
-    quick = ("--scenario", "yard.yaml", "--steps", "1", "--cell", "4", "--rays", "64", "--out", "out")
+    quick = ("--scenario", "yard.yaml", "--steps", "1", "--cell-m", "4", "--rays", "64", "--out", "out")
     return ("evaluate", rig, *quick, *more)
 
 

@@ -9,7 +9,7 @@ import pytest
 import torchcover as package
 from torchcover import Coverage, Region, RegionsOfInterest
 
-SMALL = ["--steps", 9, "--cell", 0.5, "--threshold", 2, "--rays", 1024]
+SMALL = ["--steps", 9, "--cell-m", 0.5, "--thresholds-m", 2, "--rays", 1024]
 ASKED = [
     *("--region", "behind:-6,-2,-2,2", "--region", "ahead:2,6,-2,2"),
     *("--height", "dog:-0.1,0.5", "--height", "child:-0.1,1.1", "--grid", "-10,10,-10,10"),
@@ -51,7 +51,7 @@ def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(e
         heights={"dog": (-0.1, 0.5), "child": (-0.1, 1.1)},
         grid={"x_m": (-10.0, 10.0), "y_m": (-10.0, 10.0)},
     )
-    settings = {"steps": 9, "cell_m": 0.5, "thresholds": 2.0, "rays": 1024}
+    settings = {"steps": 9, "cell_m": 0.5, "thresholds_m": 2.0, "rays": 1024}
     result = package.evaluate(worlds / "both.yaml", worlds / "yard.yaml", ask=ask, **settings)
     loaded = Coverage.load(worlds / "out" / "coverage.npz")
     np.testing.assert_array_equal(result.coverage.radius, loaded.radius)
@@ -141,7 +141,7 @@ def test_where_nothing_was_seen_no_sensor_is_called_dispensable(evaluate):
 
 def test_where_nothing_is_detected_no_sensor_is_called_dispensable_either(torchcover, worlds):
     scene = ("--scenario", worlds / "yard.yaml", "--out", worlds / "out", "--steps", 2, "--rays", 1024)
-    asked = ("--cell", 0.5, "--region", "ahead:2,6,-2,2", "--threshold", 1e-9, "--redundancy")
+    asked = ("--cell-m", 0.5, "--region", "ahead:2,6,-2,2", "--thresholds-m", 1e-9, "--redundancy")
     code, printed, _ = torchcover("evaluate", worlds / "both.yaml", *scene, *asked)
     assert (code, "Nothing of what was asked about is detected" in " ".join(printed.split())) == (0, True)
     assert "No single point of failure" not in printed

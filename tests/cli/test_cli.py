@@ -31,7 +31,9 @@ def recording(tmp_path):
 
 def test_a_recording_is_evaluated_and_the_files_agree(drawn_maps, torchcover, recording, tmp_path):
     out = tmp_path / "out"
-    code, printed, _ = torchcover("evaluate", "--frames", recording, "--out", out, "--threshold", 0.4, "--threshold", 1)
+    code, printed, _ = torchcover(
+        "evaluate", "--frames", recording, "--out", out, "--thresholds-m", 0.4, "--thresholds-m", 1
+    )
     assert code == 0
     assert str(out) in printed.replace("\n", "")
     coverage = Coverage.load(out / "coverage.npz")
@@ -106,7 +108,7 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
         " horizontal_fov_deg: 360, columns: 90, max_range_m: 60}\n"
     )
     for out in ("a", "b"):
-        arguments = ["--steps", 1, "--cell", 1, "--reference", "paper", "--rays", 16384, "--out", tmp_path / out]
+        arguments = ["--steps", 1, "--cell-m", 1, "--reference", "paper", "--rays", 16384, "--out", tmp_path / out]
         assert torchcover("evaluate", tmp_path / "rig.yaml", *arguments)[0] == 0
     a, b = (Coverage.load(tmp_path / out / "coverage.npz") for out in "ab")
     np.testing.assert_array_equal(a.radius, b.radius)
@@ -127,7 +129,7 @@ def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, world
 
     update = CoverageMetric.update
     monkeypatch.setattr(CoverageMetric, "update", noted)
-    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell", 4, "--rays", 4096, "--out", worlds / "out"]
+    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell-m", 4, "--rays", 4096, "--out", worlds / "out"]
     for reference in ("surface", "paper"):
         assert torchcover("evaluate", worlds / "low.yaml", *options, "--reference", reference)[0] == 0
     (points, weights, _), _, (_, none, _), _ = given
@@ -139,7 +141,7 @@ def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, world
 
 @pytest.mark.parametrize("name", REFERENCE_SENSORS)
 def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchcover, worlds, name):
-    options = ["--scenario", worlds / "yard.yaml", "--steps", 1, "--cell", 4, "--rays", 1024, "--out", worlds / "out"]
+    options = ["--scenario", worlds / "yard.yaml", "--steps", 1, "--cell-m", 4, "--rays", 1024, "--out", worlds / "out"]
     assert torchcover("evaluate", worlds / "low.yaml", *options, "--reference", name)[0] == 0
     summary = json.loads((worlds / "out" / "summary.json").read_text())
     by_area = REFERENCE_SENSORS[name].square_metres
@@ -149,7 +151,7 @@ def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchco
 
 
 def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_not(torchcover, worlds):
-    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell", 4, "--rays", 1024, "--out"]
+    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell-m", 4, "--rays", 1024, "--out"]
     rows = {}
     for measure in ("area", "known"):
         assert torchcover("evaluate", worlds / "low.yaml", *options, worlds / measure, "--estimate", measure)[0] == 0
@@ -195,20 +197,20 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["evaluate", "none.yaml"], "none.yaml: no such file"),
         (["evaluate", "--frames", "no_such_folder"], "no_such_folder"),
         (["evaluate", "kitti", "--scenario", "courtyard", "--frames", "recording"], "exclude each other"),
-        (["evaluate", "front_roof_128", "--cell", "0.3"], "not a multiple of the cell of 0.3 m"),
+        (["evaluate", "front_roof_128", "--cell-m", "0.3"], "not a multiple of the cell of 0.3 m"),
         (
-            ["evaluate", "front_roof_128", "--cell", "20"],
+            ["evaluate", "front_roof_128", "--cell-m", "20"],
             "region '20m' holds no cell centre; use smaller cells than 20 m",
         ),
-        (["evaluate", "front_roof_128", "--cell", "1e-310"], "x: inf cells of 1e-310 m, over 100,000,000"),
-        (["evaluate", "front_roof_128", "--cell", "0.02"], "the sums of 80,000,000 cells in 16 blocks: "),
-        (["evaluate", "front_roof_128", "--threshold", "inf"], "thresholds: finite distances"),
+        (["evaluate", "front_roof_128", "--cell-m", "1e-310"], "x: inf cells of 1e-310 m, over 100,000,000"),
+        (["evaluate", "front_roof_128", "--cell-m", "0.02"], "the sums of 80,000,000 cells in 16 blocks: "),
+        (["evaluate", "front_roof_128", "--thresholds-m", "inf"], "thresholds: finite distances"),
         (["evaluate", "front_roof_128", "--rays", "99999999999"], "rays a step (230,400 of the rig's sensors, 99,999"),
         (["evaluate", "front_roof_128", "--steps", "9" * 20], "steps: a number from 1 to 1,000,000,000 is needed"),
         (["evaluate", "front_roof_128", "--workers", "1000000"], "1,000,000 workers: 3e+05 GB of memory are needed"),
         (["evaluate", "front_roof_128", "--device", "meta"], "device meta: cannot be used here"),
-        (["evaluate", "front_roof_128", "--cell", "-1"], "cell: a positive length"),
-        (["evaluate", "front_roof_128", "--threshold", "-1"], "thresholds: finite distances >= 0"),
+        (["evaluate", "front_roof_128", "--cell-m", "-1"], "cell: a positive length"),
+        (["evaluate", "front_roof_128", "--thresholds-m", "-1"], "thresholds: finite distances >= 0"),
         (["evaluate", "front_roof_128", "--steps", "0"], "--steps"),
         (["evaluate", "front_roof_128", "--steps", "many"], "--steps"),
         (["evaluate", "front_roof_128", "--seed", "-1"], "--seed"),
@@ -229,12 +231,12 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             "estimate area: it needs the",
         ),
         (["evaluate", "front_roof_128", "--rays", "0"], "--rays"),
-        (["evaluate", "--frames", "recording", "--rays", "9"], "reference, rays and every are for simulations"),
+        (["evaluate", "--frames", "recording", "--rays", "9"], "reference, rays and every_s are for simulations"),
         (["evaluate", "--frames", "recording", "--reference", "paper"], "for a recording `recorded` or `accumulated`"),
         (["evaluate", "--frames", "recording", "--reference", "accumulated"], "does not say when its scans were made"),
         (["evaluate", "--frames", "recording", "--sensors", "roof"], "which has sensor, reference; got roof"),
         (
-            ["evaluate", "--frames", "recording", "--reference", "recorded", "--window", "1"],
+            ["evaluate", "--frames", "recording", "--reference", "recorded", "--window-s", "1"],
             "recorded reference has none",
         ),
         (["evaluate", "front_roof_128", "--sensors", "roof"], "--sensors: for a recording, which --frames gives"),
@@ -335,8 +337,8 @@ def test_a_grid_that_does_not_fit_into_memory_ends_in_one_line(torchcover, tmp_p
     def no_memory(*_, **__):
         raise RuntimeError("[enforce fail at alloc_cpu.cpp] can't allocate memory")
 
-    monkeypatch.setattr("torchcover.evaluation.settings.CoverageMetric", no_memory)
-    code, _, complaints = torchcover("evaluate", "front_roof_32", "--cell", "0.05", "--out", tmp_path / "out")
+    monkeypatch.setattr("torchcover.evaluation.observers.CoverageMetric", no_memory)
+    code, _, complaints = torchcover("evaluate", "front_roof_32", "--cell-m", "0.05", "--out", tmp_path / "out")
     assert code == 2
     assert complaints.strip() == (
         "torchcover: a cell of 0.05 m: there is not enough memory for the sums of 12,800,000 cells in 16 blocks; "
@@ -361,7 +363,7 @@ def test_out_of_memory_on_a_gpu_ends_in_one_line_and_keeps_what_was_measured(
 
     calls = count()
     monkeypatch.setattr("torchcover.coverage.metric.nearest", search)
-    code, _, complaints = torchcover("evaluate", "--frames", recording, "--cell", 4, "--out", tmp_path / "out")
+    code, _, complaints = torchcover("evaluate", "--frames", recording, "--cell-m", 4, "--out", tmp_path / "out")
     assert code == 2
     assert complaints.splitlines()[-1].startswith("torchcover: there is not enough memory (")
     assert told in complaints.splitlines()[-1]

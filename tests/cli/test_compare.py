@@ -16,7 +16,18 @@ def compare(torchcover, worlds, *rigs, steps=1, out="out", options=()):
     """Run it on the tiny yard; returns exit code, stdout, stderr, and the folder."""
     paths = [worlds / f"{rig}.yaml" for rig in rigs]
     folder = worlds / out
-    arguments = ["--scenario", worlds / "yard.yaml", "--steps", steps, "--cell", 4, "--threshold", 2, "--out", folder]
+    arguments = [
+        "--scenario",
+        worlds / "yard.yaml",
+        "--steps",
+        steps,
+        "--cell-m",
+        4,
+        "--thresholds-m",
+        2,
+        "--out",
+        folder,
+    ]
     arguments += ["--rays", 4096, *options]
     return *torchcover("compare", *paths, *arguments), folder
 
@@ -39,7 +50,7 @@ def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
         assert row["radius_m"] == ("" if same["radius_m"] is None else str(same["radius_m"]))
         assert row["radius_m_best"] == str(same["radius_m_best"])
     alone = worlds / "alone"
-    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell", 4, "--threshold", 2, "--out", alone]
+    options = ["--scenario", worlds / "yard.yaml", "--steps", 2, "--cell-m", 4, "--thresholds-m", 2, "--out", alone]
     assert torchcover("evaluate", worlds / "both.yaml", *options, "--rays", 4096)[0] == 0
     np.testing.assert_array_equal(Coverage.load(alone / "coverage.npz").radius, coverages["both"].radius)
 
@@ -172,7 +183,7 @@ def recording(tmp_path):
 )
 def test_the_rigs_of_a_recording_are_compared(torchcover, recording, tmp_path, rigs, radii):
     out = tmp_path / "out"
-    arguments = ["--frames", recording, "--format", "folder", "--cell", 4, "--out", out]
+    arguments = ["--frames", recording, "--format", "folder", "--cell-m", 4, "--out", out]
     code, _, complaints = torchcover("compare", *rigs, *arguments)
     assert code == 0, complaints
     summary = json.loads((out / "summary.json").read_text())
@@ -190,13 +201,14 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
     arguments = ["--frames", recording, "--out", tmp_path / "out"]
     for command, rigs, message in (
         ("compare", ["near", "middle"], "no clouds of the rig middle; the frames have far, kitti, near"),
-        ("evaluate", [], f"{recording} holds the rigs far, kitti, near: say which, or compare them"),
         ("compare", ["near", "far", "--format", "bag"], "format 'bag': no such format of recordings; there"),
         ("compare", ["near", "far", "--scenario", "urban"], "exclude each other"),
     ):
         code, _, error = torchcover(command, *rigs, *arguments)
         assert (code, message in error, error.count("\n")) == (2, True, 1), error
     assert torchcover("evaluate", "near", *arguments)[0] == 0
+    assert torchcover("evaluate", *arguments)[0] == 0
+    assert list(json.loads((tmp_path / "out" / "summary.json").read_text())["rigs"]) == ["far", "kitti", "near"]
     code, _, error = torchcover("evaluate", "kitti", "--format", "folder")
     assert (code, "--format: for a recording" in error) == (2, True)
 
@@ -205,12 +217,12 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
     ("arguments", "message"),
     [
         ([], "which rig?"),
-        (["front_roof_128"], "at least two rigs; got 'front_roof_128' only"),
+        (["front_roof_128"], "at least two rigs are needed; got front_roof_128 only"),
         (["front_roof_128", "no_such_rig"], "neither a .yaml file nor one of the built-in rigs: argoverse2,"),
         (["front_roof_128", "none.yaml"], "none.yaml: no such file"),
         (["front_roof_128", "front_roof_64", "--scenario", "moon"], "one of the built-in scenarios: courtyard"),
-        (["front_roof_128", "front_roof_64", "--cell", "0.3"], "not a multiple of the cell"),
-        (["front_roof_128", "front_roof_64", "--threshold", "-1"], "thresholds: finite distances >= 0"),
+        (["front_roof_128", "front_roof_64", "--cell-m", "0.3"], "not a multiple of the cell"),
+        (["front_roof_128", "front_roof_64", "--thresholds-m", "-1"], "thresholds: finite distances >= 0"),
         (["front_roof_128", "front_roof_64", "--device", "abacus"], "device abacus: cannot be used here"),
         (["front_roof_128", "front_roof_64", "--steps", "0"], "--steps"),
         (

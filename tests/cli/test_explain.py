@@ -2,7 +2,7 @@
 
 import json
 
-RAYS = ["--rays", "256", "--cell", "1"]
+RAYS = ["--rays", "256", "--cell-m", "1"]
 
 
 def whats(folder):

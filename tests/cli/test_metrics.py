@@ -8,11 +8,22 @@ import numpy as np
 import pytest
 
 from torchcover import Coverage
-from torchcover.evaluation import compare
+from torchcover.evaluation import evaluate
 
 
 def run(torchcover, worlds, *rigs, command="compare", options=(), out="out", steps=2):
-    arguments = ["--scenario", worlds / "yard.yaml", "--steps", steps, "--cell", 4, "--threshold", 2, "--rays", 4096]
+    arguments = [
+        "--scenario",
+        worlds / "yard.yaml",
+        "--steps",
+        steps,
+        "--cell-m",
+        4,
+        "--thresholds-m",
+        2,
+        "--rays",
+        4096,
+    ]
     paths = [worlds / f"{rig}.yaml" for rig in rigs]
     folder = worlds / out
     return *torchcover(command, *paths, *arguments, "--out", folder, *options), folder
@@ -84,7 +95,7 @@ def test_a_recording_without_boxes_has_the_metrics_that_need_none(torchcover, wo
     )
     shutil.rmtree(worlds / "drive" / "boxes")
     code, printed, error = torchcover(
-        "evaluate", "--frames", worlds / "drive", "--metrics", "all", "--cell", 4, "--out", worlds / "of_drive"
+        "evaluate", "--frames", worlds / "drive", "--metrics", "all", "--cell-m", 4, "--out", worlds / "of_drive"
     )
     assert code == 0, error
     assert "point_density" in printed
@@ -93,12 +104,12 @@ def test_a_recording_without_boxes_has_the_metrics_that_need_none(torchcover, wo
 
 def test_taus_have_intervals_over_worlds_that_are_drawn_the_same_again(worlds):
     def taus():
-        result = compare(
+        result = evaluate(
             [worlds / f"{rig}.yaml" for rig in ("low", "both", "other/low")],
             worlds / "yard.yaml",
             steps=9,
             cell_m=4.0,
-            thresholds=2.0,
+            thresholds_m=2.0,
             rays=2048,
             metrics="k_cover",
         )
@@ -114,7 +125,7 @@ def test_taus_have_intervals_over_worlds_that_are_drawn_the_same_again(worlds):
 
 @pytest.mark.parametrize("metrics", ["", ()])
 def test_nothing_is_asked_for_with_nothing(worlds, metrics):
-    result = compare(
+    result = evaluate(
         [worlds / "low.yaml", worlds / "both.yaml"],
         worlds / "yard.yaml",
         steps=1,

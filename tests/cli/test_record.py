@@ -15,7 +15,7 @@ def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_p
     assert "3/3" in told  # the bar
     assert (code, len(printed.splitlines())) == (0, 1)
     assert printed.startswith(f"Wrote 3 frames to {recording}; ")
-    cell = ("--cell", 1, "--threshold", 0.4, "--threshold", 1)
+    cell = ("--cell-m", 1, "--thresholds-m", 0.4, "--thresholds-m", 1)
     assert torchcover("evaluate", worlds / "both.yaml", *options, *cell, "--out", measured)[0] == 0
     assert torchcover("evaluate", "--frames", recording, *cell, "--out", read)[0] == 0
     first, second = (Coverage.load(folder / "coverage.npz") for folder in (measured, read))

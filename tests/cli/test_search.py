@@ -7,7 +7,7 @@ import pytest
 
 from tests.placement.surfaces import Surface
 from torchcover.cli import search_run
-from torchcover.cli.search import parsed_budget
+from torchcover.cli.commands import parsed_budget
 from torchcover.placement import SearchPlan
 
 CHOICE = Path(__file__).parents[2] / "examples" / "placement" / "robot_corners.yaml"

@@ -9,7 +9,7 @@ from PIL import Image
 
 from torchcover.cli import show
 from torchcover.evaluation import scene_pictures, sensor_views
-from torchcover.evaluation.rig_names import as_called, distinct_names
+from torchcover.evaluation.task import as_called, distinct_names
 from torchcover.simulation import Rig, Scenario, builtin_names
 
 

@@ -5,13 +5,13 @@ import json
 import pytest
 
 from torchcover.cli.printing import advice
-from torchcover.evaluation import StudyPlan, WorkPoint
+from torchcover.evaluation import Settings, StudyPlan, WorkPoint
 
 
 def test_a_small_study_writes_a_table_a_diagram_and_an_advice(torchcover, tmp_path):
     out = tmp_path / "out"
     rays = ["--rays", "256", "--rays", "64", "--rays", "64"]
-    options = [*rays, "--steps", "2", "--runs", "2", "--long-run-steps", "8", "--cell", "4"]
+    options = [*rays, "--steps", "2", "--runs", "2", "--long-run-steps", "8", "--cell-m", "4"]
     code, text, complaints = torchcover("study", "front_roof_32", "--scenario", "courtyard", *options, "--out", out)
     assert code == 0, complaints
     assert "percentage points" in text
@@ -32,8 +32,8 @@ def test_a_small_study_writes_a_table_a_diagram_and_an_advice(torchcover, tmp_pa
     ("options", "message"),
     [
         (["--rays", "0"], "rays"),
-        (["--cell", "0.3"], "multiple of the cell"),
-        (["--every", "0.15"], "every_s: a positive multiple of the time step"),
+        (["--cell-m", "0.3"], "multiple of the cell"),
+        (["--every-s", "0.15"], "every_s: a positive multiple of the time step"),
         (["--scenario", "nowhere"], "nowhere"),
         (["--long-run", "nowhere.npz"], "nowhere.npz"),
     ],
@@ -46,9 +46,9 @@ def test_what_makes_no_sense_ends_in_one_line(torchcover, tmp_path, options, mes
 
 
 def test_the_advice_has_every_option_that_decides_about_the_error():
-    plan = StudyPlan("rig", "urban", steps=8, every_s=2.0)
+    plan = StudyPlan(Settings("rig", "urban", steps=8, every_s=2.0))
     point = WorkPoint(1024, 4, 2, 7, {})
-    expected = "For 2 percentage points of detection: --rays 1024 --steps 4 --every 2 (7 s)."
+    expected = "For 2 percentage points of detection: --rays 1024 --steps 4 --every-s 2 (7 s)."
     assert advice(0.02, point, plan) == expected
     assert advice(0.02, None, plan).endswith("not reached within 8 steps.")
 

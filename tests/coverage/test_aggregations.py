@@ -1,16 +1,28 @@
 """Aggregations beside the mean of means, each by its definition; and one that nobody here has heard of."""
 
 import math
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, fields
 from typing import ClassVar
 
 import numpy as np
 import pytest
 import torch
 
-from torchcover import BevGrid, Coverage, CoverageMetric
-from torchcover.coverage import AGGREGATIONS, Aggregation, Layer, Quantiles, State, StepQuantiles
-from torchcover.estimation import Quantity
+from torchcover import BevGrid, Coverage, CoverageMetric, Region
+from torchcover.coverage import (
+    AGGREGATIONS,
+    Aggregation,
+    Layer,
+    Maximum,
+    PooledMean,
+    Quantiles,
+    State,
+    StepQuantiles,
+    aggregation_named,
+)
+from torchcover.estimation import Estimate, Quantity
+from torchcover.report import RENDERERS, CoverageTable
 
 ONE_CELL = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
 NOTHING = torch.zeros(0, 3)
@@ -94,7 +106,167 @@ def test_blind_steps_saturate_and_unprobed_ones_do_not_count():
     assert quantile(steps, 0.4, kind=StepQuantiles) == pytest.approx(0.1, rel=0.13)
 
 
+# Regions
+
+
+def random_steps(count, seed=0):
+    """Points around the origin, with weights, seen from a few others."""
+    random = np.random.default_rng(seed)
+    for _ in range(count):
+        points, seen = (torch.from_numpy(random.uniform(-2, 2, (n, 3)) * [1, 1, 0.2]) for n in (60, 3))
+        yield seen, points, torch.from_numpy(random.uniform(0.5, 2, 60))
+
+
+NEAR, ALL = Region("near", (-1.0, 1.0), (-1.0, 1.0)), Region("all", (-2.0, 2.0), (-2.0, 2.0))
+FOUR = BevGrid(x=(-2.0, 2.0), y=(-2.0, 2.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+MEANS = {"radius_m", "detection_0.4m"}
+EVERY = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), StepQuantiles((0.5,)))
+
+
+def in_regions(steps, first=0, **options):
+    metric = CoverageMetric(FOUR, blocks=8, aggregations=EVERY, regions=[NEAR, ALL], max_radius=9.0, **options)
+    for index, (sensor, reference, weights) in enumerate(steps, first):
+        metric.update(sensor, reference, weights=weights, index=index)
+    return metric
+
+
+def radii_in(region, sensor, reference, weights):
+    """Of the points of a region, with their weights."""
+    inside = ((reference[:, :2] >= region.x[0]) & (reference[:, :2] < region.x[1])).all(dim=1)
+    return torch.cdist(reference[inside], sensor).amin(dim=1).numpy(), weights[inside].numpy()
+
+
+def test_the_number_of_a_region_is_what_the_aggregation_makes_of_all_its_points():
+    steps = list(random_steps(40))
+    coverage = in_regions(steps, square_metres=True).compute()
+    for row, region in zip(coverage.summary(), (NEAR, ALL), strict=True):
+        each = [radii_in(region, *step) for step in steps]
+        radii, m2 = (np.concatenate(parts) for parts in zip(*each, strict=True))
+        found = {key: number.value for key, number in row.numbers.items()}
+        assert found["radius_maximum_m"] == pytest.approx(radii.max(), rel=1e-6)
+        # Points that weigh their square metres: their pooled mean is that by area.
+        assert found["radius_pooled_m"] == pytest.approx((radii * m2).sum() / m2.sum(), rel=1e-6)
+        assert found["radius_pooled_m"] == pytest.approx(found["radius_m"], rel=1e-12)
+        shares = np.concatenate([own / own.sum() for _, own in each])
+        order = radii.argsort()
+        half = radii[order][np.searchsorted(shares[order].cumsum(), 0.5 * len(steps))]
+        assert found["radius_q0.5_m"] == pytest.approx(half, rel=0.13)
+        means = [(own * weights).sum() / weights.sum() for own, weights in each]
+        assert found["radius_step_q0.5_m"] == pytest.approx(np.quantile(means, 0.5), rel=0.13)
+
+
+def test_the_error_of_a_region_s_number_is_the_jackknife_over_its_blocks():
+    steps = list(random_steps(16))
+    coverage = in_regions(steps, square_metres=True).compute()
+    numbers = coverage.summary()[0].numbers
+    whole = numbers["radius_q0.9_m"].value
+    left_out = []
+    for block in range(8):
+        rest = [step for at, step in enumerate(steps) if at // 2 != block]
+        left_out.append(in_regions(rest, square_metres=True).compute().summary()[0].numbers["radius_q0.9_m"].value)
+    pseudo = 8 * whole - 7 * np.array(left_out)
+    assert numbers["radius_q0.9_m"].error == pytest.approx(pseudo.std(ddof=1) / 8**0.5, rel=1e-9)
+    assert numbers["radius_pooled_m"].error == pytest.approx(numbers["radius_m"].error, rel=1e-9)
+    assert math.isnan(numbers["radius_maximum_m"].error)
+    assert all(math.isnan(number.error) for number in in_regions(steps[:7]).compute().summary()[0].numbers.values())
+
+
+@pytest.mark.parametrize("square_metres", [True, False])
+def test_parts_and_files_give_the_numbers_of_the_whole(tmp_path, square_metres):
+    steps = list(random_steps(64))
+    whole = in_regions(steps, square_metres=square_metres).compute()
+    one, other = (
+        in_regions(part, first, square_metres=square_metres) for part, first in ((steps[:5], 0), (steps[5:], 5))
+    )
+    one.merge_state(other)
+    for row, expected in zip(one.compute().summary(), whole.summary(), strict=True):
+        for key, number in expected.numbers.items():
+            assert row.numbers[key][1:3] == pytest.approx(number[1:3], rel=1e-9, nan_ok=True)
+    whole.save(tmp_path / "c.npz")
+    assert str(Coverage.load(tmp_path / "c.npz").summary()) == str(whole.summary())
+    assert whole.scalars()["radius_q0.9_m_error/near/all"] == whole.summary()[0].numbers["radius_q0.9_m"].error
+
+
+def test_what_was_not_seen_or_not_asked_for_is_unknown():
+    empty = in_regions([(ORIGIN, NOTHING, torch.zeros(0))] * 9).compute()
+    other = Region("other", (0.0, 2.0), (0.0, 2.0))
+    for coverage, region in ((empty, NEAR), (in_regions(random_steps(9)).compute(), other)):
+        numbers = coverage.summary([region])[0].numbers
+        assert numbers.keys() >= {"radius_maximum_m", "radius_pooled_m", "radius_q0.5_m", "radius_step_q0.5_m"}
+        assert all(not number.known and math.isnan(number.error) for key, number in numbers.items() if key not in MEANS)
+
+
+def test_any_number_of_a_result_has_an_estimate():
+    def measured(shift):
+        metric = CoverageMetric(
+            FOUR, aggregations=EVERY, regions=[NEAR], sensors=["a", "b"], square_metres=True, blocks=8, max_radius=9.0
+        )
+        for world, (seen, reference, weights) in enumerate(random_steps(3)):
+            metric.update({"a": seen[:2] + shift, "b": seen[2:]}, reference, weights=weights, index=world)
+        return metric.compute()
+
+    one, other = measured(0.0), measured(0.1)
+    keys = [quantity.key for quantity in one.every_quantity]
+    assert {"known_radius_m", "radius_m_without_a", "radius_q0.9_m", "seen_by_two_0.4m"} < set(keys)
+    row = one.summary()[0]
+    values = {**row.numbers, **{f"known_{key}": number for key, number in row.known.items()}, **row.redundancy.seen_by}
+    for key in keys:
+        found, compared = (each.estimate_of(key, NEAR, "all") for each in (one, other))
+        assert [quantity.key for quantity in found.quantities] == [key]
+        if key in values:
+            assert float(found.value) == values[key].value
+        # Three worlds are too few to show an error, and enough to race with.
+        assert found.left_out.shape == (3, 1)
+        assert math.isnan(found.error)
+        (difference,) = compared.differences(found, least=3).values()
+        assert difference.blocks == 3
+        assert math.isnan(difference.error) == (key == "radius_maximum_m")
+    with pytest.raises(ValueError, match=r"radius_q0\.8_m: the result has no such number; it has radius_q0"):
+        one.estimate_of("radius_q0.8_m", NEAR, "all")
+
+
 # Any other
+
+
+@dataclass(frozen=True)
+class Blind(Aggregation):
+    """The share of points that nothing is near: all that an aggregation of sums has to be."""
+
+    name: ClassVar[str] = "blind"
+    words: ClassVar[str] = "blind shares"
+
+    def states(self, cells):
+        return {name: State(torch.zeros(cells, dtype=torch.float64)) for name in ("blind", "all")}
+
+    def update(self, sums, step):
+        sums["blind"].index_add_(0, step.cell, (step.radius > 0.5).double())
+        sums["all"].index_add_(0, step.cell, torch.ones_like(step.radius))
+
+    def layers(self, sums, probed_steps, max_radius):
+        quantity = Quantity("blind_share", "share that nothing is near", "share", lower_is_better=True)
+        return [Layer(quantity, sums["blind"] / sums["all"])]
+
+
+def test_an_aggregation_of_ones_own_has_a_map_numbers_errors_and_a_place_in_every_table():
+    steps = list(random_steps(16))
+    metric = CoverageMetric(FOUR, blocks=16, aggregations=[Blind()], regions=[NEAR])
+    for index, (sensor, reference, _) in enumerate(steps):
+        metric.update(sensor, reference, index=index)
+    found = metric.compute()
+    blind = [(radii_in(NEAR, *step)[0] > 0.5) for step in steps]
+    base, sums = (
+        torch.tensor(each, dtype=torch.float64) for each in ([len(b) for b in blind], [b.sum() for b in blind])
+    )
+    expected = Estimate.of_ratios((), base, sums[:, None], torch.ones(16))
+    number = found.summary()[0].numbers["blind_share"]
+    assert (number.value, number.error) == pytest.approx((float(expected.value), float(expected.error)), rel=1e-12)
+    assert found.layers["blind_share"].values.shape == FOUR.shape
+    table = CoverageTable.of({"rig": found}, [NEAR])
+    assert table.rows["rig"][0].summary.numbers["blind_share"] == number
+    for written in ("text", "csv", "json", "markdown"):
+        assert "blind_share" in RENDERERS[written](table) or "nothing is near" in " ".join(
+            RENDERERS[written](table).split()
+        )
 
 
 @dataclass(frozen=True)
@@ -131,3 +303,23 @@ def test_an_aggregation_of_ones_own_is_measured_merged_saved_and_loaded(tmp_path
 
 def test_aggregations_have_names_of_their_own():
     assert len({kind.name for kind in AGGREGATIONS}) == len({kind.words for kind in AGGREGATIONS}) == len(AGGREGATIONS)
+
+
+def test_each_of_the_package_has_a_name_that_makes_it():
+    for kind in AGGREGATIONS:
+        words = f"{kind.name}:0.5,0.9" if fields(kind) else kind.name
+        assert aggregation_named(words) == (kind((0.5, 0.9)) if fields(kind) else kind())
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("minimum", "aggregation minimum: one of maximum, quantiles, step_quantiles, pooled is needed"),
+        ("maximum:0.5", "aggregation maximum:0.5: maximum takes no levels"),
+        ("quantiles", "aggregation quantiles: levels are needed, as in quantiles:0.5,0.9"),
+        ("quantiles:0.5,2", "aggregation quantiles:0.5,2: levels are needed"),
+    ],
+)
+def test_what_makes_no_aggregation_is_refused(words, message):
+    with pytest.raises(ValueError, match=re.escape(message)):
+        aggregation_named(words)

@@ -250,7 +250,7 @@ def rewrite(path, header=None, **arrays):
         {"header": lambda _: "[1]"},
         {"header": lambda _: "3"},
         {"header": lambda _: "no JSON"},
-        {"header": lambda _: '{"format": 4}'},
+        {"header": lambda _: '{"format": 5}'},
         {"header": lambda old: json.dumps({name: value for name, value in old.items() if name != "counts"})},
         {"header": lambda old: json.dumps({**old, "grid": {**old["grid"], "cell": 0.7}})},
     ],
@@ -311,6 +311,6 @@ def test_an_array_file_is_no_coverage_file(saved):
 
 
 def test_a_newer_format_is_refused_by_its_number(saved):
-    rewrite(saved, header=lambda old: json.dumps({**old, "format": 5, "unheard of": 1}))
-    with pytest.raises(ValueError, match=r"coverage\.npz: coverage format 5; this torchcover reads format 4"):
+    rewrite(saved, header=lambda old: json.dumps({**old, "format": 6, "unheard of": 1}))
+    with pytest.raises(ValueError, match=r"coverage\.npz: coverage format 6; this torchcover reads format 5"):
         Coverage.load(saved)

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from torchcover import Region, compare
+from torchcover import Region, evaluate
 from torchcover.data import RegionsOfInterest
 from torchcover.evaluation import agree, save_agreement, score_placements
 from torchcover.evaluation.agreeing import READINGS, TRUTHS
@@ -85,7 +85,7 @@ def test_own_numbers_are_those_of_compare_over_both_measures():
         "regions": {"front": {"x_m": (0, 20), "y_m": (-10, 10)}},
         "grid": {"x_m": (0, 20), "y_m": (-10, 10), "cell_m": 1.0},
     }
-    result = compare(list(RIGS.values()), "courtyard", ask=RegionsOfInterest.model_validate(asked), steps=8, seed=3)
+    result = evaluate(list(RIGS.values()), "courtyard", ask=RegionsOfInterest.model_validate(asked), steps=8, seed=3)
     found = {one.name: one for one in scores.candidates}
     for measure, words in (("area", "visible surface"), ("known", "known cells")):
         each = [

@@ -14,7 +14,7 @@ import torchcover
 from torchcover.coverage import Maximum, StepQuantiles
 from torchcover.data import BadFrameError
 from torchcover.evaluation import Checkpoint, checkpoint
-from torchcover.evaluation.checkpoint_file import read_header, read_state, write_checkpoint
+from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
 from torchcover.files import BadFileError
 
 STEPS = 16
@@ -155,7 +155,7 @@ def test_a_complete_run_goes_on_when_more_steps_are_wanted(frame_of, path):
 
 def test_looks_at_a_target_error_go_on_as_they_would_have(frame_of, path, monkeypatch):
     monkeypatch.setattr("torchcover.evaluation.target_error.MIN_STEPS", 8)
-    target = {"target_error": "0.2m", "thresholds": ()}
+    target = {"target_error": "0.2m", "thresholds_m": ()}
     whole = measured(Drive(frame_of), **target)
     assert 8 < whole.run.steps < STEPS
     for at in range(6, whole.run.steps - 1):
@@ -176,7 +176,7 @@ def test_what_one_observer_has_seen_and_another_has_not_is_not_kept(frame_of, pa
     ("changes", "named"),
     [
         ({"cell_m": 4.0}, r"cell_m \(8.0 there, 4.0 here\)"),
-        ({"thresholds": (0.4, 1.0)}, r"thresholds \(\[0.4\] there, \[0.4, 1.0\] here\)"),
+        ({"thresholds_m": (0.4, 1.0)}, r"thresholds_m \(\[0.4\] there, \[0.4, 1.0\] here\)"),
         ({"aggregations": ()}, r"aggregations \(other content\)"),
         ({"estimate": "known"}, r"estimate \(null there, \"known\" here\)"),
         ({"target_error": "1%"}, r"target_error \(other content\)"),

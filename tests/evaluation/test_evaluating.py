@@ -1,9 +1,12 @@
 """`evaluate` and `compare`: what a notebook gets is what the command line writes."""
 
 import csv
+import dataclasses
+import inspect
 import json
 import re
 import sys
+from collections.abc import Iterable
 
 import numpy as np
 import pytest
@@ -12,9 +15,9 @@ from matplotlib.figure import Figure
 
 import torchcover
 from torchcover import Coverage, Rig, Scenario
-from torchcover.coverage import Maximum
+from torchcover.coverage import Maximum, Quantiles
 from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame
-from torchcover.evaluation import TargetError
+from torchcover.evaluation import Settings, TargetError
 from torchcover.evaluation.omissions import HEAVY
 
 SMALL = {"steps": 2, "cell_m": 4.0, "rays": 1024}
@@ -85,7 +88,7 @@ def test_one_rig(tmp_path):
 
 def test_rigs_and_scenarios_as_objects_and_the_others_against_the_first(tmp_path):
     rigs = [Rig.load("front_roof_32"), Rig.load("front_roof_32").model_copy(update={"name": "again"})]
-    result = torchcover.compare(rigs, Scenario.load("courtyard"), **SMALL)
+    result = torchcover.evaluate(rigs, Scenario.load("courtyard"), **SMALL)
     assert list(result.coverages) == ["front_roof_32", "again"]
     with pytest.raises(ValueError, match=r"2 rigs \(front_roof_32, again\): use coverages"):
         _ = result.coverage
@@ -107,19 +110,15 @@ def test_no_world_is_built_after_the_run_to_draw_the_ego(monkeypatch):
 
 
 def test_any_source_of_frames_will_do():
-    both = torchcover.compare(frames=Source(), cell_m=4.0)
+    both = torchcover.evaluate(frames=Source(), cell_m=4.0)
     assert list(both.coverages) == ["low", "high"]
     assert both.record["frames"] == "made up"
     assert both.record["reference"] is None
     one = torchcover.evaluate("high", frames=Source(), cell_m=4.0, steps=2)
     assert one.run.steps == 2
     assert torch.equal(one.coverage.radius.nan_to_num(-1.0), both.coverages["high"].radius.nan_to_num(-1.0))
-    with pytest.raises(ValueError, match="rigs low, high: say which, or compare them"):
-        torchcover.evaluate(frames=Source())
     with pytest.raises(ValueError, match=r"no clouds of the rig middle; the frames have low, high"):
-        torchcover.compare(["low", "middle"], frames=Source())
-    with pytest.raises(ValueError, match="at least two rigs; got 'low' only"):
-        torchcover.compare(["low"], frames=Source())
+        torchcover.evaluate(["low", "middle"], frames=Source())
     with pytest.raises(ValueError, match="exclude each other"):
         torchcover.evaluate("low", "courtyard", frames=Source())
 
@@ -206,13 +205,13 @@ def test_observers_see_the_rigs_that_are_measured_under_their_names():
     assert one.observed["rigs"] == {("high",)}
     named = torchcover.evaluate("kitti", frames=Single(), cell_m=4.0, steps=2, observers={"rigs": Rigs()})
     assert named.observed["rigs"] == {("kitti",)}
-    both = torchcover.compare(["high", "low"], frames=Source(), cell_m=4.0, observers={"rigs": Rigs()})
+    both = torchcover.evaluate(["high", "low"], frames=Source(), cell_m=4.0, observers={"rigs": Rigs()})
     assert both.observed["rigs"] == {("high", "low")}
 
 
 def test_a_rig_may_be_called_what_no_file_can_be(tmp_path):
     rigs = [Rig.load("front_roof_32").model_copy(update={"name": name}) for name in ("a/b", "a b")]
-    result = torchcover.compare(rigs, **{**SMALL, "steps": 1})
+    result = torchcover.evaluate(rigs, **{**SMALL, "steps": 1})
     result.save(tmp_path)
     stems = [path.stem for path in sorted((tmp_path / "coverage").iterdir())]
     assert len(stems) == 2
@@ -221,7 +220,7 @@ def test_a_rig_may_be_called_what_no_file_can_be(tmp_path):
 
 def test_settings_have_one_form_whatever_they_are_given_as():
     result = torchcover.evaluate(
-        frames=Single(), cell_m=4.0, steps=1, thresholds=0.4, device=torch.device("cpu"), target_error="5%"
+        frames=Single(), cell_m=4.0, steps=1, thresholds_m=0.4, device=torch.device("cpu"), target_error="5%"
     )
     assert result.coverage.thresholds == (0.4,)
     assert result.record["device"] == "cpu"
@@ -234,9 +233,10 @@ def test_settings_have_one_form_whatever_they_are_given_as():
     [
         ({"steps": 0}, ValueError, "steps: at least 1 is needed; got 0"),
         ({"steps": -1}, ValueError, "steps: at least 1 is needed; got -1"),
-        ({"thresholds": "0.4"}, TypeError, "thresholds: metres are needed, as in 0.4"),
+        ({"thresholds_m": "0.4"}, TypeError, "thresholds_m: metres are needed, as in 0.4"),
         ({"target_error": 0.1}, TypeError, "target error: numbers with their units"),
-        ({"aggregations": Maximum()}, TypeError, "aggregations: a sequence of objects"),
+        ({"aggregations": Maximum()}, TypeError, "aggregations: names such as maximum"),
+        ({"aggregations": "minimum"}, ValueError, "aggregation minimum: one of maximum"),
         ({"frames": [1, 2]}, TypeError, "FrameSource is needed; got list, which has no rigs, "),
     ],
 )
@@ -245,13 +245,43 @@ def test_what_a_setting_cannot_be_is_said_before_the_run(settings, error, messag
         torchcover.evaluate(**{"frames": Single(), "cell_m": 4.0, **settings})
 
 
-def test_a_single_rig_is_no_list_of_rigs():
-    with pytest.raises(TypeError, match="a list of two or more is needed; got 'front_roof_32'"):
-        torchcover.compare("front_roof_32")
+def test_a_rig_alone_and_a_list_of_it_are_one_thing():
+    alone, listed = (torchcover.evaluate(rigs, frames=Source(), cell_m=8.0) for rigs in ("high", ["high"]))
+    assert alone.summary == listed.summary
+    assert not listed.is_comparison
+
+
+def test_results_are_compared_as_if_they_had_been_measured_together():
+    low, high = (torchcover.evaluate(rig, frames=Source(), cell_m=4.0) for rig in ("low", "high"))
+    together = torchcover.evaluate(["low", "high"], frames=Source(), cell_m=4.0)
+    assert torchcover.compare([low, high]).summary == torchcover.compare([together]).summary == together.summary
+    assert torchcover.compare([low, high]).run is None
+    with pytest.raises(ValueError, match="at least two measured rigs; got low only"):
+        torchcover.compare([low])
+    with pytest.raises(ValueError, match=r"front_roof_32: not measured; compare takes results and \.npz files"):
+        torchcover.compare(["front_roof_32", "front_roof_128"])
+    with pytest.raises(TypeError, match="results of `evaluate` or coverage files are needed; got Coverage"):
+        torchcover.compare([low.coverage, high.coverage])
+
+
+def test_every_argument_is_declared_once_and_stands_in_the_signature_and_in_the_docstring():
+    """And an argument that is none is refused by its name."""
+    parameters = inspect.signature(torchcover.evaluate).parameters
+    assert [*parameters] == [one.name for one in dataclasses.fields(Settings)]
+    assert [name for name, one in parameters.items() if one.kind is one.POSITIONAL_OR_KEYWORD] == ["rigs", "scenario"]
+    assert parameters["thresholds_m"].annotation == float | Iterable[float]
+    assert parameters["device"].default == "cpu"
+    for name in parameters:
+        assert f"\n    {name}: " in torchcover.evaluate.__doc__
+    with pytest.raises(TypeError, match="evaluate: got an unexpected keyword argument 'stepz'"):
+        torchcover.evaluate("front_roof_32", stepz=3)
 
 
 def test_aggregations_are_measured_drawn_and_saved(tmp_path):
-    result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1, aggregations=[Maximum()])
+    result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1, aggregations=["maximum", Quantiles((0.5,))])
+    assert all(
+        row["radius_q0.5_m"] <= 1.13 * row["radius_maximum_m"] + 0.01 for row in result.summary if row["known_cells"]
+    )
     (quantity,) = [layer.quantity for layer in result.coverage.layers.values() if "maximum" in layer.quantity.key]
     files = result.save(tmp_path)
     assert f"{quantity.key}_ground" in {path.stem for path in files}
@@ -272,13 +302,13 @@ def test_a_folder_of_results_is_of_one_run(tmp_path):
     (tmp_path / "maps").mkdir()
     for mine in ("notes.txt", "maps/mine.png"):
         (tmp_path / mine).write_text("mine")
-    torchcover.compare(frames=Source(), cell_m=8.0, thresholds=(0.4, 1.0)).save(tmp_path, error_maps=True)
+    torchcover.evaluate(frames=Source(), cell_m=8.0, thresholds_m=(0.4, 1.0)).save(tmp_path, error_maps=True)
     files = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=2).save(tmp_path)
     found = {path for path in tmp_path.rglob("*") if path.is_file()}
     assert found == {*files, tmp_path / "notes.txt", tmp_path / "maps" / "mine.png"}
     listed = json.loads((tmp_path / "summary.json").read_text())["files"]
     assert {tmp_path / name for name in listed} == {*files} - {tmp_path / "summary.json"}
-    torchcover.compare(frames=Source(), cell_m=8.0).save(tmp_path)
+    torchcover.evaluate(frames=Source(), cell_m=8.0).save(tmp_path)
     assert not (tmp_path / "coverage.npz").exists()
 
 
@@ -313,7 +343,7 @@ def test_a_result_stays_whole_until_the_numbers_of_the_next_are_there(tmp_path, 
 
 
 def test_numbers_are_safe_and_listed_although_a_map_could_not_be_written(tmp_path, monkeypatch):
-    torchcover.compare(frames=Source(), cell_m=8.0).save(tmp_path)
+    torchcover.evaluate(frames=Source(), cell_m=8.0).save(tmp_path)
     monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: full(path))
     with pytest.raises(OSError, match="no space left"):
         torchcover.evaluate(frames=Single(), cell_m=8.0, steps=2).save(tmp_path)

@@ -8,7 +8,7 @@ import pytest
 import torchcover
 from torchcover import Rig, Scenario
 from torchcover.data import SimulatedFrames
-from torchcover.evaluation.settings import spread_s
+from torchcover.evaluation.task import spread_s
 from torchcover.simulation import PaperReference
 
 RIG = Rig.model_validate(
@@ -27,7 +27,7 @@ RIG = Rig.model_validate(
         ],
     }
 )
-FEW = {"cell_m": 4.0, "rays": 64, "reference_sensor": "paper"}
+FEW = {"cell_m": 4.0, "rays": 64, "reference": "paper"}
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def errors(result):
 def test_going_round_again_makes_no_error_smaller(drive):
     # A reference whose own draws scatter little: only that becomes less. Four rounds of new data would have half the
     # error.
-    settings = {**FEW, "reference_sensor": "surface", "rays": 1024}
+    settings = {**FEW, "reference": "surface", "rays": 1024}
     once, often = (torchcover.evaluate(RIG, drive(8), steps=steps, **settings) for steps in (8, 8 * 4))
     known = errors(once) > 0
     assert np.median(errors(often)[known] / errors(once)[known]) > 0.75

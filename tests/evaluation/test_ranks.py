@@ -88,7 +88,7 @@ def in_ranks(folder, work, size=2):
 
 
 def measured(source, ranks=None, **settings):
-    result = torchcover.compare(
+    result = torchcover.evaluate(
         ["a", "b"], frames=source, cell_m=8.0, observers={"names": Names()}, ranks=ranks, **settings
     )
     counts, sums = {}, {}

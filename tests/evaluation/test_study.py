@@ -8,6 +8,7 @@ import torch
 from torchcover.coverage import BevGrid, CoverageMetric
 from torchcover.evaluation import (
     CoverageObserver,
+    Settings,
     StudyPlan,
     Truth,
     area_sums,
@@ -15,9 +16,10 @@ from torchcover.evaluation import (
     evaluate,
 )
 from torchcover.evaluation.study_runs import tried
+from torchcover.simulation import Rig
 
 GRID = BevGrid(x=(-40.0, 160.0), y=(-40.0, 40.0), cell=8.0)
-SMALL = {"rays": (64,), "steps": 2, "runs": 2, "long_run_steps": 8, "cell_m": 4.0}
+SMALL = {"settings": Settings("front_roof_32", steps=2, cell_m=4.0), "rays": (64,), "runs": 2, "long_run_steps": 8}
 
 
 def coverage(shift_m, steps=1, **settings):
@@ -64,7 +66,7 @@ def test_only_square_metres_can_be_a_long_run():
 
 
 def test_a_study_says_of_the_same_steps_what_an_evaluation_says():
-    plan = StudyPlan("front_roof_32", **SMALL)
+    plan = StudyPlan(**SMALL)
     same = evaluate("front_roof_32", steps=4, cell_m=4.0, rays=64).coverage
     (trial,) = tried(plan, 100.0, progress=False).trials
     whole, again = trial.sums(4)[0], area_sums(same)
@@ -72,7 +74,7 @@ def test_a_study_says_of_the_same_steps_what_an_evaluation_says():
 
 
 def test_more_steps_cost_more_time_and_the_start_is_in_it():
-    study = error_against_time(StudyPlan("front_roof_32", **SMALL))
+    study = error_against_time(StudyPlan(**SMALL))
     assert [(point.rays, point.steps, point.runs) for point in study.points] == [(64, 1, 4), (64, 2, 2)]
     one, two = study.points
     assert study.start_s < 100 < study.start_s + 50
@@ -85,31 +87,40 @@ def test_more_steps_cost_more_time_and_the_start_is_in_it():
 
 
 def test_runs_are_looked_at_whenever_their_steps_have_doubled():
-    assert StudyPlan("rig", steps=100).lengths == [6, 12, 24, 48, 96]
-    assert StudyPlan("rig", steps=5).lengths == [1, 2, 4]
+    assert StudyPlan(Settings("rig", steps=100)).lengths == [6, 12, 24, 48, 96]
+    assert StudyPlan(Settings("rig", steps=5)).lengths == [1, 2, 4]
+
+
+def test_the_command_that_is_timed_has_every_option_that_is_not_as_usual():
+    settings = Settings("rig", "urban", cell_m=0.5, thresholds_m=(0.2, 1), every_s=5.0, steps=7)
+    assert StudyPlan(settings).command == [
+        "evaluate", "rig", "--scenario=urban", "--cell-m=0.5", "--thresholds-m=0.2", "--thresholds-m=1.0",
+        "--every-s=5.0",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"rays": ()}, "rays: at least one is needed"),
-        ({"steps": 0}, "steps: at least 1 is needed; got 0"),
         ({"runs": 0}, "runs: at least 1 is needed; got 0"),
         ({"long_run_steps": 0}, "long_run_steps: at least 1"),
+        ({"settings": Settings()}, "one rig and a scenario are needed, by names or paths"),
+        ({"settings": Settings(Rig.load("front_roof_32"))}, "one rig and a scenario are needed, by names or paths"),
     ],
 )
 def test_a_plan_that_makes_no_sense_is_refused_at_once(changes, message):
     with pytest.raises(ValueError, match=message):
-        StudyPlan("front_roof_32", **changes)
+        StudyPlan(**{**SMALL, **changes})
 
 
 def test_a_saved_long_run_is_used_and_one_of_another_threshold_refused(tmp_path):
     saved = tmp_path / "long_run.npz"
     coverage(0.0, blocks=16).save(saved)
-    study = error_against_time(StudyPlan("front_roof_32", **{**SMALL, "long_run": saved}))
+    study = error_against_time(StudyPlan(**SMALL, long_run=saved))
     assert torch.equal(study.truth.coverage.radius, coverage(0.0).radius)
     with pytest.raises(ValueError, match=r"long_run.npz: measured within 0.4 m; wanted is 0.2 m"):
-        error_against_time(StudyPlan("front_roof_32", threshold_m=0.2, long_run=saved))
+        error_against_time(StudyPlan(Settings("front_roof_32", thresholds_m=0.2), long_run=saved))
 
 
 def test_a_long_run_that_was_cut_short_is_no_truth(monkeypatch):
@@ -123,4 +134,4 @@ def test_a_long_run_that_was_cut_short_is_no_truth(monkeypatch):
         lambda self, frame: interrupted() if calls else calls.append(frame) or update(self, frame),
     )
     with pytest.raises(KeyboardInterrupt):
-        error_against_time(StudyPlan("front_roof_32", **SMALL))
+        error_against_time(StudyPlan(**SMALL))

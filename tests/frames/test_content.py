@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torchcover.data import ChosenRigs, RecordedFrames, SimulatedFrames
-from torchcover.simulation.aimed_reference import reference_called
+from torchcover.simulation.simulated_frames import reference_called
 
 RIG = (
     "name: low\nsensors:\n  - {name: front, mount: {x_m: 2.5, z_m: 0.8}, channels: 8, vertical_fov_deg: [-30, 0], "

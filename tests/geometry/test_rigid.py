@@ -5,7 +5,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchcover.geometry import check_rigid, invert, rigid, rotation_from_euler, rotation_from_quaternion, transform
+from torchcover.geometry import (
+    check_rigid,
+    euler_from_rotation,
+    invert,
+    rigid,
+    rotation_from_euler,
+    rotation_from_quaternion,
+    transform,
+)
 
 angles = st.tuples(*[st.floats(-360, 360)] * 3)
 positions = st.tuples(*[st.floats(-1e3, 1e3)] * 3)
@@ -135,3 +143,10 @@ def changed(row, column, value):
 def test_check_rigid_says_what_is_wrong(bad, message):
     with pytest.raises(ValueError, match=message):
         check_rigid(bad, "T")
+
+
+@pytest.mark.parametrize("pitch", [-90.0, -89.999, 0.0, 45.0, 90.0])
+def test_euler_angles_describe_the_rotation_they_came_from(pitch):
+    for yaw, roll in ((0, 0), (30, 20), (-170, 100)):
+        rotation = rotation_from_euler(yaw, pitch, roll)
+        np.testing.assert_allclose(rotation_from_euler(*euler_from_rotation(rotation)), rotation, atol=1e-8)

@@ -11,7 +11,11 @@ from torchcover.placement import Objective, paired
 from torchcover.simulation import Scenario, Simulator, SurfaceReference
 
 NOISY = lidar("noisy", range_noise_m=0.03, dropout=0.2, mount={"x_m": 0.5, "z_m": 2.2, "yaw_deg": 40})
-TWO = rig(lidar(), NOISY, name="two")
+RADAR = {
+    "type": "radar", "name": "radar", "mount": {"x_m": 2.1, "z_m": 0.6}, "horizontal_fov_deg": 120,
+    "vertical_fov_deg": [-20, 20], "azimuth_cell_deg": 6, "range_cell_m": 0.4, "max_range_m": 40, "dropout": 0.1,
+}  # fmt: skip
+TWO = rig(lidar(), NOISY, RADAR, name="two")
 
 
 def same(a, b):
@@ -84,7 +88,7 @@ def test_the_order_of_instants_and_of_rigs_makes_no_difference(instants):
     both = instants.score(TWO, [1, 2]).joined(instants.score(TWO, [0, 5]))
     np.testing.assert_array_equal(both.area, whole.at([1, 2, 0, 5]).area)
     counts = [instants.bits(TWO, [k]).self_hits.sum() for k in (0, 1, 2, 5)]
-    assert both.self_hit_share == pytest.approx(sum(counts) / 4 / TWO.sensors[0].rays / 2)
+    assert both.self_hit_share == pytest.approx(sum(counts) / 4 / sum(sensor.rays for sensor in TWO.sensors))
 
 
 def test_the_bits_of_a_rig_are_those_of_any_of_its_sensors(instants):

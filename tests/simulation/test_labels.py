@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Box
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World, labels
 
 CAR = Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh()

@@ -6,6 +6,7 @@ import torch
 
 from torchcover.data import SimulatedFrames
 from torchcover.detection import box_visibility
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Rig, SurfaceReference
 from torchcover.simulation.patches import Bounds, Patches
 from torchcover.simulation.reference_sensor import Surroundings
@@ -13,7 +14,6 @@ from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Plane
 from torchcover.simulation.sight import sight
 from torchcover.simulation.surface_points import SurfaceStrata
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World
 
 from .small_worlds import AHEAD, FLOOR, agrees, box, scenario

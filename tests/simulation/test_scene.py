@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Pose, Scenario
 from torchcover.simulation.bodies import in_vehicle_frame
 from torchcover.simulation.instant import ALL_AROUND_RAYS, BURIED_SHARE, CLEAR_RADII
 from torchcover.simulation.rays import into_tiles, unit_directions
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Plane
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World
 
 SPHERE = into_tiles(unit_directions(np.linspace(-89, 89, 150)[:, None], np.linspace(-179, 179, 300)[None]))

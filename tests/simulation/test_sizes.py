@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import (
     CameraSensor,
     Lidar,
@@ -18,7 +19,6 @@ from torchcover.simulation.memory import check_fits, machine_bytes
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box
 from torchcover.simulation.traffic import Highway, Urban
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World, steps_of
 
 SPACED = {"vertical_fov_deg": (-10, 10), "horizontal_fov_deg": 360, "max_range_m": 50}

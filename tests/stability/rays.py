@@ -7,11 +7,11 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from torchcover.geometry import rigid, rotation_from_euler, transform
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Mesh, Plane
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World
 
 from .case import Case, most, relative

@@ -1,9 +1,12 @@
-"""What a user writes, under `mypy --strict` (`make types`): nothing in it may need a cast or an ignore."""
+"""What a user writes, under `mypy --strict` (`make types`): nothing that is right needs a cast or an ignore."""
 
+from pathlib import Path
+
+import torch
 from torchmetrics import MetricCollection
 from torchmetrics.wrappers import MetricTracker
 
-from torchcover import BevGrid, Coverage, CoverageMetric, Region
+from torchcover import BevGrid, Coverage, CoverageMetric, Region, compare, evaluate
 from torchcover.coverage import CoverageNumber
 from torchcover.data import ChosenRigs, Frame, RecordedFrames, SimulatedFrames
 
@@ -14,6 +17,15 @@ def measured(frames: SimulatedFrames | RecordedFrames | ChosenRigs) -> Coverage:
     for frame in frames:
         metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, index=frame.place_in_time)
     return metric.compute()
+
+
+def compared(rigs: list[Path], frames: SimulatedFrames) -> list[float]:
+    """Arguments in each of their forms, and what `evaluate` gives."""
+    one = evaluate("front_roof_128", "urban", steps=64, thresholds_m=0.4, device=torch.device("cpu"), metrics="all")
+    several = evaluate(rigs, frames=frames, thresholds_m=(0.4, 1.0), ask="ask.yaml", target_error=["1%", "0.02m"])
+    evaluate("front_roof_128", stepz=64)  # type: ignore[call-arg]  # an argument that there is not
+    evaluate("front_roof_128", steps="64")  # type: ignore[arg-type]
+    return [float(coverage.radius.nanmean()) for coverage in compare([one, several, "saved.npz"]).coverages.values()]
 
 
 def names(frames: RecordedFrames) -> list[str]:

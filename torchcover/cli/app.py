@@ -1,21 +1,14 @@
-"""The commands and their options."""
+"""The command line as a program: its commands, and how they end."""
 
 import io
 import sys
 import warnings
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from torchcover.cli import options
-from torchcover.cli.agree import agree
-from torchcover.cli.asking import asked
-from torchcover.cli.record import record
-from torchcover.cli.running import checkpoint_in, finish, logged, opened, sharing, watching
-from torchcover.cli.search import search
-from torchcover.cli.study import study
-from torchcover.cli.targets import targets
+from torchcover.cli import commands
+from torchcover.cli.evaluate import compare, evaluate
 from torchcover.evaluation.interrupt import terminable
 
 app = typer.Typer(
@@ -84,194 +77,10 @@ def version(show: Annotated[bool, typer.Option("--version", help="Print the vers
         raise typer.Exit
 
 
-@app.command()
-def evaluate(
-    rig: options.RigOrNone = None,
-    scenario: options.ScenarioOrNone = None,
-    frames: options.Frames = None,
-    recording_format: options.Format = None,
-    sensors: options.Sensors = None,
-    window: options.Window = None,
-    steps: options.Steps = None,
-    seed: options.Seed = 0,
-    vehicle: options.Vehicle = None,
-    out: options.Out = Path("out"),
-    region: options.Regions = None,
-    height: options.Heights = None,
-    grid: options.Grid = None,
-    ask: options.Ask = None,
-    cell: options.Cell = None,
-    threshold: options.Thresholds = None,
-    reference: options.Reference = None,
-    rays: options.Rays = None,
-    estimate: options.Estimate = None,
-    every: options.Every = None,
-    target_error: options.TargetErrors = None,
-    redundancy: options.Redundancy = False,
-    metrics: options.Metrics = None,
-    error_maps: options.ErrorMaps = False,
-    rerun: options.Rerun = None,
-    explain: options.Explain = False,
-    device: options.Device = "cpu",
-    workers: options.Workers = 0,
-    skip_bad_frames: options.SkipBadFrames = False,
-    resume: options.Resume = False,
-) -> None:
-    """Measure the coverage of a rig: a table, maps, and files to compare and to log."""
-    from torchcover.evaluation import evaluate
-
-    with sharing(out) as ranks:
-        log = logged(rerun, ranks)
-        result = evaluate(
-            rig,
-            scenario,
-            frames=opened(frames, recording_format, sensors, reference, window),
-            steps=steps,
-            seed=seed,
-            vehicle=vehicle,
-            ask=asked(ask, region, height, grid),
-            cell_m=cell,
-            thresholds=threshold or (0.4,),
-            reference_sensor=None if frames else reference,
-            rays=rays,
-            estimate=estimate,
-            every_s=every,
-            target_error=target_error,
-            redundancy=redundancy,
-            metrics=metrics or (),
-            device=device,
-            workers=workers,
-            skip_bad_frames=skip_bad_frames,
-            checkpoint=checkpoint_in(out, resume=resume),
-            ranks=ranks,
-            observers=watching(log),
-            progress=True,
-        )
-        finish(result, out, ranks, log, error_maps=error_maps, explain=explain)
-
-
-@app.command()
-def compare(
-    rigs: options.Rigs = None,
-    scenario: options.ScenarioOrNone = None,
-    frames: options.Frames = None,
-    recording_format: options.Format = None,
-    sensors: options.Sensors = None,
-    window: options.Window = None,
-    steps: options.Steps = None,
-    seed: options.Seed = 0,
-    vehicle: options.Vehicle = None,
-    out: options.Out = Path("out"),
-    region: options.Regions = None,
-    height: options.Heights = None,
-    grid: options.Grid = None,
-    ask: options.Ask = None,
-    cell: options.Cell = None,
-    threshold: options.Thresholds = None,
-    reference: options.Reference = None,
-    rays: options.Rays = None,
-    estimate: options.Estimate = None,
-    every: options.Every = None,
-    target_error: options.TargetErrors = None,
-    redundancy: options.Redundancy = False,
-    metrics: options.Metrics = None,
-    error_maps: options.ErrorMaps = False,
-    rerun: options.Rerun = None,
-    explain: options.Explain = False,
-    device: options.Device = "cpu",
-    workers: options.Workers = 0,
-    skip_bad_frames: options.SkipBadFrames = False,
-    resume: options.Resume = False,
-) -> None:
-    """Compare rigs in the same frames: a table with the better values marked, maps side by side, differences."""
-    from torchcover.evaluation import compare
-
-    with sharing(out) as ranks:
-        log = logged(rerun, ranks)
-        result = compare(
-            rigs or (),
-            scenario,
-            frames=opened(frames, recording_format, sensors, reference, window),
-            steps=steps,
-            seed=seed,
-            vehicle=vehicle,
-            ask=asked(ask, region, height, grid),
-            cell_m=cell,
-            thresholds=threshold or (0.4,),
-            reference_sensor=None if frames else reference,
-            rays=rays,
-            estimate=estimate,
-            every_s=every,
-            target_error=target_error,
-            redundancy=redundancy,
-            metrics=metrics or (),
-            device=device,
-            workers=workers,
-            skip_bad_frames=skip_bad_frames,
-            checkpoint=checkpoint_in(out, resume=resume),
-            ranks=ranks,
-            observers=watching(log),
-            progress=True,
-        )
-        finish(result, out, ranks, log, error_maps=error_maps, explain=explain)
-
-
-app.command()(study)
-app.command()(record)
-
-
-@app.command()
-def rig(
-    frames: options.RecordingFrames,
-    recording_format: options.Format = None,
-    sensors: options.SensorsOfRig = None,
-    lidar: Annotated[
-        list[str] | None,
-        typer.Option(help="SENSOR=MODEL: a LiDAR scans as this model (see `list`), and is not estimated."),
-    ] = None,
-) -> None:
-    """Print the sensors of a recording as a rig: mounts, LiDARs and cameras for `show` and `evaluate`."""
-    from torchcover.cli.rig import run
-
-    run(frames, recording_format, sensors or (), lidar or ())
-
-
-@app.command()
-def show(
-    name: Annotated[str, typer.Argument(help="Rig, scenario or vehicle: a built-in name (see `list`) or a YAML file.")],
-    scenario: Annotated[
-        str | None, typer.Option(help="For a rig: the scenario whose ego carries it and that it sees (courtyard).")
-    ] = None,
-    rig: Annotated[str | None, typer.Option(help="For a scenario: whose points to draw (front_roof_128).")] = None,
-    vehicle: options.Vehicle = None,
-    step: Annotated[int | None, typer.Option(min=0, help="Time step of the scenario or the depth images (0).")] = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the simulation, likewise (0).")] = None,
-    film: Annotated[
-        Path | None, typer.Option(help="For a scenario: 10 s of it from that step on, as a .gif or .mp4 (ffmpeg) file.")
-    ] = None,
-    out: options.Out = Path("out"),
-) -> None:
-    """Draw a rig and the depth images of its cameras, a frame of a scenario, or the mount regions of a vehicle."""
-    from torchcover.cli.show import run
-
-    run(name, scenario=scenario, rig=rig, vehicle=vehicle, step=step, seed=seed, film=film, out=out)
-
-
-app.command()(targets)
-app.command()(search)
-app.command()(agree)
-
-
-@app.command("list")
-def list_builtin(
-    word: Annotated[
-        str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
-    ] = None,
-) -> None:
-    """List the built-in rigs, scenarios, LiDAR models and vehicles."""
-    from torchcover.cli.listing import run
-
-    run(word)
+for command in (evaluate, compare, commands.study, commands.record, commands.rig, commands.show,
+                commands.targets, commands.search, commands.agree):  # fmt: skip
+    app.command()(command)
+app.command("list")(commands.list_builtin)
 
 
 def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)

@@ -1,10 +1,62 @@
-"""The options that several commands share."""
+"""Options: those of `evaluate`, as its settings declare them, and those that the command line adds."""
 
+import inspect
 import os
+from collections.abc import Callable, Sequence
+from functools import update_wrapper
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_type_hints
 
 import typer
+
+from torchcover.evaluation.settings import OPTIONS, Settings
+
+if TYPE_CHECKING:
+    from torchcover.simulation import RegionsOfInterest
+
+Command = Callable[..., None]
+
+
+def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command], Command]:
+    """A decorator: the command has these options, too, and gets those that were given as keywords.
+
+    Args:
+        parameters: From `of_evaluate` or `parameters_of`.
+    """
+    shared = {each.name for each in parameters}
+
+    def decorate(command: Command) -> Command:
+        def called(**given: Any) -> None:  # noqa: ANN401  (as typer has read them)
+            command(**{name: value for name, value in given.items() if name not in shared or value is not None})
+
+        own = [each for each in parameters_of(command) if each.kind is not inspect.Parameter.VAR_KEYWORD]
+        update_wrapper(called, command)
+        # What typer reads.
+        called.__signature__ = inspect.Signature([*own, *parameters])  # type: ignore[attr-defined]
+        called.__annotations__ = {each.name: each.annotation for each in (*own, *parameters)}
+        return called
+
+    return decorate
+
+
+def of_evaluate(*names: str) -> list[inspect.Parameter]:
+    """Options of `evaluate`, as `Settings` declares them: their names there, with dashes for underscores."""
+    return [_parameter(name) for name in names]
+
+
+def parameters_of(command: Command) -> list[inspect.Parameter]:
+    """What a command takes."""
+    hints = get_type_hints(command, include_extras=True)
+    return [each.replace(annotation=hints[each.name]) for each in inspect.signature(command).parameters.values()]
+
+
+def _parameter(name: str) -> inspect.Parameter:
+    option, usual = OPTIONS[name], getattr(Settings, name)
+    shown = usual if type(usual) in (bool, int, str) else None
+    kind = option.typed or get_args(Settings.__annotations__[name])[0]
+    told = typer.Option(f"--{name.replace('_', '-')}", help=option.words, min=option.minimum)
+    annotation: Any = Annotated[kind if shown is not None else kind | None, told]
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=shown, annotation=annotation)
 
 
 def check_out(folder: Path) -> Path:
@@ -24,147 +76,65 @@ def check_out(folder: Path) -> Path:
     return folder
 
 
-RigOrNone = Annotated[
-    str | None, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file. Optional with --frames.")
-]
 Rig = Annotated[str, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file.")]
-Rigs = Annotated[
-    list[str] | None,
-    typer.Argument(
-        help="Rigs: built-in names (see `list`) or YAML files, two or more; with --frames those in it. Or coverage.npz "
-        "files of runs over the same frames."
-    ),
-]
-ScenarioOrNone = Annotated[str | None, typer.Option(help="Scenario: a built-in name or a YAML file (courtyard).")]
-Frames = Annotated[
-    Path | None,
-    typer.Option(help="A recording instead of a simulation, of any layout in docs/recordings.md."),
-]
-RecordingFrames = Annotated[Path, typer.Option("--frames", help="The recording, of any layout in docs/recordings.md.")]
 Format = Annotated[str | None, typer.Option("--format", help="Format of the recording, if it is not recognised.")]
-Sensors = Annotated[
-    list[str] | None,
-    typer.Option(
-        help="With --frames: sensors of a rig, as in `roof,left`; once for each rig. Not given: those of the recording."
-    ),
-]
-SensorsOfRig = Annotated[
-    list[str] | None, typer.Option("--sensors", help="Its sensors, as in `roof,left`. Not given: all of the recording.")
-]
-Window = Annotated[
-    float | None,
-    typer.Option(help="Seconds over which `--reference accumulated` adds up what all sensors saw (2)."),
-]
-Steps = Annotated[
-    int | None, typer.Option(min=1, help="Steps to simulate (64), or most frames of a recording to use (all).")
-]
-RecordedSteps = Annotated[int | None, typer.Option(min=1, help="Steps to simulate (64), a frame each.")]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of the simulation.")]
-Vehicle = Annotated[
-    str | None,
-    typer.Option(
-        help="What carries the rig: a built-in vehicle, a YAML file or a mesh in metres. Not given: the scenario's own "
-        "ego, else the vehicle that the rig names, else an SUV."
-    ),
-]
 Out = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
-RecordingOut = Annotated[
-    Path, typer.Option("--out", help="Folder for the recording, new or empty.", callback=check_out)
-]
-Layout = Annotated[
-    str, typer.Option("--format", help="`folder`, or `kitti`: KITTI's object layout, of a rig of one LiDAR.")
-]
-Regions = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--region",
-        help="Region NAME:x0,x1,y0,y1 in metres, forward and to the left; may be repeated. Not given: the paper's in "
-        "front, and the near field on the four sides of the vehicle.",
-    ),
-]
-Heights = Annotated[
-    list[str] | None,
-    typer.Option("--height", help="Height band NAME:z0,z1 in metres; may be repeated, and overlap (ground, obstacle)."),
-]
-Grid = Annotated[
-    str | None, typer.Option(help="Extent x0,x1,y0,y1 of the grid in metres (-40,160,-40,40, more if regions need it).")
-]
-Ask = Annotated[
-    Path | None, typer.Option(help="The same, and polygons, in a YAML file; an option replaces what it says.")
-]
-Cell = Annotated[float | None, typer.Option(help="Side of a grid cell in metres (0.25).")]
-Thresholds = Annotated[
-    list[float] | None, typer.Option("--threshold", help="Detection threshold in metres (0.4); may be repeated.")
-]
-Reference = Annotated[
-    str | None,
-    typer.Option(
-        help="Reference sensor: `surface`, points drawn evenly on what can be seen (default); `even`, rays spread over "
-        "the regions and the grid; or `paper`. With --frames: `recorded`, or `accumulated` from the recording itself."
-    ),
-]
-RecordedReference = Annotated[
-    str | None,
-    typer.Option(
-        help="Reference sensor that is recorded too: `surface` (default), `even` or `paper`, as of `evaluate`."
-    ),
-]
-Rays = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        help="Rays of the reference sensor at each step (surface: 16384; even: 262144; paper: 1048576, a square).",
-    ),
-]
-Estimate = Annotated[
-    Literal["area", "known"] | None,
-    typer.Option(
-        help="What the number of a region is a mean over: `area`, its visible surface (default; needs `surface`), or "
-        "`known`, its known cells, as in the paper."
-    ),
-]
-Every = Annotated[
-    float | None,
-    typer.Option(
-        help="Seconds between one step and the next; steps that follow each other are alike. Not given: 10 in traffic, "
-        "which starts anew in another city every minute, else what spreads the steps over the scenario."
-    ),
-]
-TargetErrors = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--target-error",
-        help="Stop once every number (of the usual regions, those in front) is this good: 0.1% (standard error of each "
-        "detection, in percentage points) or 0.02m (of each radius); both may be given. --steps is then the most steps "
-        "(4096).",
-    ),
-]
-Redundancy = Annotated[
-    bool,
-    typer.Option("--redundancy", help="Say by how many sensors places are seen, and what is lost when each one fails."),
-]
-Metrics = Annotated[
-    str | None,
-    typer.Option(
-        help="Coverage metrics that others published, on the same frames: `all`, or names as in `k_cover,s_mig` "
-        "(docs/metrics.md)."
-    ),
-]
-ErrorMaps = Annotated[bool, typer.Option("--error-maps", help="Draw maps of the standard errors too.")]
-Rerun = Annotated[
-    Path | None,
-    typer.Option(help="Write clouds, boxes, rigs and maps to this .rrd file for the Rerun viewer (extra `rerun`)."),
-]
-Explain = Annotated[bool, typer.Option("--explain", help="Say what was left out because the scene did not need it.")]
-Device = Annotated[str, typer.Option(help="Where the search and the sums run: cpu, cuda, cuda:1, ...")]
-Workers = Annotated[int, typer.Option(min=0, help="Processes that make frames; 0 makes them in this one.")]
-Resume = Annotated[
-    bool,
-    typer.Option(
-        "--resume",
-        help="Go on from the checkpoint in --out, whatever ended that run; from a complete one with more --steps.",
-    ),
-]
-SkipBadFrames = Annotated[
-    bool, typer.Option("--skip-bad-frames", help="Skip and count frames that cannot be read, instead of stopping.")
-]
+
+
+def asked(
+    file: Path | None, regions: Sequence[str] | None, heights: Sequence[str] | None, grid: str | None
+) -> "RegionsOfInterest | None":
+    """What is asked about; None if nothing is said of it.
+
+    Args:
+        file: YAML; what options give replaces what it says.
+        regions: NAME:x0,x1,y0,y1 each.
+        heights: NAME:z0,z1 each.
+        grid: x0,x1,y0,y1.
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: What cannot be read, or makes no sense; a name that is given twice.
+    """
+    if file is None and not (regions or heights or grid):
+        return None
+    from pydantic import ValidationError
+
+    from torchcover.simulation import RegionsOfInterest
+    from torchcover.simulation.documents import explain
+
+    content = {} if file is None else RegionsOfInterest.load(file).model_dump(exclude_unset=True)
+    if regions:
+        sides = _named("--region", regions, ("x0", "x1", "y0", "y1"))
+        content["regions"] = {name: {"x_m": side[:2], "y_m": side[2:]} for name, side in sides.items()}
+    if heights:
+        content["heights"] = _named("--height", heights, ("z0", "z1"))
+    if grid:
+        side = _numbers("--grid", grid, grid, ("x0", "x1", "y0", "y1"))
+        content["grid"] = {**content.get("grid", {}), "x_m": side[:2], "y_m": side[2:]}
+    try:
+        return RegionsOfInterest.model_validate(content)
+    except ValidationError as error:
+        raise ValueError(explain(error)) from error
+
+
+def _named(option: str, given: Sequence[str], bounds: Sequence[str]) -> dict[str, tuple[float, ...]]:
+    found: dict[str, tuple[float, ...]] = {}
+    for text in given:
+        name, colon, numbers = text.rpartition(":")
+        if not (colon and name):
+            raise ValueError(f"{option} {text}: NAME:{','.join(bounds)} is needed, in metres")
+        if name in found:
+            raise ValueError(f"{option} {text}: the name {name!r} is given already; choose another")
+        found[name] = _numbers(option, text, numbers, bounds)
+    return found
+
+
+def _numbers(option: str, text: str, numbers: str, bounds: Sequence[str]) -> tuple[float, ...]:
+    try:
+        found = tuple(float(number) for number in numbers.split(","))
+    except ValueError:
+        found = ()
+    if len(found) != len(bounds):
+        raise ValueError(f"{option} {text}: {len(bounds)} numbers {','.join(bounds)} in metres are needed")
+    return found

@@ -100,7 +100,7 @@ def advice(wanted: float, point: WorkPoint | None, plan: StudyPlan) -> str:
     """The options of `evaluate` that reach an error."""
     if point is None:
         return f"For {100 * wanted:g} percentage points of detection: not reached within {plan.lengths[-1]:,} steps."
-    every = "" if plan.every_s is None else f" --every {plan.every_s:g}"
+    every = "" if plan.settings.every_s is None else f" --every-s {plan.settings.every_s:g}"
     return (
         f"For {100 * wanted:g} percentage points of detection: --rays {point.rays} --steps {point.steps}{every} "
         f"({point.seconds:.0f} s)."

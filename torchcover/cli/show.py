@@ -9,8 +9,8 @@ from rich.console import Console
 from rich.progress import track
 
 from torchcover.evaluation import cameras_of, rig_pictures, scenario_pictures, vehicle_picture
-from torchcover.evaluation.rig_names import as_called
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
+from torchcover.evaluation.task import as_called
 from torchcover.files import BadFileError
 from torchcover.report import check_film, write_film
 from torchcover.simulation import Scenario, builtin_names
@@ -29,7 +29,7 @@ def run(
     *,
     scenario: str | None,
     rig: str | None,
-    vehicle: str | None,
+    vehicle: str | None = None,
     step: int | None,
     seed: int | None,
     film: Path | None,

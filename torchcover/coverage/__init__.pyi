@@ -7,6 +7,7 @@ from .aggregations import PooledMean as PooledMean
 from .aggregations import Quantiles as Quantiles
 from .aggregations import State as State
 from .aggregations import StepQuantiles as StepQuantiles
+from .aggregations import aggregation_named as aggregation_named
 from .grid import BevGrid as BevGrid
 from .layer import Layer as Layer
 from .measures import Measure as Measure

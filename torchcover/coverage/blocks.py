@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Self
+from typing import Self, TypeVar
 
 import torch
 from torch import Tensor
@@ -97,6 +97,9 @@ class BlockSums:
         spread = listed.new_zeros((*listed.shape[:-1], math.prod(self.shape)))
         spread[..., self.at] = listed
         return spread.view(*listed.shape[:-1], *self.shape)
+
+
+BlockSumsT = TypeVar("BlockSumsT", bound=BlockSums)
 
 
 class Blocks(BlockSums):

@@ -9,28 +9,30 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypedDict, TypeVar
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
+from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums, BlockSumsT
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.redundancy import PlaceSums, Redundancy, redundancy_quantities
+from torchcover.coverage.region_sums import PlaceNumbers
 from torchcover.coverage.regions import Region
 from torchcover.estimation import Quantity
 from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
 
-FORMAT_VERSION = 4
+FORMAT_VERSION = 5
 Arrays = dict[str, NDArray[Any]]
 # Steps, cells, what is divided by, sums.
 IN_BLOCKS = ("block_steps", "block_cell", "block_probed_steps", "block_sums")
 OVER_AREA = ("area_steps", "area_cell", "area_m2", "area_sums")
 OVER_PLACES = ("place_steps", "place_m2", "place_sums")
-BlockSumsT = TypeVar("BlockSumsT", bound=BlockSums)
+# Numbers of regions, and what they are without each block.
+AGGREGATED = ("region_numbers", "region_numbers_left_out")
 
 
 class CoverageParts(TypedDict):
@@ -46,6 +48,7 @@ class CoverageParts(TypedDict):
     blocks: Blocks | None
     area: AreaSums | None
     regions: Sequence[Region]
+    aggregated: PlaceNumbers | None
     redundancy: Redundancy | None
 
 
@@ -58,6 +61,7 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         path: The file.
     """
     grid, blocks, area, redundancy = parts["grid"], parts["blocks"], parts["area"], parts["redundancy"]
+    aggregated = parts["aggregated"]
     header = {
         "format": FORMAT_VERSION,
         "grid": {"x": grid.x, "y": grid.y, "cell": grid.cell, "heights": dict(grid.heights)},
@@ -68,12 +72,15 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         "blocks": 1 if blocks is None else len(blocks.steps),
         "square_metres": area is not None,
         "regions": [asdict(region) for region in parts["regions"]],
+        "aggregated": [] if aggregated is None else [quantity._asdict() for quantity in aggregated.quantities],
         "sensors": None if redundancy is None else redundancy.sensors,
         "redundancy": [] if redundancy is None else [layer.quantity._asdict() for layer in redundancy.layers.values()],
     }
     tensors = {"probed_steps": parts["probed_steps"], "points": parts["points"]}
     tensors |= {layer.quantity.key: layer.values for layer in parts["layers"]}
     tensors |= {f"{key}_error": error for key, error in errors.items()}
+    if aggregated is not None:
+        tensors |= dict(zip(AGGREGATED, aggregated[1:], strict=True))
     if redundancy is not None:
         tensors |= {key: layer.values for key, layer in redundancy.layers.items()}
         if redundancy.places is not None:
@@ -134,8 +141,20 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
         "blocks": None if header["blocks"] == 1 else _read_listed(Blocks, IN_BLOCKS, header, grid, arrays),
         "area": _read_listed(AreaSums, OVER_AREA, header, grid, arrays) if header["square_metres"] else None,
         "regions": [_region(stored) for stored in header["regions"]],
+        "aggregated": _aggregated(header, grid, arrays) if header["aggregated"] else None,
         "redundancy": None if header["sensors"] is None else _redundancy(header, grid, arrays),
     }
+
+
+def _aggregated(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> PlaceNumbers:
+    quantities = tuple(Quantity(**quantity) for quantity in header["aggregated"])
+    value, left_out = (torch.from_numpy(arrays[name]) for name in AGGREGATED)
+    places = len(header["regions"]) * len(grid.heights)
+    blocks = 0 if header["blocks"] == 1 else header["blocks"]
+    shape = (places, len(quantities))
+    if (tuple(value.shape), tuple(left_out.shape)) != (shape, (blocks, *shape)):
+        raise ValueError(f"{AGGREGATED[0]} of shape {tuple(value.shape)} in {blocks} blocks; needed is {shape}")
+    return PlaceNumbers(quantities, value, left_out)
 
 
 def _redundancy(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> Redundancy:

@@ -40,7 +40,7 @@ def estimate_known(
     )
 
 
-def estimate_area(quantities: Sequence[Quantity], area: AreaSums, band: int, cells: Tensor) -> Estimate:
+def estimate_area(quantities: Sequence[Quantity], area: AreaSums | None, band: int, cells: Tensor) -> Estimate:
     """The ratio of sums over the visible surface of a region, and what it becomes without each block.
 
     R = E[ sum of r dA ] / E[ sum of dA ]: a ratio of additive sums, so that the number of points, the size of cells and
@@ -48,13 +48,21 @@ def estimate_area(quantities: Sequence[Quantity], area: AreaSums, band: int, cel
 
     Args:
         quantities: What the numbers are, as in `estimate_known`.
-        area: The sums over the whole grid.
+        area: The sums over the whole grid, if there are any.
         band: Number of the height band.
         cells: (Y, X) bool, the cells of the region.
 
     Returns:
         NaN where no square metre was seen.
+
+    Raises:
+        ValueError: There are no such sums.
     """
+    if area is None:
+        raise ValueError(
+            "no estimate by area: the reference points had no square metres; take them from a SurfaceReference and "
+            "give the metric square_metres=True"
+        )
     each = area_in_blocks(area, band, cells)
     return Estimate.of_ratios(quantities, each[:, 0], each[:, 1:], area.steps)
 

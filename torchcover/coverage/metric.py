@@ -1,20 +1,21 @@
 """The coverage metric: clouds in, fixed-size sums, coverage out."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations import Aggregation, BinnedStep, MeanOfMeans, VisibleArea
+from torchcover.coverage.aggregations import Aggregation, BinnedStep, MeanOfMeans, State, VisibleArea
 from torchcover.coverage.binning import mean_per_cell
-from torchcover.coverage.blocks import AreaSums, Blocks
+from torchcover.coverage.blocks import AreaSums, Blocks, BlockSumsT
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.plotting import draw_coverage
 from torchcover.coverage.redundancy import PlaceSums, Redundancy, SensorFailures
-from torchcover.coverage.regions import Region, check_regions, regions_within
+from torchcover.coverage.region_sums import IN_REGIONS, RegionSums
+from torchcover.coverage.regions import Places, Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.steps import Clouds, SensorClouds, Step, as_list, check_parameters, checked_steps
 from torchcover.metrics import SumsInBlocks, figure_of
@@ -49,10 +50,11 @@ class CoverageMetric(SumsInBlocks):
             infinity, such a step makes the radius of its cells infinite.
         blocks: 1 for no errors, or an even number from 8 on: at least half as many blocks are in use at the end of a
             long run. The state grows with it: 24 bytes a cell and block.
-        aggregations: Maps beside the mean of means, from `torchcover.coverage`: `Maximum()`, `PooledMean()`,
-            `Quantiles(levels)`, `StepQuantiles(levels)`, or a class of one's own; at most one of each.
+        aggregations: Others than the mean of means, from `torchcover.coverage`: `Maximum()`, `PooledMean()`,
+            `Quantiles(levels)`, `StepQuantiles(levels)`, or a class of one's own; at most one of each. Each gives maps,
+            and numbers of `regions`.
         regions: What the result gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
-            the grid if not given. The sums do not depend on it.
+            the grid if not given. Sums depend on it only with `aggregations` or `sensors`.
         sensors: Names of the rig's sensors, for `Coverage.redundancy`: then `update` takes a cloud for each by its
             name, and what the rig is without each of them is known as well.
         square_metres: Whether there is to be an estimate by area too; then every step needs the square metres of its
@@ -110,7 +112,8 @@ class CoverageMetric(SumsInBlocks):
             "blocks": blocks,
             "aggregations": tuple(aggregations),
             "square_metres": square_metres,
-            **({"sensors": tuple(sensors), "regions": regions} if sensors else {}),
+            **({"sensors": tuple(sensors)} if sensors else {}),
+            **({"regions": regions} if sensors or aggregations else {}),
         }
         super().__init__(blocks, meaning, **kwargs)
         self.grid = grid
@@ -120,9 +123,9 @@ class CoverageMetric(SumsInBlocks):
         self.max_radius = float(max_radius)
         self.square_metres = square_metres
         over_area = [VisibleArea(self.thresholds, blocks)] if square_metres else []
-        self._failures = SensorFailures(
-            self.sensors, self.thresholds, grid, regions, self.max_radius, blocks, square_metres
-        )
+        places = Places(regions, grid)
+        self._in_regions = RegionSums(aggregations, places, blocks)
+        self._failures = SensorFailures(self.sensors, self.thresholds, places, self.max_radius, blocks, square_metres)
         redundancy = [self._failures] if sensors else []
         self._of_grid: tuple[Aggregation, ...] = (MeanOfMeans(self.thresholds, blocks), *over_area, *aggregations)
         self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *redundancy)
@@ -138,15 +141,18 @@ class CoverageMetric(SumsInBlocks):
                 self.add_sum(name, (), torch.int64)
         self._state_names: dict[str, list[str]] = {}
         for aggregation in self.aggregations:
-            states = aggregation.states(self.grid.cells)
-            self._state_names[aggregation.name] = list(states)
-            for name, state in states.items():
-                full_name = f"{aggregation.name}_{name}"
-                self.add_state(full_name, state.initial, dist_reduce_fx=state.reduction, persistent=True)
-                self._in_blocks = (*self._in_blocks, *[full_name] * state.in_blocks)
+            self._add_states_of(aggregation.name, aggregation.states(self.grid.cells))
+        self._add_states_of(IN_REGIONS, self._in_regions.states())
 
-    def _sums_of(self, aggregation: Aggregation) -> dict[str, Tensor]:
-        return {name: getattr(self, f"{aggregation.name}_{name}") for name in self._state_names[aggregation.name]}
+    def _add_states_of(self, owner: str, states: Mapping[str, State]) -> None:
+        self._state_names[owner] = list(states)
+        for name, state in states.items():
+            full_name = f"{owner}_{name}"
+            self.add_state(full_name, state.initial, dist_reduce_fx=state.reduction, persistent=True)
+            self._in_blocks = (*self._in_blocks, *[full_name] * state.in_blocks)
+
+    def _sums_of(self, owner: str) -> dict[str, Tensor]:
+        return {name: getattr(self, f"{owner}_{name}") for name in self._state_names[owner]}
 
     def update(
         self,
@@ -228,12 +234,14 @@ class CoverageMetric(SumsInBlocks):
         # Before saturation: a point with nothing within `max_radius` is not detected at a threshold of `max_radius`.
         detected = [(distance <= threshold).double() for threshold in self.thresholds]
         radius = distance.clamp(max=distance.new_tensor(self.max_radius)).double()
-        means = mean_per_cell(cell, torch.stack([radius, *detected]), self.grid.cells, weights)
+        values = torch.stack([radius, *detected])
+        means = mean_per_cell(cell, values, self.grid.cells, weights)
         self.probed_steps[block, means.cell] += 1
         self.points[means.cell] += means.points
-        step = BinnedStep(cell, radius, weights, means, block, self.grid.cells, of_sensors)
+        step = BinnedStep(cell, values, weights, means, block, self.grid.cells, of_sensors)
         for aggregation in self.aggregations:
-            aggregation.update(self._sums_of(aggregation), step)
+            aggregation.update(self._sums_of(aggregation.name), step)
+        self._in_regions.update(self._sums_of(IN_REGIONS), step)
 
     def compute(self) -> Coverage:
         """The coverage so far. Cells that no reference point ever probed are NaN with count 0."""
@@ -245,22 +253,23 @@ class CoverageMetric(SumsInBlocks):
             probed_steps=probed_steps.view(self.grid.shape),
             points=self.points.view(self.grid.shape).clone(),
             layers=[layer for one in self._of_grid for layer in self._layers(one, probed_steps)],
-            blocks=self._blocks() if self.blocks > 1 else None,
-            area=self._area() if self.square_metres else None,
+            blocks=self._listed(Blocks, self.probed_steps, self.mean_sums) if self.blocks > 1 else None,
+            area=self._listed(AreaSums, self.area_m2, self.area_sums) if self.square_metres else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
             regions=self.regions,
+            aggregated=self._in_regions.numbers(self._sums_of(IN_REGIONS), self.max_radius),
             redundancy=self._redundancy(probed_steps) if self.sensors else None,
         )
 
     def _layers(self, aggregation: Aggregation, probed_steps: Tensor) -> list[Layer]:
-        found = aggregation.layers(self._sums_of(aggregation), probed_steps, self.max_radius)
+        found = aggregation.layers(self._sums_of(aggregation.name), probed_steps, self.max_radius)
         return [Layer(layer.quantity, layer.values.view(self.grid.shape)) for layer in found]
 
     def _redundancy(self, probed_steps: Tensor) -> Redundancy:
         layers = {layer.quantity.key: layer for layer in self._layers(self._failures, probed_steps)}
         if not self.square_metres:
             return Redundancy(self.sensors, layers, None)
-        sums = self._sums_of(self._failures)
+        sums = self._sums_of(self._failures.name)
         places = PlaceSums(self.block_steps.clone(), sums["place_m2"].clone(), sums["place_sums"].clone())
         return Redundancy(self.sensors, layers, places)
 
@@ -287,14 +296,6 @@ class CoverageMetric(SumsInBlocks):
         draw_coverage(self.compute() if val is None else val, ax, layer, height)
         return fig, ax
 
-    def _blocks(self) -> Blocks:
+    def _listed(self, kind: type[BlockSumsT], base: Tensor, sums: Tensor) -> BlockSumsT:
         shape = self.grid.shape
-        return Blocks.of(
-            self.block_steps, self.probed_steps.view(-1, *shape), self.mean_sums.view(self.blocks, -1, *shape)
-        )
-
-    def _area(self) -> AreaSums:
-        shape = self.grid.shape
-        return AreaSums.of(
-            self.block_steps, self.area_m2.view(-1, *shape), self.area_sums.view(self.blocks, -1, *shape)
-        )
+        return kind.of(self.block_steps, base.view(-1, *shape), sums.view(self.blocks, -1, *shape))

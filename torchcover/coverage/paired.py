@@ -53,6 +53,10 @@ def differences(coverages: Mapping[str, Coverage], region: Region, height: str) 
     Returns:
         Name of the rig -> key of the quantity -> difference.
     """
-    estimates = {name: coverage.estimate(region, height) for name, coverage in coverages.items()}
-    first = next(iter(estimates.values()))
-    return {name: estimate.differences(first) for name, estimate in estimates.items()}
+    first = next(iter(coverages.values()))
+    found: dict[str, dict[str, Difference]] = {name: {} for name in coverages}
+    for part in (Coverage.estimate, Coverage.estimate_aggregated):
+        expected = part(first, region, height)
+        for name, coverage in coverages.items():
+            found[name] |= part(coverage, region, height).differences(expected)
+    return found

@@ -61,4 +61,14 @@ def by_area(quantity: Quantity) -> Quantity:
     return quantity._replace(key=f"{kind}_area_{unit}", title=f"{quantity.title}, by area")
 
 
+def over_known(quantity: Quantity) -> Quantity:
+    """The same over the known cells of a region, every cell weighing the same, where the number itself is by area.
+
+    Example:
+        >>> over_known(RADIUS).key
+        'known_radius_m'
+    """
+    return quantity._replace(key=f"known_{quantity.key}", title=f"{quantity.title}, over known cells")
+
+
 RADIUS = radius()

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import ClassVar, NamedTuple
 
 import torch
@@ -10,10 +9,9 @@ from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, BinnedStep, State
 from torchcover.coverage.binning import mean_per_cell
-from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import RADIUS, detection, seen_by_two, sensors_seeing, without
-from torchcover.coverage.regions import Region
+from torchcover.coverage.regions import Places
 from torchcover.estimation import Quantity
 
 
@@ -69,8 +67,7 @@ class SensorFailures(Aggregation):
     Args:
         sensors: Names of the sensors, in the order of `BinnedStep.of_sensors`.
         thresholds: Detection thresholds in metres.
-        grid: Cells and height bands.
-        regions: Those whose numbers have errors.
+        places: Regions and bands whose numbers have errors.
         max_radius: Saturation of the radius in metres.
         blocks: Blocks of contiguous steps for the errors.
         square_metres: Whether weights are square metres.
@@ -81,8 +78,7 @@ class SensorFailures(Aggregation):
 
     sensors: tuple[str, ...]
     thresholds: tuple[float, ...]
-    grid: BevGrid
-    regions: tuple[Region, ...]
+    places: Places
     max_radius: float
     blocks: int = 1
     square_metres: bool = False
@@ -94,7 +90,7 @@ class SensorFailures(Aggregation):
 
     def states(self, cells: int) -> dict[str, State]:
         """`sums` (V, C): means of each step, or with square metres those times them, and `m2` (C); both by region."""
-        values, places = len(self.quantities), len(self.regions) * len(self.grid.heights)
+        values, places = len(self.quantities), self.places.count
         with_all = 1 + len(self.thresholds)
         zero = torch.zeros((), dtype=torch.float64)
         states = {"sums": State(zero.expand(values, cells))}
@@ -115,7 +111,7 @@ class SensorFailures(Aggregation):
         sums["sums"][:, cell] += mean * weight
         # Row by row in one order, so that what a sensor adds nothing to is the same without it, to the last bit.
         products = torch.cat([step.means.mean, mean]) * weight
-        for place, member in enumerate(self._members(cell)):
+        for place, member in enumerate(self.places.members(cell)):
             sums["place_m2"][step.block, place] += weight[member].sum()
             sums["place_sums"][step.block, :, place] += products[:, member].sum(dim=1)
 
@@ -133,19 +129,6 @@ class SensorFailures(Aggregation):
             rows.append(radius.clamp(max=radius.new_tensor(self.max_radius)).double())
             rows += [(radius <= threshold).double() for threshold in self.thresholds]
         return torch.stack(rows)
-
-    def _members(self, cell: Tensor) -> Tensor:
-        """(P, K) bool: whether a cell is of a place."""
-        bands, rows, columns = self.grid.shape
-        of_band = torch.arange(bands, device=cell.device)[:, None] == cell // (rows * columns)
-        of_region = self._masks.to(cell.device)[:, cell % (rows * columns)]
-        return (of_region[:, None] & of_band).flatten(0, 1)
-
-    @cached_property
-    def _masks(self) -> Tensor:
-        """(R, Y * X) bool."""
-        empty = torch.empty((0, *self.grid.shape[1:]), dtype=torch.bool)
-        return torch.cat([empty, *(region.mask(self.grid)[None] for region in self.regions)]).flatten(1)
 
     def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
         """One for each quantity; 0 / 0, which is NaN, where nothing was seen."""

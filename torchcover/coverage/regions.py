@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
@@ -134,6 +135,46 @@ class Region:
         return torch.from_numpy(
             shapely.contains_xy(polygon, (x + further_x)[None, :].numpy(), (y + further_y)[:, None].numpy())
         )
+
+
+class Places:
+    """The P places of a grid that numbers are given for: each region in each band, region by region.
+
+    Args:
+        regions: Regions within the grid.
+        grid: Cells and height bands.
+    """
+
+    def __init__(self, regions: Sequence[Region], grid: BevGrid) -> None:
+        self.regions = tuple(regions)
+        self.grid = grid
+        self.count = len(self.regions) * len(grid.heights)
+
+    def of_points(self, cell: Tensor) -> tuple[Tensor, Tensor]:
+        """For each place that a point lies in, (K,) the place and (K,) which point; a point may lie in several.
+
+        Args:
+            cell: (N,) int64 cell of each point.
+        """
+        band, column = cell // self._columns, cell % self._columns
+        region, point = self._masks.to(cell.device)[:, column].nonzero(as_tuple=True)
+        return region * len(self.grid.heights) + band[point], point
+
+    def members(self, cell: Tensor) -> Tensor:
+        """(P, K) bool: whether each of (K,) cells is of a place."""
+        of_band = torch.arange(len(self.grid.heights), device=cell.device)[:, None] == cell // self._columns
+        of_region = self._masks.to(cell.device)[:, cell % self._columns]
+        return (of_region[:, None] & of_band).flatten(0, 1)
+
+    @property
+    def _columns(self) -> int:
+        return math.prod(self.grid.shape[1:])
+
+    @cached_property
+    def _masks(self) -> Tensor:
+        """(R, Y * X) bool."""
+        empty = torch.empty((0, *self.grid.shape[1:]), dtype=torch.bool)
+        return torch.cat([empty, *(region.mask(self.grid)[None] for region in self.regions)]).flatten(1)
 
 
 def check_regions(regions: Sequence[Region], grid: BevGrid) -> None:

@@ -1,8 +1,10 @@
 """The result: maps over the grid, and one number a region."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cached_property
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from difflib import get_close_matches
+from functools import cached_property, partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -15,12 +17,12 @@ from torchcover.coverage.coverage_file import CoverageParts, read_coverage, writ
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.layer import Layer
 from torchcover.coverage.measures import Measure, area_in_blocks, estimate_area, estimate_known
-from torchcover.coverage.quantity import RADIUS, by_area
-from torchcover.coverage.redundancy import Redundancy
-from torchcover.coverage.region_redundancy import over_known, over_place, quantities_of, region_redundancy
+from torchcover.coverage.quantity import RADIUS, by_area, over_known
+from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
+from torchcover.coverage.region_sums import PlaceNumbers
 from torchcover.coverage.regions import Region, check_regions, regions_within
-from torchcover.coverage.summary import RegionRedundancy, RegionSummary
-from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Estimate, Number, Quantity, ratio_errors
+from torchcover.coverage.summary import RegionRedundancy, RegionSummary, estimate_redundancy, region_redundancy
+from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Estimate, Quantity, ratio_errors
 
 
 class Coverage:
@@ -40,6 +42,7 @@ class Coverage:
         area: The sums over the visible surface, if the reference points had square metres.
         regions: What `summary` gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
             the grid if not given.
+        aggregated: What other aggregations than the mean of means say of `regions`, if there were any.
         redundancy: What each sensor of the rig adds, if the metric was told of the sensors.
 
     Attributes:
@@ -68,6 +71,7 @@ class Coverage:
         blocks: Blocks | None = None,
         area: AreaSums | None = None,
         regions: Sequence[Region] | None = None,
+        aggregated: PlaceNumbers | None = None,
         redundancy: Redundancy | None = None,
     ) -> None:
         self.grid = grid
@@ -80,6 +84,7 @@ class Coverage:
         self.blocks = blocks
         self.area = area
         self.regions = regions_within(grid) if regions is None else tuple(regions)
+        self.aggregated = aggregated
         self.redundancy = redundancy
         self._estimates: dict[tuple[Region, str, Measure], Estimate] = {}
 
@@ -167,6 +172,9 @@ class Coverage:
                 points that have square metres, or "known", the paper's unweighted mean over the known cells. Not given:
                 that of this result.
 
+        Returns:
+            That of `quantities`.
+
         Raises:
             ValueError: A region that reaches beyond the grid, or holds no cell centre; no such band; "area" of points
                 without square metres.
@@ -183,19 +191,59 @@ class Coverage:
             raise ValueError(f"height {height!r}: the grid has {', '.join(self.grid.heights)}")
         band = list(self.grid.heights).index(height)
         if measure == "area":
-            return estimate_area(self.quantities, self._square_metres(), band, cells)
+            return estimate_area(self.quantities, self.area, band, cells)
         known = cells & (self.probed_steps[band] > 0)
         probed = self.probed_steps[band][known]
         sums = probed * torch.stack([self.layers[quantity.key].values[band][known] for quantity in self.quantities])
         return estimate_known(self.quantities, probed, sums, self.blocks, band, known)
 
-    def _square_metres(self) -> AreaSums:
-        if self.area is None:
-            raise ValueError(
-                "no estimate by area: the reference points had no square metres; take them from a SurfaceReference and "
-                "give the metric square_metres=True"
-            )
-        return self.area
+    def estimate_aggregated(self, region: Region, height: str) -> Estimate:
+        """The numbers of other aggregations in one region and band; unknown where the metric was not told of it."""
+        if self.aggregated is None:
+            return self.estimate(region, height)[:0]
+        quantities, value, left_out = self.aggregated
+        place = self._place(region, height)
+        if place is None or self.blocks is None:
+            return Estimate.of(quantities, torch.full_like(value[0], math.nan) if place is None else value[place])
+        used = self.blocks.steps > 0
+        return Estimate(quantities, value[place], left_out[used, place], self.blocks.steps[used])
+
+    def estimate_of(self, key: str, region: Region, height: str) -> Estimate:
+        """Any one number, by the name of its column in `summary.csv`.
+
+        Args:
+            key: "radius_m", "detection_0.4m"; "known_detection_0.4m" over the known cells of a result by area;
+                "radius_maximum_m" of an aggregation; "radius_m_without_roof" and "seen_by_two_0.4m" of redundancy.
+            region: A region within the grid.
+            height: Name of the band.
+
+        Raises:
+            ValueError: There is no such number; as `estimate`.
+        """
+        for quantities, estimate in self._estimators.items():
+            for at, quantity in enumerate(quantities):
+                if quantity.key == key:
+                    return replace(estimate(region, height)[at : at + 1], quantities=(quantity,))
+        there = [quantity.key for quantity in self.every_quantity]
+        nearest = get_close_matches(key, there, n=1) or there
+        raise ValueError(f"{key}: the result has no such number; it has {', '.join(nearest)}")
+
+    @property
+    def every_quantity(self) -> tuple[Quantity, ...]:
+        """All that `estimate_of` has a number of."""
+        return tuple(quantity for quantities in self._estimators for quantity in quantities)
+
+    @property
+    def _estimators(self) -> dict[tuple[Quantity, ...], Callable[[Region, str], Estimate]]:
+        estimators: dict[tuple[Quantity, ...], Callable[[Region, str], Estimate]] = {self.quantities: self.estimate}
+        if self.aggregated is not None:
+            estimators[self.aggregated.quantities] = self.estimate_aggregated
+        if self.measure == "area":
+            estimators[tuple(map(over_known, self.quantities))] = partial(self.estimate, measure="known")
+        if self.redundancy is not None:
+            own = redundancy_quantities(self.redundancy.sensors, self.thresholds)
+            estimators[own] = lambda region, height: self._estimate_redundancy(region, height)[len(self.quantities) :]
+        return estimators
 
     def scalars(self, regions: Sequence[Region] | None = None) -> dict[str, float]:
         """The summary as a flat dict for a logger.
@@ -235,6 +283,7 @@ class Coverage:
             "blocks": self.blocks,
             "area": self.area,
             "regions": self.regions,
+            "aggregated": self.aggregated,
             "redundancy": self.redundancy,
         }
         write_coverage(parts, self.errors, Path(path))
@@ -254,37 +303,43 @@ class Coverage:
         cells, band = region.mask(self.grid), list(self.grid.heights).index(height)
         probed = self.probed_steps[band].cpu()[cells]
         known_cells = int((probed > 0).sum())
+        numbers = partial(Estimate.numbers, count=known_cells, count_of="known cells")
         return RegionSummary(
             region=region.name,
             height=height,
             cells=len(probed),
             known_cells=known_cells,
             measure=self.measure,
-            numbers=self._numbers(region, height, self.measure, known_cells),
-            known=self._numbers(region, height, "known", known_cells),
+            # How often other intervals than those by area hold the truth has not been measured.
+            numbers=numbers(self.estimate(region, height), intervals=self.measure == "area")
+            | numbers(self.estimate_aggregated(region, height), intervals=False),
+            known=numbers(self.estimate(region, height, "known"), intervals=False),
             visible_m2=math.nan if self.area is None else self._visible_m2(self.area, band, cells),
             redundancy=self._without_each(region, height),
         )
 
-    def _numbers(self, region: Region, height: str, measure: Measure, known_cells: int) -> dict[str, Number]:
-        # How often an interval around the mean over known cells holds the truth has not been measured.
-        intervals = measure == "area"
-        return self.estimate(region, height, measure).numbers(
-            intervals=intervals, count=known_cells, count_of="known cells"
-        )
-
     def _without_each(self, region: Region, height: str) -> RegionRedundancy | None:
         """What each sensor adds; by area it is known of the regions only that the metric was told of."""
-        redundancy, band = self.redundancy, list(self.grid.heights).index(height)
+        redundancy = self.redundancy
         if redundancy is None or (redundancy.places is not None and region not in self.regions):
             return None
-        quantities = quantities_of(redundancy, self.thresholds)
-        if redundancy.places is not None:
-            place = self.regions.index(region) * len(self.grid.heights) + band
-            return region_redundancy(redundancy, self.thresholds, over_place(redundancy.places, place, quantities))
-        known = region.mask(self.grid).to(self.radius.device) & (self.probed_steps[band] > 0)
-        with_all = self.estimate(region, height, "known").value
-        return region_redundancy(redundancy, self.thresholds, over_known(redundancy, with_all, band, known, quantities))
+        return region_redundancy(redundancy, self.thresholds, self._estimate_redundancy(region, height))
+
+    def _estimate_redundancy(self, region: Region, height: str) -> Estimate:
+        """With all sensors, then of `redundancy_quantities`; unknown by area where the metric was not told of it."""
+        assert self.redundancy is not None
+        with_all = self.estimate(region, height, "known" if self.redundancy.places is None else "area")
+        known = region.mask(self.grid).to(self.radius.device) & (self.probed_steps[self._band(height)] > 0)
+        return estimate_redundancy(self.redundancy, with_all, self._place(region, height), self._band(height), known)
+
+    def _band(self, height: str) -> int:
+        return list(self.grid.heights).index(height)
+
+    def _place(self, region: Region, height: str) -> int | None:
+        """Which place of `Places` it is; None if it is none."""
+        if region not in self.regions:
+            return None
+        return self.regions.index(region) * len(self.grid.heights) + self._band(height)
 
     def _visible_m2(self, area: AreaSums, band: int, cells: Tensor) -> float:
         total = float(area_in_blocks(area, band, cells.to(area.at.device))[:, 0].sum())

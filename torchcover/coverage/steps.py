@@ -11,10 +11,11 @@ from torch import Tensor
 from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
 from torchcover.coverage.quantity import detection
 from torchcover.coverage.redundancy import SensorFailures
+from torchcover.coverage.region_sums import IN_REGIONS
 from torchcover.neighbors import check_cloud, check_tensor
 
 # The aggregations that a metric has by itself, and the names that its own states begin with.
-BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, SensorFailures.name, "block", "probed"})
+BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, SensorFailures.name, IN_REGIONS, "block", "probed"})
 
 # Steps are numbered in int64, and blocks double until one holds the last.
 MAX_NUMBER = 10**15

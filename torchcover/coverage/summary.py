@@ -1,10 +1,17 @@
 """The numbers of a region, as tables and loggers take them."""
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import torch
+from torch import Tensor
+
+from torchcover.coverage.aggregations import MeanOfMeans
 from torchcover.coverage.measures import Measure
-from torchcover.estimation import Difference, Number
+from torchcover.coverage.quantity import without
+from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
+from torchcover.estimation import Difference, Estimate, Number
 
 
 @dataclass(frozen=True)
@@ -36,9 +43,10 @@ class RegionSummary:
         cells: Number of cells in the region.
         known_cells: How many of them a reference point has probed.
         measure: What `numbers` are means over: "area", the visible surface, or "known", the known cells.
-        numbers: Key of the quantity, such as `"radius_m"` or `"detection_0.4m"` -> its number; the error is NaN if it
-            was not asked for, or if there are not enough steps.
-        known: The numbers over the known cells, every cell weighing the same; `numbers` itself if that is its measure.
+        numbers: Key of the quantity, such as `"radius_m"` or `"detection_0.4m"` -> its number, those of other
+            aggregations last; the error is NaN if it was not asked for, or if there are not enough steps.
+        known: Radius and detections over the known cells, every cell weighing the same; as in `numbers` if that is its
+            measure.
         visible_m2: Mean over the steps of the square metres of the region's surface that the reference sees; NaN where
             its points have none.
         redundancy: What each sensor adds; None if that was not asked for.
@@ -58,3 +66,53 @@ class RegionSummary:
     def known_share(self) -> float:
         """Share of the region's cells that are known. `known` is about this share, and biased when it is low."""
         return self.known_cells / self.cells
+
+
+def estimate_redundancy(
+    redundancy: Redundancy, with_all: Estimate, place: int | None, band: int, known: Tensor
+) -> Estimate:
+    """The numbers of one region with all sensors, then those of `redundancy_quantities`.
+
+    Args:
+        redundancy: What is known of the sensors.
+        with_all: The numbers of the region by the measure of the coverage.
+        place: Which of `redundancy.places` it is; None if it is none of them.
+        band: Number of the height band.
+        known: (Y, X) bool, the known cells of the region, whose unweighted means they are where there are no places;
+            the errors of those are unknown.
+    """
+    quantities = (*with_all.quantities, *(layer.quantity for layer in redundancy.layers.values()))
+    if redundancy.places is None:
+        values = torch.stack([layer.values[band][known].mean() for layer in redundancy.layers.values()])
+        return Estimate.of(quantities, torch.cat([with_all.value, values]))
+    if place is None:
+        return Estimate.of(quantities, with_all.value.new_full((len(quantities),), math.nan))
+    steps, m2, sums = redundancy.places
+    return Estimate.of_ratios(quantities, m2[:, place], sums[:, :, place], steps)
+
+
+def region_redundancy(redundancy: Redundancy, thresholds: tuple[float, ...], estimate: Estimate) -> RegionRedundancy:
+    """The numbers of a region without each sensor.
+
+    Args:
+        redundancy: Whose sensors.
+        thresholds: Detection thresholds in metres.
+        estimate: From `estimate_redundancy`.
+    """
+    single, several = MeanOfMeans(thresholds).quantities, redundancy_quantities((), thresholds)
+    numbers, count = estimate.numbers(intervals=False), len(single)
+    each, change = {}, {}
+    for at, sensor in enumerate(redundancy.sensors):
+        start = count + len(several) + at * count
+        own = estimate[start : start + count]
+        each[sensor] = {quantity.key: numbers[without(sensor, quantity).key] for quantity in single}
+        change[sensor] = replace(own, quantities=single).differences(estimate[:count])
+    decisive = single[min(1, count - 1)]
+    losses = {sensor: _loss(changes[decisive.key].gain) for sensor, changes in change.items()}
+    worst = max(losses, key=losses.__getitem__)
+    seen_by = {quantity.key: numbers[quantity.key] for quantity in several}
+    return RegionRedundancy(seen_by, each, change, worst if losses[worst] > 0 else None)
+
+
+def _loss(gain: float) -> float:
+    return 0.0 if math.isnan(gain) else -gain

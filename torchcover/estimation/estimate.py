@@ -151,8 +151,8 @@ class Estimate:
         """The numbers by the keys of their quantities.
 
         Args:
-            intervals: Whether they have intervals: not where nobody has measured how often such an interval holds the
-                truth.
+            intervals: Whether they have intervals: not where how often such an interval holds the truth has
+                not been measured.
             count: How many they are over.
             count_of: What these are.
         """

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from torchcover.evaluation.placement_scores import PlacementScores, score_placements
-from torchcover.evaluation.task import AnyScenario
 from torchcover.published import Agreement, Judged, agreement_of, published_results
 from torchcover.published.baselines import mean_height_m
 from torchcover.published.ranks import spearman
-from torchcover.simulation import Rig, builtin_names
+from torchcover.simulation import Rig, Scenario, builtin_names
 
 PAPER = "place3d2024"
 # Quantity and class in `datasets/published/place3d_2024.csv`, and what it is called here.
@@ -39,7 +39,7 @@ class AgreementStudy:
 
 def agree(
     paper: str = PAPER,
-    scenario: AnyScenario = "urban",
+    scenario: Scenario | str | Path = "urban",
     *,
     metrics: Sequence[str] | None = None,
     steps: int = 64,

@@ -1,21 +1,42 @@
-"""No run is lost: what it knows is written to a file now and then, and it goes on from there."""
+"""No run is lost: what it knows is written to a file now and then, and it goes on from there.
+
+The file is an `.npz` of the states of observers, and a header that says of which run they are.
+"""
 
 import io
+import json
+import math
 import time
 import warnings
+import zipfile
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import IO, Any, Protocol
 
-from torchcover.evaluation.checkpoint_file import RUN_KEYS, read_header, read_state, write_checkpoint, write_states
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
 from torchcover.evaluation.observers import CoverageObserver, Stateful
-from torchcover.evaluation.run_identity import differences
+from torchcover.evaluation.transport import Words, spread, words_of
+from torchcover.files import NpyHeader, check_memory, read_npz, reads, write_durably
 
 EVERY_S = 60.0
 # Writing takes at most this share of the time, though it may take seconds.
 MOST_TIME = 0.05
+FORMAT_VERSION = 1
+HEADER = "header"
+# Of NumPy's types: numbers that are real, and truth.
+KINDS = "fiub"
+# What the header has of the run.
+RUN_KEYS = ("steps", "counts", "skipped", "seconds")
+
+Array = NDArray[Any]
+State = Mapping[str, Any]
 
 
 class Progressing(Protocol):
@@ -40,9 +61,6 @@ class Checkpoint:
 
     path: Path
     resume: bool = True
-
-
-AnyCheckpoint = Checkpoint | str | Path
 
 
 class Journal:
@@ -122,3 +140,140 @@ def _checked(name: str, one: object) -> Stateful:
     except TypeError as error:
         raise TypeError(f"{name}: its state_dict cannot be kept in a checkpoint: {error}") from error
     return one
+
+
+def differences(here: Mapping[str, str], there: Mapping[str, str]) -> str:
+    """What two runs differ in, in words; empty where they do not.
+
+    Example:
+        >>> differences({"seed": "0", "scenario": "#17"}, {"seed": "1", "scenario": "#4"})
+        'scenario (other content), seed (1 there, 0 here)'
+    """
+    names = [name for name in sorted(here.keys() | there.keys()) if here.get(name) != there.get(name)]
+    return ", ".join(f"{name} {_change(here.get(name, 'none'), there.get(name, 'none'))}" for name in names)
+
+
+def _change(here: str, there: str) -> str:
+    return "(other content)" if "#" in (here[0], there[0]) else f"({there} there, {here} here)"
+
+
+def write_checkpoint(path: Path, header: Mapping[str, Any], states: Mapping[str, State]) -> None:
+    """Write it in the place of the one that is there; see `write_durably`.
+
+    Args:
+        path: The file.
+        header: What else is to be known, for JSON: `identity`, and `run` with `RUN_KEYS`.
+        states: By name; each of tensors, numbers, texts, None, and lists and dicts of them.
+
+    Raises:
+        TypeError: A state holds something else.
+        OSError: There is no room.
+    """
+    write_durably(path, partial(write_states, header=header, states=states))
+
+
+@reads("a checkpoint")
+def read_header(path: Path) -> dict[str, Any]:
+    """The header.
+
+    Raises:
+        FileNotFoundError: No such file.
+        BadFileError: Not a checkpoint, a damaged one, or one of another version.
+    """
+    text = str(_read(path, HEADER))
+    header: dict[str, Any] = json.loads(text)
+    if header.get("format") != FORMAT_VERSION:
+        raise ValueError(f"checkpoint format {header.get('format')}; this torchcover reads format {FORMAT_VERSION}")
+    for name, keys in (("identity", ()), ("run", RUN_KEYS), ("states", ())):
+        if not isinstance(header.get(name), dict) or not set(keys) <= header[name].keys():
+            raise ValueError(f"not a whole checkpoint: {name} is missing, or parts of it")
+    return header
+
+
+@reads("a checkpoint")
+def read_state(path: Path, header: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """One of the states, bit for bit.
+
+    Args:
+        path: The file.
+        header: Its header.
+        name: Which.
+
+    Raises:
+        BadFileError: It is damaged, or takes more memory than `TORCHCOVER_MAX_FILE_GB` allows.
+    """
+    state: dict[str, Any] = _unpacked(header["states"][name], path)
+    return state
+
+
+def write_states(file: IO[bytes], header: Mapping[str, Any], states: Mapping[str, State]) -> None:
+    """The content of the file."""
+    # One array after the other: together they would take as much memory again as the states.
+    with zipfile.ZipFile(file, "w") as archive:
+        numbers = iter(range(10**9))
+        packed = {name: _packed(state, archive, numbers) for name, state in states.items()}
+        _add(archive, HEADER, np.array(json.dumps({"format": FORMAT_VERSION, **header, "states": packed})))
+
+
+def _add(archive: zipfile.ZipFile, name: str, array: Array) -> None:
+    with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+        np.lib.format.write_array(member, array, allow_pickle=False)
+
+
+def _packed(value: Any, archive: zipfile.ZipFile, numbers: Iterator[int]) -> Any:  # noqa: ANN401  (a tree)
+    if isinstance(value, Tensor):
+        return {"tensor": _add_tensor(value, archive, f"{next(numbers)}")}
+    if isinstance(value, Mapping):
+        return {"dict": {_key(key): _packed(each, archive, numbers) for key, each in value.items()}}
+    if isinstance(value, list | tuple):
+        return {"list": [_packed(each, archive, numbers) for each in value]}
+    if value is None or type(value) in (bool, int, float, str):
+        return value
+    raise TypeError(f"a state of tensors, numbers, texts, lists and dicts is needed; got {type(value).__name__} in it")
+
+
+def _key(key: Any) -> str:  # noqa: ANN401
+    if not isinstance(key, str):
+        raise TypeError(f"a state is a dict by names; got the key {key!r}")
+    return key
+
+
+def _add_tensor(tensor: Tensor, archive: zipfile.ZipFile, name: str) -> dict[str, Any]:
+    array = tensor.detach().cpu().numpy()
+    if array.dtype.kind not in KINDS:
+        raise TypeError(f"a state of real numbers is needed; got a tensor of {tensor.dtype}")
+    words, at = words_of(array)
+    _add(archive, name, words)
+    if at is not None:
+        _add(archive, f"{name}.at", at)
+    return {"name": name, "dtype": array.dtype.str, "shape": list(tensor.shape), "places": at is not None}
+
+
+def _unpacked(node: Any, path: Path) -> Any:  # noqa: ANN401  (a tree)
+    if not isinstance(node, dict):
+        return node
+    ((kind, content),) = node.items()
+    if kind == "dict":
+        return {key: _unpacked(each, path) for key, each in content.items()}
+    if kind == "list":
+        return [_unpacked(each, path) for each in content]
+    return torch.from_numpy(_array(content, path))
+
+
+def _array(content: Mapping[str, Any], path: Path) -> Array:
+    dtype, shape, name = np.dtype(content["dtype"]), tuple(content["shape"]), content["name"]
+    if dtype.kind not in KINDS or min(shape, default=0) < 0:
+        raise ValueError(f"an array of {dtype} and the shape {shape}")
+    check_memory(math.prod(shape) * dtype.itemsize)
+    words = _read(path, name)
+    return spread(Words(words, _read(path, f"{name}.at") if content["places"] else None), dtype, shape)
+
+
+def _read(path: Path, name: str) -> Array:
+    return read_npz(path, _check_kind, lambda _: [name])[name]
+
+
+def _check_kind(header: NpyHeader) -> None:
+    """Words of bits and where they are, and one text: the header."""
+    if header.dtype.kind not in "uU":
+        raise ValueError(f"an array of {header.dtype}")

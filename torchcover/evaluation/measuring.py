@@ -1,5 +1,7 @@
 """One measurement: a task and its settings in, a result out; from a checkpoint, and over ranks."""
 
+import hashlib
+import json
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -7,54 +9,45 @@ from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
-from torchcover.evaluation.checkpoint import AnyCheckpoint, Checkpoint, Journal
-from torchcover.evaluation.observers import AnyObserver, CoverageObserver
+from torchcover import __version__
+from torchcover.coverage import CoverageMetric
+from torchcover.evaluation.checkpoint import Checkpoint, Journal
+from torchcover.evaluation.observers import BLOCKS, AnyObserver, CoverageObserver, new_metric, usable_device
 from torchcover.evaluation.omissions import left_out
 from torchcover.evaluation.other_metrics import compared, metrics_of
 from torchcover.evaluation.pipeline import Run, observe
 from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.result_files import claimed
-from torchcover.evaluation.run_identity import run_identity
 from torchcover.evaluation.sensor_drawings import check_drawable
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import TargetWatch
-from torchcover.evaluation.task import Task
-from torchcover.frames import BadFrameError
+from torchcover.evaluation.task import CALLER, Task
+from torchcover.frames import BadFrameError, FrameSource
+from torchcover.simulation import Asked
 
 Observers = Mapping[str, AnyObserver]
+# Of an identity, what is longer is told by its hash.
+MAX_TOLD = 40
 
 
-def measured(
-    task: Task,
-    settings: Settings,
-    others: Observers,
-    checkpoint: AnyCheckpoint | None = None,
-    ranks: Ranks | None = None,
-    *,
-    progress: bool = False,
-) -> Result:
+def measured(task: Task[FrameSource], settings: Settings) -> Result:
     """Measure it.
 
     Args:
         task: Which rigs in which frames.
         settings: How.
-        others: The user's own observers.
-        checkpoint: Where the run is saved, and goes on from.
-        ranks: The processes that share it.
-        progress: Whether to show a bar.
 
     Raises:
         ValueError: As `evaluate`.
     """
+    ranks = settings.ranks
     frames = task.frames
     sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
     check_drawable(sensors)
     metrics = metrics_of(task, settings)
     with ranks.aborting() if ranks else nullcontext():
-        coverage, seen, run = _observed(
-            task, settings, {**others, **metrics.observers}, checkpoint, ranks, progress=progress
-        )
+        coverage, seen, run = _observed(task, settings, {**settings.observers, **metrics.observers})
     metrics = metrics.after(seen)
     coverages = {name: observer.compute() for name, observer in coverage.items()}
     if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
@@ -71,7 +64,7 @@ def measured(
         awaited=task.asked.awaited,
         sensors=task.sensors,
         ego_outline_m=frames.ego_outline_m,
-        observed={name: seen[name].compute() for name in others},
+        observed={name: seen[name].compute() for name in settings.observers},
         metrics=compared(metrics, coverages, task.asked.awaited, settings.seed),
         left_out=left_out(
             run.counts,
@@ -82,27 +75,19 @@ def measured(
         ),
     )
     if result.cut_short:
-        warnings.warn(result.cut_short, RuntimeWarning, stacklevel=3)
+        warnings.warn(result.cut_short, RuntimeWarning, stacklevel=CALLER)
     return result
 
 
-def _observed(
-    task: Task,
-    settings: Settings,
-    others: Observers,
-    checkpoint: AnyCheckpoint | None,
-    ranks: Ranks | None,
-    *,
-    progress: bool,
-) -> tuple[Observers, Observers, Run]:
+def _observed(task: Task[FrameSource], settings: Settings, others: Observers) -> tuple[Observers, Observers, Run]:
     """All that was seen, by all ranks."""
+    ranks, checkpoint = settings.ranks, settings.checkpoint
     if ranks:
         settings = replace(settings, device=ranks.device(settings.device))
     sensors = task.sensor_names() if settings.redundancy else {}
+    has_areas = task.frames.square_metres
     coverage = {
-        name: CoverageObserver(
-            settings.metric(task.asked, sensors.get(name, ()), square_metres=task.frames.square_metres), name
-        )
+        name: CoverageObserver(metric_of(settings, task.asked, sensors.get(name, ()), square_metres=has_areas), name)
         for name in task.rigs
     }
     target = settings.target_error
@@ -128,7 +113,7 @@ def _observed(
             device=settings.device,
             skip_bad_frames=settings.skip_bad_frames,
             until=watch,
-            progress=progress and (ranks is None or ranks.rank == 0),
+            progress=settings.progress and (ranks is None or ranks.rank == 0),
             keep_partial=True,
             journal=journal,
             ranks=ranks,
@@ -164,7 +149,7 @@ def _whole(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Ru
     return whole, observers
 
 
-def _place(checkpoint: AnyCheckpoint, ranks: Ranks | None) -> Checkpoint:
+def _place(checkpoint: Checkpoint | str | Path, ranks: Ranks | None) -> Checkpoint:
     """Where this process keeps it: every rank has a file of its own."""
     place = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
     if ranks is None or ranks.rank == 0:
@@ -177,3 +162,89 @@ def _states(coverage: Observers, others: Observers, watch: TargetWatch | None) -
     """What a checkpoint keeps, by the names that its file and messages have."""
     rigs = {f"coverage of {name}": one for name, one in coverage.items()}
     return {**rigs, **{f"observer {name}": one for name, one in others.items()}, **({"watch": watch} if watch else {})}
+
+
+def metric_of(
+    settings: Settings,
+    asked: Asked,
+    sensors: Sequence[str] = (),
+    *,
+    square_metres: bool,
+    blocks: int = BLOCKS,
+) -> CoverageMetric:
+    """An empty metric of what `evaluate` is to measure.
+
+    Args:
+        settings: How.
+        asked: What is asked about.
+        sensors: Names of the sensors, for redundancy.
+        square_metres: Whether the frames have the square metres of reference points.
+        blocks: For standard errors.
+
+    Raises:
+        ValueError: An estimate by area is wanted, and there are no square metres; a device that cannot be used; as
+            `new_metric`.
+    """
+    if settings.estimate == "area" and not square_metres:
+        raise ValueError(
+            "estimate area: it needs the square metres of reference points, which the surface reference of a "
+            "simulation gives; leave it out for means over the known cells"
+        )
+    return new_metric(
+        asked,
+        settings.thresholds_m,
+        usable_device(settings.device),
+        blocks=blocks,
+        aggregations=settings.aggregations,
+        sensors=sensors,
+        square_metres=square_metres and settings.estimate != "known",
+    )
+
+
+def run_identity(
+    task: Task[FrameSource], settings: Settings, others: Mapping[str, AnyObserver], ranks: int = 1
+) -> dict[str, str]:
+    """All that the result of a run depends on, by name: not the steps, of which there may be more later, nor who works.
+
+    Args:
+        task: What is measured.
+        settings: How.
+        others: The user's own observers.
+        ranks: How many processes share the run; each has its own part of it.
+
+    Returns:
+        Name -> what it is, or a hash of it.
+
+    Raises:
+        FileNotFoundError: A file that a document names is missing.
+    """
+    kinds = {name: f"{type(one).__module__}.{type(one).__qualname__}" for name, one in others.items()}
+    everything = {
+        "torchcover": __version__,
+        **task.frames.content,
+        "rigs": task.rigs,
+        **_asked(task.asked),
+        "thresholds_m": settings.thresholds_m,
+        "aggregations": settings.aggregations,
+        "estimate": settings.estimate,
+        "redundancy": settings.redundancy,
+        "target_error": settings.target_error,
+        "observers": kinds,
+        "ranks": ranks,
+    }
+    return {name: _told(value) for name, value in everything.items()}
+
+
+def _asked(asked: Asked) -> dict[str, object]:
+    grid = asked.grid
+    return {
+        "cell_m": grid.cell,
+        "grid": [grid.x, grid.y],
+        "heights": list(grid.heights.items()),
+        "regions": [[region.name, region.x, region.y, region.corners_m] for region in asked.regions],
+    }
+
+
+def _told(value: object) -> str:
+    text = json.dumps(value, sort_keys=True, default=repr)
+    return text if len(text) <= MAX_TOLD else f"#{hashlib.sha256(text.encode()).hexdigest()}"

@@ -13,7 +13,7 @@ from torchcover.coverage.measures import area_in_blocks
 from torchcover.estimation import MIN_BLOCKS, Quantity
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
-from torchcover.frames import BadFrameError, Frame
+from torchcover.frames import BadFrameError, Frame, FrameSource
 from torchcover.published import PUBLISHED, FrameMetric, PublishedNumber, Setup, Sights
 from torchcover.published.comparison import OWN, MetricComparison, Series
 from torchcover.published.ranks import Array
@@ -56,7 +56,7 @@ class OtherMetrics(NamedTuple):
         return OtherMetrics(of_rigs, self.left_out)
 
 
-def metrics_of(task: Task, settings: Settings) -> OtherMetrics:
+def metrics_of(task: Task[FrameSource], settings: Settings) -> OtherMetrics:
     """Make the metrics that were asked for; what cannot be made for all rigs is left out, if others can.
 
     Raises:
@@ -64,7 +64,7 @@ def metrics_of(task: Task, settings: Settings) -> OtherMetrics:
     """
     if not settings.metrics:
         return OtherMetrics({}, {})
-    sights, threshold_m = Sights(), settings.thresholds[0] if settings.thresholds else 0.4
+    sights, threshold_m = Sights(), settings.thresholds_m[0] if settings.thresholds_m else 0.4
     ego = task.frames.scenario.ego_mesh() if isinstance(task.frames, SimulatedFrames) else None
     lacking = _lacking(task)
     left_out = {name: WHY[min(missing)] for name in settings.metrics if (missing := PUBLISHED[name].needs & lacking)}
@@ -88,7 +88,7 @@ def metrics_of(task: Task, settings: Settings) -> OtherMetrics:
     return OtherMetrics(observers, left_out)
 
 
-def _lacking(task: Task) -> frozenset[Need]:
+def _lacking(task: Task[FrameSource]) -> frozenset[Need]:
     """What the frames, or the rigs, do not have."""
     first = None if isinstance(task.frames, SimulatedFrames) else _first_frame(task)
     there: dict[Need, bool] = {
@@ -101,7 +101,7 @@ def _lacking(task: Task) -> frozenset[Need]:
     return frozenset(need for need, known in there.items() if not known)
 
 
-def _first_frame(task: Task) -> Frame | None:
+def _first_frame(task: Task[FrameSource]) -> Frame | None:
     for index in range(len(task.frames)):
         try:
             return task.frames[index]

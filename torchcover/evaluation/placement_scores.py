@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -10,15 +11,14 @@ from torch import Tensor
 
 from torchcover.coverage import Coverage, Region
 from torchcover.coverage.measures import Measure, area_in_blocks
-from torchcover.evaluation.evaluating import compare
+from torchcover.evaluation.evaluating import evaluate
 from torchcover.evaluation.other_metrics import drawn_worlds
-from torchcover.evaluation.rig_names import AnyRig, loaded
-from torchcover.evaluation.task import AnyScenario
+from torchcover.evaluation.task import AnyRig, loaded
 from torchcover.published import PUBLISHED, Candidate
 from torchcover.published.baselines import mean_height_m, rays
 from torchcover.published.comparison import Series
 from torchcover.published.ranks import LEAST, Array
-from torchcover.simulation import RegionsOfInterest
+from torchcover.simulation import RegionsOfInterest, Scenario
 
 THRESHOLD_M = 0.4
 CELL_M = 1.0
@@ -62,7 +62,7 @@ class PlacementScores:
 
 def score_placements(
     rigs: Mapping[str, AnyRig],
-    scenario: AnyScenario = "urban",
+    scenario: Scenario | str | Path = "urban",
     *,
     region: Region | None = None,
     metrics: Sequence[str] | None = None,
@@ -103,11 +103,11 @@ def score_placements(
         raise ValueError(f"rigs: three or more are needed to speak of ranks; got {', '.join(rigs) or 'none'}")
     carried = {name: loaded(rig).model_copy(update={"name": name}) for name, rig in rigs.items()}
     region = circle() if region is None else region
-    result = compare(
+    result = evaluate(
         list(carried.values()),
         scenario,
         ask=_around(region),
-        thresholds=THRESHOLD_M,
+        thresholds_m=THRESHOLD_M,
         metrics=tuple(dict.fromkeys([*(PUBLISHED if metrics is None else metrics), COUNTS_POINTS])),
         steps=steps,
         seed=seed,

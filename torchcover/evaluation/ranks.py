@@ -14,8 +14,8 @@ from torch import distributed
 from torch.distributed.distributed_c10d import PrefixStore, Store
 from torch.distributed.rendezvous import rendezvous
 
+from torchcover.evaluation.checkpoint import differences
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.run_identity import differences
 from torchcover.evaluation.transport import packed, unpacked
 
 Payload = TypeVar("Payload")

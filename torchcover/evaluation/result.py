@@ -234,8 +234,8 @@ class Result:
         if refused < REFUSED_SHARE * drawn:
             return []
         return [
-            f"{refused:,} of {drawn:,} places of the reference sensor ({refused / drawn:.0%}) were refused, for they lay "
-            "inside bodies or below the ground: does the ego stand on the ground, and do faces point outwards?"
+            f"{refused:,} of {drawn:,} places of the reference sensor ({refused / drawn:.0%}) were refused: they lay "
+            "inside bodies or below the ground. Does the ego stand on the ground, and do faces point outwards?"
         ]
 
     @property

@@ -1,21 +1,191 @@
-"""The runs of a study: every number of rays over the same instants, with a stopwatch."""
+"""The runs of a study: what is tried, the long run that it is measured against, and a stopwatch."""
 
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import torch
 from torch import Tensor
 
-from torchcover.evaluation.observers import CoverageObserver
+from torchcover.coverage import Coverage, CoverageMetric, forward_regions
+from torchcover.evaluation.measuring import metric_of
+from torchcover.evaluation.observers import BLOCKS, CoverageObserver
+from torchcover.evaluation.pipeline import observe
 from torchcover.evaluation.progress import progress_of
-from torchcover.evaluation.study_plan import StudyPlan
-from torchcover.evaluation.study_truth import area_sums
-from torchcover.simulation import SimulatedFrames
+from torchcover.evaluation.settings import DEFAULT_SCENARIO, OPTIONS, Settings
+from torchcover.evaluation.task import Task, simulation
+from torchcover.simulation import ReferenceSensor, SimulatedFrames, reference_called
+
+# The long run's seed is far away from any other.
+LONG_RUN_SEED = 1_000_003
+# What runs have reached is looked at after these steps at the least, then after twice as many, ...
+DOUBLINGS = 4
+DEFAULT_STEPS = 128
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """Which numbers of rays of the surface reference are tried, for how many steps, and what they are measured against.
+
+    Args:
+        settings: Of `evaluate`: one rig and a scenario, by names or paths, and what else decides about its numbers;
+            `steps` are the most of a run (128).
+        rays: Numbers of rays of the reference sensor at each step.
+        runs: Runs of so many steps that errors are averaged over; shorter ones are their parts, so that there are more.
+        long_run: What the runs are measured against: a coverage file of the same rig in the same scenario, with another
+            seed. Not given: a run is made for it.
+        long_run_steps: Steps of that run.
+
+    Raises:
+        ValueError: No number of rays or run, or not one rig by its name.
+    """
+
+    settings: Settings
+    rays: tuple[int, ...] = (1024, 4096, 16_384)
+    runs: int = 2
+    long_run: Path | None = None
+    long_run_steps: int = 512
+
+    def __post_init__(self) -> None:
+        if not self.rays:
+            raise ValueError("rays: at least one is needed; got none")
+        for name in ("runs", "long_run_steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: at least 1 is needed; got {getattr(self, name)}")
+        named = (*self.settings.rigs, self.settings.scenario or DEFAULT_SCENARIO)
+        if len(named) != 2 or not all(isinstance(one, str | Path) for one in named):
+            raise ValueError(
+                "study: one rig and a scenario are needed, by names or paths: a command is timed with them"
+            )
+
+    @property
+    def rig(self) -> str:
+        """What the rig was called."""
+        return str(self.settings.rigs[0])
+
+    @property
+    def scenario(self) -> str:
+        """What the scenario was called."""
+        return str(self.settings.scenario or DEFAULT_SCENARIO)
+
+    @property
+    def lengths(self) -> list[int]:
+        """Steps after which runs are looked at: each twice the one before."""
+        steps = self.settings.steps or DEFAULT_STEPS
+        shortest = max(1, steps >> DOUBLINGS)
+        return [shortest << k for k in range(DOUBLINGS + 1) if shortest << k <= steps]
+
+    def frames(self, seed: int, steps: int) -> SimulatedFrames:
+        """The frames of a run."""
+        return simulation(replace(self.settings, seed=seed, steps=steps)).frames
+
+    def reference_sensor(self, rays: int) -> ReferenceSensor:
+        """The reference sensor, aimed as that of `evaluate`."""
+        return reference_called(rays=rays, asked=self.task.asked)
+
+    def metric(self, blocks: int) -> CoverageMetric:
+        """An empty metric."""
+        return metric_of(self.settings, self.task.asked, square_metres=True, blocks=blocks)
+
+    @property
+    def command(self) -> list[str]:
+        """What `torchcover` is told to do the same: the command, the rig, and the options that are not as usual."""
+        usual, words = Settings(), ["evaluate", self.rig]
+        for name, option in OPTIONS.items():
+            given = getattr(self.settings, name)
+            if option.in_study and given != getattr(usual, name):
+                each = given if isinstance(given, tuple) else [given]
+                words += [f"--{name.replace('_', '-')}={value}" for value in each]
+        return words
+
+    @cached_property
+    def task(self) -> Task[SimulatedFrames]:
+        """What is measured."""
+        return simulation(self.settings)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The long run: what it says about the paper's regions and bands.
+
+    Args:
+        coverage: Its coverage, by area.
+
+    Raises:
+        ValueError: It has no square metres.
+    """
+
+    coverage: Coverage
+
+    def __post_init__(self) -> None:
+        if self.coverage.measure != "area":
+            raise ValueError("long run: its reference points had no square metres; make it with the surface reference")
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Its own standard errors by the key of their quantity, root mean squares: no smaller error can be told."""
+        places = [(region, height) for region in forward_regions() for height in self.coverage.grid.heights]
+        each = torch.stack([self.coverage.estimate(*place).error for place in places])
+        return self._by_key(each.square().nanmean(dim=0).sqrt())
+
+    def distances(self, sums: Tensor) -> dict[str, float]:
+        """Root mean squares of what runs are off by, over them, the regions and the bands, by the key of the quantity.
+
+        NaN if a run has seen nothing of a region of which the long run has.
+
+        Args:
+            sums: (N, R, 1 + Q, H) what `area_sums` says of each of N runs.
+        """
+        truth = _ratios(area_sums(self.coverage))
+        known = truth.isfinite()
+        squares = (_ratios(sums) - truth).square().where(known, 0.0)
+        return self._by_key((squares.sum(dim=(0, 1, 3)) / (len(sums) * known.sum(dim=(0, 2)))).sqrt())
+
+    def _by_key(self, numbers: Tensor) -> dict[str, float]:
+        keys = [quantity.key for quantity in self.coverage.quantities]
+        return dict(zip(keys, numbers.tolist(), strict=True))
+
+
+def area_sums(coverage: Coverage) -> Tensor:
+    """(R, 1 + Q, H) sums over the visible surface of the paper's R regions in H bands; those of other steps add up.
+
+    The square metres, then those times each of Q quantities.
+    """
+    assert coverage.area is not None  # no other is studied
+    sums = coverage.area.totals()
+    return torch.stack([sums[:, :, region.mask(coverage.grid)].sum(dim=2) for region in forward_regions()])
+
+
+def long_run(plan: StudyPlan, *, progress: bool) -> Truth:
+    """Do it, or read it.
+
+    Raises:
+        FileNotFoundError: No such file.
+        ValueError: It is no coverage by area, or one with other thresholds.
+    """
+    if plan.long_run is None:
+        observer = CoverageObserver(plan.metric(BLOCKS))
+        frames = plan.frames(LONG_RUN_SEED + plan.settings.seed, plan.long_run_steps)
+        observe(frames, [observer], progress=progress, title="long run")
+        return Truth(observer.compute())
+    coverage = Coverage.load(plan.long_run)
+    if coverage.thresholds != plan.settings.thresholds_m:
+        measured, wanted = (
+            " and ".join(f"{threshold:g} m" for threshold in each)
+            for each in (coverage.thresholds, plan.settings.thresholds_m)
+        )
+        raise ValueError(f"{plan.long_run}: measured within {measured}; wanted is {wanted}")
+    return Truth(coverage)
+
+
+def _ratios(sums: Tensor) -> Tensor:
+    return sums[..., 1:, :] / sums[..., :1, :]
 
 
 @dataclass
@@ -101,7 +271,7 @@ def tried(plan: StudyPlan, one_step_s: float, *, progress: bool) -> Tried:
         progress: Whether to show a bar.
     """
     steps, part = plan.runs * plan.lengths[-1], plan.lengths[0]
-    base = plan.frames(plan.seed, steps)
+    base = plan.frames(plan.settings.seed, steps)
     trials = [
         Trial(rays, base.with_reference_sensor(plan.reference_sensor(rays)), CoverageObserver(plan.metric(blocks=1)))
         for rays in plan.rays
@@ -132,14 +302,11 @@ def command_s(plan: StudyPlan) -> float:
     Raises:
         ValueError: It fails.
     """
-    command = [sys.executable, "-m", "torchcover", "evaluate", str(plan.rig), "--scenario", str(plan.scenario)]
-    settings: dict[str, object] = {"rays": plan.rays[0], "steps": 1, "seed": plan.seed, "cell": plan.cell_m}
-    if plan.vehicle is not None:
-        settings["vehicle"] = plan.vehicle
+    words = [*plan.command, f"--rays={plan.rays[0]}", "--steps=1"]
     clock = Clock()
     with TemporaryDirectory() as folder, clock.running():
-        options = [f"--{name}={value}" for name, value in settings.items()]
-        done = subprocess.run([*command, *options, f"--out={folder}"], check=False, capture_output=True, text=True)
+        command = [sys.executable, "-m", "torchcover", *words, f"--out={folder}"]
+        done = subprocess.run(command, check=False, capture_output=True, text=True)
     if done.returncode:
-        raise ValueError(f"{' '.join([*command[1:], *options])} ended with {done.returncode}: {done.stderr.strip()}")
+        raise ValueError(f"torchcover {' '.join(words)} ended with {done.returncode}: {done.stderr.strip()}")
     return clock.seconds

@@ -10,9 +10,8 @@ from matplotlib.figure import Figure
 from torchcover.coverage import BevGrid
 from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.result_files import ResultFiles
-from torchcover.evaluation.rig_names import AnyRig, as_called
-from torchcover.evaluation.settings import spread_s
 from torchcover.evaluation.target_page import target_page
+from torchcover.evaluation.task import AnyRig, as_called, spread_s
 from torchcover.report import draw_targets, page_html
 from torchcover.simulation import Scenario, Sensor, with_ego
 from torchcover.simulation.bodies import Body

@@ -1,34 +1,49 @@
-"""What there is to measure: which rigs, in which frames."""
+"""What there is to measure: which rigs, what they are called, in which frames."""
 
+import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
-from torchcover.evaluation.rig_names import AnyRig, distinct_names, given_as, is_document, loaded
-from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings, spread_s
+from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings
 from torchcover.frames import BadFrameError, ChosenRigs, FrameSource
 from torchcover.recordings import RecordedFrames
 from torchcover.recordings.suspicion import suspicions
-from torchcover.simulation import Asked, Scenario, Sensor, SimulatedFrames, reference_called, with_ego
+from torchcover.simulation import (
+    Asked,
+    RegionsOfInterest,
+    Rig,
+    Scenario,
+    Sensor,
+    SimulatedFrames,
+    builtin_names,
+    reference_called,
+    with_ego,
+)
 
-AnyScenario = Scenario | str | Path
-AnyFrames = FrameSource | str | Path
+AnyRig = Rig | str | Path
+SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
+
+# Steps that follow each other are alike (docs/measured/error_bars.md), and every minute is another city.
+EVERY_S_IN_TRAFFIC = 10.0
+# Where warnings point to: the call of `evaluate`, beyond its own function, the one around that, and ours.
+CALLER = 4
 
 
-class Task(NamedTuple):
+class Task(NamedTuple, Generic[SourceT]):
     """Which rigs are measured in which frames.
 
     Args:
         frames: Frames of these rigs, under the names that they have in tables and files.
-        given: Name of each rig -> what the user called it; None if nobody named it.
+        given: Name of each rig -> what the user called it; None if it was not named.
         sensors: Name of each rig -> its sensors, where they are known.
         description: Where the frames come from, in words.
         asked: What is asked about.
         steps: Frames to use at most; None for all.
     """
 
-    frames: FrameSource
+    frames: SourceT
     given: Mapping[str, str | None]
     sensors: Mapping[str, Sequence[Sensor]]
     description: Mapping[str, object]
@@ -39,11 +54,6 @@ class Task(NamedTuple):
     def rigs(self) -> tuple[str, ...]:
         """What the rigs are called in tables and files."""
         return tuple(self.given)
-
-    @property
-    def place(self) -> str:
-        """Where the frames come from, for a message."""
-        return str(self.description["frames"] or self.description["scenario"])
 
     def sensor_names(self) -> Mapping[str, Sequence[str]]:
         """Name of each rig -> names of its sensors, from the first frame that can be used.
@@ -62,14 +72,8 @@ class Task(NamedTuple):
         raise ValueError("redundancy: no frame can be used")
 
 
-def task_of(rigs: Sequence[AnyRig], scenario: AnyScenario | None, frames: AnyFrames | None, settings: Settings) -> Task:
+def task_of(settings: Settings) -> Task[FrameSource]:
     """Simulate a scenario, or read a recording.
-
-    Args:
-        rigs: Those that were named; all of a recording if none.
-        scenario: The world; None for the default.
-        frames: A recording or another source instead.
-        settings: The rest.
 
     Raises:
         ValueError: No rig, a scenario beside a recording, settings for the other of the two, a rig that is not there.
@@ -79,15 +83,19 @@ def task_of(rigs: Sequence[AnyRig], scenario: AnyScenario | None, frames: AnyFra
     Warns:
         UserWarning: A recording that looks wrong; see `torchcover.recordings.suspicion`.
     """
+    for rig in settings.rigs:
+        if not isinstance(rig, Rig) and Path(rig).suffix == ".npz":
+            raise ValueError(f"{rig} is measured already: read it by Coverage.load, or compare it with others")
+    frames = settings.frames
     if frames is None:
-        return _simulation(rigs, DEFAULT_SCENARIO if scenario is None else scenario, settings)
-    if scenario is not None:
+        return simulation(settings)
+    if settings.scenario is not None:
         raise ValueError("scenario and frames exclude each other: simulate a scenario or read a recording")
     settings.check_recording()
     source = RecordedFrames(frames) if isinstance(frames, str | Path) else frames
     if isinstance(source, RecordedFrames):
         for doubt in suspicions(source, settings.steps):
-            warnings.warn(doubt, stacklevel=3)  # where `evaluate` or `compare` is called from
+            warnings.warn(doubt, stacklevel=CALLER)
     if not isinstance(source, FrameSource):
         missing = [name for name in vars(FrameSource) if not name.startswith("_") and not hasattr(source, name)]
         raise TypeError(
@@ -95,25 +103,35 @@ def task_of(rigs: Sequence[AnyRig], scenario: AnyScenario | None, frames: AnyFra
             f"which has no {', '.join(missing)}; for a list of frames, or a dataset, feed observers: "
             "torchcover.evaluation.observe(frames, observers)"
         )
-    return _recording(rigs, source, settings)
+    return _recording(source, settings)
 
 
-def _simulation(rigs: Sequence[AnyRig], scenario: AnyScenario, settings: Settings) -> Task:
+def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFrames]:
+    """Simulate a scenario.
+
+    Args:
+        settings: Of `evaluate`.
+        boxes: Whether frames are to have objects, even if no metric is about them.
+
+    Raises:
+        ValueError, FileNotFoundError: As `task_of`.
+    """
+    rigs, scenario = settings.rigs, DEFAULT_SCENARIO if settings.scenario is None else settings.scenario
     if not rigs:
         raise ValueError("which rig? Give a built-in name (see `torchcover list`) or a YAML file, or a recording")
     names = distinct_names(rigs)
     carried = {name: loaded(rig) for name, rig in zip(names, rigs, strict=True)}
     loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     world = with_ego(loaded_world, carried, settings.vehicle)
-    asked = settings.asked(world.ego_box().outline_m)
+    asked = (settings.ask or RegionsOfInterest()).around(world.ego_box().outline_m, settings.cell_m)
     frames = SimulatedFrames(
         world,
         rigs=carried,
         steps=settings.simulated_steps,
         seed=settings.seed,
         every_s=spread_s(world, settings.every_s),
-        reference_sensor=reference_called(settings.reference_sensor, settings.rays, asked),
-        boxes=settings.needs_boxes,
+        reference_sensor=reference_called(settings.reference, settings.rays, asked),
+        boxes=boxes or settings.needs_boxes,
     )
     frames.simulator.check_run(frames.steps)
     given = {name: given_as(rig) for name, rig in zip(names, rigs, strict=True)}
@@ -130,7 +148,8 @@ def _most_steps(frames: SimulatedFrames, settings: Settings) -> int | None:
     return max(DEFAULT_STEPS, distinct)
 
 
-def _recording(rigs: Sequence[AnyRig], frames: FrameSource, settings: Settings) -> Task:
+def _recording(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
+    rigs = settings.rigs
     names = distinct_names(rigs or list(frames.rigs))
     only_one = len(names) == len(frames.rigs) == 1  # which goes by any name
     chosen = ChosenRigs(frames, dict(zip(names, frames.rigs if only_one else names, strict=True)))
@@ -139,5 +158,93 @@ def _recording(rigs: Sequence[AnyRig], frames: FrameSource, settings: Settings) 
     # A name that is in the recording may be a name only; any other has to be that of a rig.
     documents = {name: rig for name, rig in named.items() if is_document(rig) or name not in frames.rigs}
     sensors = {**chosen.sensors, **{name: loaded(rig).sensors for name, rig in documents.items()}}
-    asked = settings.asked(frames.ego_outline_m)
+    asked = (settings.ask or RegionsOfInterest()).around(frames.ego_outline_m, settings.cell_m)
     return Task(chosen, given, sensors, frames.description, asked, settings.steps)
+
+
+def spread_s(scenario: Scenario, given_s: float | None) -> float:
+    """Time between two steps: what was given, else 10 s in traffic, else what spreads the steps over the scenario.
+
+    That is the golden share of its instants, round and round: any number of steps lies evenly over all of it, and no
+    instant comes again before all have been seen.
+
+    Example:
+        >>> drive = {"name": "drive", "ego": {"shape": {"type": "box", "size_m": [4, 2, 2]}, "trajectory": "drive.csv"}}
+        >>> ground = {"bodies": [{"name": "ground", "shape": {"type": "plane", "size_m": [99, 99]}}], "duration_s": 30}
+        >>> every_s = spread_s(Scenario.model_validate({**drive, **ground}), None)
+        >>> [round(step * every_s % 30.1, 1) for step in range(6)]
+        [0.0, 18.6, 7.1, 25.7, 14.2, 2.7]
+    """
+    if given_s is not None:
+        return given_s
+    if scenario.instants is None:
+        return EVERY_S_IN_TRAFFIC
+    share = (math.sqrt(5) - 1) / 2 * scenario.instants
+    each_once = (steps for steps in range(1, scenario.instants + 1) if math.gcd(steps, scenario.instants) == 1)
+    return min(each_once, key=lambda steps: abs(steps - share)) * scenario.step_s
+
+
+def distinct_names(rigs: Sequence[AnyRig]) -> list[str]:
+    """What the columns are called: the rig's name, or the stem of its file; numbered where two would be the same.
+
+    Example:
+        >>> distinct_names(["kitti", "old/my.yaml", "new/my.yaml"])
+        ['kitti', 'my', 'my_2']
+    """
+    return distinct([_stem(rig) for rig in rigs])
+
+
+def distinct(stems: Sequence[str]) -> list[str]:
+    """Names of which no two are the same, for no file system; numbered where they would be.
+
+    Example:
+        >>> distinct(["roof", "Roof", "grille"])
+        ['roof', 'Roof_2', 'grille']
+    """
+    names: list[str] = []
+    for stem in stems:
+        name, number = stem, 2
+        while name.lower() in (other.lower() for other in names):
+            name, number = f"{stem}_{number}", number + 1
+        names.append(name)
+    return names
+
+
+def loaded(rig: AnyRig) -> Rig:
+    """The rig itself.
+
+    Raises:
+        FileNotFoundError: No such file or built-in name.
+        ValueError: The file is not a rig.
+    """
+    return rig if isinstance(rig, Rig) else Rig.load(rig)
+
+
+def as_called(rig: AnyRig) -> Rig:
+    """The rig itself, under the name that tables and files of every command have for it.
+
+    Raises:
+        FileNotFoundError: As `loaded`.
+        ValueError: As `loaded`.
+    """
+    return loaded(rig).model_copy(update={"name": _stem(rig)})
+
+
+def is_document(rig: AnyRig) -> bool:
+    """Whether there is more to it than a name: a rig, the path of one, or the name of a built-in one."""
+    return isinstance(rig, Rig) or _is_file(rig) or str(rig) in builtin_names("rigs")
+
+
+def given_as(rig: AnyRig) -> str:
+    """What the user called it."""
+    return rig.name if isinstance(rig, Rig) else str(rig)
+
+
+def _stem(rig: AnyRig) -> str:
+    if isinstance(rig, Rig):
+        return rig.name
+    return Path(rig).stem if _is_file(rig) else str(rig)
+
+
+def _is_file(rig: str | Path) -> bool:
+    return Path(rig).suffix in (".yaml", ".yml")

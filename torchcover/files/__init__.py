@@ -2,6 +2,7 @@
 
 from torchcover.files.bad_file import BadFileError, naming, reads
 from torchcover.files.budget import TooLargeError, check_memory
+from torchcover.files.csv_tables import read_csv
 from torchcover.files.durable import write_durably
 from torchcover.files.feather import read_feather
 from torchcover.files.json_tables import read_json_table
@@ -23,6 +24,7 @@ __all__ = [
     "npz_headers",
     "parse_xml",
     "parse_yaml",
+    "read_csv",
     "read_feather",
     "read_json_table",
     "read_npy",

@@ -12,7 +12,7 @@ from torchcover.files.text import decode
 OBJECTS_PER_BYTE = 8
 
 
-class Table(NamedTuple):
+class JsonTable(NamedTuple):
     """A table.
 
     Args:
@@ -37,7 +37,7 @@ class Table(NamedTuple):
 
 
 @reads("a table of rows")
-def read_json_table(path: Path) -> Table:
+def read_json_table(path: Path) -> JsonTable:
     """Read a JSON list of objects.
 
     Raises:
@@ -47,4 +47,4 @@ def read_json_table(path: Path) -> Table:
     rows = json.loads(decode(path.read_bytes()))
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise ValueError(f"a list of objects is needed; got {type(rows).__name__}")
-    return Table(path, rows, {row["token"]: row for row in rows if "token" in row})
+    return JsonTable(path, rows, {row["token"]: row for row in rows if "token" in row})

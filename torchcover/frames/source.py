@@ -60,7 +60,7 @@ class FrameSource(Protocol):
 
     @property
     def ego_outline_m(self) -> NDArray[np.float64] | None:
-        """(K, 2) corners x, y of the ego in the vehicle frame in metres; None if nobody knows."""
+        """(K, 2) corners x, y of the ego in the vehicle frame in metres; None if unknown."""
         ...
 
     @property
@@ -75,7 +75,7 @@ class FrameSource(Protocol):
 
     @property
     def reference_record(self) -> Mapping[str, object] | None:
-        """Where the reference comes from, for `summary.json`: `sensor` and its settings; None if nobody knows.
+        """Where the reference comes from, for `summary.json`: `sensor` and its settings; None if unknown.
 
         It has `notes`, sentences that a reader of the numbers has to know, and if it was simulated `every_s`.
         """

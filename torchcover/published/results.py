@@ -8,9 +8,8 @@ from typing import Self
 
 import numpy as np
 
-from torchcover.files import reads
+from torchcover.files import read_csv, reads
 from torchcover.published.ranks import Array, spearman
-from torchcover.recordings.formats.csv_tables import read_csv
 from torchcover.simulation import builtin_folder
 
 COLUMNS = ("placement", "quantity", "model", "class")

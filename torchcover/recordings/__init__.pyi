@@ -3,6 +3,7 @@ from .clouds.readers import read_cloud as read_cloud
 from .formats import FORMATS as FORMATS
 from .formats import RecordingFormat as RecordingFormat
 from .formats import open_recording as open_recording
+from .formats import read_objects as read_objects
 from .recorded_frames import RecordedFrames as RecordedFrames
 from .recorded_frames import reference_of_recording as reference_of_recording
 from .recorded_reference import RecordedReference as RecordedReference

@@ -30,7 +30,7 @@ class Thinned:
         voxel: (N,) int64 number of the voxel of each, ascending.
         of_box: Name of each object -> (M, 3) float64 points in the frame of its box: x along its heading, its centre in
             the middle.
-        unnamed: Points in boxes without a name, which nobody can find again.
+        unnamed: Points in boxes without a name, which cannot be found again.
         dropped: As `InVehicle.dropped`.
     """
 
@@ -237,7 +237,7 @@ def _first_place(recording: Recording) -> NDArray[np.float64]:
 
 
 def _pose(recording: Recording, index: int) -> Matrix:
-    """Where the vehicle was; it has not moved where nobody knows."""
+    """Where the vehicle was; it has not moved where that is unknown."""
     pose = recording.world_T_vehicle(index)
     return np.eye(4) if pose is None else pose
 

@@ -22,7 +22,7 @@ class InVehicle(NamedTuple):
     Args:
         points_m: (N, 3) float32.
         dropped: How many points were left out: `nonfinite`, `no_return`, `own_vehicle`; of an accumulated reference
-            also `gone`, those of objects that nobody has labelled at the instant.
+            also `gone`, those of objects that are not labelled at the instant.
         weights: (N,) float32 what each point counts for; None if all count the same.
         heights_m: (N,) float32 above the local ground, NaN where there is none at or below; None if that is unknown.
     """
@@ -38,7 +38,7 @@ def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
 
     Args:
         scan: What was stored.
-        body: The vehicle itself: points in it are its own. None: nobody knows how large it is.
+        body: The vehicle itself: points in it are its own. None: its size is unknown.
 
     Raises:
         ValueError: A coordinate beyond 1e5 m, as in a world frame.

@@ -14,7 +14,6 @@ from torchcover.detection.inside import with_hits
 from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
 from torchcover.recordings.accumulated_reference import AccumulatedReference
-from torchcover.recordings.formats import open_recording
 from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, joined
 from torchcover.recordings.recorded_reference import RecordedReference, Reference
 from torchcover.recordings.recording import Recording
@@ -24,7 +23,7 @@ RESULTS = frozenset({".lock", "summary.json", "checkpoint.npz"})
 
 
 class RecordedFrames(FrameDataset):
-    """What the sensors of a recording saw beside a reference, instant by instant. A map-style torch Dataset.
+    """What the sensors of a recording saw compared with a reference, instant by instant. A map-style torch Dataset.
 
     Points that are not finite, never came back (they lie in the sensor) or lie on the vehicle itself are in neither
     cloud; `Frame.counts` says how many (`sensor_nonfinite`, `reference_no_return`, ...). An empty sensor cloud is a
@@ -58,7 +57,11 @@ class RecordedFrames(FrameDataset):
         rigs: Mapping[str, Sequence[str]] | None = None,
         reference: Reference | None = None,
     ) -> None:
-        self.recording = open_recording(recording) if isinstance(recording, str | os.PathLike) else recording
+        if isinstance(recording, str | os.PathLike):
+            from torchcover.recordings.formats import open_recording  # all formats, for a path only
+
+            recording = open_recording(recording)
+        self.recording = recording
         self.sensors_of_rigs = {name: tuple(of) for name, of in (rigs or self.recording.rigs).items()}
         self._check_sensors()
         if reference is None:
@@ -184,7 +187,7 @@ class RecordedFrames(FrameDataset):
 
 
 def _stamps(place: Path) -> Iterator[tuple[str, int, int]]:
-    """Path, size and time of change of every file; those of results that somebody keeps beside it are no part of it."""
+    """Path, size and time of change of every file; those of results that are kept in its folder are no part of it."""
     if place.is_file():
         yield place.name, place.stat().st_size, place.stat().st_mtime_ns
     for folder, folders, names in os.walk(place):

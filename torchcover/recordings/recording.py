@@ -88,7 +88,7 @@ class Recording(Protocol):
 
     @property
     def times_s(self) -> NDArray[np.float64] | None:
-        """(F,) when they were, ascending; None if nobody knows."""
+        """(F,) when they were, ascending; None if unknown."""
         ...
 
     @property
@@ -98,7 +98,7 @@ class Recording(Protocol):
 
     @property
     def rigs(self) -> Mapping[str, Sequence[str]]:
-        """Name of each rig -> its sensors, where nobody wishes anything else."""
+        """Name of each rig -> its sensors, unless others are asked for."""
         ...
 
     @property
@@ -108,7 +108,7 @@ class Recording(Protocol):
 
     @property
     def body(self) -> BoundingBox | None:
-        """The vehicle itself, in its own frame; None if nobody knows."""
+        """The vehicle itself, in its own frame; None if unknown."""
         ...
 
     @property
@@ -131,11 +131,11 @@ class Recording(Protocol):
         ...
 
     def world_T_vehicle(self, index: int, /) -> Matrix | None:
-        """(4, 4) where the vehicle was, in a world that does not move; None if nobody knows."""
+        """(4, 4) where the vehicle was, in a world that does not move; None if unknown."""
         ...
 
     def boxes(self, index: int, /) -> Boxes | None:
-        """The labelled objects of an instant in the vehicle frame; None where nobody has labelled it."""
+        """The labelled objects of an instant in the vehicle frame; None where it is not labelled."""
         ...
 
 

@@ -37,7 +37,7 @@ FASTEST_MPS = 100.0
 
 
 @dataclass(frozen=True)
-class Look:
+class RecordedInstant:
     """One instant: name of each sensor -> (N, 3) float32 its points in the vehicle frame; the boxes."""
 
     clouds: dict[str, NDArray[np.float32]]
@@ -200,19 +200,19 @@ def alone_in_window(recording: Recording, reference: AccumulatedReference) -> st
         return None
     return (
         f"its instants are {apart_s:g} s apart, and a window of {reference.window_s:g} s reaches none but its own: are "
-        "the times in seconds? Else ask for a longer window (--window)"
+        "the times in seconds? Else ask for a longer window (--window-s)"
     )
 
 
-def _look(recording: Recording, sensors: Sequence[str], instant: int) -> Look | None:
+def _look(recording: Recording, sensors: Sequence[str], instant: int) -> RecordedInstant | None:
     try:
         clouds = {sensor: in_vehicle(recording.scan(sensor, instant), recording.body).points_m for sensor in sensors}
-        return Look(clouds, recording.boxes(instant))
+        return RecordedInstant(clouds, recording.boxes(instant))
     except (OSError, ValueError):
         return None
 
 
-def _joined(look: Look, sensors: Sequence[str]) -> NDArray[np.float32]:
+def _joined(look: RecordedInstant, sensors: Sequence[str]) -> NDArray[np.float32]:
     return np.concatenate([np.empty((0, 3), np.float32), *(look.clouds[sensor] for sensor in sensors)])
 
 

@@ -16,7 +16,7 @@ NONE = "none"
 
 def decisive(table: CoverageTable) -> Quantity:
     """What sensors are judged by: the detection at the first threshold, or the radius where there is none."""
-    return table.quantities[min(1, len(table.quantities) - 1)]
+    return table.means[min(1, len(table.thresholds))]
 
 
 def sensors_of(rows: Sequence[Row]) -> tuple[str, ...]:

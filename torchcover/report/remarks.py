@@ -73,7 +73,8 @@ def _on_errors(table: CoverageTable, rig: str) -> list[Remark]:
         return []
     if blocks < MIN_BLOCKS:
         return [Remark("too_few_blocks", blocks, MIN_BLOCKS)]
-    numbers = [row.summary.numbers.values() for row in table.rows[rig]]
+    means = [quantity.key for quantity in table.means]  # of a largest radius no error is ever known
+    numbers = [[row.summary.numbers[key] for key in means] for row in table.rows[rig]]
     without = sum(any(math.isfinite(number.value) and math.isnan(number.error) for number in row) for row in numbers)
     return [Remark("standard_errors", blocks, blocks), Remark("one_block_regions", without, len(numbers))]
 

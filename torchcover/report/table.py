@@ -52,7 +52,7 @@ class CoverageTable:
     """What a run has found, for one rig or for several over the same frames.
 
     Args:
-        quantities: What there is a number of.
+        quantities: What there is a number of: the means, then what other aggregations say.
         grid: Cells and height bands.
         thresholds: Detection thresholds in metres.
         max_radius: Saturation of the radius in metres.
@@ -94,7 +94,7 @@ class CoverageTable:
         summaries = {rig: coverage.summary(regions) for rig, coverage in coverages.items()}
         rows = _rows(coverages, regions, summaries)
         return cls(
-            quantities=first.quantities,
+            quantities=(*first.quantities, *(first.aggregated.quantities if first.aggregated else ())),
             grid=first.grid,
             thresholds=first.thresholds,
             max_radius=first.max_radius,
@@ -103,6 +103,11 @@ class CoverageTable:
             conditions={rig: _conditions(coverage) for rig, coverage in coverages.items()},
             notes=tuple(notes),
         )
+
+    @property
+    def means(self) -> tuple[Quantity, ...]:
+        """The mean radius, then the detection at each threshold."""
+        return self.quantities[: 1 + len(self.thresholds)]
 
     @property
     def rigs(self) -> tuple[str, ...]:
@@ -129,16 +134,16 @@ def _rows(
     several = len(coverages) > 1
     rows = []
     for (region, height), of_rigs in zip(places, zip(*summaries.values(), strict=True), strict=True):
-        best = _best(first.quantities, of_rigs) if several else [frozenset[str]()]
+        best = _best(of_rigs) if several else [frozenset[str]()]
         compared = differences(coverages, region, height) if several else {}
         each = zip(coverages, of_rigs, best, strict=True)
         rows.append({rig: Row(rig, region, summary, own, compared.get(rig, {})) for rig, summary, own in each})
     return rows
 
 
-def _best(quantities: Sequence[Quantity], rigs: Sequence[RegionSummary]) -> list[frozenset[str]]:
+def _best(rigs: Sequence[RegionSummary]) -> list[frozenset[str]]:
     """For each rig, the quantities in which it is best."""
-    marks = {quantity.key: best_of([summary.numbers[quantity.key] for summary in rigs]) for quantity in quantities}
+    marks = {key: best_of([summary.numbers[key] for summary in rigs]) for key in rigs[0].numbers}
     return [frozenset(key for key, marked in marks.items() if marked[at]) for at in range(len(rigs))]
 
 

@@ -1,6 +1,3 @@
-from .aimed_reference import DEFAULT_REFERENCE as DEFAULT_REFERENCE
-from .aimed_reference import reference_called as reference_called
-from .aimed_reference import reference_of_objects as reference_of_objects
 from .builtin import builtin_documents as builtin_documents
 from .builtin import builtin_folder as builtin_folder
 from .builtin import builtin_names as builtin_names
@@ -33,7 +30,10 @@ from .sensor import RayHits as RayHits
 from .sensor import Returns as Returns
 from .sensor import Sensor as Sensor
 from .sensor import vertical_fov_deg as vertical_fov_deg
+from .simulated_frames import DEFAULT_REFERENCE as DEFAULT_REFERENCE
 from .simulated_frames import SimulatedFrames as SimulatedFrames
+from .simulated_frames import reference_called as reference_called
+from .simulated_frames import reference_of_objects as reference_of_objects
 from .simulator import Observation as Observation
 from .simulator import Simulator as Simulator
 from .surface_reference import SurfaceReference as SurfaceReference

@@ -11,7 +11,7 @@ from torchcover.simulation.documents import Pose
 from torchcover.simulation.rays import unit_directions
 from torchcover.simulation.sensor import Draws, Elevation, Numbers, Ranging, RayHits, Returns
 
-# What is told about a division by rounding is no cell more.
+# What rounding adds to a quotient makes no cell more.
 ROUNDING = 1e-9
 
 Resolution = Annotated[float, Field(ge=1e-3)]
@@ -21,14 +21,14 @@ class Radar(Ranging):
     """A radar that tells apart range and azimuth, and no elevation. Its frame is x forward, y left, z up.
 
     The opening is cut into equal cells of azimuth, none wider than `azimuth_cell_deg`, and the range into cells of
-    `range_cell_m` from the sensor on. A cell casts rays at the middles of an even raster over its azimuth and all of
-    the vertical opening, so narrow that neighbours are at most `ray_spacing_m` apart at the largest range: what is
-    larger is hit. The point of a cell is the hit in the middle of its hits by range, of two the nearer: it lies on a
-    true surface, on that which fills most of the cell's view, and not on the bit of road in front of it.
+    `range_cell_m` from the sensor on. Rays point to the middles of an even raster over each cell of azimuth and all of
+    the vertical opening, so fine that neighbours are at most `ray_spacing_m` apart at the largest range: what is larger
+    is hit. The point of a cell is the hit in the middle of its hits by range, of two the nearer: it lies on a true
+    surface, on that which fills most of the cell's view, and not on the bit of road in front of it.
 
     This is geometry only: without radar cross section, incidence, multipath, Doppler or side lobes. Whatever is hit
-    gives a point, the road too, of which a real radar hears little; what a bumper or a car's underside lets through or
-    reflects is not seen.
+    gives a point, the road too, of which a real radar hears little; nothing is seen through a bumper, or below a car by
+    way of the road.
 
     Args:
         name: What maps and messages call it.
@@ -91,8 +91,10 @@ class Radar(Ranging):
     def _raster(self) -> tuple[int, int]:
         """Rows of rays, and columns in each cell of azimuth."""
         spacing_deg = math.degrees(self.ray_spacing_m / self.max_range_m)
-        wide_deg, high_deg = self.horizontal_fov_deg / self.azimuth_cells, float(np.ptp(self.vertical_fov_deg))
-        return tuple(max(math.ceil(opening / spacing_deg - ROUNDING), 1) for opening in (high_deg, wide_deg))
+        low_deg, high_deg = self.vertical_fov_deg
+        cell_deg = self.horizontal_fov_deg / self.azimuth_cells
+        rows, columns = (math.ceil(opening / spacing_deg - ROUNDING) for opening in (high_deg - low_deg, cell_deg))
+        return max(rows, 1), max(columns, 1)
 
     def directions(self) -> NDArray[np.float64]:
         """(3, rows, columns) unit directions in the radar's frame."""

@@ -8,14 +8,15 @@ import numpy as np
 from pydantic import NonNegativeFloat, PlainValidator, PositiveFloat, TypeAdapter, ValidationInfo, model_validator
 
 from torchcover.geometry import BoundingBox
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, called, mover_mesh
 from torchcover.simulation.documents import Document, PathBeside, Pose, load_document
 from torchcover.simulation.kinds import TRAFFIC
 from torchcover.simulation.local_ground import STEEPEST_DEG, level_faces
+from torchcover.simulation.recorded.bodies import read_boxes
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.tracks import read_boxes, read_trajectory
 from torchcover.simulation.traffic.kind import Traffic
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World, steps_of
 
 # What carries a rig that names no vehicle, unless the document says otherwise.

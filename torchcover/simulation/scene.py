@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, invert, overlap
+from torchcover.geometry.trajectory import poses_at
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
 from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces
 from torchcover.simulation.memory import check_fits
@@ -17,7 +18,6 @@ from torchcover.simulation.rays import Tile, rotate
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.solids import Solids
 from torchcover.simulation.surface import AboveGround, SceneSurface, bounds_along
-from torchcover.simulation.trajectory import poses_at
 from torchcover.simulation.world import Actor, World
 
 Matrix = NDArray[np.float64]

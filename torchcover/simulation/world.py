@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, euler_from_rotation, invert, transform
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.trajectory import Trajectory
 
 Matrix = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.recordings.recorders import RECORDERS
-from torchcover.recordings.recorders.recorder import Setup, Step
+from torchcover.recordings.recorders.recorder import RecordedStep, RecordingSetup
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.simulated_frames import SimulatedFrames
 
@@ -58,9 +58,9 @@ def write_recording(
         recorder.write(_step(frames, index))
 
 
-def _setup(frames: SimulatedFrames) -> Setup:
+def _setup(frames: SimulatedFrames) -> RecordingSetup:
     (rig,) = frames.rigs.values()
-    return Setup(
+    return RecordingSetup(
         rig.name,
         {sensor.name: sensor.mount.matrix() for sensor in rig.sensors},
         [sensor.name for sensor in rig.sensors if isinstance(sensor, Lidar)],
@@ -70,7 +70,7 @@ def _setup(frames: SimulatedFrames) -> Setup:
     )
 
 
-def _step(frames: SimulatedFrames, index: int) -> Step:
+def _step(frames: SimulatedFrames, index: int) -> RecordedStep:
     """Simulate a step of the only rig."""
     ((name, rig),) = frames.rigs.items()
     seen = frames.simulator.step(index)
@@ -79,7 +79,7 @@ def _step(frames: SimulatedFrames, index: int) -> Step:
     scene, step = frames.simulator.scene_of(index)
     world = scene.world
     played = round(index * frames.every_s / world.time_step_s) // world.steps if world.steps > 1 else 0
-    return Step(
+    return RecordedStep(
         f"{index:06d}",
         index * frames.every_s + played * APART_S,
         world.ego.trajectory.at(step * world.time_step_s),

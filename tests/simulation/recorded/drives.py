@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchcover.geometry import euler_from_rotation, invert, rigid
-from torchcover.simulation.recorded import argoverse2, nuscenes
+from torchcover.recordings.formats import argoverse2, nuscenes
 
 T0_NS = 315_966_000_000_000_000
 STEP_S, STEPS = 0.2, 21

@@ -5,6 +5,8 @@ import pickle
 import numpy as np
 import pytest
 
+from tests.recordings.drives import CAR_SIZE_M, Drive
+from tests.recordings.layouts import LAYOUTS
 from tests.simulation.recorded.drives import (
     EGO,
     ORIGIN_M,
@@ -22,8 +24,8 @@ from tests.simulation.recorded.drives import (
     write_nuscenes,
 )
 from torchcover import Rig, Scenario
-from torchcover.evaluation.settings import spread_s
-from torchcover.geometry import BoundingBox, rigid
+from torchcover.evaluation.task import spread_s
+from torchcover.geometry import BoundingBox, invert, rigid
 from torchcover.simulation import PaperReference, Simulator
 from torchcover.simulation.builtin import builtin_folder, builtin_names
 from torchcover.simulation.height_field import Slopes
@@ -290,6 +292,32 @@ def test_who_is_where_the_ego_is_is_left_out_and_named(tmp_path):
     assert "sign" in names
 
 
+@pytest.mark.parametrize(
+    ("layout", "name", "faces"), [("kitti_raw", "0", 13), ("carla", "17", 13), ("folder", "car", 12)]
+)
+def test_whatever_recording_has_boxes_plays_as_traffic(tmp_path, layout, name, faces):
+    recorded = Drive()
+    drive = scenario(LAYOUTS[layout](recorded, tmp_path))
+    world = drive.world()
+    (car,) = world.actors
+    assert (drive.steps, car.name) == (5, name)
+    np.testing.assert_allclose(BoundingBox.around(car.mesh.vertices_m).size_m, CAR_SIZE_M, atol=1e-6)
+    assert len(car.mesh.faces) >= faces  # a plain folder calls it "car, red", which is no word for a road user
+    for instant, time_s in enumerate(recorded.times_s):
+        wanted = invert(recorded.world_T_vehicle(instant)) @ recorded.world_T_car(instant)
+        wanted = wanted @ rigid(np.eye(3), [0.0, 0.0, -CAR_SIZE_M[2] / 2])
+        found = invert(world.ego.trajectory.at(time_s)) @ car.trajectory.at(time_s)
+        np.testing.assert_allclose(found, wanted, atol=1e-4, err_msg=str(instant))
+    assert len(Simulator(drive, {"rig": RIG}, FEW).step(2).clouds["rig"]) > 100
+
+
+def test_the_vehicle_of_a_recording_is_one_of_the_others_if_another_is_the_ego(tmp_path):
+    world = scenario(LAYOUTS["kitti_raw"](Drive(), tmp_path), ego_id="0").world()
+    (own,) = world.actors
+    assert own.name == "ego"
+    np.testing.assert_allclose(BoundingBox.around(own.mesh.vertices_m).size_m, (4.774, 1.82, 1.93))
+
+
 def test_one_scene_of_several_is_shown(tmp_path):
     folder = write_nuscenes(tmp_path / "v1.0-mini", scenes=("first", "second"))
     for path in (tmp_path, folder):
@@ -305,8 +333,15 @@ def test_what_a_run_means_depends_on_what_is_in_the_files(tmp_path):
     folder = write_argoverse2(tmp_path / "log")
     before = scenario(folder).content()
     assert before == scenario(write_argoverse2(tmp_path / "copy")).content()
-    write_argoverse2(folder, OTHERS[:-1])
-    assert before != scenario(folder).content()
+    first = OTHERS[0]
+    for others in (
+        OTHERS[:-1],
+        (first._replace(start_m=(24.0, 0.1)), *OTHERS[1:]),
+        (first._replace(size_m=(4.5, 1.8, 1.6)), *OTHERS[1:]),
+        (first._replace(category="bus"), *OTHERS[1:]),
+    ):
+        assert before != scenario(write_argoverse2(folder, others)).content()
+    assert before != scenario(write_argoverse2(tmp_path / "flat", heights=flat_m)).content()
     assert before != scenario(tmp_path / "copy", begin_s=1.0).content()
 
 

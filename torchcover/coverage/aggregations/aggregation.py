@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import ClassVar, Literal, NamedTuple
 
 from torch import Tensor
@@ -29,7 +30,7 @@ class BinnedStep(NamedTuple):
 
     Args:
         cell: (N,) int64 cell of each point.
-        radius: (N,) float64 blind spot radius in metres, at most `max_radius`.
+        values: (1 + T, N) float64 of each point: its `radius`, then 1 for each threshold that it is within, or 0.
         weight: (N,) weight of each point; None if all weigh the same.
         means: Over the points of each cell: the radius, then the detection at each threshold.
         block: Number of the block that the step belongs to.
@@ -39,19 +40,26 @@ class BinnedStep(NamedTuple):
     """
 
     cell: Tensor
-    radius: Tensor
+    values: Tensor
     weight: Tensor | None
     means: CellMeans
     block: int
     cells: int
     of_sensors: Tensor | None = None
 
+    @property
+    def radius(self) -> Tensor:
+        """(N,) float64 blind spot radius in metres, at most `max_radius`."""
+        return self.values[0]
 
+
+@dataclass(frozen=True)
 class Aggregation(ABC):
     """How the radii of a cell, point by point and step by step, become one number, or a few.
 
-    An aggregation is a frozen dataclass: its fields are part of what the sums of a metric mean. A new one is a class
-    and a line in `AGGREGATIONS`.
+    It gives maps, and numbers of regions: a region in a height band is one large cell. The numbers have errors where
+    all its states are added up. An aggregation is a frozen dataclass: its fields are part of what the sums of a metric
+    mean. A new one is a class and a line in `AGGREGATIONS`.
 
     Attributes:
         name: Tells it from the others; its states begin with it.
@@ -79,5 +87,6 @@ class Aggregation(ABC):
             max_radius: Saturation of the radius in metres.
 
         Returns:
-            Layers of (C,) values, which the metric gives the shape of the grid.
+            Layers of (C,) values, which the metric gives the shape of the grid, or reads as the numbers of C regions;
+            the same quantities whatever the sums.
         """

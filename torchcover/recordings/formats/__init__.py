@@ -1,9 +1,11 @@
 """The layouts of recordings, by name: a new one is a class and a line here."""
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
+from torchcover.recordings.formats import argoverse2, commonroad, nuscenes
 from torchcover.recordings.formats.argoverse2 import Argoverse2
 from torchcover.recordings.formats.carla import Carla
 from torchcover.recordings.formats.folder import FolderRecording
@@ -11,6 +13,8 @@ from torchcover.recordings.formats.kitti_object import KittiObject
 from torchcover.recordings.formats.kitti_raw import KittiRaw
 from torchcover.recordings.formats.nuscenes import NuScenes
 from torchcover.recordings.formats.ros2 import Ros2
+from torchcover.recordings.formats.track_tables import read_box_tracks
+from torchcover.recordings.objects import RecordedObjects, objects_of
 from torchcover.recordings.recording import Recording
 
 
@@ -66,3 +70,61 @@ def open_recording(path: str | os.PathLike[str], format_name: str | None = None)
             return recording_format(path)
     known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in FORMATS.items())
     raise ValueError(f"{path}: a recording of no known format; known are {known}")
+
+
+class ObjectFormat(NamedTuple):
+    """A format whose objects over time can be read without any scan.
+
+    Args:
+        recognises: Whether what is at a path that exists is meant to be of it.
+        read: From the path to the objects.
+    """
+
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path], RecordedObjects]
+
+
+# By what it consists of, for messages.
+OBJECT_FORMATS = {
+    "tables of nuScenes (a folder with sample_annotation.json)": ObjectFormat(
+        nuscenes.has_objects, nuscenes.read_objects
+    ),
+    "a log of Argoverse 2 (a folder with annotations.feather)": ObjectFormat(
+        argoverse2.has_objects, argoverse2.read_objects
+    ),
+    "a scenario of CommonRoad (.xml)": ObjectFormat(lambda path: path.suffix == ".xml", commonroad.read_objects),
+    "a table of boxes (.csv)": ObjectFormat(
+        lambda path: path.suffix == ".csv", lambda path: RecordedObjects(read_box_tracks(path))
+    ),
+}
+
+
+def read_objects(path: str | os.PathLike[str], scene: str | None = None) -> RecordedObjects:
+    """Read the objects of a recording over time, and the drive of its ego.
+
+    Args:
+        path: A log of Argoverse 2, tables of nuScenes, a scenario of CommonRoad, a table of boxes, or any recording
+            with poses, times and boxes.
+        scene: Which of tables that hold several.
+
+    Raises:
+        FileNotFoundError: There is nothing at the path, or a part of it is missing.
+        ValueError: No format that recognises it; what the format itself finds wrong.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such file or folder; recorded tracks are needed")
+    if scene is not None:
+        if not nuscenes.has_objects(path):
+            raise ValueError(f"{path}: scene: is for tables of nuScenes; leave it out")
+        return nuscenes.read_objects(path, scene)
+    for one in OBJECT_FORMATS.values():
+        if one.recognises(path):
+            return one.read(path)
+    for recording_format in FORMATS.values():
+        if recording_format.recognises(path):
+            return objects_of(recording_format(path))
+    raise ValueError(
+        f"{path}: recorded tracks are {'; '.join(OBJECT_FORMATS)}; or a recording with poses and boxes "
+        f"({', '.join(FORMATS)})"
+    )

@@ -14,12 +14,16 @@ from torchcover.detection.boxes import Boxes
 from torchcover.files import naming, read_feather
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings.objects import Ego, RecordedObjects, track_of
 from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
-from torchcover.recordings.tracks import Seen, Tracks
+from torchcover.recordings.seen import Seen, SeenObjects, by_name
 
 # The ego frame lies in the rear axle, 0.30 m above the ground; the centre of a Ford Fusion is 1.339 m before it, as in
 # the rig `argoverse2`, where the source is.
 vehicle_T_ego = rigid(np.eye(3), [-1.339, 0.0, 0.30])
+# As in the body `ford_fusion`, where its source is.
+SIZE_M = (4.869, 1.852, 1.476)
 POSE = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 CUBOIDS = ("timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *POSE)
 # Its outline is 4.87 x 1.85 m, and the LiDARs are up to 1.94 m high.
@@ -27,8 +31,30 @@ BODY = BoundingBox((-2.436, -0.926, 0.05), (2.436, 0.926, 2.14))
 # Each has 32 lasers; `laser_number` counts on from the upper one.
 LASERS = {"up_lidar": (0, 32), "down_lidar": (32, 64)}
 SWEEPS = ("sensors", "lidar")
+POSES = "city_SE3_egovehicle.feather"
+ANNOTATIONS = ("annotations.feather", "annotations_with_ego.feather")
 # Poses and sweeps have their times from one clock.
 MAX_CLOCK_GAP_NS = 10_000_000
+# The cuboids of those who ride are of the riders only; what they ride has one of its own, and is a box without anybody.
+CLASSES = {
+    "regular_vehicle": "passenger",
+    "large_vehicle": "delivery",
+    "truck": "truck",
+    "box_truck": "truck",
+    "truck_cab": "truck",
+    "bus": "bus",
+    "school_bus": "bus",
+    "articulated_bus": "bus",
+    "motorcycle": "motorcycle",
+    "pedestrian": "pedestrian",
+    "official_signaler": "pedestrian",
+    "bicyclist": "pedestrian",
+    "motorcyclist": "pedestrian",
+    "wheeled_rider": "pedestrian",
+}
+EGO_CATEGORY = "ego_vehicle"
+# An annotation belongs to a sweep, and the poses are those of the sweeps and others.
+MAX_ANNOTATION_GAP_S = 0.1
 
 
 class Argoverse2:
@@ -66,7 +92,7 @@ class Argoverse2:
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether it has sweeps and poses."""
-        return path.joinpath(*SWEEPS).is_dir() and (path / "city_SE3_egovehicle.feather").exists()
+        return path.joinpath(*SWEEPS).is_dir() and (path / POSES).exists()
 
     @property
     def frames(self) -> range:
@@ -112,26 +138,15 @@ class Argoverse2:
         return SensorCalibrations("calibration/", {name: vehicle_T_ego @ ego_T[name] for name in LASERS}, cameras)
 
     @cached_property
-    def _tracks(self) -> Tracks | None:
+    def _tracks(self) -> SeenObjects | None:
         """The cuboids of each sweep, in the frame of the ego at that time."""
-        path = self.path / "annotations.feather"
+        path = self.path / ANNOTATIONS[0]
         if not path.exists():
             return None
-        columns = read_feather(path, CUBOIDS)
-        times_s = (columns["timestamp_ns"].astype(np.int64) - self._times_ns[0]) * 1e-9
-        rotations = np.column_stack([columns[name] for name in ("qw", "qx", "qy", "qz")])
-        places = np.column_stack([columns[name] for name in ("tx_m", "ty_m", "tz_m")])
-        sizes = np.column_stack([columns[name] for name in ("length_m", "width_m", "height_m")])
-        tracks: dict[str, list[Seen]] = {}
-        for name, category, time_s, rotation, place, size in zip(
-            columns["track_uuid"], columns["category"], times_s, rotations, places, sizes, strict=True
-        ):
-            ego_T_box = rigid(rotation_from_quaternion(rotation), place)
-            tracks.setdefault(str(name), []).append(Seen(float(time_s), ego_T_box, tuple(size), str(category).lower()))
-        return Tracks(tracks, longest_gap_s=0.0)
+        return SeenObjects(_seen(read_feather(path, CUBOIDS), int(self._times_ns[0])), longest_gap_s=0.0)
 
     def _read_poses(self) -> list[Matrix]:
-        path = self.path / "city_SE3_egovehicle.feather"
+        path = self.path / POSES
         columns = read_feather(path, ("timestamp_ns", *POSE))
         times_ns = columns["timestamp_ns"].astype(np.int64)
         order = np.argsort(times_ns, kind="stable")
@@ -145,6 +160,58 @@ class Argoverse2:
                 f"{path}: the pose nearest to the sweep {self.names[worst]} is {gaps[worst] * 1e-9:.3f} s off"
             )
         return poses_of({name: column[nearest] for name, column in columns.items()})
+
+
+def has_objects(path: Path) -> bool:
+    """Whether it is a log with annotations, be there sweeps or not."""
+    return any((path / name).exists() for name in ANNOTATIONS)
+
+
+def read_objects(path: Path) -> RecordedObjects:
+    """Read the cuboids of a log and the drive of its ego, at times after the first pose.
+
+    Raises:
+        BadFileError: Tables of another content.
+        FileNotFoundError: No poses.
+        ImportError: pyarrow is not installed.
+    """
+    annotations = next(path / name for name in ANNOTATIONS if (path / name).exists())
+    cuboids, poses = read_feather(annotations, CUBOIDS), read_feather(path / POSES, ("timestamp_ns", *POSE))
+    with naming(path / POSES, "poses of Argoverse 2"):
+        origin_ns = int(poses["timestamp_ns"].min())
+        ego_s = _seconds(poses, origin_ns)
+        order = np.argsort(ego_s, kind="stable")
+        world_T_driven = np.stack(poses_of(poses))[order]
+        drive = Trajectory.from_poses(ego_s[order], world_T_driven)
+    with naming(annotations, "cuboids of Argoverse 2"):
+        times_s = _seconds(cuboids, origin_ns)
+        if (
+            times_s.min() < drive.times_s[0] - MAX_ANNOTATION_GAP_S
+            or times_s.max() > drive.times_s[-1] + MAX_ANNOTATION_GAP_S
+        ):
+            raise ValueError(
+                f"its times lie {times_s.min():g} to {times_s.max():g} s after the first pose of {POSES}, and the last "
+                f"pose is at {drive.times_s[-1]:g} s: are both of one log?"
+            )
+        world_T_ego = {time_s: drive.at(time_s) for time_s in np.unique(times_s).tolist()}
+        tracks = tuple(
+            track_of(seen, CLASSES.get(seen[0].category), np.stack([world_T_ego[one.time_s] for one in seen]))
+            for seen in by_name(_seen(cuboids, origin_ns)).values()
+            if seen[0].category != EGO_CATEGORY
+        )
+    return RecordedObjects(tracks, (Ego("ego", drive.times_s, world_T_driven, invert(vehicle_T_ego), SIZE_M),))
+
+
+def _seen(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> list[Seen]:
+    """The cuboids, in the frame of the ego at their times, which are after an origin."""
+    sizes_m = zip(*(columns[name].tolist() for name in CUBOIDS[3:6]), strict=True)
+    times_s, poses = _seconds(columns, origin_ns).tolist(), poses_of(columns)
+    rows = zip(columns["track_uuid"], columns["category"], times_s, poses, sizes_m, strict=True)
+    return [Seen(str(name), time_s, pose, size_m, str(what).lower()) for name, what, time_s, pose, size_m in rows]
+
+
+def _seconds(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> Matrix:
+    return np.asarray((columns["timestamp_ns"].astype(np.int64) - origin_ns) * 1e-9, dtype=np.float64)
 
 
 def poses_of(columns: Mapping[str, NDArray[Any]]) -> list[Matrix]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torchcover.cameras import read_depth
 from torchcover.cameras.calibration import LOOKING_FORWARD
 from torchcover.detection.boxes import Boxes
-from torchcover.files import naming
+from torchcover.files import naming, read_csv
 from torchcover.geometry import invert, transform
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.readers import read_cloud
@@ -25,7 +25,6 @@ from torchcover.recordings.formats.carla_files import (
     read_carla_vehicle,
     right_handed,
 )
-from torchcover.recordings.formats.csv_tables import read_csv
 from torchcover.recordings.formats.file_names import check_frames, check_same_names, frame_files
 from torchcover.recordings.recording import Scan, check_times
 
@@ -64,7 +63,7 @@ class Carla:
             bad table.
 
     Warns:
-        UserWarning: Nobody knows how long a turn takes, and the first file of a LiDAR looks like a part of one.
+        UserWarning: How long a turn takes is unknown, and the first file of a LiDAR looks like a part of one.
     """
 
     layout: ClassVar[str] = "sensors.json, ID/FRAME.ply of each LiDAR and ID/FRAME.png of each depth camera in it"
@@ -204,7 +203,7 @@ def _lists(folder: Path) -> list[Path]:
 
 
 def _parts_of_a_turn(sensor: CarlaSensor, times_s: NDArray[np.float64]) -> int:
-    """How many files make a turn; 1 where nobody knows, as of a camera."""
+    """How many files make a turn; 1 where that is unknown, as of a camera."""
     if sensor.rotation_frequency is None or sensor.camera is not None or len(times_s) < 2:
         return 1
     turns_in_a_file = sensor.rotation_frequency * float(np.median(np.diff(times_s)))

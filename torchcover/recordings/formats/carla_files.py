@@ -11,10 +11,9 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, Va
 from torchcover.cameras import Camera
 from torchcover.detection.box_layouts import upright_rows
 from torchcover.detection.boxes import Boxes
-from torchcover.files import naming, parse_yaml, read_short_text, reads
+from torchcover.files import naming, parse_yaml, read_csv, read_short_text, reads
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.formats.csv_tables import read_csv
 
 LIDARS = ("sensor.lidar.ray_cast", "sensor.lidar.ray_cast_semantic")
 DEPTH = "sensor.camera.depth"

@@ -10,10 +10,9 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.detection.boxes import Boxes
-from torchcover.files import naming
+from torchcover.files import naming, read_csv
 from torchcover.geometry import rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import RIGID_TOLERANCE, Matrix
-from torchcover.recordings.formats.csv_tables import read_csv
 from torchcover.recordings.formats.file_names import check_frames, some_of
 
 PLACE, ROTATION = ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")

@@ -69,7 +69,7 @@ class KittiObject:
         return Scan(read_cloud(path), vehicle_T_velodyne, str(path))
 
     def world_T_vehicle(self, index: int) -> None:
-        """Nobody knows."""
+        """Unknown."""
 
     def calibrations(self) -> SensorCalibrations:
         """The rectified cameras of the first frame; the layout has the sizes of their images only where there are some.

@@ -1,9 +1,10 @@
 """nuScenes (Caesar et al., CVPR 2020): the LiDAR on the roof, its sweeps and key frames, and the annotations."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,12 +17,30 @@ from torchcover.files import naming, read_json_table
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quaternion
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.readers import read_cloud
+from torchcover.recordings.objects import Ego, RecordedObjects, track_of
 from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
-from torchcover.recordings.tracks import Seen, Tracks
+from torchcover.recordings.seen import Seen, SeenObjects, by_name
 
 # The ego frame lies under the rear axle, on the ground; the centre of a Renault Zoe's box is 1.385 m before it, as in
 # the rig `nuscenes`, where the source is.
 vehicle_T_ego = rigid(np.eye(3), [-1.385, 0.0, 0.0])
+# As in the body `renault_zoe`, where its source is.
+SIZE_M = (4.084, 1.730, 1.562)
+# By the beginning of a category; the first that fits counts.
+CLASSES = (
+    ("vehicle.car", "passenger"),
+    ("vehicle.emergency.police", "passenger"),
+    ("vehicle.emergency", "emergency"),
+    ("vehicle.truck", "truck"),
+    ("vehicle.bus", "bus"),
+    ("vehicle.motorcycle", "motorcycle"),
+    ("vehicle.bicycle", "bicycle"),
+    ("human.pedestrian.child", "child"),
+    ("human.pedestrian.wheelchair", None),
+    ("human.pedestrian.stroller", None),
+    ("human.pedestrian.personal_mobility", None),
+    ("human.pedestrian", "pedestrian"),
+)
 CHANNEL = "LIDAR_TOP"
 # Nothing but the car and what is mounted on it can be in its outline of 4.08 x 1.73 m up to a little above the LiDAR.
 BODY = BoundingBox((-2.042, -0.865, 0.05), (2.042, 0.865, 2.04))
@@ -57,7 +76,7 @@ class NuScenes:
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether there are tables of samples."""
-        return path.is_dir() and ((path / "sample_data.json").exists() or any(path.glob("v1.0-*/sample_data.json")))
+        return path.is_dir() and bool(_tables_with("sample_data", path))
 
     def scan(self, sensor: str, index: int) -> Scan:
         """Read a sweep."""
@@ -129,27 +148,9 @@ class NuScenes:
         self._tables, self._sample_times = tables, samples
 
     @cached_property
-    def _tracks(self) -> Tracks:
+    def _tracks(self) -> SeenObjects:
         with naming(self._tables, "annotations of nuScenes"):
-            return self._read_tracks()
-
-    def _read_tracks(self) -> Tracks:
-        categories = {row["token"]: str(row["name"]) for row in read_json_table(self._tables / "category.json").rows}
-        instances = read_json_table(self._tables / "instance.json")
-        tracks: dict[str, list[Seen]] = {}
-        for row in read_json_table(self._tables / "sample_annotation.json").rows:
-            if row["sample_token"] not in self._sample_times:
-                continue
-            width, length, height = row["size"]
-            token = row["instance_token"]
-            seen = Seen(
-                self._sample_times[row["sample_token"]],
-                rigid(rotation_from_quaternion(row["rotation"]), row["translation"]),
-                (length, width, height),
-                categories[instances.row(token)["category_token"]],
-            )
-            tracks.setdefault(token, []).append(seen)
-        return Tracks(tracks)
+            return SeenObjects(_seen(self._tables, self._sample_times))
 
     def _samples(self, tables: Path, scenes: Sequence[str] | None) -> dict[str, float]:
         """Token -> time in seconds of the key frames of the wanted scenes."""
@@ -160,6 +161,79 @@ class NuScenes:
         wanted = {token for name, token in by_name.items() if scenes is None or name in scenes}
         rows = read_json_table(tables / "sample.json").rows
         return {row["token"]: row["timestamp"] * 1e-6 for row in rows if row["scene_token"] in wanted}
+
+
+def has_objects(path: Path) -> bool:
+    """Whether it is one folder of tables with annotations, be there scans or not."""
+    return path.is_dir() and len(_tables_with("sample_annotation", path)) == 1
+
+
+def read_objects(path: Path, scene: str | None = None) -> RecordedObjects:
+    """Read the annotations of one scene and the drive of its ego, at times after its first sample.
+
+    Args:
+        path: The data set, or its folder of tables.
+        scene: Its name, or its token; the only one if None.
+
+    Raises:
+        BadFileError: Tables of another content, several scenes.
+        FileNotFoundError: A table is missing.
+    """
+    (tables,) = _tables_with("sample_annotation", path)
+    samples, poses = (read_json_table(tables / f"{name}.json").rows for name in ("sample", "ego_pose"))
+    with naming(tables, "tables of nuScenes"):
+        token = _scene(samples, tables / "scene.json", scene)
+        taken = {row["token"]: row["timestamp"] for row in samples if row["scene_token"] == token}
+        first_us, last_us = min(taken.values()), max(taken.values())
+        seen = by_name(_seen(tables, {token: (time_us - first_us) * 1e-6 for token, time_us in taken.items()}))
+        driven = sorted((row for row in poses if first_us <= row["timestamp"] <= last_us), key=itemgetter("timestamp"))
+        if not driven:
+            raise ValueError("no ego_pose from the first sample of the scene to the last")
+        ego_s = np.array([(row["timestamp"] - first_us) * 1e-6 for row in driven])
+        world_T_ego = np.stack([pose_of(row) for row in driven])
+        tracks = tuple(track_of(one, _class(one[0].category)) for one in seen.values())
+    return RecordedObjects(tracks, (Ego("ego", ego_s, world_T_ego, invert(vehicle_T_ego), SIZE_M),))
+
+
+def _seen(tables: Path, times_s: Mapping[str, float]) -> list[Seen]:
+    """The annotations of samples.
+
+    Args:
+        tables: Their folder.
+        times_s: Token of each sample -> its time.
+    """
+    categories, instances = read_json_table(tables / "category.json"), read_json_table(tables / "instance.json")
+    seen = []
+    for row in read_json_table(tables / "sample_annotation.json").rows:
+        if row["sample_token"] in times_s:
+            width, length, height = row["size"]
+            name = row["instance_token"]
+            category = str(categories.row(instances.row(name)["category_token"])["name"])
+            world_T_box = rigid(rotation_from_quaternion(row["rotation"]), row["translation"])
+            seen.append(Seen(name, times_s[row["sample_token"]], world_T_box, (length, width, height), category))
+    return seen
+
+
+def _scene(samples: list[dict[str, Any]], path: Path, scene: str | None) -> str:
+    """The token of the scene that is meant.
+
+    Raises:
+        ValueError: There is none of this name, or none is named of several.
+    """
+    tokens = dict.fromkeys(str(row["scene_token"]) for row in samples)
+    rows = read_json_table(path).rows if path.exists() else []
+    names = {row["name"]: row["token"] for row in rows if row["token"] in tokens}
+    called = names or {token: token for token in tokens}
+    if scene is None and len(tokens) == 1:
+        return next(iter(tokens))
+    if scene is not None and (scene in called or scene in tokens):
+        return str(called.get(scene, scene))
+    told = ", ".join(list(called)[:8]) + (f" and {len(called) - 8} more" if len(called) > 8 else "")
+    raise ValueError(f"scene: one of {told or 'none'} is needed; got {'none' if scene is None else repr(scene)}")
+
+
+def _class(category: str) -> str | None:
+    return next((found for beginning, found in CLASSES if category.lower().startswith(beginning)), None)
 
 
 def pose_of(row: dict[str, Any]) -> Matrix:
@@ -194,13 +268,18 @@ def _is_lidar(row: dict[str, Any]) -> bool:
 
 
 def _tables(path: Path) -> Path:
-    if (path / "sample_data.json").exists():
-        return path
-    versions = sorted(found.parent for found in path.glob("v1.0-*/sample_data.json"))
-    if len(versions) != 1:
-        names = ", ".join(version.name for version in versions) or "none"
+    found = _tables_with("sample_data", path)
+    if len(found) != 1:
+        names = ", ".join(version.name for version in found) or "none"
         raise ValueError(f"{path}: one folder of tables v1.0-*/ is needed; got {names}; name it in the path")
-    return versions[0]
+    return found[0]
+
+
+def _tables_with(table: str, path: Path) -> list[Path]:
+    """The folder itself if the table is in it, else those of its versions."""
+    if (path / f"{table}.json").exists():
+        return [path]
+    return sorted(found.parent for found in path.glob(f"v1.0-*/{table}.json"))
 
 
 def check_beneath(folder: Path, name: str) -> str:

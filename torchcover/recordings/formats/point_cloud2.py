@@ -23,7 +23,7 @@ class CloudMessage(NamedTuple):
     Args:
         points_m: (N, 3) in the frame of the sensor, those that are not finite included.
         stamp_ns: The time of the message, 0 if its sender gave none.
-        offsets_s: (N,) when each point was measured, since then; None if nobody knows.
+        offsets_s: (N,) when each point was measured, since then; None if unknown.
     """
 
     points_m: Points

@@ -130,7 +130,7 @@ class Ros2:
         return SensorCalibrations(f"static transforms to {self.vehicle_frame}", self._mounts)
 
     def boxes(self, index: int) -> None:
-        """Nobody has labelled anything."""
+        """None: there are no labels."""
 
     def _frames_of_clouds(self) -> dict[str, str]:
         """Topic of each cloud that comes often -> its frame."""

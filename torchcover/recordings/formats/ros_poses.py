@@ -18,12 +18,12 @@ ODOMETRY, TF, POSE = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "geometr
 WORLD = "odom"
 # Messages are recorded at most so long after they were stamped.
 WINDOW_NS = 1_000_000_000
-# Nobody knows where the vehicle was between two poses that are farther apart; before the first and after the last
+# Where the vehicle was is unknown between two poses that are farther apart; before the first and after the last
 # it goes on as before for a little.
 LONGEST_GAP_S, EDGE_S = 1.0, 0.15
 
 
-class Series(NamedTuple):
+class PoseSeries(NamedTuple):
     """Poses at ascending times.
 
     Args:
@@ -76,7 +76,7 @@ class VehiclePoses:
         self.source = source
         self._bag, self._topic, self._links = bag, topic, links
         self.logged_ns = bag.times_ns(topic)
-        self._last: tuple[int, Mapping[str, Series]] = (-1, {})
+        self._last: tuple[int, Mapping[str, PoseSeries]] = (-1, {})
         ends = [self._around(int(self.logged_ns[end])) for end in (0, -1)]
         moving = [link for link in links if isinstance(link, str)]
         self._span_ns = (
@@ -111,7 +111,7 @@ class VehiclePoses:
                     world_T_here = world_T_here @ link
             return world_T_here
 
-    def _around(self, logged_ns: int) -> Mapping[str, Series]:
+    def _around(self, logged_ns: int) -> Mapping[str, PoseSeries]:
         if self._last[0] != logged_ns:
             messages = self._bag.messages(self._topic, logged_ns - WINDOW_NS, logged_ns + WINDOW_NS)
             self._last = (
@@ -121,7 +121,7 @@ class VehiclePoses:
         return self._last[1]
 
 
-def series_of(messages: Sequence[Any], kind: str, name: str) -> dict[str, Series]:
+def series_of(messages: Sequence[Any], kind: str, name: str) -> dict[str, PoseSeries]:
     """Name of each frame -> its poses; those of `Odometry` and `PoseStamped` are called after their type.
 
     Raises:
@@ -190,11 +190,11 @@ def _of_tree(bag: Bag, topic: str, tree: FrameTree, vehicle_frame: str) -> list[
     return [VehiclePoses(bag, topic, links, f"{topic} ({vehicle_frame} in {frame})")]
 
 
-def _series(poses: Mapping[int, Matrix]) -> Series:
+def _series(poses: Mapping[int, Matrix]) -> PoseSeries:
     times_ns = np.array(sorted(poses), dtype=np.int64)
     sorted_poses = np.array([poses[int(time_ns)] for time_ns in times_ns])
     wxyz = np.array([quaternion_from_rotation(pose[:3, :3]) for pose in sorted_poses])
-    return Series(times_ns, sorted_poses[:, :3, 3], wxyz)
+    return PoseSeries(times_ns, sorted_poses[:, :3, 3], wxyz)
 
 
 def _slerp(first: Matrix, second: Matrix, share: Matrix) -> Matrix:

@@ -10,7 +10,7 @@ from torchcover.files import write_npz
 from torchcover.geometry import BoundingBox, invert, quaternion_from_rotation, transform
 from torchcover.recordings.formats.folder import BOXES, POSES_FILE, REFERENCE, SETTINGS_FILE
 from torchcover.recordings.formats.folder_tables import PLACE, ROTATION, write_boxes
-from torchcover.recordings.recorders.recorder import Setup, Step
+from torchcover.recordings.recorders.recorder import RecordedStep, RecordingSetup
 
 # What is so near to the ground is the ground that the vehicle stands on.
 CLEARANCE_M = 0.05
@@ -29,7 +29,7 @@ class FolderRecorder:
         ValueError: A sensor whose name is none of a folder.
     """
 
-    def __init__(self, folder: Path, setup: Setup) -> None:
+    def __init__(self, folder: Path, setup: RecordingSetup) -> None:
         self._folder = folder
         self._mounts = setup.mounts
         for name in self._mounts:
@@ -43,7 +43,7 @@ class FolderRecorder:
         (folder / SETTINGS_FILE).write_text(self._settings(setup), encoding="utf-8")
         self._append(["frame", "time_s", *PLACE, *ROTATION, "instant"])
 
-    def write(self, step: Step) -> None:
+    def write(self, step: RecordedStep) -> None:
         """Write a step; its line in `poses.csv` comes last."""
         for sensor, points in step.clouds.items():
             cloud = transform(invert(self._mounts[sensor]), points)
@@ -65,7 +65,7 @@ class FolderRecorder:
         with (self._folder / POSES_FILE).open("a", newline="", encoding="utf-8") as file:
             csv.writer(file).writerow(row)
 
-    def _settings(self, setup: Setup) -> str:
+    def _settings(self, setup: RecordingSetup) -> str:
         """The text of `frames.yaml`; values as JSON, which YAML reads."""
         own = setup.body
         body = BoundingBox((*own.lower_m[:2], own.lower_m[2] + CLEARANCE_M), own.upper_m)

@@ -8,7 +8,7 @@ from torchcover.detection.boxes import Boxes
 from torchcover.files import write_npz
 from torchcover.geometry import invert, transform
 from torchcover.recordings.formats.kitti_files import vehicle_T_velodyne
-from torchcover.recordings.recorders.recorder import Setup, Step
+from torchcover.recordings.recorders.recorder import RecordedStep, RecordingSetup
 
 # About KITTI's own camera, 0.27 m before the LiDAR and 0.08 m below it: x right, y down, z ahead. There are no images.
 camera_T_velodyne = np.array([[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, -0.08], [1.0, 0.0, 0.0, -0.27], [0, 0, 0, 1]])
@@ -32,7 +32,7 @@ class KittiRecorder:
         ValueError: Another rig than of one LiDAR.
     """
 
-    def __init__(self, folder: Path, setup: Setup) -> None:
+    def __init__(self, folder: Path, setup: RecordingSetup) -> None:
         if len(setup.mounts) != 1 or not setup.lidars:
             names = ", ".join(setup.mounts)
             raise ValueError(
@@ -47,7 +47,7 @@ class KittiRecorder:
         rows["Tr_imu_to_velo"] = "1 0 0 0 0 1 0 0 0 0 1 0"
         self._calibration = "".join(f"{key}: {numbers}\n" for key, numbers in rows.items())
 
-    def write(self, step: Step) -> None:
+    def write(self, step: RecordedStep) -> None:
         """Write a step; its LiDAR cloud comes last."""
         frame, velodyne_T_vehicle = step.frame, invert(vehicle_T_velodyne)
         (self._folder / "calib" / f"{step.name}.txt").write_text(self._calibration, encoding="utf-8")

@@ -10,7 +10,7 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import Points
 
 
-class Setup(NamedTuple):
+class RecordingSetup(NamedTuple):
     """What is recorded, the same at every step.
 
     Args:
@@ -30,7 +30,7 @@ class Setup(NamedTuple):
     boxes: bool
 
 
-class Step(NamedTuple):
+class RecordedStep(NamedTuple):
     """A step of a recording.
 
     Args:
@@ -51,7 +51,7 @@ class Step(NamedTuple):
 class Recorder(Protocol):
     """Writes a recording step by step."""
 
-    def __init__(self, folder: Path, setup: Setup, /) -> None:
+    def __init__(self, folder: Path, setup: RecordingSetup, /) -> None:
         """Begin one in an empty or a new folder.
 
         Raises:
@@ -59,6 +59,6 @@ class Recorder(Protocol):
         """
         ...
 
-    def write(self, step: Step, /) -> None:
+    def write(self, step: RecordedStep, /) -> None:
         """Write a step; what was written before stays good if this one fails."""
         ...

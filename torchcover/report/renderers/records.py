@@ -21,6 +21,7 @@ def records_of(table: CoverageTable) -> list[Record]:
 def columns_of(table: CoverageTable) -> Columns:
     """What each record has, and where it is in a row."""
     keys = [quantity.key for quantity in table.quantities]
+    means = [quantity.key for quantity in table.means]
     columns: Columns = {
         "rig": lambda row: row.rig,
         "region": lambda row: row.summary.region,
@@ -28,7 +29,7 @@ def columns_of(table: CoverageTable) -> Columns:
     }
     for key in keys:
         columns |= _numbers(key)
-    for key in keys if table.measure == "area" else ():
+    for key in means if table.measure == "area" else ():
         columns |= _known(key)
     columns |= _conditions(table)
     for key in keys if len(table.rigs) > 1 else ():
@@ -39,7 +40,7 @@ def columns_of(table: CoverageTable) -> Columns:
         for quantity in redundancy_quantities((), table.thresholds):
             columns |= _seen_by(quantity.key)
     for sensor in sensors:
-        for key in keys:
+        for key in means:
             columns |= _without(sensor, key)
     return columns
 

@@ -2,14 +2,18 @@
 
 import math
 from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 
+from torchcover.files import reads
 from torchcover.geometry import BoundingBox
-from torchcover.simulation.recorded.track import Track
+from torchcover.recordings.formats.track_tables import check_gaps, read_box_tracks
+from torchcover.recordings.objects import Track
 from torchcover.simulation.shapes import Box, Mesh
 from torchcover.simulation.traffic.fleet import CATEGORIES
 from torchcover.simulation.traffic.vehicle_class import VehicleType
+from torchcover.simulation.world import Actor
 
 # A body is stretched or squeezed to a box by this at most; beyond, the box itself is shown. The boxes of people hold
 # their stride and their arms, which the bodies do not have.
@@ -48,6 +52,27 @@ class Bodies:
 
     def _scaled(self, kind: str | None, size_m: tuple[float, float, float]) -> Mesh:
         if kind is None:
-            return Box(type="box", size_m=size_m).mesh()
+            return box_mesh(size_m)
         mesh = self._meshes[kind]
         return Mesh(mesh.vertices_m * (np.array(size_m) / self._sizes_m[kind]), mesh.faces)
+
+
+@reads("a file of boxes")
+def read_boxes(path: Path) -> tuple[Actor, ...]:
+    """Read recorded boxes as actors that are boxes; see `read_box_tracks`.
+
+    Raises:
+        BadFileError: As there, or a gap in time.
+    """
+    tracks = read_box_tracks(path)
+    for track in tracks:
+        try:
+            check_gaps(track.trajectory.times_s)
+        except ValueError as error:
+            raise ValueError(f"id {track.name}: {error}") from error
+    return tuple(Actor(track.name, track.category, box_mesh(track.size_m), track.trajectory) for track in tracks)
+
+
+def box_mesh(size_m: tuple[float, float, float]) -> Mesh:
+    """A box of a length, width and height that stands on its origin."""
+    return Box(type="box", size_m=size_m).mesh()

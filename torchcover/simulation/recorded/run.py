@@ -1,16 +1,23 @@
 """Which track is the ego, and from when to when a recording is shown."""
 
+from collections.abc import Sequence
 from difflib import get_close_matches
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
-from torchcover.simulation.recorded.track import Ego, Recording, Track, pieces
-from torchcover.simulation.trajectory import Trajectory
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings.objects import Ego, RecordedObjects, Track
 
 TIME_SLACK_S = 1e-6
+# Whoever moves faster than this, by more than this, was moved by the recording.
+FASTEST_MPS = 90.0
+JUMP_M = 1.0
+# Poses that follow each other more closely say nothing but noise about a speed.
+CLOSEST_S = 1e-3
 TOLD = 8
 
 
@@ -28,7 +35,7 @@ class Cast(NamedTuple):
     others: tuple[Track, ...]
 
 
-class Run(NamedTuple):
+class Excerpt(NamedTuple):
     """What is shown of a recording.
 
     Args:
@@ -44,7 +51,7 @@ class Run(NamedTuple):
     others: tuple[Track, ...]
 
 
-def cast_of(recording: Recording, ego_id: str | None, ego_T_vehicle: Matrix | None) -> Cast:
+def cast_of(recording: RecordedObjects, ego_id: str | None, ego_T_vehicle: Matrix | None) -> Cast:
     """Choose the ego.
 
     Args:
@@ -71,7 +78,7 @@ def cast_of(recording: Recording, ego_id: str | None, ego_T_vehicle: Matrix | No
     return Cast(found[0].name, found[0].trajectory, (*others, *(body for body in bodies if body is not None)))
 
 
-def run_of(cast: Cast, begin_s: float, duration_s: float | None, max_gap_s: float) -> Run:
+def excerpt_of(cast: Cast, begin_s: float, duration_s: float | None, max_gap_s: float) -> Excerpt:
     """Choose the times: those at which the ego and the others are known, or of them what is asked for.
 
     An ego of which one pose is known stands there; that instant alone is shown, unless a duration is given.
@@ -107,7 +114,7 @@ def run_of(cast: Cast, begin_s: float, duration_s: float | None, max_gap_s: floa
         )
     begin_s += first_s
     whole = cast.drive if stands else _without_gaps(cast, begin_s, begin_s + duration_s, max_gap_s, first_s)
-    return Run(begin_s, duration_s, whole, cast.others)
+    return Excerpt(begin_s, duration_s, whole, cast.others)
 
 
 def _without_gaps(cast: Cast, begin_s: float, end_s: float, max_gap_s: float, first_s: float) -> Trajectory:
@@ -127,6 +134,29 @@ def _without_gaps(cast: Cast, begin_s: float, end_s: float, max_gap_s: float, fi
     )
 
 
+def pieces(trajectory: Trajectory, max_gap_s: float) -> list[Trajectory]:
+    """What is left of a trajectory where it was unseen for too long, or jumps."""
+    kept = _apart(trajectory.times_s)
+    times_s, places_m, angles_deg = trajectory.times_s[kept], trajectory.positions_m[kept], trajectory.angles_deg[kept]
+    taken_s, way_m = np.diff(times_s), np.linalg.norm(np.diff(places_m, axis=0), axis=1)
+    breaks = np.flatnonzero((taken_s > max_gap_s) | (way_m > FASTEST_MPS * taken_s + JUMP_M)) + 1
+    return [
+        Trajectory(times_s[first:end], places_m[first:end], angles_deg[first:end], trajectory.transient)
+        for first, end in pairwise([0, *breaks.tolist(), len(times_s)])
+    ]
+
+
+def _apart(times_s: Matrix) -> Sequence[int] | slice:
+    """Numbers of times that do not follow each other too closely."""
+    if len(times_s) < 2 or np.diff(times_s).min() >= CLOSEST_S:
+        return slice(None)
+    kept = [0]
+    for number, time_s in enumerate(times_s.tolist()):
+        if time_s - times_s[kept[-1]] >= CLOSEST_S:
+            kept.append(number)
+    return kept
+
+
 def _drive(ego: Ego, ego_T_vehicle: Matrix | None) -> Trajectory:
     """Of the vehicle frame of an ego."""
     world_T_vehicle = ego.world_T_ego @ (ego.ego_T_vehicle if ego_T_vehicle is None else ego_T_vehicle)
@@ -134,7 +164,7 @@ def _drive(ego: Ego, ego_T_vehicle: Matrix | None) -> Trajectory:
 
 
 def _as_track(ego: Ego) -> Track | None:
-    """A recording's own ego as one of the others; None if nobody knows how large it is."""
+    """A recording's own ego as one of the others; None if its size is unknown."""
     if ego.size_m is None:
         return None
     drive = _drive(ego, None)
@@ -142,7 +172,7 @@ def _as_track(ego: Ego) -> Track | None:
     return Track(ego.name, "car", "passenger", ego.size_m, there)
 
 
-def _told(recording: Recording, like: str) -> str:
+def _told(recording: RecordedObjects, like: str) -> str:
     """Some of the ids that there are, those that look like one first."""
     names = [*(ego.name for ego in recording.egos), *(track.name for track in recording.tracks)]
     alike = get_close_matches(like, names, n=TOLD, cutoff=0.3)

@@ -10,18 +10,18 @@ from pydantic import BeforeValidator, Field
 
 from torchcover.geometry import BoundingBox, invert, overlap
 from torchcover.geometry.rigid import Matrix
-from torchcover.simulation.documents import PathBeside, Pose, builtin_hashes, file_hash
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings.formats import read_objects
+from torchcover.recordings.formats.track_tables import read_trajectory
+from torchcover.recordings.objects import Ego, RecordedObjects
+from torchcover.simulation.documents import PathBeside, Pose, builtin_hashes
 from torchcover.simulation.recorded.bodies import Bodies
-from torchcover.simulation.recorded.formats import format_of
 from torchcover.simulation.recorded.ground import ground_below, stood_on
-from torchcover.simulation.recorded.run import Run, cast_of, poses_at_all, run_of
-from torchcover.simulation.recorded.track import Ego, Recording, pieces
+from torchcover.simulation.recorded.run import Excerpt, cast_of, excerpt_of, pieces, poses_at_all
 from torchcover.simulation.shapes import Mesh, MeshFile
-from torchcover.simulation.tracks import read_trajectory
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import EGO, load_bodies
 from torchcover.simulation.traffic.kind import Traffic
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor, World, steps_of
 
 # A time that is so near to an instant is that instant.
@@ -36,8 +36,8 @@ class RecordedTraffic(Traffic):
     """Traffic as it was recorded; beyond the end of the recording the same plays again.
 
     Args:
-        path: A log of Argoverse 2, tables of nuScenes, a scenario of CommonRoad or a table of boxes; relative to the
-            document.
+        path: A log of Argoverse 2, tables of nuScenes, a scenario of CommonRoad, a table of boxes, or any recording
+            with poses and boxes (KITTI's raw data, CARLA, a plain folder); relative to the document.
         scene: Name or token of one scene of tables of nuScenes that hold several.
         ego_id: Which track is the ego; if not given, the recording's own, or in CommonRoad the start of the first
             planning problem.
@@ -71,12 +71,10 @@ class RecordedTraffic(Traffic):
         return steps_of(self._run.duration_s, self.time_step_s)
 
     def content(self) -> dict[str, Any]:
-        """Its keys, what is in its files, and the bodies that may stand for boxes."""
-        files = format_of(self.path).files(self.path) or []
-        one_file = self.model_copy(update={"path": files[0]})
+        """Its keys, what was recorded, and the bodies that may stand for boxes."""
         return {
-            **Traffic.content(one_file),
-            "files": list(map(file_hash, files)),
+            **Traffic.content(self.model_copy(update={"path": None})),
+            "objects": self._objects.digest(),
             "vehicles": builtin_hashes("vehicles"),
         }
 
@@ -104,18 +102,23 @@ class RecordedTraffic(Traffic):
         return World((ground,), driver, tuple(others), self.time_step_s, run.duration_s, ground=(0,))
 
     @cached_property
-    def _run(self) -> Run:
-        """What of the recording is shown; read when first needed."""
-        recording = format_of(self.path).read(self.path, self.scene)
+    def _objects(self) -> RecordedObjects:
+        """Who was recorded; read when first needed."""
+        return read_objects(self.path, self.scene)
+
+    @cached_property
+    def _run(self) -> Excerpt:
+        """What of the recording is shown."""
+        recording = self._objects
         if self.ego_trajectory is not None:
             if self.ego_id is not None:
                 raise ValueError("ego_id and ego_trajectory exclude each other: the ego is one of them")
             drive = read_trajectory(self.ego_trajectory)
             driven = Ego(self.ego_trajectory.name, drive.times_s, poses_at_all(drive), np.eye(4))
-            recording = Recording(recording.tracks, (driven,))
+            recording = RecordedObjects(recording.tracks, (driven,))
         frame = None if self.ego_T_vehicle is None else self.ego_T_vehicle.matrix()
         try:
-            return run_of(cast_of(recording, self.ego_id, frame), self.begin_s, self.duration_s, self.max_gap_s)
+            return excerpt_of(cast_of(recording, self.ego_id, frame), self.begin_s, self.duration_s, self.max_gap_s)
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from error
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.height_field import Ground, Plain
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.crowd import Walker
@@ -15,7 +16,6 @@ from torchcover.simulation.traffic.city import FREE_AT_CORNERS_M, PARKED, PARKED
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet
 from torchcover.simulation.traffic.roads import Polyline
 from torchcover.simulation.traffic.scenery import PAVEMENT_M
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor
 
 Numbers = NDArray[np.float64]

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet
 from torchcover.simulation.traffic.flow import Agent, Flow, Lane
 from torchcover.simulation.traffic.hills import Hills
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor
 
 Numbers = NDArray[np.float64]

@@ -7,12 +7,12 @@ from functools import cache, lru_cache
 import numpy as np
 
 from torchcover.geometry import BoundingBox
+from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.documents import load_document
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.flow import Agent, Lane
 from torchcover.simulation.traffic.idm import Driver
-from torchcover.simulation.trajectory import Trajectory
 from torchcover.simulation.world import Actor
 
 # What each built-in body counts as.

@@ -8,13 +8,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import check_memory, decode, reads
+from torchcover.files.bad_file import reads
+from torchcover.files.budget import check_memory
+from torchcover.files.text import decode
 
 # Of a word of a row, once it is an object of Python, for each byte of the file.
 BYTES_PER_BYTE = 20
 
 
-class Table(NamedTuple):
+class CsvTable(NamedTuple):
     """Columns of a table.
 
     Args:
@@ -27,14 +29,16 @@ class Table(NamedTuple):
 
 
 @reads("a table in CSV")
-def read_csv(path: Path, numbers: Sequence[str], words: Sequence[str], optional: Sequence[str] = ()) -> Table:
+def read_csv(
+    path: Path, numbers: Sequence[str], words: Sequence[str] = (), optional: Sequence[str] | None = ()
+) -> CsvTable:
     """Read a table whose first line names its columns, in any order.
 
     Args:
         path: The file.
         numbers: Columns of numbers.
         words: Columns of anything.
-        optional: Columns of numbers that may be missing.
+        optional: Columns of numbers that may be missing; None: any others may be there, and are not read.
 
     Raises:
         BadFileError: Columns that are missing, doubled or unknown, a row of another width, or what is no finite number;
@@ -52,8 +56,8 @@ def read_csv(path: Path, numbers: Sequence[str], words: Sequence[str], optional:
         lines.append(line)
         table.append(row)
     columns = dict(zip(names, zip(*table, strict=True) if table else [()] * len(names), strict=True))
-    return Table(
-        {name: _finite(name, columns[name], lines) for name in names if name not in words},
+    return CsvTable(
+        {name: _finite(name, columns[name], lines) for name in (*numbers, *(optional or ())) if name in columns},
         {name: [word.strip() for word in columns[name]] for name in words},
     )
 
@@ -69,7 +73,9 @@ def _rows(text: str) -> Iterator[tuple[int, list[str]]]:
         raise ValueError(f"line {reader.line_num}: not CSV ({error})") from error
 
 
-def _check_names(names: Sequence[str], needed: Sequence[str], optional: Sequence[str]) -> None:
+def _check_names(names: Sequence[str], needed: Sequence[str], optional: Sequence[str] | None) -> None:
+    if optional is None:
+        names, optional = [name for name in names if name in needed], ()
     missing = [name for name in needed if name not in names]
     unknown = [name for name in names if name not in (*needed, *optional)]
     doubled = sorted({name for name in names if names.count(name) > 1})

@@ -1,11 +1,10 @@
-"""Objects over time, seen at some instants and wanted at others."""
+"""Objects as annotators saw them: each at some instants, and wanted at others or as a track."""
 
 from bisect import bisect_left
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from torchcover.detection.box_layouts import upright_rows
 from torchcover.detection.boxes import Boxes
@@ -19,48 +18,55 @@ class Seen(NamedTuple):
     """An object at an instant.
 
     Args:
+        name: Its id.
         time_s: When.
         world_T_box: (4, 4) where: its centre, x along its length.
         size_m: Length, width, height.
         category: What it is.
     """
 
+    name: str
     time_s: float
     world_T_box: Matrix
     size_m: tuple[float, float, float]
     category: str
 
 
-class Tracks:
-    """Objects by name, each seen at ascending times; between two of them it moves evenly.
+def by_name(seen: Iterable[Seen]) -> dict[str, list[Seen]]:
+    """Those of each object, in the order of time."""
+    found: dict[str, list[Seen]] = {}
+    for one in sorted(seen, key=lambda one: one.time_s):
+        found.setdefault(one.name, []).append(one)
+    return found
+
+
+class SeenObjects:
+    """Objects at any time; between two of theirs they move evenly.
 
     Args:
-        tracks: Name -> when and where it was seen, in any order.
-        longest_gap_s: Where it was unseen for longer, nobody knows where it was.
+        seen: When and where they were seen, in any order.
+        longest_gap_s: Where one was unseen for longer, it is unknown where it was.
     """
 
-    def __init__(self, tracks: Mapping[str, Sequence[Seen]], longest_gap_s: float = 1.0) -> None:
-        self._tracks = {name: sorted(seen, key=lambda one: one.time_s) for name, seen in tracks.items()}
-        self._times = {name: [one.time_s for one in seen] for name, seen in self._tracks.items()}
+    def __init__(self, seen: Sequence[Seen], longest_gap_s: float = 1.0) -> None:
+        ordered = by_name(seen)
+        self._seen = {name: ordered[name] for name in dict.fromkeys(one.name for one in seen)}
+        self._times = {name: [one.time_s for one in of] for name, of in self._seen.items()}
         self._longest_gap_s = longest_gap_s
 
     def at(self, time_s: float, vehicle_T_world: Matrix) -> Boxes:
-        """The objects of an instant that lies within their tracks, in the vehicle frame."""
-        found = {}
-        for name, seen in self._tracks.items():
-            one = self._between(seen, self._times[name], time_s)
-            if one is not None:
-                found[name] = one
-        poses = np.array([one.world_T_box for one in found.values()]).reshape(-1, 4, 4)
+        """The objects of an instant that lies within their times, in the vehicle frame."""
+        between = (self._between(seen, self._times[name], time_s) for name, seen in self._seen.items())
+        found = [one for one in between if one is not None]
+        poses = np.array([one.world_T_box for one in found]).reshape(-1, 4, 4)
         rows = upright_rows(
             transform(vehicle_T_world, poses[:, :3, 3]),
-            np.array([one.size_m for one in found.values()]).reshape(-1, 3),
+            np.array([one.size_m for one in found]).reshape(-1, 3),
             poses[:, :3, 0] @ vehicle_T_world[:3, :3].T,
             None,
         )
-        names = tuple(one.category for one in found.values())
-        return (
-            Boxes.from_rows(rows, ids=tuple(found), categories=names) if found else Boxes.from_rows(torch.empty(0, 7))
+        return Boxes.from_rows(
+            rows, ids=tuple(one.name for one in found), categories=tuple(one.category for one in found)
         )
 
     def _between(self, seen: Sequence[Seen], times_s: Sequence[float], time_s: float) -> Seen | None:

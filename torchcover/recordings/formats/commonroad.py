@@ -9,35 +9,20 @@ import numpy as np
 from torchcover.files import parse_xml, reads
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
-from torchcover.simulation.recorded.track import Ego, Recording, Track, checked_size, moving, only_one_scene
-from torchcover.simulation.recorded.words import CLASSES
-from torchcover.simulation.trajectory import Trajectory
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings.objects import Ego, RecordedObjects, Track, checked_size, class_of, moving
 
 OBSTACLES = ("obstacle", "dynamicObstacle", "staticObstacle")
 
 
-def files(path: Path) -> list[Path] | None:
-    """The file; None if it is none of these."""
-    return [path] if path.suffix == ".xml" else None
-
-
-def read(path: Path, scene: str | None) -> Recording:
-    """Read a file.
-
-    Args:
-        path: It.
-        scene: None: a file is one.
+@reads("a scenario of CommonRoad")
+def read_objects(path: Path) -> RecordedObjects:
+    """Read the obstacles and planning problems of a file.
 
     Raises:
         BadFileError: Another content.
         FileNotFoundError: No such file.
     """
-    only_one_scene(scene, "a scenario of CommonRoad")
-    return _read(path)
-
-
-@reads("a scenario of CommonRoad")
-def _read(path: Path) -> Recording:
     root = parse_xml(path)
     if root.tag != "commonRoad":
         raise ValueError(f"<commonRoad> is needed as its root; got <{root.tag[:40]}>")
@@ -48,7 +33,7 @@ def _read(path: Path) -> Recording:
     egos = tuple(_ego(problem, step_s) for problem in root.iter("planningProblem"))
     if not found:
         raise ValueError("no obstacle in it")
-    return Recording(tuple(found), egos)
+    return RecordedObjects(tuple(found), egos)
 
 
 def _ego(problem: Element, step_s: float) -> Ego:
@@ -77,7 +62,7 @@ def _track(obstacle: Element, step_s: float) -> Track:
     trajectory = moving(name, times_s, places_m, angles_deg)
     if obstacle.tag == "staticObstacle" or (obstacle.findtext("role") or "").strip() == "static":
         trajectory = Trajectory(times_s[:1], places_m[:1], angles_deg[:1])
-    return Track(name, category, CLASSES.get(category), size_m, trajectory)
+    return Track(name, category, class_of(category), size_m, trajectory)
 
 
 def _shape(obstacle: Element, name: str) -> tuple[tuple[float, float, float], tuple[float, float]]:

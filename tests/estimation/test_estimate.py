@@ -1,0 +1,88 @@
+"""Estimates: what numbers and differences say of sums in blocks, by hand and by SciPy."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy import stats
+
+from torchcover.coverage.quantity import RADIUS, detection
+from torchcover.estimation import Estimate
+
+BOTH = (RADIUS, detection(0.4))
+
+
+def sums(blocks, seed=0):
+    """Square metres in each block, and radius and detection times them."""
+    random = np.random.default_rng(seed)
+    m2 = 1.0 + random.random(blocks)
+    return m2, m2[:, None] * random.random((blocks, 2))
+
+
+def estimate(m2, each, steps=None):
+    steps = torch.ones(len(m2), dtype=torch.int64) if steps is None else torch.tensor(steps)
+    return Estimate.of_ratios(BOTH, torch.from_numpy(m2), torch.from_numpy(each), steps)
+
+
+def test_a_ratio_without_a_block_is_that_of_the_others_and_unused_blocks_do_not_count():
+    m2, each = sums(9)
+    m2[4], each[4] = 0.0, 0.0
+    found = estimate(m2, each, [1, 1, 1, 1, 0, 1, 1, 1, 1])
+    np.testing.assert_allclose(found.value, each.sum(axis=0) / m2.sum(), rtol=1e-12)
+    assert len(found.left_out) == len(found.steps) == 8
+    np.testing.assert_allclose(found.left_out[-1], each[:-1].sum(axis=0) / m2[:-1].sum(), rtol=1e-12)
+    of_each = estimate(np.stack([m2, m2]).T, each, [1, 1, 1, 1, 0, 1, 1, 1, 1])
+    np.testing.assert_allclose(of_each.left_out, found.left_out, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("blocks", "least"), [(8, 8), (3, 3), (5, 2)])
+def test_differences_of_means_over_worlds_are_a_paired_t_test(blocks, least):
+    random = np.random.default_rng(blocks)
+    own, other = random.random((2, blocks, 2))
+    one, two = (estimate(np.ones(blocks), each) for each in (own, other))
+    found = list(two.differences(one, least=least).values())
+    for at, difference in enumerate(found):
+        test = stats.ttest_rel(other[:, at], own[:, at])
+        low, high = test.confidence_interval()
+        assert difference.value == pytest.approx((other - own)[:, at].mean(), rel=1e-9)
+        assert difference.value / difference.error == pytest.approx(test.statistic, rel=1e-9)
+        assert difference.p == pytest.approx(test.pvalue, rel=1e-9)
+        assert (difference.low, difference.high) == pytest.approx((low, high), rel=1e-4)
+        assert difference.significant is bool(test.pvalue < 0.05)
+    # Less of a radius is better, more of a detection.
+    assert [each.better for each in found] == [(other < own)[:, 0].sum(), (other > own)[:, 1].sum()]
+    assert [each.gain for each in found] == [-found[0].value, found[1].value]
+    assert {each.blocks for each in found} == {blocks}
+
+
+def test_too_few_blocks_show_no_error_and_say_so_of_nothing():
+    few = estimate(*sums(7))
+    assert few.error.isnan().all()
+    assert few.errors(7).isfinite().all()
+    for number, difference in zip(few.numbers().values(), few.differences(few).values(), strict=True):
+        assert number.known
+        assert all(map(math.isnan, (*number[2:5], *difference[2:5], difference.p)))
+        assert difference.significant is None
+
+
+def test_blocks_that_all_say_the_same_prove_nothing():
+    m2 = np.full(8, 2.0)
+    numbers = estimate(m2, 0.5 * np.stack([m2, m2]).T).numbers().values()
+    assert [number.value for number in numbers] == [0.5, 0.5]
+    assert all(math.isnan(number.error) and math.isnan(number.low) for number in numbers)
+
+
+def test_what_is_infinite_for_both_differs_by_nothing():
+    blind = estimate(np.ones(8), np.tile([np.inf, 0.0], (8, 1)))
+    radius, seen = blind.differences(blind).values()
+    assert (radius.value, seen.value) == (0.0, 0.0)
+    assert math.isnan(radius.error)
+
+
+def test_without_blocks_there_is_a_value_only():
+    alone = Estimate.of(BOTH, torch.tensor([1.0, 0.5], dtype=torch.float64))
+    assert [number.value for number in alone.numbers().values()] == [1.0, 0.5]
+    assert alone.error.isnan().all()
+    assert [difference.blocks for difference in alone.differences(alone).values()] == [0, 0]
+    assert alone[1:].quantities == (detection(0.4),)

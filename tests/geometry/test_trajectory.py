@@ -1,0 +1,47 @@
+"""Where a body is at and between the times of its poses."""
+
+import numpy as np
+
+from torchcover.geometry import rotation_from_euler
+from torchcover.geometry.trajectory import Trajectory, poses_at
+
+
+def test_between_poses_a_body_moves_straight_and_turns_the_shorter_way():
+    turn = Trajectory.from_arrays(
+        [0.0, 2.0, 3.0], [[0, 0, 0], [4, 0, 0], [4, 2, 0]], [[170, 0, 0], [-170, 10, 0], [-170, 10, -6]]
+    )
+    np.testing.assert_allclose(turn.at(1.0)[:3, 3], [2, 0, 0])
+    np.testing.assert_allclose(turn.at(1.0)[:3, :3], rotation_from_euler(180, 5, 0), atol=1e-12)
+    np.testing.assert_allclose(turn.at(2.5)[:3, :3], rotation_from_euler(-170, 10, -3), atol=1e-12)
+    np.testing.assert_allclose(turn.at(2.0)[:3, 3], [4, 0, 0])
+
+
+def test_outside_its_times_a_body_rests_or_is_not_there():
+    resting = Trajectory.from_arrays([1.0, 2.0], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0]] * 2)
+    np.testing.assert_array_equal(resting.at(-5.0), resting.at(1.0))
+    np.testing.assert_array_equal(resting.at(9.0), resting.at(2.0))
+    transient = Trajectory(resting.times_s, resting.positions_m, resting.angles_deg, transient=True)
+    times = np.array([0.9, 1.0, 1.5, 2.0, 2.1])
+    np.testing.assert_allclose(transient.positions_at(times)[:, 0], [np.nan, 0, 0.5, 1, np.nan])
+    np.testing.assert_allclose(resting.positions_at(times)[:, 0], [0, 0, 0.5, 1, 1])
+
+
+def test_positions_at_many_times_are_those_of_the_poses():
+    generator = np.random.default_rng(0)
+    track = Trajectory.from_arrays(
+        np.sort(generator.uniform(0, 9, 20)), generator.normal(size=(20, 3)), np.zeros((20, 3))
+    )
+    times = generator.uniform(-1, 10, 50)
+    np.testing.assert_allclose(track.positions_at(times), [track.at(time)[:3, 3] for time in times], atol=1e-12)
+
+
+def test_poses_of_many_bodies_are_those_of_each():
+    generator, common = np.random.default_rng(2), np.array([0.0, 1.0, 2.5])
+    tracks = [
+        Trajectory.from_arrays(common[:k] + late, generator.normal(size=(k, 3)), generator.uniform(-400, 400, (k, 3)))
+        for k in (1, 2, 3)
+        for late in (0.0, 0.0, 0.7)
+    ]
+    for time_s in (-1.0, 0.0, 0.3, 1.0, 2.4, 9.0):
+        np.testing.assert_array_equal(poses_at(tracks, time_s), [track.at(time_s) for track in tracks])
+    assert poses_at([], 0.0).shape == (0, 4, 4)

@@ -1,0 +1,295 @@
+"""What each command is called with; what it does is imported when it runs."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from torchcover.cli import options
+from torchcover.cli.options import of_evaluate, with_options
+from torchcover.evaluation.settings import OPTIONS
+
+UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
+
+
+@with_options(of_evaluate(*(name for name, option in OPTIONS.items() if option.in_study)))
+def study(
+    rig: options.Rig,
+    rays: Annotated[
+        list[int] | None,
+        typer.Option(min=1, help="Rays of the reference at each step; may be repeated (1024, 4096 and 16384)."),
+    ] = None,
+    steps: Annotated[int, typer.Option(min=1, help="Most steps of a run.")] = 128,
+    runs: Annotated[int, typer.Option(min=1, help="Runs of so many steps that errors are averaged over.")] = 2,
+    long_run: Annotated[
+        Path | None,
+        typer.Option(
+            help="What runs are measured against: coverage.npz of `evaluate` with another seed, or long_run.npz of an "
+            "earlier study. Not given: a run is made for it."
+        ),
+    ] = None,
+    long_run_steps: Annotated[int, typer.Option(min=8, help="Steps of that run.")] = 512,
+    out: options.Out = Path("out"),
+    **settings: Any,  # noqa: ANN401
+) -> None:
+    """Measure error against run time for numbers of rays and of steps, and recommend a setting."""
+    from torchcover.cli.printing import print_study
+    from torchcover.evaluation import Settings, StudyPlan, claimed, error_against_time, rank_count
+
+    if rank_count() > 1:
+        raise ValueError(
+            "study measures run times, which ranks beside each other would change: run it without torchrun"
+        )
+    plan = StudyPlan(
+        Settings(rig, steps=steps, **settings),
+        rays=tuple(sorted(set(rays or StudyPlan.rays))),
+        runs=runs,
+        long_run=long_run,
+        long_run_steps=long_run_steps,
+    )
+    with claimed(out):
+        found = error_against_time(plan, progress=True)
+        found.save(out)
+        print_study(found, out)
+
+
+@with_options(of_evaluate("scenario", "seed", "vehicle", "reference", "rays", "every_s"))
+def record(
+    rig: options.Rig,
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for the recording, new or empty.", callback=options.check_out)
+    ],
+    steps: Annotated[int | None, typer.Option(min=1, help="Steps to simulate (64), a frame each.")] = None,
+    layout: Annotated[
+        str, typer.Option("--format", help="`folder`, or `kitti`: KITTI's object layout, of a rig of one LiDAR.")
+    ] = "folder",
+    **settings: Any,  # noqa: ANN401
+) -> None:
+    """Write what a simulated rig sees as a recording, for other tools and for `evaluate --frames`."""
+    from torchcover.evaluation import Settings
+    from torchcover.evaluation.task import simulation
+    from torchcover.simulation import Rig, write_recording
+
+    frames = simulation(Settings(Rig.load(rig), steps=steps, **settings), boxes=True).frames
+    write_recording(frames, out, layout, progress=_with_a_bar)
+    typer.echo(f"Wrote {len(frames)} frames to {out}; read them with: torchcover evaluate --frames {out}")
+
+
+def _with_a_bar(steps: range) -> Iterator[int]:
+    from torchcover.evaluation.progress import progress_of
+
+    with progress_of(len(steps), "record", shown=True) as bar:
+        for step in steps:
+            yield step
+            bar.advance(len(steps))
+
+
+def rig(
+    frames: Annotated[Path, typer.Option("--frames", help="The recording, of any layout in docs/recordings.md.")],
+    recording_format: options.Format = None,
+    sensors: Annotated[
+        list[str] | None,
+        typer.Option("--sensors", help="Its sensors, as in `roof,left`. Not given: all of the recording."),
+    ] = None,
+    lidar: Annotated[
+        list[str] | None,
+        typer.Option(help="SENSOR=MODEL: a LiDAR scans as this model (see `list`), and is not estimated."),
+    ] = None,
+) -> None:
+    """Print the sensors of a recording as a rig: mounts, LiDARs and cameras for `show` and `evaluate`."""
+    from torchcover.files import as_yaml
+    from torchcover.recordings import open_recording
+    from torchcover.simulation import rig_document
+
+    models = dict(_pair(text) for text in lidar or ())
+    names = [name for of in sensors or () for name in of.split(",")]
+    document = rig_document(open_recording(frames, recording_format), sensors=names or None, models=models)
+    typer.echo(as_yaml(document), nl=False)
+
+
+def _pair(text: str) -> tuple[str, str]:
+    sensor, equals, model = text.partition("=")
+    if not (sensor and equals and model):
+        raise ValueError(f"--lidar {text}: SENSOR=MODEL is needed, as in LIDAR_TOP=velodyne_hdl32e")
+    return sensor, model
+
+
+@with_options(of_evaluate("vehicle"))
+def show(
+    name: Annotated[str, typer.Argument(help="Rig, scenario or vehicle: a built-in name (see `list`) or a YAML file.")],
+    scenario: Annotated[
+        str | None, typer.Option(help="For a rig: the scenario whose ego carries it and that it sees (courtyard).")
+    ] = None,
+    rig: Annotated[str | None, typer.Option(help="For a scenario: whose points to draw (front_roof_128).")] = None,
+    step: Annotated[int | None, typer.Option(min=0, help="Time step of the scenario or the depth images (0).")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the simulation, likewise (0).")] = None,
+    film: Annotated[
+        Path | None, typer.Option(help="For a scenario: 10 s of it from that step on, as a .gif or .mp4 (ffmpeg) file.")
+    ] = None,
+    out: options.Out = Path("out"),
+    **settings: Any,  # noqa: ANN401
+) -> None:
+    """Draw a rig and the depth images of its cameras, a frame of a scenario, or the mount regions of a vehicle."""
+    from torchcover.cli.show import run
+
+    run(name, scenario=scenario, rig=rig, step=step, seed=seed, film=film, out=out, **settings)
+
+
+@with_options(of_evaluate("vehicle", "every_s", "seed"))
+def targets(
+    rig: options.Rig,
+    target: Annotated[
+        str,
+        typer.Option(
+            help="What is put around the vehicle: child (1.10 m), adult, dog, cyclist, pole, a built-in vehicle, the "
+            "YAML file of one, or a mesh file."
+        ),
+    ] = "child",
+    scenario: Annotated[
+        str | None, typer.Option(help="Scenario: a built-in name or a YAML file. Not given: flat ground, nothing else.")
+    ] = None,
+    steps: Annotated[
+        int | None, typer.Option(min=1, help="Steps to average (16, or 1 where nothing moves and no sensor is noisy).")
+    ] = None,
+    raster: Annotated[
+        str | None, typer.Option(help="Cells x0,x1,y0,y1,step in metres (within 5 m of the vehicle, step 0.2).")
+    ] = None,
+    heading: Annotated[
+        str, typer.Option(help="Side that it turns to the vehicle: narrow, wide, or its yaw in degrees.")
+    ] = "narrow",
+    hits: Annotated[int, typer.Option(min=1, help="Points that are enough to see it.")] = 5,
+    threshold_m: Annotated[
+        float, typer.Option("--threshold-m", help="Detection threshold in metres, for the share of its surface.")
+    ] = 0.4,
+    require: Annotated[
+        Path | None, typer.Option(help="YAML file of requirements: exit code 1 if one is not met.")
+    ] = None,
+    rerun: Annotated[
+        Path | None, typer.Option(help="Write the map to this .rrd file, for the Rerun viewer (extra `rerun`).")
+    ] = None,
+    out: options.Out = Path("out/targets"),
+    **settings: Any,  # noqa: ANN401
+) -> None:
+    """Put a body at every place around the vehicle: how much of it is seen, where not, and whether that is enough."""
+    from torchcover.cli.target_run import run
+
+    code = run(
+        rig,
+        target,
+        scenario,
+        raster=raster,
+        steps=steps,
+        hits=hits,
+        threshold_m=threshold_m,
+        heading=heading,
+        require=require,
+        rerun=rerun,
+        out=out,
+        **settings,
+    )
+    raise typer.Exit(code)
+
+
+def search(
+    space: Annotated[Path, typer.Argument(help="YAML file of what is free, and of what a good rig is.")],
+    budget: Annotated[
+        str | None, typer.Option(help="Time for all of it: 30min (if nothing is given), 90s, 2h; or --evaluations.")
+    ] = None,
+    evaluations: Annotated[
+        int | None, typer.Option(min=1, help="Candidates instead of a time: the same ones whatever the machine.")
+    ] = None,
+    optimiser: Annotated[
+        str, typer.Option(help="auto, gp (Gaussian process), cmaes (extra `search`), enumerate (choices) or random.")
+    ] = "auto",
+    measure: Annotated[
+        Literal["area", "known"],
+        typer.Option(help="What a score is: `area`, the share of the visible surface, or `known`, of the known cells."),
+    ] = "area",
+    worlds: Annotated[int | None, typer.Option(min=1, help="Worlds of each scenario to search in (6).")] = None,
+    fresh_worlds: Annotated[int | None, typer.Option(min=1, help="Fresh worlds of each to test in (16).")] = None,
+    per_world: Annotated[int | None, typer.Option(min=1, help="Instants of each world (3).")] = None,
+    every_s: Annotated[float | None, typer.Option("--every-s", help="Seconds between two of them (20).")] = None,
+    rays: Annotated[int | None, typer.Option(min=1, help="Rays of the reference at each instant (16384).")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the search and of its worlds.")] = 0,
+    test_seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of the fresh worlds, another one (the next).")
+    ] = None,
+    workers: Annotated[int, typer.Option(min=0, help="Processes that score; 0 scores in this one.")] = 0,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the evaluations in --out, whatever ended that search.")
+    ] = False,
+    out: options.Out = Path("out/search"),
+) -> None:
+    """Look for better places for sensors, compared with a random search, and test what was found in fresh worlds."""
+    from torchcover.cli.search_run import run
+
+    if budget is not None and evaluations is not None:
+        raise ValueError("--budget, --evaluations: one of them; both are given")
+    given = {"worlds": worlds, "fresh_worlds": fresh_worlds, "per_world": per_world, "every_s": every_s,
+             "rays": rays}  # fmt: skip
+    run(
+        space,
+        out,
+        resume=resume,
+        evaluations=evaluations,
+        budget_s=None if budget is None else parsed_budget(budget),
+        optimiser=optimiser,
+        measure=measure,
+        seed=seed,
+        test_seed=test_seed,
+        workers=workers,
+        **{name: value for name, value in given.items() if value is not None},
+    )
+
+
+def parsed_budget(text: str) -> float:
+    """Seconds.
+
+    Raises:
+        ValueError: No number with a unit.
+
+    Example:
+        >>> parsed_budget("30min"), parsed_budget("1.5h"), parsed_budget("90 s")
+        (1800.0, 5400.0, 90.0)
+    """
+    match = re.fullmatch(r"\s*(\d{1,9}(?:\.\d{1,9})?)\s*(s|min|h)\s*", text)
+    if match is None:
+        raise ValueError(f"--budget: a time is needed, as in 90s, 30min or 2h; got {text!r}")
+    return float(match[1]) * UNITS_S[match[2]]
+
+
+@with_options(of_evaluate("seed", "every_s", "workers"))
+def agree(
+    paper: Annotated[str, typer.Argument(help="Published placements: place3d2024.")],
+    scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "urban",
+    metrics: Annotated[
+        str, typer.Option(help="Metrics of others, as in `k_cover,point_density`, or `all`; see `compare --metrics`.")
+    ] = "all",
+    steps: Annotated[int, typer.Option(min=1, help="Steps to simulate.")] = 64,
+    out: options.Out = Path("out/agree"),
+    **settings: Any,  # noqa: ANN401
+) -> None:
+    """Rank published placements by metrics, and by the detectors that were trained on them; say what that is worth."""
+    from torchcover.cli.printing import print_agreement
+    from torchcover.evaluation import agree, claimed, rank_count, save_agreement
+    from torchcover.published import metric_names
+
+    if rank_count() > 1:
+        raise ValueError("agree: ranks do not share it; run it without torchrun, with --workers")
+    with claimed(out):
+        study = agree(paper, scenario, metrics=metric_names(metrics), steps=steps, progress=True, **settings)
+        files = save_agreement(study, out)
+    print_agreement(study, files, out)
+
+
+def list_builtin(
+    word: Annotated[
+        str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
+    ] = None,
+) -> None:
+    """List the built-in rigs, scenarios, LiDAR models and vehicles."""
+    from torchcover.cli.listing import run
+
+    run(word)

@@ -1,0 +1,260 @@
+"""The commands `evaluate` and `compare`; and what else is run and shared like them. Heavy things are imported late."""
+
+import inspect
+import json
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from torchcover.cli import options
+from torchcover.cli.options import of_evaluate, parameters_of, with_options
+from torchcover.evaluation.settings import OPTIONS
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from torchcover.evaluation import Checkpoint, Ranks, Result
+    from torchcover.evaluation.rerun_log import RerunLog
+    from torchcover.frames import FrameSource
+
+
+def _measure(
+    rigs: list[str] | None,
+    at_least: int,
+    frames: Annotated[
+        Path | None, typer.Option(help="A recording instead of a simulation, of any layout in docs/recordings.md.")
+    ] = None,
+    recording_format: options.Format = None,
+    sensors: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="With --frames: sensors of a rig, as in `roof,left`; once for each rig. Not given: those of the "
+            "recording."
+        ),
+    ] = None,
+    window_s: Annotated[
+        float | None,
+        typer.Option(
+            "--window-s", help="Seconds over which `--reference accumulated` adds up what all sensors saw (2)."
+        ),
+    ] = None,
+    region: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Region NAME:x0,x1,y0,y1 in metres, forward and to the left; may be repeated, and replaces those of "
+            "--ask.",
+        ),
+    ] = None,
+    height: Annotated[
+        list[str] | None,
+        typer.Option(help="Height band NAME:z0,z1 in metres; may be repeated, and overlap (ground, obstacle)."),
+    ] = None,
+    grid: Annotated[
+        str | None,
+        typer.Option(help="Extent x0,x1,y0,y1 of the grid in metres (-40,160,-40,40, more if regions need it)."),
+    ] = None,
+    out: options.Out = Path("out"),
+    error_maps: Annotated[bool, typer.Option("--error-maps", help="Draw maps of the standard errors too.")] = False,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(help="Write clouds, boxes, rigs and maps to this .rrd file for the Rerun viewer (extra `rerun`)."),
+    ] = None,
+    explain: Annotated[
+        bool, typer.Option("--explain", help="Say what was left out because the scene did not need it.")
+    ] = False,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Go on from the checkpoint in --out, whatever ended that run; from a complete one with more --steps.",
+        ),
+    ] = False,
+    **settings: Any,  # noqa: ANN401
+) -> None:
+    """Measure rigs in the same frames, save what was measured, and print it."""
+    from torchcover.evaluation import evaluate as evaluate_
+
+    recording = opened(frames, recording_format, sensors, settings.get("reference"), window_s)
+    if recording is not None:
+        settings.pop("reference", None)
+    named = list(rigs or (() if recording is None else recording.rigs))
+    if 0 < len(named) < at_least:
+        raise ValueError(
+            f"compare: at least two rigs are needed; got {named[0]} only (for one: `evaluate`; of a recording, each "
+            "--sensors makes a rig)"
+        )
+    if (asked := options.asked(settings.get("ask"), region, height, grid)) is not None:
+        settings["ask"] = asked
+    with sharing(out) as ranks:
+        log = logged(rerun, ranks)
+        result = evaluate_(
+            rigs,
+            frames=recording,
+            checkpoint=checkpoint_in(out, resume=resume),
+            ranks=ranks,
+            observers={} if log is None else {"rerun": log},
+            progress=True,
+            **settings,
+        )
+        finish(result, out, ranks, log, error_maps=error_maps, explain=explain)
+
+
+MEASURING = [
+    *(each for each in parameters_of(_measure) if each.default is not inspect.Parameter.empty),
+    *of_evaluate(*OPTIONS),
+]
+USUAL = {each.name: each.default for each in MEASURING}
+
+
+@with_options(MEASURING)
+def evaluate(
+    rigs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="A rig, or several in the same frames: built-in names (see `list`) or YAML files. With --frames those "
+            "in it, all if not given."
+        ),
+    ] = None,
+    **given: Any,  # noqa: ANN401
+) -> None:
+    """Measure the coverage of a rig, or of several: a table, maps, and files to compare and to log."""
+    _measure(rigs, 1, **given)
+
+
+@with_options(MEASURING)
+def compare(
+    rigs: Annotated[
+        list[str] | None,
+        typer.Argument(
+            help="Rigs as in `evaluate`, two or more. Or coverage.npz files of runs over the same frames: nothing is "
+            "measured then."
+        ),
+    ] = None,
+    **given: Any,  # noqa: ANN401
+) -> None:
+    """Compare rigs in the same frames: a table with the better values marked, maps side by side, differences."""
+    if saved := [rig for rig in rigs or () if Path(rig).suffix == ".npz"]:
+        _compare_saved(
+            saved, {each.name: each.default for each in MEASURING} | given, only=len(saved) == len(rigs or ())
+        )
+    else:
+        _measure(rigs, 2, **given)
+
+
+def _compare_saved(files: list[str], given: dict[str, Any], *, only: bool) -> None:
+    from torchcover.evaluation import compare
+
+    changed = [
+        f"--{name.replace('_', '-')}"
+        for name, value in USUAL.items()
+        if given[name] != value and name not in ("out", "error_maps", "explain")
+    ]
+    if changed or not only:
+        raise ValueError(
+            f"{files[0]} is measured already: compare coverage files with each other, without "
+            f"{', '.join(changed) or 'rigs'}; or `evaluate` rigs in the same frames first"
+        )
+    with sharing(given["out"]) as ranks:
+        result = compare(files)
+        finish(result, given["out"], ranks, error_maps=given["error_maps"], explain=given["explain"])
+
+
+def opened(
+    frames: Path | None,
+    recording_format: str | None,
+    sensors: list[str] | None,
+    reference: str | None,
+    window_s: float | None,
+) -> "FrameSource | None":
+    """The recording of a command line, if it names one.
+
+    Raises:
+        ValueError: Options for recordings without one; what `open_recording` raises.
+    """
+    if frames is None:
+        for option, given in (("format", recording_format), ("sensors", sensors), ("window-s", window_s)):
+            if given is not None:
+                raise ValueError(f"--{option}: for a recording, which --frames gives")
+        return None
+    from rich.console import Console
+    from rich.markup import escape
+
+    from torchcover.recordings import RecordedFrames, open_recording, reference_of_recording
+
+    with Console(stderr=True).status(f"opening {escape(str(frames))}"):  # seconds, where there are 100,000 frames
+        recording = open_recording(frames, recording_format)
+    return RecordedFrames(
+        recording,
+        rigs={names: names.split(",") for names in sensors} if sensors else None,
+        reference=reference_of_recording(reference, window_s),
+    )
+
+
+def checkpoint_in(out: Path, *, resume: bool) -> "Checkpoint":
+    """The checkpoint in the folder of the results; one line if it is not what the user may think."""
+    from torchcover.evaluation import Checkpoint
+
+    path = out / "checkpoint.npz"
+    if resume and not path.exists():
+        typer.echo(f"torchcover: {path} is not there: the run starts with its first step", err=True)
+    elif path.exists() and not resume and not _complete(out):
+        typer.echo(f"torchcover: {path} will be replaced; to go on from it, stop now and add --resume", err=True)
+    return Checkpoint(path, resume)
+
+
+def _complete(out: Path) -> bool:
+    """Whether the run of a folder has come to its end; nothing of it is lost if another one takes its place."""
+    try:
+        return json.loads((out / "summary.json").read_text(encoding="utf-8"))["complete"] is True
+    except (OSError, ValueError, LookupError, TypeError):
+        return False
+
+
+@contextmanager
+def sharing(out: Path) -> "Iterator[Ranks | None]":
+    """The folder, kept for this run; and the processes that share it, the first of which writes."""
+    from torchcover.evaluation import claimed, joined_ranks
+
+    with joined_ranks() as ranks, claimed(out) if ranks is None or ranks.rank == 0 else nullcontext():
+        yield ranks
+
+
+def logged(path: Path | None, ranks: "Ranks | None") -> "RerunLog | None":
+    """The recording for the Rerun viewer, if there is to be one.
+
+    Raises:
+        ValueError: Several processes share the run, or rerun-sdk is not installed.
+    """
+    if path is None:
+        return None
+    if ranks is not None:
+        raise ValueError(f"--rerun {path}: several processes cannot write one file; run it without torchrun")
+    from torchcover.evaluation.rerun_log import RerunLog
+
+    try:
+        return RerunLog(path)
+    except ImportError as error:
+        raise ValueError(f"--rerun {error}") from error
+
+
+def finish(
+    result: "Result",
+    out: Path,
+    ranks: "Ranks | None",
+    log: "RerunLog | None" = None,
+    *,
+    error_maps: bool,
+    explain: bool,
+) -> None:
+    """Results are safe before anything is printed; then the command ends as the run did."""
+    from torchcover.cli.printing import print_result
+
+    if ranks is None or ranks.rank == 0:
+        files = result.save(out, error_maps=error_maps)
+        print_result(result, files, out, explain=explain)
+        if log is not None:
+            log.finish(result)
+    if result.run is not None:
+        result.run.raise_failure()

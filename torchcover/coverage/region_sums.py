@@ -1,0 +1,108 @@
+"""Aggregations over regions: a region in a height band is one large cell, whose sums are kept in blocks."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from torchcover.coverage.aggregations import Aggregation, BinnedStep, State
+from torchcover.coverage.binning import mean_per_cell
+from torchcover.coverage.regions import Places
+from torchcover.estimation import Quantity
+
+# The states that are about regions begin with it.
+IN_REGIONS = "regions"
+
+
+class PlaceNumbers(NamedTuple):
+    """What aggregations say of P regions and bands, region by region.
+
+    `value` (P, Q) float64, NaN where unknown; `left_out` (B, P, Q) without each of the blocks, NaN of an aggregation
+    that no error is known of; no row where there is one block.
+    """
+
+    quantities: tuple[Quantity, ...]
+    value: Tensor
+    left_out: Tensor
+
+
+class RegionSums:
+    """The states of aggregations over regions, for their numbers there and the errors of these.
+
+    An aggregation is asked as for a map, but for one cell a region and band: its number is what it makes of all points
+    there. States that are added up are kept in blocks; of a largest value no error is known, for it is the same
+    whichever block is left out but one.
+
+    Args:
+        aggregations: Whose numbers.
+        places: Regions and bands.
+        blocks: Blocks of contiguous steps.
+    """
+
+    def __init__(self, aggregations: Sequence[Aggregation], places: Places, blocks: int) -> None:
+        self.aggregations = tuple(aggregations) if places.count else ()
+        self.places = places
+        self.blocks = blocks
+
+    def states(self) -> dict[str, State]:
+        """`probed` (B, P): steps of a block with a point in the place; and those of each aggregation, (B, ..., P)."""
+        if not self.aggregations:
+            return {}
+        states = {"probed": self._in_blocks(State(torch.zeros((), dtype=torch.int64).expand(self.places.count)))}
+        for aggregation in self.aggregations:
+            for name, state in aggregation.states(self.places.count).items():
+                states[f"{aggregation.name}_{name}"] = self._in_blocks(state)
+        return states
+
+    def _in_blocks(self, state: State) -> State:
+        added = state.reduction == "sum"
+        shape = (self.blocks if added else 1, *state.initial.shape)
+        return State(state.initial.expand(shape), state.reduction, in_blocks=added)
+
+    def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
+        """Add the points of a step to all regions that they lie in."""
+        if not self.aggregations:
+            return
+        place, point = self.places.of_points(step.cell)
+        values = step.values[:, point]
+        weight = None if step.weight is None else step.weight[point]
+        of_sensors = None if step.of_sensors is None else step.of_sensors[:, point]
+        means = mean_per_cell(place, values, self.places.count, weight)
+        sums["probed"][step.block, means.cell] += 1
+        there = BinnedStep(place, values, weight, means, 0, self.places.count, of_sensors)
+        for aggregation in self.aggregations:
+            own = self._of(aggregation, sums)
+            aggregation.update({name: state[min(step.block, len(state) - 1)] for name, state in own.items()}, there)
+
+    def numbers(self, sums: Mapping[str, Tensor], max_radius: float) -> PlaceNumbers | None:
+        """What the sums say; None without aggregations."""
+        if not self.aggregations:
+            return None
+        every = list(range(self.blocks))
+        choices = [every, *(every[:block] + every[block + 1 :] for block in every if self.blocks > 1)]
+        values = []
+        for aggregation in self.aggregations:
+            own = self._of(aggregation, sums)
+            in_blocks = all(len(state) == self.blocks for state in own.values())
+            each = []
+            for blocks in choices if in_blocks else choices[:1]:
+                chosen = {name: state[blocks].sum(dim=0) if len(state) > 1 else state[0] for name, state in own.items()}
+                layers = aggregation.layers(chosen, sums["probed"][blocks].sum(dim=0), max_radius)
+                each.append(torch.stack([layer.values for layer in layers], dim=1))
+            unknown = torch.full_like(each[0], math.nan)
+            values.append(torch.stack(each if in_blocks else [*each, *[unknown] * (len(choices) - 1)]))
+        found = torch.cat(values, dim=2)
+        quantities = tuple(quantity for one in self.aggregations for quantity in region_quantities(one))
+        return PlaceNumbers(quantities, found[0], found[1:])
+
+    def _of(self, aggregation: Aggregation, sums: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        return {name: sums[f"{aggregation.name}_{name}"] for name in aggregation.states(self.places.count)}
+
+
+def region_quantities(aggregation: Aggregation) -> tuple[Quantity, ...]:
+    """What an aggregation gives a number of each region of, before it has seen anything."""
+    empty = {name: state.initial.clone() for name, state in aggregation.states(1).items()}
+    nothing = torch.zeros(1, dtype=torch.int64)
+    return tuple(layer.quantity for layer in aggregation.layers(empty, nothing, math.inf))

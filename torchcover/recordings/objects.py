@@ -1,0 +1,200 @@
+"""The objects of a recording over time: when and where each was, how large, and what it was."""
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.files import naming
+from torchcover.geometry import euler_from_rotation, rigid, rotation_from_euler
+from torchcover.geometry.rigid import Matrix
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings.recording import Recording
+from torchcover.recordings.seen import Seen, by_name
+
+# What road users are called where a data set has no names of its own, in lower case -> their class by SUMO's names.
+CLASSES = {
+    "car": "passenger",
+    "suv": "passenger",
+    "taxi": "passenger",
+    "vehicle": "passenger",
+    "passenger": "passenger",
+    "parkedvehicle": "passenger",
+    "priorityvehicle": "emergency",
+    "van": "delivery",
+    "truck": "truck",
+    "lorry": "truck",
+    "bus": "bus",
+    "motorcycle": "motorcycle",
+    "bicycle": "bicycle",
+    "cyclist": "bicycle",
+    "pedestrian": "pedestrian",
+    "person": "pedestrian",
+    "adult": "pedestrian",
+    "child": "child",
+    # Models of two-wheelers, as CARLA calls them.
+    "crossbike": "bicycle",
+    "century": "bicycle",
+    "omafiets": "bicycle",
+    "low_rider": "motorcycle",
+    "ninja": "motorcycle",
+    "yzf": "motorcycle",
+    "zx125": "motorcycle",
+}
+
+
+class Track(NamedTuple):
+    """A box over time.
+
+    Args:
+        name: Its id.
+        category: What the recording calls it.
+        vehicle_class: Its class by SUMO's names, such as "passenger" or "pedestrian"; None if it is no road user.
+        size_m: Length, width, height; NaN for a height that was not recorded.
+        trajectory: Of the middle of its bottom; transient, unless it is there all the time.
+    """
+
+    name: str
+    category: str
+    vehicle_class: str | None
+    size_m: tuple[float, float, float]
+    trajectory: Trajectory
+
+
+class Ego(NamedTuple):
+    """A recording's own ego.
+
+    Args:
+        name: Its id.
+        times_s: (K,) when.
+        world_T_ego: (K, 4, 4) where.
+        ego_T_vehicle: (4, 4) the vehicle frame in that of these poses: on the ground under the middle of its body.
+        size_m: Of its body, as published; None if it is unknown.
+    """
+
+    name: str
+    times_s: NDArray[np.float64]
+    world_T_ego: Matrix
+    ego_T_vehicle: Matrix
+    size_m: tuple[float, float, float] | None = None
+
+
+class RecordedObjects(NamedTuple):
+    """Who was recorded, at times of one clock.
+
+    Args:
+        tracks: Everybody but its egos.
+        egos: Its own; the first is meant if none is named.
+    """
+
+    tracks: tuple[Track, ...]
+    egos: tuple[Ego, ...] = ()
+
+    def digest(self) -> str:
+        """A hash of all of it."""
+        found = hashlib.sha256()
+        for track in self.tracks:
+            way = track.trajectory
+            found.update(repr((*track[:4], way.transient)).encode())
+            found.update(np.column_stack([way.times_s, way.positions_m, way.angles_deg]).tobytes())
+        for ego in self.egos:
+            found.update(repr((ego.name, ego.ego_T_vehicle.tolist(), ego.size_m, ego.times_s.tolist())).encode())
+            found.update(ego.world_T_ego.tobytes())
+        return found.hexdigest()
+
+
+def track_of(seen: Sequence[Seen], vehicle_class: str | None, world_T_source: Matrix | None = None) -> Track:
+    """A track from boxes about their middles.
+
+    Args:
+        seen: An object, in the order of time; of its sizes the median counts.
+        vehicle_class: See `Track`.
+        world_T_source: (K, 4, 4) the frame in which it was seen each time; None: the world.
+
+    Raises:
+        ValueError: No size, times that do not ascend, numbers that are none; the message names the id.
+    """
+    name = seen[0].name
+    sizes_m = np.array([one.size_m for one in seen], dtype=np.float64)
+    world_T_box = np.stack([one.world_T_box for one in seen])
+    if world_T_source is not None:
+        world_T_box = world_T_source @ world_T_box
+    checked_size(name, sizes_m.min(axis=0))
+    length, width, height = checked_size(name, np.median(sizes_m, axis=0))
+    places_m = world_T_box[:, :3, 3] - sizes_m[:, 2:] / 2 * world_T_box[:, :3, 2]
+    angles_deg = euler_from_rotation(world_T_box[:, :3, :3])
+    trajectory = moving(name, np.array([one.time_s for one in seen]), places_m, angles_deg)
+    return Track(name, seen[0].category, vehicle_class, (length, width, height), trajectory)
+
+
+def checked_size(name: str, size_m: Matrix) -> tuple[float, ...]:
+    """A size that a body can have, as far as it was recorded.
+
+    Raises:
+        ValueError: It is not; the message names the id.
+    """
+    if not (np.isfinite(size_m).all() and (size_m > 0).all()):
+        raise ValueError(f"id {name}: a box needs a positive length, width and height; got {size_m.tolist()}")
+    return tuple(size_m.tolist())
+
+
+def moving(name: str, times_s: Matrix, places_m: Matrix, angles_deg: Matrix) -> Trajectory:
+    """A trajectory that is there within its times.
+
+    Raises:
+        ValueError: As `Trajectory`; the message names the id.
+    """
+    try:
+        return Trajectory(times_s, places_m, angles_deg, transient=True)
+    except ValueError as error:
+        raise ValueError(f"id {name}: {error}") from error
+
+
+def objects_of(recording: Recording) -> RecordedObjects:
+    """The labelled objects of a recording, and the drive of its vehicle, in the world of its poses.
+
+    Raises:
+        BadFileError: It has no times, no poses or no boxes, an object of it has no id, or no trajectory.
+    """
+    with naming(recording.path, "objects of a recording"):
+        poses = [recording.world_T_vehicle(index) for index in range(len(recording.names))]
+        world_T_vehicle = np.stack([pose for pose in poses if pose is not None] or [np.eye(4)])
+        if recording.times_s is None or len(world_T_vehicle) < len(poses):
+            raise ValueError("its vehicle has no poses with times, without which its objects have no way")
+        times_s = recording.times_s - recording.times_s[0]
+        seen = by_name(_labelled(recording, times_s, world_T_vehicle))
+        tracks = tuple(track_of(of, class_of(of[0].category)) for of in seen.values())
+    body = recording.body
+    size_m = None if body is None else (*body.size_m[:2], body.upper_m[2])
+    return RecordedObjects(tracks, (Ego("ego", times_s, world_T_vehicle, np.eye(4), size_m),))
+
+
+def class_of(category: str) -> str | None:
+    """The class of a road user by a word of its category, the last that is known: of `vehicle.car` that of a car.
+
+    Example:
+        >>> class_of("Car"), class_of("walker.pedestrian.0007"), class_of("static.barrier")
+        ('passenger', 'pedestrian', None)
+    """
+    return next((CLASSES[word] for word in reversed(category.strip().lower().split(".")) if word in CLASSES), None)
+
+
+def _labelled(recording: Recording, times_s: NDArray[np.float64], world_T_vehicle: Matrix) -> Iterator[Seen]:
+    """The objects of all instants, one after the other."""
+    labelled = False
+    for index, (name, time_s) in enumerate(zip(recording.names, times_s.tolist(), strict=True)):
+        boxes = recording.boxes(index)
+        if boxes is None:
+            continue
+        labelled = True
+        if "" in boxes.ids:
+            raise ValueError(f"an object of {name} has no id, by which it would be found again in other instants")
+        rows = boxes.rows.double().numpy()
+        turned = rotation_from_euler(np.rad2deg(rows[:, 6]), np.zeros(len(rows)), np.zeros(len(rows)))
+        placed = world_T_vehicle[index] @ rigid(turned, rows[:, :3])
+        for own, world_T_box, row, category in zip(boxes.ids, placed, rows, boxes.categories, strict=True):
+            yield Seen(own, time_s, world_T_box, tuple(row[3:6].tolist()), category)
+    if not labelled:
+        raise ValueError("no instant of it has labelled objects")
