@@ -13,6 +13,7 @@ from torchcover.simulation import shapes
 from torchcover.simulation.documents import Document, NameOrFile, Pose, is_file_name, load_document
 from torchcover.simulation.mount_regions import MountRegion
 from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.sound import told
 
 # No building, and no terrain within a sensor's range, is higher.
 TALLEST_SCENERY_M = 1000.0
@@ -100,6 +101,11 @@ Shape = Annotated[
 ]
 
 
+def sound_mesh(shape: Shape, owner: str) -> Mesh:
+    """The form of a body, with warnings if a file has lies in it; see `told`."""
+    return told(owner, shape.mesh()) if isinstance(shape, shapes.MeshFile) else shape.mesh()
+
+
 class Body(Document):
     """A shape with a name, at one or more places.
 
@@ -119,7 +125,7 @@ class Body(Document):
 
     def meshes(self) -> list[Mesh]:
         """One mesh for each pose."""
-        mesh = self.shape.mesh()
+        mesh = sound_mesh(self.shape, f"body {self.name!r}")
         warn_of_scenery(f"body {self.name!r}", mesh)
         return [mesh.moved(pose.matrix()) for pose in self.poses]
 
@@ -190,7 +196,7 @@ def mover_mesh(name: str, shape: Shape, category: str = "ego") -> Mesh:
         shape: Its form, in its own frame.
         category: What it is: "ego", or that of an actor.
     """
-    mesh = in_vehicle_frame(shape.mesh())
+    mesh = in_vehicle_frame(sound_mesh(shape, name))
     warn_of_mover(name, mesh, category)
     return mesh
 

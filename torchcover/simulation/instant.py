@@ -70,6 +70,21 @@ class Instant:
         """(N,) heights above the local ground of (N, 3) points of the vehicle frame; see `LocalGround.heights_m`."""
         return self.ground.heights_m(points_m, self.world_T_vehicle)
 
+    def first_faces(self, points_m: Float32, normals: Float32, within_m: float) -> NDArray[np.int64]:
+        """Which face that never moves lies at each of some points of such faces, or above it.
+
+        Args:
+            points_m: (N, 3) in the vehicle frame.
+            normals: (N, 3) of length one, on the side that is looked at.
+            within_m: How far above at most.
+
+        Returns:
+            (N,) numbers of the faces, as `RayCaster.faces_met` counts them, -1 for none.
+        """
+        starts_m = transform(self.static_T_vehicle, points_m + np.float32(within_m) * normals)
+        towards = -(normals @ self.static_T_vehicle[:3, :3].T)
+        return self.static.faces_met(starts_m, towards, 2 * within_m)
+
     def scan(
         self,
         vehicle_T_sensor: Matrix,

@@ -120,7 +120,8 @@ class Patches(NamedTuple):
     would say no more, for rays meet float32 triangles. `outward` (N,): whether they are seen from the side only to
     which first x second points. `of_object` (N,) int32: number of the object that they belong to, -1 for none.
     `heights_m` (2, N) float32: between which heights above the local ground all of their points lie; (0, N) where that
-    was not asked.
+    was not asked. `face` (1, N) int32: of which of all faces that never move each is a part, if that coincides with
+    another, else -1; (0, N) where none does.
     """
 
     corner_m: Float32
@@ -129,6 +130,7 @@ class Patches(NamedTuple):
     outward: Bools
     of_object: Int32
     heights_m: Float32
+    face: Int32
 
     @classmethod
     def of(cls, mesh: Mesh) -> Self:
@@ -141,6 +143,7 @@ class Patches(NamedTuple):
         mesh: Mesh,
         bounds: Bounds | None = None,
         heights: Callable[[Float64, Int64], tuple[Float32, Bools]] | None = None,
+        coincident: Int32 | None = None,
     ) -> Self:
         """Cut a mesh, or what is wanted of it.
 
@@ -149,6 +152,7 @@ class Patches(NamedTuple):
             bounds: What lies outside of these boxes is left out; all is wanted if not given.
             heights: Of (3, 3, N) corners, coordinates, triangles and (N,) the faces that they are parts of: their
                 `heights_m`, and (N,) whether any of that is wanted.
+            coincident: (F,) what patches of each face have as `face`, if any coincides.
         """
         extent_m = 0.0 if bounds is not None else float(np.ptp(mesh.vertices_m, axis=0).max())
         corners_m = np.ascontiguousarray(mesh.vertices_m[mesh.faces].transpose(1, 2, 0))
@@ -156,14 +160,21 @@ class Patches(NamedTuple):
         (corner, second, third), face, heights_m = _cut(corners_m, bounds, longest_m, heights)
         first_m, second_m = (second - corner).astype(np.float32), (third - corner).astype(np.float32)
         nobodys = np.full(len(face), -1, dtype=np.int32)
-        return cls(corner.astype(np.float32), first_m, second_m, outward_faces(mesh)[face], nobodys, heights_m)
+        outward = outward_faces(mesh)[face]
+        of_face = np.empty((0, len(face)), dtype=np.int32) if coincident is None else coincident[None, face]
+        return cls(corner.astype(np.float32), first_m, second_m, outward, nobodys, heights_m, of_face)
 
     @classmethod
     def joined(cls, parts: "list[Patches]") -> Self:
         """Those of several, one after the other."""
         none, rows = np.empty((3, 0), dtype=np.float32), len(parts[0].heights_m) if parts else 0
         nobodys = np.empty(0, dtype=np.int32)
-        parts = [Patches(none, none, none, np.empty(0, dtype=bool), nobodys, none[:rows]), *parts]
+        # What moves has no faces that coincide.
+        faces = max((len(part.face) for part in parts), default=0)
+        of_none = (part._replace(face=np.full((faces, len(part.outward)), -1, dtype=np.int32)) for part in parts)
+        parts = [part if len(part.face) == faces else other for part, other in zip(parts, of_none, strict=True)]
+        no_face = np.empty((faces, 0), dtype=np.int32)
+        parts = [Patches(none, none, none, np.empty(0, dtype=bool), nobodys, none[:rows], no_face), *parts]
         return cls._make(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
 
     def taken(self, numbers: NDArray[np.int64]) -> Self:

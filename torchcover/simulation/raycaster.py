@@ -149,6 +149,25 @@ class RayCaster:
         answer = self._scene.run(origins_m, directions.T, dists=limit_m.copy(), output=True)
         return Hits(answer["tfar"], answer["geomID"])
 
+    def faces_met(
+        self, origins_m: NDArray[np.floating], directions: NDArray[np.floating], limit_m: float
+    ) -> NDArray[np.int64]:
+        """Which face each of some rays meets first, counted through the faces of all bodies.
+
+        Args:
+            origins_m: (N, 3) where they start.
+            directions: (N, 3) unit directions.
+            limit_m: Where they end.
+
+        Returns:
+            (N,) numbers, -1 for none.
+        """
+        starts_m, towards = origins_m.astype(np.float32), directions.astype(np.float32)
+        ends_m = np.full(len(starts_m), limit_m, dtype=np.float32)
+        answer = self._scene.run(starts_m, towards, dists=ends_m, output=True)
+        met: NDArray[np.int64] = np.where(answer["geomID"] >= 0, self._numbers(answer), -1)
+        return met
+
     def _numbers(self, answer: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
         """(N,) which of all faces each ray hit; any number where it hit none."""
         numbers: NDArray[np.int64] = self._first_face[np.maximum(answer["geomID"], 0)] + np.maximum(answer["primID"], 0)

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import NonNegativeFloat, PlainValidator, PositiveFloat, TypeAdapter, ValidationInfo, model_validator
 
-from torchcover.geometry import BoundingBox
+from torchcover.geometry import BoundingBox, rigid
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, called, mover_mesh
@@ -15,7 +15,8 @@ from torchcover.simulation.documents import Document, PathBeside, Pose, load_doc
 from torchcover.simulation.kinds import TRAFFIC
 from torchcover.simulation.local_ground import STEEPEST_DEG, level_faces
 from torchcover.simulation.recorded.bodies import read_boxes
-from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.shapes import Mesh, MeshFile
+from torchcover.simulation.sound import coincident_faces, warn_of_coincidence
 from torchcover.simulation.traffic.kind import Traffic
 from torchcover.simulation.world import Actor, World, steps_of
 
@@ -251,12 +252,18 @@ class Scenario(Document):
                     f"body {static[number][1].name!r} is ground, but none of its faces is an upper side that one could "
                     f"stand on, at most {STEEPEST_DEG:g} degrees steep; is z up?"
                 )
+        driver = self.ego.actor("ego", "ego")
         actors = tuple(actor.actor(actor.name, actor.category) for actor in self.actors)
+        static_T_world = rigid(np.eye(3), -driver.trajectory.positions_m[0])
+        within = [isinstance(body.shape, MeshFile) for _, body in static]
+        coincident = coincident_faces([mesh.moved(static_T_world) for mesh, _ in static], within)
+        warn_of_coincidence([body.name for _, body in static], coincident)
         return World(
             static=tuple(mesh for mesh, _ in static),
-            ego=self.ego.actor("ego", "ego"),
+            ego=driver,
             actors=actors + (read_boxes(self.boxes) if self.boxes else ()),
             time_step_s=self.time_step_s,
             duration_s=self.duration_s,
             ground=ground or None,
+            coincident=tuple(coincident) if any(mask.any() for mask in coincident) else (),
         )

@@ -123,8 +123,19 @@ class Scene:
                 {self._first_moving + k: number[id(actor)] for k, actor in enumerate(self._moving) if actor is not ego},
                 bounds,
                 None if heights_m is None else self._above_ground(*heights_m),
+                self.coincident,
             )
         return self._surfaces[box]
+
+    @cached_property
+    def coincident(self) -> Sequence[NDArray[np.int32]]:
+        """For each static mesh (F,) numbers of its faces that coincide with others among all that never move, or -1."""
+        first = sum(len(actor.mesh.faces) for actor in self._resting)
+        ends = first + np.cumsum([len(mask) for mask in self.world.coincident])
+        return [
+            np.where(mask, np.arange(end - len(mask), end), -1).astype(np.int32)
+            for mask, end in zip(self.world.coincident, ends.tolist(), strict=True)
+        ]
 
     def _above_ground(self, lowest_m: float, highest_m: float) -> AboveGround:
         squares_T_static = self._world_T_local.copy()

@@ -102,6 +102,8 @@ class SceneSurface:
         moving: Of the others the number of the object, by that of the body in an instant.
         bounds: Boxes in the frame of what never moves, outside of which no scenery is ever asked for.
         above: What is asked by height above the local ground; None if nothing is.
+        coincident: For each mesh that never moves (F,) numbers of its faces that coincide with others, -1 for the rest;
+            empty if none does.
     """
 
     def __init__(
@@ -112,13 +114,17 @@ class SceneSurface:
         moving: Mapping[int, int],
         bounds: Bounds,
         above: AboveGround | None = None,
+        coincident: Sequence[NDArray[np.int32]] = (),
     ) -> None:
         self._above = above
         self._moving = {body: (objects[number], number) for body, number in moving.items()}
         placed = [objects[number].moved(pose).given_to(number) for number, pose in resting.items()]
         if above is not None:
             placed = [above.of_objects(patches, np.eye(4), *_box_of(patches)) for patches in placed]
-        cut = [Patches.cut(mesh, bounds, above and above.of_scenery(number)) for number, mesh in enumerate(scenery)]
+        cut = [
+            Patches.cut(mesh, bounds, above and above.of_scenery(number), coincident[number] if coincident else None)
+            for number, mesh in enumerate(scenery)
+        ]
         patches = Patches.joined(cut + placed)
         order, cell = _by_place(patches)
         self._static = patches.taken(order)
@@ -176,6 +182,7 @@ def placed_each(kinds: Sequence[tuple[Patches, int]], destination_T_source: Floa
         outward=all_parts.outward,
         of_object=np.array([number for _, number in kinds], dtype=np.int32).repeat(count),
         heights_m=all_parts.heights_m,
+        face=all_parts.face,
     )
 
 

@@ -1,7 +1,7 @@
 """Points drawn evenly over a surface, stratified by boxes and by objects."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,8 @@ class SurfacePoints(NamedTuple):
 
     `points_m` (K, 3) where; `heights_m` (K,) above what bands are measured from; `normals` (K, 3) of length one on the
     side from which they are looked at; `per_m2` (K,) how many points a square metre was given there, from all strata
-    together; `of_object` (K,) number of the object that they are on, -1 for none.
+    together; `of_object` (K,) number of the object that they are on, -1 for none; `face` (1, K) or (0, K) as in
+    `Patches`.
     """
 
     points_m: Float32
@@ -36,6 +37,11 @@ class SurfacePoints(NamedTuple):
     normals: Float32
     per_m2: Float64
     of_object: Int32
+    face: Int32
+
+    def some(self, which: Bools) -> Self:
+        """Those of them for which (K,) is true."""
+        return type(self)(*(part[which] for part in self[:-1]), self.face[:, which])
 
 
 class Stratum(NamedTuple):
@@ -119,6 +125,7 @@ class SurfaceStrata:
             (self._normals[:, patch] * side).T,
             np.array([density for _, density in drawn]) @ inside[:, kept] + object_per_m2[of_object],
             of_object,
+            self._patches.face.take(patch, axis=1),
         )
 
     def _heights_of(self, points_m: Float32, patch: Numbers) -> Float32:

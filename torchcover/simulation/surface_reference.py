@@ -21,6 +21,7 @@ from torchcover.simulation.reference_sensor import (
     position_in_shell,
 )
 from torchcover.simulation.sight import Sight, sight
+from torchcover.simulation.sound import COINCIDE_M
 from torchcover.simulation.surface_points import SurfacePoints, SurfaceStrata
 
 Float32 = NDArray[np.float32]
@@ -45,8 +46,8 @@ class SurfaceReference:
         E_place[ integral of f over the surface that the place sees ],
 
     whatever the number of rays and of places. A face of a closed body is seen from its outer side; a face of anything
-    open, such as a plane, from both. Where two faces coincide and look the same way, both count. Outside of all areas
-    and bands there are points on objects only.
+    open, such as a plane, from both. Of faces that never move and lie within 1 mm of each other, one counts. Outside
+    of all areas and bands there are points on objects only.
 
     Args:
         areas: Rectangles x, y in the vehicle frame in metres, ((x_low, x_high), (y_low, y_high)) each. They may
@@ -135,7 +136,7 @@ class SurfaceReference:
         on_objects, looks = math.ceil(self.object_points / self.places), []
         for place_m in places_m:
             found = strata.draw(place_m, self._rays_each, surroundings.generator, on_objects=on_objects)
-            found = self._in_range(found, place_m)
+            found = self._in_range(_uncovered(found, surroundings), place_m)
             targets_m = found.points_m + np.float32(above_m) * found.normals
             looks.append((found, sight(instant, place_m, targets_m, threads=surroundings.threads)))
         objects = len(surroundings.scene.world.objects)
@@ -169,7 +170,7 @@ class SurfaceReference:
 
     def _in_range(self, drawn: SurfacePoints, place_m: Float64) -> SurfacePoints:
         near = np.linalg.norm(drawn.points_m - place_m, axis=1) <= self.max_range_m
-        return drawn if near.all() else SurfacePoints(*(part[near] for part in drawn))
+        return drawn if near.all() else drawn.some(near)
 
     def _gathered(self, looks: list[tuple[SurfacePoints, Sight]], objects: int, redrawn: int) -> ReferenceScan:
         # One place stands for one of so many: every place's points are a surface of their own.
@@ -187,3 +188,16 @@ class SurfaceReference:
             places=self.places,
             heights_m=heights_m if self.band_frame == "ground" else None,
         )
+
+
+def _uncovered(found: SurfacePoints, surroundings: Surroundings) -> SurfacePoints:
+    """The points but those whose face is not the first from above of faces that coincide."""
+    asked = np.flatnonzero(found.face[0] >= 0) if len(found.face) else np.empty(0, dtype=np.int64)
+    if len(asked) == 0:
+        return found
+    uncovered = np.ones(len(found.points_m), dtype=bool)
+    first = surroundings.instant.first_faces(found.points_m[asked], found.normals[asked], COINCIDE_M)
+    # Between two faces of one surface rounding decides; these are not covered by another.
+    coincident = np.concatenate(surroundings.scene.coincident)
+    uncovered[asked] = (first == found.face[0, asked]) | (first < 0) | ~np.isin(first, coincident[coincident >= 0])
+    return found.some(uncovered)

@@ -47,6 +47,8 @@ class World:
         parked: Objects that never move, of which there may be many.
         ground: Numbers of the static meshes that one drives or walks on: their level faces are the ground. None if
             that is not known: then `Scene.ground` finds it.
+        coincident: For each static mesh (F,) which of its faces lie within 1 mm of others, of which one counts; empty
+            if none do.
     """
 
     static: tuple[Mesh, ...]
@@ -56,6 +58,7 @@ class World:
     duration_s: float = 0.0
     parked: tuple[Actor, ...] = ()
     ground: tuple[int, ...] | None = None
+    coincident: tuple[NDArray[np.bool_], ...] = ()
 
     @property
     def objects(self) -> tuple[Actor, ...]:
