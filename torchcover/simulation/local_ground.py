@@ -1,5 +1,6 @@
 """The ground of a world: what one drives or walks on, and how high above it something is."""
 
+import math
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Literal, NamedTuple
@@ -32,9 +33,11 @@ BEYOND_M = 0.02
 PROBES = np.array([0.1, 0.5, 0.9])
 # Whoever stands on the ground has it so near above or below.
 NEAR_M = 1.0
+# Ground that is nowhere higher or lower than that is looked at as a whole, and not square by square.
+LEVEL_M = 0.3
 # Side of the smallest squares in which the height of the ground is known roughly, of how many at most.
 SQUARE_M = 8.0
-MOST_SQUARES = 1_000_000
+MOST_SQUARES = 65_536
 # Points are rounded to float32, and so are their heights: so little above or below the ground they lie on it.
 ROUNDING_M = 5e-4
 # Bounds of heights are so much wider.
@@ -216,8 +219,8 @@ class LocalGround:
 class GroundSquares(NamedTuple):
     """The lowest and the highest ground in the squares of a raster, and of rasters with squares twice as large.
 
-    `lower_m` (2,) the first corner; `square_m` the side of a square; `levels` for each raster (2, columns, rows) of the
-    lowest and the highest, infinite and minus infinite where there is none.
+    `lower_m` (2,) the first corner; `square_m` the side of a square, infinite if there is but one; `levels` for each
+    raster (2, columns, rows) of the lowest and the highest, infinite and minus infinite where there is none.
     """
 
     lower_m: Float64
@@ -230,8 +233,12 @@ class GroundSquares(NamedTuple):
         parts = [mesh.vertices_m[mesh.faces] for mesh in meshes]
         corners_m = np.concatenate([np.empty((0, 3, 3)), *parts]).transpose(1, 2, 0)
         if corners_m.shape[2] == 0:
-            return cls(np.zeros(2), SQUARE_M, [np.full((2, 1, 1), [[[np.inf]], [[-np.inf]]], dtype=np.float32)])
+            return cls(np.zeros(2), math.inf, [np.array([[[np.inf]], [[-np.inf]]], dtype=np.float32)])
         lower_m, upper_m = corners_m.min(axis=0), corners_m.max(axis=0)
+        lowest_m, highest_m = float(lower_m[2].min()), float(upper_m[2].max())
+        if highest_m - lowest_m <= LEVEL_M:
+            everywhere = np.array([lowest_m - SLACK_M, highest_m + SLACK_M], dtype=np.float32)
+            return cls(np.zeros(2), math.inf, [everywhere.reshape(2, 1, 1)])
         first_m, size_m = lower_m[:2].min(axis=1), np.ptp(np.hstack([lower_m[:2], upper_m[:2]]), axis=1)
         square_m = max(SQUARE_M, float(np.sqrt(size_m.prod() / MOST_SQUARES)), float(size_m.max()) / MOST_SQUARES)
         from_square = ((lower_m[:2] - first_m[:, None]) / square_m).astype(np.int64)
@@ -263,6 +270,9 @@ class GroundSquares(NamedTuple):
         Returns:
             (N,) and (N,); infinite and minus infinite where there is none.
         """
+        if math.isinf(self.square_m):
+            lowest_m, highest_m = (np.full(lower_m.shape[1], bound) for bound in self.levels[0].ravel())
+            return lowest_m, highest_m
         extent = np.max(upper_m - lower_m, axis=0) / self.square_m
         level = np.clip(np.ceil(np.log2(np.maximum(extent, 1.0))), 0, len(self.levels) - 1).astype(np.int64)
         lowest_m, highest_m = np.full(len(level), np.inf, np.float32), np.full(len(level), -np.inf, np.float32)
@@ -270,14 +280,15 @@ class GroundSquares(NamedTuple):
             raster, some = self.levels[number], np.flatnonzero(level == number)
             sides = np.array(raster.shape[1:])[:, None]
             ends = [
-                np.floor((side_m[:, some] - self.lower_m[:, None]) / (self.square_m * 2**number)).astype(np.int64)
+                (side_m.take(some, axis=1) - self.lower_m[:, None]) / (self.square_m * 2**number)
                 for side_m in (lower_m, upper_m)
             ]
             outside = ((ends[1] < 0) | (ends[0] >= sides)).any(axis=0)
-            (from_x, from_y), (to_x, to_y) = (np.clip(end, 0, sides - 1) for end in ends)
-            low_m, high_m = lowest_m[some], highest_m[some]
-            for x, y in ((from_x, from_y), (from_x, to_y), (to_x, from_y), (to_x, to_y)):
-                low_m, high_m = np.minimum(low_m, raster[0, x, y]), np.maximum(high_m, raster[1, x, y])
+            (from_x, from_y), (to_x, to_y) = (np.clip(end, 0, sides - 1).astype(np.int64) for end in ends)
+            squares, rows = raster.reshape(2, -1), raster.shape[2]
+            at = [squares.take(x * rows + y, axis=1) for x in (from_x, to_x) for y in (from_y, to_y)]
+            low_m = np.minimum(np.minimum(at[0][0], at[1][0]), np.minimum(at[2][0], at[3][0]))
+            high_m = np.maximum(np.maximum(at[0][1], at[1][1]), np.maximum(at[2][1], at[3][1]))
             lowest_m[some], highest_m[some] = np.where(outside, np.inf, low_m), np.where(outside, -np.inf, high_m)
         return lowest_m, highest_m
 

@@ -6,6 +6,7 @@ interpreter lock, so that threads add up. An origin may lie on a face, as far as
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -102,7 +103,7 @@ class RayCaster:
             raise ValueError(
                 f"bodies within {MAX_M:g} m of the origin are needed; a vertex has the coordinate {reach_m}"
             )
-        self._faces = Faces(bodies, reach_m)
+        self._reach_m = reach_m
         self._first_face = np.cumsum([0] + [len(body.faces) for body in bodies])
         self._bodies = bodies
         self._closed: dict[int, NDArray[np.bool_]] = {}  # asked of few: hardly any ray meets a face from behind
@@ -113,6 +114,11 @@ class RayCaster:
             TriangleMesh(self._scene, body.vertices_m.astype(np.float32), body.faces.astype(np.int32))
         # embreex commits the scene when it is first used; do it before several threads do.
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    @cached_property
+    def _faces(self) -> Faces:
+        """Asked where rays have a common origin, which may lie on a face."""
+        return Faces(self._bodies, self._reach_m)
 
     def cast(self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32) -> Hits:
         """Cast rays from one origin. A ray that starts on a face does not hit that face.
