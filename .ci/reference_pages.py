@@ -24,7 +24,7 @@ from torchcover.cli.app import app
 ROOT = Path(__file__).parent.parent
 ROOMS = (
     "coverage", "evaluation", "placement", "targets", "data", "simulation", "cameras", "detection", "training",
-    "metrics", "neighbors", "report", "geometry",
+    "metrics", "estimation", "neighbors", "report", "geometry",
 )  # fmt: skip
 # Where the classes of documents are defined.
 DOCUMENTS = (

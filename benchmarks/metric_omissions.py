@@ -19,7 +19,7 @@ def main():
 
     def update(grid=GRID, **options):
         metric = CoverageMetric(grid, (0.4,), **options)
-        return lambda: metric.update(frame.sensor, frame.reference, index=0)
+        return lambda: metric.update(frame.sensor, frame.reference, place_in_time=0)
 
     everything = {"maximum": True, "pooled": True, "quantiles": (0.5,), "blocks": 16}
     pairs = {

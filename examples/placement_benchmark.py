@@ -207,10 +207,10 @@ def page(judged, scores, options):
     return text
 
 
-def ranks(judged, candidates):
+def ranks(judged, rankings):
     """The table of some placements, and what it is worth."""
-    found = agreement_of(candidates, judged, placements=True)
-    (height,) = (one for one in candidates if one.name == "mean mounting height")
+    found = agreement_of(rankings, judged, placements=True)
+    (height,) = (one for one in rankings if one.name == "mean mounting height")
     ceiling = f"{judged.ceiling:.2f}" if len(judged.judges) > 1 else "an unknown amount, for there is one of each,"
     text = (
         f"The trainings agree with each other by {ceiling} on {len(judged.placements)} placements, whose "
@@ -219,7 +219,7 @@ def ranks(judged, candidates):
         f"gives the best more than {found.by_chance:.2f}.\n\n"
         "| metric | Spearman | tau-b | p | lead |\n|---|---:|---:|---:|---:|\n"
     )
-    order = sorted(zip(found.ranked, candidates, strict=True), key=lambda pair: -np.nan_to_num(pair[0].spearman.value))
+    order = sorted(zip(found.ranked, rankings, strict=True), key=lambda pair: -np.nan_to_num(pair[0].spearman.value))
     leads = []
     for row, one in order:
         if np.isnan(row.spearman.value):

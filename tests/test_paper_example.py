@@ -199,7 +199,7 @@ def test_pieces_merge_to_what_one_run_with_a_block_for_each_says(paper, square_m
             clouds = [4 * torch.rand((count, 3), generator=random) - torch.tensor([0, 2, 0.5]) for count in (3, 9)]
             weights = torch.rand(9, generator=random) + 0.1
             for metric in (whole, piece):
-                metric.update(*clouds, weights=weights, index=index)
+                metric.update(*clouds, weights=weights, place_in_time=index)
         folder = tmp_path / f"{first:05d}"
         paper.pieces.save_piece(folder, {("my/rig.yaml", "known"): piece.compute()})
         pieces.append(folder)

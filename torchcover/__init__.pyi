@@ -2,6 +2,7 @@ from . import cameras as cameras
 from . import coverage as coverage
 from . import data as data
 from . import detection as detection
+from . import estimation as estimation
 from . import evaluation as evaluation
 from . import geometry as geometry
 from . import metrics as metrics

@@ -63,8 +63,8 @@ class Measurement:
             frame, surface = self.frames[index], self.surface_frames[index]
             reference = thinned(frame.reference, self.grid, POINTS_PER_CELL, seed=index)
             for rig, cloud in frame.clouds.items():
-                known[rig].update(cloud, reference, index=index)
-                area[rig].update(cloud, surface.reference, weights=surface.reference_weights, index=index)
+                known[rig].update(cloud, reference, place_in_time=index)
+                area[rig].update(cloud, surface.reference, weights=surface.reference_weights, place_in_time=index)
             for observer in also:
                 observer.update(frame)
         metrics = {"known": known, "area": area}

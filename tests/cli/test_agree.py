@@ -13,7 +13,7 @@ def test_a_small_run_prints_ranks_and_what_they_are_worth(torchcover, tmp_path):
     assert "No metric is validated by this" in text
     assert "cannot separate metrics" in text
     assert "…" not in text
-    assert {path.name for path in out.iterdir()} >= {"agreement.csv", "scores.csv", "agreement.json", "agreement.md"}
+    assert {path.name for path in out.iterdir()} >= {"agreement.csv", "scores.csv", "agreement.json"}
 
 
 @pytest.mark.parametrize(

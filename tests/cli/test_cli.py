@@ -123,9 +123,9 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
 def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, worlds, monkeypatch):
     given = []
 
-    def noted(self, sensor, reference, *, weights, index):
-        given.append((len(reference), weights, index))
-        update(self, sensor, reference, weights=weights, index=index)
+    def noted(self, sensor, reference, *, weights, place_in_time):
+        given.append((len(reference), weights, place_in_time))
+        update(self, sensor, reference, weights=weights, place_in_time=place_in_time)
 
     update = CoverageMetric.update
     monkeypatch.setattr(CoverageMetric, "update", noted)
@@ -170,7 +170,7 @@ def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording
     monkeypatch.setattr(
         CoverageMetric,
         "update",
-        lambda self, *clouds, **more: given.append(more["index"]) or update(self, *clouds, **more),
+        lambda self, *clouds, **more: given.append(more["place_in_time"]) or update(self, *clouds, **more),
     )
     assert torchcover("evaluate", "--frames", recording, "--out", tmp_path / "out", "--skip-bad-frames")[0] == 0
     assert given == [0, 2, 3]

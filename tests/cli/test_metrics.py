@@ -33,7 +33,7 @@ def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
     code, printed, error, out = run(torchcover, worlds, "low", "both", "other/low", options=["--metrics", "all"])
     assert (code, error.count("warning")) == (0, 0)
     assert "None of these metrics is validated" in printed
-    assert "lob: the distance decides the order" in " ".join(printed.split())
+    assert "m_sog: only for ranks" in " ".join(printed.split())
     summary = json.loads((out / "summary.json").read_text())
     numbers = {(row["rig"], row["name"]): row for row in summary["metrics"]["numbers"]}
     assert numbers["both", "points"]["rank"] == 1.0
@@ -41,7 +41,7 @@ def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
     assert numbers["low", "object_coverage_2m:bus"]["value"] is None
     notes = summary["metrics"]["notes"]
     assert sum(note.startswith("s_mig, s_mig_occluded: S-MIG falls") for note in notes) == 1
-    assert sum(note.startswith("lob: the distance decides") for note in notes) == 1
+    assert sum(note.startswith("m_sog: only for ranks") for note in notes) == 1
     with (out / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(summary["metrics"]["numbers"])

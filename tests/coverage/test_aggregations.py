@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import dataclass, fields
+from itertools import product
 from typing import ClassVar
 
 import numpy as np
@@ -118,7 +119,8 @@ def random_steps(count, seed=0):
 
 
 NEAR, ALL = Region("near", (-1.0, 1.0), (-1.0, 1.0)), Region("all", (-2.0, 2.0), (-2.0, 2.0))
-FOUR = BevGrid(x=(-2.0, 2.0), y=(-2.0, 2.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+BANDS = {"all": (-1.0, 1.0), "high": (0.1, 1.0)}
+FOUR = BevGrid(x=(-2.0, 2.0), y=(-2.0, 2.0), cell=1.0, heights=BANDS)
 MEANS = {"radius_m", "detection_0.4m"}
 EVERY = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), StepQuantiles((0.5,)))
 
@@ -126,21 +128,22 @@ EVERY = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), StepQuantiles((0.5,)))
 def in_regions(steps, first=0, **options):
     metric = CoverageMetric(FOUR, blocks=8, aggregations=EVERY, regions=[NEAR, ALL], max_radius=9.0, **options)
     for index, (sensor, reference, weights) in enumerate(steps, first):
-        metric.update(sensor, reference, weights=weights, index=index)
+        metric.update(sensor, reference, weights=weights, place_in_time=index)
     return metric
 
 
-def radii_in(region, sensor, reference, weights):
+def radii_in(region, sensor, reference, weights, band=BANDS["all"]):
     """Of the points of a region, with their weights."""
-    inside = ((reference[:, :2] >= region.x[0]) & (reference[:, :2] < region.x[1])).all(dim=1)
+    low, high = (torch.tensor([region.x[end], region.y[end], band[end]]) for end in (0, 1))
+    inside = ((reference >= low) & (reference < high)).all(dim=1)
     return torch.cdist(reference[inside], sensor).amin(dim=1).numpy(), weights[inside].numpy()
 
 
 def test_the_number_of_a_region_is_what_the_aggregation_makes_of_all_its_points():
     steps = list(random_steps(40))
     coverage = in_regions(steps, square_metres=True).compute()
-    for row, region in zip(coverage.summary(), (NEAR, ALL), strict=True):
-        each = [radii_in(region, *step) for step in steps]
+    for row, (region, band) in zip(coverage.summary(), product((NEAR, ALL), BANDS.values()), strict=True):
+        each = [radii_in(region, *step, band) for step in steps]
         radii, m2 = (np.concatenate(parts) for parts in zip(*each, strict=True))
         found = {key: number.value for key, number in row.numbers.items()}
         assert found["radius_maximum_m"] == pytest.approx(radii.max(), rel=1e-6)
@@ -158,12 +161,12 @@ def test_the_number_of_a_region_is_what_the_aggregation_makes_of_all_its_points(
 def test_the_error_of_a_region_s_number_is_the_jackknife_over_its_blocks():
     steps = list(random_steps(16))
     coverage = in_regions(steps, square_metres=True).compute()
-    numbers = coverage.summary()[0].numbers
+    numbers = coverage.summary()[-1].numbers
     whole = numbers["radius_q0.9_m"].value
     left_out = []
     for block in range(8):
         rest = [step for at, step in enumerate(steps) if at // 2 != block]
-        left_out.append(in_regions(rest, square_metres=True).compute().summary()[0].numbers["radius_q0.9_m"].value)
+        left_out.append(in_regions(rest, square_metres=True).compute().summary()[-1].numbers["radius_q0.9_m"].value)
     pseudo = 8 * whole - 7 * np.array(left_out)
     assert numbers["radius_q0.9_m"].error == pytest.approx(pseudo.std(ddof=1) / 8**0.5, rel=1e-9)
     assert numbers["radius_pooled_m"].error == pytest.approx(numbers["radius_m"].error, rel=1e-9)
@@ -202,7 +205,7 @@ def test_any_number_of_a_result_has_an_estimate():
             FOUR, aggregations=EVERY, regions=[NEAR], sensors=["a", "b"], square_metres=True, blocks=8, max_radius=9.0
         )
         for world, (seen, reference, weights) in enumerate(random_steps(3)):
-            metric.update({"a": seen[:2] + shift, "b": seen[2:]}, reference, weights=weights, index=world)
+            metric.update({"a": seen[:2] + shift, "b": seen[2:]}, reference, weights=weights, place_in_time=world)
         return metric.compute()
 
     one, other = measured(0.0), measured(0.1)
@@ -251,7 +254,7 @@ def test_an_aggregation_of_ones_own_has_a_map_numbers_errors_and_a_place_in_ever
     steps = list(random_steps(16))
     metric = CoverageMetric(FOUR, blocks=16, aggregations=[Blind()], regions=[NEAR])
     for index, (sensor, reference, _) in enumerate(steps):
-        metric.update(sensor, reference, index=index)
+        metric.update(sensor, reference, place_in_time=index)
     found = metric.compute()
     blind = [(radii_in(NEAR, *step)[0] > 0.5) for step in steps]
     base, sums = (
@@ -287,11 +290,24 @@ class Minimum(Aggregation):
         return [Layer(quantity, (-sums["negative"]).where(probed_steps > 0, math.nan))]
 
 
+def test_what_is_known_of_means_only_is_told_of_means_only():
+    metric = CoverageMetric(
+        FOUR, (), aggregations=[Blind()], regions=[NEAR], sensors=["a"], square_metres=True, max_radius=9.0
+    )
+    for sensor, reference, weights in random_steps(4):
+        metric.update({"a": sensor}, reference, weights=weights)
+    table = CoverageTable.of({"rig": metric.compute()}, [NEAR])
+    columns = RENDERERS["csv"](table).splitlines()[0].split(",")
+    assert {"blind_share", "blind_share_error", "known_radius_m", "radius_m_without_a"} < set(columns)
+    assert not {"known_blind_share", "blind_share_without_a"} & set(columns)
+    assert "without it mean blind spot radius is 9.00 m" in " ".join(RENDERERS["text"](table).split())
+
+
 def test_an_aggregation_of_ones_own_is_measured_merged_saved_and_loaded(tmp_path):
     grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
     one, other = (CoverageMetric(grid, aggregations=[Minimum()], blocks=8) for _ in range(2))
     one.update(ORIGIN, points_at(0.5, 0.25))
-    other.update(ORIGIN, points_at(0.75, 0.125), index=1)
+    other.update(ORIGIN, points_at(0.75, 0.125), place_in_time=1)
     one.merge_state(other)
     one.compute().save(tmp_path / "coverage.npz")
     layer = Coverage.load(tmp_path / "coverage.npz").layers["radius_minimum_m"]

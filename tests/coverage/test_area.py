@@ -34,7 +34,7 @@ def steps_of(count, seed=0, points=40):
 def metric_over(steps, index=None, cell=1.0, **options):
     metric = CoverageMetric(grid(cell), (0.4, 0.8), square_metres=True, **options)
     for number, (sensor, reference, m2) in zip(index or range(len(steps)), steps, strict=True):
-        metric.update(sensor, reference, weights=m2, index=number)
+        metric.update(sensor, reference, weights=m2, place_in_time=number)
     return metric
 
 
@@ -141,7 +141,7 @@ def simulated(region, reference_sensor, steps):
     """Height -> (value, error) of the radius and of the detection."""
     metric = CoverageMetric(BevGrid(x=region.x, y=region.y, cell=0.5), max_radius=50.0, blocks=16, square_metres=True)
     for frame in SimulatedFrames("courtyard", "front_roof_32", steps=steps, reference_sensor=reference_sensor):
-        metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, index=frame.index)
+        metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, place_in_time=frame.index)
     coverage = metric.compute()
     estimates = {height: coverage.estimate(region, height, "area") for height in ("ground", "obstacle")}
     return {

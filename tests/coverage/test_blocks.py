@@ -38,7 +38,7 @@ def random_steps(count: int, seed: int = 0, *, dyadic: bool = False, weighted: b
         else:
             radii = {int(cell): random.random(random.integers(1, 4)).tolist() for cell in cells}
         weights = {cell: (random.random(len(own)) + 0.1).tolist() for cell, own in radii.items()}
-        more = {"index": index}
+        more = {"place_in_time": index}
         if weighted:
             more["weights"] = torch.tensor([weight for own in weights.values() for weight in own], dtype=torch.float64)
         steps.append({"radii": radii, "weights": weights, "clouds": clouds_of(radii), "more": more})
@@ -54,14 +54,14 @@ def metric_over(steps, *, blocks=16, **options) -> CoverageMetric:
 
 def slow_blocks(steps, blocks: int, *, weighted: bool = False) -> dict[str, np.ndarray]:
     """The sums in blocks in plain loops."""
-    last = max(step["more"]["index"] for step in steps)
+    last = max(step["more"]["place_in_time"] for step in steps)
     length = 1
     while last // length >= blocks:
         length *= 2
     sums = {name: np.zeros((blocks, CELLS)) for name in ("probed_steps", "radius", "detection")}
     sums["steps"] = np.zeros(blocks)
     for step in steps:
-        block = step["more"]["index"] // length
+        block = step["more"]["place_in_time"] // length
         sums["steps"][block] += 1
         for cell, own in step["radii"].items():
             weights = step["weights"][cell] if weighted else [1.0] * len(own)
@@ -119,7 +119,9 @@ def test_unequal_blocks_are_weighed_as_in_plain_loops(seed):
 
 
 def test_blocks_that_all_say_the_same_do_not_say_how_exact_they_are():
-    coverage = metric_over([{"clouds": clouds_of({0: [0.25]}), "more": {"index": at}} for at in range(40)]).compute()
+    coverage = metric_over(
+        [{"clouds": clouds_of({0: [0.25]}), "more": {"place_in_time": at}} for at in range(40)]
+    ).compute()
     (row,) = coverage.summary([EVERYWHERE])
     assert row.numbers["radius_m"].value == 0.25
     for number in row.numbers.values():
@@ -129,7 +131,9 @@ def test_blocks_that_all_say_the_same_do_not_say_how_exact_they_are():
 @pytest.mark.parametrize(("radius", "detection_error"), [(0.25, 1.0), (1.0, 1.0), (0.0, 1.0)])
 def test_no_error_of_a_cell_is_zero_however_much_its_blocks_agree(radius, detection_error):
     """Ten blocks that all say the same, and two more in which all is seen, or nothing: 12 values about a mean of 10."""
-    coverage = metric_over([{"clouds": clouds_of({0: [radius]}), "more": {"index": at}} for at in range(40)]).compute()
+    coverage = metric_over(
+        [{"clouds": clouds_of({0: [radius]}), "more": {"place_in_time": at}} for at in range(40)]
+    ).compute()
     each = math.sqrt(12 / 11) / 12
     assert float(coverage.detection_error.flatten()[0]) == pytest.approx(each * detection_error)
     expected = radius * math.sqrt(1 + 4**2) * each
@@ -138,7 +142,9 @@ def test_no_error_of_a_cell_is_zero_however_much_its_blocks_agree(radius, detect
 
 def test_one_step_a_block_gives_the_textbook_error_in_a_region():
     radii = np.random.default_rng(0).random(16).astype(np.float32)
-    steps = [{"clouds": clouds_of({2: [float(radius)]}), "more": {"index": at}} for at, radius in enumerate(radii)]
+    steps = [
+        {"clouds": clouds_of({2: [float(radius)]}), "more": {"place_in_time": at}} for at, radius in enumerate(radii)
+    ]
     coverage = metric_over(steps).compute()
     expected = radii.astype(float).std(ddof=1) / 4
     assert coverage.summary([EVERYWHERE])[0].numbers["radius_m"].error == pytest.approx(expected)
@@ -172,7 +178,7 @@ def test_the_error_in_a_cell_is_that_of_a_ratio_of_sums_with_two_more_blocks():
 
 
 def test_no_error_is_told_from_fewer_than_8_blocks_nor_in_a_cell_that_fewer_probed():
-    steps = [{"clouds": clouds_of({0: [at / 32], **({1: [0.1]} if at < 7 else {})}), "more": {"index": at}}
+    steps = [{"clouds": clouds_of({0: [at / 32], **({1: [0.1]} if at < 7 else {})}), "more": {"place_in_time": at}}
              for at in range(8)]  # fmt: skip
     (few,), (enough,) = (metric_over(steps[:count]).compute().summary([EVERYWHERE]) for count in (7, 8))
     assert math.isnan(few.numbers["radius_m"].error)
@@ -195,7 +201,7 @@ def test_the_error_of_a_difference_is_that_of_the_paired_values():
     shared, own = 2 * random.random(16), 0.02 * random.random(16)
     estimates = []
     for radii in (shared, shared + own):
-        steps = [{"clouds": clouds_of({0: [r]}), "more": {"index": at}} for at, r in enumerate(radii.tolist())]
+        steps = [{"clouds": clouds_of({0: [r]}), "more": {"place_in_time": at}} for at, r in enumerate(radii.tolist())]
         estimates.append(metric_over(steps).compute().estimate(EVERYWHERE, "all"))
     difference = estimates[1].minus(estimates[0])
     assert float(difference.value[0]) == pytest.approx(own.mean(), rel=1e-4)
@@ -289,18 +295,18 @@ def test_blocks_change_no_number(aggregations):
 
 def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
     steps = random_steps(3, dyadic=True)
-    steps[2]["more"]["index"] = 1_000_000
+    steps[2]["more"]["place_in_time"] = 1_000_000
     coverage = metric_over(steps).compute()
     assert coverage.blocks.steps.tolist() == [2] + [0] * 14 + [1]
     assert math.isnan(coverage.summary([EVERYWHERE])[0].numbers["radius_m"].error)
 
 
 @pytest.mark.parametrize(
-    ("index", "message"), [(-1, "a number from 0 to .*; got -1"), ([0, 1], "2 indices for 1 reference clouds")]
+    ("index", "message"), [(-1, "a number from 0 to .*; got -1"), ([0, 1], "2 places in time for 1 reference clouds")]
 )
 def test_numbers_of_steps_that_make_no_sense_are_refused(index, message):
     with pytest.raises(ValueError, match=message):
-        CoverageMetric(GRID, blocks=16).update(*clouds_of({0: [0.5]}), index=index)
+        CoverageMetric(GRID, blocks=16).update(*clouds_of({0: [0.5]}), place_in_time=index)
 
 
 # Weights
@@ -322,7 +328,7 @@ def test_weighted_means_are_those_of_plain_loops():
 def test_equal_weights_change_nothing_and_their_scale_in_a_step_neither():
     steps = random_steps(20, seed=6, weighted=True)
     options = {"aggregations": [Maximum(), Quantiles((0.1, 0.5))]}
-    plain = [{**step, "more": {"index": step["more"]["index"]}} for step in steps]
+    plain = [{**step, "more": {"place_in_time": step["more"]["place_in_time"]}} for step in steps]
     factors = [2.0 ** (at % 5) for at in range(20)]
 
     def with_weights(of) -> Coverage:
@@ -373,7 +379,7 @@ def test_bad_weights_are_refused_and_nothing_is_counted(weights, message):
     metric = CoverageMetric(GRID)
     with pytest.raises(ValueError, match=rf"weights\[0\]: .*{message}"):
         metric.update(*clouds_of({0: [0.5, 0.5]}), weights=torch.tensor(weights))
-    with pytest.raises(ValueError, match="2 weights and 1 indices for 1 reference clouds"):
+    with pytest.raises(ValueError, match="2 weights and 1 places in time for 1 reference clouds"):
         metric.update(*clouds_of({0: [0.5]}), weights=[torch.ones(1), torch.ones(1)])
     assert int(metric.steps) == 0
 

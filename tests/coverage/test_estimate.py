@@ -28,7 +28,7 @@ def steps_of(count, seed=0, points=12):
 def metric_over(steps, index=None, **options):
     metric = CoverageMetric(GRID, (0.4, 0.8), **options)
     for number, (sensor, reference) in zip(index or range(len(steps)), steps, strict=True):
-        metric.update(sensor, reference, index=number)
+        metric.update(sensor, reference, place_in_time=number)
     return metric
 
 
@@ -84,3 +84,24 @@ def test_the_summary_has_the_numbers_with_their_errors():
 def test_no_such_band_is_said():
     with pytest.raises(ValueError, match="height 'middle': the grid has low, high"):
         metric_over(steps_of(2)).compute().estimate(PART, "middle")
+
+
+@pytest.mark.parametrize("measure", ["known", "area"])
+def test_numbers_of_worlds_that_are_drawn_again_are_those_of_a_run_over_them(measure):
+    random = np.random.default_rng(1)
+    steps = [(sensor, reference, torch.from_numpy(random.uniform(0.1, 2, 12))) for sensor, reference in steps_of(10)]
+
+    def over(numbers):
+        metric = CoverageMetric(GRID, (0.4, 0.8), blocks=16, square_metres=True)
+        for number in numbers:
+            sensor, reference, m2 = steps[number]
+            metric.update(sensor, reference, weights=m2, place_in_time=number)
+        return metric.compute().estimate(PART, "low", measure)
+
+    drawn = [0, 0, 3, 3, 3, 4, 5, 7, 8, 9]
+    weights = torch.tensor(np.bincount(drawn, minlength=10), dtype=torch.float64)
+    whole = over(range(10))
+    once = torch.ones_like(weights)
+    torch.testing.assert_close(whole.resampled(torch.stack([weights, once]))[0], over(drawn).value)
+    torch.testing.assert_close(whole.resampled(once[None])[0], whole.value)
+    torch.testing.assert_close(whole[1:].resampled(1 - torch.eye(10)), whole.left_out[:, 1:])

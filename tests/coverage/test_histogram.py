@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchcover.coverage.histogram import bin_of, check_levels, histogram_quantiles
+from torchcover.coverage.aggregations.quantiles import bin_of, check_levels, histogram_quantiles
 
 
 @settings(max_examples=100, deadline=None)

@@ -314,24 +314,24 @@ def test_what_is_no_sequence_of_thresholds_is_refused(thresholds):
         (
             10**20,
             ValueError,
-            r"index\[0\]: a number from 0 to 1,000,000,000,000,000 is needed; got 1000000000000000000",
+            r"place_in_time\[0\]: a number from 0 to 1,000,000,000,000,000 is needed; got 1000000000000000000",
         ),
-        (-1, ValueError, r"index\[0\]: a number from 0"),
-        (1.5, TypeError, "index: a whole number, or a list with one for each step, is needed; got 1.5"),
-        (["1"], TypeError, "index: a whole number"),
+        (-1, ValueError, r"place_in_time\[0\]: a number from 0"),
+        (1.5, TypeError, "place_in_time: a whole number, or a list with one for each step, is needed; got 1.5"),
+        (["1"], TypeError, "place_in_time: a whole number"),
     ],
 )
 def test_a_number_of_a_step_that_is_none_is_refused(index, error, message):
     metric = CoverageMetric(ONE_CELL, blocks=8)
     with pytest.raises(error, match=message):
-        metric.update(ORIGIN, ORIGIN, index=index)
+        metric.update(ORIGIN, ORIGIN, place_in_time=index)
     assert int(metric.steps) == 0
 
 
 def test_the_largest_number_of_a_step_has_its_block():
     metric = CoverageMetric(ONE_CELL, blocks=8)
-    metric.update(ORIGIN, ORIGIN, index=np.int64(3))
-    metric.update(ORIGIN, ORIGIN, index=10**15)
+    metric.update(ORIGIN, ORIGIN, place_in_time=np.int64(3))
+    metric.update(ORIGIN, ORIGIN, place_in_time=10**15)
     assert metric.block_steps.sum() == 2
     assert 8 * int(metric.block_length) > 10**15
 

@@ -22,7 +22,7 @@ def test_significant_is_what_a_paired_t_test_calls_so(shift, seed):
     for name, own in radii.items():
         metric = CoverageMetric(SQUARE, blocks=16)
         for at, radius in enumerate(own.tolist()):
-            metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), index=at)
+            metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), place_in_time=at)
         coverages[name] = metric.compute()
     itself, other = differences(coverages, NEAR, "ground").values()
     found = other["radius_m"]

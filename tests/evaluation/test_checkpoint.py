@@ -12,7 +12,7 @@ import torch
 
 import torchcover
 from torchcover.coverage import Maximum, StepQuantiles
-from torchcover.data import BadFrameError
+from torchcover.data import BadFrameError, FrameDataset
 from torchcover.evaluation import Checkpoint, checkpoint
 from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
 from torchcover.files import BadFileError
@@ -21,7 +21,7 @@ STEPS = 16
 SETTINGS = {"cell_m": 8.0, "aggregations": (Maximum(), StepQuantiles((0.5,)))}
 
 
-class Drive:
+class Drive(FrameDataset):
     """A source of frames, some of which may be bad; slower than nothing, so that a kill finds it at work."""
 
     rigs = ("a",)
@@ -30,6 +30,7 @@ class Drive:
     description = {"scenario": None, "frames": "drive", "seed": None}  # noqa: RUF012
     square_metres = False
     reference_record = None
+    world_of = staticmethod(int)
 
     def __init__(self, frame_of, bad=(), content="drive", delay_s=0.0):
         self.frame_of, self.bad, self.content, self.delay_s = frame_of, bad, {"frames": content}, delay_s

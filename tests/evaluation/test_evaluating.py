@@ -16,9 +16,9 @@ from matplotlib.figure import Figure
 import torchcover
 from torchcover import Coverage, Rig, Scenario
 from torchcover.coverage import Maximum, Quantiles
-from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame
+from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame, FrameDataset
 from torchcover.evaluation import Settings, TargetError
-from torchcover.evaluation.omissions import HEAVY
+from torchcover.evaluation.result_page import HEAVY
 
 SMALL = {"steps": 2, "cell_m": 4.0, "rays": 1024}
 
@@ -37,7 +37,7 @@ class PointCount:
         self.points += other.points
 
 
-class Source:
+class Source(FrameDataset):
     """Frames of a source that is neither a simulation nor a recording."""
 
     rigs = ("low", "high")
@@ -47,6 +47,7 @@ class Source:
     square_metres = False
     reference_record = None
     content = {"frames": "made up"}  # noqa: RUF012
+    world_of = staticmethod(int)
 
     def __len__(self):
         return 3

@@ -11,11 +11,14 @@ from traceback import format_exception
 
 import pytest
 import torch
+from torch.utils.data import Subset
 
-from torchcover import BevGrid, CoverageMetric
-from torchcover.data import BadFrameError, SimulatedFrames
+from torchcover import BevGrid, CoverageMetric, Scenario, evaluate
+from torchcover.data import BadFrameError, ChosenRigs, SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe, pipeline
 from torchcover.evaluation.pipeline import MOST_TOGETHER, made_together
+from torchcover.frames import worlds_of
+from torchcover.simulation import PaperReference
 
 GRID = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, heights={"all": (-1.0, 1.0)})
 
@@ -57,6 +60,9 @@ class Spoiled:
     def __len__(self):
         return len(self.frames)
 
+    def world_of(self, index):
+        return index
+
     def __getitem__(self, index):
         if index in self.bad:
             raise BadFrameError(f"f{index} (frame {index}): rubbish")
@@ -96,7 +102,9 @@ def test_coverage_is_that_of_the_metric_with_weights_and_places_in_time(frames):
     for rig, observer in observers.items():
         metric = CoverageMetric(GRID, blocks=16)
         for frame in frames:
-            metric.update(frame.clouds[rig], frame.reference, weights=frame.reference_weights, index=frame.index)
+            metric.update(
+                frame.clouds[rig], frame.reference, weights=frame.reference_weights, place_in_time=frame.index
+            )
         assert torch.equal(observer.compute().radius, metric.compute().radius)
         assert torch.equal(observer.compute().blocks.sums, metric.compute().blocks.sums)
     assert (run.steps, dict(run.counts), run.complete) == (6, {"seen": 15}, True)
@@ -113,25 +121,75 @@ def test_workers_change_nothing_and_frames_come_in_order(frames, workers):
 
 def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_order():
     spread = SimulatedFrames("urban", "front_roof_32", steps=15, every_s=10.0)
-    tasks = list(made_together(spread, range(15), workers=2))
+    tasks = list(made_together(range(15), spread.world_of))
     assert tasks == [[*range(7)], [*range(7, 13)], [13, 14]]
     assert [{spread.simulator.run_of(index) for index in task} for task in tasks] == [{0}, {1}, {2}]
-    dense = list(made_together(SimulatedFrames("urban", "front_roof_32", steps=1000), range(700), workers=2))
+    dense = list(made_together(range(700), SimulatedFrames("urban", "front_roof_32", steps=1000).world_of))
     assert [index for task in dense for index in task] == [*range(700)]
     assert max(map(len, dense)) == MOST_TOGETHER
-    for alone in (
-        made_together(spread, range(3), workers=1),
-        made_together(SimulatedFrames("courtyard", "front_roof_32", steps=3), range(3), workers=2),
-        made_together([], range(3), workers=2),
-    ):
-        assert list(alone) == [[0], [1], [2]]
+    still = SimulatedFrames("courtyard", "front_roof_32", steps=3)  # of which every process has the whole
+    for alone in (still, []):
+        assert list(made_together(range(3), worlds_of(alone))) == [[0], [1], [2]]
+
+
+class Wrapped:
+    """Frames of another source, in a user's own class."""
+
+    def __init__(self, frames):
+        self.frames = frames
+
+    def __len__(self):
+        return len(self.frames)
+
+    def __getitem__(self, index):
+        return self.frames[index]
+
+
+class Told(Wrapped):
+    """And says all that the other one says."""
+
+    def __getattr__(self, name):
+        return getattr(self.frames, name)
+
+
+def test_whoever_wraps_frames_keeps_their_worlds():
+    frames = SimulatedFrames("urban", "front_roof_32", steps=15, every_s=10.0)
+    chosen, told = ChosenRigs(frames, {"mine": "front_roof_32"}), Told(frames)
+    part = Subset(Told(chosen), [14, 0, 6, 7])
+    worlds = [frames.world_of(index) for index in range(15)]
+    assert [worlds_of(chosen)(index) for index in range(15)] == worlds == [0] * 7 + [1] * 6 + [2] * 2
+    assert [worlds_of(told)(index) for index in range(15)] == worlds
+    assert [worlds_of(part)(index) for index in range(4)] == [2, 0, 0, 1]
+
+
+def test_each_world_is_built_by_one_worker_whoever_gives_the_frames(monkeypatch, tmp_path):
+    few = PaperReference(rows=4, columns=4)
+    frames = SimulatedFrames("parking", "front_roof_32", steps=4, every_s=35.0, reference_sensor=few)
+    build = Scenario.world
+
+    def world(self, seed, run, *rest):
+        with (tmp_path / "built").open("a") as file:
+            file.write(f"{run}\n")
+        return build(self, seed, run, *rest)
+
+    monkeypatch.setattr(Scenario, "world", world)
+    evaluate(frames=Told(frames), cell_m=8.0, workers=2)
+    assert sorted((tmp_path / "built").read_text().split()) == ["0", "1"]
+
+
+@pytest.mark.parametrize("frames_of", [Wrapped, lambda frames: Subset(Wrapped(frames), [0, 1])])
+def test_a_source_that_does_not_know_its_worlds_is_refused_where_it_matters(frames, frames_of):
+    source = frames_of(Told(frames))
+    assert observe(source, [Names()], workers=1).steps == len(source)
+    with pytest.raises(TypeError, match=r"^frames: Wrapped does not say which world a frame is of"):
+        observe(source, [Names()], workers=2, keep_partial=True)
 
 
 @pytest.mark.parametrize("scenario", ["urban", "courtyard"])
 def test_no_list_is_made_of_all_the_steps_there_may_be(scenario):
     frames = SimulatedFrames(scenario, "front_roof_32", steps=20_000)
     tracemalloc.start()
-    tasks = made_together(frames, range(20_000), workers=2)
+    tasks = made_together(range(20_000), frames.world_of)
     assert sum(map(len, tasks)) == 20_000
     _, most_bytes = tracemalloc.get_traced_memory()
     tracemalloc.stop()

@@ -12,14 +12,14 @@ import torch
 from torch.distributed import FileStore
 
 import torchcover
-from torchcover.data import BadFrameError, SimulatedFrames
+from torchcover.data import BadFrameError, FrameDataset, SimulatedFrames
 from torchcover.evaluation import Ranks, joined_ranks
 from torchcover.evaluation.transport import packed, unpacked
 
 LONGEST_S = 60.0
 
 
-class Drive:
+class Drive(FrameDataset):
     """A source of frames, some of which may be bad."""
 
     rigs = ("a", "b")
@@ -28,6 +28,7 @@ class Drive:
     description = {"scenario": None, "frames": "drive", "seed": None}  # noqa: RUF012
     square_metres = False
     reference_record = None
+    world_of = staticmethod(int)
 
     def __init__(self, frame_of, length=7, bad=(), content="drive", delay_s=0.0):
         self.frame_of, self.length, self.bad, self.content = frame_of, length, bad, {"frames": content}

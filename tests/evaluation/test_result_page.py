@@ -8,7 +8,7 @@ import pytest
 
 import torchcover
 from torchcover.evaluation import save_targets, survey_target
-from torchcover.evaluation.result_page import page_of, rig_document
+from torchcover.evaluation.result_page import rig_document
 from torchcover.simulation import Rig
 from torchcover.targets import Raster, Requirements, check
 
@@ -53,7 +53,7 @@ def test_the_page_says_what_the_table_says_and_where_it_comes_from(result, tmp_p
 
 
 def test_the_page_has_what_was_asked_for(result):
-    page = page_of(result)
+    page = result.page
     assert [line.name for line in page.outlines] == [region.name for region in result.regions]
     quantities = dict.fromkeys(one.quantity for one in page.maps)
     assert "sensors that see within 0.4 m" in quantities

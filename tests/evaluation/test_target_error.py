@@ -24,7 +24,9 @@ def add(metric: CoverageMetric, index: int, scale: float = 0.3) -> None:
     """A radius between 0 and 1, and one that is `scale` of it."""
     radius = np.random.default_rng(index).random()
     reference = torch.tensor([[0.5, 0.5, 0.0], [1.5, 0.5, 0.0]])
-    metric.update(reference - torch.tensor([[0.0, 0.0, radius], [0.0, 0.0, scale * radius]]), reference, index=index)
+    metric.update(
+        reference - torch.tensor([[0.0, 0.0, radius], [0.0, 0.0, scale * radius]]), reference, place_in_time=index
+    )
 
 
 def filled(steps: int, scale: float = 0.3) -> CoverageMetric:
@@ -139,7 +141,7 @@ def test_however_good_it_looks_no_run_ends_before_64_steps(steps):
 def test_nothing_known_is_not_good_enough():
     metric = a_metric()
     for index in range(64):
-        metric.update(torch.zeros(1, 3), torch.tensor([[-9.0, 0.0, 0.0]]), index=index)
+        metric.update(torch.zeros(1, 3), torch.tensor([[-9.0, 0.0, 0.0]]), place_in_time=index)
     watch = TargetWatch(TargetError(radius_m=1.0), {"a": CoverageObserver(metric)}, REGIONS)
     assert not watch.is_reached(64)
     assert watch.expected_steps(100) == 100

@@ -17,7 +17,6 @@ from torchcover.geometry import BoundingBox
 from torchcover.published import (
     FalseVisible,
     KCover,
-    Lob,
     MSog,
     ObjectCoverage,
     PerceptionEntropy,
@@ -98,7 +97,7 @@ def coverage_step(index: int) -> Step:
         "sensor": sensor,
         "reference": reference,
         "weights": torch.rand(60, generator=generator) + 0.1,
-        "index": index,
+        "place_in_time": index,
     }
 
 
@@ -106,7 +105,7 @@ def coverage(steps: int, changes: Mapping[str, Step], **options: Any) -> Case:
     return Case(
         lambda **changed: CoverageMetric(**{**COVERAGE, **options, **changed}),
         [coverage_step(index) for index in range(steps)],
-        {"sensor": torch.zeros(1, 3), "reference": torch.empty(0, 3), "weights": torch.empty(0), "index": 0},
+        {"sensor": torch.zeros(1, 3), "reference": torch.empty(0, 3), "weights": torch.empty(0), "place_in_time": 0},
         {
             "grid": {"grid": BevGrid(**{**SHAPE, "x": (-1.0, 3.0)}, heights=BANDS)},
             "grid, bands in another order": {"grid": BevGrid(**SHAPE, heights=dict(reversed(BANDS.items())))},
@@ -310,15 +309,4 @@ CASES = {
     ),
     "s-mig, occluded": of_frames(SMig, {**VOXELS, "occlusion": True}, OF_VOXELS),
     "m-sog": of_frames(MSog, VOXELS, {**OF_VOXELS, "category": {"category": "pedestrian"}}),
-    "lob": of_frames(
-        Lob,
-        {"sensors": BOTH, "distances_m": (8.0, 5.0)},
-        {
-            "sensors": {"sensors": BOTH[:1]},
-            "distances_m": {"distances_m": (5.0, 8.0)},
-            "height_m": {"height_m": (0.0, 1.0)},
-            "cell_m": {"cell_m": 0.5},
-            "width_m": {"width_m": 4.0},
-        },
-    ),
 }

@@ -21,7 +21,7 @@ import torchcover.detection
 import torchcover.published
 from torchcover.coverage import AGGREGATIONS
 from torchcover.metrics import MergeableMetric, SumsInBlocks
-from torchcover.published import FrameMetric, WorldBlocks, WorldRatios
+from torchcover.published import FrameMetric, WorldRatios
 
 from .cases import ALL, CASES, flat, in_lists
 
@@ -72,7 +72,7 @@ def test_every_metric_and_every_aggregation_of_the_package_is_asked():
     for room in (torchcover.coverage, torchcover.detection, torchcover.published):
         for module in pkgutil.iter_modules(room.__path__, f"{room.__name__}."):
             importlib.import_module(module.name)
-    bases = {MergeableMetric, SumsInBlocks, FrameMetric, WorldBlocks, WorldRatios}
+    bases = {MergeableMetric, SumsInBlocks, FrameMetric, WorldRatios}
     kinds = {kind for base in bases for kind in base.__subclasses__()} - bases
     own = {kind for kind in kinds if kind.__module__.startswith("torchcover.")}
     assert {type(case.make()) for case in CASES.values()} == own

@@ -1,5 +1,6 @@
 """Metrics of others over frames: closed forms, slow twins, what does not matter, and bad frames."""
 
+import itertools
 import math
 from dataclasses import replace
 
@@ -101,7 +102,7 @@ def test_an_object_that_nobody_can_see_counts_for_hits_only_and_a_far_one_for_no
     hidden, far = [20.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0], [90.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]
     metric = ObjectCoverage()
     metric.update(frame_of([[8.0, 0.0, 0.5]], [[8.0, 0.0, 0.5], [88.0, 0.0, 0.5]], [CAR, hidden, far]))
-    numbers = {number.name: number for number in metric.compute()}
+    numbers = {number.quantity.key: number for number in metric.compute()}
     assert (numbers["object_coverage_0.4m"].value, numbers["object_coverage_0.4m"].count) == (1.0, 1)
     assert (numbers["objects_hit_1"].value, numbers["objects_hit_1"].count) == (0.5, 2)
 
@@ -212,27 +213,65 @@ def test_errors_are_those_of_a_mean_over_worlds():
         metric.update(frame_of([[0.5, 0.5, 0.0]] * count, index=index))
     number = metric.compute()[0]
     assert number.value == pytest.approx(np.mean(counts))
-    assert number.standard_error == pytest.approx(np.std(counts, ddof=1) / len(counts) ** 0.5)
+    assert number.error == pytest.approx(np.std(counts, ddof=1) / len(counts) ** 0.5)
 
 
 def test_frames_of_one_world_are_no_more_worlds():
     metric = PointDensity(GRID, ())
     for index in range(40):
-        metric.update(frame_of([[0.5, 0.5, 0.0]] * (index % 5), index=index, instant=index // 6))
-    assert all(math.isnan(number.standard_error) for number in metric.compute())  # 7 of them
+        metric.update(frame_of([[0.5, 0.5, 0.0]] * (index % 5), index=index, place_in_time=index // 6))
+    assert all(math.isnan(number.error) for number in metric.compute())  # 7 of them
+
+
+@pytest.mark.parametrize(
+    ("worlds", "with_objects", "known"), [(10, 7, False), (10, 8, True), (5, 4, False), (5, 5, True)]
+)
+def test_a_number_that_few_worlds_know_has_no_error_and_none_to_race_with_unless_all_know_it(
+    worlds, with_objects, known
+):
+    metric = ObjectCoverage()
+    for index in range(worlds):
+        there = index < with_objects
+        metric.update(frame_of([[10.0, 0.0, 1.0]] * (index % 2), boxes=[CAR] if there else [], index=index))
+    (at,) = (at for at, one in enumerate(metric.compute()) if one.quantity.key == "objects_hit_1")
+    assert math.isfinite(float(metric.estimate().errors(least=3)[at])) == known
+    assert math.isfinite(metric.compute()[at].error) == (known and worlds >= 8)
 
 
 def test_what_a_draw_of_worlds_gives_is_what_the_metric_gives_over_them():
     case = CASES["object coverage"]
-    metric = case.over(case.steps)
-    at = {step["frame"].place_in_time // int(metric.block_length): step for step in case.steps}
-    weights = torch.zeros(1, 16)
-    for block, times in ((0, 2), (3, 1)):
-        weights[0, block] = times
-    drawn = case.over([at[0], at[0], at[3]])
-    torch.testing.assert_close(
-        metric.resampled(weights)[0], torch.tensor([one.value for one in drawn.compute()]).double(), equal_nan=True
-    )
+    estimate = case.over(case.steps).estimate()
+    assert len(estimate.steps) == len(case.steps)  # a world each
+    drawn = case.over([case.steps[0], case.steps[0], case.steps[3]]).compute()
+    weights = torch.zeros(1, len(case.steps))
+    weights[0, 0], weights[0, 3] = 2, 1
+    again = torch.tensor([[number.value for number in drawn]]).double()
+    torch.testing.assert_close(estimate.resampled(weights), again, equal_nan=True)
+
+
+@pytest.mark.parametrize("name", OF_FRAMES)
+def test_without_a_world_it_is_what_the_other_frames_say_and_errors_come_from_that(name):
+    case = CASES[name]
+    telling = [step["frame"] for step in case.steps if case.over([step]).compute()[0].known]
+    frames = [
+        replace(frame, place_in_time=world) for world, frame in zip(range(10), itertools.cycle(telling), strict=False)
+    ]
+
+    def over(some):
+        metric = case.make()
+        metric.update(some)
+        return metric
+
+    metric = over(frames)
+    estimate = metric.estimate()
+    assert [number.value for number in metric.compute()] == pytest.approx(estimate.value.tolist(), abs=0, nan_ok=True)
+    assert estimate.steps.tolist() == [1] * 10
+    for world, row in enumerate(estimate.left_out):
+        expected = over(frames[:world] + frames[world + 1 :]).estimate().value
+        torch.testing.assert_close(row, expected.where(row.isfinite(), math.nan), equal_nan=True)
+    errors = estimate.error.where(estimate.error > 1e-12, math.nan)
+    assert [number.error for number in metric.compute()] == pytest.approx(errors.tolist(), nan_ok=True)
+    assert errors.isfinite().any()
 
 
 # What does not matter, and what is unknown.
@@ -258,7 +297,7 @@ def test_the_order_of_points_boxes_and_frames_does_not_matter(case):
 
     first, second = case.over(case.steps), case.over([shuffled(step) for step in case.steps[::-1]])
     for one, other in zip(first.compute(), second.compute(), strict=True):
-        assert one.value == pytest.approx(other.value, rel=1e-12, nan_ok=True), one.name
+        assert one.value == pytest.approx(other.value, rel=1e-12, nan_ok=True), one.quantity.key
         assert one.count == other.count
 
 
@@ -282,8 +321,8 @@ def test_metrics_that_share_a_search_find_what_each_finds_alone(case):
 def test_an_unknown_number_is_nan_with_a_count_of_0_and_nothing_else_is(case):
     for metric in (case.over([case.bland]), case.over(case.steps[:1]), case.over(case.steps)):
         for number in metric.compute():
-            assert math.isnan(number.value) == (number.count == 0), number.name
-            assert math.isnan(number.standard_error) or number.standard_error > 0
+            assert math.isnan(number.value) == (number.count == 0), number.quantity.key
+            assert math.isnan(number.error) or number.error > 0
 
 
 @pytest.mark.parametrize("name", ["object coverage", "perception entropy"])

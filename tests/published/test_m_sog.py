@@ -43,7 +43,7 @@ def test_three_labels_of_one_voxel_by_hand():
     ]
     number = m_sog([AHEAD], frames)
     assert number.value == pytest.approx(-1.039721 / 8, abs=1e-7)  # H(.5, .25, .25)
-    assert (number.name, number.count, number.count_of) == ("m_sog_car_0.5m", 8, "voxels")
+    assert (number.quantity.key, number.count, number.count_of) == ("m_sog_car_0.5m", 8, "voxels")
     assert "only for ranks" in number.warning
     always = [frame(index, boxes(CAR), reference=seen(ON_CAR, ON_WALL)) for index in range(4)]
     assert m_sog([AHEAD], always).value == 0.0
@@ -93,11 +93,11 @@ def test_it_is_that_of_a_slow_twin_and_its_error_the_jackknife_by_hand():
     assert number.parameters["crossed_share"] == crossed.mean()
     left_out = [twin(np.delete(labels, drop, axis=0)) for drop in range(16)]
     expected = math.sqrt(15 / 16 * sum((one - np.mean(left_out)) ** 2 for one in left_out))
-    assert number.standard_error == pytest.approx(expected)
+    assert number.error == pytest.approx(expected)
     metric = MSog(sensors, voxel_m=0.5, region=REGION)
     metric.update(frames)
-    assert metric.resampled(1.0 - torch.eye(16))[:, 0].tolist() == pytest.approx(left_out)
-    assert math.isnan(m_sog(sensors, frames[:7]).standard_error)
+    assert metric.estimate().resampled(1.0 - torch.eye(16))[:, 0].tolist() == pytest.approx(left_out)
+    assert math.isnan(m_sog(sensors, frames[:7]).error)
 
 
 def test_what_was_never_seen_is_unknown():
@@ -115,7 +115,7 @@ def test_at_a_metre_it_is_blind_for_nearly_every_voxel_is_crossed_by_any_rig():
     one = [frame(0, boxes((10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0)), reference=seen([10.0, 0.0, 1.5]))]
     counts = [m_sog(place3d(name), one, voxel_m=1.0, region=PUBLISHED_REGION).count for name in ("center", "line")]
     assert counts == [9564, 9400]  # of 9600
-    assert m_sog(place3d("center"), one, voxel_m=1.0, region=PUBLISHED_REGION).name == "m_sog_car_1m"
+    assert m_sog(place3d("center"), one, voxel_m=1.0, region=PUBLISHED_REGION).quantity.key == "m_sog_car_1m"
 
 
 @pytest.mark.parametrize(

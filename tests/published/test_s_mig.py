@@ -26,7 +26,7 @@ def s_mig(sensors, frames, **options):
 
 
 def value(metric, name=":car"):
-    return next(number for number in metric.compute() if number.name.endswith(name))
+    return next(number for number in metric.compute() if number.quantity.key.endswith(name))
 
 
 def test_entropy_of_known_probabilities():
@@ -39,7 +39,12 @@ def test_what_is_always_there_says_nothing_and_half_of_the_time_a_bit_a_voxel():
     assert value(s_mig([ahead], always)).value == 0.0
     number = value(s_mig([ahead], half))
     assert number.value == pytest.approx(-8 * math.log(2), rel=1e-12)  # 4 m in voxels of 0.5 m
-    assert (number.count, number.count_of, number.unit, number.higher_is_better) == (1, "boxes", "nats", True)
+    assert (number.count, number.count_of, number.quantity.unit, number.quantity.lower_is_better) == (
+        1,
+        "boxes",
+        "nats",
+        False,
+    )
     assert number.parameters["voxels_crossed"] == 20
     assert number.parameters["entropy_captured_nats"] == -number.value
     # The same ray again, or from four sensors, is no other voxel.
@@ -64,7 +69,7 @@ def test_categories_have_numbers_of_their_own_and_those_that_never_come_have_non
     person = (8.0, 0.0, 1.0, 1.0, 1.0, 2.0, 0.0)
     both = Boxes.from_rows(torch.tensor([AHEAD, person]), categories=("car", "pedestrian"))
     every, car, pedestrian, cyclist = s_mig([beam(z_m=1.0)], [frame(0, both), frame(1, NONE)]).compute()
-    assert [every.name, car.name] == ["s_mig_0.5m", "s_mig_0.5m:car"]
+    assert [every.quantity.key, car.quantity.key] == ["s_mig_0.5m", "s_mig_0.5m:car"]
     assert (car.value, pedestrian.value) == pytest.approx((-8 * math.log(2), -2 * math.log(2)))
     assert every.value == pytest.approx(car.value + pedestrian.value)
     assert (every.count, car.count, pedestrian.count) == (2, 1, 1)
@@ -141,15 +146,15 @@ def test_errors_over_worlds_are_the_jackknife_by_hand_and_none_below_eight():
     whole = s_mig(sensors, frames)
     left_out = [value(s_mig(sensors, frames[:drop] + frames[drop + 1 :])).value for drop in range(16)]
     expected = math.sqrt(15 / 16 * sum((one - np.mean(left_out)) ** 2 for one in left_out))
-    assert value(whole).standard_error == pytest.approx(expected, rel=1e-9)
+    assert value(whole).error == pytest.approx(expected, rel=1e-9)
     weights = 1.0 - torch.eye(16)
-    assert whole.resampled(weights)[:, 1].tolist() == pytest.approx(left_out)
-    assert whole.resampled(torch.zeros(1, 16)).isnan().all()
-    assert math.isnan(value(s_mig(sensors, frames[:7])).standard_error)
+    assert whole.estimate().resampled(weights)[:, 1].tolist() == pytest.approx(left_out)
+    assert whole.estimate().resampled(torch.zeros(1, 16)).isnan().all()
+    assert math.isnan(value(s_mig(sensors, frames[:7])).error)
     hits = {"beam": torch.tensor([[9.0, 0.0, 1.0]])}
     occluded = s_mig(sensors, [frame(one.index, one.boxes, clouds=hits) for one in frames], occlusion=True)
     assert value(occluded).value < 0
-    assert math.isnan(value(occluded).standard_error)
+    assert math.isnan(value(occluded).error)
 
 
 def test_with_occlusion_rays_end_at_what_was_measured_and_without_points_nowhere():
@@ -158,10 +163,10 @@ def test_with_occlusion_rays_end_at_what_was_measured_and_without_points_nowhere
     frames = [frame(0, boxes(AHEAD), clouds=clouds), frame(1, NONE)]
     number = value(s_mig([beam(z_m=1.25)], frames, occlusion=True))
     # From 3 to 5 m, in one of two frames.
-    assert number.name == "s_mig_occluded_0.5m:car"
+    assert number.quantity.key == "s_mig_occluded_0.5m:car"
     assert number.value == pytest.approx(-4 * math.log(2) / 2)
-    assert math.isnan(number.standard_error)
-    assert s_mig([beam(z_m=1.25)], frames, occlusion=True).resampled(torch.ones(1, 16)) is None
+    assert math.isnan(number.error)
+    assert s_mig([beam(z_m=1.25)], frames, occlusion=True).estimate().resampled(torch.ones(1, 2)) is None
 
 
 def test_with_occlusion_it_is_the_mean_over_frames_of_the_entropy_on_their_way():
@@ -191,7 +196,7 @@ def test_finer_voxels_make_it_larger_about_as_their_number_grows():
     half = [frame(0, boxes(AHEAD)), frame(1, NONE)]
     coarse, fine = (value(s_mig([beam(z_m=1.0)], half, voxel_m=voxel_m)) for voxel_m in (0.5, 0.1))
     assert fine.value == pytest.approx(5 * coarse.value)
-    assert fine.name == "s_mig_0.1m:car"
+    assert fine.quantity.key == "s_mig_0.1m:car"
 
 
 def test_the_published_rig_crosses_as_many_voxels_as_were_counted_before():

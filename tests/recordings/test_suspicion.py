@@ -13,7 +13,7 @@ from tests.recordings.drives import Drive
 from torchcover.data import AccumulatedReference, RecordedFrames, Scan
 from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler, transform
-from torchcover.recordings.suspicion import ground_height_m, suspicions
+from torchcover.recordings.suspicion import ground_height_m
 
 MOUNT = rigid(rotation_from_euler(2.0, 1.0, -1.0), [0.5, 0.1, 1.73])
 SIZE_M = (4.0, 1.8, 1.5)
@@ -85,7 +85,7 @@ class Street:
 
 
 def doubts(street, **options):
-    return suspicions(RecordedFrames(street, **options))
+    return RecordedFrames(street, **options).doubts(None)
 
 
 def test_nothing_is_wrong_with_what_is_right():

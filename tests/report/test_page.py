@@ -18,7 +18,7 @@ from torchcover.coverage.quantity import RADIUS
 from torchcover.report import Line, Page, PageMap, PageRig, PageTable, SensorView, Words, maps_of, page_html, scale_of
 from torchcover.report.page.codes import CellBytes, decoded, encoded
 from torchcover.report.page.content import Array
-from torchcover.report.page.fitting import fitted
+from torchcover.report.page.writing import fitted
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 NASTY = "</script><script>document.title='broken'</script>"
@@ -123,7 +123,7 @@ def over_surface(size: int, points) -> Coverage:
     metric = CoverageMetric(GRID, blocks=16, square_metres=True)
     for index in range(16):
         m2 = 0.1 + 0.8 * torch.rand(400, generator=torch.Generator().manual_seed(index))
-        metric.update(points(size, 100 + index), points(400, 1000 + index), weights=m2, index=index)
+        metric.update(points(size, 100 + index), points(400, 1000 + index), weights=m2, place_in_time=index)
     return metric.compute()
 
 

@@ -33,7 +33,7 @@ def measured(steps: int = 16, points: int = 400):
         reference = torch.rand(points, 3, generator=random) ** torch.tensor([3.0, 3.0, 1.0]) * size
         reference[:, 0] *= 0.6
         m2 = 10 ** (-3 * torch.rand(points, generator=random))
-        metric.update(torch.rand(60, 3, generator=random) * size, reference, weights=m2, index=index)
+        metric.update(torch.rand(60, 3, generator=random) * size, reference, weights=m2, place_in_time=index)
     return metric.compute()
 
 

@@ -34,7 +34,7 @@ def over_steps(steps: int) -> Coverage:
     radii = torch.rand(steps, generator=torch.Generator().manual_seed(0))
     for index, radius in enumerate(radii):
         place = torch.tensor([[0.5 + index % 2, 0.5 + index // 2 % 2, 0.0]])
-        coverage.update(place - torch.tensor([0.0, 0.0, float(radius)]), place, index=index)
+        coverage.update(place - torch.tensor([0.0, 0.0, float(radius)]), place, place_in_time=index)
     return coverage.compute()
 
 
@@ -125,7 +125,7 @@ def test_a_region_that_one_block_alone_has_probed_has_a_number_without_error():
     coverage = metric(blocks=16)
     for index in range(16):
         x = 2.5 if index == 3 else 0.5
-        coverage.update(torch.tensor([[x, 0.5, -0.2]]), torch.tensor([[x, 0.5, 0.0]]), index=index)
+        coverage.update(torch.tensor([[x, 0.5, -0.2]]), torch.tensor([[x, 0.5, 0.0]]), place_in_time=index)
     text = text_of(coverage.compute(), NEAR, FAR)
     assert cells_of(text, "near")[2] == "0.20"
     assert cells_of(text, "far")[2] == "0.20"
@@ -135,7 +135,7 @@ def test_a_region_that_one_block_alone_has_probed_has_a_number_without_error():
 def test_an_infinite_number_has_no_error():
     coverage = metric(blocks=16)
     for index in range(16):
-        coverage.update(ORIGIN if index else torch.zeros(0, 3), ORIGIN, index=index)
+        coverage.update(ORIGIN if index else torch.zeros(0, 3), ORIGIN, place_in_time=index)
     assert cells_of(text_of(coverage.compute(), NEAR), "near")[2] == "infinite"
 
 

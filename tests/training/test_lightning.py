@@ -85,7 +85,7 @@ def make_metric(**options):
 def expected(frames):
     metric = make_metric()
     for frame in frames:
-        metric.update(frame.sensor, frame.reference, index=frame.index)
+        metric.update(frame.sensor, frame.reference, place_in_time=frame.index)
     return metric.compute()
 
 
@@ -266,7 +266,7 @@ def test_the_weights_of_reference_points_count(tmp_path):
     make_trainer(tmp_path, callback).fit(Validated(), loader(2), loader(frames))
     metric = make_metric()
     for frame in frames:
-        metric.update(frame.sensor, frame.reference, weights=weights, index=frame.index)
+        metric.update(frame.sensor, frame.reference, weights=weights, place_in_time=frame.index)
     assert_same(callback.coverage, metric.compute())
     assert not torch.equal(callback.coverage.radius, expected(frames).radius)
 

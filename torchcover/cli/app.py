@@ -9,7 +9,7 @@ import typer
 
 from torchcover.cli import commands
 from torchcover.cli.evaluate import compare, evaluate
-from torchcover.evaluation.interrupt import terminable
+from torchcover.evaluation.progress import terminable
 
 app = typer.Typer(
     name="torchcover",

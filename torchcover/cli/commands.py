@@ -39,9 +39,7 @@ def study(
     from torchcover.evaluation import Settings, StudyPlan, claimed, error_against_time, rank_count
 
     if rank_count() > 1:
-        raise ValueError(
-            "study measures run times, which ranks beside each other would change: run it without torchrun"
-        )
+        raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
     plan = StudyPlan(
         Settings(rig, steps=steps, **settings),
         rays=tuple(sorted(set(rays or StudyPlan.rays))),
@@ -273,14 +271,14 @@ def agree(
 ) -> None:
     """Rank published placements by metrics, and by the detectors that were trained on them; say what that is worth."""
     from torchcover.cli.printing import print_agreement
-    from torchcover.evaluation import agree, claimed, rank_count, save_agreement
+    from torchcover.evaluation import agree, claimed, rank_count
     from torchcover.published import metric_names
 
     if rank_count() > 1:
         raise ValueError("agree: ranks do not share it; run it without torchrun, with --workers")
     with claimed(out):
         study = agree(paper, scenario, metrics=metric_names(metrics), steps=steps, progress=True, **settings)
-        files = save_agreement(study, out)
+        files = study.save(out)
     print_agreement(study, files, out)
 
 

@@ -18,7 +18,8 @@ from torchcover.evaluation import (
     study_table,
     verdict,
 )
-from torchcover.published.tables import text_tables
+from torchcover.evaluation.agreeing import NOTES
+from torchcover.published.comparison import text_tables
 from torchcover.report import error_words, narrowest_width, print_table, shown_unit, text_table
 
 
@@ -73,7 +74,7 @@ DETECTORS_ONLY = "* an interval over detectors only: of worlds there are none, o
 
 
 def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> None:
-    """How metrics rank the placements beside each thing that detectors say of them, and the notes."""
+    """How metrics rank the placements, for each thing that detectors say of them, and the notes."""
     console = Console()
     truths = list(dict.fromkeys(truth for truth, _ in study.found))
     readings = list(dict.fromkeys(reading for _, reading in study.found))
@@ -91,7 +92,7 @@ def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> 
         wide.print(table)
     for truth in truths:
         console.print(verdict(truth, {one: study.found[truth, one] for one in readings}), markup=False, soft_wrap=True)
-    for note in study.notes:
+    for note in NOTES:
         console.print(note, markup=False, soft_wrap=True)
     console.print(f"Wrote {', '.join(path.name for path in files)} to {out}", markup=False, soft_wrap=True)
 

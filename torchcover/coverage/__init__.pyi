@@ -1,6 +1,7 @@
 from .aggregations import AGGREGATIONS as AGGREGATIONS
 from .aggregations import Aggregation as Aggregation
 from .aggregations import BinnedStep as BinnedStep
+from .aggregations import Layer as Layer
 from .aggregations import Maximum as Maximum
 from .aggregations import MeanOfMeans as MeanOfMeans
 from .aggregations import PooledMean as PooledMean
@@ -9,7 +10,6 @@ from .aggregations import State as State
 from .aggregations import StepQuantiles as StepQuantiles
 from .aggregations import aggregation_named as aggregation_named
 from .grid import BevGrid as BevGrid
-from .layer import Layer as Layer
 from .measures import Measure as Measure
 from .metric import CoverageMetric as CoverageMetric
 from .number_metric import CoverageNumber as CoverageNumber

@@ -16,9 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from torchcover.coverage.aggregations import Layer
 from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums, BlockSumsT
 from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.layer import Layer
 from torchcover.coverage.redundancy import PlaceSums, Redundancy, redundancy_quantities
 from torchcover.coverage.region_sums import PlaceNumbers
 from torchcover.coverage.regions import Region

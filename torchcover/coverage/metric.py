@@ -7,17 +7,16 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations import Aggregation, BinnedStep, MeanOfMeans, State, VisibleArea
+from torchcover.coverage.aggregations import Aggregation, BinnedStep, Layer, MeanOfMeans, State, VisibleArea
 from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.blocks import AreaSums, Blocks, BlockSumsT
 from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.layer import Layer
 from torchcover.coverage.plotting import draw_coverage
 from torchcover.coverage.redundancy import PlaceSums, Redundancy, SensorFailures
 from torchcover.coverage.region_sums import IN_REGIONS, RegionSums
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.steps import Clouds, SensorClouds, Step, as_list, check_parameters, checked_steps
+from torchcover.coverage.steps import CheckedStep, Clouds, SensorClouds, as_list, check_parameters, checked_steps
 from torchcover.metrics import SumsInBlocks, figure_of
 from torchcover.neighbors import nearest
 
@@ -160,7 +159,7 @@ class CoverageMetric(SumsInBlocks):
         reference: Clouds,
         *,
         weights: Clouds | None = None,
-        index: int | Sequence[int] | None = None,
+        place_in_time: int | Sequence[int] | None = None,
     ) -> None:
         """Add one step, or one step for each entry of two lists.
 
@@ -172,22 +171,22 @@ class CoverageMetric(SumsInBlocks):
             weights: (M,) square metres that each reference point stands for (`frame.reference_weights`), or a list of
                 the same length: what it weighs in the mean over its cell in its step, and in the estimate by area. Not
                 given: all weigh the same.
-            index: Number of the step in time, 10^15 at most, or a list of them; it decides about the block, so that
-                steps of one number, as of an instant that is seen again, share one. Not given: counted on from the
-                steps so far.
+            place_in_time: Number of the step, 10^15 at most, or a list of them (`frame.place_in_time`); it decides
+                about the block, so that steps of one number, as of an instant that is seen again, share one. Not
+                given: counted on from the steps so far.
 
         Raises:
             ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights
-                that are not positive and finite, none where there is to be an estimate by area, an index that is
+                that are not positive and finite, none where there is to be an estimate by area, a place in time that is
                 negative or too large.
-            TypeError: A cloud is not a floating-point tensor, an index not a whole number.
+            TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
         """
         if self.square_metres and weights is None:
             raise ValueError(
                 "weights: the square metres of each reference point are needed, as a SurfaceReference gives them; got "
                 "none (without square_metres=True, points may do without)"
             )
-        for step in checked_steps(sensor, reference, weights, index, names=self.sensors, first=int(self.steps)):
+        for step in checked_steps(sensor, reference, weights, place_in_time, names=self.sensors, first=int(self.steps)):
             self._add_step(step)
 
     def forward(
@@ -196,17 +195,17 @@ class CoverageMetric(SumsInBlocks):
         reference: Clouds,
         *,
         weights: Clouds | None = None,
-        index: int | Sequence[int] | None = None,
+        place_in_time: int | Sequence[int] | None = None,
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
-        if index is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
-            index = [int(self.steps) + step for step in range(len(as_list(reference, "reference")))]
-        coverage: Coverage = super().forward(sensor, reference, weights=weights, index=index)
+        if place_in_time is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
+            place_in_time = [int(self.steps) + step for step in range(len(as_list(reference, "reference")))]
+        coverage: Coverage = super().forward(sensor, reference, weights=weights, place_in_time=place_in_time)
         return coverage
 
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
-    def _add_step(self, step: Step) -> None:
-        sensors, reference, weights, index = step
+    def _add_step(self, step: CheckedStep) -> None:
+        sensors, reference, weights, place_in_time = step
         inside, of, cell = self.grid.bins(reference)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
         each = [self._distance(reference[inside], cloud.to(reference.device)) for cloud in sensors.values()]
@@ -214,7 +213,7 @@ class CoverageMetric(SumsInBlocks):
         distance = each[0] if of_sensors is None else of_sensors.amin(dim=0)
         device = self.points.device
         weights = None if weights is None else weights.to(reference.device)[inside[of]].to(device)
-        block = self._block_of(index)
+        block = self._block_of(place_in_time)
         of_sensors = None if of_sensors is None else of_sensors[:, of].to(device)
         self._accumulate(block, cell.to(device), distance[of].to(device), weights, of_sensors)
         self.steps += 1

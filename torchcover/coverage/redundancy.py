@@ -7,9 +7,8 @@ from typing import ClassVar, NamedTuple
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations import Aggregation, BinnedStep, State
+from torchcover.coverage.aggregations import Aggregation, BinnedStep, Layer, State
 from torchcover.coverage.binning import mean_per_cell
-from torchcover.coverage.layer import Layer
 from torchcover.coverage.quantity import RADIUS, detection, seen_by_two, sensors_seeing, without
 from torchcover.coverage.regions import Places
 from torchcover.estimation import Quantity

@@ -6,23 +6,22 @@ from dataclasses import replace
 from difflib import get_close_matches
 from functools import cached_property, partial
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations import MeanOfMeans
-from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
+from torchcover.coverage.aggregations import Layer, MeanOfMeans
+from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
 from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.layer import Layer
-from torchcover.coverage.measures import Measure, area_in_blocks, estimate_area, estimate_known
+from torchcover.coverage.measures import Measure, area_in_blocks, errors_of_cells, estimate_area, estimate_known
 from torchcover.coverage.quantity import RADIUS, by_area, over_known
 from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
 from torchcover.coverage.region_sums import PlaceNumbers
 from torchcover.coverage.regions import Region, check_regions, regions_within
 from torchcover.coverage.summary import RegionRedundancy, RegionSummary, estimate_redundancy, region_redundancy
-from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Estimate, Quantity, ratio_errors
+from torchcover.estimation import Estimate, Quantity
 
 
 class Coverage:
@@ -112,19 +111,10 @@ class Coverage:
         """Key of a quantity -> (H, Y, X) standard errors; NaN where too few blocks probed, empty without blocks."""
         if self.blocks is None:
             return {}
-        errors = self._errors_of(self.blocks, self.quantities)
+        errors = errors_of_cells(self.quantities, self.blocks)
         if self.area is not None:
-            each = self._errors_of(self.area, self.quantities)
+            each = errors_of_cells(self.quantities, self.area)
             errors |= {by_area(one).key: each[one.key] for one in self.quantities}
-        return errors
-
-    def _errors_of(self, blocks: BlockSums, quantities: Sequence[Quantity]) -> dict[str, Tensor]:
-        where = blocks.known_in() >= MIN_BLOCKS_OF_A_CELL
-        base, sums = blocks.spread_over(where)
-        errors = {}
-        for one, own in zip(quantities, sums, strict=True):
-            errors[one.key] = sums.new_full(self.grid.shape, math.nan)
-            errors[one.key][where] = ratio_errors(base, own, one.unit)
         return errors
 
     @property
@@ -272,20 +262,8 @@ class Coverage:
 
         What `load` gives back has the same numbers, errors and differences to the last bit.
         """
-        parts: CoverageParts = {
-            "grid": self.grid,
-            "thresholds": self.thresholds,
-            "max_radius": self.max_radius,
-            "probed_steps": self.probed_steps,
-            "points": self.points,
-            "layers": list(self.layers.values()),
-            "counts": self.counts,
-            "blocks": self.blocks,
-            "area": self.area,
-            "regions": self.regions,
-            "aggregated": self.aggregated,
-            "redundancy": self.redundancy,
-        }
+        given = {name: getattr(self, name) for name in CoverageParts.__annotations__}
+        parts = cast("CoverageParts", given | {"layers": list(self.layers.values())})
         write_coverage(parts, self.errors, Path(path))
 
     @classmethod

@@ -26,7 +26,7 @@ Clouds: TypeAlias = Tensor | Sequence[Tensor]
 SensorClouds: TypeAlias = Clouds | Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]]
 
 
-class Step(NamedTuple):
+class CheckedStep(NamedTuple):
     """One step: clouds in the vehicle frame, weights of the reference points, and its number in time.
 
     `sensors` has those of the rig by the names of the sensors; one without a name if they are not told apart.
@@ -77,46 +77,47 @@ def checked_steps(
     sensor: SensorClouds,
     reference: Clouds,
     weights: Clouds | None,
-    index: int | Sequence[int] | None,
+    place_in_time: int | Sequence[int] | None,
     *,
     names: Sequence[str] = (),
     first: int,
-) -> list[Step]:
+) -> list[CheckedStep]:
     """The steps of an update, in order.
 
     Args:
         sensor: As in `CoverageMetric.update`, and so are the others.
         reference: Reference points.
         weights: Their weights.
-        index: Numbers of the steps in time.
+        place_in_time: Numbers of the steps in time.
         names: Of the sensors, where they are told apart.
-        first: Number of the first step if `index` is not given.
+        first: Number of the first step if `place_in_time` is not given.
 
     Raises:
         ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights that are
-            not positive and finite, an index that is negative or above 10^15.
-        TypeError: A cloud is not a floating-point tensor, an index not a whole number.
+            not positive and finite, a place in time that is negative or above 10^15.
+        TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
     """
     rigs = [sensor] if isinstance(sensor, Mapping) else as_list(sensor, "sensor")
     sensors = [_by_name(rig, names) for rig in rigs]
     references = as_list(reference, "reference")
     count = len(references)
     every_weights: Sequence[Tensor | None] = [None] * count if weights is None else as_list(weights, "weights")
-    numbers = list(range(first, first + count)) if index is None else _numbers(index)
+    numbers = list(range(first, first + count)) if place_in_time is None else _numbers(place_in_time)
     if len(sensors) != count:
         raise ValueError(f"{len(sensors)} sensor clouds for {count} reference clouds; one pair a step")
     if len(every_weights) != count or len(numbers) != count:
         raise ValueError(
-            f"{len(every_weights)} weights and {len(numbers)} indices for {count} reference clouds; one a step each"
+            f"{len(every_weights)} weights and {len(numbers)} places in time for {count} reference clouds; one a step "
+            "each"
         )
-    steps = [Step(*parts) for parts in zip(sensors, references, every_weights, numbers, strict=True)]
+    steps = [CheckedStep(*parts) for parts in zip(sensors, references, every_weights, numbers, strict=True)]
     for at, step in enumerate(steps):
         for name, cloud in step.sensors.items():
             check_cloud(cloud, f"sensor[{at}]" + f"[{name!r}]" * bool(name))
         check_cloud(step.reference, f"reference[{at}]")
         _check_weights(step.weights, len(step.reference), f"weights[{at}]")
         if not 0 <= step.number <= MAX_NUMBER:
-            raise ValueError(f"index[{at}]: a number from 0 to {MAX_NUMBER:,} is needed; got {step.number}")
+            raise ValueError(f"place_in_time[{at}]: a number from 0 to {MAX_NUMBER:,} is needed; got {step.number}")
     return steps
 
 
@@ -150,12 +151,14 @@ def _by_name(rig: Any, names: Sequence[str]) -> Mapping[str, Tensor]:  # noqa: A
     return {name: rig[name] for name in names}
 
 
-def _numbers(index: Any) -> list[int]:  # noqa: ANN401  (whatever the caller gave)
-    each = index if isinstance(index, Sequence) else [index]
+def _numbers(place_in_time: Any) -> list[int]:  # noqa: ANN401  (whatever the caller gave)
+    each = place_in_time if isinstance(place_in_time, Sequence) else [place_in_time]
     try:
         return [operator.index(number) for number in each]
     except (TypeError, ValueError) as error:
-        raise TypeError(f"index: a whole number, or a list with one for each step, is needed; got {index!r}") from error
+        raise TypeError(
+            f"place_in_time: a whole number, or a list with one for each step, is needed; got {place_in_time!r}"
+        ) from error
 
 
 def _check_weights(weights: Tensor | None, points: int, name: str) -> None:

@@ -1,8 +1,9 @@
 """Estimates from sums in blocks, and the numbers and differences that are read from them."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import torch
@@ -90,6 +91,7 @@ class Estimate:
         value: (Q,) float64 from all steps; NaN where unknown.
         left_out: (g, Q) without each block.
         steps: (g,) int64 steps in these blocks, each above 0.
+        again: From (R, g) how often each block comes to (R, Q) what the numbers were then; None if that is unknown.
 
     Example:
         >>> detection = Quantity("detection_0.4m", "detection within 0.4 m", "share", lower_is_better=False)
@@ -102,12 +104,16 @@ class Estimate:
         >>> difference, = other.differences(one).values()
         >>> round(difference.value, 3), difference.blocks, difference.better
         (0.05, 8, 8)
+        >>> one.resampled(torch.tensor([[1.0] * 8, [1.0] + [0.0] * 7]))
+        tensor([[0.3500],
+                [0.0000]], dtype=torch.float64)
     """
 
     quantities: tuple[Quantity, ...]
     value: Tensor
     left_out: Tensor
     steps: Tensor
+    again: Callable[[Tensor], Tensor] | None = None
 
     @classmethod
     def of(cls, quantities: Sequence[Quantity], value: Tensor) -> "Estimate":
@@ -127,11 +133,37 @@ class Estimate:
         whole = sums.sum(dim=0) / base.sum(dim=0)
         used = steps.nonzero().flatten().tolist() if len(steps) > 1 else []
         left_out = [_without(sums, block).sum(dim=0) / _without(base, block).sum(dim=0) for block in used]
-        return cls(tuple(quantities), whole, torch.stack(left_out) if left_out else whole[None][:0], steps[used])
+        without = torch.stack(left_out) if left_out else whole[None][:0]
+        return cls(tuple(quantities), whole, without, steps[used], partial(_ratios_again, base[used], sums[used]))
+
+    @classmethod
+    def of_blocks(cls, quantities: Sequence[Quantity], again: Callable[[Tensor], Tensor], steps: Tensor) -> "Estimate":
+        """Of numbers that say for themselves what they become if blocks come more or less often.
+
+        Args:
+            quantities: What they are.
+            again: As in `Estimate`; float64.
+            steps: (g,) steps in each block, all above 0.
+        """
+        once = torch.ones(1, len(steps), dtype=torch.float64, device=steps.device)
+        values = again(torch.cat([once, 1.0 - torch.diag(once[0])]))
+        return cls(tuple(quantities), values[0], values[1:], steps, again)
 
     def __getitem__(self, which: slice) -> "Estimate":
         """Some of the numbers."""
-        return Estimate(self.quantities[which], self.value[which], self.left_out[:, which], self.steps)
+        again = None if self.again is None else partial(_some_again, self.again, which)
+        return Estimate(self.quantities[which], self.value[which], self.left_out[:, which], self.steps, again)
+
+    def resampled(self, weights: Tensor) -> Tensor | None:
+        """What the numbers were if other worlds had come, for intervals of what is made from numbers of several rigs.
+
+        Args:
+            weights: (R, g) how often each block comes, in each of R draws.
+
+        Returns:
+            (R, Q) float64; None if it is unknown.
+        """
+        return None if self.again is None else self.again(weights.to(self.value))
 
     @property
     def error(self) -> Tensor:
@@ -198,3 +230,11 @@ class Estimate:
 def _without(sums: Tensor, block: int) -> Tensor:
     # Not by a difference: infinite radii, and what is left of nearly everything, would not survive it.
     return torch.cat([sums[:block], sums[block + 1 :]])
+
+
+def _ratios_again(base: Tensor, sums: Tensor, weights: Tensor) -> Tensor:
+    return (weights @ sums) / (weights @ base.to(sums)).view(len(weights), -1)
+
+
+def _some_again(again: Callable[[Tensor], Tensor], which: slice, weights: Tensor) -> Tensor:
+    return again(weights)[:, which]

@@ -1,14 +1,20 @@
 """Whether metrics rank published sensor placements as the detectors that were trained on them do."""
 
+import csv
+import io
+import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import IO
 
 from torchcover.evaluation.placement_scores import PlacementScores, score_placements
-from torchcover.published import Agreement, Judged, agreement_of, published_results
-from torchcover.published.baselines import mean_height_m
-from torchcover.published.ranks import spearman
-from torchcover.simulation import Rig, Scenario, builtin_names
+from torchcover.files import write_durably
+from torchcover.published import Agreement, Judged, Ranked, Relation, agreement_of, read_results
+from torchcover.published.agreement import kind_of
+from torchcover.simulation import Scenario, builtin_folder, builtin_names
 
 PAPER = "place3d2024"
 # Quantity and class in `datasets/published/place3d_2024.csv`, and what it is called here.
@@ -16,6 +22,17 @@ TRUTHS = {("map", "car"): "car mAP", ("map", "bicycle"): "bicycle mAP", ("map", 
           ("miou", ""): "mIoU"}  # fmt: skip
 # How the rolls of Table 7 are read, and what the rigs are called at their end.
 READINGS = {"radians": "", "degrees": "_degrees"}
+# What has to be known before any of it is believed; `examples/place3d` has the tables that say so.
+NOTES = (
+    "8 placements, 4 of which have the same mean height and which have 4 heights in all, cannot separate metrics: "
+    "whatever grows with the height ranks them much as the detectors do.",
+    "No metric is validated by this: for cars, Li et al. (ICRA 2024) and Place3D rank the same four placements "
+    "(center, line, pyramid, trapezoid) with a Spearman correlation of -0.80, so that no metric can agree with both.",
+    "The paper does not say whether rolls are radians or degrees; in degrees pyramid_roll is all but pyramid, as "
+    "in the published car mAP (52.12 and 52.17).",
+)
+COLUMNS = ("truth", "rolls", "metric", "kind", "spearman", "spearman_low", "spearman_high", "kendall", "kendall_low",
+           "kendall_high", "p", "interval_over")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,14 +44,64 @@ class AgreementStudy:
         scores: What the metrics say of each rig.
         scenario: Where they were measured.
         seed: Seed of the traffic.
-        notes: What has to be known before any of it is believed.
     """
 
     found: Mapping[tuple[str, str], Agreement]
     scores: PlacementScores
     scenario: str
     seed: int
-    notes: tuple[str, ...]
+
+    @property
+    def record(self) -> dict[str, object]:
+        """Everything, as JSON takes it; what is unknown is None."""
+        return {
+            "scenario": self.scenario,
+            "steps": self.scores.steps,
+            "seed": self.seed,
+            "notes": list(NOTES),
+            "truths": [
+                {
+                    "truth": truth,
+                    "rolls": reading,
+                    "judges": list(found.judged.judges),
+                    "placements": dict(zip(found.judged.placements, found.judged.mean.tolist(), strict=True)),
+                    "noise_ceiling": _known(found.judged.ceiling),
+                    "metrics_looked_at": found.looked_at,
+                    "best": found.best,
+                    "p_of_the_best": _known(found.best_p),
+                    "best_by_chance_95": _known(found.by_chance),
+                }
+                for (truth, reading), found in self.found.items()
+            ],
+            "rows": [dict(zip(COLUMNS, row, strict=True)) for row in self.rows],
+        }
+
+    @property
+    def rows(self) -> list[tuple[object, ...]]:
+        """A row of `COLUMNS` for each metric, truth and reading of the rolls."""
+        return [
+            (truth, reading, row.metric, row.kind, *map(_known, (*row.spearman, *row.kendall, row.p)), _over(row))
+            for (truth, reading), one in self.found.items()
+            for row in one.ranked
+        ]
+
+    def save(self, folder: Path) -> list[Path]:
+        """Write the files.
+
+        Returns:
+            `agreement.csv`, a row for each metric, truth and reading of the rolls; `scores.csv`, what each metric says
+            of each rig; `agreement.json`, everything.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        scores = [(one.name, kind_of(one), *map(_known, one.gains.tolist())) for one in self.scores.rankings]
+        texts = {
+            "agreement.csv": _csv([COLUMNS, *self.rows]),
+            "scores.csv": _csv([("metric", "kind", *self.scores.rigs), *scores]),
+            "agreement.json": json.dumps(self.record, indent=1, allow_nan=False),
+        }
+        for name, text in texts.items():
+            write_durably(folder / name, partial(_write, text))
+        return [folder / name for name in texts]
 
 
 def agree(
@@ -70,53 +137,71 @@ def agree(
     scores = score_placements(
         rigs, scenario, metrics=metrics, steps=steps, seed=seed, every_s=every_s, workers=workers, progress=progress
     )
-    results = published_results("place3d_2024")
+    return AgreementStudy(agreements(scores), scores, str(getattr(scenario, "name", scenario)), seed)
+
+
+def agreements(scores: PlacementScores) -> dict[tuple[str, str], Agreement]:
+    """What detectors say, and how the rolls are read -> how metrics rank the placements of Place3D.
+
+    Args:
+        scores: What the metrics say of its rigs, both readings of the rolls among them.
+    """
+    results = read_results(builtin_folder("published") / "place3d_2024.csv")
     found = {}
     for key, words in TRUTHS.items():
         judged = results[key]
+        truth = Judged(words, judged.placements, judged.judges, judged.values)
         for reading, ending in READINGS.items():
-            named = [_rig_of(placement, ending, rigs) for placement in judged.placements]
-            truth = Judged(words, judged.placements, judged.judges, judged.values)
+            named = [_rig_of(placement, ending, scores.rigs) for placement in judged.placements]
             found[words, reading] = agreement_of(scores.of(named), truth)
-    notes = (_on_heights(results["map", "car"].placements), contradiction(), *_on_rolls(results["map", "car"]))
-    return AgreementStudy(found, scores, str(getattr(scenario, "name", scenario)), seed, notes)
+    return found
 
 
-def contradiction() -> str:
-    """That two papers rank the same placements of LiDARs differently, with the correlation of their car mAP.
+def verdict(truth: str, found: Mapping[str, Agreement]) -> str:
+    """What the detectors agree on, and what the best of so many metrics is worth."""
+    first = next(iter(found.values()))
+    judges = first.judged.judges
+    words = (
+        f"{len(judges)} networks ({', '.join(judges)}) agree with each other by {first.judged.ceiling:.2f} on {truth}."
+    )
+    for reading, one in found.items():
+        words += (
+            f" Rolls in {reading}: of {one.looked_at} metrics the best is `{one.best}`, p = {one.best_p:.3f} as the "
+            f"best of so many; one of twenty times chance alone gives the best more than {one.by_chance:.2f}."
+        )
+    return words
+
+
+def relation(one: Relation) -> str:
+    """A number and its interval.
 
     Example:
-        >>> contradiction()
-        'No metric is validated by this: for cars, Li et al. (ICRA 2024) and Place3D rank the same four placements ...'
+        >>> relation(Relation(0.857, 0.5, 0.95))
+        '+0.86 [+0.50, +0.95]'
     """
-    place3d, li = (published_results(name)["map", "car"] for name in ("place3d_2024", "li_2024"))
-    both = [name for name in place3d.placements if name in li.placements]
-    rho = float(spearman(place3d.of(both).mean, li.of(both).mean))
-    count = {3: "three", 4: "four"}.get(len(both), str(len(both)))
-    return (
-        f"No metric is validated by this: for cars, Li et al. (ICRA 2024) and Place3D rank the same {count} placements "
-        f"({', '.join(both)}) with a Spearman correlation of {rho:.2f}, so that no metric can agree with both."
-    )
+    if math.isnan(one.value):
+        return "-"
+    return f"{one.value:+.2f} [{one.low:+.2f}, {one.high:+.2f}]"
 
 
-def _rig_of(placement: str, ending: str, rigs: Mapping[str, str]) -> str:
+def _rig_of(placement: str, ending: str, rigs: Sequence[str]) -> str:
     name = f"{PAPER}_{placement}"
     return f"{name}{ending}" if f"{name}{ending}" in rigs else name
 
 
-def _on_heights(placements: Sequence[str]) -> str:
-    heights = [mean_height_m(Rig.load(f"{PAPER}_{placement}")) for placement in placements]
-    shared = max(heights.count(height) for height in heights)
-    return (
-        f"{len(placements)} placements, {shared} of which have the same mean height and which have {len(set(heights))} "
-        "heights in all, cannot separate metrics: whatever grows with the height ranks them much as the detectors do."
-    )
+def _over(row: Ranked) -> str:
+    return "worlds and networks" if row.over_worlds else "networks"
 
 
-def _on_rolls(cars: Judged) -> tuple[str, ...]:
-    """What speaks for one reading of the rolls."""
-    pyramid, rolled = (float(cars.of([name]).mean[0]) for name in ("pyramid", "pyramid_roll"))
-    return (
-        "The paper does not say whether rolls are radians or degrees; in degrees pyramid_roll is all but pyramid, as "
-        f"in the published car mAP ({rolled:.2f} and {pyramid:.2f}).",
-    )
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def _csv(rows: Sequence[Sequence[object]]) -> str:
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
+    return text.getvalue()
+
+
+def _write(text: str, file: IO[bytes]) -> None:
+    file.write(text.encode())

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.evaluation.observers import CoverageObserver, Stateful
-from torchcover.evaluation.transport import Words, spread, words_of
+from torchcover.evaluation.transport import Bits, spread, words_of
 from torchcover.files import NpyHeader, check_memory, read_npz, reads, write_durably
 
 EVERY_S = 60.0
@@ -266,7 +266,7 @@ def _array(content: Mapping[str, Any], path: Path) -> Array:
         raise ValueError(f"an array of {dtype} and the shape {shape}")
     check_memory(math.prod(shape) * dtype.itemsize)
     words = _read(path, name)
-    return spread(Words(words, _read(path, f"{name}.at") if content["places"] else None), dtype, shape)
+    return spread(Bits(words, _read(path, f"{name}.at") if content["places"] else None), dtype, shape)
 
 
 def _read(path: Path, name: str) -> Array:

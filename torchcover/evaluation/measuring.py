@@ -13,13 +13,12 @@ from torchcover import __version__
 from torchcover.coverage import CoverageMetric
 from torchcover.evaluation.checkpoint import Checkpoint, Journal
 from torchcover.evaluation.observers import BLOCKS, AnyObserver, CoverageObserver, new_metric, usable_device
-from torchcover.evaluation.omissions import left_out
 from torchcover.evaluation.other_metrics import compared, metrics_of
 from torchcover.evaluation.pipeline import Run, observe
 from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.result_files import claimed
-from torchcover.evaluation.sensor_drawings import check_drawable
+from torchcover.evaluation.result_page import check_drawable, left_out
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import TargetWatch
 from torchcover.evaluation.task import CALLER, Task
@@ -45,10 +44,10 @@ def measured(task: Task[FrameSource], settings: Settings) -> Result:
     frames = task.frames
     sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
     check_drawable(sensors)
-    metrics = metrics_of(task, settings)
+    metrics = metrics_of(task, settings) if settings.metrics else None
+    others = {**settings.observers, **(metrics.observers if metrics else {})}
     with ranks.aborting() if ranks else nullcontext():
-        coverage, seen, run = _observed(task, settings, {**settings.observers, **metrics.observers})
-    metrics = metrics.after(seen)
+        coverage, seen, run = _observed(task, settings, others)
     coverages = {name: observer.compute() for name, observer in coverage.items()}
     if len({coverage.counts["steps"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
@@ -65,7 +64,7 @@ def measured(task: Task[FrameSource], settings: Settings) -> Result:
         sensors=task.sensors,
         ego_outline_m=frames.ego_outline_m,
         observed={name: seen[name].compute() for name in settings.observers},
-        metrics=compared(metrics, coverages, task.asked.awaited, settings.seed),
+        metrics=compared(metrics.after(seen), coverages, task.asked.awaited, settings.seed) if metrics else None,
         left_out=left_out(
             run.counts,
             list(coverages.values()),

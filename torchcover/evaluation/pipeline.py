@@ -14,12 +14,10 @@ import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from torchcover.evaluation.checkpoint import Journal
-from torchcover.evaluation.interrupt import held_back
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.progress import progress_of
+from torchcover.evaluation.progress import held_back, progress_of
 from torchcover.evaluation.ranks import Ranks
-from torchcover.frames import BadFrameError, Frame, FrameSource
-from torchcover.simulation import SimulatedFrames
+from torchcover.frames import BadFrameError, Frame, FrameSource, worlds_of
 
 Frames = FrameSource | Dataset[Frame] | Sequence[Frame]
 
@@ -116,6 +114,7 @@ def observe(
     Raises:
         BadFrameError: The frame that ended it.
         ValueError: Not a single frame could be used.
+        TypeError: Several processes make the frames, which do not say of which worlds they are; see `worlds_of`.
         ChildProcessError: A worker was killed.
         KeyboardInterrupt: Ctrl-C.
 
@@ -138,14 +137,17 @@ def observe(
     most = len(frames) if steps is None else min(steps, len(frames))  # type: ignore[arg-type]  # map-style: has one
     if journal:
         journal.restore(run)
-    todo = _left(_share(frames, range(most), ranks), run, skip_bad_frames=skip_bad_frames)
+    world_of = int if workers < 2 and ranks is None else worlds_of(frames)
+    todo = iter(range(most)) if ranks is None else ranks.share(range(most), world_of)
+    todo = _left(todo, run, skip_bad_frames=skip_bad_frames)
     start = time.perf_counter() - run.seconds
     consistent = True  # all observers and the rule know of the same frames
     run.reached = until is not None and run.steps > 0 and until.is_reached(run.steps)
     share = most if ranks is None else -(-most // ranks.size)
     try:
         with _threads_beside(workers), progress_of(share, title, done=run.steps, shown=progress) as bar:
-            for frame in _each(frames, () if run.reached else todo, workers, run, skip_bad_frames=skip_bad_frames):
+            tasks = made_together(() if run.reached else todo, world_of if workers > 1 else int)
+            for frame in _each(frames, tasks, workers, run, skip_bad_frames=skip_bad_frames):
                 if ranks:
                     ranks.check_others()
                 with held_back():
@@ -205,12 +207,6 @@ def _feed(frame: Frame, observers: Sequence[AnyObserver], run: Run) -> None:
     run.steps += 1
 
 
-def _share(frames: Frames, indices: range, ranks: Ranks | None) -> Iterator[int]:
-    if ranks is None:
-        return iter(indices)
-    return ranks.share(indices, _worlds(frames) or int)
-
-
 def _left(indices: Iterator[int], run: Run, *, skip_bad_frames: bool) -> Iterator[int]:
     """What a checkpoint has left to do."""
     done = run.steps + len(run.skipped)
@@ -224,25 +220,13 @@ def _left(indices: Iterator[int], run: Run, *, skip_bad_frames: bool) -> Iterato
     return indices
 
 
-def _worlds(frames: Frames) -> Callable[[int], int] | None:
-    """Which world a frame is of, where there are several: each is built for its own frames."""
-    if not isinstance(frames, SimulatedFrames) or frames.scenario.repeats:
-        return None
-    return frames.simulator.run_of
-
-
-def made_together(frames: Frames, indices: Iterable[int], workers: int) -> Iterator[list[int]]:
+def made_together(indices: Iterable[int], world_of: Callable[[int], int]) -> Iterator[list[int]]:
     """Which frames a worker makes in a row: those of one world, so that only one worker builds it.
 
     Args:
-        frames: Where they come from.
-        indices: Which of them, in order.
-        workers: Processes that make them.
+        indices: All frames, in order.
+        world_of: Which world a frame is of.
     """
-    world_of = _worlds(frames)
-    if workers < 2 or world_of is None:
-        yield from ([index] for index in indices)
-        return
     for _, of_world in groupby(indices, world_of):
         while together := list(islice(of_world, MOST_TOGETHER)):
             yield together
@@ -266,11 +250,13 @@ class _FramesOrErrors(Dataset[Frame | ValueError]):
             return copy
 
 
-def _each(frames: Frames, indices: Iterable[int], workers: int, run: Run, *, skip_bad_frames: bool) -> Iterator[Frame]:
+def _each(
+    frames: Frames, tasks: Iterable[list[int]], workers: int, run: Run, *, skip_bad_frames: bool
+) -> Iterator[Frame]:
     """One frame at a time; notes bad ones if they are to be skipped."""
     loader = DataLoader(
         _FramesOrErrors(frames),
-        batch_sampler=made_together(frames, indices, workers),
+        batch_sampler=tasks,
         collate_fn=list,
         num_workers=workers,
         prefetch_factor=1 if workers else None,  # what is made ahead waits in shared memory

@@ -1,24 +1,20 @@
 """What metrics say of several sensor placements, on the same frames, and what they would have said in other worlds."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from torchcover.coverage import Coverage, Region
-from torchcover.coverage.measures import Measure, area_in_blocks
+from torchcover.coverage.measures import Measure
+from torchcover.estimation import Quantity
 from torchcover.evaluation.evaluating import evaluate
-from torchcover.evaluation.other_metrics import drawn_worlds
 from torchcover.evaluation.task import AnyRig, loaded
-from torchcover.published import PUBLISHED, Candidate
-from torchcover.published.baselines import mean_height_m, rays
-from torchcover.published.comparison import Series
-from torchcover.published.ranks import LEAST, Array
-from torchcover.simulation import RegionsOfInterest, Scenario
+from torchcover.published import PUBLISHED, Ranking
+from torchcover.published.ranks import BASELINE, LEAST, OWN, rankings
+from torchcover.simulation import RegionsOfInterest, Rig, Scenario
 
 THRESHOLD_M = 0.4
 CELL_M = 1.0
@@ -43,21 +39,18 @@ class PlacementScores:
 
     Args:
         rigs: Names of the placements.
-        candidates: A row for each metric, with values in the order of `rigs`.
+        rankings: A row for each metric, with numbers in the order of `rigs`.
         steps: Steps that they were measured in.
     """
 
     rigs: tuple[str, ...]
-    candidates: tuple[Candidate, ...]
+    rankings: tuple[Ranking, ...]
     steps: int
 
-    def of(self, rigs: Sequence[str]) -> tuple[Candidate, ...]:
+    def of(self, rigs: Sequence[str]) -> tuple[Ranking, ...]:
         """The rows of some of the placements, in another order."""
-        at = [self.rigs.index(rig) for rig in rigs]
-        return tuple(
-            Candidate(one.name, one.kind, one.values[at], None if one.draws is None else one.draws[:, at])
-            for one in self.candidates
-        )
+        places = [self.rigs.index(rig) for rig in rigs]
+        return tuple(one.of(places) for one in self.rankings)
 
 
 def score_placements(
@@ -96,7 +89,7 @@ def score_placements(
     Example:
         >>> rigs = {name: f"place3d2024_{name}" for name in ("center", "line", "pyramid")}
         >>> scores = score_placements(rigs, "courtyard", metrics=["point_density"], steps=1)
-        >>> [one.values.tolist() for one in scores.candidates if one.kind == "baseline"][1:]
+        >>> [one.gains.tolist() for one in scores.rankings if one.metric == "baseline"][1:]
         [[2.5, 2.2, 2.35], [16000.0, 16000.0, 16000.0]]
     """
     if len(rigs) < LEAST:
@@ -120,11 +113,11 @@ def score_placements(
     assert result.metrics is not None  # some were asked for
     return PlacementScores(
         rigs=tuple(rigs),
-        candidates=(
+        rankings=(
             *_own([result.coverages[rig] for rig in rigs], region, seed),
-            *_of_others(result.metrics.series),
-            Candidate("mean mounting height", "baseline", np.array([mean_height_m(rig) for rig in carried.values()])),
-            Candidate("rays", "baseline", np.array([float(rays(rig)) for rig in carried.values()])),
+            *_of_others(result.metrics.rankings),
+            _of_rigs("mean mounting height", "m", map(_mean_height_m, carried.values())),
+            _of_rigs("rays", "rays", map(_rays, carried.values())),
         ),
         steps=steps,
     )
@@ -138,44 +131,37 @@ def _around(region: Region) -> RegionsOfInterest:
     return RegionsOfInterest.model_validate({"regions": {region.name: where}, "grid": grid})
 
 
-def _own(coverages: Sequence[Coverage], region: Region, seed: int) -> Iterator[Candidate]:
+def _own(coverages: Sequence[Coverage], region: Region, seed: int) -> Iterator[Ranking]:
     """Our own: detection over the visible surface and over the known cells, for each band and both."""
-    weights = drawn_worlds(coverages[0], seed)
     for measure, words in MEASURES.items():
-        each = {
-            band: np.stack([_detection(one, region, band, measure, weights) for one in coverages])
-            for band in coverages[0].grid.heights
-        }
-        for name, found in {**each, "both bands": np.mean(list(each.values()), axis=0)}.items():
-            label = f"detection {THRESHOLD_M:g} m, {name}, {region.name}, {words}"
-            yield Candidate(label, "coverage", found[:, 0], None if weights is None else found[:, 1:].T)
+        name, bands = f"detection {THRESHOLD_M:g} m, {{}}, {region.name}, {words}", []
+        for band in coverages[0].grid.heights:
+            estimates = [coverage.estimate(region, band, measure)[1:] for coverage in coverages]
+            numbers = [list(estimate.numbers(intervals=measure == "area").values()) for estimate in estimates]
+            (one,) = rankings(OWN, numbers, estimates, seed)
+            bands.append(one._replace(name=name.format(band)))
+        yield from bands
+        both = np.mean([one.gains for one in bands], axis=0)
+        draws = [one.draws for one in bands if one.draws is not None]
+        again = np.asarray(np.mean(draws, axis=0)) if len(draws) == len(bands) else None
+        yield Ranking.of_values(bands[0].quantity, both, OWN, again)._replace(name=name.format("both bands"))
 
 
-def _detection(coverage: Coverage, region: Region, band: str, measure: Measure, weights: Tensor | None) -> Array:
-    """(1 + R,) the number itself, then that of each draw of worlds."""
-    blocks, area = coverage.blocks, coverage.area
-    assert blocks is not None  # `compare` keeps both
-    assert area is not None
-    once = torch.ones(1, len(blocks.steps), dtype=torch.float64)
-    drawn = once if weights is None else torch.cat([once, weights])
-    number, cells = list(coverage.grid.heights).index(band), region.mask(coverage.grid)
-    if measure == "area":
-        m2, _, detected = area_in_blocks(area, number, cells).T
-        return np.asarray((drawn @ detected) / (drawn @ m2))
-    in_band = torch.zeros(coverage.grid.shape, dtype=torch.bool)
-    in_band[number] = cells
-    steps, (_, sums) = blocks.spread_over(in_band)
-    probed = drawn @ steps.double()
-    known = probed > 0
-    means = (drawn @ sums.double()) / probed.where(known, 1.0)
-    return np.asarray(means.sum(dim=1) / known.sum(dim=1))
-
-
-def _of_others(series: Sequence[Series]) -> Iterator[Candidate]:
-    for one in series:
-        number = one.any_number
-        if number.is_part and number.name.split(":")[1] not in CATEGORIES:
+def _of_others(published: Sequence[Ranking]) -> Iterator[Ranking]:
+    for one in published:
+        if one.is_part and one.name.split(":")[1] not in CATEGORIES:
             continue
-        name = number.name if number.higher_is_better else f"{number.name} (less is better)"
-        draws = None if one.draws is None else one.sign * one.draws
-        yield Candidate(name, "baseline" if number.name == POINTS else "published", one.sign * one.values, draws)
+        name = f"{one.name} (less is better)" if one.quantity.lower_is_better else one.name
+        yield one._replace(name=name, metric=BASELINE if one.name == POINTS else one.metric)
+
+
+def _of_rigs(words: str, unit: str, values: Iterable[float]) -> Ranking:
+    return Ranking.of_values(Quantity(words, words, unit, lower_is_better=False), list(values))
+
+
+def _mean_height_m(rig: Rig) -> float:
+    return round(sum(sensor.mount.z_m for sensor in rig.sensors) / len(rig.sensors), 6)
+
+
+def _rays(rig: Rig) -> float:
+    return float(sum(sensor.rays for sensor in rig.sensors))

@@ -103,7 +103,7 @@ class Ranks:
 
     @contextmanager
     def connected(self) -> Iterator[None]:
-        """Where ranks `gather` and `merge`; elsewhere nobody knows of them, such as a metric that would add them up.
+        """Where ranks `gather` and `merge`; elsewhere other code, such as a metric that adds up, does not know of them.
 
         Raises:
             ChildProcessError: Another rank cannot go on.

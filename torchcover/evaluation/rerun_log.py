@@ -148,7 +148,7 @@ def log_sensors(stream: Any, rig: str, sensors: Sequence[Sensor]) -> None:  # no
     """Where sensors are, and the edges of what they see."""
     import rerun as rr
 
-    from torchcover.evaluation.sensor_drawings import sensor_views
+    from torchcover.evaluation.result_page import sensor_views
 
     for view in sensor_views(sensors):
         stream.log([rig, "sensors", view.name], rr.LineStrips3D(frustum(view)), static=True)

@@ -12,17 +12,32 @@ from numpy.typing import NDArray
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
 from torchcover.estimation import MIN_BLOCKS
-from torchcover.evaluation.interrupt import held_back
-from torchcover.evaluation.omissions import Omission
 from torchcover.evaluation.pipeline import Run
+from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_files import ResultFiles
-from torchcover.evaluation.result_page import page_of
-from torchcover.evaluation.sensor_drawings import sensor_views
-from torchcover.evaluation.target_error import TargetError
-from torchcover.evaluation.target_outcome import outcome
-from torchcover.published.comparison import MetricComparison
-from torchcover.published.tables import numbers_csv, record, tau_csv
-from torchcover.report import RENDERERS, CoverageTable, file_stems, map_figures, page_html, table_dict
+from torchcover.evaluation.result_page import (
+    Omission,
+    facts_of,
+    left_out_table,
+    page_tables,
+    region_line,
+    rig_document,
+    sensor_views,
+)
+from torchcover.evaluation.target_error import TargetError, outcome
+from torchcover.published.comparison import MetricComparison, numbers_csv, record, tau_csv
+from torchcover.published.comparison import page_tables as metric_tables
+from torchcover.report import (
+    RENDERERS,
+    CoverageTable,
+    Page,
+    PageRig,
+    file_stems,
+    map_figures,
+    maps_of,
+    page_html,
+    table_dict,
+)
 from torchcover.simulation import Sensor
 
 # Where more places of the reference sensor are refused, something is wrong with the scene.
@@ -38,11 +53,11 @@ class Result:
     Args:
         coverages: By the name of the rig; the others are compared with the first.
         regions: Those that numbers are given for.
-        run: How the run went; None if nobody knows, for they were saved.
-        rigs: What the user called each rig, by its name; None for the rig of a recording that nobody named.
+        run: How the run went; None if unknown, for they were saved.
+        rigs: What the user called each rig, by its name; None for the rig of a recording that was not named.
         source: Where the frames came from: `scenario`, `vehicle`, `frames`, `seed`.
-        reference_record: Where the reference comes from, as `FrameSource.reference_record` says; None if nobody knows.
-        device: Where it ran; None if nobody knows.
+        reference_record: Where the reference comes from, as `FrameSource.reference_record` says; None if unknown.
+        device: Where it ran; None if unknown.
         target_error: What was aimed at.
         awaited: The regions that it was about.
         sensors: The sensors of the rigs that they are known of, for the maps.
@@ -109,7 +124,7 @@ class Result:
 
     @property
     def record(self) -> dict[str, Any]:
-        """Everything but the maps: what stands in `summary.json`; what nobody knows is None."""
+        """Everything but the maps: what stands in `summary.json`; what is unknown is None."""
         rigs = {"rigs": dict(self.rigs)} if self.is_comparison else {"rig": next(iter(self.rigs.values()))}
         return {
             **rigs,
@@ -123,6 +138,24 @@ class Result:
             **table_dict(self.table),
             **({} if self.metrics is None else {"metrics": record(self.metrics)}),
         }
+
+    @property
+    def page(self) -> Page:
+        """All that it knows, on one page: tables, maps and rigs, under which settings, and where they come from."""
+        rigs = {name: self.sensors.get(name, ()) for name in self.coverages}
+        place = self.source.get("frames") or self.source.get("scenario") or "runs that were saved"
+        where = f"{place}, on {self.vehicle}" if self.vehicle else place
+        return Page(
+            title=" against ".join(rigs) if len(rigs) == 2 else ", ".join(rigs),
+            lead=f"Blind spots and coverage in {where}, measured by torchcover.",
+            tables=[*page_tables(self.table), *(metric_tables(self.metrics) if self.metrics else [])],
+            maps=list(maps_of(self.coverages)),
+            rigs=[PageRig(name, sensor_views(of), rig_document(name, of)) for name, of in rigs.items()],
+            ego_outline_m=self.ego_outline_m,
+            outlines=[region_line(region) for region in self.regions],
+            facts=facts_of(self.record, self.rigs, self._first.counts["steps"]),
+            more_tables=[left_out_table(self.left_out)] if self.left_out else [],
+        )
 
     def maps(self, *, errors: bool = False) -> Iterator[tuple[str, Figure]]:
         """Draw the maps, one by one; several rigs side by side, and their differences to the first.
@@ -173,7 +206,7 @@ class Result:
                     files.add("metrics_tau.csv", partial(_write, tau_csv(self.metrics)))
                 summary = self.record
                 files.publish(summary)
-            files.add("report.html", partial(_write, page_html(page_of(self))))
+            files.add("report.html", partial(_write, page_html(self.page)))
             for stem, figure in self.maps(errors=error_maps):
                 files.add(f"maps/{stem}.png", partial(_draw, figure))
             files.publish(summary)

@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from filelock import FileLock, Timeout
 
-from torchcover.evaluation.interrupt import held_back
+from torchcover.evaluation.progress import held_back
 
 # Written last, and taken away first: without it the folder is not complete.
 SUMMARY = "summary.json"

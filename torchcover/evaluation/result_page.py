@@ -1,46 +1,86 @@
-"""The page of a result: its tables, maps and rigs, under which settings, and where they come from."""
+"""The parts of the page of a result: tables, rigs as they are drawn and written, settings, what was left out."""
 
 import platform
+import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
-from torchcover.coverage import Region
-from torchcover.evaluation.omissions import Omission
-from torchcover.evaluation.sensor_drawings import sensor_views
+from torchcover.coverage import AGGREGATIONS, Aggregation, Coverage, Region
 from torchcover.files import as_yaml
-from torchcover.published.tables import page_tables as metric_tables
-from torchcover.report import BOLD_MARKS, PLACE_HEADINGS, Line, Page, PageRig, PageTable, Words, maps_of, parts_of
+from torchcover.report import BOLD_MARKS, PLACE_HEADINGS, Line, PageTable, SensorView, Words, parts_of
 from torchcover.report.remarks import marks_on, notes_on
 from torchcover.report.table import CoverageTable
-from torchcover.simulation import Sensor
+from torchcover.simulation import CameraSensor, Sensor, vertical_fov_deg
 
-if TYPE_CHECKING:
-    from torchcover.evaluation.result import Result
-
-# What decides about the numbers, beside this package.
+# What decides about the numbers, with this package.
 PACKAGES = ("torch", "numpy", "embreex", "trimesh", "pykdtree", "kornia")
 OF_THE_RUN = ("torchcover", "seconds", "complete", "device", "skipped_frames")
 ELSEWHERE = ("rows", "metrics", "counts", "frame_counts", "left_out", "rig", "rigs")
+# What it is, how often it was left out, and of how many; the counts are those of the frames, added up.
+COUNTED = (
+    ("moving bodies out of every sensor's range: not placed", "moving_bodies_out_of_range", "moving_bodies"),
+    ("pairs of a ray and a moving body that cannot meet: not cast", "ray_body_pairs_left_out", "ray_body_pairs"),
+    ("rays of sensors where nothing moves: cast once, for all steps", "sensor_rays_reused", "sensor_rays"),
+    ("rays that end on the ego itself: known from the first scan", "sensor_self_hits_reused", "sensor_self_hits"),
+)
+# Packages that take long to import, and what would have needed them; not all lenses with distortion need kornia, but
+# where there is one, nobody is to think that its distortion was left out.
+HEAVY = {"kornia": "lenses with distortion", "lightning": "training", "lzf": "compressed PCD files"}
 
 
-def page_of(result: "Result") -> Page:
-    """All that a result knows, on one page."""
-    rigs = list(result.coverages)
-    return Page(
-        title=" against ".join(rigs) if len(rigs) == 2 else ", ".join(rigs),
-        lead=f"Blind spots and coverage in {_place(result)}, measured by torchcover.",
-        tables=[*page_tables(result.table), *(metric_tables(result.metrics) if result.metrics else [])],
-        maps=list(maps_of(result.coverages)),
-        rigs=[_rig(name, result.sensors.get(name, ())) for name in rigs],
-        ego_outline_m=result.ego_outline_m,
-        outlines=[Line(region.name, _corners(region)) for region in result.regions],
-        facts=_facts(result),
-        more_tables=[_left_out(result.left_out)] if result.left_out else [],
-    )
+@dataclass(frozen=True)
+class Omission:
+    """Something that a run left out.
+
+    Args:
+        what: What it is, and why it could be left out.
+        count: How often; None where there is nothing to count.
+        of: Of how many; likewise.
+    """
+
+    what: str
+    count: int | None = None
+    of: int | None = None
+
+
+def left_out(
+    frame_counts: Mapping[str, int],
+    coverages: Sequence[Coverage],
+    aggregations: Sequence[Aggregation] = (),
+    sensors: Sequence[Sensor] = (),
+    *,
+    workers: int = 0,
+) -> list[Omission]:
+    """List what was left out of a run, at its end: later, other modules may have been imported for other reasons.
+
+    Args:
+        frame_counts: Sums of `Frame.counts`.
+        coverages: What the metrics gave, one for each rig.
+        aggregations: Those that were asked for.
+        sensors: Those that are known of all rigs.
+        workers: Processes that made the frames. What they have imported is unknown.
+    """
+    found = [
+        Omission(what, frame_counts[count], frame_counts[of]) for what, count, of in COUNTED if frame_counts.get(count)
+    ]
+    outside = sum(coverage.counts["outside_points"] for coverage in coverages)
+    inside = sum(coverage.counts["inside_points"] for coverage in coverages)
+    if outside:
+        found.append(Omission("reference points outside every cell: not searched for", outside, inside + outside))
+    asked_for = {aggregation.name for aggregation in aggregations}
+    others = [aggregation.words for aggregation in AGGREGATIONS if aggregation.name not in asked_for]
+    if others:
+        found.append(Omission(f"{', '.join(others)}: not asked for, not kept"))
+    used = set(HEAVY) if workers else set(sys.modules)
+    if any(isinstance(sensor, CameraSensor) and sensor.lens != "pinhole" for sensor in sensors):
+        used.add("kornia")
+    unused = [package for package in HEAVY if package not in used]
+    return found + [Omission(f"{package}, for {HEAVY[package]}: not imported") for package in unused]
 
 
 def page_tables(table: CoverageTable) -> list[PageTable]:
@@ -51,6 +91,34 @@ def page_tables(table: CoverageTable) -> list[PageTable]:
     return [*parts[:-1], PageTable(last.title, last.headings, last.rows, last.words_first, [*marks, *notes_on(table)])]
 
 
+def sensor_views(sensors: Sequence[Sensor]) -> list[SensorView]:
+    """Where sensors are and what they see."""
+    return [
+        SensorView(
+            name=sensor.name,
+            vehicle_T_sensor=sensor.mount.matrix(),
+            horizontal_fov_deg=sensor.horizontal_fov_deg,
+            vertical_fov_deg=vertical_fov_deg(sensor),
+            range_m=sensor.max_range_m,
+        )
+        for sensor in sensors
+    ]
+
+
+def check_drawable(sensors: Sequence[Sensor]) -> None:
+    """Find out before a run, not after it, whether its maps can show the sensors.
+
+    Raises:
+        ValueError: A sensor none of whose rays in the middle row is one, so that it is unknown how wide it sees.
+    """
+    for sensor in sensors:
+        if not 0 < sensor.horizontal_fov_deg <= 360:
+            raise ValueError(
+                f"sensor {sensor.name!r}: its rays span {sensor.horizontal_fov_deg:g} degrees in the middle row; above "
+                "0 are needed, so check its lens and its principal point"
+            )
+
+
 def rig_document(name: str, sensors: Sequence[Sensor]) -> str:
     """A rig as YAML that `Rig.load` reads; empty if its sensors are not known, or are not of ours."""
     known = [sensor.model_dump(mode="json", exclude_unset=True) for sensor in sensors if isinstance(sensor, BaseModel)]
@@ -59,13 +127,9 @@ def rig_document(name: str, sensors: Sequence[Sensor]) -> str:
     return as_yaml({"name": name, "sensors": known})
 
 
-def _rig(name: str, sensors: Sequence[Sensor]) -> PageRig:
-    return PageRig(name, sensor_views(sensors), rig_document(name, sensors))
-
-
-def _place(result: "Result") -> str:
-    place = result.source.get("frames") or result.source.get("scenario")
-    return f"{place}, on {result.vehicle}" if result.vehicle else str(place or "runs that were saved")
+def region_line(region: Region) -> Line:
+    """Its outline on the maps."""
+    return Line(region.name, _corners(region))
 
 
 def _corners(region: Region) -> np.ndarray[Any, np.dtype[np.float64]]:
@@ -75,13 +139,18 @@ def _corners(region: Region) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.array([[left, low], [right, low], [right, high], [left, high]])
 
 
-def _facts(result: "Result") -> dict[str, dict[str, str]]:
-    record = result.record
+def facts_of(record: Mapping[str, Any], rigs: Mapping[str, str | None], steps: int) -> dict[str, dict[str, str]]:
+    """Under which settings, and how the run went.
+
+    Args:
+        record: What stands in `summary.json`.
+        rigs: What the user called each rig, by its name.
+        steps: Steps that were measured.
+    """
     settings = {name: value for name, value in record.items() if name not in (*OF_THE_RUN, *ELSEWHERE)}
-    steps = {"steps": next(iter(result.coverages.values())).counts["steps"]}
     run = {name: record[name] for name in OF_THE_RUN} | {"python": platform.python_version()} | _versions()
-    rigs = {f"rig {name}": str(given) for name, given in result.rigs.items() if given is not None}
-    return {"Settings": rigs | words_of(steps | settings), "Run": words_of(run)}
+    named = {f"rig {name}": str(given) for name, given in rigs.items() if given is not None}
+    return {"Settings": named | words_of({"steps": steps} | settings), "Run": words_of(run)}
 
 
 def _versions() -> dict[str, str]:
@@ -95,7 +164,7 @@ def _versions() -> dict[str, str]:
 
 
 def words_of(facts: Mapping[str, Any]) -> dict[str, str]:
-    """Facts of a record as a page says them; without those that nobody knows."""
+    """Facts of a record as a page says them; without those that are unknown."""
     return {name.replace("_", " "): _value(value) for name, value in facts.items() if value not in (None, [], {})}
 
 
@@ -113,7 +182,8 @@ def _value(value: object) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _left_out(omissions: Sequence[Omission]) -> PageTable:
+def left_out_table(omissions: Sequence[Omission]) -> PageTable:
+    """What a run left out."""
     rows = [tuple(map(Words, _omission(one))) for one in omissions]
     return PageTable("Left out, for this run did not need it", ("what", "count", "of", "share"), rows)
 

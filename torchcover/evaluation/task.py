@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings
-from torchcover.frames import BadFrameError, ChosenRigs, FrameSource
+from torchcover.frames import ChosenRigs, FrameSource
 from torchcover.recordings import RecordedFrames
-from torchcover.recordings.suspicion import suspicions
 from torchcover.simulation import (
     Asked,
     RegionsOfInterest,
@@ -56,32 +55,27 @@ class Task(NamedTuple, Generic[SourceT]):
         return tuple(self.given)
 
     def sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """Name of each rig -> names of its sensors, from the first frame that can be used.
+        """Name of each rig -> names of its sensors.
 
         Raises:
-            ValueError: It does not know which points are of which sensor, or no frame can be used.
+            ValueError: It is unknown which points are of which sensor.
         """
-        if isinstance(self.frames, SimulatedFrames):
-            return {name: [sensor.name for sensor in rig.sensors] for name, rig in self.frames.rigs.items()}
-        for index in range(len(self.frames)):
-            try:
-                frame = self.frames[index]
-            except BadFrameError:
-                continue  # the run itself skips it, or ends with it
-            return {name: list(frame.clouds_by_sensor(name)) for name in self.rigs}
-        raise ValueError("redundancy: no frame can be used")
+        known = self.frames.sensor_names
+        if unknown := [rig for rig in self.rigs if rig not in known]:
+            raise ValueError(f"redundancy: unknown which points of {', '.join(unknown)} are of which sensor")
+        return known
 
 
 def task_of(settings: Settings) -> Task[FrameSource]:
     """Simulate a scenario, or read a recording.
 
     Raises:
-        ValueError: No rig, a scenario beside a recording, settings for the other of the two, a rig that is not there.
+        ValueError: No rig, a scenario and a recording, settings for the other of the two, a rig that is not there.
         FileNotFoundError: An unknown name or file.
         TypeError: Frames that do not say whose they are.
 
     Warns:
-        UserWarning: A recording that looks wrong; see `torchcover.recordings.suspicion`.
+        UserWarning: What looks wrong; see `FrameSource.doubts`.
     """
     for rig in settings.rigs:
         if not isinstance(rig, Rig) and Path(rig).suffix == ".npz":
@@ -93,16 +87,14 @@ def task_of(settings: Settings) -> Task[FrameSource]:
         raise ValueError("scenario and frames exclude each other: simulate a scenario or read a recording")
     settings.check_recording()
     source = RecordedFrames(frames) if isinstance(frames, str | Path) else frames
-    if isinstance(source, RecordedFrames):
-        for doubt in suspicions(source, settings.steps):
-            warnings.warn(doubt, stacklevel=CALLER)
-    if not isinstance(source, FrameSource):
-        missing = [name for name in vars(FrameSource) if not name.startswith("_") and not hasattr(source, name)]
+    if missing := [name for name in vars(FrameSource) if not name.startswith("_") and not hasattr(source, name)]:
         raise TypeError(
             f"frames: a recording's path or a torchcover.data.FrameSource is needed; got {type(source).__name__}, "
             f"which has no {', '.join(missing)}; for a list of frames, or a dataset, feed observers: "
             "torchcover.evaluation.observe(frames, observers)"
         )
+    for doubt in source.doubts(settings.steps):
+        warnings.warn(doubt, stacklevel=CALLER)
     return _recording(source, settings)
 
 

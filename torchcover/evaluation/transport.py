@@ -15,7 +15,7 @@ MIN_ZEROS = 0.5
 _WORDS = {1: np.uint8, 2: np.uint16, 4: np.uint32, 8: np.uint64}
 
 
-class Words(NamedTuple):
+class Bits(NamedTuple):
     """The bits of an array.
 
     Args:
@@ -27,7 +27,7 @@ class Words(NamedTuple):
     at: NDArray[Any] | None
 
 
-def words_of(array: NDArray[Any]) -> Words:
+def words_of(array: NDArray[Any]) -> Bits:
     """The bits of an array of real numbers or truth values.
 
     Example:
@@ -36,12 +36,12 @@ def words_of(array: NDArray[Any]) -> Words:
     """
     words = np.ascontiguousarray(array).view(_WORDS[array.itemsize]).reshape(-1)
     if words.size - np.count_nonzero(words) < MIN_ZEROS * words.size:
-        return Words(words, None)
+        return Bits(words, None)
     at = np.flatnonzero(words)
-    return Words(words[at], at.astype(np.uint32 if words.size < 2**32 else np.uint64))
+    return Bits(words[at], at.astype(np.uint32 if words.size < 2**32 else np.uint64))
 
 
-def spread(words: Words, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+def spread(words: Bits, dtype: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     """The array again.
 
     Raises:
@@ -84,5 +84,5 @@ class _Pickler(pickle.Pickler):
         return NotImplemented
 
 
-def _tensor(words: Words, dtype: str, shape: tuple[int, ...]) -> Tensor:
+def _tensor(words: Bits, dtype: str, shape: tuple[int, ...]) -> Tensor:
     return torch.from_numpy(spread(words, np.dtype(dtype), shape))

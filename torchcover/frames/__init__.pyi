@@ -9,3 +9,4 @@ from .source import BadFrameError as BadFrameError
 from .source import ChosenRigs as ChosenRigs
 from .source import FrameDataset as FrameDataset
 from .source import FrameSource as FrameSource
+from .source import worlds_of as worlds_of

@@ -27,8 +27,8 @@ class Frame:
         boxes: The objects of that instant; None if they are unknown, which is not the same as none being there.
         sensor_points: Name of each rig -> name of each of its sensors -> how many of the rig's points are its own, in
             their order; None if it is unknown which points are whose.
-        instant: Number in time of what it shows, for standard errors: frames that share it, as of an instant that is
-            seen again or of one city, do not count as independent. None: `index`, every frame is its own.
+        place_in_time: Number of what it shows, for standard errors: frames that share it, as of an instant that is
+            seen again or of one city, do not count as independent. Not given: `index`, every frame is its own.
     """
 
     clouds: Mapping[str, Tensor]
@@ -38,14 +38,13 @@ class Frame:
     counts: Mapping[str, int] = field(default_factory=dict)
     reference_weights: Tensor | None = None
     boxes: Boxes | None = None
-    instant: int | None = None
+    place_in_time: int = None  # type: ignore[assignment]  # filled in at once
     sensor_points: Mapping[str, Mapping[str, int]] | None = None
     reference_heights_m: Tensor | None = None
 
-    @property
-    def place_in_time(self) -> int:
-        """Number of what it shows; `CoverageMetric.update` takes it as `index`."""
-        return self.index if self.instant is None else self.instant
+    def __post_init__(self) -> None:
+        if self.place_in_time is None:
+            object.__setattr__(self, "place_in_time", self.index)
 
     @property
     def sensor(self) -> Tensor:
@@ -110,7 +109,7 @@ class Frame:
 class FrameBatch:
     """Frames side by side, as `CoverageMetric.update` takes them.
 
-    `metric.update(batch.sensor, batch.reference, weights=batch.weights, index=batch.index)`.
+    `metric.update(batch.sensor, batch.reference, weights=batch.weights, place_in_time=batch.place_in_time)`.
 
     Args:
         frames: The frames in order.
@@ -165,8 +164,8 @@ class FrameBatch:
         return given or None
 
     @property
-    def index(self) -> list[int]:
-        """The place in time of each frame."""
+    def place_in_time(self) -> list[int]:
+        """That of each frame."""
         return [frame.place_in_time for frame in self.frames]
 
     @property

@@ -2,7 +2,7 @@
 
 import re
 from abc import abstractmethod
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol, TypeVar, runtime_checkable
 
@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 from torchcover.frames.frame import Frame
 
 if TYPE_CHECKING:  # what they are is no matter of frames; who draws or measures them knows
-    from torchcover.simulation import Sensor
+    from torchcover.simulation import Mesh, Sensor
 
 ValueT = TypeVar("ValueT")
 
@@ -59,6 +59,11 @@ class FrameSource(Protocol):
         ...
 
     @property
+    def sensor_names(self) -> Mapping[str, Sequence[str]]:
+        """The names of the sensors of those rigs whose `Frame.sensor_points` says which points are of which sensor."""
+        ...
+
+    @property
     def ego_outline_m(self) -> NDArray[np.float64] | None:
         """(K, 2) corners x, y of the ego in the vehicle frame in metres; None if unknown."""
         ...
@@ -90,6 +95,25 @@ class FrameSource(Protocol):
         """
         ...
 
+    def world_of(self, index: int, /) -> int:
+        """Which world a frame is of, by any number: frames of one are made by one process, which builds it once.
+
+        The index itself where nothing has to be built, so that any process may make any frame.
+        """
+        ...
+
+    def has_boxes(self) -> bool:
+        """Whether frames have `Frame.boxes`."""
+        ...
+
+    def ego_mesh(self) -> "Mesh | None":
+        """The body of the ego in the vehicle frame; None if unknown."""
+        ...
+
+    def doubts(self, steps: int | None, /) -> Sequence[str]:
+        """What looks wrong about so many frames (None: all), a sentence each: warnings before they are measured."""
+        ...
+
     def __len__(self) -> int:
         """Number of frames."""
         ...
@@ -103,8 +127,54 @@ class FrameSource(Protocol):
         ...
 
 
+def worlds_of(frames: object) -> Callable[[int], int]:
+    """`FrameSource.world_of` of any map-style dataset or list of frames.
+
+    A list holds what was made before; a torch `Subset` has the worlds of what it is of.
+
+    Raises:
+        TypeError: A dataset that does not say which world a frame is of.
+
+    Example:
+        >>> worlds_of(["a frame", "another one"])(1)
+        1
+    """
+    if hasattr(frames, "world_of"):
+        known: Callable[[int], int] = frames.world_of
+        return known
+    if isinstance(frames, Sequence):
+        return int
+    if hasattr(frames, "dataset") and hasattr(frames, "indices"):
+        whole, indices = worlds_of(frames.dataset), frames.indices
+        return lambda index: whole(indices[index])
+    raise TypeError(
+        f"frames: {type(frames).__name__} does not say which world a frame is of, so that each process would build "
+        "every world; give it world_of(index), see FrameSource, or use a single process"
+    )
+
+
 class FrameDataset(Dataset[Frame]):
-    """A map-style torch Dataset of frames that a `for` loop goes through in order."""
+    """A map-style torch Dataset of frames that a `for` loop goes through in order.
+
+    A `FrameSource` that is one of these has to say of the rest of itself only what there is to say.
+    """
+
+    @property
+    def sensor_names(self) -> Mapping[str, Sequence[str]]:
+        """Nothing: which points are of which sensor is unknown."""
+        return {}
+
+    def has_boxes(self) -> bool:
+        """None of them."""
+        return False
+
+    def ego_mesh(self) -> "Mesh | None":
+        """Unknown."""
+        return None
+
+    def doubts(self, steps: int | None) -> Sequence[str]:
+        """None."""
+        return ()
 
     @abstractmethod
     def __len__(self) -> int:
@@ -144,9 +214,30 @@ class ChosenRigs(FrameDataset):
         return self._chosen(self.frames.sensors)
 
     @property
+    def sensor_names(self) -> Mapping[str, Sequence[str]]:
+        """Those of these rigs, as far as they are known."""
+        return self._chosen(self.frames.sensor_names)
+
+    @property
     def ego_outline_m(self) -> NDArray[np.float64] | None:
         """As there."""
         return self.frames.ego_outline_m
+
+    def world_of(self, index: int) -> int:
+        """As there."""
+        return self.frames.world_of(index)
+
+    def has_boxes(self) -> bool:
+        """As there."""
+        return self.frames.has_boxes()
+
+    def ego_mesh(self) -> "Mesh | None":
+        """As there."""
+        return self.frames.ego_mesh()
+
+    def doubts(self, steps: int | None) -> Sequence[str]:
+        """As there."""
+        return self.frames.doubts(steps)
 
     @property
     def description(self) -> Mapping[str, object]:

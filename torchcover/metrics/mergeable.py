@@ -3,14 +3,20 @@
 import hashlib
 import math
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities.distributed import gather_all_tensors
 
-from torchcover.metrics.table import filled, joined
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# What fills a table up to the length of another one; no row holds it.
+FILLER = math.inf
 
 
 class MergeableMetric(Metric):
@@ -209,3 +215,41 @@ class MergeableMetric(Metric):
 
         super()._apply(moved, *args, **kwargs)
         return self
+
+
+def with_rows(table: Tensor, rows: Tensor) -> Tensor:
+    """A table with some more rows, in ascending order: by the first column, then by the second, and so on.
+
+    Args:
+        table: (K, C) float64 finite rows in that order.
+        rows: (N, C) more of them, in any order.
+
+    Example:
+        >>> with_rows(torch.tensor([[1.0, 5.0]]), torch.tensor([[1.0, 3.0], [0.0, 9.0]])).tolist()
+        [[0.0, 9.0], [1.0, 3.0], [1.0, 5.0]]
+    """
+    both = torch.cat([table, rows.to(table)])
+    order = np.lexsort(both.cpu().numpy().T[::-1])
+    return both[torch.from_numpy(order).to(both.device)]
+
+
+def filled(table: Tensor, length: int) -> Tensor:
+    """The table, filled up to a length."""
+    return torch.nn.functional.pad(table, (0, 0, 0, length - len(table)), value=FILLER)
+
+
+def joined(tables: Tensor) -> Tensor:
+    """One table from several, (parts, K, C), that were filled up to the same length."""
+    rows = tables.flatten(0, 1)
+    return with_rows(rows[:0], rows[rows[:, 0] != FILLER])
+
+
+def figure_of(ax: "Axes | None") -> "tuple[Figure, Axes]":
+    """The axes that a metric was given and their figure, or new ones of pyplot's, as torchmetrics has it."""
+    if ax is None:
+        import matplotlib.pyplot as plt
+
+        return plt.subplots(layout="constrained")
+    figure = ax.get_figure(root=True)
+    assert figure is not None, "axes that were removed from their figure"
+    return figure, ax

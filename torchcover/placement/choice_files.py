@@ -8,7 +8,7 @@ from io import BytesIO
 from pathlib import Path
 
 from torchcover.evaluation import sensor_views
-from torchcover.evaluation.interrupt import held_back
+from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_files import ResultFiles
 from torchcover.evaluation.result_page import rig_document, words_of
 from torchcover.placement.choosing import SensorChoice

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.evaluation.interrupt import held_back
+from torchcover.evaluation.progress import held_back
 from torchcover.placement.bits import Bits
 from torchcover.placement.held_worlds import Look
 from torchcover.placement.objective import Objective

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from torchcover.evaluation.interrupt import held_back
+from torchcover.evaluation.progress import held_back
 from torchcover.evaluation.result_files import ResultFiles
 from torchcover.placement.evaluation import Evaluation
 from torchcover.placement.result import SearchResult

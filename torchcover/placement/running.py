@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchcover.evaluation import claimed
-from torchcover.evaluation.interrupt import held_back
-from torchcover.evaluation.progress import progress_of
+from torchcover.evaluation.progress import held_back, progress_of
 from torchcover.files import BadFileError
 from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
 from torchcover.placement.fresh import FreshTest, fresh_test

@@ -1,15 +1,26 @@
 """Whether metrics rank sensor placements as detectors do, and how much that can mean."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from itertools import combinations
+from pathlib import Path
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.published.ranks import Array, kendall_tau_b, permutation_p, spearman, strongest_by_chance
-from torchcover.published.results import Judged
+from torchcover.files import read_csv, reads
+from torchcover.published.ranks import (
+    BASELINE,
+    OWN,
+    Array,
+    Ranking,
+    kendall_tau_b,
+    permutation_p,
+    spearman,
+    strongest_by_chance,
+)
 
 # coverage: torchcover's own numbers; published: those of others; baseline: what takes no simulation to know, or little.
 Kind = Literal["coverage", "published", "baseline"]
@@ -17,23 +28,97 @@ Kind = Literal["coverage", "published", "baseline"]
 LEVELS = 0.025, 0.975
 # What the best of several metrics that mean nothing exceeds in one of twenty orders.
 BY_CHANCE = 0.95
+# Of a table of published results.
+COLUMNS = ("placement", "quantity", "model", "class")
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
-    """What a metric says of n placements.
+class Judged:
+    """What several judges, detectors or trainings of one, say of the same placements.
 
     Args:
-        name: The metric, with what decides it.
-        kind: Whose it is.
-        values: (n,), NaN where unknown; more is better, as its authors say it.
-        draws: (R, n) what it would have said of other worlds; None if nobody knows.
+        name: What they say: "car mAP".
+        placements: Names of the n placements.
+        judges: Names of the J judges.
+        values: (J, n) what each says of each; more is better.
+
+    Raises:
+        ValueError: Values of another shape, or that are not finite.
+
+    Example:
+        >>> judged = Judged("AP", ("a", "b", "c"), ("net", "other"), np.array([[1.0, 2.0, 3.0], [2.0, 1.0, 3.0]]))
+        >>> judged.mean.tolist(), judged.ceiling
+        ([1.5, 1.5, 3.0], 0.5)
     """
 
     name: str
-    kind: Kind
+    placements: tuple[str, ...]
+    judges: tuple[str, ...]
     values: Array
-    draws: Array | None = None
+
+    def __post_init__(self) -> None:
+        if self.values.shape != (len(self.judges), len(self.placements)) or not np.isfinite(self.values).all():
+            raise ValueError(
+                f"{self.name}: a finite number of each of {len(self.judges)} judges for each of "
+                f"{len(self.placements)} placements is needed; got {self.values.shape}"
+            )
+
+    @property
+    def mean(self) -> Array:
+        """(n,) mean over the judges."""
+        return np.asarray(self.values.mean(axis=0))
+
+    @property
+    def ceiling(self) -> float:
+        """Mean Spearman correlation of each two judges: what they agree on; NaN for a single one.
+
+        A metric cannot be expected to follow them more closely than they follow each other.
+        """
+        pairs = [spearman(self.values[a], self.values[b]) for a, b in combinations(range(len(self.judges)), 2)]
+        return float(np.mean(pairs)) if pairs else float("nan")
+
+    def of(self, placements: Sequence[str]) -> Self:
+        """Of some of the placements, in another order.
+
+        Raises:
+            ValueError: One that they say nothing of.
+        """
+        if missing := [name for name in placements if name not in self.placements]:
+            raise ValueError(f"{self.name}: nothing is known of {', '.join(missing)}")
+        columns = [self.placements.index(name) for name in placements]
+        return type(self)(self.name, tuple(placements), self.judges, self.values[:, columns])
+
+
+def kind_of(one: Ranking) -> Kind:
+    """Whose number it is."""
+    return "coverage" if one.metric == OWN else "baseline" if one.metric == BASELINE else "published"
+
+
+@reads("a table of published results")
+def read_results(path: Path) -> Mapping[tuple[str, str], Judged]:
+    """The results of a table in CSV with the columns placement, quantity, model, class and value.
+
+    Raises:
+        BadFileError: Not such a table, a number that is there twice or missing.
+    """
+    table = read_csv(path, numbers=("value",), words=COLUMNS)
+    found: dict[tuple[str, str], dict[tuple[str, str], float]] = {}
+    words = zip(*(table.words[column] for column in COLUMNS), strict=True)
+    for (placement, quantity, model, category), value in zip(words, table.numbers["value"].tolist(), strict=True):
+        of_kind = found.setdefault((quantity, category), {})
+        if (model, placement) in of_kind:
+            raise ValueError(f"{quantity} {category} of {model or 'no model'} on {placement} is there twice")
+        of_kind[model, placement] = value
+    return {key: _judged(" ".join(key).strip(), values) for key, values in found.items()}
+
+
+def _judged(name: str, values: Mapping[tuple[str, str], float]) -> Judged:
+    judges, placements = (tuple(dict.fromkeys(words)) for words in zip(*values, strict=True))
+    missing = [f"{judge} on {place}" for judge in judges for place in placements if (judge, place) not in values]
+    if missing:
+        raise ValueError(f"{name}: no value of {', '.join(missing)}")
+    array = np.array([[values[judge, place] for place in placements] for judge in judges])
+    return Judged(name, placements, judges, array)
 
 
 class Relation(NamedTuple):
@@ -67,7 +152,7 @@ class Ranked:
 
 @dataclass(frozen=True)
 class Agreement:
-    """How metrics rank placements, beside what judges say of them.
+    """How metrics rank placements, compared with what judges say of them.
 
     Args:
         judged: What the judges say.
@@ -90,7 +175,7 @@ class Agreement:
 
 
 def agreement_of(
-    candidates: Sequence[Candidate], judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
+    rankings: Sequence[Ranking], judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
 ) -> Agreement:
     """Rank placements by metrics, and compare with the mean of the judges.
 
@@ -98,9 +183,9 @@ def agreement_of(
     `draws`. The placements are the same in each draw, unless they too are a sample.
 
     Args:
-        candidates: What the metrics say of the placements of `judged`, in its order.
+        rankings: What the metrics say of the placements of `judged`, in its order.
         judged: What the judges say.
-        draws: How often; at most as many as the candidates have.
+        draws: How often; at most as many as the rankings have.
         seed: Of the draws.
         placements: Whether to draw placements, too.
 
@@ -108,32 +193,34 @@ def agreement_of(
         ValueError: A metric of another number of placements, or with fewer draws.
 
     Example:
+        >>> from torchcover.estimation import Quantity
         >>> judged = Judged("AP", tuple("abcd"), ("net", "other"), np.array([[1.0, 2, 3, 4], [1, 2, 4, 3]]))
-        >>> found = agreement_of([Candidate("height", "baseline", np.array([1.0, 2, 3, 3]))], judged, draws=100)
+        >>> height = Ranking.of_values(Quantity("height", "mean height", "m", lower_is_better=False), [1.0, 2, 3, 3])
+        >>> found = agreement_of([height], judged, draws=100)
         >>> round(found.ranked[0].spearman.value, 3), found.best, found.looked_at
         (1.0, 'height', 1)
     """
     count = len(judged.placements)
-    for one in candidates:
-        if one.values.shape != (count,) or (one.draws is not None and one.draws[:draws].shape != (draws, count)):
+    for one in rankings:
+        if len(one.numbers) != count or (one.draws is not None and one.draws[:draws].shape != (draws, count)):
             raise ValueError(f"{one.name}: a value of each of {count} placements is needed, and {draws} draws or none")
     truths, columns = _drawn(judged, draws, seed, placements=placements)
-    ranked = tuple(_ranked(one, judged.mean, truths, columns) for one in candidates)
+    ranked = tuple(_ranked(one, judged.mean, truths, columns) for one in rankings)
     strength = np.array([abs(row.spearman.value) for row in ranked])
     if np.isnan(strength).all():
         return Agreement(judged, ranked, None, math.nan, math.nan)
-    series = np.stack([one.values for one in candidates])
+    series = np.stack([one.gains for one in rankings])
     return Agreement(
         judged=judged,
         ranked=ranked,
-        best=candidates[int(np.nanargmax(strength))].name,
+        best=rankings[int(np.nanargmax(strength))].name,
         best_p=permutation_p(series, judged.mean),
         by_chance=float(np.quantile(strongest_by_chance(series, judged.mean), BY_CHANCE)),
     )
 
 
 def lead(
-    one: Candidate, other: Candidate, judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
+    one: Ranking, other: Ranking, judged: Judged, *, draws: int = 500, seed: int = 0, placements: bool = False
 ) -> Relation:
     """By how much Spearman's correlation of a metric is above that of another one, with its interval.
 
@@ -148,13 +235,15 @@ def lead(
         placements: Whether to draw placements, too.
 
     Example:
+        >>> from torchcover.estimation import Quantity
         >>> judged = Judged("AP", tuple("abcd"), ("net",), np.array([[1.0, 2, 3, 4]]))
-        >>> good, bad = (Candidate("", "published", np.array(values)) for values in ([1.0, 2, 3, 4], [4.0, 3, 2, 1]))
+        >>> height = Quantity("height", "mean height", "m", lower_is_better=False)
+        >>> good, bad = (Ranking.of_values(height, values) for values in ([1.0, 2, 3, 4], [4.0, 3, 2, 1]))
         >>> lead(good, bad, judged)
         Relation(value=2.0, low=2.0, high=2.0)
     """
     truths, columns = _drawn(judged, draws, seed, placements=placements)
-    found = [spearman(each.values, judged.mean) for each in (one, other)]
+    found = [spearman(each.gains, judged.mean) for each in (one, other)]
     drawn = [spearman(*_along(each, truths, columns)) for each in (one, other)]
     return _with_ends(float(found[0] - found[1]), drawn[0] - drawn[1])
 
@@ -167,18 +256,18 @@ def _drawn(judged: Judged, draws: int, seed: int, *, placements: bool) -> tuple[
     return judged.values[chosen].mean(axis=1), columns
 
 
-def _along(one: Candidate, truths: Array, columns: NDArray[np.int64]) -> tuple[Array, Array]:
+def _along(one: Ranking, truths: Array, columns: NDArray[np.int64]) -> tuple[Array, Array]:
     """(R, n) what a metric and the judges say in each draw."""
-    drawn = np.broadcast_to(one.values, truths.shape) if one.draws is None else one.draws[: len(truths)]
+    drawn = np.broadcast_to(one.gains, truths.shape) if one.drawn_gains is None else one.drawn_gains[: len(truths)]
     return np.take_along_axis(drawn, columns, axis=1), np.take_along_axis(truths, columns, axis=1)
 
 
-def _ranked(one: Candidate, truth: Array, truths: Array, columns: NDArray[np.int64]) -> Ranked:
+def _ranked(one: Ranking, truth: Array, truths: Array, columns: NDArray[np.int64]) -> Ranked:
     drawn = _along(one, truths, columns)
     rho, tau = (
-        _with_ends(float(statistic(one.values, truth)), statistic(*drawn)) for statistic in (spearman, kendall_tau_b)
+        _with_ends(float(statistic(one.gains, truth)), statistic(*drawn)) for statistic in (spearman, kendall_tau_b)
     )
-    return Ranked(one.name, one.kind, rho, tau, permutation_p(one.values, truth), one.draws is not None)
+    return Ranked(one.name, kind_of(one), rho, tau, permutation_p(one.gains, truth), one.draws is not None)
 
 
 def _with_ends(value: float, drawn: Array) -> Relation:

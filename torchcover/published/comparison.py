@@ -1,61 +1,30 @@
-"""Metrics side by side: which rig each thinks best, and how alike their orders are."""
+"""Metrics side by side: which rig each thinks best, how alike their orders are, and both in tables and files."""
 
+import csv
+import io
+import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
+from rich.table import Table
 
-from torchcover.published.number import PublishedNumber
-from torchcover.published.ranks import LEAST, Array, kendall_tau_b, midranks
+from torchcover.estimation import Number
+from torchcover.published.ranks import LEAST, Ranking, kendall_tau_b
 from torchcover.published.s_mig import unequal_rays
+from torchcover.report import PageTable, Words, json_record, number_words, shown_unit, text_table
 
-# The metric that numbers of torchcover itself are of.
-OWN = "torchcover"
+TITLE, TAU_TITLE = "Metrics of others", "Kendall's tau-b with torchcover's numbers, 95 % over worlds"
+
 INTERVAL = (0.025, 0.975)
 NOT_VALIDATED = "None of these metrics is validated; docs/metrics.md says what each is blind to."
 TOO_FEW = "Kendall's tau needs three rigs or more: two are in one order or in the other by chance; there are {}"
-
-
-class Series(NamedTuple):
-    """One number of every rig.
-
-    Args:
-        metric: The metric that it is of; `OWN` for a number of torchcover's table.
-        numbers: One for each rig; None of a rig that the metric could not be made for.
-        draws: (R, rigs) the numbers over worlds that were drawn again; None if nobody knows them.
-    """
-
-    metric: str
-    numbers: tuple[PublishedNumber | None, ...]
-    draws: Array | None = None
-
-    @property
-    def any_number(self) -> PublishedNumber:
-        """That of the first rig that has one."""
-        return next(number for number in self.numbers if number is not None)
-
-    @property
-    def name(self) -> str:
-        """Its name."""
-        return self.any_number.name
-
-    @property
-    def sign(self) -> int:
-        """1 where more is better, else -1."""
-        return 1 if self.any_number.higher_is_better else -1
-
-    @property
-    def values(self) -> Array:
-        """(rigs,) its values; NaN where unknown."""
-        return np.array([math.nan if number is None else number.value for number in self.numbers])
-
-    @property
-    def ranks(self) -> Array:
-        """(rigs,) 1 for the best; equal ones share the mean of theirs, NaN where unknown."""
-        return midranks(-self.sign * self.values)
+# Of a table with a row for each rig and number.
+COLUMNS = ("rig", "metric", "name", "value", "error", "low", "high", "unit", "lower_is_better", "count", "count_of",
+           "parameters", "warning", "rank")  # fmt: skip
 
 
 class Tau(NamedTuple):
@@ -74,24 +43,24 @@ class Tau(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MetricComparison:
-    """What metrics of others say of the rigs of a run, beside torchcover's own numbers.
+    """What metrics of others say of the rigs of a run, compared with torchcover's own numbers.
 
     Args:
         rigs: Their names.
-        series: The metrics' numbers.
+        rankings: The metrics' numbers.
         own: torchcover's numbers of regions that they are held against.
         left_out: Name of a metric that could not be made -> why.
     """
 
     rigs: tuple[str, ...]
-    series: Sequence[Series]
-    own: Sequence[Series] = ()
+    rankings: Sequence[Ranking]
+    own: Sequence[Ranking] = ()
     left_out: Mapping[str, str] | None = None
 
     @property
-    def main(self) -> list[Series]:
+    def main(self) -> list[Ranking]:
         """The numbers that are about everything, and not about a category or a region only."""
-        return [one for one in self.series if not one.any_number.is_part]
+        return [one for one in self.rankings if not one.is_part]
 
     def taus(self) -> list[Tau]:
         """Of all pairs of the main numbers and torchcover's own; none for fewer than three rigs."""
@@ -100,38 +69,131 @@ class MetricComparison:
         return [tau_of(first, second) for first, second in combinations([*self.main, *self.own], 2)]
 
     def rows(self) -> Iterator[dict[str, Any]]:
-        """A row for each rig and number, those of parts too; NaN where unknown."""
-        for one in (*self.series, *self.own):
+        """A row of `COLUMNS` for each rig and number, those of parts too; NaN where unknown."""
+        for one in (*self.rankings, *self.own):
             for rig, number, rank in zip(self.rigs, one.numbers, one.ranks.tolist(), strict=True):
-                if number is not None:
-                    yield {"rig": rig, "metric": one.metric, **number._asdict(), "rank": rank}
+                given = {**number.quantity._asdict(), **number._asdict(), "rig": rig, "rank": rank}
+                row = {**given, "metric": one.metric, "name": one.name}
+                yield {column: row[column] for column in COLUMNS}
 
     @property
     def notes(self) -> list[str]:
         """What a reader is to know."""
         few = [] if len(self.rigs) >= LEAST else [f"{TOO_FEW.format(len(self.rigs))}."]
         warned: dict[str, dict[str, None]] = {}  # what to say of which metrics
-        for one in self.series:
+        for one in self.rankings:
             for number in one.numbers:
-                if number is not None and number.warning:
+                if number.warning:
                     warned.setdefault(number.warning, {})[one.metric] = None
         warnings = [f"{', '.join(metrics)}: {warning}" for warning, metrics in warned.items()]
-        rays = [note for one in self.main if one.metric.startswith("s_mig") and (note := self._unequal_rays(one))]
+        along_rays = [one for one in self.main if one.metric.startswith("s_mig")]
+        rays = [note for one in along_rays if (note := unequal_rays(dict(zip(self.rigs, one.numbers, strict=True))))]
         missing = [f"Without {name}: {why}" for name, why in (self.left_out or {}).items()]
         return [NOT_VALIDATED, *few, *warnings, *rays, *missing]
 
-    def _unequal_rays(self, one: Series) -> str | None:
-        known = {rig: number for rig, number in zip(self.rigs, one.numbers, strict=True) if number is not None}
-        return unequal_rays(known)
 
-
-def tau_of(first: Series, second: Series) -> Tau:
+def tau_of(first: Ranking, second: Ranking) -> Tau:
     """Kendall's tau-b of two numbers, each turned so that more is better, and its interval over drawn worlds."""
-    value = float(kendall_tau_b(first.sign * first.values, second.sign * second.values))
-    known = int((~np.isnan(first.values + second.values)).sum())
+    value = float(kendall_tau_b(first.gains, second.gains))
+    known = int((~np.isnan(first.gains + second.gains)).sum())
     low = high = math.nan
-    if first.draws is not None and second.draws is not None:
-        drawn = kendall_tau_b(first.sign * first.draws, second.sign * second.draws)
+    if first.drawn_gains is not None and second.drawn_gains is not None:
+        drawn = kendall_tau_b(first.drawn_gains, second.drawn_gains)
         if not np.isnan(value) and not np.isnan(drawn).all():
             low, high = (float(end) for end in np.nanquantile(drawn, INTERVAL))
     return Tau(first.name, second.name, value, low, high, known)
+
+
+def page_tables(comparison: MetricComparison) -> list[PageTable]:
+    """All numbers, those of parts too; and the taus, if there are any."""
+    rows = [[Words(word) for word in row] for row in map(_row, comparison.rankings)]
+    tables = [PageTable(_title(comparison), _headings(comparison), rows, 3, comparison.notes)]
+    if taus := _tau_rows(comparison):
+        headings, *tau_rows = taus
+        tables.append(PageTable(TAU_TITLE, headings, [[Words(word) for word in row] for row in tau_rows]))
+    return tables
+
+
+def text_tables(comparison: MetricComparison) -> list[Table]:
+    """The main numbers, and the taus, for `rich.console.Console.print`."""
+    by_metric: dict[str, list[list[str]]] = {}
+    for one in comparison.main:
+        by_metric.setdefault(one.metric, []).append(_row(one))
+    caption = "\n".join(comparison.notes)
+    tables = [text_table(_headings(comparison), by_metric.values(), title=_title(comparison), caption=caption)]
+    if taus := _tau_rows(comparison):
+        tables.append(text_table(taus[0], [taus[1:]], title=TAU_TITLE))
+    return tables
+
+
+def record(comparison: MetricComparison) -> dict[str, Any]:
+    """As `summary.json` has it: what is unknown is None."""
+    return {
+        "numbers": _number_records(comparison),
+        "tau": _tau_records(comparison),
+        "notes": comparison.notes,
+    }
+
+
+def numbers_csv(comparison: MetricComparison) -> str:
+    """A line for each rig and number; an unknown one is an empty field, parameters are JSON."""
+    rows = _number_records(comparison)
+    return _csv(COLUMNS, ({**row, "parameters": json.dumps(row["parameters"], sort_keys=True)} for row in rows))
+
+
+def tau_csv(comparison: MetricComparison) -> str:
+    """A line for each pair of numbers."""
+    return _csv(Tau._fields, _tau_records(comparison))
+
+
+def _number_records(comparison: MetricComparison) -> list[dict[str, Any]]:
+    return [{**json_record(row), "parameters": json_record(row["parameters"])} for row in comparison.rows()]
+
+
+def _tau_records(comparison: MetricComparison) -> list[dict[str, Any]]:
+    return [json_record(tau._asdict()) for tau in comparison.taus()]
+
+
+def _title(comparison: MetricComparison) -> str:
+    return f"{TITLE} (rank)" if len(comparison.rigs) > 1 else TITLE
+
+
+def _headings(comparison: MetricComparison) -> list[str]:
+    return ["metric", "unit", "better", *comparison.rigs]
+
+
+def _row(one: Ranking) -> list[str]:
+    better = "less" if one.quantity.lower_is_better else "more"
+    ranks = one.ranks.tolist() if len(one.numbers) > 1 else [math.nan]
+    return [one.name, shown_unit(one.quantity.unit).name, better, *map(_words, one.numbers, ranks)]
+
+
+def _words(number: Number, rank: float) -> str:
+    """A number and its rank; an unknown one is a dash."""
+    if not number.known:
+        return "–"
+    return number_words(number) if math.isnan(rank) else f"{number_words(number)} ({rank:g})"
+
+
+def _tau_rows(comparison: MetricComparison) -> list[list[str]]:
+    """The headings, then a row for each main number; nothing if there are no taus."""
+    found = {(tau.first, tau.second): tau for tau in comparison.taus()}
+    # Numbers of torchcover that the table has room for: the detections.
+    shown = [own.name for own in comparison.own if not own.quantity.lower_is_better]
+    rows = [[one.name, *(_tau_words(found[one.name, own]) for own in shown)] for one in comparison.main if found]
+    return [["metric", *shown], *rows] if rows else []
+
+
+def _tau_words(tau: Tau) -> str:
+    if math.isnan(tau.tau):
+        return "–"
+    interval = "" if math.isnan(tau.low) else f" [{tau.low:+.2f}, {tau.high:+.2f}]"
+    return f"{tau.tau:+.2f}{interval}"
+
+
+def _csv(columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in rows)
+    return text.getvalue()

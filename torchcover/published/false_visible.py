@@ -1,20 +1,25 @@
-"""How much of what is not seen was thought to be visible."""
+"""How much of what is not seen was thought to be visible: where a rig would see something in an empty world."""
 
 import hashlib
+import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import BevGrid
 from torchcover.frames import Frame
-from torchcover.published.field_of_view import field_of_view
-from torchcover.published.places import coarse_grid
+from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.sights import Sights, rig_of
-from torchcover.published.world_ratios import Ratio, WorldRatios
 from torchcover.simulation import Sensor
+from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
+
+# Of rays that meet neither the ground nor the vehicle: beyond any grid.
+FARTHEST_M = 1000.0
 
 
 class FalseVisible(WorldRatios):
@@ -27,7 +32,7 @@ class FalseVisible(WorldRatios):
 
     Args:
         sensors: The rig's sensors.
-        ego: The vehicle's body; None if nobody knows it: then it hides nothing from the prediction.
+        ego: The vehicle's body; None if it is unknown: then it hides nothing from the prediction.
         grid: Extent and height bands; its cells are made `cell_m` long.
         threshold_m: Distance within which a point counts as seen.
         cell_m: Side of the cells.
@@ -43,7 +48,7 @@ class FalseVisible(WorldRatios):
         >>> metric = FalseVisible(Rig.load("front_roof_32").sensors, None, BevGrid(x=(0.0, 40.0), y=(-5.0, 5.0)))
         >>> hidden = torch.tensor([[30.5, 0.5, 0.0], [0.5, 0.5, 0.0]])
         >>> metric.update(Frame({"rig": torch.zeros(0, 3)}, hidden, 0, "a"))
-        >>> [(one.name, one.value) for one in metric.compute()]
+        >>> [(one.quantity.key, one.value) for one in metric.compute()]
         [('false_visible_ground_0.4m_1m', 0.5), ('false_visible_obstacle_0.4m_1m', nan)]
     """
 
@@ -70,7 +75,13 @@ class FalseVisible(WorldRatios):
         predicted = field_of_view(sensors, coarse, ego)
         given = {"threshold_m": float(threshold_m), "cell_m": float(cell_m)}
         ratios = [
-            Ratio(f"false_visible_{band}_{threshold_m:g}m_{cell_m:g}m", "share", False, "invisible cells", given)
+            said(
+                f"false_visible_{band}_{threshold_m:g}m_{cell_m:g}m",
+                "share",
+                "invisible cells",
+                lower_is_better=True,
+                **given,
+            )
             for band in coarse.heights
         ]
         fingerprint = hashlib.sha256(predicted.numpy().tobytes()).hexdigest()
@@ -91,3 +102,95 @@ class FalseVisible(WorldRatios):
         false_visible = invisible & self.predicted.to(cell.device).view(invisible.shape)
         base = invisible.sum(dim=1)
         return base.double(), false_visible.sum(dim=1).double(), base
+
+
+def coarse_grid(grid: BevGrid, cell_m: float) -> BevGrid:
+    """A grid of other cells, as large as the given one, or by a part of a cell larger.
+
+    Example:
+        >>> coarse_grid(BevGrid(x=(-0.5, 2.0), y=(0.0, 1.0), cell=0.25), 1.0).x
+        (-1.0, 2.0)
+    """
+    x, y = ((math.floor(low / cell_m) * cell_m, math.ceil(high / cell_m) * cell_m) for low, high in (grid.x, grid.y))
+    return BevGrid(x, y, cell_m, grid.heights)
+
+
+def field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego: Mesh | None = None) -> Tensor:
+    """Which cells the rays of a rig cross, down to the plane z = 0, up to their range or the vehicle's own body.
+
+    Rays are looked at every half cell over ground.
+
+    Args:
+        sensors: With mounts, rays and ranges.
+        grid: Cells and height bands.
+        ego: The vehicle's body in the vehicle frame; None if it hides nothing.
+
+    Returns:
+        (H, Y, X) bool.
+
+    Example:
+        >>> from torchcover.simulation import Rig
+        >>> grid = BevGrid(x=(-5.0, 40.0), y=(-5.0, 5.0), cell=1.0)
+        >>> seen = field_of_view(Rig.load("front_roof_32").sensors, grid)
+        >>> [bool(seen[0, 5, x]) for x in (0, 6, 30)]           # behind it, too close, and ahead
+        [False, False, True]
+    """
+    seen = np.zeros(grid.cells, dtype=bool)
+    caster = None if ego is None else RayCaster([ego])
+    for sensor in sensors:
+        vehicle_T_sensor = sensor.mount.matrix()
+        directions = sensor.directions().reshape(3, -1)
+        directions = vehicle_T_sensor[:3, :3] @ directions[:, ~np.isnan(directions[0])]
+        origin_m = vehicle_T_sensor[:3, 3]
+        ends_m = _ends_m(origin_m, directions, min(sensor.max_range_m, FARTHEST_M), caster)
+        _mark(seen, grid, origin_m, directions, sensor.min_range_m, ends_m)
+    return torch.from_numpy(seen).view(grid.shape)
+
+
+def _ends_m(
+    origin_m: NDArray[np.float64], directions: NDArray[np.float64], range_m: float, ego: RayCaster | None
+) -> NDArray[np.float64]:
+    """(n,) where the rays end."""
+    down = directions[2] < 0
+    to_ground = np.full(directions.shape[1], np.inf)
+    to_ground[down] = origin_m[2] / -directions[2, down]
+    ends_m: NDArray[np.float64] = np.minimum(to_ground, range_m)
+    if ego is None:
+        return ends_m
+    hits = ego.cast(origin_m, directions.astype(np.float32), ends_m.astype(np.float32))
+    ends_m[hits.body >= 0] = 0.0  # what points at the vehicle sees the vehicle
+    return ends_m
+
+
+def _mark(
+    seen: NDArray[np.bool_],
+    grid: BevGrid,
+    origin_m: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    min_range_m: float,
+    ends_m: NDArray[np.float64],
+) -> None:
+    level = np.hypot(directions[0], directions[1])
+    # Ring by ring over ground: few rays are left in the far ones. The last point of each ray is looked at, too.
+    far_m = ends_m * level
+    order = np.argsort(-far_m)
+    directions, ends_m, level, far_m = directions[:, order], ends_m[order], level[order], far_m[order]
+    corner_m = np.abs(np.array([grid.x, grid.y])).max(axis=1) + np.abs(origin_m[:2])
+    step_m = grid.cell / 2
+    rings = np.arange(step_m, min(float(far_m[0]) if len(far_m) else 0.0, float(np.hypot(*corner_m))), step_m)
+    left = np.searchsorted(-far_m, -rings, side="right")
+    for ring_m, rays in zip(rings.tolist(), left.tolist(), strict=True):
+        along_m = ring_m / level[:rays]
+        _mark_points(seen, grid, origin_m, directions[:, :rays], np.where(along_m >= min_range_m, along_m, np.nan))
+    _mark_points(seen, grid, origin_m, directions, np.where(ends_m >= max(min_range_m, 1e-9), ends_m, np.nan))
+
+
+def _mark_points(
+    seen: NDArray[np.bool_],
+    grid: BevGrid,
+    origin_m: NDArray[np.float64],
+    directions: NDArray[np.float64],
+    along_m: NDArray[np.float64],
+) -> None:
+    points = torch.from_numpy((origin_m[:, None] + directions * along_m).T)
+    seen[grid.bins(points).cell.numpy()] = True

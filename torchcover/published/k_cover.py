@@ -6,11 +6,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchcover.coverage import BevGrid, Region
+from torchcover.coverage import BevGrid, Region, check_regions
+from torchcover.coverage.regions import Places
 from torchcover.frames import Frame
-from torchcover.published.places import Places
+from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.sights import Sights, rig_of
-from torchcover.published.world_ratios import Ratio, WorldRatios
 
 AT_LEAST = (1, 2, 3)
 
@@ -32,8 +32,8 @@ class KCover(WorldRatios):
         kwargs: For `torchmetrics.Metric`.
 
     Raises:
-        ValueError: k below 1, a threshold that is negative, regions that the grid does not hold. From `update`: nobody
-            knows which points are of which sensor; no square metres where they are wanted.
+        ValueError: k below 1, a threshold that is negative, regions that the grid does not hold. From `update`: points
+            of unknown sensors; no square metres where they are wanted.
 
     Example:
         >>> grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0)
@@ -61,15 +61,23 @@ class KCover(WorldRatios):
             raise ValueError(f"threshold_m: a finite distance >= 0 in metres is needed; got {threshold_m}")
         if not at_least or any(least < 1 for least in at_least) or len(set(at_least)) < len(at_least):
             raise ValueError(f"at_least: different numbers of sensors from 1 on are needed; got {tuple(at_least)}")
-        places = Places(grid, regions)
+        check_regions(regions, grid)
+        places = Places(regions, grid)
+        names = ["", *(f":{region.name}_{band}" for region in places.regions for band in grid.heights)]
         counted = "reference points, by square metres" if square_metres else "reference points"
         ratios = [
-            Ratio(f"k_cover_{k}_{threshold_m:g}m{place}", "share", True, counted, {"k": k, "threshold_m": threshold_m})
+            said(f"k_cover_{k}_{threshold_m:g}m{name}", "share", counted, k=k, threshold_m=threshold_m)
             for k in at_least
-            for place in places.names
+            for name in names
         ]
-        meaning = {"threshold_m": float(threshold_m), "at_least": tuple(at_least), "square_metres": square_metres}
-        super().__init__(ratios, {**meaning, **places.meaning}, rig, **kwargs)
+        meaning = {
+            "threshold_m": float(threshold_m),
+            "at_least": tuple(at_least),
+            "square_metres": square_metres,
+            "grid": grid,
+            "regions": places.regions,
+        }
+        super().__init__(ratios, meaning, rig, **kwargs)
         self.places = places
         self.threshold_m = float(threshold_m)
         self.at_least = tuple(at_least)
@@ -90,6 +98,9 @@ class KCover(WorldRatios):
         sensors = within.sum(dim=0)[point]
         weight = weights.to(point.device)[point].double()
         seen = [weight * (sensors >= k) for k in self.at_least]
-        sums = self.places.sums(cell, torch.stack([torch.ones_like(weight), weight, *seen]))
+        values = torch.stack([torch.ones_like(weight), weight, *seen])
+        place, of_place = self.places.of_points(cell)
+        in_places = values.new_zeros(len(values), self.places.count).index_add_(1, place, values[:, of_place])
+        sums = torch.cat([values.sum(dim=1, keepdim=True), in_places], dim=1)
         count, base = (row.repeat(len(seen)) for row in sums[:2])
         return base, sums[2:].flatten(), count.long()

@@ -2,20 +2,21 @@
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.estimation import ROUND_OFF, jackknife_error
+from torchcover.estimation import Estimate, Number
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox
+from torchcover.metrics import SumsInBlocks
 from torchcover.neighbors import check_cloud
-from torchcover.published.number import PublishedNumber
+from torchcover.published.frame_metric import BLOCKS, FrameMetric, said
 from torchcover.published.region_voxels import REGION, check_sensors, checked_grid, crossed_by, ray_count
 from torchcover.published.sights import Sights
-from torchcover.published.world_blocks import BLOCKS, WorldBlocks
 from torchcover.simulation import Sensor
 
 # Numbers that are kept of each voxel and block: frames in which it is labelled as the category, and as anything else.
@@ -28,7 +29,7 @@ RANKS_ONLY = (
 )
 
 
-class MSog(WorldBlocks):
+class MSog(SumsInBlocks, FrameMetric):
     """Mean entropy in nats of what the voxels on the way of a rig's rays hold, as a loss: M-SOG (Place3D, 2024).
 
         H(v)  = - sum over c of p_c(v) ln p_c(v)         c: the category, anything else, empty
@@ -65,7 +66,7 @@ class MSog(WorldBlocks):
         >>> for index, points in enumerate((seen, seen[:0])):
         ...     metric.update(Frame({"rig": torch.zeros(0, 3)}, points, index, str(index), boxes=car))
         >>> number = metric.compute()[0]
-        >>> number.name, round(number.value * number.count / math.log(2), 9)
+        >>> number.quantity.key, round(number.value * number.count / math.log(2), 9)
         ('m_sog_car_0.5m', -1.0)
     """
 
@@ -85,7 +86,7 @@ class MSog(WorldBlocks):
         check_sensors(sensors)
         grid = checked_grid(region, voxel_m, BLOCKS * LABELS * 8)
         meaning = {"sensors": tuple(sensors), "voxel_m": float(voxel_m), "region": region, "category": category}
-        super().__init__(meaning, rig, **kwargs)
+        super().__init__(BLOCKS, meaning, rig, **kwargs)
         self.sensors = tuple(sensors)
         self.grid = grid
         self.category = category
@@ -111,52 +112,34 @@ class MSog(WorldBlocks):
         chosen = 2 * np.bincount(which, weights=votes[voxel >= 0], minlength=len(occupied)) >= points
         return torch.from_numpy(occupied[chosen]), torch.from_numpy(occupied[~chosen])
 
-    def compute(self) -> tuple[PublishedNumber, ...]:
-        """The number; NaN if the category was never seen, or no ray crosses the region."""
-        used = self.block_steps.cpu() > 0
-        values = self._values(torch.cat([torch.ones(1, BLOCKS), (1.0 - torch.eye(BLOCKS))[used]]).double())
-        error = jackknife_error(values[1:], values[0], self.block_steps.cpu()[used])
-        crossed = int(crossed_by(self.sensors, self.grid).sum())
-        return (
-            PublishedNumber(
-                name=f"m_sog_{self.category}_{self.grid.voxel_m:g}m",
-                value=float(values[0]),
-                unit="nats",
-                higher_is_better=True,
-                parameters={
-                    "voxel_m": self.grid.voxel_m,
-                    "region_m": (self.grid.region.lower_m, self.grid.region.upper_m),
-                    "category": self.category,
-                    "rays": ray_count(self.sensors),
-                    "crossed_share": crossed / self.grid.voxels,
-                },
-                count=0 if values[0].isnan() else crossed,
-                count_of="voxels",
-                standard_error=float(error) if error > ROUND_OFF else math.nan,
-                warning=RANKS_ONLY,
-            ),
-        )
-
-    def resampled(self, weights: Tensor) -> Tensor:
-        """(R, 1) the number if each block of worlds had come as often as it is weighted.
-
-        Args:
-            weights: (R, 16) how often.
-        """
-        return self._values(weights.double().cpu())[:, None].to(weights.device)
-
-    def _values(self, weights: Tensor) -> Tensor:
-        """(R,) the number for each of (R, 16) weights of the blocks."""
+    def _found(self) -> tuple[Estimate, Sequence[Number]]:
         crossed = torch.from_numpy(crossed_by(self.sensors, self.grid).reshape(-1).nonzero()[0])
-        unknown = torch.full((len(weights),), math.nan, dtype=torch.float64)
-        if len(crossed) == 0 or not self.labelled[:, 0].any():
-            return unknown
-        steps = weights @ self.block_steps.cpu().double()
-        total, part = torch.zeros(len(weights), dtype=torch.float64), max(AT_ONCE // len(weights), 1)
-        for start in range(0, len(crossed), part):
-            some = crossed[start : start + part]
-            labelled = self.labelled[:, :, some.to(self.labelled.device)].cpu().double()
-            share = torch.tensordot(weights, labelled, dims=1) / steps[:, None, None]
-            empty = (1.0 - share.sum(dim=1)).clamp(min=0.0)
-            total += torch.special.entr(share).sum(dim=(1, 2)) + torch.special.entr(empty).sum(dim=1)
-        return torch.where(steps > 0, -total / len(crossed), unknown)
+        about = said(
+            f"m_sog_{self.category}_{self.grid.voxel_m:g}m",
+            "nats",
+            "voxels",
+            voxel_m=self.grid.voxel_m,
+            region_m=(self.grid.region.lower_m, self.grid.region.upper_m),
+            category=self.category,
+            rays=ray_count(self.sensors),
+            crossed_share=len(crossed) / self.grid.voxels,
+        )
+        used = self.block_steps.cpu() > 0
+        # Unknown if the category was never seen.
+        on_the_way = crossed.to(self.labelled.device) if self.labelled[:, 0].any() else crossed[:0]
+        labelled, steps = self.labelled[:, :, on_the_way].cpu()[used], self.block_steps.cpu()[used]
+        estimate = Estimate.of_blocks([about.quantity], partial(_again, labelled, steps), steps)
+        return estimate, [about._replace(count=0 if estimate.value[0].isnan() else len(crossed), warning=RANKS_ONLY)]
+
+
+def _again(labelled: Tensor, steps: Tensor, weights: Tensor) -> Tensor:
+    """(R, 1) the number of voxels labelled (g, 2, K) times in blocks of steps (g,), if these weigh (R, g)."""
+    of_all, voxels = weights @ steps.double(), labelled.shape[2]
+    total, part = torch.zeros(len(weights), dtype=torch.float64), max(AT_ONCE // len(weights), 1)
+    for start in range(0, voxels, part):
+        some = labelled[:, :, start : start + part].double()
+        share = torch.tensordot(weights, some, dims=1) / of_all[:, None, None]
+        empty = (1.0 - share.sum(dim=1)).clamp(min=0.0)
+        total += torch.special.entr(share).sum(dim=(1, 2)) + torch.special.entr(empty).sum(dim=1)
+    known = (of_all > 0) & (voxels > 0)
+    return torch.where(known, -total / max(voxels, 1), math.nan)[:, None]

@@ -8,9 +8,9 @@ from torch import Tensor
 
 from torchcover.detection.visibility import mean_by_box
 from torchcover.frames import Frame
+from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
 from torchcover.published.sights import Sights, rig_of
-from torchcover.published.world_ratios import Ratio, WorldRatios
 
 HITS = (1, 5, 10)
 
@@ -20,7 +20,7 @@ class ObjectCoverage(WorldRatios):
 
     The share of one object is that of `torchcover.detection.box_visibility`: of what the reference's places see of it,
     in square metres where the weights are; an object of which they see nothing is unknown and not in the mean. Hits are
-    counted over all objects, those that nobody can see among them.
+    counted over all objects, those that are hidden from everywhere among them.
 
     Args:
         threshold_m: Distance within which a point counts as seen.
@@ -41,7 +41,7 @@ class ObjectCoverage(WorldRatios):
         >>> reference = torch.tensor([[8.0, 0.0, 0.5], [8.0, 0.0, 1.5]])
         >>> metric = ObjectCoverage()
         >>> metric.update(Frame({"rig": torch.tensor([[8.0, 0.0, 0.6]])}, reference, 0, "a", boxes=boxes))
-        >>> [(one.name, one.value) for one in metric.compute() if one.known and ":" not in one.name]
+        >>> [(one.quantity.key, one.value) for one in metric.compute() if one.known and ":" not in one.quantity.key]
         [('object_coverage_0.4m', 0.5), ('objects_hit_1', 1.0), ('objects_hit_5', 0.0), ('objects_hit_10', 0.0)]
     """
 
@@ -63,9 +63,9 @@ class ObjectCoverage(WorldRatios):
         strata = ObjectStrata(categories, range_borders_m)
         names = [f"object_coverage_{threshold_m:g}m", *(f"objects_hit_{least}" for least in hits)]
         given: list[dict[str, Any]] = [{"threshold_m": threshold_m}, *({"hits": least} for least in hits)]
-        within = {"range_m": strata.range_borders_m[-1]}
+        within: dict[str, Any] = {"range_m": strata.range_borders_m[-1]}
         ratios = [
-            Ratio(name + stratum, "share", True, "objects", {**parameters, **within})
+            said(name + stratum, "share", "objects", **parameters, **within)
             for name, parameters in zip(names, given, strict=True)
             for stratum in strata.names
         ]

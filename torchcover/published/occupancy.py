@@ -188,9 +188,9 @@ def voxels_in_box(centres_m: Sequence[NDArray[np.float64]], box: NDArray[np.floa
     (x_m, y_m, z_m), reach_m = centres_m, math.hypot(box[3], box[4]) / 2 + ROUNDING_M
     x0, x1 = np.searchsorted(x_m, (box[0] - reach_m, box[0] + reach_m))
     y0, y1 = np.searchsorted(y_m, (box[1] - reach_m, box[1] + reach_m))
-    beside_x, beside_y = x_m[x0:x1, None] - box[0], y_m[y0:y1] - box[1]
+    off_x, off_y = x_m[x0:x1, None] - box[0], y_m[y0:y1] - box[1]
     cosine, sine = math.cos(box[6]), math.sin(box[6])
-    ahead, left = beside_x * cosine + beside_y * sine, beside_y * cosine - beside_x * sine
+    ahead, left = off_x * cosine + off_y * sine, off_y * cosine - off_x * sine
     x, y = (_within(ahead, box[3]) & _within(left, box[4])).nonzero()
     z = np.flatnonzero(_within(z_m - box[2], box[5]))
     column = (x + x0) * len(y_m) + y + y0

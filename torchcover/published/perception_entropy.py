@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from torchcover.frames import Frame
+from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
 from torchcover.published.sights import Sights, count_in_boxes, rig_of
-from torchcover.published.world_ratios import Ratio, WorldRatios
 from torchcover.simulation import CameraSensor, Sensor
 
 # Of average precision a ln m + b over m points or pixels on the object, as GO4ROBO has them.
@@ -72,7 +72,7 @@ class PerceptionEntropy(WorldRatios):
         kwargs: For `torchmetrics.Metric`.
 
     Raises:
-        ValueError: From `update`: a frame without boxes; of a rig with cameras, if nobody knows which points are of
+        ValueError: From `update`: a frame without boxes; of a rig with cameras, if it is unknown which points are of
             which sensor.
 
     Example:
@@ -98,7 +98,7 @@ class PerceptionEntropy(WorldRatios):
         strata = ObjectStrata(categories, range_borders_m)
         given = {"range_m": strata.range_borders_m[-1], "constants": dict(CONSTANTS), "cameras": sorted(cameras)}
         ratios = [
-            Ratio(form + name, "nats", False, "objects", given)
+            said(form + name, "nats", "objects", lower_is_better=True, **given)
             for form in ("perception_entropy", "perception_entropy_bounded")
             for name in strata.names
         ]

@@ -9,8 +9,8 @@ from torch import Tensor
 from torchcover.coverage import BevGrid, Region, check_regions
 from torchcover.frames import Frame
 from torchcover.neighbors import check_cloud
+from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.sights import rig_of
-from torchcover.published.world_ratios import Ratio, WorldRatios
 
 
 class PointDensity(WorldRatios):
@@ -33,7 +33,7 @@ class PointDensity(WorldRatios):
         >>> metric = PointDensity(BevGrid(x=(0.0, 4.0), y=(0.0, 1.0), cell=1.0), ())
         >>> cloud = torch.tensor([[0.5, 0.5, 0.0], [1.5, 0.5, 0.0], [9.0, 0.0, 0.0]])
         >>> metric.update(Frame({"rig": cloud}, torch.zeros(0, 3), 0, "a"))
-        >>> [(one.name, one.value) for one in metric.compute()]
+        >>> [(one.quantity.key, one.value) for one in metric.compute()]
         [('points', 3.0), ('point_density', 0.5), ('point_uniformity_1m', 0.5)]
     """
 
@@ -48,9 +48,9 @@ class PointDensity(WorldRatios):
         check_regions(regions, grid)
         names = ["", *(f":{region.name}" for region in regions)]
         ratios = [
-            Ratio("points", "points", True, "frames"),
-            *(Ratio(f"point_density{name}", "points/m2", True, "frames") for name in names),
-            *(Ratio(f"point_uniformity_{grid.cell:g}m{name}", "share", True, "frames") for name in names),
+            said("points", "points", "frames"),
+            *(said(f"point_density{name}", "points/m2", "frames") for name in names),
+            *(said(f"point_uniformity_{grid.cell:g}m{name}", "share", "frames") for name in names),
         ]
         super().__init__(ratios, {"grid": grid, "regions": tuple(regions)}, rig, **kwargs)
         self.grid = grid

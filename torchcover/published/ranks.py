@@ -1,12 +1,15 @@
-"""How alike two orders of the same rigs are, and whether that is more than chance."""
+"""Rigs in the order of a number, how alike two such orders are, and whether that is more than chance."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from itertools import permutations
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
+import torch
 from numpy.typing import ArrayLike, NDArray
+
+from torchcover.estimation import MIN_BLOCKS, Estimate, Number, Quantity
 
 Array: TypeAlias = NDArray[np.float64]
 # Of two (..., n) series: how alike they are, (...).
@@ -16,6 +19,98 @@ Statistic: TypeAlias = Callable[[ArrayLike, ArrayLike], Array]
 LEAST = 3
 # All orders of 8 things are tried; of more, as many are drawn.
 MOST_TRIED = math.factorial(8)
+# Worlds are drawn again so many times for intervals.
+DRAWS = 500
+# The metric that numbers of torchcover itself are of; and what takes no simulation to know, or little.
+OWN, BASELINE = "torchcover", "baseline"
+
+
+class Ranking(NamedTuple):
+    """One number of every rig, which ranks them.
+
+    Args:
+        name: Of the number, with all that decides it.
+        metric: The published metric that it is of, `OWN` or `BASELINE`.
+        numbers: One for each rig.
+        draws: (R, rigs) what they were in worlds that are drawn again; None if that is unknown.
+
+    Example:
+        >>> height = Quantity("height", "mean mounting height", "m", lower_is_better=False)
+        >>> Ranking.of_values(height, [2.2, 2.5, 2.2]).ranks.tolist()
+        [2.5, 1.0, 2.5]
+    """
+
+    name: str
+    metric: str
+    numbers: tuple[Number, ...]
+    draws: Array | None = None
+
+    @classmethod
+    def of_values(
+        cls, quantity: Quantity, values: Sequence[float] | Array, metric: str = BASELINE, draws: Array | None = None
+    ) -> "Ranking":
+        """Of values (rigs,) without errors."""
+        return cls(quantity.key, metric, tuple(Number(quantity, float(value)) for value in values), draws)
+
+    @property
+    def quantity(self) -> Quantity:
+        """What the numbers are."""
+        return self.numbers[0].quantity
+
+    @property
+    def is_part(self) -> bool:
+        """Whether it is about a part only of what another number is about: a category, a region."""
+        return ":" in self.name
+
+    @property
+    def gains(self) -> Array:
+        """(rigs,) the values, with the sign turned so that more is better; NaN where unknown."""
+        return np.array([number.quantity.gain(number.value) for number in self.numbers])
+
+    @property
+    def drawn_gains(self) -> Array | None:
+        """(R, rigs) likewise those of the draws."""
+        return None if self.draws is None else self.quantity.gain(1.0) * self.draws
+
+    @property
+    def ranks(self) -> Array:
+        """(rigs,) 1 for the best; equal ones share the mean of theirs, NaN where unknown."""
+        return midranks(-self.gains)
+
+    def of(self, rigs: Sequence[int]) -> "Ranking":
+        """Of some of the rigs, by their places, in another order."""
+        numbers = tuple(self.numbers[rig] for rig in rigs)
+        return self._replace(numbers=numbers, draws=None if self.draws is None else self.draws[:, list(rigs)])
+
+
+def rankings(
+    metric: str, numbers: Sequence[Sequence[Number]], estimates: Sequence[Estimate], seed: int
+) -> list[Ranking]:
+    """A ranking by each number of a metric.
+
+    Args:
+        metric: As in `Ranking`.
+        numbers: What it says of each rig, the same numbers of all.
+        estimates: What these come from, of each rig.
+        seed: Of the worlds that are drawn again, the same for all metrics of a run.
+    """
+    draws = [drawn_again(estimate, seed) for estimate in estimates]
+    known = [each for each in draws if each is not None]
+    stacked = np.stack(known, axis=2) if len(known) == len(draws) else None
+    return [
+        Ranking(each[0].quantity.key, metric, each, None if stacked is None else stacked[:, at])
+        for at, each in enumerate(zip(*numbers, strict=True))
+    ]
+
+
+def drawn_again(estimate: Estimate, seed: int) -> Array | None:
+    """(R, Q) numbers over worlds that are drawn with replacement; None if too few, or what that gives, are known."""
+    worlds = len(estimate.steps)
+    if worlds < MIN_BLOCKS:
+        return None
+    drawn = np.random.default_rng([seed, worlds]).multinomial(worlds, np.full(worlds, 1 / worlds), size=DRAWS)
+    again = estimate.resampled(torch.from_numpy(drawn))
+    return None if again is None else again.cpu().numpy()
 
 
 def midranks(values: ArrayLike) -> Array:

@@ -27,7 +27,7 @@ def checked_grid(region: BoundingBox, voxel_m: float, bytes_a_voxel: int) -> Vox
 
 
 def check_sensors(sensors: Sequence[Sensor]) -> None:
-    """Refuse a rig that nobody knows: it would have no rays, which some metrics reward.
+    """Refuse a rig without sensors: it would have no rays, which some metrics reward.
 
     Raises:
         ValueError: There is no sensor.
@@ -61,7 +61,7 @@ def crossed_on_the_way(sensors: Sequence[Sensor], frame: Frame, rig: str | None,
     its drop-out, is left out.
 
     Raises:
-        ValueError: Nobody knows which points are of which sensor, or a sensor is none of these.
+        ValueError: Which points are of which sensor is unknown, or a sensor is none of these.
     """
     mounts = {sensor.name: sensor.mount.matrix()[:3, 3] for sensor in sensors}
     crossed = np.zeros(grid.shape, dtype=bool)

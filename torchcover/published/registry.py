@@ -1,32 +1,76 @@
-"""The metrics of others, by the names that `torchcover compare --metrics` takes."""
+"""The metrics of others by the names that `torchcover compare --metrics` takes: what they need, and how one is made."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
 
-from torchcover.published.boards import Lob
-from torchcover.published.false_visible import FalseVisible
+from torchcover.coverage import BevGrid, Region, forward_regions
+from torchcover.published.false_visible import FalseVisible, coarse_grid
+from torchcover.published.frame_metric import FrameMetric
 from torchcover.published.k_cover import KCover
 from torchcover.published.m_sog import MSog
 from torchcover.published.object_coverage import ObjectCoverage
 from torchcover.published.perception_entropy import PerceptionEntropy
-from torchcover.published.places import coarse_grid
 from torchcover.published.point_density import PointDensity
 from torchcover.published.s_mig import SMig
-from torchcover.published.setup import Published, Setup
+from torchcover.published.sights import Sights
+from torchcover.simulation import Sensor
+from torchcover.simulation.shapes import Mesh
 
+# boxes: `Frame.boxes`. sensors: the rig's sensors, with mounts and rays. sensor_points: which points are of which
+# sensor.
+Need: TypeAlias = Literal["boxes", "sensors", "sensor_points"]
+
+GRID = BevGrid(x=(-40.0, 160.0), y=(-40.0, 40.0))
 # Of smaller cells most are empty whatever the rig.
 UNIFORMITY_CELL_M = 1.0
 
 
-def _object_coverage(setup: Setup) -> ObjectCoverage:
-    return ObjectCoverage(setup.threshold_m, **setup.of_frames)
+@dataclass(frozen=True)
+class Setup:
+    """What metrics of one rig are made from.
+
+    Args:
+        rig: Its name in `Frame.clouds`; the only one if not given.
+        sensors: Its sensors; empty if they are unknown.
+        ego: The body that carries it, in the vehicle frame; None if it is unknown.
+        grid: Cells and height bands of the run.
+        regions: Those that numbers are given for.
+        square_metres: Whether frames have the square metres of their reference points.
+        threshold_m: Distance within which a point counts as seen.
+        sights: What metrics of the same run share, so that each frame is searched once.
+        sync_on_compute: As in `torchmetrics.Metric`.
+    """
+
+    rig: str | None = None
+    sensors: Sequence[Sensor] = ()
+    ego: Mesh | None = None
+    grid: BevGrid = GRID
+    regions: Sequence[Region] = field(default_factory=forward_regions)
+    square_metres: bool = True
+    threshold_m: float = 0.4
+    sights: Sights = field(default_factory=Sights)
+    sync_on_compute: bool = True
+
+    @property
+    def of_frames(self) -> dict[str, Any]:
+        """The arguments that metrics of what frames show have in common."""
+        return {"rig": self.rig, "sights": self.sights, "sync_on_compute": self.sync_on_compute}
 
 
-def _perception_entropy(setup: Setup) -> PerceptionEntropy:
-    return PerceptionEntropy(setup.sensors, **setup.of_frames)
+@dataclass(frozen=True)
+class Published:
+    """A metric by its name in `torchcover compare --metrics`.
 
+    Args:
+        make: Makes it.
+        needs: What it cannot do without.
+        words: What it says, in a line.
+    """
 
-def _k_cover(setup: Setup) -> KCover:
-    return KCover(setup.grid, setup.regions, setup.threshold_m, square_metres=setup.square_metres, **setup.of_frames)
+    make: Callable[[Setup], FrameMetric]
+    needs: frozenset[Need]
+    words: str
 
 
 def _point_density(setup: Setup) -> PointDensity:
@@ -37,48 +81,45 @@ def _point_density(setup: Setup) -> PointDensity:
     return PointDensity(grid, setup.regions, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
 
 
-def _false_visible(setup: Setup) -> FalseVisible:
-    return FalseVisible(setup.sensors, setup.ego, setup.grid, setup.threshold_m, **setup.of_frames)
-
-
-def _s_mig(setup: Setup) -> SMig:
-    return SMig(setup.sensors, **setup.of_frames)
-
-
-def _s_mig_occluded(setup: Setup) -> SMig:
-    return SMig(setup.sensors, occlusion=True, **setup.of_frames)
-
-
-def _m_sog(setup: Setup) -> MSog:
-    return MSog(setup.sensors, **setup.of_frames)
-
-
-def _lob(setup: Setup) -> Lob:
-    return Lob(setup.sensors, rig=setup.rig, sync_on_compute=setup.sync_on_compute)
-
-
 PUBLISHED: Mapping[str, Published] = {
     "object_coverage": Published(
-        _object_coverage, frozenset({"boxes"}), "share of an object within the threshold; objects with 1, 5, 10 points"
+        lambda setup: ObjectCoverage(setup.threshold_m, **setup.of_frames),
+        frozenset({"boxes"}),
+        "share of an object within the threshold; objects with 1, 5, 10 points",
     ),
     "perception_entropy": Published(
-        _perception_entropy, frozenset({"boxes"}), "nats of a detector's error, from points on objects (Ma 2021)"
+        lambda setup: PerceptionEntropy(setup.sensors, **setup.of_frames),
+        frozenset({"boxes"}),
+        "nats of a detector's error, from points on objects (Ma 2021)",
     ),
-    "k_cover": Published(_k_cover, frozenset({"sensor_points"}), "share of the surface seen by 1, 2, 3 sensors"),
+    "k_cover": Published(
+        lambda setup: KCover(
+            setup.grid, setup.regions, setup.threshold_m, square_metres=setup.square_metres, **setup.of_frames
+        ),
+        frozenset({"sensor_points"}),
+        "share of the surface seen by 1, 2, 3 sensors",
+    ),
     "point_density": Published(_point_density, frozenset(), "points, for each square metre, and how evenly"),
     "false_visible": Published(
-        _false_visible, frozenset({"sensors"}), "blind cells that the field of view promised (Börger 2022)"
+        lambda setup: FalseVisible(setup.sensors, setup.ego, setup.grid, setup.threshold_m, **setup.of_frames),
+        frozenset({"sensors"}),
+        "blind cells that the field of view promised (Börger 2022)",
     ),
     "s_mig": Published(
-        _s_mig, frozenset({"boxes", "sensors"}), "minus the entropy of objects along the rays, in nats (Hu 2022)"
+        lambda setup: SMig(setup.sensors, **setup.of_frames),
+        frozenset({"boxes", "sensors"}),
+        "minus the entropy of objects along the rays, in nats (Hu 2022)",
     ),
     "s_mig_occluded": Published(
-        _s_mig_occluded, frozenset({"boxes", "sensors", "sensor_points"}), "the same, up to what the rays hit"
+        lambda setup: SMig(setup.sensors, occlusion=True, **setup.of_frames),
+        frozenset({"boxes", "sensors", "sensor_points"}),
+        "the same, up to what the rays hit",
     ),
     "m_sog": Published(
-        _m_sog, frozenset({"boxes", "sensors"}), "minus the mean entropy of labels along the rays (Place3D 2024)"
+        lambda setup: MSog(setup.sensors, **setup.of_frames),
+        frozenset({"boxes", "sensors"}),
+        "minus the mean entropy of labels along the rays (Place3D 2024)",
     ),
-    "lob": Published(_lob, frozenset({"sensors"}), "cells of boards at 10 to 50 m that rays hit (Kim and Park 2020)"),
 }
 
 

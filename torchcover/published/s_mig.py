@@ -1,8 +1,8 @@
 """S-MIG: the entropy of an occupancy grid along the rays of a rig (Hu et al. 2022), and its negative."""
 
 import hashlib
-import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,13 +10,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.estimation import ROUND_OFF, jackknife_error
+from torchcover.estimation import Estimate, Number
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox
 from torchcover.metrics import with_rows
 from torchcover.neighbors import check_cloud
-from torchcover.published.frame_metric import FrameMetric
-from torchcover.published.number import PublishedNumber
+from torchcover.published.frame_metric import BLOCKS, FrameMetric, said
 from torchcover.published.occupancy import COLUMNS, Occupancy, occupancy_of, occupancy_rows
 from torchcover.published.region_voxels import (
     REGION,
@@ -27,7 +26,6 @@ from torchcover.published.region_voxels import (
     ray_count,
 )
 from torchcover.published.sights import Sights
-from torchcover.published.world_blocks import BLOCKS
 from torchcover.simulation import Sensor
 
 CATEGORIES = ("car", "pedestrian", "cyclist")
@@ -43,7 +41,7 @@ class SMig(FrameMetric):
         S-MIG = - sum over the distinct voxels v on the way of any ray of  -p ln p - (1 - p) ln(1 - p)
 
     with independent voxels. Higher is better, say its authors; yet it falls as more voxels are crossed, and a rig
-    without rays has the highest value, 0. Its negative, which is beside it in `parameters["entropy_captured_nats"]`, is
+    without rays has the highest value, 0. Its negative, which is in its `parameters["entropy_captured_nats"]`, is
     what roadside placement maximises (EGVS, Jiang 2025, as far as its text could be read). Compare rigs of the same
     number of rays (`unequal_rays`).
 
@@ -67,7 +65,7 @@ class SMig(FrameMetric):
 
     Raises:
         ValueError: No sensor, no category or one twice, voxels that do not divide the region or do not fit into the
-            memory. From `update`: a frame without boxes; with occlusion, points of which nobody knows the sensor.
+            memory. From `update`: a frame without boxes; with occlusion, points of unknown sensors.
 
     Example:
         >>> from torchcover.detection import Boxes
@@ -77,7 +75,7 @@ class SMig(FrameMetric):
         >>> for index, boxes in enumerate((car, car.of_category())):  # a car that is there in half of the frames
         ...     metric.update(Frame({"rig": torch.zeros(0, 3)}, torch.zeros(0, 3), index, str(index), boxes=boxes))
         >>> number = metric.compute()[1]
-        >>> number.name, round(number.value / math.log(2))
+        >>> number.quantity.key, round(number.value / np.log(2))
         ('s_mig_0.2m:car', -1600)
     """
 
@@ -130,46 +128,30 @@ class SMig(FrameMetric):
             self.crossings += torch.from_numpy(crossed.reshape(-1)).to(self.crossings)
         self.boxes = with_rows(self.boxes, rows)
 
-    def compute(self) -> tuple[PublishedNumber, ...]:
+    def _found(self) -> tuple[Estimate, Sequence[Number]]:
         """All categories together, then each."""
-        of_each, times = self._occupancies(), self._crossings()
-        used = np.flatnonzero(of_each[0].steps)
-        weights = np.concatenate([np.ones((1, BLOCKS)), (1.0 - np.eye(BLOCKS))[used]])
-        values = torch.from_numpy(self._values(of_each, times, weights))
-        error = jackknife_error(values[1:], values[0], torch.from_numpy(of_each[0].steps[used]))
-        error = error.where((error > ROUND_OFF) & (not self.occlusion), math.nan)
+        of_each, times, rays = self._occupancies(), self._crossings(), ray_count(self.sensors)
+        about = [
+            said(
+                f"s_mig{'_occluded' if self.occlusion else ''}_{self.grid.voxel_m:g}m{name}",
+                "nats",
+                "boxes",
+                voxel_m=self.grid.voxel_m,
+                region_m=(self.grid.region.lower_m, self.grid.region.upper_m),
+                rays=rays,
+                voxels_crossed=int((times > 0).sum()),
+            )
+            for name in ("", *(f":{category}" for category in self.categories))
+        ]
+        quantities, steps = [one.quantity for one in about], torch.from_numpy(of_each[0].steps)
+        estimate = Estimate.of_blocks(quantities, partial(_again, of_each, times), steps[steps > 0])
+        if self.occlusion:  # what was crossed in each block is unknown
+            estimate = Estimate.of(quantities, estimate.value)
         boxes = [one.boxes for one in of_each]
-        names = ["", *(f":{category}" for category in self.categories)]
-        rays = ray_count(self.sensors)
-        return tuple(
-            PublishedNumber(
-                name=f"s_mig{'_occluded' if self.occlusion else ''}_{self.grid.voxel_m:g}m{name}",
-                value=value,
-                unit="nats",
-                higher_is_better=True,
-                parameters={
-                    "voxel_m": self.grid.voxel_m,
-                    "region_m": (self.grid.region.lower_m, self.grid.region.upper_m),
-                    "rays": rays,
-                    "voxels_crossed": int((times > 0).sum()),
-                    "entropy_captured_nats": -value,
-                },
-                count=count,
-                count_of="boxes",
-                standard_error=own_error,
-                warning=FALLS,
-            )
-            for name, value, count, own_error in zip(
-                names, values[0].tolist(), [sum(boxes), *boxes], error.tolist(), strict=True
-            )
-        )
-
-    def resampled(self, weights: Tensor) -> Tensor | None:
-        """As `FrameMetric.resampled`; None with occlusion, for nobody knows what was crossed in each block."""
-        if self.occlusion:
-            return None
-        values = self._values(self._occupancies(), self._crossings(), weights.double().cpu().numpy())
-        return torch.from_numpy(values).to(weights.device)
+        return estimate, [
+            one._replace(count=count, parameters={**one.parameters, "entropy_captured_nats": -value}, warning=FALLS)
+            for one, count, value in zip(about, [sum(boxes), *boxes], estimate.value.tolist(), strict=True)
+        ]
 
     def _crossings(self) -> NDArray[np.float64 | np.bool_]:
         """(voxels,) how often each voxel is crossed in a frame, on average."""
@@ -185,28 +167,29 @@ class SMig(FrameMetric):
             what, lambda: [occupancy_of(table, number, self.grid, BLOCKS) for number in range(len(self.categories))]
         )
 
-    def _values(
-        self, of_each: Sequence[Occupancy], times: NDArray[np.float64 | np.bool_], weights: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """(R, 1 + C) the numbers: their sum, and each; NaN where there was no box."""
-        values = np.full((len(weights), 1 + len(of_each)), np.nan)
-        for column, one in enumerate(of_each, 1):
-            if one.boxes:
-                values[:, column] = -one.entropy_nats(times, weights)
-        known = [column for column, one in enumerate(of_each, 1) if one.boxes]
-        if known:
-            values[:, 0] = values[:, known].sum(axis=1)
-        return values
+
+def _again(of_each: Sequence[Occupancy], times: NDArray[np.float64 | np.bool_], weights: Tensor) -> Tensor:
+    """(R, 1 + C) the sum over the categories, and each; NaN where there was no box."""
+    of_blocks = np.zeros((len(weights), BLOCKS))
+    of_blocks[:, of_each[0].steps > 0] = weights.cpu().numpy()
+    values = np.full((len(weights), 1 + len(of_each)), np.nan)
+    for column, one in enumerate(of_each, 1):
+        if one.boxes:
+            values[:, column] = -one.entropy_nats(times, of_blocks)
+    known = [column for column, one in enumerate(of_each, 1) if one.boxes]
+    if known:
+        values[:, 0] = values[:, known].sum(axis=1)
+    return torch.from_numpy(values)
 
 
-def unequal_rays(numbers: Mapping[str, PublishedNumber]) -> str | None:
+def unequal_rays(numbers: Mapping[str, Number]) -> str | None:
     """What is to be said of the numbers of several rigs: that one has more rays than another; None if none has.
 
     Args:
         numbers: Name of the rig -> its number, of one `SMig` each.
 
     Example:
-        >>> one, two = (PublishedNumber("s_mig_0.2m", -3.0, "nats", True, {"rays": n}, 1, "boxes") for n in (4000, 90))
+        >>> one, two = (said("s_mig_0.2m", "nats", "boxes", rays=rays) for rays in (4000, 90))
         >>> unequal_rays({"one": one, "two": two})
         's_mig_0.2m: the rigs have different numbers of rays (one 4,000, two 90), and fewer rays score higher'
         >>> unequal_rays({"one": one, "same": one})
@@ -214,6 +197,6 @@ def unequal_rays(numbers: Mapping[str, PublishedNumber]) -> str | None:
     rays = {rig: number.parameters["rays"] for rig, number in numbers.items()}
     if len(set(rays.values())) < 2:
         return None
-    name = next(iter(numbers.values())).name
+    name = next(iter(numbers.values())).quantity.key
     each = ", ".join(f"{rig} {count:,}" for rig, count in rays.items())
     return f"{name}: the rigs have different numbers of rays ({each}), and fewer rays score higher"

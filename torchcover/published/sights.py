@@ -36,7 +36,7 @@ class Sights:
         self._frame: Frame | None = None
         self._found: dict[tuple[Any, ...], Any] = {}
         self._of_all: tuple[tuple[Any, ...], Any] | None = None
-        # Whether anybody wants to know of single sensors: then nobody searches for the rig as a whole.
+        # Whether a metric asks for single sensors: then the rig as a whole takes no search of its own.
         self.by_sensor = False
 
     def __reduce__(self) -> tuple[type["Sights"], tuple[()], dict[str, bool]]:
@@ -58,7 +58,7 @@ class Sights:
         """(S, M) the same for each sensor of the rig.
 
         Raises:
-            ValueError: Nobody knows which points are of which sensor.
+            ValueError: Which points are of which sensor is unknown.
         """
 
         def search() -> Tensor:
@@ -72,7 +72,7 @@ class Sights:
         """The objects of the frame.
 
         Raises:
-            ValueError: Nobody looked for them; the message says how to get them.
+            ValueError: The frame has none; the message says how to get them.
         """
         if frame.boxes is None:
             raise ValueError(NO_BOXES.format(f"frame {frame.name!r}"))
@@ -99,7 +99,7 @@ class Sights:
         return self.once(frame, ("bins", grid), lambda: grid.bins(frame.reference))
 
     def once(self, frame: Frame, what: tuple[Any, ...], find: Callable[[], Found]) -> Found:
-        """Whatever is to be found in a frame; looked for if nobody has asked for it."""
+        """Whatever is to be found in a frame; looked for when it is first asked for."""
         if frame is not self._frame:
             self._frame, self._found = frame, {}
         if what not in self._found:

@@ -85,6 +85,31 @@ class RecordedFrames(FrameDataset):
         return {}
 
     @property
+    def sensor_names(self) -> Mapping[str, tuple[str, ...]]:
+        """The names of the sensors of each rig."""
+        return self.sensors_of_rigs
+
+    def world_of(self, index: int) -> int:
+        """The index: nothing has to be built."""
+        return index
+
+    def has_boxes(self) -> bool:
+        """Whether the first frame whose boxes can be read has any, or says that there are none."""
+        for instant in self.recording.frames:
+            try:
+                return self.recording.boxes(instant) is not None
+            except (OSError, ValueError):
+                continue  # whoever measures it will say so
+        return False
+
+    def doubts(self, steps: int | None) -> Sequence[str]:
+        """As `torchcover.recordings.suspicion` says."""
+        from torchcover.recordings.suspicion import suspicions  # only before a measurement
+
+        many = len(self) if steps is None else min(steps, len(self))
+        return suspicions(self.recording, self.reference, self.sensors_of_rigs, many)
+
+    @property
     def ego_outline_m(self) -> NDArray[np.float64] | None:
         """The outline of the vehicle, if the recording says how large it is."""
         body = self.recording.body
@@ -161,7 +186,7 @@ class RecordedFrames(FrameDataset):
             reference_weights=None if reference.weights is None else torch.from_numpy(reference.weights),
             reference_heights_m=None if reference.heights_m is None else torch.from_numpy(reference.heights_m),
             boxes=boxes,
-            instant=None if self.recording.instants is None else self.recording.instants[instant],
+            place_in_time=position if self.recording.instants is None else self.recording.instants[instant],
             sensor_points={
                 rig: {sensor: len(scans[sensor].points_m) for sensor in of} for rig, of in self.sensors_of_rigs.items()
             },

@@ -118,7 +118,7 @@ class Recording(Protocol):
 
     @property
     def instants(self) -> Sequence[int] | None:
-        """`Frame.instant` of each instant, for standard errors; None: no two of them are known to be alike."""
+        """`Frame.place_in_time` of each instant, for standard errors; None: no two of them are known to be alike."""
         ...
 
     def scan(self, sensor: str, index: int, /) -> Scan:

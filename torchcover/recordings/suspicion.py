@@ -12,8 +12,7 @@ from torchcover.geometry import invert
 from torchcover.neighbors import nearest
 from torchcover.recordings.accumulated_reference import AccumulatedReference
 from torchcover.recordings.in_vehicle import in_vehicle
-from torchcover.recordings.recorded_frames import RecordedFrames
-from torchcover.recordings.recorded_reference import RecordedReference
+from torchcover.recordings.recorded_reference import RecordedReference, Reference
 from torchcover.recordings.recording import Recording
 
 # What is looked at, evenly spread over what will be measured.
@@ -44,19 +43,19 @@ class RecordedInstant:
     boxes: Boxes | None
 
 
-def suspicions(frames: RecordedFrames, steps: int | None = None) -> list[str]:
+def suspicions(recording: Recording, reference: Reference, rigs: Mapping[str, Sequence[str]], many: int) -> list[str]:
     """What looks wrong about a recording, a sentence each with what to do; it looks at a few frames only.
 
     A frame that cannot be read is not looked at: whoever measures it will say so.
 
     Args:
-        frames: The recording.
-        steps: How many of its frames will be measured; None for all.
+        recording: The recording.
+        reference: Where its reference clouds come from.
+        rigs: Name of each rig -> its sensors.
+        many: How many of its frames will be measured, from the first on.
     """
-    recording = frames.recording
-    many = len(frames) if steps is None else min(steps, len(frames))
-    judged = dict.fromkeys(sensor for of in frames.sensors_of_rigs.values() for sensor in of)
-    recorded = recording.reference_sensors if isinstance(frames.reference, RecordedReference) else ()
+    judged = dict.fromkeys(sensor for of in rigs.values() for sensor in of)
+    recorded = recording.reference_sensors if isinstance(reference, RecordedReference) else ()
     sensors = tuple(dict.fromkeys((*judged, *recorded)))
     looks = [
         look
@@ -68,10 +67,10 @@ def suspicions(frames: RecordedFrames, steps: int | None = None) -> list[str]:
         *(mirrored(sensor, [(look.clouds[sensor], look.boxes) for look in looks]) for sensor in sensors),
         *(
             same_clouds(rig, [(_joined(look, of), _joined(look, recorded)) for look in looks])
-            for rig, of in frames.sensors_of_rigs.items()
+            for rig, of in rigs.items()
         ),
         *wrong_motion(recording),
-        alone_in_window(recording, frames.reference) if isinstance(frames.reference, AccumulatedReference) else None,
+        alone_in_window(recording, reference) if isinstance(reference, AccumulatedReference) else None,
     ]
     return [f"{recording.path}: {doubt}" for doubt in doubts if doubt is not None]
 

@@ -3,7 +3,7 @@
 from torchcover.report.drawings.choice import ChoiceSize, draw_choice
 from torchcover.report.drawings.film import check_film, write_film
 from torchcover.report.drawings.four_views import draw_four_views
-from torchcover.report.drawings.frame import ActorMark, Standing, draw_depths, draw_scene
+from torchcover.report.drawings.frame import ActorMark, Scenery, draw_depths, draw_scene
 from torchcover.report.drawings.rig import draw_rig
 from torchcover.report.drawings.search import Slice, draw_fronts, draw_progress, draw_slices
 from torchcover.report.drawings.targets import draw_targets
@@ -23,7 +23,7 @@ from torchcover.report.renderers.layout import BOLD_MARKS, PLACE_HEADINGS, Part,
 from torchcover.report.renderers.markdown_file import as_markdown
 from torchcover.report.renderers.text_file import narrowest_width, print_table, text_table
 from torchcover.report.table import CoverageTable, Row
-from torchcover.report.wording import difference_heading, error_words, percent, shown_unit
+from torchcover.report.wording import difference_heading, error_words, number_words, percent, shown_unit
 
 __all__ = [
     "BOLD_MARKS",
@@ -42,10 +42,10 @@ __all__ = [
     "Part",
     "Remark",
     "Row",
+    "Scenery",
     "SensorView",
     "SkinPatch",
     "Slice",
-    "Standing",
     "Words",
     "WorkPanel",
     "as_markdown",
@@ -75,6 +75,7 @@ __all__ = [
     "marks_on",
     "narrowest_width",
     "notes_on",
+    "number_words",
     "page_html",
     "parts_of",
     "percent",

@@ -16,7 +16,7 @@ class ShownUnit(NamedTuple):
         name: Behind a number.
         difference_name: Behind a difference of two of them.
         factor: From the unit of the quantity to what is shown.
-        decimals: Of a number without an error.
+        decimals: Of a number without an error; None for four digits.
         max_decimals: More than anybody can use, however small the error.
         highest: The largest number there is, as it is shown.
     """
@@ -24,7 +24,7 @@ class ShownUnit(NamedTuple):
     name: str
     difference_name: str
     factor: float
-    decimals: int
+    decimals: int | None
     max_decimals: int
     highest: float
 
@@ -45,7 +45,7 @@ def shown_unit(unit: Unit) -> ShownUnit:
         >>> shown_unit("share").name, shown_unit("nats").name
         ('%', 'nats')
     """
-    return _UNITS.get(unit) or ShownUnit(unit, unit, 1.0, 2, 4, math.inf)
+    return _UNITS.get(unit) or ShownUnit(unit, unit, 1.0, None, 9, math.inf)
 
 
 class Rounded(NamedTuple):
@@ -118,9 +118,16 @@ def _to_error(value: float, error: float, shown: ShownUnit) -> Rounded:
 
 
 def _to_decimals(value: float, shown: ShownUnit) -> Rounded:
-    number = _round(value, shown.decimals)
+    decimals = _decimals(value, shown)
+    number = _round(value, decimals)
     # A share is told from none; a length below half a centimetre is none.
-    return _not_to_an_end(number, value, shown, shown.decimals) if math.isfinite(shown.highest) else number
+    return _not_to_an_end(number, value, shown, decimals) if math.isfinite(shown.highest) else number
+
+
+def _decimals(value: float, shown: ShownUnit) -> int:
+    if shown.decimals is not None:
+        return shown.decimals
+    return min(shown.max_decimals, max(0, 3 - math.floor(math.log10(abs(value))))) if value else 0
 
 
 def _not_to_an_end(number: Rounded, value: float, shown: ShownUnit, decimals: int) -> Rounded:
@@ -148,13 +155,14 @@ def value_words(number: float, error: float, unit: Unit) -> str:
     """A number and its standard error, without the unit.
 
     Args:
-        number: Metres, or a share in [0, 1].
+        number: In its unit.
         error: Its standard error; NaN for none.
         unit: Its unit.
 
     Returns:
-        A length with two decimals, a share in percent with one; with an error as many as its two digits need, at most
-        four and three. A share is never rounded to 0 or 100. "unknown" for NaN, "infinite" for infinity.
+        A length with two decimals, a share in percent with one, what has another unit with four digits; with an error
+        as many as its two digits need, of lengths and shares at most four and three. A share is never rounded to 0 or
+        100. "unknown" for NaN, "infinite" for infinity.
 
     Example:
         >>> none = float("nan")
@@ -164,6 +172,8 @@ def value_words(number: float, error: float, unit: Unit) -> str:
         ['0.341 ± 0.012', '0.3413 ± 0.0012', '0.3413 ± <0.0001', '0.34 ± 0']
         >>> value_words(0.49812, 0.00123, "share"), value_words(1.0, 0.0, "share")
         ('49.81 ± 0.12', '100 ± 0')
+        >>> value_words(-0.0123456, none, "nats"), value_words(12345.6, none, "points")
+        ('-0.01235', '12346')
     """
     if math.isnan(number):
         return UNKNOWN
@@ -225,7 +235,7 @@ def difference_words(difference: Difference) -> str:
     shown = shown_unit(unit)
     value, error = shown.factor * difference.value, shown.factor * difference.error
     inexact = error > 100 * ROUND_OFF
-    decimals = decimals_of(error, shown.max_decimals) if inexact else shown.decimals
+    decimals = decimals_of(error, shown.max_decimals) if inexact else _decimals(value, shown)
     # What rounds to nothing has no sign: a loss too small to be shown is no gain. Adding 0 turns -0.0 into 0.0.
     shown_value = round(value, decimals) + 0.0
     words = f"{shown_value:{'+' if shown_value else ''}.{decimals}f}" if inexact or value else "0"

@@ -30,6 +30,7 @@ from .sensor import RayHits as RayHits
 from .sensor import Returns as Returns
 from .sensor import Sensor as Sensor
 from .sensor import vertical_fov_deg as vertical_fov_deg
+from .shapes import Mesh as Mesh
 from .simulated_frames import DEFAULT_REFERENCE as DEFAULT_REFERENCE
 from .simulated_frames import SimulatedFrames as SimulatedFrames
 from .simulated_frames import reference_called as reference_called

@@ -22,6 +22,7 @@ from torchcover.simulation.regions_of_interest import Asked, RegionsOfInterest
 from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.sensor import Sensor
+from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.simulator import Observation, Simulator
 from torchcover.simulation.surface_reference import SurfaceReference
 
@@ -46,7 +47,7 @@ class SimulatedFrames(FrameDataset):
         rig: The sensors, the name of a built-in rig, or the path of a YAML file.
         rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds.
         steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
-            traffic, the same instants are seen again, which `Frame.instant` and `Frame.counts` say.
+            traffic, the same instants are seen again, which `Frame.place_in_time` and `Frame.counts` say.
         seed: Seed of the traffic and of the reference sensor's poses.
         reference_sensor: The reference sensor, such as `PaperReference()`. If not given, a `SurfaceReference` that is
             aimed at the usual regions: `reference_called`, and `reference_of_objects` with boxes, at up to twice the
@@ -133,6 +134,23 @@ class SimulatedFrames(FrameDataset):
         return {name: rig.sensors for name, rig in self.rigs.items()}
 
     @property
+    def sensor_names(self) -> Mapping[str, Sequence[str]]:
+        """The names of the sensors of each rig."""
+        return {name: [sensor.name for sensor in rig.sensors] for name, rig in self.rigs.items()}
+
+    def world_of(self, index: int) -> int:
+        """Which world a frame is of; of one that plays again and again every process has it whole: the index."""
+        return index if self.scenario.repeats else self.simulator.run_of(index)
+
+    def has_boxes(self) -> bool:
+        """Whether they were asked for."""
+        return self.boxes
+
+    def ego_mesh(self) -> Mesh:
+        """What carries the rigs, in the vehicle frame; no world is built for it."""
+        return self.scenario.ego_mesh()
+
+    @property
     def ego_outline_m(self) -> NDArray[np.float64]:
         """(4, 2) corners x, y of the ego as seen from above, counter-clockwise; no world is built for it."""
         return self.scenario.ego_box().outline_m
@@ -203,7 +221,7 @@ class SimulatedFrames(FrameDataset):
             name=f"{self.scenario.name} step {index}",
             counts=seen.counts,
             boxes=self._boxes(index, clouds, seen.drawn) if self.boxes else None,
-            instant=self.simulator.place_in_time(index),
+            place_in_time=self.simulator.place_in_time(index),
             sensor_points={
                 name: dict(zip((sensor.name for sensor in self.rigs[name].sensors), points, strict=True))
                 for name, points in seen.sensor_points.items()

@@ -136,7 +136,7 @@ class CoverageCallback(Callback):
             [sensor_of(frame, self.rig) for frame in new.frames],
             new.reference,
             weights=new.weights,
-            index=None if UNKNOWN_INDEX in indices else new.index,
+            place_in_time=None if UNKNOWN_INDEX in indices else new.place_in_time,
         )
 
     def _shard(self, trainer: Trainer, loader_index: int) -> Shard | None:

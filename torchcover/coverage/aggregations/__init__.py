@@ -1,14 +1,11 @@
-"""Aggregations: how radii become maps and numbers of regions. One file each; a new one is a class and a line here."""
+"""Aggregations: how radii become maps and numbers of regions. A new one is a class and a line here."""
 
 from dataclasses import fields
 
-from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, State
+from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, Layer, State
 from torchcover.coverage.aggregations.maximum import Maximum
-from torchcover.coverage.aggregations.mean_of_means import MeanOfMeans
-from torchcover.coverage.aggregations.pooled_mean import PooledMean
-from torchcover.coverage.aggregations.quantiles import Quantiles
-from torchcover.coverage.aggregations.step_quantiles import StepQuantiles
-from torchcover.coverage.aggregations.visible_area import VisibleArea
+from torchcover.coverage.aggregations.means import MeanOfMeans, PooledMean, VisibleArea
+from torchcover.coverage.aggregations.quantiles import Quantiles, StepQuantiles
 
 # Those that a metric may have besides the mean of means.
 AGGREGATIONS: tuple[type[Aggregation], ...] = (Maximum, Quantiles, StepQuantiles, PooledMean)
@@ -43,6 +40,7 @@ __all__ = [
     "AGGREGATIONS",
     "Aggregation",
     "BinnedStep",
+    "Layer",
     "Maximum",
     "MeanOfMeans",
     "PooledMean",

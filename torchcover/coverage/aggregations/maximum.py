@@ -8,8 +8,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, State
-from torchcover.coverage.layer import Layer
+from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, Layer, State
 from torchcover.coverage.quantity import radius
 
 

@@ -1,17 +1,79 @@
-"""Quantiles of the points' radii, each step weighing the same."""
+"""Quantiles over points and over steps, from histograms, whose size does not grow with the steps."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, State
-from torchcover.coverage.histogram import RADIUS_EDGES_M, bin_of, check_levels, histogram_quantiles
-from torchcover.coverage.layer import Layer
+from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, Layer, State
 from torchcover.coverage.quantity import radius
 from torchcover.estimation import Quantity
+
+# A sum of weights that misses its target by rounding has reached it: 0.1 + 0.2 + 0.3 is half of 1.2.
+ROUNDED_DOWN = 1 - 1e-9
+# Bins of radii: 20 a decade from 1 cm to 100 m, and one beyond each end.
+RADIUS_EDGES_M = torch.cat([torch.tensor([0.0]), torch.logspace(-2, 2, 81), torch.tensor([math.inf])]).double()
+
+
+def bin_of(values: Tensor, edges: Tensor) -> Tensor:
+    """Index of the half-open bin [edges[i], edges[i + 1]) of each value.
+
+    Args:
+        values: (N,) float64.
+        edges: (B + 1,) float64, ascending; a bin between equal edges is empty.
+
+    Returns:
+        (N,) int64 bin indices in [0, B), -1 outside.
+
+    Example:
+        >>> bin_of(torch.tensor([-0.1, 0.0, 0.9, 2.0]).double(), torch.tensor([0.0, 1.0, 2.0]).double())
+        tensor([-1,  0,  0, -1])
+    """
+    index = torch.bucketize(values, edges.to(values.device), right=True) - 1
+    return index.where(index < len(edges) - 1, -1)
+
+
+def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float]) -> Tensor:
+    """Quantiles from weights in bins, linear within a bin.
+
+    Args:
+        histogram: (B, C) weight in each bin, one column a cell.
+        edges: (B + 1,) bin edges, ascending; the last may be infinite.
+        levels: Q levels in [0, 1].
+
+    Returns:
+        (Q, C) quantiles; infinite in the last bin if its upper edge is; NaN in a column without weight.
+    """
+    edges, cumulative = edges.to(histogram.device), histogram.cumsum(dim=0)
+    total = cumulative[-1]
+    rows = []
+    for level in levels:
+        target = total * level
+        # The second condition matters at level 0: the least value lies in the first bin that has any weight.
+        at = ((cumulative < target * ROUNDED_DOWN) | (cumulative == 0)).sum(dim=0).clamp(max=len(histogram) - 1)
+        weight = histogram.gather(0, at[None])[0]
+        below = cumulative.gather(0, at[None])[0] - weight
+        share = ((target - below) / weight).nan_to_num(0.0).clamp(0, 1)
+        low, high = edges[at], edges[at + 1]
+        value = torch.where(high.isinf(), high, low + share * (high - low))
+        rows.append(value.where(total > 0, math.nan))
+    return torch.stack(rows)
+
+
+def check_levels(levels: Sequence[float]) -> tuple[float, ...]:
+    """The levels of quantiles as plain floats.
+
+    Raises:
+        ValueError: None, one given twice, or one outside [0, 1].
+    """
+    checked = tuple(float(level) for level in levels)
+    distinct = {f"{level:g}" for level in checked}  # as the keys of their layers tell them apart
+    if not checked or len(distinct) != len(checked) or not all(0 <= level <= 1 for level in checked):
+        raise ValueError(f"levels: different numbers in [0, 1] are needed; got {tuple(levels)}")
+    return checked
 
 
 @dataclass(frozen=True)
@@ -60,3 +122,41 @@ class Quantiles(Aggregation):
         """A map for each level."""
         values = histogram_quantiles(sums["histogram"], RADIUS_EDGES_M, self.levels).clamp(max=max_radius)
         return list(map(Layer, self.quantities, values))
+
+
+@dataclass(frozen=True)
+class StepQuantiles(Aggregation):
+    """Quantiles over the steps that have probed a cell of the mean radius of its points in the step.
+
+    Where `Quantiles` asks for the bad points of a cell, this asks for its bad moments: at level 0.9, one step in ten
+    is worse. The histogram is that of `Quantiles`, and so is the error.
+
+    Args:
+        levels: Which, in [0, 1].
+
+    Raises:
+        ValueError: No level, or one outside [0, 1].
+    """
+
+    name: ClassVar[str] = "step_quantiles"
+    words: ClassVar[str] = "quantiles over steps"
+
+    levels: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "levels", check_levels(self.levels))
+
+    def states(self, cells: int) -> dict[str, State]:
+        """`histogram` (bins, C): in how many steps the mean radius of the cell fell into each bin."""
+        return {"histogram": State(torch.zeros((), dtype=torch.int64).expand(len(RADIUS_EDGES_M) - 1, cells))}
+
+    def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
+        """Count the step in every cell that it has probed; a cell comes once."""
+        bins = bin_of(step.means.mean[0].clamp(max=1e300), RADIUS_EDGES_M)
+        sums["histogram"][bins, step.means.cell] += 1
+
+    def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
+        """A map for each level."""
+        values = histogram_quantiles(sums["histogram"].double(), RADIUS_EDGES_M, self.levels).clamp(max=max_radius)
+        quantities = [radius(f"step_q{level:g}", f"{level:g} quantile over steps of the mean") for level in self.levels]
+        return list(map(Layer, quantities, values))

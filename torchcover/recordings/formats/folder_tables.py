@@ -26,7 +26,8 @@ class PoseTable:
 
     Args:
         path: A table with the columns `frame, x_m, y_m, z_m, qw, qx, qy, qz`, and `time_s` if it is `timed`; `instant`
-            may be there too, a whole number that frames share which are no news to each other (see `Frame.instant`).
+            may be there too, a whole number that frames share which are no news to each other
+            (`Frame.place_in_time`).
         names: The frames, in order.
         timed: Whether there are times.
 

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from torchcover.report.drawings.body import VIEWS, draw_body
+from torchcover.report.drawings.vehicle import VIEWS, draw_body
 from torchcover.report.maps.overlay import SensorView, sensor_colour
 from torchcover.report.maps.sheet import (
     HEADING_POINTS,

@@ -1,4 +1,4 @@
-"""What the maps of a run show: the quantities of its measure, and those of the aggregations beside it."""
+"""What the maps of a run show: the quantities of its measure, and those of other aggregations."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass

@@ -95,7 +95,7 @@ class PageRig:
     Args:
         name: What tables and maps call it.
         sensors: Its sensors, if they are known.
-        document: It as YAML; empty if nobody knows.
+        document: It as YAML; empty if it is unknown.
     """
 
     name: str
