@@ -95,14 +95,15 @@ class Frame:
 
     def _each(self, change: Callable[[Tensor], Tensor], boxes: Boxes | None) -> "Frame":
         clouds = {name: change(cloud) for name, cloud in self.clouds.items()}
-        of_points = {
-            name: None if values is None else change(values)
-            for name, values in (
-                ("reference_weights", self.reference_weights),
-                ("reference_heights_m", self.reference_heights_m),
-            )
-        }
-        return replace(self, clouds=clouds, reference=change(self.reference), boxes=boxes, **of_points)
+        weights, heights_m = self.reference_weights, self.reference_heights_m
+        return replace(
+            self,
+            clouds=clouds,
+            reference=change(self.reference),
+            reference_weights=None if weights is None else change(weights),
+            reference_heights_m=None if heights_m is None else change(heights_m),
+            boxes=boxes,
+        )
 
 
 @dataclass(frozen=True)

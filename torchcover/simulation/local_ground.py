@@ -127,7 +127,8 @@ def _probes_m(corners_m: Float64, border: Numbers) -> Float64:
     across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(np.float64).tiny)
     probes_m = start_m[:, None] + PROBES[:, None] * (end_m - start_m)[:, None]
     probes_m[..., :2] += BEYOND_M * across[:, None]
-    return probes_m.reshape(-1, 3)
+    probes: Float64 = probes_m.reshape(-1, 3)
+    return probes
 
 
 def _met(caster: RayCaster, places_m: Float64, near_m: float) -> Numbers:

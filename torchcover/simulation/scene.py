@@ -88,7 +88,7 @@ class Scene:
         static, known = self.world.static, self.world.ground
         if known is None:
             looks = np.unique(np.linspace(0, self.world.steps - 1, GROUND_LOOKS).astype(np.int64))
-            times_s = self.world.time_step_s * looks
+            times_s = self.world.time_step_s * looks.astype(np.float64)
             return ground_under(static, self.world.ego.trajectory.positions_at(times_s))
         return [
             level_faces(mesh) if number in known else np.zeros(len(mesh.faces), dtype=bool)

@@ -149,8 +149,8 @@ def _inner_points(side: int) -> Float64:
     """(N, 3) shares of the corners of a triangle, of points spread over it."""
     a, b = np.indices((side, side)).reshape(2, -1)
     inside = a + b < side
-    a, b = (a[inside] + 1 / 3) / side, (b[inside] + 1 / 3) / side
-    return np.stack([1 - a - b, a, b], axis=1)
+    second, third = (a[inside] + 1 / 3) / side, (b[inside] + 1 / 3) / side
+    return np.stack([1 - second - third, second, third], axis=1)
 
 
 def _share(count: int, of: int) -> str:

@@ -20,7 +20,7 @@ Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
 # Between which heights above the ground the ground itself lies.
-OF_GROUND_M = np.float32([[-TOLERANCE_M - HEIGHT_SLACK_M], [HEIGHT_SLACK_M]])
+OF_GROUND_M = np.array([[-TOLERANCE_M - HEIGHT_SLACK_M], [HEIGHT_SLACK_M]], dtype=np.float32)
 # Side of the squares of the ground by which patches are looked up.
 CELL_M = 16  # a power of two
 # A drive is followed by boxes around stretches of it of this length.
@@ -68,8 +68,8 @@ class AboveGround(NamedTuple):
             others = np.flatnonzero(~self.ground[number][face])
             corners_m = _moved_corners(self.squares_T_static, triangles_m.take(others, axis=2))
             heights_m[:, others] = self.squares.heights_m(corners_m)
-            low_m, high_m = heights_m
-            return heights_m, (high_m >= self.lowest_m) & (low_m <= self.highest_m)
+            wanted: Bools = (heights_m[1] >= self.lowest_m) & (heights_m[0] <= self.highest_m)
+            return heights_m, wanted
 
         return heights
 

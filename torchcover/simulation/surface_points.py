@@ -41,7 +41,9 @@ class SurfacePoints(NamedTuple):
 
     def some(self, which: Bools) -> Self:
         """Those of them for which (K,) is true."""
-        return type(self)(*(part[which] for part in self[:-1]), self.face[:, which])
+        turned = self._replace(face=self.face.T)
+        some = type(self)._make(part[which] for part in turned)
+        return some._replace(face=some.face.T)
 
 
 class Stratum(NamedTuple):
@@ -131,7 +133,8 @@ class SurfaceStrata:
     def _heights_of(self, points_m: Float32, patch: Numbers) -> Float32:
         """(K,) what the third bounds of the boxes are about, of (3, K) points on the patches."""
         if self._heights_m is None:
-            return points_m[2]
+            z_m: Float32 = points_m[2]
+            return z_m
         asked = np.flatnonzero(self._patches.heights_m[1].take(patch) > HEIGHT_SLACK_M)  # the others are the ground
         heights_m = np.zeros(len(patch), dtype=np.float32)
         heights_m[asked] = self._heights_m(points_m.take(asked, axis=1).T)
