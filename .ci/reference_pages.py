@@ -173,8 +173,17 @@ def api():
             if inspect.isclass(one) or inspect.isfunction(one):
                 lines += ["", f"::: {one.__module__}.{one.__qualname__}"]
                 if hasattr(one, "__wrapped__"):  # whose arguments are the fields of a document: not in its source
-                    lines += ["    options:", "      force_inspection: true"]
+                    lines += ["    options:", "      show_signature: false", *argument_rows(one)]
     return "\n".join(lines)
+
+
+def argument_rows(function):
+    """A table of the arguments of a function."""
+    words = of_docstring(function)[1]
+    yield from ("", "| argument | default | |", "|---|---|---|")
+    for name, one in inspect.signature(function).parameters.items():
+        default = "" if one.default is None or callable(one.default) else f"`{one.default!r}`"
+        yield f"| `{name}` | {cell(default)} | {cell(words[name])} |"
 
 
 def cell(text):

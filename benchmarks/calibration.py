@@ -21,7 +21,7 @@ from torchcover.coverage.blocks import AreaSums
 from torchcover.coverage.measures import estimate_area
 from torchcover.data import SimulatedFrames
 from torchcover.estimation import ratio_errors, student
-from torchcover.evaluation.observers import BLOCKS
+from torchcover.evaluation.measuring import BLOCKS
 from torchcover.evaluation.target_error import LOOKS_IN_A_ROW, MAX_GROWTH, MIN_GROWTH, MIN_STEPS
 from torchcover.simulation.regions_of_interest import GRID_X_M, GRID_Y_M
 

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.timing import compare, table
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import Draws, PaperReference, Rig, Scenario
-from torchcover.simulation.instant import Scan, cast_from
+from torchcover.simulation.instant import SensorScan, cast_from
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles, rotate
 from torchcover.simulation.scene import Scene
@@ -78,7 +78,7 @@ def at_every_body(instant, pose, tiles):
         found.append((directions * hits.range_m + pose[:3, 3].astype(np.float32)[:, None])[:, seen].T)
         self_hits += int((hits.body == instant.ego).sum())
     points = np.concatenate(found)
-    return Scan(points, np.arange(len(points)), np.empty(0, dtype=np.float32), 0, self_hits)
+    return SensorScan(points, np.arange(len(points)), np.empty(0, dtype=np.float32), 0, self_hits)
 
 
 def ego_again(scene, sensor):

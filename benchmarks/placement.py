@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from benchmarks.timing import table
-from torchcover.placement import OPTIMISERS, Cube, PlacementSearch, SearchSpace
+from torchcover.placement import OPTIMISERS, Cube, PlacementSearch, SearchSpace, run_search
 from torchcover.placement.optimisers.gp_model import GaussianProcess
 
 SPACE = {
@@ -26,18 +26,12 @@ def gains(result):
     for pick in result.picks:
         if pick.is_start:
             yield pick.arm, "-", "nothing better than the start", "", "", "", ""
-        for _, measure, gain in result.gains_of(pick):
+        for gain in pick.gains:
             places = ", ".join(f"{value:.2f}" for value in pick.evaluation.values.values())
-            fresh = f"{100 * gain.gain:+.2f} ± {100 * gain.error:.2f}"
-            yield (
-                pick.arm,
-                measure,
-                places,
-                f"{100 * gain.search_gain:+.2f}",
-                fresh,
-                f"{gain.t:.1f}",
-                f"{gain.better} of {gain.worlds}",
-            )
+            test = gain.test
+            fresh = f"{100 * test.gain:+.2f} ± {100 * test.error:.2f}"
+            better = f"{test.better} of {test.blocks}"
+            yield pick.arm, gain.measure, places, f"{100 * gain.search_gain:+.2f}", fresh, f"{gain.t:.1f}", better
 
 
 def emulator(search):
@@ -79,7 +73,7 @@ def main(arguments=()):
     torch.set_num_threads(1)
     search = PlacementSearch(SearchSpace.model_validate(SPACE), measure=options.measure, **budget, **given)
     start = time.process_time()
-    result = search.run()
+    result = run_search(search)
     seconds = time.process_time() - start
     spent = [f"{name} {len(arm.evaluations) - 1}" for name, arm in search.arms.items()]
     print(f"{search.optimiser_name}, {len(search.instants)} instants; candidates: {', '.join(spent)}; {seconds:.0f} s "

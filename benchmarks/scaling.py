@@ -22,7 +22,7 @@ from benchmarks.timing import table
 from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.checkpoint import write_checkpoint
-from torchcover.evaluation.observers import new_metric
+from torchcover.evaluation.measuring import new_metric
 from torchcover.evaluation.transport import packed
 from torchcover.simulation import Scenario
 

@@ -337,7 +337,7 @@ def test_a_grid_that_does_not_fit_into_memory_ends_in_one_line(torchcover, tmp_p
     def no_memory(*_, **__):
         raise RuntimeError("[enforce fail at alloc_cpu.cpp] can't allocate memory")
 
-    monkeypatch.setattr("torchcover.evaluation.observers.CoverageMetric", no_memory)
+    monkeypatch.setattr("torchcover.evaluation.measuring.CoverageMetric", no_memory)
     code, _, complaints = torchcover("evaluate", "front_roof_32", "--cell-m", "0.05", "--out", tmp_path / "out")
     assert code == 2
     assert complaints.strip() == (

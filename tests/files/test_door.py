@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchcover.files import BadFileError, TooLargeError, check_memory, read_npz, read_short_text, reads
-from torchcover.files.text import MAX_SHORT_BYTES
+from torchcover.files.bad_file import MAX_SHORT_BYTES
 
 
 def reading(tmp_path, error):

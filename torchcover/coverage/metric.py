@@ -11,12 +11,14 @@ from torchcover.coverage.aggregations import Aggregation, BinnedStep, Layer, Mea
 from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.blocks import AreaSums, Blocks, BlockSumsT
 from torchcover.coverage.grid import BevGrid
+from torchcover.coverage.measures import Measure, estimate_area
 from torchcover.coverage.plotting import draw_coverage
 from torchcover.coverage.redundancy import PlaceSums, Redundancy, SensorFailures
 from torchcover.coverage.region_sums import IN_REGIONS, RegionSums
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.steps import CheckedStep, Clouds, SensorClouds, as_list, check_parameters, checked_steps
+from torchcover.estimation import Estimate
 from torchcover.metrics import SumsInBlocks, figure_of
 from torchcover.neighbors import nearest
 
@@ -259,6 +261,26 @@ class CoverageMetric(SumsInBlocks):
             aggregated=self._in_regions.numbers(self._sums_of(IN_REGIONS), self.max_radius),
             redundancy=self._redundancy(probed_steps) if self.sensors else None,
         )
+
+    def estimates(self, places: Sequence[tuple[Region, str]], measure: Measure) -> list[Estimate]:
+        """The numbers of regions in bands so far: those of `compute().estimate`, but no maps are made for them.
+
+        Args:
+            places: Regions within the grid, each with the name of a band.
+            measure: What the numbers are means over, as there.
+
+        Raises:
+            ValueError: As there.
+        """
+        if measure == "known" or not self.square_metres:
+            coverage = self.compute()
+            return [coverage.estimate(region, height, measure) for region, height in places]
+        area, quantities = self._listed(AreaSums, self.area_m2, self.area_sums), MeanOfMeans(self.thresholds).quantities
+        bands = list(self.grid.heights)
+        return [
+            estimate_area(quantities, area, bands.index(height), region.mask(self.grid).to(area.at.device))
+            for region, height in places
+        ]
 
     def _layers(self, aggregation: Aggregation, probed_steps: Tensor) -> list[Layer]:
         found = aggregation.layers(self._sums_of(aggregation.name), probed_steps, self.max_radius)

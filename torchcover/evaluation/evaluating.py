@@ -55,7 +55,7 @@ def compare(results: Sequence[Result | str | Path]) -> Result:
 
     Example:
         >>> low, high = (evaluate(rig, steps=8, cell_m=2.0, rays=512) for rig in ("front_grille_128", "front_roof_128"))
-        >>> compare([low, high]).table.rigs
+        >>> list(compare([low, high]).coverages)
         ['front_grille_128', 'front_roof_128']
     """
     measured_already = [one for given in results for one in _coverages(given)]

@@ -1,18 +1,19 @@
 """One measurement: a task and its settings in, a result out; from a checkpoint, and over ranks."""
 
-import hashlib
-import json
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-from torchcover import __version__
-from torchcover.coverage import CoverageMetric
+import torch
+from torch import Tensor
+
+from torchcover.coverage import Aggregation, CoverageMetric
 from torchcover.evaluation.checkpoint import Checkpoint, Journal
-from torchcover.evaluation.observers import BLOCKS, AnyObserver, CoverageObserver, new_metric, usable_device
+from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.other_metrics import compared, metrics_of
 from torchcover.evaluation.pipeline import Run, observe
 from torchcover.evaluation.ranks import Ranks
@@ -21,13 +22,17 @@ from torchcover.evaluation.result_files import claimed
 from torchcover.evaluation.result_page import check_drawable, left_out
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import TargetWatch
-from torchcover.evaluation.task import CALLER, Task
+from torchcover.evaluation.task import CALLER, Task, run_identity
 from torchcover.frames import BadFrameError, FrameSource
 from torchcover.simulation import Asked
+from torchcover.simulation.memory import check_fits
 
 Observers = Mapping[str, AnyObserver]
-# Of an identity, what is longer is told by its hash.
-MAX_TOLD = 40
+# For standard errors: at least half as many are in use at the end of a long run.
+BLOCKS = 16
+# Beside its sums a metric makes a result of them, at most as large.
+STATE_COPIES = 2
+TOO_MANY_CELLS = "use larger cells, or a smaller grid"
 
 
 def measured(task: Task[FrameSource], settings: Settings) -> Result:
@@ -200,50 +205,58 @@ def metric_of(
     )
 
 
-def run_identity(
-    task: Task[FrameSource], settings: Settings, others: Mapping[str, AnyObserver], ranks: int = 1
-) -> dict[str, str]:
-    """All that the result of a run depends on, by name: not the steps, of which there may be more later, nor who works.
-
-    Args:
-        task: What is measured.
-        settings: How.
-        others: The user's own observers.
-        ranks: How many processes share the run; each has its own part of it.
-
-    Returns:
-        Name -> what it is, or a hash of it.
+def usable_device(name: str) -> torch.device:
+    """The device of this name.
 
     Raises:
-        FileNotFoundError: A file that a document names is missing.
+        ValueError: It cannot be used here.
     """
-    kinds = {name: f"{type(one).__module__}.{type(one).__qualname__}" for name, one in others.items()}
-    everything = {
-        "torchcover": __version__,
-        **task.frames.content,
-        "rigs": task.rigs,
-        **_asked(task.asked),
-        "thresholds_m": settings.thresholds_m,
-        "aggregations": settings.aggregations,
-        "estimate": settings.estimate,
-        "redundancy": settings.redundancy,
-        "target_error": settings.target_error,
-        "observers": kinds,
-        "ranks": ranks,
-    }
-    return {name: _told(value) for name, value in everything.items()}
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device, dtype=torch.float64).item()  # the device `meta` has no values
+    except (RuntimeError, AssertionError, TypeError, ImportError) as error:
+        said = str(error).splitlines()[0].partition(". ")[0]  # some go on for pages
+        raise ValueError(f"device {name}: cannot be used here ({said}); try cpu") from error
+    return device
 
 
-def _asked(asked: Asked) -> dict[str, object]:
+def new_metric(
+    asked: Asked,
+    thresholds: tuple[float, ...],
+    device: torch.device,
+    *,
+    blocks: int = BLOCKS,
+    aggregations: Sequence[Aggregation] = (),
+    sensors: Sequence[str] = (),
+    square_metres: bool = False,
+) -> CoverageMetric:
+    """An empty metric of what is asked about, with standard errors unless there is one block only.
+
+    Raises:
+        ValueError: A threshold that makes no sense, or more cells than there is memory for.
+    """
     grid = asked.grid
-    return {
-        "cell_m": grid.cell,
-        "grid": [grid.x, grid.y],
-        "heights": list(grid.heights.items()),
-        "regions": [[region.name, region.x, region.y, region.corners_m] for region in asked.regions],
-    }
-
-
-def _told(value: object) -> str:
-    text = json.dumps(value, sort_keys=True, default=repr)
-    return text if len(text) <= MAX_TOLD else f"#{hashlib.sha256(text.encode()).hexdigest()}"
+    build = partial(
+        CoverageMetric,
+        grid,
+        thresholds,
+        max_radius=grid.diagonal_m,
+        blocks=blocks,
+        aggregations=aggregations,
+        regions=asked.regions,
+        sensors=sensors,
+        square_metres=square_metres,
+        sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
+    )
+    try:
+        with torch.device("meta"):  # where tensors have a size and take no memory
+            need = STATE_COPIES * sum(
+                state.nbytes for state in build().metric_state.values() if isinstance(state, Tensor)
+            )
+        check_fits(f"the sums of {grid.cells:,} cells in {blocks} blocks", need, TOO_MANY_CELLS)
+        return build().to(device)
+    except RuntimeError as error:  # what torch raises when there is no memory left on the device
+        raise ValueError(
+            f"a cell of {grid.cell:g} m: there is not enough memory for the sums of {grid.cells:,} cells in {blocks} "
+            f"blocks; {TOO_MANY_CELLS}"
+        ) from error

@@ -1,22 +1,12 @@
 """What is fed with frames: coverage, and whatever else a user wants to know of them."""
 
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
-import torch
 from torch import Tensor
 
-from torchcover.coverage import Aggregation, Coverage, CoverageMetric
+from torchcover.coverage import Coverage, CoverageMetric
 from torchcover.frames import Frame
-from torchcover.simulation import Asked
-from torchcover.simulation.memory import check_fits
-
-# For standard errors: at least half as many are in use at the end of a long run.
-BLOCKS = 16
-# Beside its sums a metric makes a result of them, at most as large.
-STATE_COPIES = 2
-TOO_MANY_CELLS = "use larger cells, or a smaller grid"
 
 ResultT = TypeVar("ResultT", covariant=True)
 
@@ -135,60 +125,3 @@ class CoverageObserver:
 
 
 AnyObserver = Observer[Any]
-
-
-def usable_device(name: str) -> torch.device:
-    """The device of this name.
-
-    Raises:
-        ValueError: It cannot be used here.
-    """
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device, dtype=torch.float64).item()  # the device `meta` has no values
-    except (RuntimeError, AssertionError, TypeError, ImportError) as error:
-        said = str(error).splitlines()[0].partition(". ")[0]  # some go on for pages
-        raise ValueError(f"device {name}: cannot be used here ({said}); try cpu") from error
-    return device
-
-
-def new_metric(
-    asked: Asked,
-    thresholds: tuple[float, ...],
-    device: torch.device,
-    *,
-    blocks: int = BLOCKS,
-    aggregations: Sequence[Aggregation] = (),
-    sensors: Sequence[str] = (),
-    square_metres: bool = False,
-) -> CoverageMetric:
-    """An empty metric of what is asked about, with standard errors unless there is one block only.
-
-    Raises:
-        ValueError: A threshold that makes no sense, or more cells than there is memory for.
-    """
-    grid = asked.grid
-    build = partial(
-        CoverageMetric,
-        grid,
-        thresholds,
-        max_radius=grid.diagonal_m,
-        blocks=blocks,
-        aggregations=aggregations,
-        regions=asked.regions,
-        sensors=sensors,
-        square_metres=square_metres,
-        sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
-    )
-    try:
-        with torch.device("meta"):  # where tensors have a size and take no memory
-            need = STATE_COPIES * sum(
-                state.nbytes for state in build().metric_state.values() if isinstance(state, Tensor)
-            )
-        check_fits(f"the sums of {grid.cells:,} cells in {blocks} blocks", need, TOO_MANY_CELLS)
-        return build().to(device)
-    except RuntimeError as error:  # what torch raises when there is no memory left on the device
-        raise ValueError(
-            f"a cell of {grid.cell:g} m: there is not enough memory for the sums of {grid.cells:,} cells in {blocks} "
-            f"blocks; {TOO_MANY_CELLS}"
-        ) from error

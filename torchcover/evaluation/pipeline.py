@@ -164,7 +164,7 @@ def observe(
                     journal.write_if_due(run)
     except (Exception, KeyboardInterrupt) as error:  # hours of work are not lost to any of them
         clear_frames(error.__traceback__)  # which would keep the workers alive
-        run.failure = _killed_worker(error, workers, run.steps) or error
+        run.failure = killed_worker(error, workers, run.steps) or error
     run.seconds = time.perf_counter() - start
     if journal and run.steps and consistent:
         with held_back():
@@ -188,7 +188,7 @@ def _threads_beside(workers: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _killed_worker(error: BaseException, workers: int, steps: int) -> ChildProcessError | None:
+def killed_worker(error: BaseException, workers: int, steps: int) -> ChildProcessError | None:
     """What torch says, wherever this process is, when a worker dies; as an error that a user can do something about."""
     told = isinstance(error, RuntimeError) and str(error).startswith("DataLoader worker (pid")
     # Or its last frame could not be fetched; what a worker itself raises is "Caught ... in DataLoader worker process".
@@ -232,7 +232,7 @@ def made_together(indices: Iterable[int], world_of: Callable[[int], int]) -> Ite
             yield together
 
 
-class _FramesOrErrors(Dataset[Frame | ValueError]):
+class FramesOrErrors(Dataset[Frame | ValueError]):
     """Frames; what is wrong with one stands in its place, so that it costs none of those that are made with it."""
 
     def __init__(self, frames: Frames) -> None:
@@ -255,7 +255,7 @@ def _each(
 ) -> Iterator[Frame]:
     """One frame at a time; notes bad ones if they are to be skipped."""
     loader = DataLoader(
-        _FramesOrErrors(frames),
+        FramesOrErrors(frames),
         batch_sampler=tasks,
         collate_fn=list,
         num_workers=workers,

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import Coverage, CoverageMetric, forward_regions
-from torchcover.evaluation.measuring import metric_of
-from torchcover.evaluation.observers import BLOCKS, CoverageObserver
+from torchcover.evaluation.measuring import BLOCKS, metric_of
+from torchcover.evaluation.observers import CoverageObserver
 from torchcover.evaluation.pipeline import observe
 from torchcover.evaluation.progress import progress_of
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, OPTIONS, Settings

@@ -1,11 +1,15 @@
 """What there is to measure: which rigs, what they are called, in which frames."""
 
+import hashlib
+import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
+from torchcover import __version__
+from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings
 from torchcover.frames import ChosenRigs, FrameSource
 from torchcover.recordings import RecordedFrames
@@ -28,6 +32,8 @@ SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
 EVERY_S_IN_TRAFFIC = 10.0
 # Where warnings point to: the call of `evaluate`, beyond its own function, the one around that, and ours.
 CALLER = 4
+# Of an identity, what is longer is told by its hash.
+MAX_TOLD = 40
 
 
 class Task(NamedTuple, Generic[SourceT]):
@@ -240,3 +246,52 @@ def _stem(rig: AnyRig) -> str:
 
 def _is_file(rig: str | Path) -> bool:
     return Path(rig).suffix in (".yaml", ".yml")
+
+
+def run_identity(
+    task: Task[FrameSource], settings: Settings, others: Mapping[str, AnyObserver], ranks: int = 1
+) -> dict[str, str]:
+    """All that the result of a run depends on, by name: not the steps, of which there may be more later, nor who works.
+
+    Args:
+        task: What is measured.
+        settings: How.
+        others: The user's own observers.
+        ranks: How many processes share the run; each has its own part of it.
+
+    Returns:
+        Name -> what it is, or a hash of it.
+
+    Raises:
+        FileNotFoundError: A file that a document names is missing.
+    """
+    kinds = {name: f"{type(one).__module__}.{type(one).__qualname__}" for name, one in others.items()}
+    everything = {
+        "torchcover": __version__,
+        **task.frames.content,
+        "rigs": task.rigs,
+        **_asked(task.asked),
+        "thresholds_m": settings.thresholds_m,
+        "aggregations": settings.aggregations,
+        "estimate": settings.estimate,
+        "redundancy": settings.redundancy,
+        "target_error": settings.target_error,
+        "observers": kinds,
+        "ranks": ranks,
+    }
+    return {name: _told(value) for name, value in everything.items()}
+
+
+def _asked(asked: Asked) -> dict[str, object]:
+    grid = asked.grid
+    return {
+        "cell_m": grid.cell,
+        "grid": [grid.x, grid.y],
+        "heights": list(grid.heights.items()),
+        "regions": [[region.name, region.x, region.y, region.corners_m] for region in asked.regions],
+    }
+
+
+def _told(value: object) -> str:
+    text = json.dumps(value, sort_keys=True, default=repr)
+    return text if len(text) <= MAX_TOLD else f"#{hashlib.sha256(text.encode()).hexdigest()}"

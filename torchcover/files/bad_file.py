@@ -1,5 +1,6 @@
-"""The door of the readers: what is refused unread, and the one error that leaves it."""
+"""The door of the readers: what is refused unread, the memory a file may take, and the one error that leaves it."""
 
+import math
 import os
 import stat
 from collections.abc import Callable, Iterator
@@ -15,6 +16,12 @@ Content = TypeVar("Content")
 
 # Libraries quote what they choke on, which may be the whole file.
 MAX_REASON_CHARS = 500
+VARIABLE = "TORCHCOVER_MAX_FILE_GB"
+# A scan takes megabytes; a saved result with eight thresholds in the command line's grid, which is much, twice a
+# thousand of them.
+DEFAULT_GB = 2.0
+# A calibration has kilobytes; what is parsed slowly must not be long.
+MAX_SHORT_BYTES = 1_000_000
 
 
 class BadFileError(ValueError):
@@ -110,3 +117,63 @@ def _check_regular(path: Path, content: str) -> None:
 
 def _one_line(error: Exception) -> str:
     return " ".join(str(error).split())[:MAX_REASON_CHARS] or type(error).__name__
+
+
+class TooLargeError(ValueError):
+    """Reading a file takes more memory than one may take."""
+
+
+def check_memory(needed_bytes: int) -> None:
+    """Refuse to read a file that needs more memory than one may take, before any of it is reserved.
+
+    Args:
+        needed_bytes: What reading it takes at its largest, the file's own bytes included where they are held.
+
+    Raises:
+        TooLargeError: More than 2 GB, or than the environment variable TORCHCOVER_MAX_FILE_GB says.
+
+    Example:
+        >>> check_memory(16 * 100_000)  # a scan
+    """
+    allowed_gb = _allowed_gb()
+    if needed_bytes > allowed_gb * 1e9:
+        needed_gb = f"{needed_bytes / 1e9:.3g}" if needed_bytes < 10**300 else "endless"
+        raise TooLargeError(
+            f"reading it takes {needed_gb} GB of memory, more than the {allowed_gb:g} GB that one file may take; "
+            f"use a smaller one, or set the environment variable {VARIABLE}"
+        )
+
+
+def _allowed_gb() -> float:
+    given = os.environ.get(VARIABLE)
+    try:
+        allowed_gb = DEFAULT_GB if given is None else float(given)
+    except ValueError:
+        allowed_gb = math.nan
+    if not allowed_gb > 0:
+        raise ValueError(f"the environment variable {VARIABLE} has to be a number of gigabytes; got {given!r}")
+    return allowed_gb
+
+
+def decode(data: bytes) -> str:
+    """Decode UTF-8, with or without a byte order mark.
+
+    Raises:
+        ValueError: Not UTF-8.
+    """
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"not text in UTF-8: byte {error.start} is 0x{data[error.start]:02x}") from error
+
+
+def read_short_text(path: Path) -> str:
+    """Text of a file that people write, or could have written.
+
+    Raises:
+        ValueError: More than a megabyte, or not UTF-8.
+    """
+    size_bytes = path.stat().st_size
+    if size_bytes > MAX_SHORT_BYTES:
+        raise ValueError(f"{size_bytes} bytes; at most {MAX_SHORT_BYTES} are read of such a file")
+    return decode(path.read_bytes())

@@ -8,9 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files.bad_file import reads
-from torchcover.files.budget import check_memory
-from torchcover.files.text import decode
+from torchcover.files.bad_file import check_memory, decode, reads
 
 # Of a word of a row, once it is an object of Python, for each byte of the file.
 BYTES_PER_BYTE = 20

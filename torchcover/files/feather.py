@@ -6,8 +6,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from torchcover.files.bad_file import reads
-from torchcover.files.budget import check_memory
+from torchcover.files.bad_file import check_memory, reads
 
 
 @reads("a feather table")

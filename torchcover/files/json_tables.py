@@ -4,9 +4,7 @@ import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torchcover.files.bad_file import reads
-from torchcover.files.budget import check_memory
-from torchcover.files.text import decode
+from torchcover.files.bad_file import check_memory, decode, reads
 
 # Python's objects take about so many times the bytes of their text.
 OBJECTS_PER_BYTE = 8

@@ -12,7 +12,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files.budget import check_memory
+from torchcover.files.bad_file import check_memory
 
 # Deflate spends at least 2 bits on 258 bytes.
 DEFLATE_MAX_RATIO = 1032

@@ -6,8 +6,7 @@ from typing import NoReturn
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from torchcover.files.budget import check_memory
-from torchcover.files.text import decode
+from torchcover.files.bad_file import check_memory, decode
 
 # A tree of elements takes about so many times the bytes of its text.
 TREE_PER_BYTE = 20

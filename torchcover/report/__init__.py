@@ -1,11 +1,17 @@
 """What a run shows: a table and its renderers, maps, drawings, a page. Imports matplotlib and rich: import it late."""
 
-from torchcover.report.drawings.choice import ChoiceSize, draw_choice
 from torchcover.report.drawings.film import check_film, write_film
 from torchcover.report.drawings.four_views import draw_four_views
 from torchcover.report.drawings.frame import ActorMark, Scenery, draw_depths, draw_scene
 from torchcover.report.drawings.rig import draw_rig
-from torchcover.report.drawings.search import Slice, draw_fronts, draw_progress, draw_slices
+from torchcover.report.drawings.search import (
+    ChoiceSize,
+    Slice,
+    draw_choice,
+    draw_fronts,
+    draw_progress,
+    draw_slices,
+)
 from torchcover.report.drawings.targets import draw_targets
 from torchcover.report.drawings.vehicle import SkinPatch, draw_vehicle
 from torchcover.report.drawings.work_precision import WorkPanel, draw_work_precision

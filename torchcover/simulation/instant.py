@@ -29,7 +29,7 @@ Float32 = NDArray[np.float32]
 NO_GROUND = LocalGround([], np.zeros(3))
 
 
-class Scan(NamedTuple):
+class SensorScan(NamedTuple):
     """What one sensor saw: `points` (N, 3) float32 in the vehicle frame, and how many rays went where.
 
     `ray` (N,) says which ray, counted over the tiles, made each point, and `range_m` (N,) how far it went. `body_casts`
@@ -94,7 +94,7 @@ class Instant:
         own_m: Sequence[Float32] = (),
         ego_points: bool = False,
         threads: int = 1,
-    ) -> Scan:
+    ) -> SensorScan:
         """Cast the rays of one sensor. The ego occludes, but its own points are left out unless they are wanted.
 
         Args:
@@ -107,7 +107,7 @@ class Instant:
             threads: Number of threads; the result does not depend on it.
 
         Returns:
-            A `Scan`, the points in the order of the tiles.
+            A `SensorScan`, the points in the order of the tiles.
         """
         bodies = self.outlines(vehicle_T_sensor[:3, 3])
 
@@ -125,7 +125,7 @@ class Instant:
             with ThreadPoolExecutor(threads) as pool:
                 scans = list(pool.map(scan_tile, tiles, own))
         points, seen, range_m, self_hits, casts = zip(*scans, strict=True)
-        return Scan(
+        return SensorScan(
             points=np.concatenate(points),
             ray=np.flatnonzero(np.concatenate(seen)),
             range_m=np.concatenate(range_m),

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.simulation.instant import Instant, Scan
+from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.rays import into_tiles, pixels_in_tiles
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws, RayHits, Sensor
@@ -37,9 +37,9 @@ class MountedSensor:
         self.pixel_of_ray = pixels_in_tiles(directions)
         self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=sensor.max_range_m)
         self._at_rest = not scene.moves
-        self._hits: Scan | None = None
+        self._hits: SensorScan | None = None
 
-    def scan(self, instant: Instant, draws: Draws, *, threads: int = 1) -> Scan:
+    def scan(self, instant: Instant, draws: Draws, *, threads: int = 1) -> SensorScan:
         """What it makes of what its rays hit at one time of the scene.
 
         Args:
@@ -57,7 +57,7 @@ class MountedSensor:
         along = error_m[:, None] / np.linalg.norm(ways_m, axis=1, keepdims=True)
         return hits._replace(points=(hits.points + ways_m * along).astype(np.float32))
 
-    def _cast(self, instant: Instant, threads: int) -> Scan:
+    def _cast(self, instant: Instant, threads: int) -> SensorScan:
         if self._hits is not None:
             return self._hits
         hits = instant.scan(

@@ -17,7 +17,7 @@ SHORTER = 1e-6
 
 
 class Sight(NamedTuple):
-    """What a place sees of N points: `seen` (N,); `self_hits` were hidden by the ego; `body_casts` as in `Scan`."""
+    """What a place sees of N points: `seen` (N,); `self_hits` were hidden by the ego; the rest as in `SensorScan`."""
 
     seen: NDArray[np.bool_]
     self_hits: int

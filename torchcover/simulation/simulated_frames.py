@@ -45,7 +45,7 @@ class SimulatedFrames(FrameDataset):
     Args:
         scenario: The world, the name of a built-in one, or the path of a YAML file.
         rig: The sensors, the name of a built-in rig, or the path of a YAML file.
-        rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds.
+        rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds; `{}`: the reference alone.
         steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
             traffic, the same instants are seen again, which `Frame.place_in_time` and `Frame.counts` say.
         seed: Seed of the traffic and of the reference sensor's poses.
@@ -60,6 +60,7 @@ class SimulatedFrames(FrameDataset):
             scenario.
         vehicle: What carries the rigs: a built-in vehicle, the YAML file of one, or a mesh file. Not given: the
             scenario's own ego, else the vehicle that the rigs name, else an SUV.
+        kept_bytes: As in `Simulator`.
 
     Raises:
         FileNotFoundError: An unknown name or file.
@@ -85,6 +86,7 @@ class SimulatedFrames(FrameDataset):
         every_s: float | None = None,
         boxes: bool = False,
         vehicle: str | Path | None = None,
+        kept_bytes: float | None = None,
     ) -> None:
         if not 1 <= steps <= MAX_STEPS:
             raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
@@ -99,6 +101,7 @@ class SimulatedFrames(FrameDataset):
             reference_sensor,
             seed=seed,
             every_s=every_s,
+            kept_bytes=kept_bytes,
         )
         self.steps = steps
         self.boxes = boxes
@@ -283,7 +286,7 @@ def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
 
 def _rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | None) -> dict[str, Rig]:
     """One rig by its own name, or several by the names that they are given."""
-    if (rig is None) == (not rigs):
+    if (rig is None) == (rigs is None):
         raise ValueError("give one rig, or several as rigs={name: rig}")
     if rig is not None:
         only = _load(rig)

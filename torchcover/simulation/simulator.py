@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox
-from torchcover.simulation.instant import Instant, Scan
+from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.reference_sensor import ReferenceScan, ReferenceSensor, Surroundings
@@ -145,7 +145,7 @@ class Simulator:
         other._check_size()
         return other
 
-    def scans(self, index: int) -> Mapping[str, Sequence[Scan]]:
+    def scans(self, index: int) -> Mapping[str, Sequence[SensorScan]]:
         """What the sensors see at one step, as in `step`, bit for bit; the reference is not cast.
 
         Args:
@@ -297,10 +297,10 @@ class Simulator:
         ]
         return max([float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches])
 
-    def _scans(self, stage: Stage, instant: Instant, index: int) -> dict[str, list[Scan]]:
+    def _scans(self, stage: Stage, instant: Instant, index: int) -> dict[str, list[SensorScan]]:
         return {name: self._scan_rig(sensors, instant, index) for name, sensors in stage.mounted.items()}
 
-    def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[Scan]:
+    def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[SensorScan]:
         scans = []
         for k, mounted in enumerate(sensors, 1):
             draws = Draws(np.random.default_rng([self.seed, index, k]))
@@ -313,7 +313,7 @@ class Simulator:
         return Surroundings(scene, instant, generator, name, threads=torch.get_num_threads())
 
 
-def _counts_of(scene: Scene, instant: Instant, scans: Sequence[Scan], reference: ReferenceScan) -> dict[str, int]:
+def _counts_of(scene: Scene, instant: Instant, scans: Sequence[SensorScan], reference: ReferenceScan) -> dict[str, int]:
     """What the rays of all sensors and of the reference met, and what was left out, next to all that there was."""
     rays, self_hits = sum(scan.rays for scan in scans), sum(scan.self_hits for scan in scans)
     pairs = (rays + reference.rays) * len(instant.moving)
