@@ -2,7 +2,7 @@
 
 from torchcover.report.drawings.film import check_film, write_film
 from torchcover.report.drawings.four_views import draw_four_views
-from torchcover.report.drawings.frame import ActorMark, Scenery, draw_depths, draw_scene
+from torchcover.report.drawings.frame import ActorMark, StandingFaces, draw_depths, draw_scene
 from torchcover.report.drawings.rig import draw_rig
 from torchcover.report.drawings.search import (
     ChoiceSize,
@@ -48,10 +48,10 @@ __all__ = [
     "Part",
     "Remark",
     "Row",
-    "Scenery",
     "SensorView",
     "SkinPatch",
     "Slice",
+    "StandingFaces",
     "Words",
     "WorkPanel",
     "as_markdown",
