@@ -31,8 +31,8 @@ from torchcover.simulation.shapes import Mesh
 CELL_M = 0.5
 # What stands in a key for the sensor without which the number is worst.
 ANY = "any"
-LEVEL = re.compile(r"q([\d.]+)_m")
-SEEN_WITHIN = re.compile(r"(?:detection|sensors|seen_by_two)_([\d.]+)m")
+LEVEL = re.compile(r"q(\d+(?:\.\d+)?)_m")
+SEEN_WITHIN = re.compile(r"(?:detection|sensors|seen_by_two)_(\d+(?:\.\d+)?)m")
 FAILURE = re.compile(r"(.+)_without_(.+)")
 
 
