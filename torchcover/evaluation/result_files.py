@@ -77,12 +77,7 @@ class ResultFiles:
         return self
 
     def add(self, name: str, write: Callable[[Path], object]) -> None:
-        """Write a file aside.
-
-        Args:
-            name: Its path within the folder.
-            write: Writes it to the path that it is given.
-        """
+        """Write a file aside."""
         path = self._aside / name
         path.parent.mkdir(exist_ok=True)
         write(path)
