@@ -202,8 +202,9 @@ def target_page(
         not_checked: Requirements that are about other targets, in words.
     """
     failed = [verdict for verdict in verdicts if not verdict.passed]
-    tables = [*([_verdicts(verdicts)] if verdicts else []), _sides(seen), _places(seen.worst(), "The worst places")]
-    tables += [_places(verdict.worst, f"Not met: {verdict.requirement.words}") for verdict in failed]
+    tables = [_verdicts(verdicts)] if verdicts else []
+    tables += [sides_table(seen), places_table(seen.worst(), "The worst places")]
+    tables += [places_table(verdict.worst, f"Not met: {verdict.requirement.words}") for verdict in failed]
     return Page(
         title=f"{seen.rig}: would it see {seen.target}?",
         lead=f"In {seen.scenario}, measured by torchcover."
@@ -252,7 +253,8 @@ def _maps(seen: TargetMap) -> list[PageMap]:
     ]
 
 
-def _sides(seen: TargetMap) -> PageTable:
+def sides_table(seen: TargetMap) -> PageTable:
+    """The share of the places on each side that have enough points, and how far out one has not."""
     sides, unseen_to_m = seen.sides(), seen.unseen_to_m()
     within = list(dict.fromkeys(side.within_m for side in sides))
     rows = []
@@ -270,7 +272,8 @@ def _unseen(to_m: float) -> str:
     return f"{to_m:.2f}" if to_m else "nowhere"
 
 
-def _places(places: Sequence[Place], title: str) -> PageTable:
+def places_table(places: Sequence[Place], title: str) -> PageTable:
+    """Where places are, and how much of a target is seen there."""
     headings = ("side", "x\n(m)", "y\n(m)", "distance\n(m)", "points", "sensors", "surface\n(%)")
     rows = [tuple(map(Words, _place(place))) for place in places]
     return PageTable(title, headings, rows)
