@@ -1,6 +1,6 @@
 """What a rig sees of a target: names and defaults in, a map and its files out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from torchcover.report import (
     PageTable,
     Words,
     draw_targets,
+    json_record,
     page_html,
     percent,
 )
@@ -159,9 +160,8 @@ def save_targets(
             files.add("targets.npz", lambda path: write_arrays(seen, path))
             files.publish(record)
         page = target_page(seen, verdicts, sensors, not_checked)
-        files.add("report.html", lambda path: path.write_text(page_html(page), encoding="utf-8"))
-        figure = target_picture(seen)
-        files.add("targets.png", lambda path: figure.savefig(path, dpi=figure.dpi))
+        files.add_text("report.html", page_html(page))
+        files.add_figure("targets.png", target_picture(seen))
         files.publish(record)
     return files.paths
 
@@ -171,20 +171,16 @@ def target_record(seen: TargetMap, verdicts: Sequence[Verdict] = ()) -> dict[str
     return {
         **seen.settings(),
         "cells": seen.counts,
-        "sides": [_known(side._asdict()) for side in seen.sides()],
-        "unseen_to_m": _known(seen.unseen_to_m()),
-        "worst": [_known(place._asdict()) for place in seen.worst()],
+        "sides": [json_record(side._asdict()) for side in seen.sides()],
+        "unseen_to_m": json_record(seen.unseen_to_m()),
+        "worst": [json_record(place._asdict()) for place in seen.worst()],
         "requirements": [_judged(verdict) for verdict in verdicts],
     }
 
 
 def _judged(verdict: Verdict) -> dict[str, Any]:
-    worst = [_known(place._asdict()) for place in verdict.worst]
+    worst = [json_record(place._asdict()) for place in verdict.worst]
     return {**verdict._asdict(), "requirement": verdict.requirement.words, "worst": worst}
-
-
-def _known(record: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: None if isinstance(value, float) and np.isnan(value) else value for key, value in record.items()}
 
 
 def target_page(
