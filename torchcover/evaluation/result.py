@@ -40,6 +40,8 @@ from torchcover.report import (
 )
 from torchcover.simulation import Sensor
 
+# Where more places of the reference sensor are refused, something is wrong with the scene.
+REFUSED_SHARE = 0.2
 # What `summary.json` says of how the run went.
 RUN_KEYS = ("seconds", "complete", "frame_counts", "skipped_frames", "left_out")
 
@@ -255,7 +257,19 @@ class Result:
         rays, every_s = record["rays_per_step"], record["every_s"]
         sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
         carried = [f"Vehicle: {self.vehicle}."] if self.vehicle else []
-        return [*on_failure, *carried, sensor, *self._on_repetitions]
+        return [*on_failure, *carried, sensor, *record["notes"], *self._on_refused, *self._on_repetitions]
+
+    @property
+    def _on_refused(self) -> list[str]:
+        """That many places of the reference sensor were refused: then it looked from few of those that it should."""
+        assert self.run is not None  # asked of a reference that was used
+        refused, drawn = self.run.counts["reference_poses_redrawn"], self.run.counts["reference_poses"]
+        if refused < REFUSED_SHARE * drawn:
+            return []
+        return [
+            f"{refused:,} of {drawn:,} places of the reference sensor ({refused / drawn:.0%}) were refused: they lay "
+            "inside bodies or below the ground. Does the ego stand on the ground, and do faces point outwards?"
+        ]
 
     @property
     def cut_short(self) -> str:

@@ -80,9 +80,11 @@ class ReferenceScan(NamedTuple):
         rays: How many rays were cast.
         self_hits: How many of them the ego took.
         body_casts: At how many pairs of a ray and a moving body; the other pairs could not meet.
-        redrawn: How often its place was drawn again, because it lay inside a body.
+        redrawn: How often its place was drawn again, because it lay inside a body or below the ground.
         drawn: (objects,) int64 how many points were drawn on each of `World.objects`, be they seen or not; None from a
             sensor that draws none.
+        heights_m: (M,) heights of the points above the local ground, from a sensor that has asked for them.
+        places: From how many places it has looked.
     """
 
     points: NDArray[np.float32]
@@ -92,6 +94,8 @@ class ReferenceScan(NamedTuple):
     body_casts: int
     redrawn: int
     drawn: NDArray[np.int64] | None = None
+    heights_m: NDArray[np.float32] | None = None
+    places: int = 1
 
 
 class ReferenceSensor(Protocol):

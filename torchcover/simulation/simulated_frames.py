@@ -25,7 +25,6 @@ from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.simulator import Observation, Simulator
 from torchcover.simulation.surface_reference import SurfaceReference
-from torchcover.simulation.world import Label
 
 DEFAULT_REFERENCE = "surface"
 # With so many points on an object, of which half are seen, its visibility has a standard error of 0.09 at most.
@@ -176,8 +175,9 @@ class SimulatedFrames(FrameDataset):
 
     @property
     def reference_record(self) -> Mapping[str, object]:
-        """The name of the reference sensor and the time between two frames."""
-        return {"sensor": self.reference_sensor.name, "every_s": self.every_s}
+        """The name of the reference sensor, the time between two frames, and what was taken for the ground."""
+        words = self.simulator.ground_words
+        return {"sensor": self.reference_sensor.name, "every_s": self.every_s, "notes": [words] if words else []}
 
     @property
     def content(self) -> Mapping[str, object]:
@@ -219,16 +219,31 @@ class SimulatedFrames(FrameDataset):
             clouds=clouds,
             reference=torch.from_numpy(seen.reference),
             reference_weights=None if weights is None else torch.from_numpy(weights),
+            reference_heights_m=torch.from_numpy(seen.reference_heights_m),
             index=index,
             name=f"{self.scenario.name} step {index}",
             counts=seen.counts,
-            boxes=_boxes(self.simulator.labels(index), clouds, seen.drawn) if self.boxes else None,
+            boxes=self._boxes(index, clouds, seen.drawn) if self.boxes else None,
             place_in_time=self.simulator.place_in_time(index),
             sensor_points={
                 name: dict(zip((sensor.name for sensor in self.rigs[name].sensors), points, strict=True))
                 for name, points in seen.sensor_points.items()
             },
         )
+
+    def _boxes(self, index: int, clouds: Mapping[str, torch.Tensor], drawn: NDArray[np.int64] | None) -> Boxes:
+        found = self.simulator.labels(index)
+        rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
+        velocities = np.array([label.velocity_mps for label in found])
+        boxes = Boxes.from_rows(
+            torch.tensor(rows, dtype=torch.float32).view(-1, 7),
+            velocity_mps=torch.tensor(velocities, dtype=torch.float32).view(-1, 2),
+            ids=tuple(label.name for label in found),
+            categories=tuple(label.category for label in found),
+            drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
+            bottom_heights_m=torch.from_numpy(self.simulator.bottom_heights_m(index, found)),
+        )
+        return with_hits(boxes, clouds)
 
 
 def reference_called(name: str | None = None, rays: int | None = None, asked: Asked | None = None) -> ReferenceSensor:
@@ -281,15 +296,3 @@ def _rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | N
 
 def _load(rig: Rig | str | Path) -> Rig:
     return rig if isinstance(rig, Rig) else Rig.load(rig)
-
-
-def _boxes(found: Sequence[Label], clouds: Mapping[str, torch.Tensor], drawn: NDArray[np.int64] | None) -> Boxes:
-    rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
-    boxes = Boxes.from_rows(
-        torch.tensor(rows, dtype=torch.float32).view(-1, 7),
-        velocity_mps=torch.tensor(np.array([label.velocity_mps for label in found]), dtype=torch.float32).view(-1, 2),
-        ids=tuple(label.name for label in found),
-        categories=tuple(label.category for label in found),
-        drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
-    )
-    return with_hits(boxes, clouds)

@@ -52,6 +52,8 @@ class FolderRecorder:
         arrays = {"points": frame.reference.numpy()}
         if frame.reference_weights is not None:
             arrays["weights"] = frame.reference_weights.numpy()
+        if frame.reference_heights_m is not None:
+            arrays["heights_m"] = frame.reference_heights_m.numpy()
         write_npz(self._folder / REFERENCE / f"{step.name}.npz", arrays)
         if frame.boxes is not None:
             write_boxes(self._folder / BOXES / f"{step.name}.csv", frame.boxes)
