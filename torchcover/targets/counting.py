@@ -9,10 +9,10 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.simulation.culling import outlines
-from torchcover.simulation.mounted import Ends, MountedSensor
 from torchcover.simulation.moving import Moving
 from torchcover.simulation.rays import rotate
 from torchcover.simulation.sensor import RayHits
+from torchcover.simulation.sight import Ends, MountedSensor
 from torchcover.targets.placing import standing
 from torchcover.targets.steps import SensorStep, Step
 from torchcover.targets.surface import Surface
