@@ -10,10 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, invert
-from torchcover.simulation.culling import SLACK_M, SLACK_SHARE, Outlines, blocks_towards, boxes_in_cone, rays_towards
 from torchcover.simulation.patches import Patches
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.rays import Tile, rotate_each
+from torchcover.simulation.rays import (
+    SLACK_M,
+    SLACK_SHARE,
+    Outlines,
+    Tile,
+    blocks_towards,
+    boxes_in_cone,
+    rays_towards,
+    rotate_each,
+)
 from torchcover.simulation.shapes import Mesh
 
 Float32 = NDArray[np.float32]
