@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from torchcover.coverage.borders import borders_below, edges_below, with_ends
+from torchcover.coverage.binning import borders_below, edges_below, with_ends
 
 # Height bands of Uecker & Zöllner 2024.
 PAPER_HEIGHTS: Mapping[str, tuple[float, float]] = MappingProxyType({"ground": (-0.5, 0.5), "obstacle": (0.5, 2.0)})
