@@ -104,18 +104,14 @@ def columns_of(table: CoverageTable) -> Columns:
 
 def _numbers(key: str) -> Columns:
     return {
-        key: lambda row: row.summary.numbers[key].value,
-        f"{key}_error": lambda row: row.summary.numbers[key].error,
+        **_with_error(key, lambda row: row.summary.numbers[key]),
         f"{key}_low": lambda row: row.summary.numbers[key].low,
         f"{key}_high": lambda row: row.summary.numbers[key].high,
     }
 
 
 def _known(key: str) -> Columns:
-    return {
-        f"known_{key}": lambda row: row.summary.known[key].value,
-        f"known_{key}_error": lambda row: row.summary.known[key].error,
-    }
+    return _with_error(f"known_{key}", lambda row: row.summary.known[key])
 
 
 def _compared(key: str) -> Columns:
@@ -135,37 +131,26 @@ def _seen_by(key: str) -> Columns:
     def number(row: Row) -> Number | None:
         return row.summary.redundancy.seen_by[key] if row.summary.redundancy else None
 
-    return {key: lambda row: _value(number(row)), f"{key}_error": lambda row: _error(number(row))}
+    return _with_error(key, number)
 
 
 def _without(sensor: str, key: str) -> Columns:
     """NaN for a rig that has no such sensor."""
 
     def number(row: Row) -> Number | None:
-        redundancy = row.summary.redundancy
-        return redundancy.without.get(sensor, {}).get(key) if redundancy else None
+        return row.summary.redundancy.without.get(sensor, {}).get(key) if row.summary.redundancy else None
 
     def change(row: Row) -> Difference | None:
-        redundancy = row.summary.redundancy
-        return redundancy.change.get(sensor, {}).get(key) if redundancy else None
-
-    def significant(row: Row) -> bool | None:
-        found = change(row)
-        return None if found is None else found.significant
+        return row.summary.redundancy.change.get(sensor, {}).get(key) if row.summary.redundancy else None
 
     without = f"{key}_without_{sensor}"
+    significant = f"{without}_change_significant"
+    columns = _with_error(without, number) | _with_error(f"{without}_change", change)
+    return {**columns, significant: lambda row: getattr(change(row), "significant", None)}
+
+
+def _with_error(key: str, number: Callable[[Row], Number | Difference | None]) -> Columns:
     return {
-        without: lambda row: _value(number(row)),
-        f"{without}_error": lambda row: _error(number(row)),
-        f"{without}_change": lambda row: _value(change(row)),
-        f"{without}_change_error": lambda row: _error(change(row)),
-        f"{without}_change_significant": significant,
+        key: lambda row: getattr(number(row), "value", math.nan),
+        f"{key}_error": lambda row: getattr(number(row), "error", math.nan),
     }
-
-
-def _value(number: Number | Difference | None) -> float:
-    return math.nan if number is None else number.value
-
-
-def _error(number: Number | Difference | None) -> float:
-    return math.nan if number is None else number.error
