@@ -150,8 +150,8 @@ class Settings:
     aggregations: Annotated[
         Read["str | Sequence[Aggregation | str]", "tuple[Aggregation, ...]"],
         Option(
-            "Maps and numbers of regions other than means: `maximum`, `pooled`, `quantiles:0.5,0.9`, "
-            "`step_quantiles:0.9`; may be repeated. In Python also objects, as in `CoverageMetric`.",
+            "Maps and numbers of regions other than means, as in `maximum` or `quantiles:0.5,0.9`; any other name "
+            "lists all; may be repeated. In Python also objects, as in `CoverageMetric`.",
             list[str],
         ),
     ] = Read(_aggregations, ())

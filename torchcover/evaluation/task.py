@@ -10,7 +10,7 @@ from typing import Generic, NamedTuple, TypeVar
 
 from torchcover import __version__
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings
+from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, OPTIONS, Settings
 from torchcover.frames import ChosenRigs, FrameSource
 from torchcover.recordings import RecordedFrames
 from torchcover.simulation import (
@@ -32,6 +32,9 @@ SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
 EVERY_S_IN_TRAFFIC = 10.0
 # Where warnings point to: the call of `evaluate`, beyond its own function, the one around that, and ours.
 CALLER = 4
+# Options that frames, what is asked and observers say by what they are, and those that change no result.
+TOLD_OTHERWISE = {"scenario", "seed", "vehicle", "reference", "rays", "every_s", "ask", "cell_m", "metrics"}
+TOLD_OTHERWISE |= {"steps", "device", "workers", "skip_bad_frames"}
 # Of an identity, what is longer is told by its hash.
 MAX_TOLD = 40
 
@@ -271,11 +274,7 @@ def run_identity(
         **task.frames.content,
         "rigs": task.rigs,
         **_asked(task.asked),
-        "thresholds_m": settings.thresholds_m,
-        "aggregations": settings.aggregations,
-        "estimate": settings.estimate,
-        "redundancy": settings.redundancy,
-        "target_error": settings.target_error,
+        **{name: getattr(settings, name) for name in OPTIONS if name not in TOLD_OTHERWISE},
         "observers": kinds,
         "ranks": ranks,
     }

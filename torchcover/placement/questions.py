@@ -4,7 +4,7 @@ import math
 import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any, NamedTuple, Self
 
@@ -16,7 +16,6 @@ from torch import Tensor
 from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, CoverageMetric, MeanOfMeans, Measure, Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.coverage.quantity import RADIUS, detection, without
-from torchcover.coverage.region_sums import region_quantities
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.measuring import BLOCKS
@@ -31,7 +30,6 @@ from torchcover.simulation.shapes import Mesh
 CELL_M = 0.5
 # What stands in a key for the sensor without which the number is worst.
 ANY = "any"
-LEVEL = re.compile(r"q(\d+(?:\.\d+)?)_m")
 SEEN_WITHIN = re.compile(r"(?:detection|sensors|seen_by_two)_(\d+(?:\.\d+)?)m")
 FAILURE = re.compile(r"(.+)_without_(.+)")
 
@@ -137,7 +135,7 @@ class Questions(NamedTuple):
             of_coverage = [one.key for one in numbers.coverage["area"].compute().every_quantity]
             known = {name: [one.key for one in metric.estimate().quantities] for name, metric in numbers.others.items()}
         single = (RADIUS, *map(detection, asked.thresholds_m))
-        others = [one.key for kind in AGGREGATIONS if not fields(kind) for one in region_quantities(kind())]
+        others = [one.key for kind in AGGREGATIONS for one in kind.parse(kind.example).quantities]
         of_coverage += [one.key for one in (*single, *(without(ANY, each) for each in single))] + others
         for name, objective in self.objectives.items():
             keys = known.get(objective.metric or "", of_coverage)
@@ -149,9 +147,7 @@ class Questions(NamedTuple):
     def aggregations(self) -> tuple[Aggregation, ...]:
         """Those whose numbers are asked for."""
         keys = {objective.key for objective in self.objectives.values()}
-        levels = tuple(sorted({float(level) for key in keys for level in LEVEL.findall(key)}))
-        every = [kind(levels) if fields(kind) else kind() for kind in AGGREGATIONS if levels or not fields(kind)]  # type: ignore[call-arg]
-        return tuple(one for one in every if not keys.isdisjoint(each.key for each in region_quantities(one)))
+        return tuple(one for kind in AGGREGATIONS if (one := kind.of_keys(keys)))
 
     def numbers_of(self, rig: Rig, ego: Mesh | None = None, measures: Sequence[Measure] = ("area",)) -> "RigNumbers":
         """What observes a rig, fed with nothing yet.
