@@ -105,7 +105,7 @@ class Questions(NamedTuple):
 
     def reference_sensor(self, rays: int) -> SurfaceReference:
         """One that is aimed at what is asked about."""
-        return SurfaceReference.from_rays(self.areas, rays, tuple(self.grid.heights.values()))
+        return SurfaceReference.from_rays(self.areas, rays, tuple(self.grid.heights.values()), self.grid.band_frame)
 
     def asked(self, points: Tensor) -> Tensor:
         """(M,) bool: which of (M, 3) points lie in a region and band that is asked about, or any for other metrics."""
@@ -295,7 +295,7 @@ def _around(grid: BevGrid, regions: Collection[Region]) -> BevGrid:
         return float(edges[edges <= low].max()), float(edges[edges >= high].min())
 
     x, y = outside(grid.x_edges_m, [one.x for one in regions]), outside(grid.y_edges_m, [one.y for one in regions])
-    return BevGrid(x, y, grid.cell, grid.heights)
+    return BevGrid(x, y, grid.cell, grid.heights, grid.band_frame)
 
 
 def _whole_cells(grid: BevGrid, mask: Tensor) -> tuple[tuple[float, float], tuple[float, float]]:
