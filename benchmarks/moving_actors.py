@@ -7,9 +7,9 @@ import numpy as np
 from benchmarks.timing import compare, table
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Draws, PaperReference, Rig, Scenario
-from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
+from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.world import Actor
 
 RANGE_M = 250.0

@@ -8,9 +8,9 @@ from benchmarks.timing import compare, table
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import Draws, PaperReference, Rig, Scenario
 from torchcover.simulation.instant import SensorScan, cast_from
-from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles, rotate
 from torchcover.simulation.scene import Scene
+from torchcover.simulation.sight import MountedSensor
 
 RANGE_M = 120.0
 STEP = 200

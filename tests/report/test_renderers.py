@@ -12,9 +12,7 @@ from torchcover.report import (
     BOLD_MARKS,
     RENDERERS,
     CoverageTable,
-    Part,
     Words,
-    as_markdown,
     json_record,
     marks_on,
     notes_on,
@@ -168,18 +166,6 @@ def test_the_notes_of_the_caller_are_in_what_a_reader_reads(trio, regions):
     table = CoverageTable.of(trio, regions, ["Reference sensor: a cat."])
     assert "Reference sensor: a cat." in RENDERERS["text"](table)
     assert "* Reference sensor: a cat." in RENDERERS["markdown"](table)
-
-
-def test_a_column_of_ones_own_is_the_last(trio, regions):
-    table = CoverageTable.of({"few": trio["few"]}, regions)
-    (part,) = parts_of(table)
-    headings, _, *rows = markdown_lines(as_markdown(table, [part.with_column("paper (m)", list("abcd"))]))
-    assert headings[-1] == "paper (m)"
-    assert [row[-1] for row in rows] == list("abcd")
-    assert headings[2] == "mean blind spot radius (m)"
-    with pytest.raises(ValueError, match="'paper': 4 cells are needed; got 1"):
-        part.with_column("paper", ["a"])
-    assert isinstance(part, Part)
 
 
 def test_a_renderer_of_ones_own_needs_no_more_than_what_is_public(trio, regions):

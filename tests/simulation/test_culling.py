@@ -6,12 +6,20 @@ import pytest
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Draws, Lidar, PaperReference, Pose, Scenario
-from torchcover.simulation.culling import blocks_towards, boxes_in_cone, outlines, rays_towards
 from torchcover.simulation.instant import cast_from
-from torchcover.simulation.mounted import MountedSensor
-from torchcover.simulation.rays import into_tiles, rotate, rotate_each, unit_directions
+from torchcover.simulation.rays import (
+    blocks_towards,
+    boxes_in_cone,
+    into_tiles,
+    outlines,
+    rays_towards,
+    rotate,
+    rotate_each,
+    unit_directions,
+)
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Plane
+from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.world import Actor, World
 
 EGO = BoundingBox((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))

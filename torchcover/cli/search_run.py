@@ -7,6 +7,7 @@ from typing import Any
 import typer
 from rich.console import Console
 
+from torchcover.cli.printing import in_words, print_whole
 from torchcover.evaluation import claimed
 from torchcover.evaluation.result_files import SUMMARY
 from torchcover.placement import (
@@ -22,7 +23,6 @@ from torchcover.placement import (
 )
 from torchcover.placement.choosing import OBJECTIVE
 from torchcover.placement.running import CHECKPOINT
-from torchcover.report import narrowest_width, text_table
 from torchcover.simulation.documents import read_mapping
 
 CHOICE_KEY = "candidates"
@@ -41,11 +41,8 @@ def run(path: Path, out: Path, *, resume: bool, **settings: Any) -> None:  # noq
     with claimed(out):
         report = find(path, out, resume=resume, **settings).report
         files = report.save(out)
-    table = report.tables[0]
-    rows = [tuple(words.text for words in row) for row in table.rows]
-    text = text_table(table.headings, [rows], title=table.title)
+    print_whole([in_words(report.tables[0])])
     console = Console()
-    Console(width=max(console.width, narrowest_width([text]))).print(text)
     console.print(f"Wrote {', '.join(file.name for file in files)} to {out}", markup=False, soft_wrap=True)
     console.print(report.sentence, markup=False, soft_wrap=True)
 

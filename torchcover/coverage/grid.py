@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from torch import Tensor
 
-from torchcover.coverage.borders import borders_below, edges_below, with_ends
+from torchcover.coverage.binning import borders_below, edges_below, with_ends
 
 # What heights are measured from: the local ground, or z = 0 of the vehicle frame, which pitches and rolls.
 BandFrame = Literal["ground", "vehicle"]

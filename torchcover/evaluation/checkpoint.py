@@ -86,9 +86,6 @@ class Journal:
     def restore(self, run: Progressing) -> None:
         """Go on from the file, if there is one and that is wanted.
 
-        Args:
-            run: Gets the steps that are done.
-
         Raises:
             ValueError: It is the checkpoint of another run; the message says in what. Or, as `BadFileError`, it is
                 damaged.
@@ -193,11 +190,6 @@ def read_header(path: Path) -> dict[str, Any]:
 @reads("a checkpoint")
 def read_state(path: Path, header: Mapping[str, Any], name: str) -> dict[str, Any]:
     """One of the states, bit for bit.
-
-    Args:
-        path: The file.
-        header: Its header.
-        name: Which.
 
     Raises:
         BadFileError: It is damaged, or takes more memory than `TORCHCOVER_MAX_FILE_GB` allows.

@@ -38,10 +38,6 @@ TOO_MANY_CELLS = "use larger cells, or a smaller grid"
 def measured(task: Task[FrameSource], settings: Settings) -> Result:
     """Measure it.
 
-    Args:
-        task: Which rigs in which frames.
-        settings: How.
-
     Raises:
         ValueError: As `evaluate`.
     """

@@ -221,12 +221,7 @@ def _left(indices: Iterator[int], run: Run, *, skip_bad_frames: bool) -> Iterato
 
 
 def made_together(indices: Iterable[int], world_of: Callable[[int], int]) -> Iterator[list[int]]:
-    """Which frames a worker makes in a row: those of one world, so that only one worker builds it.
-
-    Args:
-        indices: All frames, in order.
-        world_of: Which world a frame is of.
-    """
+    """Which frames a worker makes in a row: those of one world, so that only one worker builds it."""
     for _, of_world in groupby(indices, world_of):
         while together := list(islice(of_world, MOST_TOGETHER)):
             yield together

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -200,15 +200,15 @@ class Result:
             with held_back():  # the numbers are safe before anything ends this, and before the maps are drawn
                 for name, coverage in self._coverage_files.items():
                     files.add(name, coverage.save)
-                files.add("summary.csv", partial(_write, RENDERERS["csv"](self.table)))
+                files.add_text("summary.csv", RENDERERS["csv"](self.table))
                 if self.metrics is not None:
-                    files.add("metrics.csv", partial(_write, numbers_csv(self.metrics)))
-                    files.add("metrics_tau.csv", partial(_write, tau_csv(self.metrics)))
+                    files.add_text("metrics.csv", numbers_csv(self.metrics))
+                    files.add_text("metrics_tau.csv", tau_csv(self.metrics))
                 summary = self.record
                 files.publish(summary)
-            files.add("report.html", partial(_write, page_html(self.page)))
+            files.add_text("report.html", page_html(self.page))
             for stem, figure in self.maps(errors=error_maps):
-                files.add(f"maps/{stem}.png", partial(_draw, figure))
+                files.add_figure(f"maps/{stem}.png", figure)
             files.publish(summary)
         return files.paths
 
@@ -305,11 +305,3 @@ class Result:
         cut_short = ", cut short" if self.run is not None and not self.run.complete else ""
         about = f"Result of {', '.join(self.coverages)}: {self._first.counts['steps']} steps{cut_short}"
         return f"{about}\n{RENDERERS['text'](self.table)}"
-
-
-def _write(text: str, path: Path) -> None:
-    path.write_text(text, encoding="utf-8")
-
-
-def _draw(figure: Figure, path: Path) -> None:
-    figure.savefig(path, dpi=figure.dpi)

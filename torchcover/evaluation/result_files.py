@@ -11,6 +11,7 @@ from types import TracebackType
 from typing import Any, Self
 
 from filelock import FileLock, Timeout
+from matplotlib.figure import Figure
 
 from torchcover.evaluation.progress import held_back
 
@@ -77,16 +78,19 @@ class ResultFiles:
         return self
 
     def add(self, name: str, write: Callable[[Path], object]) -> None:
-        """Write a file aside.
-
-        Args:
-            name: Its path within the folder.
-            write: Writes it to the path that it is given.
-        """
+        """Write a file aside."""
         path = self._aside / name
         path.parent.mkdir(exist_ok=True)
         write(path)
         self._written.append(name)
+
+    def add_text(self, name: str, text: str) -> None:
+        """Write a text aside."""
+        self.add(name, lambda path: path.write_text(text, encoding="utf-8"))
+
+    def add_figure(self, name: str, figure: Figure) -> None:
+        """Draw a figure aside."""
+        self.add(name, lambda path: figure.savefig(path, dpi=figure.dpi))
 
     def publish(self, record: Mapping[str, Any]) -> None:
         """Put what was added in its place, last `summary.json`: the record, and the names of all files of this run."""

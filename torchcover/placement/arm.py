@@ -79,11 +79,7 @@ class Arm:
         return [self.evaluations[at].prefixes for at in self.front]
 
     def ask(self, number: int) -> Float64 | None:
-        """Where to look next, (variables,); None when there is nothing left.
-
-        Args:
-            number: Of the evaluation.
-        """
+        """Where to look next, (variables,); None when there is nothing left."""
         return (self._optimiser if len(self._gains[0]) == 1 else self._scalarised(number)).ask()
 
     def tell(self, evaluation: Evaluation) -> None:

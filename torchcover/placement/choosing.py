@@ -249,10 +249,6 @@ def seen_by(rig: Rig, instants: CommonInstants) -> Bytes:
 
     Each instant begins a byte of its own.
 
-    Args:
-        rig: The sensors.
-        instants: Of one detection.
-
     Raises:
         ValueError: The rig cannot be mounted.
     """
@@ -270,9 +266,6 @@ def worth_of(instants: CommonInstants) -> Worth:
     By area, a point is worth its share of the square metres that are seen. Over known cells it is worth its share of
     the square metres in its cell at its instant, which share the cell with its other instants, and that the mean with
     all known cells.
-
-    Args:
-        instants: Of one detection.
 
     Raises:
         ValueError: A region and band that no instant shows.

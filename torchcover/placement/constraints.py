@@ -71,12 +71,7 @@ class Constraints(Document):
 
 
 def misplaced(sensor: Sensor, skin: Skin) -> str | None:
-    """Why a sensor cannot be where it is: below the ground, or inside the vehicle; None if it can.
-
-    Args:
-        sensor: The sensor.
-        skin: Of the vehicle.
-    """
+    """Why a sensor cannot be where it is: below the ground, or inside the vehicle; None if it can."""
     place_m: Matrix = sensor.mount.matrix()[:3, 3]
     if place_m[2] <= 0.0:
         return f"{sensor.name} at {place_m.round(3).tolist()} m is not above the ground"

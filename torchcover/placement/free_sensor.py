@@ -187,12 +187,7 @@ class FreeSensor(Document):
 
 
 def mirrored(start: Sensor, other: Sensor | None) -> Sensor | None:
-    """A sensor as the mirror image of another, of the same model, beyond the vehicle's middle; None where that is not.
-
-    Args:
-        start: The sensor, of which the name stays.
-        other: The one that it is the image of.
-    """
+    """A sensor as the mirror image of another, of the same model, beyond the vehicle's middle; None without one."""
     if other is None:
         return None
     numbers = {key: -value if key in MIRRORED else value for key, value in numbers_of(other.mount).items()}

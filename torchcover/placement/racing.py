@@ -34,10 +34,6 @@ class Prefix(NamedTuple):
 def gains(estimate: Estimate, other: Estimate) -> tuple[Float64, Float64]:
     """What one rig has better than another after the same instants, and the standard errors of that.
 
-    Args:
-        estimate: The objectives of the one.
-        other: Those of the other.
-
     Returns:
         (O,) gains in the units of the objectives, more is better; NaN where one is unknown. (O,) errors over worlds;
         NaN for fewer than 3.

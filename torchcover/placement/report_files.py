@@ -72,15 +72,15 @@ class PlacementReport:
                     files.add(name, rig.save)
                 for name, rows in self.rows.items():
                     files.add(name, partial(_write_rows, rows))
-                files.add("search.json", partial(_write, f"{record}\n".encode()))
+                files.add_text("search.json", f"{record}\n")
                 files.publish(summary)
             pictures = []
             for stem, words, figure in self.pictures():
                 png = BytesIO()
                 figure.savefig(png, dpi=figure.dpi)
                 pictures.append(PagePicture(words, png.getvalue()))
-                files.add(f"{stem}.png", partial(_write, png.getvalue()))
-            files.add("report.html", partial(_write, page_html(self._page(pictures)).encode()))
+                files.add(f"{stem}.png", partial(Path.write_bytes, data=png.getvalue()))
+            files.add_text("report.html", page_html(self._page(pictures)))
             files.publish(summary)
         return files.paths
 
@@ -111,7 +111,3 @@ def _cell(value: object) -> object:
     if value is None or value != value:
         return ""
     return f"{value:.9g}" if isinstance(value, float) else value
-
-
-def _write(data: bytes, path: Path) -> None:
-    path.write_bytes(data)

@@ -28,10 +28,6 @@ MOST_VALUES, MOST_SLICES = 1000, 12
 def search_pictures(search: PlacementSearch, best: Evaluation | None) -> Iterator[tuple[str, str, Figure]]:
     """How the search went, what each variable does to each objective, and what objectives cost each other.
 
-    Args:
-        search: It, at its end.
-        best: What the optimiser found.
-
     Returns:
         Stem of the file, what it shows, and a figure of its own, outside pyplot.
     """

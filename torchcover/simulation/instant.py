@@ -9,11 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import transform
-from torchcover.simulation.culling import Outlines, outlines
 from torchcover.simulation.local_ground import LocalGround
 from torchcover.simulation.moving import Moving
 from torchcover.simulation.raycaster import Hits, RayCaster
-from torchcover.simulation.rays import TILE_ROWS, Tile, into_tiles, rotate, unit_directions
+from torchcover.simulation.rays import TILE_ROWS, Outlines, Tile, into_tiles, outlines, rotate, unit_directions
 
 # Directions all around, to find out whether a place lies inside a body.
 ALL_AROUND = unit_directions(np.linspace(-85.0, 85.0, 12)[:, None], np.arange(0.0, 360.0, 30.0)[None])

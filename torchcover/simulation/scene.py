@@ -11,12 +11,11 @@ from torchcover.geometry.trajectory import poses_at
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
 from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces
 from torchcover.simulation.memory import check_fits
-from torchcover.simulation.moving import Moving
+from torchcover.simulation.moving import Moving, Solids
 from torchcover.simulation.patches import Bounds
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import Tile, rotate
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.solids import Solids
 from torchcover.simulation.surface import AboveGround, SceneSurface, bounds_along
 from torchcover.simulation.world import Actor, World
 

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 from torchcover.geometry import BoundingBox
 from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.memory import check_fits
-from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.reference_sensor import ReferenceScan, ReferenceSensor, Surroundings
 from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws
+from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.stage import Stage, Stages
 from torchcover.simulation.standing import warn_of_floating
 from torchcover.simulation.world import Label, labels

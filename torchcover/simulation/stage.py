@@ -13,12 +13,12 @@ from torch.utils.data import get_worker_info
 
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.memory import machine_bytes
-from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.moving import Solids
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.solids import Solids
+from torchcover.simulation.sight import MountedSensor
 
 # A sensor on the ground is asked about a place this far above it: whether it is inside of something else.
 LIFT_M = np.array([0.0, 0.0, 0.01])

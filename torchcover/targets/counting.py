@@ -8,11 +8,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchcover.simulation.culling import outlines
-from torchcover.simulation.mounted import Ends, MountedSensor
 from torchcover.simulation.moving import Moving
-from torchcover.simulation.rays import rotate
+from torchcover.simulation.rays import outlines, rotate
 from torchcover.simulation.sensor import RayHits
+from torchcover.simulation.sight import Ends, MountedSensor
 from torchcover.targets.placing import standing
 from torchcover.targets.steps import SensorStep, Step
 from torchcover.targets.surface import Surface

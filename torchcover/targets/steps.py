@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation.instant import Instant
-from torchcover.simulation.mounted import Ends, MountedSensor
 from torchcover.simulation.reference_sensor import Surroundings, position_in_shell
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws
+from torchcover.simulation.sight import Ends, MountedSensor
 from torchcover.simulation.stage import Stages
 from torchcover.targets.placing import blocked, ground_under, standing
 from torchcover.targets.surface import SAMPLES, Surface

@@ -15,7 +15,7 @@ from torchcover.coverage import BevGrid, Coverage, check_paired
 from torchcover.report.maps.arrays import draw_map, draw_side_by_side
 from torchcover.report.maps.colours import difference_scale, scale_of
 from torchcover.report.maps.overlay import SensorView
-from torchcover.report.maps.subjects import Subject, error_subjects_of, subjects_of
+from torchcover.report.maps.subjects import Subject, difference, error_subjects_of, subjects_of
 from torchcover.report.maps.window import Window, asked_and_known, near_field
 from torchcover.report.wording import capitalised, span
 
@@ -245,15 +245,14 @@ def _draw_differences(subject: Subject, grid: BevGrid, bands: Sequence[_Band], s
     (first, expected), *others = subject.values.items()
     if not others:
         return
-    # Where both are infinite there is no difference, rather than NaN, which means unknown.
-    differences = [(values - expected).where(values != expected, 0.0) for _, values in others]
+    differences = [difference(values, expected) for _, values in others]
     scale = difference_scale(subject.quantity, torch.stack(differences))
     first_stem, *stems = file_stems(list(subject.values))
-    for (rig, _), stem, difference in zip(others, stems, differences, strict=True):
+    for (rig, _), stem, change in zip(others, stems, differences, strict=True):
         for band in bands:
             figure = draw_map(
                 # What is infinite takes the last colour: it is better or worse, not a step without a point.
-                difference[band.number].clamp(2 * scale.low, 2 * scale.high),
+                change[band.number].clamp(2 * scale.low, 2 * scale.high),
                 grid,
                 scale,
                 title=f"{rig} minus {first}: {subject.quantity.title}, {band.name}",

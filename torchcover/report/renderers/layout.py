@@ -1,7 +1,7 @@
 """A table in words, before it is text: the parts of a page, which renderers for readers have in common."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from textwrap import fill
 from types import MappingProxyType
 from typing import NamedTuple
@@ -54,17 +54,6 @@ class Part:
     headings: tuple[str, ...]
     rows: tuple[tuple[Words, ...], ...]
     bands: int
-
-    def with_column(self, heading: str, cells: Sequence[str]) -> "Part":
-        """The part with one more column.
-
-        Raises:
-            ValueError: Another number of cells than of rows.
-        """
-        if len(cells) != len(self.rows):
-            raise ValueError(f"column {heading!r}: {len(self.rows)} cells are needed; got {len(cells)}")
-        rows = tuple((*row, Words(cell)) for row, cell in zip(self.rows, cells, strict=True))
-        return replace(self, headings=(*self.headings, heading), rows=rows)
 
 
 def parts_of(table: CoverageTable) -> list[Part]:

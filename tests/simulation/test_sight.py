@@ -9,10 +9,10 @@ from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Draws, Lidar, Pose
 from torchcover.simulation.bodies import in_vehicle_frame
 from torchcover.simulation.instant import Instant
-from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Plane
+from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.world import Actor, World
 
 UTM = np.array([513_248.37, 5_403_655.81, 312.5])
