@@ -32,7 +32,7 @@ def test_on_a_ramp_bands_follow_the_ground():
     """By height the ramp is ground and what stands on it obstacle; by z the road is an obstacle from 5 to 20 m."""
     by_ground, by_z = measured(GROUND, HEIGHT), measured(VEHICLE)
     assert (by_ground.points == 1).all()
-    torch.testing.assert_close(by_ground.radius[:, 0], torch.tensor([[0.0] * 40, [1.0] * 40]).double())
+    torch.testing.assert_close(by_ground.radius[:, 0].float(), torch.tensor([[0.0] * 40, [1.0] * 40]))
     road = by_z.points[:, 0]
     assert road[0].tolist() == [1] * 5 + [0] * 35
     assert road[1].tolist() == [1] * 5 + [2] * 5 + [1] * 10 + [0] * 20
