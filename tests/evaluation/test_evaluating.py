@@ -257,6 +257,7 @@ def test_results_are_compared_as_if_they_had_been_measured_together():
     low, high = (torchcover.evaluate(rig, frames=Source(), cell_m=4.0) for rig in ("low", "high"))
     together = torchcover.evaluate(["low", "high"], frames=Source(), cell_m=4.0)
     assert torchcover.compare([low, high]).summary == torchcover.compare([together]).summary == together.summary
+    assert torchcover.compare(together).summary == together.summary
     assert torchcover.compare([low, high]).run is None
     with pytest.raises(ValueError, match="at least two measured rigs; got low only"):
         torchcover.compare([low])

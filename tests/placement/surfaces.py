@@ -67,7 +67,7 @@ def space(*, objectives=("near",), **changes):
         "start": "front_roof_32",
         "scenario": "urban",
         "free": {"roof": {"x_m": (-0.6, 0.8), "z_m": 1.8, "pitch_deg": (-10.0, 15.0)}},
-        "objectives": {name: {"region": "20m"} for name in objectives},
+        "objectives": objectives if isinstance(objectives, dict) else {name: {"region": "20m"} for name in objectives},
     }
     return SearchSpace.model_validate({**content, **changes})
 

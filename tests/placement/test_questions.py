@@ -92,6 +92,31 @@ def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several)
     assert (error[[0, 1]] > 0).all()
 
 
+def test_what_a_failure_leaves_is_over_known_cells_where_evaluate_has_it_so(several):
+    estimates = several.estimates(TWO)
+    by_area, by_cells = (dict(zip(NUMBERS, estimates[one].value.tolist(), strict=True)) for one in ("area", "known"))
+    region = several.questions.regions["20m"]
+    metric = CoverageMetric(
+        several.questions.grid, max_radius=several.questions.max_radius_m, regions=[region], sensors=["top", "low"]
+    )
+    observer = CoverageObserver(metric)
+    for frame in several.frames(TWO, several.order.tolist()):
+        observer.update(frame)
+    for key in ("detection_0.4m", "radius_m", "seen_by_two_0.4m", "detection_0.4m_without_top"):
+        assert by_cells[key] == float(observer.compute().estimate_of(key, region, "ground").value)
+        assert by_cells[key] != by_area[key]
+    # An aggregation is over all points of the region, whatever the means are over.
+    assert by_cells["radius_q0.9_m"] == by_area["radius_q0.9_m"]
+
+
+def test_a_search_over_known_cells_scores_what_it_is_tested_by():
+    objectives = {key: NUMBERS[key] for key in ("detection_0.4m", "detection_0.4m_without_any")}
+    found = held(objectives=objectives, measure="known")
+    last = list(found.prefixes(TWO))[-1].estimate
+    for name in ("value", "left_out", "steps"):
+        np.testing.assert_array_equal(getattr(last, name), getattr(found.estimates(TWO)["known"], name))
+
+
 def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
     estimate = several.estimates(TWO)["area"]
     assert estimate.left_out.shape == (3, len(NUMBERS))
@@ -129,6 +154,8 @@ def test_a_published_metric_says_what_it_says_of_the_same_frames(key):
         ("seen_by_too_0.4m", "seen_by_two_0.4m"),
         ("detection_0.40m", "detection_0.4m"),
         ("radius_maximal_m", "radius_maximum_m"),
+        ("detection_0.4.1m", "detection_0.4m"),
+        ("radius_q0.9.1_m", "radius_m"),
     ],
 )
 def test_a_number_that_no_result_has_is_refused_with_the_nearest(given, near):
@@ -147,7 +174,8 @@ def test_a_number_of_a_metric_that_it_does_not_have_is_refused_with_the_nearest(
     ("given", "message"),
     [
         ({"number": "radius_m", "detection": 0.4, "region": "20m"}, "number, detection: one of the two"),
-        ({"number": "radius_m"}, "region: it is needed"),
+        ({"number": "radius_m"}, "region: it is needed for 'radius_m'"),
+        ({"number": "s_mgi_0.2m"}, "region: it is needed for 's_mgi_0.2m'; none is by numbers of .*, s_mig, "),
         ({"number": "s_mig_0.2m", "region": "20m"}, "region: 's_mig_0.2m' has none"),
         ({"number": "s_mig_0.2m", "band": "ground"}, "band: 's_mig_0.2m' has none"),
     ],

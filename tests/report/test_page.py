@@ -261,7 +261,7 @@ def test_a_page_is_one_file_that_asks_for_nothing(named):
 
 def test_a_page_without_maps_or_sensors(tmp_path):
     text = page_html(Page("rig", "lead", rigs=[PageRig("rig")]))
-    assert "Nobody knows its sensors" in text
+    assert "Its sensors are unknown" in text
     if CHROMIUM is None:
         pytest.skip("no Chromium here: nobody looks at the page")
     dom, console = browsed(text, tmp_path / "page.html")

@@ -243,7 +243,7 @@ class CommonInstants:
         Raises:
             ValueError: The rig cannot be mounted: a sensor inside the vehicle or another body, or below the ground.
         """
-        numbers, rays, self_hits = self._observers(rig), 0, 0
+        numbers, rays, self_hits = self._observers(rig, [self.measure]), 0, 0
         for start in range(0, len(self), TOGETHER):
             for frame in self.frames(rig, self.order[start : start + TOGETHER].tolist()):
                 numbers.update(frame)
@@ -253,14 +253,14 @@ class CommonInstants:
 
     def estimates(self, rig: Rig) -> dict[Measure, Estimate]:
         """What is known of a rig after all instants, by either measure; ValueError as `prefixes`."""
-        numbers = self._observers(rig)
+        numbers = self._observers(rig, MEASURES)
         for frame in self.frames(rig, self.order.tolist()):
             numbers.update(frame)
         return {measure: numbers.estimate(measure) for measure in MEASURES}
 
-    def _observers(self, rig: Rig) -> RigNumbers:
+    def _observers(self, rig: Rig, measures: Sequence[Measure]) -> RigNumbers:
         ego = self._worlds[0].ego_mesh() if self.questions.metrics else None
-        return self.questions.numbers_of(rig, ego)
+        return self.questions.numbers_of(rig, ego, measures)
 
     def frames(self, rig: Rig | None = None, numbers: Sequence[int] | None = None) -> Iterator[Frame]:
         """What a rig sees at some instants, in their order, with the points of the reference that are asked about.

@@ -53,8 +53,10 @@ class Objective(Document):
     def _check_one_of(self) -> Self:
         if self.number is not None and self.detection is not None:
             raise ValueError(f"number, detection: one of the two is possible; got {self.number!r} and a threshold")
-        if (self.region is None) != (self.metric is not None):
-            raise ValueError("region: it is needed" if self.region is None else f"region: {self.number!r} has none")
+        if self.region is None and self.metric is None:
+            raise ValueError(f"region: it is needed for {self.key!r}; none is by numbers of {', '.join(PUBLISHED)}")
+        if self.region is not None and self.metric is not None:
+            raise ValueError(f"region: {self.number!r} has none")
         if self.metric is not None and self.band is not None:
             raise ValueError(f"band: {self.number!r} has none")
         return self

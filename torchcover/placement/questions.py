@@ -31,8 +31,8 @@ from torchcover.simulation.shapes import Mesh
 CELL_M = 0.5
 # What stands in a key for the sensor without which the number is worst.
 ANY = "any"
-LEVEL = re.compile(r"q([\d.]+)_m")
-SEEN_WITHIN = re.compile(r"(?:detection|sensors|seen_by_two)_([\d.]+)m")
+LEVEL = re.compile(r"q(\d+(?:\.\d+)?)_m")
+SEEN_WITHIN = re.compile(r"(?:detection|sensors|seen_by_two)_(\d+(?:\.\d+)?)m")
 FAILURE = re.compile(r"(.+)_without_(.+)")
 
 
@@ -134,7 +134,7 @@ class Questions(NamedTuple):
         asked = self._replace(thresholds_m=self.thresholds_m or (THRESHOLD_M,))
         numbers = asked.numbers_of(rig, ego)
         with warnings.catch_warnings(action="ignore"):  # that they were fed with nothing
-            of_coverage = [one.key for one in numbers.coverage.compute().every_quantity]
+            of_coverage = [one.key for one in numbers.coverage["area"].compute().every_quantity]
             known = {name: [one.key for one in metric.estimate().quantities] for name, metric in numbers.others.items()}
         single = (RADIUS, *map(detection, asked.thresholds_m))
         others = [one.key for kind in AGGREGATIONS if not fields(kind) for one in region_quantities(kind())]
@@ -153,27 +153,34 @@ class Questions(NamedTuple):
         every = [kind(levels) if fields(kind) else kind() for kind in AGGREGATIONS if levels or not fields(kind)]  # type: ignore[call-arg]
         return tuple(one for one in every if not keys.isdisjoint(each.key for each in region_quantities(one)))
 
-    def numbers_of(self, rig: Rig, ego: Mesh | None = None) -> "RigNumbers":
+    def numbers_of(self, rig: Rig, ego: Mesh | None = None, measures: Sequence[Measure] = ("area",)) -> "RigNumbers":
         """What observes a rig, fed with nothing yet.
 
         Args:
             rig: The sensors.
             ego: The body that carries it.
+            measures: What numbers of the coverage are means over.
         """
         keys = [one.key for one in self.objectives.values() if one.metric is None]
         failures = any(map(_of_failures, keys))
         regions = tuple(self.regions.values())
-        coverage = CoverageMetric(
-            self.grid,
-            self.thresholds_m,
-            max_radius=self.max_radius_m,
-            blocks=BLOCKS,
-            aggregations=self.aggregations,
-            regions=regions,
-            sensors=_names(rig) if failures else (),
-            square_metres=True,
-            sync_on_compute=False,
-        )
+        observers: dict[Measure, CoverageObserver] = {}
+        for measure in measures:
+            if "area" in observers and not failures:  # which has the means over known cells, too
+                observers[measure] = observers["area"]
+                continue
+            coverage = CoverageMetric(
+                self.grid,
+                self.thresholds_m,
+                max_radius=self.max_radius_m,
+                blocks=BLOCKS,
+                aggregations=self.aggregations,
+                regions=regions,
+                sensors=_names(rig) if failures else (),
+                square_metres=measure == "area",
+                sync_on_compute=False,
+            )
+            observers[measure] = CoverageObserver(coverage, rig.name)
         setup = Setup(
             rig=rig.name,
             sensors=rig.sensors,
@@ -186,7 +193,7 @@ class Questions(NamedTuple):
             sync_on_compute=False,
         )
         others = {name: PUBLISHED[name].make(setup) for name in self.metrics}
-        return RigNumbers(self, rig, CoverageObserver(coverage, rig.name), others)
+        return RigNumbers(self, rig, observers, others)
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,18 +203,19 @@ class RigNumbers:
     Args:
         questions: What is asked.
         rig: The sensors.
-        coverage: Its coverage.
+        coverage: Its coverage, by what its numbers are means over; one for both where that knows both.
         others: Published metrics, by name.
     """
 
     questions: Questions
     rig: Rig
-    coverage: CoverageObserver
+    coverage: Mapping[Measure, CoverageObserver]
     others: Mapping[str, FrameMetric]
 
     def update(self, frame: Frame) -> None:
         """Add a frame."""
-        self.coverage.update(frame)
+        for observer in dict.fromkeys(self.coverage.values()):
+            observer.update(frame)
         for metric in self.others.values():
             metric.update(frame)
 
@@ -215,7 +223,7 @@ class RigNumbers:
         """The objectives so far, each a quantity under its own name.
 
         Args:
-            measure: What numbers of the coverage are means over, where there is a choice.
+            measure: What numbers of the coverage are means over; one of those that it was made for.
         """
         answers = self._answers(measure)
         steps = max((one.steps for each in answers.values() for one in each), key=len)
@@ -230,7 +238,7 @@ class RigNumbers:
 
     def _answers(self, measure: Measure) -> dict[str, list[Estimate]]:
         """Name of each objective -> its number in each of its places."""
-        metric, objectives, regions = self.coverage.metric, self.questions.objectives, self.questions.regions
+        metric, objectives, regions = self.coverage[measure].metric, self.questions.objectives, self.questions.regions
         plain = [quantity.key for quantity in MeanOfMeans(metric.thresholds).quantities]
         places = list(dict.fromkeys(place for one in objectives.values() for place in one.places))
         if measure == "area" and all(one.metric or one.key in plain for one in objectives.values()):
@@ -243,7 +251,10 @@ class RigNumbers:
             coverage = metric.compute()
 
             def number(key: str, place: tuple[str, str]) -> Estimate:
-                key = f"known_{key}" if measure == "known" and key in plain else key
+                if not metric.square_metres:
+                    key = key.removeprefix("known_")
+                elif measure == "known" and key in plain:
+                    key = f"known_{key}"
                 return coverage.estimate_of(key, regions[place[0]], place[1])
 
         def answer(key: str, place: tuple[str, str]) -> Estimate:
@@ -261,7 +272,7 @@ class RigNumbers:
 
 def _of_failures(key: str) -> bool:
     """Whether only a metric that is told of the sensors gives the number."""
-    return FAILURE.match(key) is not None or not key.startswith(("radius", "detection"))
+    return FAILURE.match(key) is not None or not key.startswith(("radius", "detection", "known_"))
 
 
 def _chosen(estimate: Estimate, key: str) -> Estimate:

@@ -135,7 +135,7 @@ class _Budget:
 
     @property
     def expected(self) -> int:
-        """Evaluations in all, as far as anybody knows."""
+        """Evaluations in all, as far as is known."""
         plan = self._search.plan
         if plan.evaluations is not None:
             return plan.evaluations + 1

@@ -189,10 +189,10 @@ class PlacementSearch:
             raise ValueError(f"the start is to be scored at all {len(self.instants)} instants; got {start.instants}")
         for name, value in zip(self.space.objectives, start.prefixes[-1].estimate.value.tolist(), strict=True):
             if math.isnan(value):
-                raise ValueError(
-                    f"objectives.{name}: unknown at all {start.instants} instants: one of its regions and bands is "
-                    "never seen; take larger ones, more worlds or more rays"
-                )
+                why = "one of its regions and bands is never seen; take larger ones, more worlds or more rays"
+                if metric := self.space.objectives[name].metric:
+                    why = f"what {metric} is about is never there; take another scenario, or more worlds"
+                raise ValueError(f"objectives.{name}: unknown at all {start.instants} instants: {why}")
         makes = {OPTIMISER: self._makes_optimiser, RANDOM: RandomSearch}
         for name, each in makes.items():
             seed = int(np.random.SeedSequence([self.plan.seed, SEEDS[name]]).generate_state(1)[0])
