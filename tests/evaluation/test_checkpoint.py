@@ -181,6 +181,7 @@ def test_what_one_observer_has_seen_and_another_has_not_is_not_kept(frame_of, pa
         ({"cell_m": 4.0}, r"cell_m \(8.0 there, 4.0 here\)"),
         ({"thresholds_m": (0.4, 1.0)}, r"thresholds_m \(\[0.4\] there, \[0.4, 1.0\] here\)"),
         ({"aggregations": ()}, r"aggregations \(other content\)"),
+        ({"band_frame": "ground"}, r"band_frame \(\"vehicle\" there, \"ground\" here\)"),
         ({"estimate": "known"}, r"estimate \(null there, \"known\" here\)"),
         ({"target_error": "1%"}, r"target_error \(other content\)"),
         ({"observers": {}}, r"observers \(other content\)"),

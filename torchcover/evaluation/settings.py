@@ -176,6 +176,13 @@ class Settings:
             "`known`, its known cells, as in the paper."
         ),
     ] = None
+    band_frame: Annotated[
+        Literal["ground", "vehicle"] | None,
+        Option(
+            "What height bands are over: `ground`, the local ground, or `vehicle`, z of the vehicle (default; `paper` "
+            "and recordings without heights have no other).",
+        ),
+    ] = None
     every_s: Annotated[
         float | None,
         Option(
@@ -230,6 +237,10 @@ class Settings:
         check_fits(f"{self.workers:,} workers", BYTES_PER_WORKER * self.workers, "use fewer")
         if self.estimate not in (None, "area", "known"):
             raise ValueError(f"estimate {self.estimate}: `area` or `known` is needed")
+        if self.band_frame not in (None, "ground", "vehicle"):
+            raise ValueError(f"band_frame {self.band_frame}: `ground` or `vehicle` is needed")
+        if self.reference == "paper" and self.band_frame == "ground":
+            raise ValueError("band_frame ground: the paper's reference has bands over z of the vehicle; leave it out")
 
     @property
     def simulated_steps(self) -> int:

@@ -103,10 +103,15 @@ class Questions(NamedTuple):
 
     def reference_sensor(self, rays: int) -> SurfaceReference:
         """One that is aimed at what is asked about."""
-        return SurfaceReference.from_rays(self.areas, rays, tuple(self.grid.heights.values()))
+        return SurfaceReference.from_rays(self.areas, rays, tuple(self.grid.heights.values()), self.grid.band_frame)
 
-    def asked(self, points: Tensor) -> Tensor:
-        """(M,) bool: which of (M, 3) points lie in a region and band that is asked about, or any for other metrics."""
+    def asked(self, points: Tensor, height: Tensor | None = None) -> Tensor:
+        """(M,) bool: which of (M, 3) points lie in a region and band that is asked about, or any for other metrics.
+
+        Args:
+            points: In the vehicle frame.
+            height: As in `BevGrid.bins`.
+        """
         if self.metrics:
             return torch.ones(len(points), dtype=torch.bool)
         cells = torch.zeros(self.grid.shape, dtype=torch.bool)
@@ -114,7 +119,7 @@ class Questions(NamedTuple):
         for objective in self.objectives.values():
             for region, band in objective.places:
                 cells[bands.index(band)] |= self.regions[region].mask(self.grid)
-        inside, of, cell = self.grid.bins(points)
+        inside, of, cell = self.grid.bins(points, height)
         kept = torch.zeros(len(points), dtype=torch.bool)
         kept[inside[of[cells.view(-1)[cell]]]] = True
         return kept
@@ -302,7 +307,7 @@ def _around(grid: BevGrid, regions: Collection[Region]) -> BevGrid:
         return float(edges[edges <= low].max()), float(edges[edges >= high].min())
 
     x, y = outside(grid.x_edges_m, [one.x for one in regions]), outside(grid.y_edges_m, [one.y for one in regions])
-    return BevGrid(x, y, grid.cell, grid.heights)
+    return BevGrid(x, y, grid.cell, grid.heights, grid.band_frame)
 
 
 def _whole_cells(grid: BevGrid, mask: Tensor) -> tuple[tuple[float, float], tuple[float, float]]:

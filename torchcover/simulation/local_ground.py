@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,6 @@ Bools = NDArray[np.bool_]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
-# What heights are measured from: the local ground, or z = 0 of the vehicle frame, which pitches and rolls.
-BandFrame = Literal["ground", "vehicle"]
 
 # Nothing steeper is driven or walked on.
 STEEPEST_DEG = 45.0
