@@ -111,7 +111,7 @@ def test_what_a_failure_leaves_is_over_known_cells_where_evaluate_has_it_so(seve
 
 def test_a_search_over_known_cells_scores_what_it_is_tested_by():
     objectives = {key: NUMBERS[key] for key in ("detection_0.4m", "detection_0.4m_without_any")}
-    found = held(objectives=objectives, measure="known")
+    found = held(objectives=objectives, estimate="known")
     last = list(found.prefixes(TWO))[-1].estimate
     for name in ("value", "left_out", "steps"):
         np.testing.assert_array_equal(getattr(last, name), getattr(found.estimates(TWO)["known"], name))

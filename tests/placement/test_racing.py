@@ -126,12 +126,12 @@ def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(instant
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
     found = fresh_test({"higher": high}, low, instants, test_seed=1, worlds=8)["higher"]
     fresh = held(seed=1, worlds=8)
-    assert [(gain.objective, gain.measure) for gain in found] == [
+    assert [(gain.objective, gain.estimate) for gain in found] == [
         (name, measure) for measure in ("area", "known") for name in ("near", "far", "bay")
     ]
     for gain in found:
-        expected = fresh.estimates(high)[gain.measure].differences(fresh.estimates(low)[gain.measure])
-        in_search = instants.estimates(high)[gain.measure].minus(instants.estimates(low)[gain.measure])
+        expected = fresh.estimates(high)[gain.estimate].differences(fresh.estimates(low)[gain.estimate])
+        in_search = instants.estimates(high)[gain.estimate].minus(instants.estimates(low)[gain.estimate])
         column = ["near", "far", "bay"].index(gain.objective)
         np.testing.assert_equal(gain.test, expected[gain.objective])
         assert gain.search_gain == float(in_search.value[column])

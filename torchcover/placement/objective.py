@@ -1,5 +1,6 @@
 """A number of a result that a search makes better, as a space writes it."""
 
+import re
 from collections.abc import Mapping
 from typing import Annotated, Self
 
@@ -14,6 +15,8 @@ from torchcover.simulation.regions_of_interest import RegionOfInterest
 Name = Annotated[str, Field(min_length=1)]
 
 THRESHOLD_M = 0.4
+# Numbers by area or over known cells.
+CHOSEN = re.compile(r"(radius_m|(detection|sensors|seen_by_two)_[\d.]+m)(_without_|$)")
 
 
 class Objective(Document):
@@ -70,6 +73,22 @@ class Objective(Document):
     def metric(self) -> str | None:
         """The published metric that gives it; None where the coverage does."""
         return max((name for name in PUBLISHED if self.key.startswith(name)), key=len, default=None)
+
+    @property
+    def own_estimate(self) -> str:
+        """What its number is a mean over where that is no choice.
+
+        Returns:
+            "known" of a number over known cells, "-" of a published metric or an aggregation; else empty: "area" or
+            "known", as a search is asked.
+
+        Example:
+            >>> [Objective(number=key, region="20m").own_estimate for key in ("known_radius_m", "radius_maximum_m")]
+            ['known', '-']
+        """
+        if self.key.startswith("known_"):
+            return "known"
+        return "" if CHOSEN.match(self.key) else "-"
 
     @property
     def places(self) -> tuple[tuple[str, str], ...]:

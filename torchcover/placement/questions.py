@@ -4,7 +4,7 @@ import math
 import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from difflib import get_close_matches
 from typing import Any, NamedTuple, Self
 
@@ -260,7 +260,9 @@ class RigNumbers:
         def answer(key: str, place: tuple[str, str]) -> Estimate:
             alone, sensor = failed.groups() if (failed := FAILURE.match(key)) else (key, "")
             if sensor == ANY:
-                return _worst([number(f"{alone}_without_{one}", place) for one in metric.sensors])
+                worst = _worst([number(f"{alone}_without_{one}", place) for one in metric.sensors])
+                title = worst.quantities[0].title.removesuffix(metric.sensors[0]) + "any one sensor"
+                return replace(worst, quantities=(worst.quantities[0]._replace(title=title),))
             return number(key if sensor in ("", *metric.sensors) else alone, place)  # what is not there cannot fail
 
         return {
