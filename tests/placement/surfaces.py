@@ -22,7 +22,17 @@ def near_far(rig):
 class Surface:
     """Instants of so many worlds, each with its own level, and its own view of a difference."""
 
-    def __init__(self, seed=0, worlds=6, per_world=3, worth=near_far, noise=0.002, objectives=NEAR, blind=False, estimate="area"):
+    def __init__(
+        self,
+        seed=0,
+        worlds=6,
+        per_world=3,
+        worth=near_far,
+        noise=0.002,
+        objectives=NEAR,
+        blind=False,
+        estimate="area",
+    ):
         draws = np.random.default_rng([seed, 99])
         self.seed, self.worth, self.noise, self.blind = seed, worth, noise, blind
         self.objectives, self.estimate = dict(objectives), estimate

@@ -21,7 +21,7 @@ from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.measuring import BLOCKS
 from torchcover.frames import Frame
-from torchcover.placement.objective import THRESHOLD_M, Objective
+from torchcover.placement.objective import THRESHOLD_M, Objective, published_numbers
 from torchcover.published import PUBLISHED, FrameMetric, Setup, Sights
 from torchcover.simulation import Areas, RegionsOfInterest, Rig, SurfaceReference
 from torchcover.simulation.regions_of_interest import RegionOfInterest
@@ -142,6 +142,7 @@ class Questions(NamedTuple):
         for name, objective in self.objectives.items():
             keys = known.get(objective.metric or "", of_coverage)
             if objective.key not in keys:
+                keys = keys if objective.metric else [*keys, *published_numbers()]
                 near = get_close_matches(objective.key, keys, n=1, cutoff=0.0)
                 raise ValueError(f"objective {name!r}: no result has a number {objective.key!r}; near is {near[0]!r}")
 

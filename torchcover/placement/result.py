@@ -31,7 +31,7 @@ class Pick:
         role: Of several objectives, "middle" of the front, or the name of the objective that it is best in; else empty.
         evaluation: It.
         rig: It, as it can be evaluated.
-        gains: On fresh worlds, by the estimate of the search first; empty if it was not tested, as the start itself is not.
+        gains: On fresh worlds, by the estimate of the search first; empty if it was not tested, as the start itself.
     """
 
     arm: str
