@@ -3,10 +3,11 @@
 import numpy as np
 
 from tests.placement.worlds import estimate_of
-from torchcover.placement import Prefix, SearchPlan, SearchSpace, racing_order
+from torchcover.placement import Objective, Prefix, SearchPlan, SearchSpace, racing_order
 
 QUESTIONS = 2
 BEST_X, BEST_PITCH = 0.15, 4.0
+NEAR = {"near": Objective(region="20m")}
 
 
 def near_far(rig):
@@ -21,9 +22,20 @@ def near_far(rig):
 class Surface:
     """Instants of so many worlds, each with its own level, and its own view of a difference."""
 
-    def __init__(self, seed=0, worlds=6, per_world=3, worth=near_far, noise=0.002, objectives=("near",), blind=False):
+    def __init__(
+        self,
+        seed=0,
+        worlds=6,
+        per_world=3,
+        worth=near_far,
+        noise=0.002,
+        objectives=NEAR,
+        blind=False,
+        estimate="area",
+    ):
         draws = np.random.default_rng([seed, 99])
-        self.seed, self.worth, self.noise, self.objectives, self.blind = seed, worth, noise, tuple(objectives), blind
+        self.seed, self.worth, self.noise, self.blind = seed, worth, noise, blind
+        self.objectives, self.estimate = dict(objectives), estimate
         self.world_of = np.repeat(np.arange(worlds), per_world)
         self.order = racing_order(self.world_of, seed)
         self.level = draws.normal(0.0, 0.1, (len(self.world_of), QUESTIONS))
@@ -54,7 +66,7 @@ class Surface:
         return {"area": self._estimate(rig, self.order), "known": self._estimate(rig, self.order, shift=-0.1)}
 
     def anew(self, seed, worlds):
-        return Surface(seed, worlds, 3, self.worth, self.noise, self.objectives)
+        return Surface(seed, worlds, 3, self.worth, self.noise, self.objectives, estimate=self.estimate)
 
     def close(self):
         self.closed = True
@@ -77,7 +89,7 @@ def plan(**settings):
     worth = settings.pop("worth", near_far)
     blind = settings.pop("blind", False)
     makes = lambda space, plan, seed, worlds: Surface(  # noqa: E731
-        seed, worlds, plan.per_world, worth, objectives=tuple(space.objectives), blind=blind
+        seed, worlds, plan.per_world, worth, objectives=space.objectives, blind=blind, estimate=plan.estimate
     )
     budget = {} if "budget_s" in settings else {"evaluations": 20}
     return SearchPlan(**{**budget, "instants": makes, **settings})

@@ -56,7 +56,7 @@ def test_what_points_are_worth_is_what_evaluate_says_of_the_rig(objective, measu
         lidar("b", mount={"y_m": 1.2, "z_m": 0.9, "yaw_deg": 70}, channels=24, horizontal_fov_deg=200),
         lidar("c"),
     ]
-    with held(objectives={OBJECTIVE: objective}, measure=measure) as instants:
+    with held(objectives={OBJECTIVE: objective}, estimate=measure) as instants:
         worth = worth_of(instants)
         assert worth.total == pytest.approx(1.0, rel=1e-12)
         bits = [seen_by(rig(sensor), instants) for sensor in sensors]
@@ -71,7 +71,7 @@ def test_worlds_that_know_nothing_of_a_part_count_for_nothing(measure):
     walled = {"name": "walled", "ego": EGO, "bodies": [FLOOR, WALL]}
     scenarios = [type(LOT).model_validate(one) for one in (yard, walled)]
     asked = {OBJECTIVE: Objective(region="20m", band="obstacle")}
-    with held(scenarios, asked, per_world=1, every_s=0.1, measure=measure) as two:
+    with held(scenarios, asked, per_world=1, every_s=0.1, estimate=measure) as two:
         value = float(two.estimates(rig())[measure].value[0])
         assert worth_of(two).of(seen_by(rig(), two)) == pytest.approx(value, rel=1e-12)
     with (

@@ -111,10 +111,30 @@ def test_what_a_failure_leaves_is_over_known_cells_where_evaluate_has_it_so(seve
 
 def test_a_search_over_known_cells_scores_what_it_is_tested_by():
     objectives = {key: NUMBERS[key] for key in ("detection_0.4m", "detection_0.4m_without_any")}
-    found = held(objectives=objectives, measure="known")
+    found = held(objectives=objectives, estimate="known")
     last = list(found.prefixes(TWO))[-1].estimate
     for name in ("value", "left_out", "steps"):
         np.testing.assert_array_equal(getattr(last, name), getattr(found.estimates(TWO)["known"], name))
+
+
+def test_a_number_without_any_sensor_says_so(several):
+    titles = dict(zip(NUMBERS, (one.title for one in several.estimates(TWO)["area"].quantities), strict=True))
+    assert titles["detection_0.4m_without_any"] == "detection within 0.4 m, without any one sensor"
+    assert titles["detection_0.4m_without_top"] == "detection within 0.4 m, without top"
+
+
+def test_numbers_that_are_by_no_choice_of_estimate_are_the_same_by_both(several):
+    both = several.estimates(TWO)
+    objectives = {
+        "known": Objective(number="known_radius_m", region="20m"),
+        "theirs": Objective(number="k_cover_2_0.4m"),
+    }
+    more = held(objectives=objectives).estimates(TWO)
+    for estimates, asked in ((both, NUMBERS), (more, objectives)):
+        pairs = zip(asked.values(), estimates["area"].value, estimates["known"].value, strict=True)
+        for objective, by_area, by_cells in pairs:
+            assert (by_area == by_cells) == (objective.own_estimate != ""), objective.key
+    assert [one.own_estimate for one in objectives.values()] == ["known", "-"]
 
 
 def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
@@ -156,6 +176,7 @@ def test_a_published_metric_says_what_it_says_of_the_same_frames(key):
         ("radius_maximal_m", "radius_maximum_m"),
         ("detection_0.4.1m", "detection_0.4m"),
         ("radius_q0.9.1_m", "radius_q0.9_m"),
+        ("s_mgi_0.2m", "s_mig_0.2m"),
     ],
 )
 def test_a_number_that_no_result_has_is_refused_with_the_nearest(given, near):
@@ -174,8 +195,8 @@ def test_a_number_of_a_metric_that_it_does_not_have_is_refused_with_the_nearest(
     ("given", "message"),
     [
         ({"number": "radius_m", "detection": 0.4, "region": "20m"}, "number, detection: one of the two"),
-        ({"number": "radius_m"}, "region: it is needed for 'radius_m'"),
-        ({"number": "s_mgi_0.2m"}, "region: it is needed for 's_mgi_0.2m'; none is by numbers of .*, s_mig, "),
+        ({"number": "radius_m"}, r"region: it is needed for 'radius_m' \["),
+        ({"number": "s_mgi_0.2m"}, "region: it is needed for 's_mgi_0.2m'; near is 's_mig_0.2m' of a published"),
         ({"number": "s_mig_0.2m", "region": "20m"}, "region: 's_mig_0.2m' has none"),
         ({"number": "s_mig_0.2m", "band": "ground"}, "band: 's_mig_0.2m' has none"),
     ],

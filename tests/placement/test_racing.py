@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from tests.placement.worlds import estimate_of, held, lidar, prefixes_of, rig, yard
-from torchcover.placement import fresh_test, race, racing_order
+from torchcover.placement import Objective, fresh_test, race, racing_order
 from torchcover.placement.racing import gains
 
 WORLDS, PER_WORLD = 6, 3
@@ -122,16 +122,26 @@ def test_no_more_is_scored_than_is_needed():
     assert asked == [3]
 
 
+def test_a_number_that_is_by_no_choice_of_estimate_is_tested_once():
+    low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
+    keys = {"near": "radius_m", "largest": "radius_maximum_m", "cells": "known_radius_m"}
+    objectives = {name: Objective(number=key, region="20m") for name, key in keys.items()}
+    with held(objectives=objectives, estimate="known", worlds=2) as searched:
+        found = fresh_test({"higher": high}, low, searched, test_seed=1, worlds=2)["higher"]
+    said = [("near", "known"), ("largest", "-"), ("cells", "known"), ("near", "area")]
+    assert [(gain.objective, gain.estimate) for gain in found] == said
+
+
 def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(instants):
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
     found = fresh_test({"higher": high}, low, instants, test_seed=1, worlds=8)["higher"]
     fresh = held(seed=1, worlds=8)
-    assert [(gain.objective, gain.measure) for gain in found] == [
+    assert [(gain.objective, gain.estimate) for gain in found] == [
         (name, measure) for measure in ("area", "known") for name in ("near", "far", "bay")
     ]
     for gain in found:
-        expected = fresh.estimates(high)[gain.measure].differences(fresh.estimates(low)[gain.measure])
-        in_search = instants.estimates(high)[gain.measure].minus(instants.estimates(low)[gain.measure])
+        expected = fresh.estimates(high)[gain.estimate].differences(fresh.estimates(low)[gain.estimate])
+        in_search = instants.estimates(high)[gain.estimate].minus(instants.estimates(low)[gain.estimate])
         column = ["near", "far", "bay"].index(gain.objective)
         np.testing.assert_equal(gain.test, expected[gain.objective])
         assert gain.search_gain == float(in_search.value[column])

@@ -76,7 +76,7 @@ def test_the_winner_is_better_on_fresh_worlds_and_so_is_what_random_search_found
     assert abs(best.evaluation.values["roof.pitch_deg"] - 4) < 1.5
     for pick in (best, random):
         gain, by_cells = pick.gains
-        assert [gain.measure, by_cells.measure] == ["area", "known"]
+        assert [gain.estimate, by_cells.estimate] == ["area", "known"]
         assert gain.t > 4
         assert gain.test.blocks == 16
         assert gain.optimism == gain.search_gain - gain.test.gain
@@ -221,7 +221,7 @@ def test_a_budget_below_one_evaluation_says_what_one_takes(monkeypatch):
         ({"budget_s": 0.0}, "more than 0 s is needed"),
         ({"test_seed": 0}, "would not be fresh with the seed of the search; both are 0"),
         ({"optimiser": "luck"}, "one of auto, gp, cmaes, random, enumerate is needed; got 'luck'"),
-        ({"measure": "mean"}, "one of area, known is needed"),
+        ({"estimate": "mean"}, "one of area, known is needed"),
     ],
 )
 def test_a_plan_that_makes_no_sense(settings, message):

@@ -135,3 +135,21 @@ def test_only_what_is_told_from_chance_is_called_a_gain(found, words):
     assert told(found) == words
     if np.isfinite(found.test.value):
         assert told(found, optimism=True).startswith(f"{words}, optimism ")
+
+
+def test_a_number_that_is_by_no_choice_of_estimate_has_one_row(tmp_path):
+    objectives = {"near": {"region": "20m"}, "largest": {"number": "radius_maximum_m", "region": "20m"}}
+    result = run_search(PlacementSearch(space(objectives=objectives), plan(evaluations=16, estimate="known")))
+    result.save(tmp_path)
+    found = json.loads((tmp_path / "search.json").read_text())
+    assert found["estimate"] == "known"
+    tested = [pick for pick in found["found"] if pick["gains"]]
+    assert tested
+    for pick in tested:
+        assert {name: list(gains) for name, gains in pick["gains"].items()} == {
+            "near": ["known", "area"],
+            "largest": ["-"],
+        }
+    assert result.sentence.count("near: ") == result.sentence.count("largest: ") == 1
+    estimates = {tuple(cell.text for cell in row[1:3]) for row in result.report.tables[0].rows}
+    assert estimates == {("near (points)", "known"), ("near (points)", "area"), ("largest (points)", "-")}

@@ -201,7 +201,7 @@ def search(
     optimiser: Annotated[
         str, typer.Option(help="auto, gp (Gaussian process), cmaes (extra `search`), enumerate (choices) or random.")
     ] = "auto",
-    measure: Annotated[
+    estimate: Annotated[
         Literal["area", "known"],
         typer.Option(help="What a score is: `area`, the share of the visible surface, or `known`, of the known cells."),
     ] = "area",
@@ -234,7 +234,7 @@ def search(
         evaluations=evaluations,
         budget_s=None if budget is None else parsed_budget(budget),
         optimiser=optimiser,
-        measure=measure,
+        estimate=estimate,
         seed=seed,
         test_seed=test_seed,
         workers=workers,

@@ -77,7 +77,7 @@ def _chosen(path: Path, out: Path, *, resume: bool, **settings: Any) -> SensorCh
         every_s=plan.every_s,
         seed=plan.seed,
         rays=plan.rays,
-        measure=plan.measure,
+        estimate=plan.estimate,
         workers=plan.workers,
     ) as instants:
         return choose(space, instants, test_seed=plan.seed_of_test, fresh_worlds=plan.fresh_worlds)

@@ -46,7 +46,7 @@ class SensorChoice:
 
     Args:
         space: What there was to choose from.
-        measure: What the choice is by.
+        estimate: What the choice is by.
         sensors: The candidates that can be mounted.
         refused: Name of each of the others, and why it cannot be.
         candidates: What each of `sensors` sees.
@@ -61,7 +61,7 @@ class SensorChoice:
     """
 
     space: ChoiceSpace
-    measure: Measure
+    estimate: Measure
     sensors: tuple[Sensor, ...]
     refused: dict[str, str]
     candidates: Candidates
@@ -137,7 +137,7 @@ class SensorChoice:
         return {
             "torchcover": __version__,
             "choice": self.space.name,
-            "measure": self.measure,
+            "estimate": self.estimate,
             "best": {
                 "sensors": self.names(self.best.chosen),
                 "value": self.number.value,
@@ -238,9 +238,9 @@ def choose(
             raise ValueError(f"now: {lost[0]} cannot be there: {refused[lost[0]]}")
         now = tuple(places[name] for name in space.now)
     rig = space.rig(tuple(sensors[one] for one in best.chosen), f"{space.name}_best")
-    number = instants.estimates(rig)[instants.measure].numbers()[OBJECTIVE]
+    number = instants.estimates(rig)[instants.estimate].numbers()[OBJECTIVE]
     control = greedy(candidates, limits), best, number, tuple(drawn), now
-    found = SensorChoice(space, instants.measure, sensors, refused, candidates, limits, *control, None, "")
+    found = SensorChoice(space, instants.estimate, sensors, refused, candidates, limits, *control, None, "")
     return _tested(found, instants, test_seed, fresh_worlds)
 
 
@@ -290,7 +290,7 @@ def worth_of(instants: CommonInstants) -> Worth:
             raise ValueError(f"objective: no instant shows any surface of {band} in {region}; use more worlds")
         for worth, (points, weight, cell) in zip(of_bits, of_places, strict=True):
             share = weight / m2.sum()
-            if instants.measure == "known":
+            if instants.estimate == "known":
                 of_cell = torch.bincount(cell, weights=weight, minlength=grid.cells)
                 share = weight / of_cell[cell] / probed[cell] / (probed > 0).sum()
             worth.index_add_(0, points, share / len(places))
@@ -327,4 +327,4 @@ def _tested(found: SensorChoice, instants: CommonInstants, test_seed: int, world
         tests = fresh_test({"best": found.rig}, now, instants, test_seed=test_seed, worlds=worlds)
     except ValueError as error:
         return replace(found, untested=str(error))
-    return replace(found, gain=next(gain for gain in tests["best"] if gain.measure == found.measure))
+    return replace(found, gain=tests["best"][0])

@@ -119,7 +119,7 @@ class CommonInstants:
         every_s: Time between them.
         seed: Seed of the traffic, of the reference, and of the order of the instants.
         rays: About how many rays the reference casts at each instant.
-        measure: What numbers of the coverage are means over: "area", the visible surface, or "known", the known cells.
+        estimate: What numbers of the coverage are means over: "area", the visible surface, or "known", the known cells.
         budget_bytes: What all worlds may take, about 35 MB for one of `urban`. All are held: to build one again takes
             five times as long as to score a rig on three instants of it.
         workers: Processes that hold the worlds; 0 holds them in this one.
@@ -153,7 +153,7 @@ class CommonInstants:
         every_s: float = EVERY_S,
         seed: int = 0,
         rays: int = RAYS,
-        measure: Measure = "area",
+        estimate: Measure = "area",
         budget_bytes: float = BUDGET_BYTES,
         workers: int = 0,
     ) -> None:
@@ -167,9 +167,9 @@ class CommonInstants:
         if workers < 0:
             raise ValueError(f"workers: a number >= 0 is needed; got {workers}")
         self.scenarios = tuple(one if isinstance(one, Scenario) else Scenario.load(one) for one in given)
-        self.seed, self.measure, self.objectives = seed, measure, dict(objectives)
+        self.seed, self.estimate, self.objectives = seed, estimate, dict(objectives)
         self._settings: dict[str, Any] = {"vehicle": vehicle, "per_world": per_world, "every_s": every_s, "rays": rays}
-        self._settings |= {"measure": measure, "budget_bytes": budget_bytes, "workers": workers}
+        self._settings |= {"estimate": estimate, "budget_bytes": budget_bytes, "workers": workers}
         self._vehicles: set[str | None] = {None}  # that were found to be that of these worlds
         self._worlds = [with_ego(one, {}, vehicle) for one in self.scenarios]
         self.questions = Questions.around(Carrier.of(self._worlds).outline_m, objectives)
@@ -245,13 +245,13 @@ class CommonInstants:
         Raises:
             ValueError: The rig cannot be mounted: a sensor inside the vehicle or another body, or below the ground.
         """
-        numbers, rays, self_hits = self._observers(rig, [self.measure]), 0, 0
+        numbers, rays, self_hits = self._observers(rig, [self.estimate]), 0, 0
         for start in range(0, len(self), TOGETHER):
             for frame in self.frames(rig, self.order[start : start + TOGETHER].tolist()):
                 numbers.update(frame)
                 rays, self_hits = rays + frame.counts["rays"], self_hits + frame.counts["self_hits"]
             done = min(start + TOGETHER, len(self))
-            yield Prefix(done, numbers.estimate(self.measure), self_hits / rays)
+            yield Prefix(done, numbers.estimate(self.estimate), self_hits / rays)
 
     def estimates(self, rig: Rig) -> dict[Measure, Estimate]:
         """What is known of a rig after all instants, by either measure; ValueError as `prefixes`."""

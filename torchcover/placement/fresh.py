@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from contextlib import closing
 from typing import Any, NamedTuple
 
-from torchcover.coverage import Measure
 from torchcover.estimation import Difference
 from torchcover.placement.common_instants import CommonInstants
 from torchcover.report.wording import shown_unit
@@ -13,17 +12,17 @@ from torchcover.simulation import Rig
 
 
 class FreshGain(NamedTuple):
-    """What the winner has better than the start, of one objective by one measure.
+    """What the winner has better than the start, of one objective by one estimate.
 
     Args:
         objective: Its name.
-        measure: What numbers of the coverage are means over.
+        estimate: What its number is a mean over: "area", "known", or "-" where there is no such choice.
         test: The difference on fresh worlds, paired.
         search_gain: The gain on the instants of the search, which chose the winner by it.
     """
 
     objective: str
-    measure: Measure
+    estimate: str
     test: Difference
     search_gain: float
 
@@ -68,7 +67,8 @@ def fresh_test(
             left out.
 
     Returns:
-        The gains in each objective by each measure, by the names of the winners.
+        The gains by the names of the winners: in each objective by the estimate of the search, then by the other one
+        where that is a choice.
 
     Raises:
         ValueError: The seed of the search; no scenario with traffic; a rig that cannot be mounted in a fresh world.
@@ -77,13 +77,16 @@ def fresh_test(
         start_by_test = fresh.estimates(start)
         by_test = {name: fresh.estimates(winner) for name, winner in winners.items()}
     start_by_search = searched.estimates(start)
+    own = {objective: asked.own_estimate for objective, asked in searched.objectives.items()}
     tests = {}
     for name, winner in winners.items():
         by_search = searched.estimates(winner)
         tests[name] = tuple(
-            FreshGain(objective, measure, test, by_search[measure].differences(other)[objective].gain)
-            for measure, other in start_by_search.items()
-            for objective, test in by_test[name][measure].differences(start_by_test[measure]).items()
+            FreshGain(objective, own[objective] or estimate, test, in_search[objective].gain)
+            for estimate in sorted(start_by_search, key=lambda one: one != searched.estimate)
+            for in_search in [by_search[estimate].differences(start_by_search[estimate])]
+            for objective, test in by_test[name][estimate].differences(start_by_test[estimate]).items()
+            if estimate == searched.estimate or not own[objective]
         )
     return tests
 

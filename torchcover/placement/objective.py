@@ -1,29 +1,42 @@
 """A number of a result that a search makes better, as a space writes it."""
 
+import re
+import warnings
 from collections.abc import Mapping
+from difflib import get_close_matches
 from typing import Annotated, Self
 
 from pydantic import Field, NonNegativeFloat, model_validator
 
 from torchcover.coverage import Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
-from torchcover.published import PUBLISHED
-from torchcover.simulation import Document
+from torchcover.published import PUBLISHED, Setup
+from torchcover.simulation import Document, Rig
 from torchcover.simulation.regions_of_interest import RegionOfInterest
 
 Name = Annotated[str, Field(min_length=1)]
 
 THRESHOLD_M = 0.4
+# Numbers by area or over known cells.
+CHOSEN = re.compile(r"(radius_m|(detection|sensors|seen_by_two)_[\d.]+m)(_without_|$)")
+
+
+def published_numbers() -> list[str]:
+    """Those of published metrics that may be objectives, of any rig."""
+    setup = Setup(sensors=Rig.load("front_roof_32").sensors)
+    with warnings.catch_warnings(action="ignore"):  # that they were fed with nothing
+        numbers = {name: each.make(setup).estimate().quantities for name, each in PUBLISHED.items()}
+    return [one.key for name, each in numbers.items() for one in each if one.key.startswith(name)]
 
 
 class Objective(Document):
     """A number of a rig that is made better: a mean over some regions and height bands, each weighing the same.
 
     Args:
-        number: Key of any number of a result, as `summary.json` of `torchcover evaluate` has it: "radius_m",
-            "detection_0.4m", "seen_by_two_0.4m", ..., "detection_0.4m_without_roof", of which "any" stands for the
-            sensor whose failure is worst; or the name of a number of a published metric, as "s_mig_0.2m".
-            Whether more or less of it is better, it knows itself.
+        number: "radius_m", "detection_0.4m"; "known_radius_m" over known cells whatever the search is by;
+            "radius_maximum_m" of an aggregation; "seen_by_two_0.4m" or "detection_0.4m_without_roof" of redundancy,
+            where "any" stands for the sensor whose failure is worst; or a published metric's, as "s_mig_0.2m". Whether
+            more or less of it is better, it knows itself.
         detection: Threshold in metres, in short for the number `detection_0.4m`: a reference point with a point of the
             rig within it counts as detected. 0.4 if no number is given.
         band: Name of a height band of the paper, "ground" or "obstacle", or several; both if not given.
@@ -54,7 +67,9 @@ class Objective(Document):
         if self.number is not None and self.detection is not None:
             raise ValueError(f"number, detection: one of the two is possible; got {self.number!r} and a threshold")
         if self.region is None and self.metric is None:
-            raise ValueError(f"region: it is needed for {self.key!r}; none is by numbers of {', '.join(PUBLISHED)}")
+            near = get_close_matches(self.key, published_numbers(), n=1)
+            meant = f"; near is {near[0]!r} of a published metric, which needs none" if near else ""
+            raise ValueError(f"region: it is needed for {self.key!r}{meant}")
         if self.region is not None and self.metric is not None:
             raise ValueError(f"region: {self.number!r} has none")
         if self.metric is not None and self.band is not None:
@@ -70,6 +85,22 @@ class Objective(Document):
     def metric(self) -> str | None:
         """The published metric that gives it; None where the coverage does."""
         return max((name for name in PUBLISHED if self.key.startswith(name)), key=len, default=None)
+
+    @property
+    def own_estimate(self) -> str:
+        """What its number is a mean over where that is no choice.
+
+        Returns:
+            "known" of a number over known cells, "-" of a published metric or an aggregation; else empty: "area" or
+            "known", as a search is asked.
+
+        Example:
+            >>> [Objective(number=key, region="20m").own_estimate for key in ("known_radius_m", "radius_maximum_m")]
+            ['known', '-']
+        """
+        if self.key.startswith("known_"):
+            return "known"
+        return "" if CHOSEN.match(self.key) else "-"
 
     @property
     def places(self) -> tuple[tuple[str, str], ...]:

@@ -29,7 +29,7 @@ def common_instants(space: SearchSpace, plan: "SearchPlan", seed: int, worlds: i
         every_s=plan.every_s,
         seed=seed,
         rays=plan.rays,
-        measure=plan.measure,
+        estimate=plan.estimate,
         workers=plan.workers,
     )
 
@@ -44,7 +44,7 @@ class SearchPlan:
         optimiser: "auto", a name in `OPTIMISERS`, or whatever makes an `Optimiser` from a `Cube` and a seed.
         seed: Of the worlds that candidates are scored in, and of all that is drawn.
         test_seed: Of the fresh worlds; not given, the next.
-        measure: What a score is: "area", the share of the visible surface, or "known", the mean of the known cells.
+        estimate: What a score is: "area", the share of the visible surface, or "known", the mean of the known cells.
         worlds: Worlds of each scenario to search in.
         fresh_worlds: Worlds of each to test in.
         per_world: Instants of each world.
@@ -62,7 +62,7 @@ class SearchPlan:
     optimiser: str | MakesOptimiser = AUTO
     seed: int = 0
     test_seed: int | None = None
-    measure: Measure = "area"
+    estimate: Measure = "area"
     worlds: int = WORLDS
     fresh_worlds: int = FRESH_WORLDS
     per_world: int = PER_WORLD
@@ -83,8 +83,8 @@ class SearchPlan:
             raise ValueError(
                 f"test_seed: the worlds would not be fresh with the seed of the search; both are {self.seed}"
             )
-        if self.measure not in MEASURES:
-            raise ValueError(f"measure: one of {', '.join(MEASURES)} is needed; got {self.measure!r}")
+        if self.estimate not in MEASURES:
+            raise ValueError(f"estimate: one of {', '.join(MEASURES)} is needed; got {self.estimate!r}")
         if isinstance(self.optimiser, str) and self.optimiser not in (AUTO, *OPTIMISERS):
             raise ValueError(f"optimiser: one of {', '.join((AUTO, *OPTIMISERS))} is needed; got {self.optimiser!r}")
 
@@ -117,7 +117,7 @@ class SearchPlan:
             "space": space.name,
             "space_sha256": hashlib.sha256(text.encode()).hexdigest(),
             "optimiser": self.optimiser_in(space)[0],
-            "measure": self.measure,
+            "estimate": self.estimate,
             "seed": self.seed,
             "worlds": self.worlds,
             "per_world": self.per_world,

@@ -4,7 +4,7 @@ import math
 import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any, NamedTuple, Self
 
@@ -20,7 +20,7 @@ from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.measuring import BLOCKS
 from torchcover.frames import Frame
-from torchcover.placement.objective import THRESHOLD_M, Objective
+from torchcover.placement.objective import THRESHOLD_M, Objective, published_numbers
 from torchcover.published import PUBLISHED, FrameMetric, Setup, Sights
 from torchcover.simulation import Areas, RegionsOfInterest, Rig, SurfaceReference
 from torchcover.simulation.regions_of_interest import RegionOfInterest
@@ -145,6 +145,7 @@ class Questions(NamedTuple):
         for name, objective in self.objectives.items():
             keys = known.get(objective.metric or "", of_coverage)
             if objective.key not in keys:
+                keys = keys if objective.metric else [*keys, *published_numbers()]
                 near = get_close_matches(objective.key, keys, n=1, cutoff=0.0)
                 raise ValueError(f"objective {name!r}: no result has a number {objective.key!r}; near is {near[0]!r}")
 
@@ -261,7 +262,9 @@ class RigNumbers:
         def answer(key: str, place: tuple[str, str]) -> Estimate:
             alone, sensor = failed.groups() if (failed := FAILURE.match(key)) else (key, "")
             if sensor == ANY:
-                return _worst([number(f"{alone}_without_{one}", place) for one in metric.sensors])
+                worst = _worst([number(f"{alone}_without_{one}", place) for one in metric.sensors])
+                title = worst.quantities[0].title.removesuffix(metric.sensors[0]) + "any one sensor"
+                return replace(worst, quantities=(worst.quantities[0]._replace(title=title),))
             return number(key if sensor in ("", *metric.sensors) else alone, place)  # what is not there cannot fail
 
         return {

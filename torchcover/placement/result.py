@@ -18,7 +18,7 @@ from torchcover.placement.search import PlacementSearch
 from torchcover.report import PageTable, Words, file_stems
 from torchcover.simulation import Rig
 
-HEADINGS = ("found by", "objective", "measure", "gain in\nthe search", "gain on\nfresh worlds", "t",
+HEADINGS = ("found by", "objective", "estimate", "gain in\nthe search", "gain on\nfresh worlds", "t",
             "better in\n(worlds)", "optimism")  # fmt: skip
 
 
@@ -31,7 +31,7 @@ class Pick:
         role: Of several objectives, "middle" of the front, or the name of the objective that it is best in; else empty.
         evaluation: It.
         rig: It, as it can be evaluated.
-        gains: On fresh worlds, the measure of the search first; empty if it was not tested, as the start itself is not.
+        gains: On fresh worlds, by the estimate of the search first; empty if it was not tested, as the start itself.
     """
 
     arm: str
@@ -127,7 +127,7 @@ class SearchResult:
         return f"Random search with the same budget found {what} in {self._spent(RANDOM)}."
 
     def _told(self, pick: Pick, *, optimism: bool) -> str:
-        gains = [gain for gain in pick.gains if gain.measure == self.search.plan.measure]
+        gains = pick.gains[: len(self.search.space.objectives)]
         return "; ".join(f"{gain.objective}: {told(gain, optimism=optimism)}" for gain in gains)
 
     def _spent(self, arm: str) -> str:
@@ -180,7 +180,7 @@ class SearchResult:
     def _pick_record(self, pick: Pick) -> dict[str, Any]:
         gains: dict[str, dict[str, Any]] = {}
         for gain in pick.gains:
-            gains.setdefault(gain.objective, {})[gain.measure] = gain.record
+            gains.setdefault(gain.objective, {})[gain.estimate] = gain.record
         return {
             "arm": pick.arm,
             "role": pick.role or None,
@@ -192,14 +192,14 @@ class SearchResult:
 
     def _gain_rows(self) -> list[tuple[Words, ...]]:
         """Cells below `HEADINGS`; of what was not tested too."""
-        rows = []
+        rows, objectives = [], self.search.space.objectives
         for pick in self.picks:
             for gain in pick.gains:
                 test, unit = gain.test, gain.test.quantity.unit
                 words = (
                     pick.name,
                     f"{gain.objective} ({unit_words(unit)})",
-                    gain.measure,
+                    gain.estimate,
                     amount(gain.search_gain, unit, "+"),
                     f"{amount(test.gain, unit, '+')} ± {amount(test.error, unit)}",
                     f"{gain.t:.1f}",
@@ -212,9 +212,10 @@ class SearchResult:
             if not pick.gains:
                 arm = self.search.arms[pick.arm]
                 gained = arm.gains[arm.evaluations.index(pick.evaluation)].tolist()
-                name, measure = pick.name + " (the start)" * pick.is_start, self.search.plan.measure
-                for objective, unit, each in zip(self.search.space.objectives, self.units, gained, strict=True):
-                    cells = (name, f"{objective} ({unit_words(unit)})", measure, amount(each, unit, "+"), *"----")
+                name = pick.name + " (the start)" * pick.is_start
+                for (objective, asked), unit, each in zip(objectives.items(), self.units, gained, strict=True):
+                    estimate = asked.own_estimate or self.search.plan.estimate
+                    cells = (name, f"{objective} ({unit_words(unit)})", estimate, amount(each, unit, "+"), *"----")
                     rows.append(tuple(map(Words, cells)))
         return rows
 

@@ -219,5 +219,4 @@ def _tested(search: PlacementSearch, picks: Sequence[Pick]) -> tuple[Sequence[Pi
         )
     except ValueError as error:
         return picks, str(error)
-    own = {at: sorted(gains, key=lambda gain: gain.measure != plan.measure) for at, gains in tests.items()}
-    return [replace(pick, gains=own.get(f"{at}", ())) for at, pick in enumerate(picks)], ""
+    return [replace(pick, gains=tests.get(f"{at}", ())) for at, pick in enumerate(picks)], ""
