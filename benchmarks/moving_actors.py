@@ -44,7 +44,7 @@ def main():
 def steps_of(scene):
     """A function that makes the scans of some steps."""
     (lidar,) = Rig.load("front_roof_128").sensors
-    mounted = MountedSensor(lidar, scene)
+    mounted = MountedSensor(lidar, scene, lidar.max_range_m)
 
     def run():
         for step in STEPS:

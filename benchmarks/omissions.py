@@ -83,13 +83,13 @@ def at_every_body(instant, pose, tiles):
 
 def ego_again(scene, sensor):
     """A sensor fixed to the ego need not be cast at it at every step."""
-    instant, mounted = scene.at(STEP, within_m=RANGE_M), MountedSensor(sensor, scene)
+    instant, mounted = scene.at(STEP, within_m=RANGE_M), MountedSensor(sensor, scene, sensor.max_range_m)
     return afresh(instant, sensor, mounted.tiles), lambda: mounted.scan(instant, Draws(None))
 
 
 def scan_again(scene, sensor):
     """Where nothing moves one scan serves for all steps."""
-    instant, mounted = scene.at(0), MountedSensor(sensor, scene)
+    instant, mounted = scene.at(0), MountedSensor(sensor, scene, sensor.max_range_m)
     return afresh(instant, sensor, mounted.tiles), lambda: mounted.scan(instant, Draws(None))
 
 

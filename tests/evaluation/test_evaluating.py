@@ -368,3 +368,22 @@ def test_a_source_that_lacks_something_is_told_what():
 
     with pytest.raises(TypeError, match="got Unfinished, which has no square_metres; for a list"):
         torchcover.evaluate(frames=Unfinished(), cell_m=8.0)
+
+
+def test_bands_over_the_ground_see_far_obstacles_where_bands_over_z_see_the_road():
+    """On hills the vehicle pitches, and most of what is 0.5 m above its z = 0 far ahead is the road itself."""
+    far = {}
+    for band_frame in ("vehicle", "ground"):
+        result = torchcover.evaluate("front_roof_128", "urban", steps=8, cell_m=1.0, rays=2048, band_frame=band_frame)
+        assert (result.record["band_frame"], result.coverage.band_frame) == (band_frame, band_frame)
+        obstacles = {row["region"]: row for row in result.summary if row["height"] == "obstacle"}
+        far[band_frame] = obstacles["160m"]["detection_0.4m"]
+    assert far["ground"] > far["vehicle"] + 0.1
+
+
+def test_a_band_frame_that_frames_do_not_have_is_refused():
+    assert torchcover.evaluate("low", frames=Source(), cell_m=4.0).coverage.band_frame == "vehicle"
+    with pytest.raises(ValueError, match=r"f0.* are unknown; use the band frame vehicle$"):
+        torchcover.evaluate("low", frames=Source(), cell_m=4.0, band_frame="ground")
+    with pytest.raises(ValueError, match="band_frame sea: `ground` or `vehicle` is needed"):
+        torchcover.evaluate("front_roof_32", band_frame="sea")

@@ -175,7 +175,7 @@ def test_a_published_metric_says_what_it_says_of_the_same_frames(key):
         ("detection_0.40m", "detection_0.4m"),
         ("radius_maximal_m", "radius_maximum_m"),
         ("detection_0.4.1m", "detection_0.4m"),
-        ("radius_q0.9.1_m", "radius_m"),
+        ("radius_q0.9.1_m", "radius_q0.9_m"),
         ("s_mgi_0.2m", "s_mig_0.2m"),
     ],
 )

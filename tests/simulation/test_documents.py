@@ -149,7 +149,7 @@ def test_a_message_is_short_however_many_mistakes_there_are_and_however_large_th
 def test_a_vehicle_that_names_itself_is_refused(tmp_path):
     path = tmp_path / "v.yaml"
     path.write_text(f"name: v\nparts: [{{name: p, shape: {{type: vehicle, vehicle: {path}}}}}]\n")
-    with pytest.raises(ValueError, match=r"v\.yaml: document: part 'p' is the vehicle '.*v\.yaml'; a vehicle is put"):
+    with pytest.raises(ValueError, match=r"v\.yaml: part 'p' is the vehicle '.*v\.yaml'; a vehicle is put"):
         load_document(Vehicle, "vehicles", path)
 
 

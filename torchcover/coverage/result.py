@@ -14,7 +14,7 @@ from torch import Tensor
 from torchcover.coverage.aggregations import Layer, MeanOfMeans
 from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
-from torchcover.coverage.grid import BevGrid
+from torchcover.coverage.grid import BandFrame, BevGrid
 from torchcover.coverage.measures import Measure, area_in_blocks, errors_of_cells, estimate_area, estimate_known
 from torchcover.coverage.quantity import RADIUS, by_area, over_known
 from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
@@ -55,6 +55,7 @@ class Coverage:
         "saturated_points",
         "inside_points",
         "outside_points",
+        "no_ground_points",
     )
 
     def __init__(
@@ -95,6 +96,11 @@ class Coverage:
     def quantities(self) -> tuple[Quantity, ...]:
         """What there is one number of for each region: the mean radius, then the detection at each threshold."""
         return MeanOfMeans(self.thresholds).quantities
+
+    @property
+    def band_frame(self) -> BandFrame:
+        """What the height bands are over: "ground", the local ground, or "vehicle", z of the vehicle frame."""
+        return self.grid.band_frame
 
     @property
     def radius(self) -> Tensor:

@@ -50,7 +50,9 @@ def rig_pictures(
     if cameras := cameras_of(rig):
         instant = scene.at(step_of_world)
         images = {
-            camera.name: instant.range_image(camera.mount.matrix(), camera.directions(), max_range_m=camera.max_range_m)
+            camera.name: instant.range_image(
+                camera.mount.matrix(), camera.directions(), max_range_m=scenario.reach_m(camera)
+            )
             for camera in cameras
         }
         time_s = step_of_world * scene.world.time_step_s

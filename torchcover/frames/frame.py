@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from torchcover.coverage.grid import BandFrame
 from torchcover.detection.boxes import Boxes
 
 
@@ -92,6 +93,24 @@ class Frame:
     def to(self, device: torch.device | str) -> "Frame":
         """A copy on another device."""
         return self._each(lambda cloud: cloud.to(device), None if self.boxes is None else self.boxes.to(device))
+
+    def heights_in(self, band_frame: BandFrame) -> Tensor | None:
+        """The heights of the reference points that such height bands need: None for those over z of the vehicle.
+
+        Args:
+            band_frame: What the bands are over.
+
+        Raises:
+            ValueError: Bands over the ground, and the heights above it are unknown.
+        """
+        if band_frame == "vehicle":
+            return None
+        if self.reference_heights_m is None:
+            raise ValueError(
+                f"frame {self.name!r}: the heights of its reference points above the ground (reference_heights_m) are "
+                "unknown; use the band frame vehicle"
+            )
+        return self.reference_heights_m
 
     def _each(self, change: Callable[[Tensor], Tensor], boxes: Boxes | None) -> "Frame":
         clouds = {name: change(cloud) for name, cloud in self.clouds.items()}

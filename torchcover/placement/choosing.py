@@ -279,7 +279,7 @@ def worth_of(instants: CommonInstants) -> Worth:
         cells[list(grid.heights).index(band)] = questions.regions[region].mask(grid)
         of_places, m2, probed = [], torch.zeros(0), torch.zeros(grid.cells, dtype=torch.int64)
         for frame in frames:
-            inside, of, cell = grid.bins(frame.reference)
+            inside, of, cell = grid.bins(frame.reference, frame.heights_in(grid.band_frame))
             own = cells.view(-1)[cell]
             points, cell = inside[of[own]], cell[own]
             assert frame.reference_weights is not None  # square metres

@@ -80,12 +80,14 @@ class HeldWorlds(Dataset[Frame]):
     def _built(self, instant: HeldInstant, number: int) -> Frame:
         frames = self._simulations[instant.scenario]
         seen = frames[instant.step]
-        kept = self._questions.asked(seen.reference)
+        heights_m = seen.heights_in(self._questions.grid.band_frame)
+        kept = self._questions.asked(seen.reference, heights_m)
         assert seen.reference_weights is not None  # those of a SurfaceReference
         return replace(
             seen,
             reference=seen.reference[kept],
             reference_weights=seen.reference_weights[kept],
+            reference_heights_m=None if heights_m is None else heights_m[kept],
             index=number,
             place_in_time=instant.world,
             counts={"world_bytes": frames.simulator.scene_of(instant.step)[0].bytes},

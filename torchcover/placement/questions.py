@@ -4,7 +4,7 @@ import math
 import re
 import warnings
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any, NamedTuple, Self
 
@@ -16,7 +16,6 @@ from torch import Tensor
 from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, CoverageMetric, MeanOfMeans, Measure, Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.coverage.quantity import RADIUS, detection, without
-from torchcover.coverage.region_sums import region_quantities
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.measuring import BLOCKS
@@ -31,7 +30,6 @@ from torchcover.simulation.shapes import Mesh
 CELL_M = 0.5
 # What stands in a key for the sensor without which the number is worst.
 ANY = "any"
-LEVEL = re.compile(r"q(\d+(?:\.\d+)?)_m")
 SEEN_WITHIN = re.compile(r"(?:detection|sensors|seen_by_two)_(\d+(?:\.\d+)?)m")
 FAILURE = re.compile(r"(.+)_without_(.+)")
 
@@ -105,10 +103,15 @@ class Questions(NamedTuple):
 
     def reference_sensor(self, rays: int) -> SurfaceReference:
         """One that is aimed at what is asked about."""
-        return SurfaceReference.from_rays(self.areas, rays, tuple(self.grid.heights.values()))
+        return SurfaceReference.from_rays(self.areas, rays, tuple(self.grid.heights.values()), self.grid.band_frame)
 
-    def asked(self, points: Tensor) -> Tensor:
-        """(M,) bool: which of (M, 3) points lie in a region and band that is asked about, or any for other metrics."""
+    def asked(self, points: Tensor, height: Tensor | None = None) -> Tensor:
+        """(M,) bool: which of (M, 3) points lie in a region and band that is asked about, or any for other metrics.
+
+        Args:
+            points: In the vehicle frame.
+            height: As in `BevGrid.bins`.
+        """
         if self.metrics:
             return torch.ones(len(points), dtype=torch.bool)
         cells = torch.zeros(self.grid.shape, dtype=torch.bool)
@@ -116,7 +119,7 @@ class Questions(NamedTuple):
         for objective in self.objectives.values():
             for region, band in objective.places:
                 cells[bands.index(band)] |= self.regions[region].mask(self.grid)
-        inside, of, cell = self.grid.bins(points)
+        inside, of, cell = self.grid.bins(points, height)
         kept = torch.zeros(len(points), dtype=torch.bool)
         kept[inside[of[cells.view(-1)[cell]]]] = True
         return kept
@@ -137,7 +140,7 @@ class Questions(NamedTuple):
             of_coverage = [one.key for one in numbers.coverage["area"].compute().every_quantity]
             known = {name: [one.key for one in metric.estimate().quantities] for name, metric in numbers.others.items()}
         single = (RADIUS, *map(detection, asked.thresholds_m))
-        others = [one.key for kind in AGGREGATIONS if not fields(kind) for one in region_quantities(kind())]
+        others = [one.key for kind in AGGREGATIONS for one in kind.parse(kind.example).quantities]
         of_coverage += [one.key for one in (*single, *(without(ANY, each) for each in single))] + others
         for name, objective in self.objectives.items():
             keys = known.get(objective.metric or "", of_coverage)
@@ -150,9 +153,7 @@ class Questions(NamedTuple):
     def aggregations(self) -> tuple[Aggregation, ...]:
         """Those whose numbers are asked for."""
         keys = {objective.key for objective in self.objectives.values()}
-        levels = tuple(sorted({float(level) for key in keys for level in LEVEL.findall(key)}))
-        every = [kind(levels) if fields(kind) else kind() for kind in AGGREGATIONS if levels or not fields(kind)]  # type: ignore[call-arg]
-        return tuple(one for one in every if not keys.isdisjoint(each.key for each in region_quantities(one)))
+        return tuple(one for kind in AGGREGATIONS if (one := kind.of_keys(keys)))
 
     def numbers_of(self, rig: Rig, ego: Mesh | None = None, measures: Sequence[Measure] = ("area",)) -> "RigNumbers":
         """What observes a rig, fed with nothing yet.
@@ -309,7 +310,7 @@ def _around(grid: BevGrid, regions: Collection[Region]) -> BevGrid:
         return float(edges[edges <= low].max()), float(edges[edges >= high].min())
 
     x, y = outside(grid.x_edges_m, [one.x for one in regions]), outside(grid.y_edges_m, [one.y for one in regions])
-    return BevGrid(x, y, grid.cell, grid.heights)
+    return BevGrid(x, y, grid.cell, grid.heights, grid.band_frame)
 
 
 def _whole_cells(grid: BevGrid, mask: Tensor) -> tuple[tuple[float, float], tuple[float, float]]:

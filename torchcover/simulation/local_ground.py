@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,8 +17,6 @@ Bools = NDArray[np.bool_]
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
-# What heights are measured from: the local ground, or z = 0 of the vehicle frame, which pitches and rolls.
-BandFrame = Literal["ground", "vehicle"]
 
 # Nothing steeper is driven or walked on.
 STEEPEST_DEG = 45.0
@@ -82,9 +80,9 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
         One (F,) mask for each mesh.
     """
     level = [level_faces(mesh) for mesh in meshes]
-    corners_m = np.concatenate([mesh.vertices_m[mesh.faces[mask]] for mesh, mask in zip(meshes, level, strict=True)])
-    if len(corners_m) == 0:
+    if not any(mask.any() for mask in level):
         return level
+    corners_m = np.concatenate([mesh.vertices_m[mesh.faces[mask]] for mesh, mask in zip(meshes, level, strict=True)])
     together = Mesh(corners_m.reshape(-1, 3), np.arange(3 * len(corners_m)).reshape(-1, 3))
     edge, face = edges_of(together)[0], np.repeat(np.arange(len(corners_m)), 3)
     _, surface = np.unique(connected(edge, face, len(corners_m)), return_inverse=True)

@@ -15,6 +15,7 @@ from torchcover.simulation.documents import Document, PathBeside, Pose, load_doc
 from torchcover.simulation.kinds import TRAFFIC
 from torchcover.simulation.local_ground import STEEPEST_DEG, level_faces
 from torchcover.simulation.recorded.bodies import read_boxes
+from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh, MeshFile
 from torchcover.simulation.sound import coincident_faces, warn_of_coincidence
 from torchcover.simulation.traffic.kind import Traffic
@@ -139,6 +140,10 @@ class Scenario(Document):
         """Which run through the scenario a frame belongs to, and its time step in it; see `repeats`."""
         episode, step = divmod(index, self.steps)
         return (0 if self.repeats else episode), step
+
+    def reach_m(self, sensor: Sensor) -> float:
+        """How far the rays of a sensor are cast in it: whatever limits sight is decided here."""
+        return sensor.max_range_m
 
     @property
     def repeats(self) -> bool:

@@ -34,15 +34,17 @@ class MountedSensor:
     Args:
         sensor: The sensor.
         scene: Where it is.
+        reach_m: How far its rays are cast there; `Scenario.reach_m`.
     """
 
-    def __init__(self, sensor: Sensor, scene: Scene) -> None:
+    def __init__(self, sensor: Sensor, scene: Scene, reach_m: float) -> None:
         self.sensor = sensor
+        self.reach_m = reach_m
         self.vehicle_T_sensor = sensor.mount.matrix()
         directions = sensor.directions()
         self.tiles = into_tiles(directions)
         self.pixel_of_ray = pixels_in_tiles(directions)
-        self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=sensor.max_range_m)
+        self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
         self._at_rest = not scene.moves
         self._hits: SensorScan | None = None
 
@@ -70,7 +72,7 @@ class MountedSensor:
         hits = instant.scan(
             self.vehicle_T_sensor,
             self.tiles,
-            max_range_m=self.sensor.max_range_m,
+            max_range_m=self.reach_m,
             own_m=self._own_m,
             threads=threads,
         )
@@ -79,7 +81,7 @@ class MountedSensor:
         return hits
 
     def ends(self, instant: Instant) -> Ends:
-        """Where each of its rays ends: at what it hits first, the ego's body included, or at the sensor's range.
+        """Where each of its rays ends: at what it hits first, the ego's body included, or at its reach.
 
         Args:
             instant: From `Scene.at`.
@@ -87,7 +89,7 @@ class MountedSensor:
         bodies, own = instant.outlines(self.vehicle_T_sensor[:3, 3]), self._own_m or [None] * len(self.tiles)
         range_m, is_hit = [], []
         for tile, own_m in zip(self.tiles, own, strict=True):
-            limit_m = np.full(tile.directions.shape[1], self.sensor.max_range_m, dtype=np.float32)
+            limit_m = np.full(tile.directions.shape[1], self.reach_m, dtype=np.float32)
             _, hits, _ = instant.cast(self.vehicle_T_sensor, tile, limit_m, bodies, own_m)
             range_m.append(hits.range_m)
             is_hit.append((hits.body >= 0) & (hits.body != instant.ego))

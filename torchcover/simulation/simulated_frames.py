@@ -267,7 +267,7 @@ def reference_called(name: str | None = None, rays: int | None = None, asked: As
     if kind is None:
         raise ValueError(f"reference {name}: {' or '.join(f'`{known}`' for known in REFERENCE_SENSORS)} is needed")
     asked = asked or RegionsOfInterest().around()
-    return kind.from_rays(asked.areas, rays, asked.bands_m)
+    return kind.from_rays(asked.areas, rays, asked.bands_m, asked.grid.band_frame)
 
 
 def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
@@ -281,7 +281,9 @@ def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
         64
     """
     asked = asked or RegionsOfInterest().around()
-    return SurfaceReference(asked.areas, bands_m=asked.bands_m, object_points=OBJECT_POINTS)
+    return SurfaceReference(
+        asked.areas, bands_m=asked.bands_m, object_points=OBJECT_POINTS, band_frame=asked.grid.band_frame
+    )
 
 
 def _rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | None) -> dict[str, Rig]:

@@ -291,7 +291,7 @@ class Simulator:
         """How far from the origin of the vehicle frame a sensor can see: its range starts where it is mounted."""
         farthest_m = np.abs(ego.corners_m).max(axis=0) + self.reference_sensor.shell_m
         reaches = [
-            float(np.linalg.norm(sensor.mount.matrix()[:3, 3])) + sensor.max_range_m
+            float(np.linalg.norm(sensor.mount.matrix()[:3, 3])) + self.scenario.reach_m(sensor)
             for rig in self.rigs.values()
             for sensor in rig.sensors
         ]

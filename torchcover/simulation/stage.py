@@ -177,7 +177,11 @@ class Stages:
     def _on(self, scene: Scene) -> Mapping[str, Sequence[MountedSensor]]:
         """The rigs' sensors on the ego of a scene."""
         self._check_mounts(scene)
-        return {name: [MountedSensor(sensor, scene) for sensor in rig.sensors] for name, rig in self._rigs.items()}
+        reach_m = self._scenes.scenario.reach_m
+        return {
+            name: [MountedSensor(sensor, scene, reach_m(sensor)) for sensor in rig.sensors]
+            for name, rig in self._rigs.items()
+        }
 
     def _check_mounts(self, scene: Scene) -> None:
         scenario = self._scenes.scenario

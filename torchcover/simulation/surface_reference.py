@@ -7,10 +7,11 @@ from typing import ClassVar, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.coverage.grid import BandFrame
 from torchcover.geometry import BoundingBox, rigid
-from torchcover.simulation.local_ground import BandFrame
 from torchcover.simulation.patches import Bounds
 from torchcover.simulation.reference_sensor import (
+    DEFAULT_BAND_FRAME,
     PAPER_BANDS_M,
     Areas,
     Bands,
@@ -27,7 +28,6 @@ from torchcover.simulation.surface_points import SurfacePoints, SurfaceStrata
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 DEFAULT_RAYS = 16_384
-DEFAULT_BAND_FRAME: BandFrame = "vehicle"
 # How far above the surface a ray to it ends, in metres, and as a share of the coordinates that casting rounds.
 ABOVE_M = 1e-3
 ABOVE_SHARE = 5e-7
@@ -102,18 +102,25 @@ class SurfaceReference:
         check_reach(self.shell_m, self.max_range_m)
 
     @classmethod
-    def from_rays(cls, areas: Areas, rays: int | None, bands_m: Bands = PAPER_BANDS_M) -> Self:
+    def from_rays(
+        cls,
+        areas: Areas,
+        rays: int | None,
+        bands_m: Bands = PAPER_BANDS_M,
+        band_frame: BandFrame = DEFAULT_BAND_FRAME,
+    ) -> Self:
         """One that asks about some areas.
 
         Args:
             areas: As above.
             rays: About how many rays; 16,384 if not given.
             bands_m: As above.
+            band_frame: As above.
 
         Raises:
             ValueError: As for the class.
         """
-        return cls(areas, DEFAULT_RAYS if rays is None else rays, bands_m=bands_m)
+        return cls(areas, DEFAULT_RAYS if rays is None else rays, bands_m=bands_m, band_frame=band_frame)
 
     def scan(self, surroundings: Surroundings) -> ReferenceScan:
         """Draw points, and keep those that are seen; see `ReferenceSensor.scan`."""

@@ -81,7 +81,7 @@ class Steps:
         self._steps, self._every_steps, self._seed = steps, every_steps, seed
         self.places = max(1, -(-PLACES // steps))
         self._stages = Stages(scenario, {RIG: rig}, seed)
-        sensor_reach_m = [float(np.linalg.norm(s.mount.matrix()[:3, 3])) + s.max_range_m for s in rig.sensors]
+        sensor_reach_m = [float(np.linalg.norm(s.mount.matrix()[:3, 3])) + scenario.reach_m(s) for s in rig.sensors]
         raster_reach_m = float(np.linalg.norm(vehicle_T_target[:, :3, 3], axis=1).max(initial=0.0))
         self._within_m = max([raster_reach_m + target.solid.reach_m, *sensor_reach_m])
 

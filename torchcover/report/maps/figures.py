@@ -73,7 +73,7 @@ def band_figures(coverage: Coverage) -> Iterator[Named]:
     Args:
         coverage: What `CoverageMetric.compute` returned.
     """
-    headings = [f"{name}, z {span(band)}" for name, band in coverage.grid.heights.items()]
+    headings = [f"{name}, {span(coverage.grid, name)}" for name in coverage.grid.heights]
     shown = asked_and_known(coverage)
     for whole in subjects_of({"": coverage}):
         subject = _within(whole, shown)
@@ -180,8 +180,8 @@ def _within(subject: Subject, shown: Window) -> Subject:
 
 
 def _bands(grid: BevGrid) -> list[_Band]:
-    named = zip(grid.heights.items(), file_stems(list(grid.heights)), strict=True)
-    return [_Band(at, name, stem, f"z {span(z)}") for at, ((name, z), stem) in enumerate(named)]
+    named = zip(grid.heights, file_stems(list(grid.heights)), strict=True)
+    return [_Band(at, name, stem, span(grid, name)) for at, (name, stem) in enumerate(named)]
 
 
 def _draw_one(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[Named]:

@@ -57,11 +57,11 @@ def _of_quantity(
     expected, *others = values.values()
     differences = [difference(one, expected) for one in others]
     against = difference_scale(quantity, torch.stack(differences)) if differences else None
-    for band, (height, z) in enumerate(grid.heights.items()):
+    for band, height in enumerate(grid.heights):
         for at, rig in enumerate(values):
             yield PageMap(
                 quantity=quantity.title,
-                band=f"{height}, z {span(z)}",
+                band=f"{height}, {span(grid, height)}",
                 rig=rig,
                 x=grid.x,
                 y=grid.y,
