@@ -1,5 +1,7 @@
 """What the tests of several rooms share."""
 
+import signal
+
 import pytest
 from matplotlib.figure import Figure
 
@@ -16,3 +18,16 @@ def blank_maps(monkeypatch):
 @pytest.fixture
 def drawn_maps():
     """Maps as a user gets them, where a folder leaves them blank."""
+
+
+@pytest.fixture(autouse=True)
+def _signals():
+    """As in the foreground of a terminal: whoever starts the tests in the background has Ctrl-C ignored in them."""
+    usual = {
+        signal.SIGINT: signal.default_int_handler,
+        **{getattr(signal, name): signal.SIG_DFL for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name)},
+    }
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    left = {number: signal.signal(number, handler) for number, handler in before.items()}
+    assert left == usual, "a test has to leave signals as it found them"

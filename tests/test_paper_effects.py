@@ -51,7 +51,7 @@ class Here(NamedTuple):
 def coverage():
     reference = PaperReference(rows=256, columns=256)
     rigs = (*RIGS, *FITTED)
-    frames = SimulatedFrames(ROAD, rigs={name: name for name in rigs}, steps=16, seed=0, reference_sensor=reference)
+    frames = SimulatedFrames(ROAD, rigs={name: name for name in rigs}, steps=8, seed=0, reference_sensor=reference)
     observers = {name: CoverageObserver(CoverageMetric(GRID, max_radius=GRID.diagonal_m), name) for name in rigs}
     observe(frames, observers.values())
     return {name: observer.compute() for name, observer in observers.items()}

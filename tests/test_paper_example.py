@@ -277,15 +277,17 @@ def options(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def out(paper, options):
-    """The folder of a run of two steps; of the maps, only the first of each is drawn."""
+    """The folder of a run of two steps; of the maps, only the first is drawn, and the first of the cameras is made."""
 
     def write_first(figures, folder):
         paths = write_figures(islice(figures, 1), folder)
         assert [path.stat().st_size > 10_000 for path in paths] == [True]
 
     with pytest.MonkeyPatch.context() as patch:
-        for module in (paper.tables, paper.cameras):
-            patch.setattr(module, "write_figures", write_first)
+        patch.setattr(paper.tables, "write_figures", write_first)
+        patch.setattr(
+            paper.cameras, "write_figures", lambda figures, folder: folder.mkdir(parents=True) or next(figures)
+        )
         patch.setattr(sys, "argv", ["paper", *options])
         paper.__main__.main()
     return Path(options[-1])

@@ -2,13 +2,11 @@
 
 import csv
 import json
-import os
-import signal
 
 import numpy as np
 import pytest
 
-from torchcover import Coverage, CoverageMetric
+from torchcover import Coverage
 from torchcover.simulation import REFERENCE_SENSORS
 
 
@@ -122,46 +120,6 @@ def test_the_reference_sensor_is_the_one_that_was_asked_for_and_is_named(torchco
     assert summary["reference"] == {"sensor": "paper", "rays_per_step": 64 * 64, "every_s": 0.1}
     assert summary["frame_counts"]["reference_rays"] == 2 * 64 * 64
     assert "Reference sensor: paper, 4,096 rays a step; a step every 0.1 s." in " ".join(printed.split())
-
-
-@pytest.fixture
-def handler():
-    """Set what Ctrl-C or SIGTERM does."""
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    yield signal.signal
-    for number, action in before.items():
-        signal.signal(number, action)
-
-
-@pytest.mark.parametrize(
-    ("number", "action", "expected", "steps"),
-    [
-        (signal.SIGINT, signal.default_int_handler, 130, 2),
-        (signal.SIGINT, signal.SIG_IGN, 0, 3),
-        (signal.SIGTERM, signal.SIG_DFL, 143, 2),
-    ],
-)
-def test_a_signal_between_two_rigs_leaves_a_paired_result(
-    torchcover, worlds, monkeypatch, handler, number, action, expected, steps
-):
-    handler(number, action)
-    update, calls = CoverageMetric.update, []
-
-    def interrupted(self, *clouds, **more):
-        calls.append(self)
-        if len(calls) == 3:  # the first rig in the second step
-            os.kill(os.getpid(), number)
-        update(self, *clouds, **more)
-
-    monkeypatch.setattr(CoverageMetric, "update", interrupted)
-    code, _, complaints, out = compare(torchcover, worlds, "low", "both", steps=3)
-    assert code == expected
-    said = {0: [], 130: ["torchcover: interrupted"], 143: ["torchcover: terminated"]}
-    assert [line for line in complaints.splitlines() if line.startswith("torchcover:")] == said[code]
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["complete"] is (expected == 0)
-    assert [counts["steps"] for counts in summary["counts"].values()] == [steps, steps]
-    assert signal.getsignal(number) is action
 
 
 @pytest.fixture

@@ -17,6 +17,7 @@ from torchcover import BevGrid, CoverageMetric, Scenario, evaluate
 from torchcover.data import BadFrameError, ChosenRigs, SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe, pipeline
 from torchcover.evaluation.pipeline import MOST_TOGETHER, made_together
+from torchcover.evaluation.progress import terminable
 from torchcover.frames import worlds_of
 from torchcover.simulation import PaperReference
 
@@ -350,6 +351,18 @@ def test_what_there_is_outlives_a_worker_that_is_killed(frames):
     assert names.names == ["f0", "f1", "f2", "f3", "f4"][: len(names.names)]
     with pytest.raises(ChildProcessError, match=rf"a worker was killed after step {run.steps}, .*; use fewer workers"):
         run.raise_failure()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_who_ends_the_workers_too_has_ended_the_run(frames, monkeypatch):
+    """A scheduler ends all processes of a job, and a worker may be the first to go."""
+    monkeypatch.setattr(pipeline, "clear_frames", lambda _: os.kill(os.getpid(), signal.SIGTERM))
+    names = Names()
+    with terminable(lambda _: None) as signals:
+        run = observe(Deadly(frames, {5}), [names], workers=1, keep_partial=True)
+    assert signals == [signal.SIGTERM]
+    assert run.steps == len(names.names) > 0
+    assert isinstance(run.failure, KeyboardInterrupt)
 
 
 def test_ctrl_c_within_a_frame_waits_for_all_observers(frames):

@@ -2,13 +2,9 @@
 
 import copy
 import importlib
-import os
 import pickle
 import pkgutil
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pytest
@@ -23,6 +19,7 @@ from torchcover.metrics import MergeableMetric, SumsInBlocks
 from torchcover.published import FrameMetric, WorldRatios
 
 from .cases import CASES, flat, in_lists
+from .two_ranks import in_two_processes
 
 EVERY = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
 EVERY_CHANGE = pytest.mark.parametrize(
@@ -456,14 +453,7 @@ def test_a_collection_resets_and_runs_forward(case):
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory):
     """What each of two processes found, which are started once for all cases."""
-    folder = tmp_path_factory.mktemp("ranks")
-    environment = {**os.environ, "GLOO_SOCKET_IFNAME": "lo0" if sys.platform == "darwin" else "lo"}
-    environment.update(OMP_NUM_THREADS="1", PYTHONPATH=os.pathsep.join(path for path in sys.path if path))
-    command = [sys.executable, "-m", "tests.metrics.two_ranks", str(folder)]
-    root = Path(__file__).parents[2]
-    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stderr
-    return [torch.load(folder / f"{rank}.pt", weights_only=False) for rank in range(2)]
+    return in_two_processes(tmp_path_factory.mktemp("ranks"))
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -1,8 +1,6 @@
 """Of packets and of Warp: exact in their type, smallest index of a tie, whatever the order, the parts, the threads."""
 
 import math
-import os
-import subprocess
 import sys
 from importlib import import_module
 from importlib.util import find_spec
@@ -12,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.killing import operations_of
 from torchcover import nearest
 
 ROOT = Path(__file__).parents[2]
@@ -167,43 +166,29 @@ def test_equal_points_keep_their_order(installed):
     assert along_the_curve(np.ones((5000, 3), np.float32)).tolist() == list(range(5000))
 
 
-def run(code, **environment):
-    command = [sys.executable, "-W", "error", "-c", code]
-    return subprocess.run(
-        command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=120, check=False
-    )
-
-
-def test_without_its_library_a_backend_says_what_to_install():
-    done = run("""
-import sys
-sys.modules["numba"] = sys.modules["warp"] = None
-import torch, torchcover
-for backend in ("packets", "warp"):
-    try:
-        torchcover.nearest(*torch.zeros(2, 1, 3), backend=backend)
-    except ModuleNotFoundError as error:
-        print(error)
-""")
-    assert done.stdout.splitlines() == [
-        "backend 'packets' needs numba: pip install 'torchcover[fast]'",
-        "backend 'warp' needs Warp: pip install 'torchcover[warp]'",
-    ], done.stderr
+def test_without_its_library_a_backend_says_what_to_install(monkeypatch):
+    for name in ("packets", "compiled", "morton", "warp"):
+        monkeypatch.delitem(sys.modules, f"torchcover.neighbors.{name}", raising=False)
+    for backend, library, extra in (("packets", "numba", "fast"), ("warp", "warp", "warp")):
+        monkeypatch.setitem(sys.modules, library, None)
+        install = rf"backend '{backend}' needs \w+: pip install 'torchcover\[{extra}\]'"
+        with pytest.raises(ModuleNotFoundError, match=install):
+            nearest(*torch.zeros(2, 1, 3), backend=backend)
 
 
 @if_installed
 def test_a_forked_process_searches(installed):
     """As the workers of a DataLoader do, after the main process has searched on several threads."""
-    code = """
-import os, torch, torchcover
-torch.set_num_threads(2)
-clouds = torch.rand(2, 20_000, 3)
-index = torchcover.nearest(*clouds, backend="packets").index
-child = os.fork()
-if not child:
-    torch.set_num_threads(1)
-    os._exit(0 if torch.equal(torchcover.nearest(*clouds, backend="packets").index, index) else 1)
-print(os.waitpid(child, 0)[1])
-"""
-    done = run(code)
-    assert done.stdout == "0\n", done.stderr
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        clouds = torch.rand(2, 20_000, 3, generator=torch.Generator().manual_seed(0))
+        index = nearest(*clouds, backend="packets").index
+
+        def search():
+            torch.set_num_threads(1)
+            assert torch.equal(nearest(*clouds, backend="packets").index, index)
+
+        assert operations_of(search)[1] == 0
+    finally:
+        torch.set_num_threads(threads)

@@ -1,8 +1,12 @@
 """The command line as a program: its commands, and how they end."""
 
 import io
+import os
+import signal
 import sys
+import time
 import warnings
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 import typer
@@ -10,6 +14,7 @@ import typer
 from torchcover.cli import commands
 from torchcover.cli.evaluate import compare, evaluate
 from torchcover.evaluation.progress import terminable
+from torchcover.files import written_since
 
 app = typer.Typer(
     name="torchcover",
@@ -20,7 +25,8 @@ app = typer.Typer(
 )
 
 # Exit codes; those of signals are 128 and their number.
-MISTAKE, INTERRUPTED, TERMINATED = 2, 130, 143
+MISTAKE, INTERRUPTED = 2, 130
+ENDED_BY = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "hung up"}
 
 # What is raised for any mistake in options and arguments. Typer names only descendants of it.
 USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
@@ -35,7 +41,7 @@ def main() -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # where there is no ±, a result with ? is better than none
     try:
-        with warnings.catch_warnings(), terminable() as terminated:
+        with warnings.catch_warnings(), terminable(_on_signals()) as signals:
             warnings.showwarning = _warn
             warnings.filterwarnings("ignore", "The run was cut short", RuntimeWarning)  # the last line says it
             code = typer.main.get_command(app).main(standalone_mode=False)
@@ -46,8 +52,29 @@ def main() -> None:
             raise
         _fail(message)
     if code == INTERRUPTED:  # what typer makes of KeyboardInterrupt
-        _fail(*("terminated", TERMINATED) if terminated else ("interrupted", INTERRUPTED))
+        first = signals[0] if signals else signal.SIGINT
+        _fail(ENDED_BY[signal.Signals(first).name], 128 + first)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _on_signals() -> Callable[[Sequence[int]], None]:
+    """What to do at once when a signal comes: with a terminal that is gone, and when Ctrl-C comes again."""
+    start_s, terminals = time.time(), [stream for stream in (1, 2) if os.isatty(stream)]
+
+    def told(arrived: Sequence[int]) -> None:
+        name = signal.Signals(arrived[-1]).name
+        if name == "SIGHUP":
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            for stream in terminals:  # or an error in writing would be the end
+                os.dup2(nowhere, stream)
+        if name == "SIGINT" and len(arrived) > 1:
+            files = written_since(start_s)
+            kept = f"kept is {', '.join(map(str, files))}" if files else "nothing of this run is kept"
+            cursor = "\x1b[?25h" * (2 in terminals)  # a bar hides it
+            os.write(2, f"{cursor}\ntorchcover: ended at once: {kept}\n".encode())
+            os._exit(INTERRUPTED)
+
+    return told
 
 
 def _mistake(error: Exception) -> str | None:

@@ -36,7 +36,8 @@ def study(
 ) -> None:
     """Measure error against run time for numbers of rays and of steps, and recommend a setting."""
     from torchcover.cli.printing import print_study
-    from torchcover.evaluation import Settings, StudyPlan, claimed, error_against_time, rank_count
+    from torchcover.evaluation import Settings, StudyPlan, error_against_time, rank_count
+    from torchcover.files import claimed
 
     if rank_count() > 1:
         raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
@@ -271,7 +272,8 @@ def agree(
 ) -> None:
     """Rank published placements by metrics, and by the detectors that were trained on them; say what that is worth."""
     from torchcover.cli.printing import print_agreement
-    from torchcover.evaluation import agree, claimed, rank_count
+    from torchcover.evaluation import agree, rank_count
+    from torchcover.files import claimed
     from torchcover.published import metric_names
 
     if rank_count() > 1:

@@ -215,7 +215,8 @@ def _complete(out: Path) -> bool:
 @contextmanager
 def sharing(out: Path) -> "Iterator[Ranks | None]":
     """The folder, kept for this run; and the processes that share it, the first of which writes."""
-    from torchcover.evaluation import claimed, joined_ranks
+    from torchcover.evaluation import joined_ranks
+    from torchcover.files import claimed
 
     with joined_ranks() as ranks, claimed(out) if ranks is None or ranks.rank == 0 else nullcontext():
         yield ranks

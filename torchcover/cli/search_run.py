@@ -8,8 +8,7 @@ import typer
 from rich.console import Console
 
 from torchcover.cli.printing import in_words, print_whole
-from torchcover.evaluation import claimed
-from torchcover.evaluation.result_files import SUMMARY
+from torchcover.files import SUMMARY, claimed
 from torchcover.placement import (
     ChoiceSpace,
     CommonInstants,

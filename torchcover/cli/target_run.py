@@ -7,9 +7,10 @@ from typing import Any
 from rich.console import Console
 
 from torchcover.cli.printing import in_words, print_whole
-from torchcover.evaluation import claimed, save_targets, survey_target
+from torchcover.evaluation import save_targets, survey_target
 from torchcover.evaluation.rerun_log import write_target
 from torchcover.evaluation.target_survey import places_table, sides_table
+from torchcover.files import claimed
 from torchcover.simulation import Rig
 from torchcover.targets import Heading, Raster, Requirements, TargetMap, Verdict, check
 

@@ -18,11 +18,11 @@ from torchcover.evaluation.other_metrics import compared, metrics_of
 from torchcover.evaluation.pipeline import Run, observe
 from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
-from torchcover.evaluation.result_files import claimed
 from torchcover.evaluation.result_page import check_drawable, left_out
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import TargetWatch
 from torchcover.evaluation.task import CALLER, Task, run_identity
+from torchcover.files import claimed
 from torchcover.frames import BadFrameError, FrameSource
 from torchcover.simulation import Asked
 from torchcover.simulation.memory import check_fits

@@ -15,8 +15,9 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from torchcover.evaluation.checkpoint import Journal
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.progress import held_back, progress_of
+from torchcover.evaluation.progress import ENDS, held_back, progress_of
 from torchcover.evaluation.ranks import Ranks
+from torchcover.files import end_with_parent
 from torchcover.frames import BadFrameError, Frame, FrameSource, worlds_of
 
 Frames = FrameSource | Dataset[Frame] | Sequence[Frame]
@@ -163,8 +164,12 @@ def observe(
                 if journal:
                     journal.write_if_due(run)
     except (Exception, KeyboardInterrupt) as error:  # hours of work are not lost to any of them
-        clear_frames(error.__traceback__)  # which would keep the workers alive
-        run.failure = killed_worker(error, workers, run.steps) or error
+        with held_back() as signals:
+            clear_frames(error.__traceback__)  # which would keep the workers alive
+            killed = killed_worker(error, workers, run.steps)
+            # Whoever ends workers too, as schedulers do, may have ended them first.
+            run.failure = KeyboardInterrupt() if killed and not set(signals).isdisjoint(ENDS) else killed or error
+            signals.clear()
     run.seconds = time.perf_counter() - start
     if journal and run.steps and consistent:
         with held_back():
@@ -254,6 +259,7 @@ def _each(
         batch_sampler=tasks,
         collate_fn=list,
         num_workers=workers,
+        worker_init_fn=end_with_parent(),
         prefetch_factor=1 if workers else None,  # what is made ahead waits in shared memory
     )
     for batch in loader:

@@ -2,12 +2,18 @@
 
 import signal
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from types import FrameType
 from typing import Protocol
 
-# Ctrl-C, a scheduler, and the end of a worker, which torch turns into an error.
-HELD_BACK = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGCHLD") if hasattr(signal, name)]
+# Ctrl-C, a scheduler, and a terminal that is gone.
+ENDS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+# Those that come so soon after another one mean the same.
+TOGETHER_S = 1.0
+# The end of a worker too, which torch turns into an error.
+HELD_BACK = [*ENDS, *([signal.SIGCHLD] if hasattr(signal, "SIGCHLD") else [])]
 
 
 class Progress(Protocol):
@@ -83,37 +89,78 @@ def _bar(steps: int, title: str, done: int) -> Iterator[Progress]:
 
 
 @contextmanager
-def terminable() -> Iterator[list[int]]:
-    """Treat SIGTERM, as a scheduler or `docker stop` sends it, as Ctrl-C; for a program: a library leaves it alone.
+def terminable(told: Callable[[Sequence[int]], object]) -> Iterator[list[int]]:
+    """Treat SIGTERM, as a scheduler or `docker stop` sends it, and SIGHUP, of a lost connection, as Ctrl-C.
+
+    For a program: a library leaves them alone. What is ignored stays so, as under `nohup`.
+
+    Args:
+        told: Called whenever one comes, at once, with all that have come.
 
     Returns:
-        A list that holds SIGTERM once it has come.
+        A list of those that have come.
     """
-    arrived: list[int] = []
-
-    def terminate(number: int, _: object) -> None:
-        arrived.append(number)
-        raise KeyboardInterrupt
-
-    before = signal.signal(signal.SIGTERM, terminate)
+    program = _Program(told)
+    before = {number: signal.getsignal(number) for number in ENDS}
+    taken = [number for number, handler in before.items() if handler not in (signal.SIG_IGN, None)]
+    for number in taken:
+        signal.signal(number, program)
     try:
-        yield arrived
+        yield program.arrived
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number in taken:
+            signal.signal(number, before[number])
 
 
 @contextmanager
-def held_back() -> Iterator[None]:
-    """Hold them back until the block is done: no frame may count for some observers, or some sums, only."""
-    if threading.current_thread() is not threading.main_thread():  # where they never arrive
-        yield
-        return
+def held_back() -> Iterator[list[int]]:
+    """Hold them back until the block is done: no frame may count for some observers, or some sums, only.
+
+    Returns:
+        A list of those that have come; who clears it has them forgotten.
+    """
     arrived: list[int] = []
-    before = [(kind, signal.signal(kind, lambda number, _: arrived.append(number))) for kind in HELD_BACK]
+    if threading.current_thread() is not threading.main_thread():  # where they never arrive
+        yield arrived
+        return
+    before = {number: signal.getsignal(number) for number in HELD_BACK}
+
+    def hold(number: int, _: FrameType | None) -> None:
+        handler = before[number]
+        if not isinstance(handler, _Program) or handler.ends(number):
+            arrived.append(number)
+
+    taken = [number for number, handler in before.items() if handler is not None]
+    for number in taken:
+        signal.signal(number, hold)
     try:
-        yield
+        yield arrived
     finally:
-        for kind, handler in before:
-            signal.signal(kind, handler)
+        for number in taken:
+            signal.signal(number, before[number])
     for number in arrived:
+        if isinstance(before[number], _Program):
+            raise KeyboardInterrupt
         signal.raise_signal(number)  # what it would have done: nothing, where it is ignored
+
+
+class _Program:
+    """Handles the signals of a program."""
+
+    def __init__(self, told: Callable[[Sequence[int]], object]) -> None:
+        self.arrived: list[int] = []
+        self._told = told
+        self._ignored_until_s = 0.0
+
+    def ends(self, number: int) -> bool:
+        """Whether it ends the program; some send it twice, to the process and to its group, or another one with it."""
+        self.arrived.append(number)
+        self._told(self.arrived)
+        now_s = time.monotonic()
+        again = number != signal.SIGINT and now_s < self._ignored_until_s
+        self._ignored_until_s = now_s + TOGETHER_S
+        return not again
+
+    def __call__(self, number: int, _: FrameType | None) -> None:
+        if self.ends(number):
+            raise KeyboardInterrupt

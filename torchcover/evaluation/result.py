@@ -14,7 +14,6 @@ from torchcover.coverage import Coverage, Region
 from torchcover.estimation import MIN_BLOCKS
 from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.progress import held_back
-from torchcover.evaluation.result_files import ResultFiles
 from torchcover.evaluation.result_page import (
     Omission,
     facts_of,
@@ -25,6 +24,7 @@ from torchcover.evaluation.result_page import (
     sensor_views,
 )
 from torchcover.evaluation.target_error import TargetError, outcome
+from torchcover.files import Publication
 from torchcover.published.comparison import MetricComparison, numbers_csv, record, tau_csv
 from torchcover.published.comparison import page_tables as metric_tables
 from torchcover.report import (
@@ -196,7 +196,7 @@ class Result:
         for path in self.inputs:
             if path.resolve().parent in (Path(folder).resolve(), Path(folder).resolve() / "coverage"):
                 raise ValueError(f"{folder}: holds {path}, which is compared, and would lose it; choose another folder")
-        with ResultFiles(Path(folder)) as files:
+        with Publication(Path(folder)) as files:
             with held_back():  # the numbers are safe before anything ends this, and before the maps are drawn
                 for name, coverage in self._coverage_files.items():
                     files.add(name, coverage.save)

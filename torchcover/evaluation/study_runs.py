@@ -20,6 +20,7 @@ from torchcover.evaluation.pipeline import observe
 from torchcover.evaluation.progress import progress_of
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, OPTIONS, Settings
 from torchcover.evaluation.task import Task, simulation
+from torchcover.files import end_with_parent
 from torchcover.simulation import ReferenceSensor, SimulatedFrames, reference_called
 
 # The long run's seed is far away from any other.
@@ -308,7 +309,7 @@ def command_s(plan: StudyPlan) -> float:
     clock = Clock()
     with TemporaryDirectory() as folder, clock.running():
         command = [sys.executable, "-m", "torchcover", *words, f"--out={folder}"]
-        done = subprocess.run(command, check=False, capture_output=True, text=True)
+        done = subprocess.run(command, check=False, capture_output=True, text=True, preexec_fn=end_with_parent())
     if done.returncode:
         raise ValueError(f"torchcover {' '.join(words)} ended with {done.returncode}: {done.stderr.strip()}")
     return clock.seconds

@@ -10,9 +10,9 @@ from matplotlib.figure import Figure
 from torchcover import __version__
 from torchcover.coverage import BevGrid
 from torchcover.evaluation.progress import held_back
-from torchcover.evaluation.result_files import ResultFiles
 from torchcover.evaluation.result_page import rig_document, sensor_views, words_of
 from torchcover.evaluation.task import AnyRig, as_called, spread_s
+from torchcover.files import Publication
 from torchcover.report import (
     ColourScale,
     Line,
@@ -154,7 +154,7 @@ def save_targets(
         The files.
     """
     record = {**target_record(seen, verdicts), "not_checked": list(not_checked)}
-    with ResultFiles(Path(folder)) as files:
+    with Publication(Path(folder)) as files:
         with held_back():  # the numbers are safe before anything ends this
             files.add("targets.csv", lambda path: write_csv(seen, path))
             files.add("targets.npz", lambda path: write_arrays(seen, path))

@@ -1,22 +1,27 @@
-"""What every reader of a file shares: its door, its error, the memory it may take, and NumPy's files, tables."""
+"""What the system gives: the door of all readers, its error, files that are whole, NumPy's, tables, processes."""
 
 from torchcover.files.bad_file import BadFileError, TooLargeError, check_memory, decode, naming, read_short_text, reads
 from torchcover.files.csv_tables import read_csv
-from torchcover.files.durable import write_durably
 from torchcover.files.feather import read_feather
 from torchcover.files.json_tables import read_json_table
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, npz_headers, read_npy, read_npz, write_npz
+from torchcover.files.processes import end_with_parent
+from torchcover.files.publishing import SUMMARY, Publication, claimed, settled, write_durably, written_since
 from torchcover.files.xml_text import feed_xml, parse_xml
 from torchcover.files.yaml_text import as_yaml, parse_yaml
 
 __all__ = [
     "DEFLATE_MAX_RATIO",
+    "SUMMARY",
     "BadFileError",
     "NpyHeader",
+    "Publication",
     "TooLargeError",
     "as_yaml",
     "check_memory",
+    "claimed",
     "decode",
+    "end_with_parent",
     "feed_xml",
     "naming",
     "npz_headers",
@@ -29,6 +34,8 @@ __all__ = [
     "read_npz",
     "read_short_text",
     "reads",
+    "settled",
     "write_durably",
     "write_npz",
+    "written_since",
 ]

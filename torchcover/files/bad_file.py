@@ -4,12 +4,14 @@ import math
 import os
 import stat
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import wraps
 from pathlib import Path
 from typing import Concatenate, ParamSpec, TypeVar
 
 import numpy as np
+
+from torchcover.files.publishing import settled
 
 Arguments = ParamSpec("Arguments")
 Content = TypeVar("Content")
@@ -74,6 +76,10 @@ def reads(
             path = Path(path)
             # Numbers of damaged files overflow; what they become is infinite or NaN, and judged as such.
             with naming(path, content), np.errstate(all="ignore"):
+                place = settled(path)
+                if place != path:
+                    with suppress(FileNotFoundError):  # another process is just putting it in its place
+                        return read(place, *args, **kwargs)
                 _check_regular(path, content)
                 return read(path, *args, **kwargs)
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torchcover import __version__
 from torchcover.evaluation import sensor_views
 from torchcover.evaluation.progress import held_back
-from torchcover.evaluation.result_files import ResultFiles
 from torchcover.evaluation.result_page import rig_document, words_of
+from torchcover.files import Publication
 from torchcover.placement.fresh import finite
 from torchcover.report import Page, PagePicture, PageRig, PageTable, page_html
 from torchcover.simulation import Rig
@@ -66,7 +66,7 @@ class PlacementReport:
         """
         summary = {"torchcover": __version__, "complete": True, "sentence": self.sentence}
         record = json.dumps(finite({**self.record, "sentence": self.sentence}), indent=2, allow_nan=False)
-        with ResultFiles(Path(folder)) as files:
+        with Publication(Path(folder)) as files:
             with held_back():  # what was found is safe before anything ends this
                 for name, rig in self.rigs.items():
                     files.add(name, rig.save)

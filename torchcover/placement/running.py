@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from torchcover.evaluation import Checkpoint, claimed
+from torchcover.evaluation import Checkpoint
 from torchcover.evaluation.checkpoint import Journal
 from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.progress import held_back, progress_of
-from torchcover.files import BadFileError
+from torchcover.files import BadFileError, claimed
 from torchcover.placement.evaluation import OPTIMISER, RANDOM
 from torchcover.placement.fresh import amount, fresh_test
 from torchcover.placement.result import Pick, SearchResult

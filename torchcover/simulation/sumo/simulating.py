@@ -10,7 +10,7 @@ from shutil import which
 from tempfile import TemporaryFile
 from xml.etree import ElementTree
 
-from torchcover.files import parse_xml, reads
+from torchcover.files import end_with_parent, parse_xml, reads
 from torchcover.simulation.sumo.floating import ATTRIBUTES
 from torchcover.simulation.traffic.assemble import HORIZON_M
 
@@ -48,7 +48,12 @@ def output_of(program: str, *options: str | Path) -> Iterator[bytes]:
     command = [str(home / "bin" / program), *ALWAYS, *map(str, options)]
     with TemporaryFile() as said:
         process = subprocess.Popen(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=said, env=_environment(home)
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=said,
+            env=_environment(home),
+            preexec_fn=end_with_parent(),  # noqa: PLW1509  (one call of the system, no lock)
         )
         assert process.stdout is not None  # as asked for
         try:

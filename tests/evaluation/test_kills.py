@@ -1,0 +1,54 @@
+"""A result is safe from kills; `python -m benchmarks kills` asks all commands."""
+
+import json
+import os
+import shutil
+import signal
+
+import pytest
+import torch
+
+import torchcover
+from tests.killing import operations_of
+from torchcover import Coverage
+from torchcover.data import Frame, FrameDataset
+
+
+class Drive(FrameDataset):
+    """Two points that a sensor sees one of."""
+
+    rigs = ("low",)
+    sensors = {}  # noqa: RUF012
+    ego_outline_m = None
+    description = {"scenario": None, "frames": "made up", "seed": None}  # noqa: RUF012
+    square_metres = False
+    reference_record = None
+    content = {"frames": "made up"}  # noqa: RUF012
+    world_of = staticmethod(int)
+
+    def __len__(self):
+        return 3
+
+    def __getitem__(self, index):
+        points = torch.tensor([[2.0, 0.5, 0.0], [6.0, 0.5, 1.0]])
+        return Frame({"low": points[:1]}, points, index, f"f{index}")
+
+
+@pytest.mark.usefixtures("blank_maps")
+def test_a_kill_at_any_file_operation_leaves_the_earlier_or_the_new_result(tmp_path):
+    earlier, new = (torchcover.evaluate(frames=Drive(), cell_m=8.0, steps=steps) for steps in (2, 3))
+    earlier.save(tmp_path / "earlier")
+    shutil.copytree(tmp_path / "earlier", tmp_path / "counted")
+    count, code = operations_of(lambda: new.save(tmp_path / "counted"))
+    assert (count > 40, code) == (True, 0)
+    steps = []
+    for at in range(count):
+        out = tmp_path / str(at)
+        shutil.copytree(tmp_path / "earlier", out)
+        assert operations_of(lambda out=out: new.save(out), at)[1] == -signal.SIGKILL
+        steps.append(Coverage.load(out / "coverage.npz").counts["steps"])
+        summary = json.loads((out / "summary.json").read_text())
+        assert summary["counts"]["steps"] == steps[-1]
+        assert [name for name in summary["files"] if not os.path.isfile(out / name)] == []
+    assert steps == sorted(steps)
+    assert set(steps) == {2, 3}

@@ -1,0 +1,47 @@
+"""A process that is killed at any of its file operations."""
+
+import itertools
+import os
+import signal
+import sys
+
+# A fork may wait without end for a thread that only its parent has.
+LONGEST_S = 120
+# Of Python's audit events.
+OPERATIONS = ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate")
+
+
+def operations_of(act, at=None, number=signal.SIGKILL):
+    """Do something in a fork of this process, and send it a signal just before a file operation.
+
+    Args:
+        act: What to do; its operations have to be the same each time.
+        at: Before which operation; None for none.
+        number: The signal.
+
+    Returns:
+        How many operations there were, and the exit code, minus the signal's number if that has ended it.
+    """
+    there, here = os.pipe()
+    if pid := os.fork():
+        os.close(here)
+        with open(there, "rb") as told:
+            count = len(told.read())
+        return count, os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    counting = itertools.count()
+
+    def touched(event, arguments):
+        # Where a file is opened for reading nothing can break.
+        if event in OPERATIONS and (event != "open" or arguments[1] not in ("r", "rb")):
+            if next(counting) == at:
+                os.kill(os.getpid(), number)
+            os.write(here, b".")
+
+    code = 1
+    signal.alarm(LONGEST_S)
+    try:
+        sys.addaudithook(touched)
+        act()
+        code = 0
+    finally:
+        os._exit(code)
