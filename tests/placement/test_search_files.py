@@ -151,5 +151,10 @@ def test_a_number_that_is_by_no_choice_of_estimate_has_one_row(tmp_path):
             "largest": ["-"],
         }
     assert result.sentence.count("near: ") == result.sentence.count("largest: ") == 1
-    estimates = {tuple(cell.text for cell in row[1:3]) for row in result.report.tables[0].rows}
-    assert estimates == {("near (points)", "known"), ("near (points)", "area"), ("largest (points)", "-")}
+    said = [tuple(cell.text for cell in row[:3]) for row in result.report.tables[0].rows]
+    assert len(said) == len(set(said))
+    assert {each[1:] for each in said} == {
+        ("near (points)", "known"),
+        ("near (points)", "area"),
+        ("largest (points)", "-"),
+    }
