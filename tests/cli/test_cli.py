@@ -123,9 +123,9 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
 def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, worlds, monkeypatch):
     given = []
 
-    def noted(self, sensor, reference, *, weights, place_in_time):
+    def noted(self, sensor, reference, *, weights, height, place_in_time):
         given.append((len(reference), weights, place_in_time))
-        update(self, sensor, reference, weights=weights, place_in_time=place_in_time)
+        update(self, sensor, reference, weights=weights, height=height, place_in_time=place_in_time)
 
     update = CoverageMetric.update
     monkeypatch.setattr(CoverageMetric, "update", noted)

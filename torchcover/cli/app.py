@@ -14,7 +14,6 @@ import typer
 from torchcover.cli import commands
 from torchcover.cli.evaluate import compare, evaluate
 from torchcover.evaluation.progress import terminable
-from torchcover.files import written_since
 
 app = typer.Typer(
     name="torchcover",
@@ -68,6 +67,8 @@ def _on_signals() -> Callable[[Sequence[int]], None]:
             for stream in terminals:  # or an error in writing would be the end
                 os.dup2(nowhere, stream)
         if name == "SIGINT" and len(arrived) > 1:
+            from torchcover.files import written_since  # which nobody needs who asks for help
+
             files = written_since(start_s)
             kept = f"kept is {', '.join(map(str, files))}" if files else "nothing of this run is kept"
             cursor = "\x1b[?25h" * (2 in terminals)  # a bar hides it

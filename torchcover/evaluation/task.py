@@ -35,8 +35,8 @@ EVERY_S_IN_TRAFFIC = 10.0
 # Where warnings point to: the call of `evaluate`, beyond its own function, the one around that, and ours.
 CALLER = 4
 # Options that frames, what is asked and observers say by what they are, and those that change no result.
-TOLD_OTHERWISE = {"scenario", "seed", "vehicle", "reference", "rays", "every_s", "ask", "cell_m", "metrics"}
-TOLD_OTHERWISE |= {"steps", "device", "workers", "skip_bad_frames"}
+TOLD_OTHERWISE = {"scenario", "seed", "vehicle", "reference", "rays", "every_s", "ask", "cell_m", "band_frame"}
+TOLD_OTHERWISE |= {"metrics", "steps", "device", "workers", "skip_bad_frames"}
 # Of an identity, what is longer is told by its hash.
 MAX_TOLD = 40
 
