@@ -84,5 +84,5 @@ def test_what_is_no_pair_of_coverage_files_is_said(torchcover, worlds, saved):
 def test_what_is_measured_is_not_measured_again(torchcover, saved):
     file = saved("low")
     code, _, complaint = torchcover("evaluate", file)
-    assert (code, complaint.count("\n")) == (2, 1)
+    assert (code, complaint.count("\n")) == (2, 1), complaint
     assert "is measured already: read it by Coverage.load, or compare it" in complaint
