@@ -1,7 +1,8 @@
 """A hook of MkDocs: the README as the first page, and the pages that are made from the code.
 
 `reference/commands.md` from the help of the commands, `reference/documents.md` from the classes that read YAML,
-`reference/api.md` from the public names. Nothing of it is kept in the repository.
+`reference/columns.md` from those of the table, `reference/api.md` from the public names. Nothing
+of it is kept in the repository.
 """
 
 import importlib
@@ -20,6 +21,7 @@ from typer.main import get_command
 
 import torchcover
 from torchcover.cli.app import app
+from torchcover.report.renderers.records import COLUMNS
 
 ROOT = Path(__file__).parent.parent
 ROOMS = (
@@ -40,14 +42,14 @@ def on_config(config):
     """All measured tables and the generated pages are in the navigation."""
     measured = sorted(path.name for path in (ROOT / "docs" / "measured").glob("*.md"))
     config.nav.append({"Measured": [f"measured/{name}" for name in measured]})
-    config.nav.append({"Reference": [f"reference/{name}.md" for name in ("commands", "documents", "api")]})
+    config.nav.append({"Reference": [f"reference/{name}.md" for name in ("commands", "documents", "columns", "api")]})
     return config
 
 
 def on_files(files, config):
     """Add the pages that no file is written for."""
     made = {"index": first_page(), "reference/commands": commands(), "reference/documents": documents(),
-            "reference/api": api()}  # fmt: skip
+            "reference/columns": columns(), "reference/api": api()}  # fmt: skip
     for name, text in made.items():
         files.append(File.generated(config, f"{name}.md", content=text))
     return files
@@ -101,6 +103,13 @@ def documents():
                 f"| `{key}` | {cell(type_words(field.annotation))} | {cell(default)} | {cell(arguments.get(key, ''))} |"
             )
     return "\n".join(lines)
+
+
+def columns():
+    """Every column of `summary.csv` that is no number with an error."""
+    lines = ["# Columns", "", "What rows of `summary.csv` and `summary.json` have besides numbers and their errors."]
+    lines += ["", "| column | | in tables |", "|---|---|---|"]
+    return "\n".join([*lines, *(f"| `{each.key}` | {each.meaning} | {cell(each.heading)} |" for each in COLUMNS)])
 
 
 def document_classes():

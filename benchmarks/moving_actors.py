@@ -7,9 +7,9 @@ import numpy as np
 from benchmarks.timing import compare, table
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Draws, PaperReference, Rig, Scenario
-from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
+from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.world import Actor
 
 RANGE_M = 250.0
@@ -44,7 +44,7 @@ def main():
 def steps_of(scene):
     """A function that makes the scans of some steps."""
     (lidar,) = Rig.load("front_roof_128").sensors
-    mounted = MountedSensor(lidar, scene)
+    mounted = MountedSensor(lidar, scene, lidar.max_range_m)
 
     def run():
         for step in STEPS:

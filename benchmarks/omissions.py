@@ -7,10 +7,10 @@ import numpy as np
 from benchmarks.timing import compare, table
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import Draws, PaperReference, Rig, Scenario
-from torchcover.simulation.instant import Scan, cast_from
-from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.instant import SensorScan, cast_from
 from torchcover.simulation.rays import into_tiles, rotate
 from torchcover.simulation.scene import Scene
+from torchcover.simulation.sight import MountedSensor
 
 RANGE_M = 120.0
 STEP = 200
@@ -78,18 +78,18 @@ def at_every_body(instant, pose, tiles):
         found.append((directions * hits.range_m + pose[:3, 3].astype(np.float32)[:, None])[:, seen].T)
         self_hits += int((hits.body == instant.ego).sum())
     points = np.concatenate(found)
-    return Scan(points, np.arange(len(points)), np.empty(0, dtype=np.float32), 0, self_hits)
+    return SensorScan(points, np.arange(len(points)), np.empty(0, dtype=np.float32), 0, self_hits)
 
 
 def ego_again(scene, sensor):
     """A sensor fixed to the ego need not be cast at it at every step."""
-    instant, mounted = scene.at(STEP, within_m=RANGE_M), MountedSensor(sensor, scene)
+    instant, mounted = scene.at(STEP, within_m=RANGE_M), MountedSensor(sensor, scene, sensor.max_range_m)
     return afresh(instant, sensor, mounted.tiles), lambda: mounted.scan(instant, Draws(None))
 
 
 def scan_again(scene, sensor):
     """Where nothing moves one scan serves for all steps."""
-    instant, mounted = scene.at(0), MountedSensor(sensor, scene)
+    instant, mounted = scene.at(0), MountedSensor(sensor, scene, sensor.max_range_m)
     return afresh(instant, sensor, mounted.tiles), lambda: mounted.scan(instant, Draws(None))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 
 from benchmarks.timing import table
-from torchcover.placement import OPTIMISERS, Cube, PlacementSearch, SearchSpace
+from torchcover.placement import OPTIMISERS, Cube, PlacementSearch, SearchSpace, run_search
 from torchcover.placement.optimisers.gp_model import GaussianProcess
 
 SPACE = {
@@ -22,22 +22,16 @@ NAMES = ("gp", "cmaes", "random")
 
 
 def gains(result):
-    """A row for what each arm found, by each measure."""
+    """A row for what each arm found, by each estimate."""
     for pick in result.picks:
         if pick.is_start:
             yield pick.arm, "-", "nothing better than the start", "", "", "", ""
-        for _, measure, gain in result.gains_of(pick):
+        for gain in pick.gains:
             places = ", ".join(f"{value:.2f}" for value in pick.evaluation.values.values())
-            fresh = f"{100 * gain.gain:+.2f} ± {100 * gain.error:.2f}"
-            yield (
-                pick.arm,
-                measure,
-                places,
-                f"{100 * gain.search_gain:+.2f}",
-                fresh,
-                f"{gain.t:.1f}",
-                f"{gain.better} of {gain.worlds}",
-            )
+            test = gain.test
+            fresh = f"{100 * test.gain:+.2f} ± {100 * test.error:.2f}"
+            better = f"{test.better} of {test.blocks}"
+            yield pick.arm, gain.estimate, places, f"{100 * gain.search_gain:+.2f}", fresh, f"{gain.t:.1f}", better
 
 
 def emulator(search):
@@ -71,21 +65,21 @@ def main(arguments=()):
     parser.add_argument("--worlds", type=int, default=6)
     parser.add_argument("--fresh-worlds", type=int, default=16)
     parser.add_argument("--rays", type=int, default=16_384)
-    parser.add_argument("--measure", default="known")
+    parser.add_argument("--estimate", default="known")
     parser.add_argument("--repeats", type=int, default=REPEATS)
     options = parser.parse_args(arguments)
     budget = {"evaluations": options.evaluations} if options.evaluations else {"budget_s": options.budget_s}
     given = {"worlds": options.worlds, "fresh_worlds": options.fresh_worlds, "rays": options.rays}
     torch.set_num_threads(1)
-    search = PlacementSearch(SearchSpace.model_validate(SPACE), measure=options.measure, **budget, **given)
+    search = PlacementSearch(SearchSpace.model_validate(SPACE), estimate=options.estimate, **budget, **given)
     start = time.process_time()
-    result = search.run()
+    result = run_search(search)
     seconds = time.process_time() - start
     spent = [f"{name} {len(arm.evaluations) - 1}" for name, arm in search.arms.items()]
     print(f"{search.optimiser_name}, {len(search.instants)} instants; candidates: {', '.join(spent)}; {seconds:.0f} s "
           f"of processor time in this process; racing saved {search.share_saved:.0%}.\n")  # fmt: skip
     table(
-        ("found by", "measure", "x, z (m), pitch (°)", "search", "fresh (points)", "t", "better"), list(gains(result))
+        ("found by", "estimate", "x, z (m), pitch (°)", "search", "fresh (points)", "t", "better"), list(gains(result))
     )
     worth, where = emulator(search), search.evaluations[0].unit
     runs = {name: np.array([regrets(name, worth, where, seed) for seed in range(options.repeats)]) for name in NAMES}

@@ -20,9 +20,9 @@ import torch
 
 from benchmarks.timing import table
 from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called
-from torchcover.evaluation import CoverageObserver
+from torchcover.evaluation import CoverageObserver, Settings
 from torchcover.evaluation.checkpoint import write_checkpoint
-from torchcover.evaluation.measuring import new_metric
+from torchcover.evaluation.measuring import metric_of
 from torchcover.evaluation.transport import packed
 from torchcover.simulation import Scenario
 
@@ -76,10 +76,7 @@ def frames_of(steps, *, rays=16_384, rigs=1, scenario=SCENARIO):
 
 def observers_of(frames, cell_m=0.25):
     asked = RegionsOfInterest().around(cell_m=cell_m)
-    return [
-        CoverageObserver(new_metric(asked, (0.4,), torch.device("cpu"), square_metres=True), name)
-        for name in frames.rigs
-    ]
+    return [CoverageObserver(metric_of(Settings(), asked, square_metres=True), name) for name in frames.rigs]
 
 
 def times(steps, *, cell_m=0.25, **settings):

@@ -13,8 +13,8 @@ from torchcover.data import SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe
 from torchcover.simulation import PaperReference
 from torchcover.simulation.instant import Instant
-from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.scene import Scene
+from torchcover.simulation.sight import MountedSensor
 
 RIG = "front_roof_128"
 WORKERS = 2

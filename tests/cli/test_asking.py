@@ -145,3 +145,35 @@ def test_where_nothing_is_detected_no_sensor_is_called_dispensable_either(torchc
     code, printed, _ = torchcover("evaluate", worlds / "both.yaml", *scene, *asked)
     assert (code, "Nothing of what was asked about is detected" in " ".join(printed.split())) == (0, True)
     assert "No single point of failure" not in printed
+
+
+def test_bands_over_the_ground_and_over_z_agree_on_level_ground(torchcover, evaluate, worlds):
+    rows = {}
+    for band_frame, words in (("ground", "-0.5 to 0.5 m above ground"), ("vehicle", "z -0.5 to 0.5 m")):
+        code, printed, _ = evaluate("--band-frame", band_frame, "--rays", 16_384, out=band_frame)
+        assert code == 0
+        assert f"cells of 0.5 m; ground {words}" in " ".join(printed.split())
+        assert json.loads((worlds / band_frame / "summary.json").read_text())["band_frame"] == band_frame
+        assert Coverage.load(worlds / band_frame / "coverage.npz").band_frame == band_frame
+        rows[band_frame] = [float(row["detection_2m"] or "nan") for row in rows_of(worlds / band_frame)]
+    np.testing.assert_allclose(rows["ground"], rows["vehicle"], atol=0.03)
+
+
+def test_the_paper_s_reference_has_bands_over_z(evaluate, worlds):
+    assert evaluate("--reference", "paper")[0] == 0
+    assert json.loads((worlds / "out" / "summary.json").read_text())["band_frame"] == "vehicle"
+    code, _, errors = evaluate("--reference", "paper", "--band-frame", "ground")
+    assert (code, len(errors.strip().splitlines())) == (2, 1)
+    assert "band_frame ground: the paper's reference has bands over z of the vehicle; leave it out" in errors
+
+
+def test_a_recording_keeps_the_heights(torchcover, worlds):
+    recorded = worlds / "recorded"
+    scenario = ["--scenario", worlds / "yard.yaml", "--out", recorded]
+    assert torchcover("record", worlds / "both.yaml", *scenario, *SMALL[:2])[0] == 0
+    ground, vehicle = (
+        package.evaluate(frames=recorded, cell_m=4.0, band_frame=band_frame).coverage
+        for band_frame in ("ground", "vehicle")
+    )
+    assert (ground.band_frame, vehicle.band_frame) == ("ground", "vehicle")
+    np.testing.assert_array_equal(ground.radius, vehicle.radius)

@@ -117,15 +117,15 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
     assert 0 < a.summary()[0].known_share <= 1
     summary = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert summary["frame_counts"]["reference_rays"] == 128 * 128
-    assert summary["reference"] == {"sensor": "paper", "rays_per_step": 128 * 128, "every_s": 0.1}
+    assert summary["reference"] == {"sensor": "paper", "rays_per_step": 128 * 128, "every_s": 0.1, "notes": []}
 
 
 def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, worlds, monkeypatch):
     given = []
 
-    def noted(self, sensor, reference, *, weights, place_in_time):
+    def noted(self, sensor, reference, *, weights, height, place_in_time):
         given.append((len(reference), weights, place_in_time))
-        update(self, sensor, reference, weights=weights, place_in_time=place_in_time)
+        update(self, sensor, reference, weights=weights, height=height, place_in_time=place_in_time)
 
     update = CoverageMetric.update
     monkeypatch.setattr(CoverageMetric, "update", noted)

@@ -115,6 +115,8 @@ def test_errors_are_drawn_if_asked_for_and_differences_come_with_theirs(torchcov
 def test_the_reference_sensor_is_the_one_that_was_asked_for_and_is_named(torchcover, worlds):
     _, printed, _, out = compare(torchcover, worlds, "low", "both", steps=2, options=["--reference", "paper"])
     summary = json.loads((out / "summary.json").read_text())
+    (ground,) = summary["reference"].pop("notes")
+    assert ground.startswith("Ground: level faces under the ego")
     assert summary["reference"] == {"sensor": "paper", "rays_per_step": 64 * 64, "every_s": 0.1}
     assert summary["frame_counts"]["reference_rays"] == 2 * 64 * 64
     assert "Reference sensor: paper, 4,096 rays a step; a step every 0.1 s." in " ".join(printed.split())

@@ -46,6 +46,7 @@ def test_two_evaluations_of_the_same_frames_are_a_comparison(torchcover, worlds,
         ({"steps": 15}, "different reference points"),
         ({"thresholds_m": (1.0,)}, "differ in their thresholds"),
         ({"cell_m": 8.0}, "differ in their grid"),
+        ({"band_frame": "ground"}, "differ in their band_frame"),
     ],
 )
 def test_results_that_are_not_paired_are_refused(torchcover, worlds, saved, change, message):
@@ -83,5 +84,5 @@ def test_what_is_no_pair_of_coverage_files_is_said(torchcover, worlds, saved):
 def test_what_is_measured_is_not_measured_again(torchcover, saved):
     file = saved("low")
     code, _, complaint = torchcover("evaluate", file)
-    assert (code, complaint.count("\n")) == (2, 1)
+    assert (code, complaint.count("\n")) == (2, 1), complaint
     assert "is measured already: read it by Coverage.load, or compare it" in complaint

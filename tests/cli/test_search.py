@@ -43,7 +43,7 @@ def test_a_search_ends_with_what_was_gained_and_what_random_search_got(torchcove
     assert again.splitlines()[-1] == last
     code, _, said = torchcover("search", space, "--evaluations", 12, "--out", out, "--resume")
     assert code == 2
-    assert "of another search: seed 3, not 0" in said
+    assert "of another run: seed (3 there, 0 here)" in said
 
 
 @pytest.mark.parametrize(
@@ -62,6 +62,23 @@ def test_a_mistake_is_one_line(torchcover, space, tmp_path, options, message):
     assert code == 2
     assert message in said
     assert not (tmp_path / "found" / "summary.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("objective", "message"),
+    [
+        ("number: radius, region: 20m", "objective 'near': no result has a number 'radius'; near is 'radius_m'"),
+        ("number: s_mig_0.3m", "objective 'near': no result has a number 's_mig_0.3m'; near is 's_mig_0.2m'"),
+        ("number: radius_m", "objectives.near: region: it is needed"),
+    ],
+)
+def test_an_objective_that_no_result_has_is_one_line(torchcover, tmp_path, objective, message):
+    path = tmp_path / "space.yaml"
+    path.write_text(SPACE.replace("region: 20m", objective))
+    code, _, said = torchcover("search", path, "--out", tmp_path / "found")
+    assert code == 2
+    assert message in said
+    assert said.count("\n") == 1
 
 
 @pytest.mark.parametrize("options", [("--budget", "5s"), ("--evaluations", "3"), ("--optimiser", "gp"), ("--resume",)])

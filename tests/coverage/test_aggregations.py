@@ -323,15 +323,27 @@ def test_aggregations_have_names_of_their_own():
 
 def test_each_of_the_package_has_a_name_that_makes_it():
     for kind in AGGREGATIONS:
-        words = f"{kind.name}:0.5,0.9" if fields(kind) else kind.name
-        assert aggregation_named(words) == (kind((0.5, 0.9)) if fields(kind) else kind())
+        made = aggregation_named(f"{kind.name}:{kind.example}")
+        assert type(made) is kind
+        assert bool(fields(kind)) == bool(kind.example)
+        with pytest.raises(ValueError, match=rf"^aggregation {kind.name}:\?: .*\S$"):
+            aggregation_named(f"{kind.name}:?")
+        keys = [quantity.key for quantity in made.quantities]
+        assert kind.of_keys({*keys, "radius_m", "detection_0.4m"}) == made
+        assert kind.of_keys({"radius_m", "detection_0.4m"}) is None
+        assert not any(other.of_keys(set(keys)) for other in AGGREGATIONS if other is not kind)
+
+
+def test_the_numbers_of_a_search_make_its_aggregations():
+    assert Quantiles.of_keys({"radius_q0.9_m", "radius_q0_m", "radius_step_q0.5_m"}) == Quantiles((0.0, 0.9))
+    assert StepQuantiles.of_keys({"radius_q0.9_m", "radius_q2_m"}) is None
+    assert Quantiles.of_keys({"radius_q2_m", "radius_q1.5_m", "radius_q_m", "radius_q0.9_m_without_roof"}) is None
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("minimum", "aggregation minimum: one of maximum, quantiles, step_quantiles, pooled is needed"),
-        ("maximum:0.5", "aggregation maximum:0.5: maximum takes no levels"),
+        ("maximum:0.5", "aggregation maximum:0.5: maximum takes no parameters; leave out what is behind the colon"),
         ("quantiles", "aggregation quantiles: levels are needed, as in quantiles:0.5,0.9"),
         ("quantiles:0.5,2", "aggregation quantiles:0.5,2: levels are needed"),
     ],
@@ -339,3 +351,10 @@ def test_each_of_the_package_has_a_name_that_makes_it():
 def test_what_makes_no_aggregation_is_refused(words, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         aggregation_named(words)
+
+
+def test_an_unknown_name_lists_all():
+    with pytest.raises(ValueError, match=r"^aggregation minimum: one of .* is needed$") as raised:
+        aggregation_named("minimum")
+    listed = str(raised.value).removeprefix("aggregation minimum: one of ").removesuffix(" is needed").split(" or ")
+    assert [type(aggregation_named(form)) for form in listed] == list(AGGREGATIONS)

@@ -379,7 +379,7 @@ def test_bad_weights_are_refused_and_nothing_is_counted(weights, message):
     metric = CoverageMetric(GRID)
     with pytest.raises(ValueError, match=rf"weights\[0\]: .*{message}"):
         metric.update(*clouds_of({0: [0.5, 0.5]}), weights=torch.tensor(weights))
-    with pytest.raises(ValueError, match="2 weights and 1 places in time for 1 reference clouds"):
+    with pytest.raises(ValueError, match="2 weights, 1 heights and 1 places in time for 1 reference clouds"):
         metric.update(*clouds_of({0: [0.5]}), weights=[torch.ones(1), torch.ones(1)])
     assert int(metric.steps) == 0
 

@@ -105,3 +105,16 @@ def test_numbers_of_worlds_that_are_drawn_again_are_those_of_a_run_over_them(mea
     torch.testing.assert_close(whole.resampled(torch.stack([weights, once]))[0], over(drawn).value)
     torch.testing.assert_close(whole.resampled(once[None])[0], whole.value)
     torch.testing.assert_close(whole[1:].resampled(1 - torch.eye(10)), whole.left_out[:, 1:])
+
+
+@pytest.mark.parametrize("measure", ["area", "known"])
+def test_numbers_without_maps_are_those_of_the_result_to_the_last_bit(measure):
+    metric = CoverageMetric(GRID, (0.4, 0.8), blocks=16, square_metres=True)
+    for number, (sensor, reference) in enumerate(steps_of(40)):
+        metric.update(sensor, reference, weights=reference[:, 0] + 0.1, place_in_time=number)
+    places = [(PART, height) for height in GRID.heights]
+    for place, found in zip(places, metric.estimates(places, measure), strict=True):
+        expected = metric.compute().estimate(*place, measure)
+        assert found.quantities == expected.quantities
+        for name in ("value", "left_out", "steps"):
+            torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0, atol=0)

@@ -182,6 +182,7 @@ def test_everything_that_happened_is_counted():
         "saturated_points": 4,
         "inside_points": 5,
         "outside_points": 2,
+        "no_ground_points": 0,
     }
 
 

@@ -15,6 +15,8 @@ from torchcover.coverage import Maximum, StepQuantiles
 from torchcover.data import BadFrameError, FrameDataset
 from torchcover.evaluation import Checkpoint, checkpoint
 from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
+from torchcover.evaluation.settings import OPTIONS
+from torchcover.evaluation.task import TOLD_OTHERWISE
 from torchcover.files import BadFileError
 
 STEPS = 16
@@ -179,6 +181,7 @@ def test_what_one_observer_has_seen_and_another_has_not_is_not_kept(frame_of, pa
         ({"cell_m": 4.0}, r"cell_m \(8.0 there, 4.0 here\)"),
         ({"thresholds_m": (0.4, 1.0)}, r"thresholds_m \(\[0.4\] there, \[0.4, 1.0\] here\)"),
         ({"aggregations": ()}, r"aggregations \(other content\)"),
+        ({"band_frame": "ground"}, r"band_frame \(\"vehicle\" there, \"ground\" here\)"),
         ({"estimate": "known"}, r"estimate \(null there, \"known\" here\)"),
         ({"target_error": "1%"}, r"target_error \(other content\)"),
         ({"observers": {}}, r"observers \(other content\)"),
@@ -190,6 +193,10 @@ def test_a_checkpoint_of_another_run_is_refused_by_what_differs(frame_of, path, 
         measured(Drive(frame_of), path, steps=3, **changes)
     with pytest.raises(ValueError, match=r"another run: frames \(\"drive\" there, \"other\" here\)"):
         measured(Drive(frame_of, content="other"), path, steps=3)
+
+
+def test_all_options_decide_about_a_run_but_those_that_it_names():
+    assert set(OPTIONS) > TOLD_OTHERWISE
 
 
 def test_without_resume_it_starts_anew(frame_of, path):

@@ -81,6 +81,7 @@ def test_one_rig(tmp_path):
         "sensor": DEFAULT_REFERENCE,
         "rays_per_step": result.run.counts["reference_rays"] // 2,
         "every_s": 0.1,
+        "notes": [],
     }
     assert 0.5 * SMALL["rays"] < summary["reference"]["rays_per_step"] < 1.5 * SMALL["rays"]
     loaded = Coverage.load(tmp_path / "new" / "out" / "coverage.npz")
@@ -256,6 +257,7 @@ def test_results_are_compared_as_if_they_had_been_measured_together():
     low, high = (torchcover.evaluate(rig, frames=Source(), cell_m=4.0) for rig in ("low", "high"))
     together = torchcover.evaluate(["low", "high"], frames=Source(), cell_m=4.0)
     assert torchcover.compare([low, high]).summary == torchcover.compare([together]).summary == together.summary
+    assert torchcover.compare(together).summary == together.summary
     assert torchcover.compare([low, high]).run is None
     with pytest.raises(ValueError, match="at least two measured rigs; got low only"):
         torchcover.compare([low])
@@ -366,3 +368,22 @@ def test_a_source_that_lacks_something_is_told_what():
 
     with pytest.raises(TypeError, match="got Unfinished, which has no square_metres; for a list"):
         torchcover.evaluate(frames=Unfinished(), cell_m=8.0)
+
+
+def test_bands_over_the_ground_see_far_obstacles_where_bands_over_z_see_the_road():
+    """On hills the vehicle pitches, and most of what is 0.5 m above its z = 0 far ahead is the road itself."""
+    far = {}
+    for band_frame in ("vehicle", "ground"):
+        result = torchcover.evaluate("front_roof_128", "urban", steps=8, cell_m=1.0, rays=2048, band_frame=band_frame)
+        assert (result.record["band_frame"], result.coverage.band_frame) == (band_frame, band_frame)
+        obstacles = {row["region"]: row for row in result.summary if row["height"] == "obstacle"}
+        far[band_frame] = obstacles["160m"]["detection_0.4m"]
+    assert far["ground"] > far["vehicle"] + 0.1
+
+
+def test_a_band_frame_that_frames_do_not_have_is_refused():
+    assert torchcover.evaluate("low", frames=Source(), cell_m=4.0).coverage.band_frame == "vehicle"
+    with pytest.raises(ValueError, match=r"f0.* are unknown; use the band frame vehicle$"):
+        torchcover.evaluate("low", frames=Source(), cell_m=4.0, band_frame="ground")
+    with pytest.raises(ValueError, match="band_frame sea: `ground` or `vehicle` is needed"):
+        torchcover.evaluate("front_roof_32", band_frame="sea")

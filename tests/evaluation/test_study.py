@@ -1,6 +1,7 @@
 """A study of error against run time."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -114,13 +115,17 @@ def test_a_plan_that_makes_no_sense_is_refused_at_once(changes, message):
         StudyPlan(**{**SMALL, **changes})
 
 
-def test_a_saved_long_run_is_used_and_one_of_another_threshold_refused(tmp_path):
+def test_a_saved_long_run_is_used_and_one_with_other_settings_refused(tmp_path):
     saved = tmp_path / "long_run.npz"
     coverage(0.0, blocks=16).save(saved)
-    study = error_against_time(StudyPlan(**SMALL, long_run=saved))
-    assert torch.equal(study.truth.coverage.radius, coverage(0.0).radius)
-    with pytest.raises(ValueError, match=r"long_run.npz: measured within 0.4 m; wanted is 0.2 m"):
-        error_against_time(StudyPlan(Settings("front_roof_32", thresholds_m=0.2), long_run=saved))
+    plan = StudyPlan(**SMALL | {"settings": Settings("front_roof_32", steps=2, cell_m=8.0)}, long_run=saved)
+    assert torch.equal(error_against_time(plan).truth.coverage.radius, coverage(0.0).radius)
+    for changes, message in (
+        ({"thresholds_m": 0.2}, r"thresholds_m is \(0.4,\) there; \(0.2,\) is needed"),
+        ({"cell_m": 4.0}, "cell_m is 8.0 there; 4.0 is needed"),
+    ):
+        with pytest.raises(ValueError, match=f"long_run.npz: {message}"):
+            error_against_time(replace(plan, settings=replace(plan.settings, **changes)))
 
 
 def test_a_long_run_that_was_cut_short_is_no_truth(monkeypatch):

@@ -15,11 +15,10 @@ from torchmetrics.aggregation import SumMetric
 import torchcover.coverage
 import torchcover.detection
 import torchcover.published
-from torchcover.coverage import AGGREGATIONS
 from torchcover.metrics import MergeableMetric, SumsInBlocks
 from torchcover.published import FrameMetric, WorldRatios
 
-from .cases import ALL, CASES, flat, in_lists
+from .cases import CASES, flat, in_lists
 from .two_ranks import in_two_processes
 
 EVERY = pytest.mark.parametrize("case", CASES.values(), ids=list(CASES))
@@ -65,7 +64,7 @@ def assert_same(result, expected):
 # Steps.
 
 
-def test_every_metric_and_every_aggregation_of_the_package_is_asked():
+def test_every_metric_of_the_package_is_asked():
     for room in (torchcover.coverage, torchcover.detection, torchcover.published):
         for module in pkgutil.iter_modules(room.__path__, f"{room.__name__}."):
             importlib.import_module(module.name)
@@ -73,7 +72,6 @@ def test_every_metric_and_every_aggregation_of_the_package_is_asked():
     kinds = {kind for base in bases for kind in base.__subclasses__()} - bases
     own = {kind for kind in kinds if kind.__module__.startswith("torchcover.")}
     assert {type(case.make()) for case in CASES.values()} == own
-    assert {type(aggregation) for aggregation in ALL} == set(AGGREGATIONS)
 
 
 @EVERY

@@ -18,7 +18,7 @@ INSTALLED = find_spec("numba") is not None
 BACKENDS = [name for name, library in (("packets", "numba"), ("warp", "warp")) if find_spec(library)]
 if INSTALLED:
     from torchcover.neighbors import packets
-    from torchcover.neighbors.morton import along_the_curve
+    from torchcover.neighbors.packets import along_the_curve
 
 
 def generator(seed):

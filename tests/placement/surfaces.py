@@ -2,10 +2,12 @@
 
 import numpy as np
 
-from torchcover.placement import Scores, SearchPlan, SearchSpace
+from tests.placement.worlds import estimate_of
+from torchcover.placement import Objective, Prefix, SearchPlan, SearchSpace, racing_order
 
 QUESTIONS = 2
 BEST_X, BEST_PITCH = 0.15, 4.0
+NEAR = {"near": Objective(region="20m")}
 
 
 def near_far(rig):
@@ -20,10 +22,22 @@ def near_far(rig):
 class Surface:
     """Instants of so many worlds, each with its own level, and its own view of a difference."""
 
-    def __init__(self, seed=0, worlds=6, per_world=3, worth=near_far, noise=0.002, objectives=("near",), blind=()):
+    def __init__(
+        self,
+        seed=0,
+        worlds=6,
+        per_world=3,
+        worth=near_far,
+        noise=0.002,
+        objectives=NEAR,
+        blind=False,
+        estimate="area",
+    ):
         draws = np.random.default_rng([seed, 99])
-        self.seed, self.worth, self.noise, self.objectives, self.blind = seed, worth, noise, tuple(objectives), blind
+        self.seed, self.worth, self.noise, self.blind = seed, worth, noise, blind
+        self.objectives, self.estimate = dict(objectives), estimate
         self.world_of = np.repeat(np.arange(worlds), per_world)
+        self.order = racing_order(self.world_of, seed)
         self.level = draws.normal(0.0, 0.1, (len(self.world_of), QUESTIONS))
         self.tilt = draws.normal(0.0, noise, (len(self.world_of), QUESTIONS, 2))
         self.scored, self.closed = [], False
@@ -31,27 +45,28 @@ class Surface:
     def __len__(self):
         return len(self.world_of)
 
-    def score(self, rig, instants=None):
-        numbers = np.arange(len(self)) if instants is None else np.asarray(instants)
-        self.scored += numbers.tolist()
+    def _estimate(self, rig, numbers, shift=0.0):
         mount = rig.sensors[0].mount
         offset = self.tilt[numbers] @ np.array([mount.x_m, mount.pitch_deg / 10])
-        share = self.worth(rig)[None] + self.level[numbers] + offset
-        share[np.isin(self.world_of[numbers], self.blind)] = np.nan
-        visible = np.where(np.isnan(share), 0.0, 1.0)
-        return Scores(
-            instants=numbers,
-            world=self.world_of[numbers],
-            parts={name: (at,) for at, name in enumerate(self.objectives)},
-            seen_m2=np.nan_to_num(share),
-            visible_m2=visible,
-            known_share=share - 0.1,
-            self_hit_share=max(0.0, mount.pitch_deg) / 100,
-            rays=1000,
-        )
+        share = self.worth(rig)[None] + self.level[numbers] + offset + shift
+        share = np.where(self.blind, np.nan, share)
+        found = estimate_of(share[:, : len(self.objectives)], self.world_of[numbers])
+        named = [one._replace(key=name) for one, name in zip(found.quantities, self.objectives, strict=True)]
+        return type(found)(tuple(named), found.value, found.left_out, found.steps)
+
+    def prefixes(self, rig):
+        for start in range(0, len(self), 3):
+            done = min(start + 3, len(self))
+            self.scored += self.order[start:done].tolist()
+            self_hits = max(0.0, rig.sensors[0].mount.pitch_deg) / 100
+            yield Prefix(done, self._estimate(rig, self.order[:done]), self_hits)
+
+    def estimates(self, rig):
+        self.scored += self.order.tolist()
+        return {"area": self._estimate(rig, self.order), "known": self._estimate(rig, self.order, shift=-0.1)}
 
     def anew(self, seed, worlds):
-        return Surface(seed, worlds, 3, self.worth, self.noise, self.objectives)
+        return Surface(seed, worlds, 3, self.worth, self.noise, self.objectives, estimate=self.estimate)
 
     def close(self):
         self.closed = True
@@ -64,7 +79,7 @@ def space(*, objectives=("near",), **changes):
         "start": "front_roof_32",
         "scenario": "urban",
         "free": {"roof": {"x_m": (-0.6, 0.8), "z_m": 1.8, "pitch_deg": (-10.0, 15.0)}},
-        "objectives": {name: {"region": "20m"} for name in objectives},
+        "objectives": objectives if isinstance(objectives, dict) else {name: {"region": "20m"} for name in objectives},
     }
     return SearchSpace.model_validate({**content, **changes})
 
@@ -72,9 +87,9 @@ def space(*, objectives=("near",), **changes):
 def plan(**settings):
     """A plan that makes surfaces."""
     worth = settings.pop("worth", near_far)
-    blind = settings.pop("blind", ())
+    blind = settings.pop("blind", False)
     makes = lambda space, plan, seed, worlds: Surface(  # noqa: E731
-        seed, worlds, plan.per_world, worth, objectives=tuple(space.objectives), blind=blind
+        seed, worlds, plan.per_world, worth, objectives=space.objectives, blind=blind, estimate=plan.estimate
     )
     budget = {} if "budget_s" in settings else {"evaluations": 20}
     return SearchPlan(**{**budget, "instants": makes, **settings})

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.placement.worlds import EGO, FLOOR, LOT, WALL, held, lidar, rig
+from tests.placement.worlds import BAY, EGO, FLOOR, LOT, WALL, held, lidar, rig
 from torchcover import Rig
-from torchcover.placement import ChoiceSpace, Worth, choose
-from torchcover.placement.choice_files import save_choice
-from torchcover.placement.choosing import OBJECTIVE
+from torchcover.placement import ChoiceSpace, Objective, choose
+from torchcover.placement.choosing import OBJECTIVE, seen_by, worth_of
 
 SENSOR = {"type": "lidar", "channels": 16, "vertical_fov_deg": [-40, 2], "columns": 91, "horizontal_fov_deg": 180,
           "max_range_m": 60}  # fmt: skip
@@ -45,17 +44,25 @@ def loaded(folder, **changes):
     return ChoiceSpace.load(path)
 
 
+CHOSEN_BY = [Objective(detection=0.3, region=["80m", "20m"]), Objective(region=BAY, band="ground")]
+
+
 @pytest.mark.parametrize("measure", ["area", "known"])
-def test_what_points_are_worth_is_the_mean_over_worlds_of_what_rigs_score(instants, measure):
-    rigs = [rig(lidar(mount={"z_m": z, "pitch_deg": pitch})) for z, pitch in ((1.7, 0.0), (2.4, 20.0))]
-    for name in instants.objectives:
-        worth = Worth.of_objective(instants, name, measure)
-        column = list(instants.objectives).index(name)
+@pytest.mark.parametrize("objective", CHOSEN_BY)
+def test_what_points_are_worth_is_what_evaluate_says_of_the_rig(objective, measure):
+    """The OR of what sensors see, in bits, and the coverage of all of them."""
+    sensors = [
+        lidar("a", mount={"x_m": 2.2, "z_m": 0.6}, horizontal_fov_deg=100),
+        lidar("b", mount={"y_m": 1.2, "z_m": 0.9, "yaw_deg": 70}, channels=24, horizontal_fov_deg=200),
+        lidar("c"),
+    ]
+    with held(objectives={OBJECTIVE: objective}, estimate=measure) as instants:
+        worth = worth_of(instants)
         assert worth.total == pytest.approx(1.0, rel=1e-12)
-        for each in rigs:
-            bits = instants.bits(each)
-            expected = np.nanmean(instants.scores(bits).by_world(measure)[:, column])
-            assert worth.of(bits.seen) == pytest.approx(expected, rel=1e-9)
+        bits = [seen_by(rig(sensor), instants) for sensor in sensors]
+        for each in ([0], [1, 2], [0, 1, 2]):
+            expected = float(instants.estimates(rig(*(sensors[one] for one in each)))[measure].value[0])
+            assert worth.of(np.bitwise_or.reduce([bits[one] for one in each])) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("measure", ["area", "known"])
@@ -63,14 +70,15 @@ def test_worlds_that_know_nothing_of_a_part_count_for_nothing(measure):
     yard = {"name": "yard", "ego": EGO, "bodies": [FLOOR]}
     walled = {"name": "walled", "ego": EGO, "bodies": [FLOOR, WALL]}
     scenarios = [type(LOT).model_validate(one) for one in (yard, walled)]
-    from torchcover.placement import Objective
-
-    with held(scenarios, {"wall": Objective(region="20m", band="obstacle")}, per_world=1, every_s=0.1) as two:
-        worth = Worth.of_objective(two, "wall", measure)
-        bits = two.bits(rig())
-        (empty,), (known,) = two.scores(bits).by_world(measure)
-    assert np.isnan(empty)
-    assert worth.of(bits.seen) == pytest.approx(known, rel=1e-9)
+    asked = {OBJECTIVE: Objective(region="20m", band="obstacle")}
+    with held(scenarios, asked, per_world=1, every_s=0.1, estimate=measure) as two:
+        value = float(two.estimates(rig())[measure].value[0])
+        assert worth_of(two).of(seen_by(rig(), two)) == pytest.approx(value, rel=1e-12)
+    with (
+        held(scenarios[:1], asked, per_world=1, every_s=0.1) as one,
+        pytest.raises(ValueError, match="no instant shows any surface of obstacle in 20m"),
+    ):
+        worth_of(one)
 
 
 def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
@@ -80,17 +88,21 @@ def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
         pairs = [("front", "rear"), ("front", "left"), ("rear", "left")]
         named = {sensor.name: sensor for sensor in space.sensors}
         scores = {
-            pair: instants.score(space.rig(tuple(named[f"wide_{one}"] for one in pair), "pair")).by_world().mean()
+            pair: float(
+                instants.estimates(space.rig(tuple(named[f"wide_{one}"] for one in pair), "x"))["area"].value[0]
+            )
             for pair in pairs
         }
     best = max(scores, key=lambda pair: scores[pair])
     assert set(found.names(found.best.chosen)) == {f"wide_{one}" for one in best}
-    assert found.best.value == pytest.approx(scores[best], rel=1e-9)
+    assert found.best.value == pytest.approx(scores[best], rel=1e-12)
+    assert found.number.value == scores[best]
+    assert f"{100 * found.number.value:.2f} %" in found.sentence
     assert found.best.proven
     assert list(found.refused) == ["wide_inside"]
-    assert found.gain.worlds == 3
+    assert found.gain.test.blocks == 3
     assert found.gain.search_gain == pytest.approx(found.best.value - found.candidates.value(found.now), rel=1e-6)
-    written = {path.name for path in save_choice(found, folder / "out")}
+    written = {path.name for path in found.save(folder / "out")}
     assert written == {
         "best.yaml", "candidates.csv", "sizes.csv", "search.json", "sizes.png", "report.html", "summary.json",
     }  # fmt: skip
@@ -132,6 +144,7 @@ def test_places_all_over_a_region_lie_on_its_skin(tmp_path):
             "candidates.wide.grid.region: .* has no 'wing'",
         ),
         ({"objective": {"band": "sky", "region": "20m"}}, "sky"),
+        ({"objective": {"number": "radius_m", "region": "20m"}}, "candidates are chosen by a detection, .* 'radius_m'"),
         ({"objective": {"region": "behind"}}, "behind"),
         ({"candidates": {}}, "candidates"),
     ],
@@ -167,7 +180,7 @@ def test_of_few_fresh_worlds_there_is_no_error_and_no_gain_is_shown(folder):
         found = choose(space, instants, test_seed=5, fresh_worlds=1)
     assert "no gain is shown" in found.sentence
     assert "nan" not in found.sentence
-    save_choice(found, folder / "few")
+    found.save(folder / "few")
     assert json.loads((folder / "few" / "search.json").read_text())["fresh"]["error"] is None
 
 

@@ -1,14 +1,19 @@
-"""Common instants: the frames of SimulatedFrames, the numbers of CoverageMetric, whoever holds the worlds."""
+"""Common instants: the frames of SimulatedFrames, the numbers of evaluate, whoever holds the worlds."""
+
+import gc
+import os
+from copy import copy
 
 import numpy as np
 import pytest
 import torch
 
 from tests.placement.worlds import BAY, FLOOR, LOT, OBJECTIVES, WALL, held, lidar, rig, yard
-from torchcover.coverage import CoverageMetric, Region
-from torchcover.data import RegionsOfInterest, SimulatedFrames
-from torchcover.placement import Objective, paired
-from torchcover.simulation import Scenario, Simulator, SurfaceReference
+from torchcover.coverage import CoverageMetric
+from torchcover.evaluation import evaluate
+from torchcover.placement import Objective
+from torchcover.placement.common_instants import HeldWorlds
+from torchcover.simulation import RegionsOfInterest, Scenario, SimulatedFrames, Simulator, SurfaceReference
 
 NOISY = lidar("noisy", range_noise_m=0.03, dropout=0.2, mount={"x_m": 0.5, "z_m": 2.2, "yaw_deg": 40})
 RADAR = {
@@ -19,9 +24,10 @@ TWO = rig(lidar(), NOISY, RADAR, name="two")
 
 
 def same(a, b):
-    for name in ("instants", "world", "seen_m2", "visible_m2", "known_share"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-    assert (a.self_hit_share, a.rays) == (b.self_hit_share, b.rays)
+    """Estimates by measure, to the last bit."""
+    for measure in ("area", "known"):
+        for name in ("value", "left_out", "steps"):
+            np.testing.assert_array_equal(getattr(a[measure], name), getattr(b[measure], name))
 
 
 @pytest.mark.parametrize("scenario", [LOT, yard(WALL)])
@@ -37,94 +43,121 @@ def test_another_rig_sees_what_it_would_see_in_frames_of_its_own(scenario):
     np.testing.assert_array_equal(other.step(3).clouds["first"], alone[3].sensor.numpy())
 
 
-def test_scores_are_those_of_the_coverage_metric(instants):
-    scores = instants.score(TWO)
-    (site,) = instants.sites
-    sensor = site.grid.reference_sensor(site.rays)
-    frames = SimulatedFrames(site.scenario, TWO, steps=9, every_s=0.4, reference_sensor=sensor)
-    named = {region.name: region for region in RegionsOfInterest().around(frames.ego_outline_m).regions}
-    named["bay"] = Region.polygon("bay", [(2.5, -4.0), (9.0, -4.0), (9.0, 5.0)])
+def test_numbers_are_those_of_evaluate_on_the_same_instants_to_the_last_bit():
+    """By area and over known cells, in regions of several objectives, from frames that nobody has cut."""
+    found = held(objectives=OBJECTIVES, worlds=4, per_world=2)
+    frames = SimulatedFrames(
+        found._worlds[0],
+        TWO,
+        steps=max(instant.step for instant in found.instants) + 1,
+        every_s=0.4,
+        reference_sensor=found.questions.reference_sensor(1024),
+    )
+    steps = [instant.step for instant in found.instants]
+    assert len(steps) == 8
 
-    regions = [named["20m"], named["80m"], named["bay"]]
+    class InOrder(SimulatedFrames):
+        """The instants of the search, in its order."""
 
-    def expected(steps):
-        """(2, objectives): area, known cells."""
-        metric = CoverageMetric(site.grid.grid, (0.2, 0.3), regions=regions, square_metres=True)
-        for frame in map(frames.__getitem__, steps):
-            metric.update(frame.sensor, frame.reference, weights=frame.reference_weights)
-        rows = {(row.region, row.height): row for row in metric.compute().summary()}
-        return [
-            [
-                np.mean(
-                    [getattr(rows[region, band], measure)[f"detection_{m}m"].value for m, band, region in questions]
-                )
-                for questions in (objective.questions for objective in OBJECTIVES.values())
+        def __getitem__(self, index):
+            return frames[steps[found.order[index]]]
+
+    in_order = copy(frames)
+    in_order.__class__, in_order.steps = InOrder, len(steps)
+    regions = {"20m": {"x_m": (0.0, 20.0), "y_m": (-5.0, 5.0)}, "80m": {"x_m": (0.0, 80.0), "y_m": (-20.0, 20.0)}}
+    ask = RegionsOfInterest.model_validate({"regions": {**regions, **BAY}})
+    result = evaluate(frames=in_order, ask=ask, cell_m=0.5, thresholds_m=(0.2, 0.3))
+    estimates = found.estimates(TWO)
+    for measure, own in estimates.items():
+        for column, objective in enumerate(OBJECTIVES.values()):
+            rows = {(row.region, row.height): row for row in result.coverage.summary()}
+            numbers = [
+                (rows[place].numbers if measure == "area" else rows[place].known)[objective.key]
+                for place in objective.places
             ]
-            for measure in ("numbers", "known")
-        ]
+            values = torch.tensor([number.value for number in numbers], dtype=torch.float64)
+            assert own.value[column] == values.mean()
+    last = list(found.prefixes(TWO))[-1]
+    np.testing.assert_array_equal(last.estimate.value, estimates["area"].value)
 
-    for row, instant in enumerate(instants.instants[:3]):
-        np.testing.assert_allclose([scores.area[row], scores.known[row]], expected([instant.step]), rtol=0, atol=1e-9)
-    steps = [instant.step for instant in instants.instants if instant.world == 1]
-    np.testing.assert_allclose(scores.by_world()[1], expected(steps)[0], rtol=0, atol=1e-9)
+
+def test_every_prefix_is_the_coverage_of_its_instants(instants):
+    questions = instants.questions
+    metric = CoverageMetric(
+        questions.grid, questions.thresholds_m, max_radius=90.0, blocks=16, regions=(), square_metres=True
+    )
+    frames = instants.frames(TWO, instants.order.tolist())
+    for prefix in instants.prefixes(TWO):
+        for frame in (next(frames) for _ in range(3)):
+            metric.update(
+                frame.sensor, frame.reference, weights=frame.reference_weights, place_in_time=frame.place_in_time
+            )
+        (near,) = metric.estimates([(questions.regions["bay"], "ground")], "area")
+        (other,) = metric.estimates([(questions.regions["bay"], "obstacle")], "area")
+        both = torch.stack([other.value[2], near.value[2]]).mean()
+        np.testing.assert_array_equal(prefix.estimate.value[2], both)
+    assert prefix.instants == 6
 
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_it_makes_no_difference_who_holds_the_worlds(instants, workers):
     with held(workers=workers) as elsewhere:
-        same(elsewhere.score(TWO), instants.score(TWO))
-        same(elsewhere.score(rig(), [4, 1]), instants.score(rig(), [4, 1]))
+        same(elsewhere.estimates(TWO), instants.estimates(TWO))
+        for one, other in zip(elsewhere.prefixes(rig()), instants.prefixes(rig()), strict=True):
+            np.testing.assert_array_equal(one.estimate.left_out, other.estimate.left_out)
+            assert one.self_hit_share == other.self_hit_share
         for held_by in (elsewhere, instants):
             with pytest.raises(ValueError, match="inside the ego of 'lot'"):
-                held_by.score(rig(lidar(mount={"z_m": 1.0})))
-        same(elsewhere.score(TWO), instants.score(TWO))  # nothing is left over of the error
+                held_by.estimates(rig(lidar(mount={"z_m": 1.0})))
+        same(elsewhere.estimates(TWO), instants.estimates(TWO))  # nothing is left over of the error
 
 
-def test_the_order_of_instants_and_of_rigs_makes_no_difference(instants):
-    whole = instants.score(TWO)
-    shuffled = instants.score(rig(), [5, 0, 3]), instants.score(TWO, [5, 0, 3])
-    same(shuffled[1], whole.at([5, 0, 3]))
-    assert not np.array_equal(shuffled[0].seen_m2, shuffled[1].seen_m2)
-    both = instants.score(TWO, [1, 2]).joined(instants.score(TWO, [0, 5]))
-    np.testing.assert_array_equal(both.area, whole.at([1, 2, 0, 5]).area)
-    counts = [instants.bits(TWO, [k]).self_hits.sum() for k in (0, 1, 2, 5)]
-    assert both.self_hit_share == pytest.approx(sum(counts) / 4 / sum(sensor.rays for sensor in TWO.sensors))
+def test_a_world_stays_with_the_process_that_has_built_it(monkeypatch, tmp_path):
+    """The k-th batch of a DataLoader is for its k-th worker."""
+    built = HeldWorlds._built
+
+    def noted(self, instant, number):
+        (tmp_path / f"{instant.world} {number} {os.getpid()}").touch()
+        return built(self, instant, number)
+
+    monkeypatch.setattr(HeldWorlds, "_built", noted)
+    with held(workers=2, worlds=4) as elsewhere:
+        for _ in range(2):
+            elsewhere.estimates(rig())
+        list(elsewhere.prefixes(TWO))
+    world, number, process = zip(*(path.name.split() for path in tmp_path.iterdir()), strict=True)
+    assert sorted(map(int, number)) == list(range(8))
+    of_worlds = dict(zip(world, process, strict=True))
+    assert set(zip(world, process, strict=True)) == set(of_worlds.items())
+    assert sorted(map(list(of_worlds.values()).count, set(process))) == [2, 2]
 
 
-def test_the_bits_of_a_rig_are_those_of_any_of_its_sensors(instants):
-    sensors = [
-        lidar("a", mount={"x_m": 2.2, "z_m": 0.6}, horizontal_fov_deg=100),
-        lidar("b", mount={"y_m": 1.2, "z_m": 0.9, "yaw_deg": 70}, channels=24, horizontal_fov_deg=200),
-        lidar("c"),
-    ]
-    alone = [instants.bits(rig(sensor)) for sensor in sensors]
-    same(instants.scores(alone[0] | alone[1] | alone[2]), instants.score(rig(*sensors)))
-    assert (instants.scores(alone[0]).seen_m2 < instants.score(rig(*sensors)).seen_m2).any()
-    with pytest.raises(ValueError, match="the same instants"):
-        alone[0] | instants.bits(rig(), [1])
+def test_the_order_of_rigs_makes_no_difference(instants):
+    whole = instants.estimates(TWO)
+    other = instants.estimates(rig())
+    same(instants.estimates(TWO), whole)
+    assert not torch.equal(other["area"].value, whole["area"].value)
+    shares = [prefix.self_hit_share for prefix in instants.prefixes(TWO)]
+    counts = [frame.counts for frame in instants.frames(TWO)]
+    assert shares[-1] == sum(one["self_hits"] for one in counts) / sum(one["rays"] for one in counts)
 
 
-def test_what_some_worlds_do_not_show_is_unknown_there_for_all():
+def test_what_some_worlds_do_not_show_is_about_the_others():
     obstacles = {"ahead": Objective(region="20m", band="obstacle"), "ground": Objective(region="20m", band="ground")}
     scenarios = [yard(WALL), yard(name="empty"), LOT]
     found = held(scenarios, obstacles, worlds=1, per_world=1)
-    assert found.world_of.tolist() == [0, 1, 2]
-    assert found.unknown_worlds == {"ahead": 1, "ground": 0}
-    one, other = found.score(rig()), found.score(TWO)
-    for scores in (one, other):
-        np.testing.assert_array_equal(np.isnan(scores.by_world("known"))[:, 0], [False, True, False])
-        np.testing.assert_array_equal(np.isnan(scores.area)[:, 0], [False, True, False])
-    assert paired(other, one).worlds.tolist() == [2, 3]
-    with pytest.raises(
-        ValueError, match="'ahead': of 1 worlds, none shows some surface in each of: obstacle in 20m; use"
-    ):
-        held([yard()], obstacles)
+    assert [instant.world for instant in found.instants] == [0, 1, 2]
+    estimate = found.estimates(rig())["area"]
+    assert torch.isfinite(estimate.left_out).all()
+    assert estimate.left_out[1, 0] == estimate.value[0]  # the empty one has no obstacle
+    nothing = held([yard()], obstacles).estimates(rig())["area"].value
+    assert torch.isnan(nothing).tolist() == [True, False]
 
 
 def test_a_world_without_traffic_shows_each_instant_once():
     found = held([yard(WALL)], per_world=4)
-    assert found.world_of.tolist() == [0] * 4
-    assert len({one.cell_m2.sum() for one in found.references}) == 4  # draws of the reference
+    assert [instant.world for instant in found.instants] == [0] * 4
+    assert len({float(frame.reference_weights.sum()) for frame in found.frames()}) == 4  # draws of the reference
 
 
 @pytest.mark.parametrize(
@@ -139,6 +172,7 @@ def test_a_world_without_traffic_shows_each_instant_once():
         ({"seed": -1}, "seed: a number >= 0"),
         ({"budget_bytes": 1000.0}, "budget_bytes: 3 worlds .* in which 0 fit; use fewer worlds"),
         ({"budget_bytes": 1000.0, "workers": 1}, "budget_bytes: 3 worlds"),
+        ({"scenarios": [LOT, "courtyard"]}, "their egos differ"),
         ({"objectives": {"a": Objective(region="21m")}}, "objective 'a': region '21m': one of 20m, 80m"),
         ({"objectives": {"a": Objective(region="20m", band="sky")}}, "objective 'a': band 'sky': 'ground' or 'obst"),
         ({"objectives": {"a": Objective(region="20m", band=())}}, "objective 'a': band: at least one"),
@@ -153,14 +187,9 @@ def test_what_makes_no_sense_is_said_at_the_door(change, message):
         held(**change)
 
 
-def test_rigs_that_cannot_be_and_instants_that_are_not(instants):
+def test_rigs_that_cannot_be(instants):
     with pytest.raises(ValueError, match="below the ground"):
-        instants.score(rig(lidar(mount={"x_m": 3.0, "z_m": -1.0})))
-    for numbers in ([], [6], [-1]):
-        with pytest.raises(ValueError, match="numbers from 0 to 5 are needed"):
-            instants.score(rig(), numbers)
-    with pytest.raises(ValueError, match="instants \\[5\\]: the rig was not scored there"):
-        instants.score(rig(), [0, 1]).at([1, 5])
+        instants.estimates(rig(lidar(mount={"x_m": 3.0, "z_m": -1.0})))
 
 
 def test_a_rig_for_another_vehicle_is_refused_unless_the_vehicle_was_said():
@@ -168,18 +197,23 @@ def test_a_rig_for_another_vehicle_is_refused_unless_the_vehicle_was_said():
     near = {"near": Objective(region="20m", band="ground")}
     roof = rig(vehicle="renault_zoe")
     with pytest.raises(ValueError, match="is for the vehicle renault_zoe, and these instants have suv: say which"):
-        held([open_lot], near).score(roof)
-    assert held([open_lot], near, vehicle="renault_zoe").score(roof).area.shape == (2, 1)
+        held([open_lot], near).estimates(roof)
+    assert len(held([open_lot], near, vehicle="renault_zoe").estimates(roof)["area"].value) == 1
 
 
 def test_a_process_that_was_killed_is_told_and_the_others_end_with_the_search():
     instants = held(workers=9, worlds=2, per_world=1)
-    killed, other = (holder.process for holder in instants._holders)
-    killed.kill()
-    killed.join()
-    with pytest.raises(ChildProcessError, match="a process that holds worlds was killed"):
-        instants.score(rig())
+    killed, other = instants._loader._iterator._workers
+
+    def ask():
+        killed.kill()
+        killed.join()
+        instants.estimates(rig())
+
+    with pytest.raises((ChildProcessError, RuntimeError), match=r"was killed|is killed by signal"):  # at any time
+        ask()
     instants.close()
+    gc.collect()  # the error knows of what it was raised from
     other.join(20)
     assert other.exitcode == 0
 
@@ -188,14 +222,14 @@ def test_threads_make_no_difference(instants):
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1 if before > 1 else 2)
-        other = instants.score(TWO)
+        other = instants.estimates(TWO)
     finally:
         torch.set_num_threads(before)
-    same(other, instants.score(TWO))
+    same(other, instants.estimates(TWO))
 
 
 def test_a_recording_is_one_world_for_any_seed_and_none_of_it_is_fresh():
     with held(["tracks_table"], {"near": Objective(region="20m", band="ground")}, worlds=3, every_s=0.5) as recorded:
-        assert recorded.world_of.tolist() == [0, 0]
+        assert [instant.world for instant in recorded.instants] == [0, 0]
         with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'tracks_table' is the same"):
             recorded.anew(9, 3)

@@ -4,62 +4,30 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tests.placement.worlds import held, lidar, made_up, rig, yard
-from torchcover.placement import fresh_test, paired, race, racing_order
-from torchcover.placement.fresh import student_p
+from tests.placement.worlds import estimate_of, held, lidar, prefixes_of, rig, yard
+from torchcover.placement import Objective, fresh_test, race, racing_order
+from torchcover.placement.racing import gains
 
 WORLDS, PER_WORLD = 6, 3
 WORLD = np.repeat(np.arange(WORLDS), PER_WORLD)
 
 
-def test_pairs_are_those_of_a_paired_t_test():
+def test_gains_are_those_of_a_paired_t_test_and_have_the_direction_of_the_number():
     generator = np.random.default_rng(0)
     one, other = generator.normal(size=(2, 18, 2))
-    found = paired(made_up(one, WORLD), made_up(other, WORLD))
+    lower = {"lower_is_better": ["o1"]}
+    gain, error = gains(estimate_of(one, WORLD, **lower), estimate_of(other, WORLD, **lower))
     of_worlds = (one - other).reshape(6, 3, 2).mean(axis=1)
     expected = stats.ttest_1samp(of_worlds, 0.0)
-    np.testing.assert_allclose(found.gain, of_worlds.mean(axis=0))
-    np.testing.assert_allclose(found.gain / found.error, expected.statistic)
-    np.testing.assert_array_equal(found.better, (of_worlds > 0).sum(axis=0))
-    p = [student_p(float(t), 5) for t in found.gain / found.error]
-    np.testing.assert_allclose(p, expected.pvalue, rtol=1e-9)
-
-
-@pytest.mark.parametrize("freedom", [1, 2, 3, 6, 15, 40])
-def test_the_probability_of_t_is_students(freedom):
-    for t in (0.0, 0.3, -2.0, 7.0):
-        assert student_p(t, freedom) == pytest.approx(2 * stats.t.sf(abs(t), freedom), abs=1e-12)
-    assert np.isnan(student_p(float("nan"), freedom))
-
-
-def test_worlds_that_do_not_know_an_objective_are_in_no_pair():
-    values = np.arange(8.0).reshape(4, 2)
-    one = values + np.array([[0.3, 0.0], [0.1, 0.1], [0.2, 0.0], [0.9, 0.2]])
-    values[3, 0] = one[3, 0] = np.nan
-    found = paired(made_up(one, range(4)), made_up(values, range(4)), "known")
-    np.testing.assert_allclose(found.gain, [0.2, 0.075])
-    assert found.worlds.tolist() == [3, 4]
-    np.testing.assert_allclose(found.error, [stats.sem([0.3, 0.1, 0.2]), stats.sem([0.0, 0.1, 0.0, 0.2])])
-    none = paired(made_up(one[3:], [0]), made_up(values[3:], [0]))
-    assert np.isnan(none.gain[0])
-    assert np.isnan(none.error).all()
-    assert none.worlds.tolist() == [0, 1]
+    np.testing.assert_allclose(gain, of_worlds.mean(axis=0) * [1, -1])
+    np.testing.assert_allclose(gain / error, expected.statistic * [1, -1])
 
 
 def test_two_worlds_have_no_error_however_many_instants():
     values = np.random.default_rng(0).normal(size=12)
-    found = paired(made_up(values, [0, 1] * 6), made_up(np.zeros(12), [0, 1] * 6))
-    assert np.isnan(found.error[0])
-    assert found.worlds[0] == 2
-
-
-def test_pairs_are_of_the_same_instants():
-    generator = np.random.default_rng(0)
-    one, other = made_up(generator.normal(size=18), WORLD), made_up(generator.normal(size=18), WORLD)
-    some = [2, 17, 9, 10, 4]
-    expected = (one.at(some).area - other.at(some).area)[:, 0]
-    of_worlds = [expected[[0]].mean(), expected[[4]].mean(), expected[[2, 3]].mean(), expected[[1]].mean()]
-    assert paired(one.at(some), other).gain[0] == pytest.approx(np.mean(of_worlds))
+    gain, error = gains(estimate_of(values, [0, 1] * 6), estimate_of(np.zeros(12), [0, 1] * 6))
+    assert np.isnan(error[0])
+    assert gain[0] == pytest.approx(values.mean())
 
 
 def test_pairing_takes_out_what_a_world_does_to_all():
@@ -67,9 +35,9 @@ def test_pairing_takes_out_what_a_world_does_to_all():
     city = generator.normal(0, 0.07, (400, 1))
     own = generator.normal([0.5, 0.51], 0.009, (400, 2))
     one, other = (city + own[:, :1])[:, 0], (city + own[:, 1:])[:, 0]
-    error = paired(made_up(other, range(400)), made_up(one, range(400))).error[0]
+    _, error = gains(estimate_of(other, range(400)), estimate_of(one, range(400)))
     unpaired = np.sqrt((one.var(ddof=1) + other.var(ddof=1)) / 400)
-    assert (unpaired / error) ** 2 > 30
+    assert (unpaired / error[0]) ** 2 > 30
 
 
 def test_an_order_goes_round_the_worlds():
@@ -93,24 +61,19 @@ def field(generator, candidates=70, objectives=1):
 
 
 def test_a_race_finds_the_best_with_half_of_the_instants():
-    """One new candidate at a time against the best so far."""
+    """One new candidate at a time against the best so far, all in one order."""
     spent, loss, kept = [], [], []
     for repeat in range(12):
         true, values = field(np.random.default_rng(repeat))
         order = racing_order(WORLD, repeat)
-        calls = []
-
-        def score(candidate, instants, values=values, calls=calls):
-            calls.append(len(instants))
-            return made_up(values[candidate][instants], WORLD[instants], instants)
-
-        best, incumbent = 0, score(0, order)
+        best, incumbent, instants = 0, tuple(prefixes_of(values[0][order], WORLD[order])), 18
         for candidate in range(1, 70):
-            (raced,) = race(score, [candidate], order, incumbents=[incumbent])
-            if not raced.dropped and paired(raced.scores, incumbent).gain[0] > 0:
-                best, incumbent = candidate, raced.scores
+            raced = race(prefixes_of(values[candidate][order], WORLD[order]), [incumbent])
+            instants += raced[-1].instants
+            if raced[-1].instants == 18 and gains(raced[-1].estimate, incumbent[-1].estimate)[0][0] > 0:
+                best, incumbent = candidate, raced
         of_all = values.mean(axis=1)[:, 0].argmax()
-        spent.append(sum(calls) / 18 / 70)
+        spent.append(instants / 18 / 70)
         loss.append(true[of_all, 0] - true[best, 0])
         kept.append(best == of_all)
     assert np.mean(spent) < 0.5
@@ -118,70 +81,72 @@ def test_a_race_finds_the_best_with_half_of_the_instants():
     assert np.mean(kept) > 0.8
 
 
-def test_several_race_at_once_and_against_each_other():
-    _, values = field(np.random.default_rng(5), candidates=12)
-
-    def score(candidate, instants):
-        return made_up(values[candidate][instants], WORLD[instants], instants)
-
-    found = race(score, range(12), racing_order(WORLD, 5))
-    finished = [k for k, raced in enumerate(found) if not raced.dropped]
-    assert values.mean(axis=1)[:, 0].argmax() in finished
-    assert sum(len(raced.scores.instants) for raced in found) < 12 * 18 / 2
-    for raced in found:
-        assert (len(raced.scores.instants) == 18) == (not raced.dropped)
-        assert len(raced.scores.instants) % 3 == 0
-
-
 @pytest.mark.parametrize(("errors_below", "dropped"), [(1.95, False), (2.05, True)])
 def test_two_errors_below_is_too_much(errors_below, dropped):
     spread = np.tile([-1.0, 0.0, 1.0], 2)
     values = 0.01 * (spread - errors_below / np.sqrt(3))
     world = np.tile([0, 1, 2], 2)
-
-    def score(candidate, instants):
-        return made_up(values[instants], world[instants], instants)
-
-    (raced,) = race(score, ["one"], range(6), incumbents=[made_up(np.zeros(6), world)])
-    assert raced.dropped == dropped
+    best = tuple(prefixes_of(np.zeros(6), world))
+    assert (len(race(prefixes_of(values, world), [best])) == 1) == dropped
+    # Of a number that is better the lower it is, two errors above.
+    lower = {"lower_is_better": ["o0"]}
+    best = tuple(prefixes_of(np.zeros(6), world, **lower))
+    assert (len(race(prefixes_of(-values, world, **lower), [best])) == 1) == dropped
 
 
 def test_nobody_is_dropped_before_there_is_an_error_or_for_one_of_two_objectives():
-    def score(candidate, instants):
-        return made_up(worse[instants] * [1.0, candidate], WORLD[instants], instants)
-
     generator = np.random.default_rng(0)
-    best = made_up(np.zeros((18, 2)), WORLD)
     worse = generator.normal(-1.0, 0.01, (18, 2))
     order = racing_order(WORLD, 0)
-    below, aside = race(score, [1.0, -1.0], order, incumbents=[best])
-    assert below.dropped
-    assert not aside.dropped
-    assert len(below.scores.instants) == 3
-    assert len(race(score, [1.0], order, incumbents=[best], together=2)[0].scores.instants) == 4
+    world = WORLD[order]
+    best = tuple(prefixes_of(np.zeros((18, 2)), world))
+    below, aside = (race(prefixes_of(worse * [1.0, sign], world), [best]) for sign in (1.0, -1.0))
+    assert below[-1].instants == 3
+    assert aside[-1].instants == 18
+    assert len(race(prefixes_of(worse, world))) == 6
     # Three instants of two worlds have no error.
-    by_world = [0, 1, 3, *(k for k in range(18) if k not in (0, 1, 3))]
-    assert len(race(score, [1.0], by_world, incumbents=[best])[0].scores.instants) > 3
-    with pytest.raises(ValueError, match="an instant, and one at a time"):
-        race(score, [1.0], [])
+    few = np.array([0, 0, 1, *(k for k in range(2, 6) for _ in range(3))])
+    zeros = tuple(prefixes_of(np.zeros((15, 2)), few))
+    assert race(prefixes_of(worse[:15], few), [zeros])[-1].instants > 3
+
+
+def test_no_more_is_scored_than_is_needed():
+    asked = []
+
+    def scored():
+        for prefix in prefixes_of(np.random.default_rng(0).normal(-1.0, 0.01, 18), np.tile(np.arange(6), 3)):
+            asked.append(prefix.instants)
+            yield prefix
+
+    race(scored(), [tuple(prefixes_of(np.zeros(18), np.tile(np.arange(6), 3)))])
+    assert asked == [3]
+
+
+def test_a_number_that_is_by_no_choice_of_estimate_is_tested_once():
+    low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
+    keys = {"near": "radius_m", "largest": "radius_maximum_m", "cells": "known_radius_m"}
+    objectives = {name: Objective(number=key, region="20m") for name, key in keys.items()}
+    with held(objectives=objectives, estimate="known", worlds=2) as searched:
+        found = fresh_test({"higher": high}, low, searched, test_seed=1, worlds=2)["higher"]
+    said = [("near", "known"), ("largest", "-"), ("cells", "known"), ("near", "area")]
+    assert [(gain.objective, gain.estimate) for gain in found] == said
 
 
 def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(instants):
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
-    found = fresh_test({"higher": high}, low, instants, test_seed=1, worlds=3)["higher"]
-    assert (found.search_seed, found.test_seed, found.instants) == (0, 1, 6)
-    fresh = held(seed=1, worlds=3)
-    for measure in ("area", "known"):
-        expected = paired(fresh.score(high), fresh.score(low), measure)
-        in_search = paired(instants.score(high), instants.score(low), measure).gain
-        for column, name in enumerate(("near", "far", "bay")):
-            gain = found.gains[name][measure]
-            t = expected.gain[column] / expected.error[column]  # NaN where fewer than three worlds know a bay
-            one = [gain.gain, gain.error, gain.worlds, gain.better, gain.t, gain.p, gain.optimism]
-            of_pairs = [each[column] for each in (expected.gain, expected.error, expected.worlds, expected.better)]
-            further = [t, student_p(float(t), gain.worlds - 1), in_search[column] - expected.gain[column]]
-            np.testing.assert_array_equal(one, [*of_pairs, *further])
-    assert found.gains["far"]["area"].p < 0.5
+    found = fresh_test({"higher": high}, low, instants, test_seed=1, worlds=8)["higher"]
+    fresh = held(seed=1, worlds=8)
+    assert [(gain.objective, gain.estimate) for gain in found] == [
+        (name, measure) for measure in ("area", "known") for name in ("near", "far", "bay")
+    ]
+    for gain in found:
+        expected = fresh.estimates(high)[gain.estimate].differences(fresh.estimates(low)[gain.estimate])
+        in_search = instants.estimates(high)[gain.estimate].minus(instants.estimates(low)[gain.estimate])
+        column = ["near", "far", "bay"].index(gain.objective)
+        np.testing.assert_equal(gain.test, expected[gain.objective])
+        assert gain.search_gain == float(in_search.value[column])
+        np.testing.assert_equal(gain.optimism, gain.search_gain - expected[gain.objective].value)
+    assert found[1].test.p < 0.5
     with pytest.raises(ValueError, match="seed: another one than that of these worlds is needed; got 0 for both"):
         instants.anew(0, worlds=4)
     with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'yard' is the same for any seed"):

@@ -7,16 +7,17 @@ import numpy as np
 import pytest
 
 from tests.placement.surfaces import plan, space
-from torchcover.placement import FreshGain, PlacementSearch
-from torchcover.placement.fresh import student_p
-from torchcover.placement.result import told
+from torchcover.coverage.quantity import RADIUS, detection
+from torchcover.estimation import Difference
+from torchcover.placement import FreshGain, PlacementSearch, run_search
+from torchcover.placement.fresh import told
 from torchcover.simulation import Rig
 
 
 @pytest.fixture(scope="module")
 def one(tmp_path_factory):
     folder = tmp_path_factory.mktemp("one")
-    result = PlacementSearch(space(), plan(evaluations=16)).run(folder)
+    result = run_search(PlacementSearch(space(), plan(evaluations=16)), folder)
     return result, folder, result.save(folder)
 
 
@@ -41,19 +42,19 @@ def test_the_summary_comes_last_and_lists_all_files(one):
     assert files[-1].name == "summary.json"
     assert set(summary["files"]) == {path.name for path in files[:-1]}
     assert set(summary["files"]) >= {"best.yaml", "evaluations.csv", "pareto.csv", "search.json", "report.html"}
-    assert {path.name for path in folder.iterdir()} == {path.name for path in files} | {"evaluations.jsonl"}
+    assert {path.name for path in folder.iterdir()} == {path.name for path in files} | {"checkpoint.npz"}
 
 
 def test_there_is_a_row_for_every_evaluation_and_its_gain_is_the_difference_of_means(one):
     result, folder, _ = one
     table = rows(folder / "evaluations.csv")
     assert [int(row["number"]) for row in table] == list(range(17))
-    start = float(table[0]["near_mean"])
+    start = float(table[0]["near_value"])
     for row, evaluation in zip(table, result.search.evaluations, strict=True):
         assert int(row["instants"]) == evaluation.instants
         assert row["arm"] == evaluation.arm
         if row["state"] == "complete":
-            assert float(row["near_gain"]) == pytest.approx(float(row["near_mean"]) - start, abs=1e-8)
+            assert float(row["near_gain"]) == pytest.approx(float(row["near_value"]) - start, abs=1e-8)
             assert row["why"] == ""
         else:
             assert row["state"] == "dropped"
@@ -87,7 +88,7 @@ def test_the_page_shows_the_gains_the_rigs_and_the_pictures(one):
 
 
 def test_of_several_objectives_there_are_rigs_of_the_ends_and_a_front(tmp_path):
-    result = PlacementSearch(space(objectives=("near", "far")), plan(evaluations=16)).run()
+    result = run_search(PlacementSearch(space(objectives=("near", "far")), plan(evaluations=16)))
     names = {path.name for path in result.save(tmp_path)}
     assert names >= {"best.yaml", "best_near.yaml", "best_far.yaml", "pareto.png", "objective_1.png", "objective_2.png"}
     front = rows(tmp_path / "pareto.csv")
@@ -104,31 +105,56 @@ def test_where_nothing_can_be_there_are_files_all_the_same(tmp_path):
             raise ValueError("inside the wall")
         return np.array([0.5, 0.5])
 
-    result = PlacementSearch(space(), plan(evaluations=3, worth=nowhere)).run()
+    result = run_search(PlacementSearch(space(), plan(evaluations=3, worth=nowhere)))
     result.save(tmp_path)
     assert Rig.load(tmp_path / "best.yaml") == Rig.load("front_roof_32")
     assert [row["why"] for row in rows(tmp_path / "evaluations.csv")[1:]] == ["inside the wall"] * 3
     assert json.loads((tmp_path / "search.json").read_text())["found"][0]["gains"] is None
 
 
-def gain(mean, error, t, worlds=16):
-    return FreshGain(mean, error, t, student_p(t, worlds - 1), worlds, 9, 0.0, 0.0)
+DETECTION = detection(0.4)
+
+
+def gain(mean, error, significant, worlds=16, quantity=DETECTION):
+    return FreshGain("near", "area", Difference(quantity, mean, error, 0, 0, significant, 0.1, worlds, 9), 0.04)
 
 
 @pytest.mark.parametrize(
     ("found", "words"),
     [
-        (gain(-0.02, 0.004, -5.0), "lost 2.00 ± 0.40 points on 16 fresh worlds (t -5.0, better in 9)"),
-        (gain(0.03, 0.01, 3.0), "gained 3.00 ± 1.00 points on 16 fresh worlds (t 3.0, better in 9)"),
-        (gain(0.03, 0.01, 3.0, 3), "no gain is shown: +3.00 ± 1.00 points on 3 fresh worlds (t 3.0, better in 9)"),
-        (
-            gain(0.0198, 0.01, 1.98, 999),
-            "no gain is shown: +1.98 ± 1.00 points on 999 fresh worlds (t 2.0, better in 9)",
-        ),
-        (gain(0.0199, 0.01, 1.99), "no gain is shown: +1.99 ± 1.00 points on 16 fresh worlds (t 2.0, better in 9)"),
-        (gain(0.02, np.nan, np.nan), "no gain is shown: +2.00 ± ? points on 16 fresh worlds (t unknown, better in 9)"),
-        (gain(np.nan, np.nan, np.nan), "unknown in every fresh world"),
+        (gain(-0.02, 0.004, True), "lost 2.00 ± 0.40 points on 16 fresh worlds (t -5.0, better in 9)"),
+        (gain(0.03, 0.01, True), "gained 3.00 ± 1.00 points on 16 fresh worlds (t 3.0, better in 9)"),
+        (gain(0.03, 0.01, None, 3), "no gain is shown: +3.00 ± 1.00 points on 3 fresh worlds (t 3.0, better in 9)"),
+        (gain(0.0199, 0.01, False), "no gain is shown: +1.99 ± 1.00 points on 16 fresh worlds (t 2.0, better in 9)"),
+        (gain(0.02, np.nan, None), "no gain is shown: +2.00 ± ? points on 16 fresh worlds (t unknown, better in 9)"),
+        (gain(-0.1, 0.02, True, quantity=RADIUS), "gained 0.100 ± 0.020 m on 16 fresh worlds (t 5.0, better in 9)"),
+        (gain(np.nan, np.nan, None), "unknown in the fresh worlds"),
     ],
 )
-def test_nothing_is_called_a_gain_below_a_t_of_two(found, words):
+def test_only_what_is_told_from_chance_is_called_a_gain(found, words):
     assert told(found) == words
+    if np.isfinite(found.test.value):
+        assert told(found, optimism=True).startswith(f"{words}, optimism ")
+
+
+def test_a_number_that_is_by_no_choice_of_estimate_has_one_row(tmp_path):
+    objectives = {"near": {"region": "20m"}, "largest": {"number": "radius_maximum_m", "region": "20m"}}
+    result = run_search(PlacementSearch(space(objectives=objectives), plan(evaluations=16, estimate="known")))
+    result.save(tmp_path)
+    found = json.loads((tmp_path / "search.json").read_text())
+    assert found["estimate"] == "known"
+    tested = [pick for pick in found["found"] if pick["gains"]]
+    assert tested
+    for pick in tested:
+        assert {name: list(gains) for name, gains in pick["gains"].items()} == {
+            "near": ["known", "area"],
+            "largest": ["-"],
+        }
+    assert result.sentence.count("near: ") == result.sentence.count("largest: ") == 1
+    said = [tuple(cell.text for cell in row[:3]) for row in result.report.tables[0].rows]
+    assert len(said) == len(set(said))
+    assert {each[1:] for each in said} == {
+        ("near (points)", "known"),
+        ("near (points)", "area"),
+        ("largest (points)", "-"),
+    }

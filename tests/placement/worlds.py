@@ -1,8 +1,10 @@
 """Small worlds and rigs, and scores that are made up."""
 
 import numpy as np
+import torch
 
-from torchcover.placement import CommonInstants, Objective, Scores
+from torchcover.estimation import Estimate, Quantity
+from torchcover.placement import CommonInstants, Objective, Prefix
 from torchcover.simulation import Rig, Scenario
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
@@ -42,17 +44,19 @@ def held(scenarios=(LOT,), objectives=OBJECTIVES, **keys):
     return CommonInstants(scenarios, objectives, **{"worlds": 3, "per_world": 2, "every_s": 0.4, "rays": 1024} | keys)
 
 
-def made_up(values, world, instants=None):
-    """Scores of (n, O) given values: each objective is a question of its own, about one square metre."""
-    values = np.asarray(values, dtype=np.float64).reshape(len(world), -1)
-    known = ~np.isnan(values)
-    return Scores(
-        instants=np.arange(len(world)) if instants is None else np.asarray(instants),
-        world=np.asarray(world),
-        parts={f"o{k}": (k,) for k in range(values.shape[1])},
-        seen_m2=np.where(known, values, 0.0),
-        visible_m2=known.astype(np.float64),
-        known_share=values,
-        self_hit_share=0.0,
-        rays=1,
-    )
+def estimate_of(values, world, lower_is_better=()):
+    """Of (n, O) values at instants of some worlds: the means, and what they are without each world."""
+    values = torch.as_tensor(np.asarray(values, dtype=np.float64).reshape(len(world), -1))
+    each, world = torch.unique(torch.as_tensor(world), return_inverse=True)
+    sums = torch.zeros(len(each), values.shape[1], dtype=torch.float64).index_add_(0, world, values)
+    steps = torch.bincount(world)
+    names = [f"o{k}" for k in range(values.shape[1])]
+    quantities = [Quantity(name, name, "share", name in lower_is_better) for name in names]
+    return Estimate.of_ratios(quantities, steps.double(), sums, steps)
+
+
+def prefixes_of(values, world, together=3, **keys):
+    """What is known after more and more of some instants."""
+    for start in range(0, len(world), together):
+        done = min(start + together, len(world))
+        yield Prefix(done, estimate_of(values[:done], world[:done], **keys), 0.0)

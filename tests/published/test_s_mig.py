@@ -108,7 +108,6 @@ def test_occupancy_and_its_blocks_are_those_of_a_slow_twin():
     assert np.array_equal(found.voxels, np.flatnonzero(counts.sum(axis=0)))
     assert np.array_equal(found.counts[found.pattern].T, counts.reshape(16, -1)[:, found.voxels])
     assert found.steps.tolist() == [4, 5, *[4] * 8, *[0] * 6]
-    assert found.probability == pytest.approx(counts.sum(axis=0).ravel()[found.voxels] / 41)
 
 
 def test_boxes_that_overlap_count_once_and_beside_each_other_share_no_voxel():

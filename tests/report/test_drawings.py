@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from torchcover import BevGrid
 from torchcover.geometry import rigid, rotation_from_euler
-from torchcover.report import ActorMark, Scenery, SensorView, draw_depths, draw_four_views, draw_rig, draw_scene
+from torchcover.report import ActorMark, SensorView, StandingFaces, draw_depths, draw_four_views, draw_rig, draw_scene
 from torchcover.report.drawings.frame import PATH, REFERENCE, SENSOR, SKY
 from torchcover.report.maps.overlay import COLOURS
 
@@ -171,7 +171,7 @@ def box(x: float, y: float) -> np.ndarray:
 
 def scene(**options) -> Picture:
     nothing = np.zeros((0, 3), dtype=np.float32)
-    bare = Scenery(np.zeros((0, 3, 2)), np.zeros(0))
+    bare = StandingFaces(np.zeros((0, 3, 2)), np.zeros(0))
     given = {
         "standing": bare,
         "ego_outline_m": box(0, 0),
@@ -185,7 +185,7 @@ def scene(**options) -> Picture:
 
 def test_what_stands_is_drawn_the_darker_the_higher_and_the_ground_is_not():
     squares = [(box(x, 5)[:3], height) for x, height in ((10, 0.0), (15, 0.3), (20, 8.0))]
-    standing = Scenery(np.array([corners for corners, _ in squares]), np.array([height for _, height in squares]))
+    standing = StandingFaces(np.array([corners for corners, _ in squares]), np.array([height for _, height in squares]))
     picture = scene(standing=standing)
     ground, kerb, house = (picture.at(0, x + 1, 4.6).mean() for x in (10, 15, 20))
     assert ground == 1.0

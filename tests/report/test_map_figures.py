@@ -1,7 +1,7 @@
 """All maps of a run: which there are, what they are called, and what their titles and colours say."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -104,8 +104,7 @@ def test_the_near_field_is_two_lengths_of_the_ego_to_scale_and_nothing_lies_over
 
 
 def test_every_aggregation_is_drawn_under_its_key():
-    # What has a field has levels.
-    aggregations = [kind(*((0.5,) for _ in fields(kind))) for kind in AGGREGATIONS]
+    aggregations = [kind.parse(kind.example) for kind in AGGREGATIONS]
     points = torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5]])
     for over_surface, others in ((False, ()), (True, ("radius_m", "detection_0.4m"))):
         metric = CoverageMetric(SMALL, aggregations=aggregations, square_metres=over_surface)

@@ -16,7 +16,7 @@ import torch
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
 from torchcover.coverage.quantity import RADIUS
 from torchcover.report import Line, Page, PageMap, PageRig, PageTable, SensorView, Words, maps_of, page_html, scale_of
-from torchcover.report.page.codes import CellBytes, decoded, encoded
+from torchcover.report.page.codes import CellBytes, encoded
 from torchcover.report.page.content import Array
 from torchcover.report.page.writing import fitted
 
@@ -261,12 +261,21 @@ def test_a_page_is_one_file_that_asks_for_nothing(named):
 
 def test_a_page_without_maps_or_sensors(tmp_path):
     text = page_html(Page("rig", "lead", rigs=[PageRig("rig")]))
-    assert "Nobody knows its sensors" in text
+    assert "Its sensors are unknown" in text
     if CHROMIUM is None:
         pytest.skip("no Chromium here: nobody looks at the page")
     dom, console = browsed(text, tmp_path / "page.html")
     assert console == []
     assert re.search(r'<section id="maps"[^>]* hidden', dom)
+
+
+def decoded(codes, bits, scale):
+    """Numbers as the page's script reads them."""
+    top = 2**bits - 1
+    share = (codes.astype(np.float64) - 1) / (top - 2)
+    low, high = scale["low"], scale["high"]
+    values = low * (high / low) ** share if scale["log"] else low + share * (high - low)
+    return np.where(codes == top, np.inf, np.where(codes == 0, 0.0, values))
 
 
 @pytest.mark.parametrize("bits", [8, 16])

@@ -6,12 +6,20 @@ import pytest
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Draws, Lidar, PaperReference, Pose, Scenario
-from torchcover.simulation.culling import blocks_towards, boxes_in_cone, outlines, rays_towards
 from torchcover.simulation.instant import cast_from
-from torchcover.simulation.mounted import MountedSensor
-from torchcover.simulation.rays import into_tiles, rotate, rotate_each, unit_directions
+from torchcover.simulation.rays import (
+    blocks_towards,
+    boxes_in_cone,
+    into_tiles,
+    outlines,
+    rays_towards,
+    rotate,
+    rotate_each,
+    unit_directions,
+)
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Plane
+from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.world import Actor, World
 
 EGO = BoundingBox((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
@@ -68,7 +76,7 @@ def test_a_mounted_sensor_sees_the_same_without_casting_at_the_ego_again(scene, 
     lidar = Lidar(name="roof", mount=Pose(x_m=0.45, z_m=1.73, yaw_deg=20), channels=40, vertical_fov_deg=(-60, 10),
                   horizontal_fov_deg=360, columns=150, max_range_m=90)  # fmt: skip
     tiles, instant = into_tiles(lidar.directions()), scene.at(step, within_m=90.0)
-    mounted = MountedSensor(lidar, scene).scan(instant, Draws(None), threads=2)
+    mounted = MountedSensor(lidar, scene, lidar.max_range_m).scan(instant, Draws(None), threads=2)
     afresh = instant.scan(lidar.mount.matrix(), tiles, max_range_m=90)
     assert mounted.self_hits > 100
     assert_same_bits(mounted, (afresh.points, afresh.self_hits))

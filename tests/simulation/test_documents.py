@@ -82,7 +82,7 @@ def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
         ("horizontal_fov_deg: 360", "horizontal_fov_deg: 361", "less than or equal to 360"),
         ("max_range_m: 50", "max_range_m: 50\n    min_range_m: 60", r"min_range_m \(60\.0\) must be below"),
         ("columns: 8", "columns: 8\n    azimuth_offsets_deg: [1, 2]", "one for each of the 4 rows is needed; got 2"),
-        ("  - type: lidar", "  - type: radar", r"sensors\.0: type: a sensor is a 'lidar' or a 'camera'; got 'radar'"),
+        ("  - type: lidar", "  - type: sonar", r"sensors\.0: type: a sensor is a 'lidar' or .* 'radar'; got 'sonar'"),
         ("name: r\n", "", "name: Field required"),
         ("columns: 8", "columns: true", r"columns: .*valid integer \(got True\)"),
         ("columns: 8", "columns: 8.0", r"columns: .*valid integer \(got 8\.0\)"),
@@ -149,7 +149,7 @@ def test_a_message_is_short_however_many_mistakes_there_are_and_however_large_th
 def test_a_vehicle_that_names_itself_is_refused(tmp_path):
     path = tmp_path / "v.yaml"
     path.write_text(f"name: v\nparts: [{{name: p, shape: {{type: vehicle, vehicle: {path}}}}}]\n")
-    with pytest.raises(ValueError, match=r"v\.yaml: document: part 'p' is the vehicle '.*v\.yaml'; a vehicle is put"):
+    with pytest.raises(ValueError, match=r"v\.yaml: part 'p' is the vehicle '.*v\.yaml'; a vehicle is put"):
         load_document(Vehicle, "vehicles", path)
 
 

@@ -27,6 +27,7 @@ from torchcover.simulation import (
     vertical_fov_deg,
 )
 from torchcover.simulation.sensor import Ranging
+from torchcover.targets import Raster, Target, survey
 
 EGO = BoundingBox((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6))
 AREAS = (((0.0, 20.0), (-5.0, 5.0)), ((-40.0, 160.0), (-40.0, 40.0)))
@@ -218,9 +219,34 @@ def test_a_sensor_is_simulated(sensor):
     assert ranges_m.max() <= exact.max_range_m
 
 
+def test_how_far_a_sensor_reaches_is_decided_by_the_scenario(sensor, monkeypatch):
+    rig = Rig(name="r", sensors=(sensor.model_copy(update={"range_noise_m": 0.0, "dropout": 0.0}),))
+
+    def seen():
+        frames = SimulatedFrames("courtyard", rig, steps=1, reference_sensor=PaperReference(8, 8))
+        return frames[0].reference, (frames[0].sensor.double() - torch.tensor([2.6, 0.0, 1.0])).norm(dim=1)
+
+    def targets():
+        raster = Raster((4.0, 12.0), (-1.0, 7.0), 1.0)
+        return np.nansum(survey(rig, Scenario.load("courtyard"), Target.load("adult"), raster).points)
+
+    (whole, away_m), of_targets = seen(), targets()
+    reach_m = float(away_m.min() + away_m.max()) / 2 - 0.01
+    monkeypatch.setattr(Scenario, "reach_m", lambda *_: reach_m)
+    reference, near_m = seen()
+    assert torch.equal(reference, whole)
+    assert (near_m <= reach_m).all()
+    assert (away_m > reach_m).any()
+    if sensor.beams() is None:  # else points of a beam are made of all its hits
+        assert len(near_m) == (away_m <= reach_m).sum()
+    monkeypatch.setattr(Scenario, "reach_m", lambda *_: 1.0)
+    assert targets() == 0 < of_targets or sensor.type == "altimeter"
+
+
 @pytest.mark.parametrize("content", ["lidar", 3, {"type": ["lidar"]}, {"type": "sonar"}, None])
 def test_what_is_no_sensor_is_refused_with_the_kinds_there_are(content):
-    with pytest.raises(ValueError, match=r"sensors\.0\n.*type: a sensor is a 'lidar' or a 'camera' or a 'radar'; got"):
+    kinds = " or a ".join(map(repr, SENSORS))
+    with pytest.raises(ValueError, match=rf"sensors\.0\n.*type: a sensor is a {kinds}; got"):
         Rig.model_validate({"name": "r", "sensors": [content]})
 
 

@@ -136,7 +136,14 @@ def test_several_rigs_see_the_same_instant_and_share_the_reference():
         _ = both.sensor
 
 
-@pytest.mark.parametrize("given", [{}, {"rig": "front_roof_128", "rigs": {"a": "front_roof_128"}}, {"rigs": {}}])
+def test_of_no_rigs_there_is_the_reference_of_all_others():
+    alone = SimulatedFrames("courtyard", rigs={}, steps=2, seed=3, reference_sensor=SMALL)[1]
+    assert not alone.clouds
+    other = SimulatedFrames("courtyard", "front_roof_128", steps=2, seed=3, reference_sensor=SMALL)[1]
+    assert torch.equal(alone.reference, other.reference)
+
+
+@pytest.mark.parametrize("given", [{}, {"rig": "front_roof_128", "rigs": {"a": "front_roof_128"}}])
 def test_one_rig_or_several_are_needed(given):
     with pytest.raises(ValueError, match="give one rig, or several"):
         SimulatedFrames("courtyard", steps=1, **given)

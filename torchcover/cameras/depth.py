@@ -174,10 +174,6 @@ def usable(depth: Tensor, max_depth: float) -> Tensor:
 def count_unusable(depth: Tensor, max_depth: float) -> dict[str, int]:
     """How many depths `usable` refuses, by reason.
 
-    Args:
-        depth: Depths of any shape.
-        max_depth: Largest depth that counts as a measurement.
-
     Returns:
         `depth_zero`, `depth_negative` (with minus infinity), `depth_nan`, `depth_infinite`, `depth_beyond_range`.
 

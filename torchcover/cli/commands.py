@@ -213,7 +213,7 @@ def search(
     optimiser: Annotated[
         str, typer.Option(help="auto, gp (Gaussian process), cmaes (extra `search`), enumerate (choices) or random.")
     ] = "auto",
-    measure: Annotated[
+    estimate: Annotated[
         Literal["area", "known"],
         typer.Option(help="What a score is: `area`, the share of the visible surface, or `known`, of the known cells."),
     ] = "area",
@@ -228,9 +228,14 @@ def search(
     ] = None,
     workers: Annotated[int, typer.Option(min=0, help="Processes that score; 0 scores in this one.")] = 0,
     resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the evaluations in --out, whatever ended that search.")
+        bool,
+        typer.Option(
+            "--resume",
+            help="Go on from the evaluations in --out, whatever ended that search, and keep them at the end.",
+        ),
     ] = False,
     out: options.Out = Path("out/search"),
+    files: options.Files = options.ALL_FILES,
 ) -> None:
     """Look for better places for sensors, compared with a random search, and test what was found in fresh worlds."""
     from torchcover.cli.search_run import run
@@ -243,10 +248,11 @@ def search(
         space,
         out,
         resume=resume,
+        files=files,
         evaluations=evaluations,
         budget_s=None if budget is None else parsed_budget(budget),
         optimiser=optimiser,
-        measure=measure,
+        estimate=estimate,
         seed=seed,
         test_seed=test_seed,
         workers=workers,

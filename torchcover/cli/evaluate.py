@@ -264,5 +264,5 @@ def finish(
     if result.run is None:
         return
     if checkpoint and result.run.complete and not checkpoint.keep:
-        checkpoint.of(ranks).path.unlink(missing_ok=True)
+        checkpoint.of(ranks.rank if ranks else 0).path.unlink(missing_ok=True)
     result.run.raise_failure()

@@ -9,7 +9,6 @@ from rich.table import Table
 
 from torchcover.evaluation import (
     AgreementStudy,
-    Omission,
     Result,
     Study,
     StudyPlan,
@@ -20,8 +19,23 @@ from torchcover.evaluation import (
     verdict,
 )
 from torchcover.evaluation.agreeing import NOTES
+from torchcover.evaluation.result_page import left_out_table
 from torchcover.published.comparison import text_tables
-from torchcover.report import error_words, narrowest_width, print_table, shown_unit, text_table
+from torchcover.report import PageTable, error_words, narrowest_width, print_table, shown_unit, text_table
+
+
+def print_whole(tables: Sequence[Table]) -> None:
+    """Print tables as wide as they are: rather lines that are too long than numbers that are cut off."""
+    console = Console()
+    console.width = max(console.width, narrowest_width(tables))
+    for table in tables:
+        console.print(table)
+
+
+def in_words(table: PageTable) -> Table:
+    """A table of a page, for the terminal."""
+    rows = [[words.text for words in row] for row in table.rows]
+    return text_table(table.headings, [rows], title=table.title, caption="\n".join(table.notes))
 
 
 def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:
@@ -29,12 +43,9 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
     console = Console()
     print_table(result.table, console)
     if result.metrics:
-        tables = text_tables(result.metrics)
-        wide = Console(width=max(console.width, narrowest_width(tables)))
-        for table in tables:
-            wide.print(table)
+        print_whole(text_tables(result.metrics))
     if explain and result.left_out:
-        console.print(_explanation(result.left_out))
+        print_whole([in_words(left_out_table(result.left_out))])
     for line in result.run.skipped if result.run else ():
         console.print(f"skipped: {line}", style="yellow", markup=False)
     for line in result.target_lines:
@@ -55,11 +66,7 @@ def print_files(files: Sequence[Path], out: Path, console: Console) -> None:
 def print_study(study: Study, files: Sequence[Path], out: Path) -> None:
     """The tables, and the settings that are recommended."""
     console, quantities = Console(), study.quantities
-    tables = study_table(study.points, quantities), stage_table(study.stages)
-    # Rather lines that are too long than numbers that are cut off.
-    wide = Console(width=max(console.width, narrowest_width(tables)))
-    for table in tables:
-        wide.print(table)
+    print_whole([study_table(study.points, quantities), stage_table(study.stages)])
     floor = [
         f"{error_words(study.truth.errors[one.key], one.unit)} {shown_unit(one.unit).difference_name}"
         for one in quantities
@@ -91,9 +98,7 @@ def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> 
         ]
         title = f"Spearman correlation with what detectors reached, rolls in {reading}; 95 % intervals"
         tables.append(text_table(("metric", *truths), [rows], title=title, caption=DETECTORS_ONLY))
-    wide = Console(width=max(console.width, narrowest_width(tables)))
-    for table in tables:
-        wide.print(table)
+    print_whole(tables)
     for truth in truths:
         console.print(verdict(truth, {one: study.found[truth, one] for one in readings}), markup=False, soft_wrap=True)
     for note in NOTES:
@@ -110,13 +115,3 @@ def advice(wanted: float, point: WorkPoint | None, plan: StudyPlan) -> str:
         f"For {100 * wanted:g} percentage points of detection: --rays {point.rays} --steps {point.steps}{every} "
         f"({point.seconds:.0f} s)."
     )
-
-
-def _explanation(omissions: Sequence[Omission]) -> Table:
-    rows = []
-    for omission in omissions:
-        count, of = omission.count, omission.of
-        numbers = ("", "", "") if count is None or of is None else (f"{count:,}", f"{of:,}", f"{count / of:.1%}")
-        rows.append((omission.what, *numbers))
-    headings = ("what", "count", "of", "share")
-    return text_table(headings, [rows], title="Left out, for this run did not need it")

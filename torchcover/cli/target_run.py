@@ -1,19 +1,18 @@
 """What `torchcover targets` does and prints."""
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
-from rich.table import Table
 
-from torchcover.cli.printing import print_files
+from torchcover.cli.printing import in_words, print_files, print_whole
 from torchcover.evaluation import save_targets, survey_target
 from torchcover.evaluation.rerun_log import write_target
+from torchcover.evaluation.target_survey import places_table, sides_table
 from torchcover.files import claimed
-from torchcover.report import percent, text_table
 from torchcover.simulation import Rig
-from torchcover.targets import Heading, Place, Raster, Requirements, TargetMap, Verdict, check
+from torchcover.targets import Heading, Raster, Requirements, TargetMap, Verdict, check
 
 FAILED = 1
 
@@ -23,18 +22,13 @@ def run(
     target: str,
     scenario: str | None,
     *,
-    vehicle: str | None = None,
     raster: str | None,
-    steps: int | None,
-    every_s: float | None = None,
-    seed: int,
-    hits: int,
-    threshold_m: float,
     heading: str,
     require: Path | None,
     rerun: Path | None,
     out: Path,
     files: str,
+    **settings: Any,  # noqa: ANN401  (those of `survey_target`)
 ) -> int:
     """Survey a target, write and print what is seen, judge it.
 
@@ -51,14 +45,9 @@ def run(
             rig,
             target,
             scenario,
-            vehicle=vehicle,
             raster=None if raster is None else parsed_raster(raster),
-            steps=steps,
-            every_s=every_s,
-            seed=seed,
-            hits=hits,
-            threshold_m=threshold_m,
             heading=parsed_heading(heading),
+            **settings,
         )
         verdicts = [] if requirements is None else check(requirements, seen)
         sensors = Rig.load(rig).sensors
@@ -105,53 +94,19 @@ def parsed_heading(text: str) -> Heading:
 
 def _print(seen: TargetMap, verdicts: Sequence[Verdict], not_checked: Sequence[str]) -> None:
     console = Console()
-    console.print(_sides_table(seen))
-    console.print(_places_table(seen.worst(), "The places with the fewest points, 1 m apart"))
+    length, width, height = seen.target_size_m
+    size = f"{length:.2f} x {width:.2f} x {height:.2f} m"
+    console.print(f"{seen.rig} sees {seen.target} ({size}), in {seen.scenario}", markup=False, soft_wrap=True)
+    worst = places_table(seen.worst(), "The places with the fewest points, 1 m apart")
+    print_whole([in_words(sides_table(seen)), in_words(worst)])
     if unknown := seen.counts["share_unknown"]:
         console.print(f"{unknown:,} places show no surface to any random place: their share is unknown.")
     for verdict in verdicts:
         console.print(_sentence(verdict), markup=False, soft_wrap=True)
         if verdict.worst:
-            console.print(_places_table(verdict.worst, "where not, the nearest first"))
+            print_whole([in_words(places_table(verdict.worst, "where not, the nearest first"))])
     for words in not_checked:
         console.print(f"not checked, as it is not about {seen.target}: {words}", markup=False, soft_wrap=True)
-
-
-def _sides_table(seen: TargetMap) -> Table:
-    sides = seen.sides()
-    within = list(dict.fromkeys(side.within_m for side in sides))
-    rows, unseen_to_m = [], seen.unseen_to_m()
-    for name in dict.fromkeys(side.side for side in sides):
-        of_side = [side for side in sides if side.side == name]
-        shares = ("-" if side.cells == 0 else f"{percent(side.seen)} %" for side in of_side)
-        rows.append([name, *shares, _unseen(unseen_to_m[name])])
-    headings = ("side", *(f"within {limit_m:g} m" for limit_m in within), "unseen to")
-    length, width, height = seen.target_size_m
-    title = f"{seen.rig} sees {seen.target} ({length:.2f} x {width:.2f} x {height:.2f} m), in {seen.scenario}"
-    caption = f"Share of free places with {seen.hits} points or more" + ", mean over the steps" * (seen.step_count > 1)
-    return text_table(headings, [rows], title=title, caption=caption)
-
-
-def _unseen(to_m: float) -> str:
-    if math.isnan(to_m):
-        return "-"
-    return f"{to_m:.2f} m" if to_m else "nowhere"
-
-
-def _places_table(places: Sequence[Place], title: str) -> Table:
-    rows = [
-        (
-            place.side,
-            f"{place.x_m:.2f}",
-            f"{place.y_m:.2f}",
-            f"{place.distance_m:.2f}",
-            f"{place.points:.4g}",
-            f"{place.sensors:.3g}",
-            "unknown" if place.share != place.share else f"{percent(place.share)} %",
-        )
-        for place in places
-    ]
-    return text_table(("side", "x (m)", "y (m)", "distance (m)", "points", "sensors", "surface"), [rows], title=title)
 
 
 def _sentence(verdict: Verdict) -> str:

@@ -25,7 +25,7 @@ from torchcover.coverage.regions import Region
 from torchcover.estimation import Quantity
 from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
 
-FORMAT_VERSION = 5
+FORMAT_VERSION = 6
 Arrays = dict[str, NDArray[Any]]
 # Steps, cells, what is divided by, sums.
 IN_BLOCKS = ("block_steps", "block_cell", "block_probed_steps", "block_sums")
@@ -64,7 +64,13 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
     aggregated = parts["aggregated"]
     header = {
         "format": FORMAT_VERSION,
-        "grid": {"x": grid.x, "y": grid.y, "cell": grid.cell, "heights": dict(grid.heights)},
+        "grid": {
+            "x": grid.x,
+            "y": grid.y,
+            "cell": grid.cell,
+            "heights": dict(grid.heights),
+            "band_frame": grid.band_frame,
+        },
         "thresholds": parts["thresholds"],
         "max_radius": parts["max_radius"],
         "layers": [layer.quantity._asdict() for layer in parts["layers"]],
@@ -125,7 +131,13 @@ def _check_kind(header: NpyHeader) -> None:
 def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
     stored = header["grid"]
     heights = {name: (band[0], band[1]) for name, band in stored["heights"].items()}
-    grid = BevGrid(x=tuple(stored["x"]), y=tuple(stored["y"]), cell=stored["cell"], heights=heights)
+    grid = BevGrid(
+        x=tuple(stored["x"]),
+        y=tuple(stored["y"]),
+        cell=stored["cell"],
+        heights=heights,
+        band_frame=stored["band_frame"],
+    )
     layers = _layers(header["layers"], grid, arrays)
     for name in ("probed_steps", "points"):
         _check_shape(name, grid, arrays)

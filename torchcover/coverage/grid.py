@@ -1,15 +1,18 @@
 """The bird's-eye-view grid: which cell a point belongs to. Bins are half-open, [lo, hi), on every axis."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
-from torchcover.coverage.borders import borders_below, edges_below, with_ends
+from torchcover.coverage.binning import borders_below, edges_below, with_ends
+
+# What heights are measured from: the local ground, or z = 0 of the vehicle frame, which pitches and rolls.
+BandFrame = Literal["ground", "vehicle"]
 
 # Height bands of Uecker & Zöllner 2024.
 PAPER_HEIGHTS: Mapping[str, tuple[float, float]] = MappingProxyType({"ground": (-0.5, 0.5), "obstacle": (0.5, 2.0)})
@@ -40,7 +43,7 @@ class Bins(NamedTuple):
 
 @dataclass(frozen=True)
 class BevGrid:
-    """Square cells over x and y in the vehicle frame, in height bands over z.
+    """Square cells over x and y in the vehicle frame, in height bands over the ground or over its z.
 
     A cell's number is `(h * Y + y) * X + x`; arrays over the grid have the shape (H, Y, X).
 
@@ -48,12 +51,14 @@ class BevGrid:
         x: Lower and upper bound forward, in metres.
         y: Lower and upper bound to the left, in metres.
         cell: Side of a cell in metres. The extents must be multiples of it.
-        heights: Name of each height band -> lower and upper bound of z in metres. Bands may overlap, and leave gaps.
-            The default is the paper's: ground [-0.5, 0.5) and obstacle [0.5, 2.0).
+        heights: Name of each height band -> lower and upper bound in metres. Bands may overlap, and leave gaps. The
+            default is the paper's: ground [-0.5, 0.5) and obstacle [0.5, 2.0).
+        band_frame: What these are bounds of: "vehicle", z of the vehicle frame, or "ground", the height above the local
+            ground, which every point is then to come with.
 
     Raises:
         ValueError: Inverted or infinite bounds, a cell that is not positive, an extent that is not a multiple of the
-            cell, no band, or more than 1e8 cells.
+            cell, no band, another band frame, or more than 1e8 cells.
 
     Example:
         >>> grid = BevGrid(x=(0.0, 20.0), y=(-5.0, 5.0), cell=0.5)
@@ -67,6 +72,7 @@ class BevGrid:
     y: tuple[float, float]
     cell: float = 0.25
     heights: Mapping[str, tuple[float, float]] = field(default_factory=lambda: dict(PAPER_HEIGHTS))
+    band_frame: BandFrame = "vehicle"
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.cell) and self.cell > 0):
@@ -75,6 +81,8 @@ class BevGrid:
             _check_bounds(axis, bounds)
             _check_multiple(axis, bounds, self.cell)
         _check_heights(self.heights)
+        if self.band_frame not in get_args(BandFrame):
+            raise ValueError(f"band_frame: ground or vehicle is needed; got {self.band_frame!r}")
         if math.prod(self.shape) > MAX_CELLS:
             raise ValueError(f"the grid has {math.prod(self.shape):,} cells, over {MAX_CELLS:,}: use larger cells")
         self._normalise()
@@ -95,7 +103,7 @@ class BevGrid:
 
     @property
     def _key(self) -> tuple[object, ...]:
-        return self.x, self.y, self.cell, tuple(self.heights.items())
+        return self.x, self.y, self.cell, tuple(self.heights.items()), self.band_frame
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -134,30 +142,34 @@ class BevGrid:
         """(Y,) float64 cell centres along y."""
         return _centres(self.y, self.cell)
 
-    def cell_of(self, points: Tensor) -> Tensor:
+    def cell_of(self, points: Tensor, height: Tensor | None = None) -> Tensor:
         """Number of the cell of each point, in a grid whose bands do not overlap.
 
         Args:
             points: (N, 3) coordinates in metres, any floating-point type.
+            height: (N,) metres above the local ground, of a grid whose band frame it is, and of no other; NaN, where
+                there is no ground at or below a point, is in no band.
 
         Returns:
             (N,) int64 cell numbers; -1 for a point outside every cell or band.
 
         Raises:
-            ValueError: Another shape, or bands that overlap, so that a point has several cells: see `bins`.
+            ValueError: Another shape, heights that are missing or of no use, or bands that overlap, so that a point has
+                several cells: see `bins`.
         """
         if len(self._tiers) > 1:
             raise ValueError("the height bands overlap, so that a point may be in several cells: use `bins`")
-        return self._cells_of(points)[0]
+        return self._cells_of(points, height)[0]
 
-    def bins(self, points: Tensor) -> Bins:
+    def bins(self, points: Tensor, height: Tensor | None = None) -> Bins:
         """The cells that points are in, several where bands overlap.
 
         Args:
             points: As in `cell_of`.
+            height: As in `cell_of`.
 
         Raises:
-            ValueError: Another shape.
+            ValueError: Another shape, heights that are missing or of no use.
 
         Example:
             >>> bands = {"dog": (0.05, 0.5), "child": (0.1, 1.1)}
@@ -165,7 +177,7 @@ class BevGrid:
             >>> grid.bins(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.3], [1.5, 0.5, 0.9]]))
             Bins(inside=tensor([1, 2]), of=tensor([0, 0, 1]), cell=tensor([0, 2, 3]))
         """
-        cells = self._cells_of(points)
+        cells = self._cells_of(points, height)
         within = cells >= 0
         inside = within.any(dim=0).nonzero().squeeze(1)
         if len(cells) == 1:
@@ -173,29 +185,29 @@ class BevGrid:
         tier, of = within[:, inside].nonzero(as_tuple=True)
         return Bins(inside, of, cells[tier, inside[of]])
 
-    def points_by_column(self, points: Tensor) -> Tensor:
+    def points_by_column(self, points: Tensor, height: Tensor | None = None) -> Tensor:
         """How many points lie above each square of ground, in each band: what counting `bins` gives, sooner.
 
         Args:
             points: As in `cell_of`.
+            height: As in `cell_of`.
 
         Returns:
             (Y, X) float64.
 
         Raises:
-            ValueError: Another shape.
+            ValueError: Another shape, heights that are missing or of no use.
 
         Example:
             >>> grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0)
             >>> grid.points_by_column(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.9], [1.5, 0.5, 9.0]]))
             tensor([[2., 0.]], dtype=torch.float64)
         """
-        parts = _parts_of(points)
+        parts = self._parts_of(points, height)
         _, rows, columns = (count + 2 for count in self.shape)  # with a border for what is beyond
         x_bounds, y_bounds = self._bounds_on(points.device)
         count = torch.zeros(rows * columns, dtype=torch.float64, device=points.device)
-        for part in parts:
-            x, y, z = (part[:, axis].double() for axis in range(3))
+        for x, y, z in parts:
             place = edges_below(y, y_bounds, *self.y).mul_(columns).add_(edges_below(x, x_bounds, *self.x))
             bands = torch.zeros_like(z)
             for low, high in self.heights.values():
@@ -215,9 +227,9 @@ class BevGrid:
                 tiers.append([band])
         return tiers
 
-    def _cells_of(self, points: Tensor) -> Tensor:
+    def _cells_of(self, points: Tensor, height: Tensor | None) -> Tensor:
         """(tiers, N) int64 cell numbers, -1 for none."""
-        parts = _parts_of(points)
+        parts = self._parts_of(points, height)
         _, rows, columns = self.shape
         x_bounds, y_bounds = self._bounds_on(points.device)
         steps = torch.arange(columns), torch.arange(rows) * columns
@@ -229,26 +241,48 @@ class BevGrid:
             borders = [border for band in bands for border in bounds[band]]
             tiers.append((borders, with_ends(terms, OUTSIDE).to(points.device)))
 
-        def cells_of(points: Tensor) -> Tensor:
-            x, y, z = (points[:, axis].double() for axis in range(3))
+        def cells_of(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
             place = x_terms.index_select(0, edges_below(x, x_bounds, *self.x))
             place += y_terms.index_select(0, edges_below(y, y_bounds, *self.y))
             in_tiers = [place + z_terms.index_select(0, borders_below(z, borders)) for borders, z_terms in tiers]
             return torch.stack(in_tiers).clamp_(min=-1)
 
-        return torch.cat([cells_of(some) for some in parts], dim=1)
+        return torch.cat([cells_of(*part) for part in parts], dim=1)
 
     def _bounds_on(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """The borders along x and along y as `edges_below` takes them."""
         x, y = (with_ends(edges, math.nan).to(device) for edges in (self.x_edges_m, self.y_edges_m))
         return x, y
 
+    def _parts_of(self, points: Tensor, height: Tensor | None) -> Iterator[tuple[Tensor, ...]]:
+        """Float64 x, y and what bands are of, in parts that stay in the processor's cache; a GPU takes all at once."""
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"points: shape (N, 3) is needed; got {tuple(points.shape)}")
+        self.check_height(points, height)
+        each = (points[:, 0], points[:, 1], points[:, 2] if height is None else height.to(points.device))
+        size = PART if points.device.type == "cpu" else max(len(points), 1)
+        parts = zip(*(torch.split(values.detach(), size) for values in each), strict=True)
+        return (tuple(values.double() for values in part) for part in parts)
 
-def _parts_of(points: Tensor) -> Sequence[Tensor]:
-    """The points in parts that stay in the processor's cache; a GPU takes all at once."""
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"points: shape (N, 3) is needed; got {tuple(points.shape)}")
-    return torch.split(points.detach(), PART if points.device.type == "cpu" else max(len(points), 1))
+    def check_height(self, points: Tensor, height: Tensor | None, name: str = "height") -> None:
+        """Refuse heights that do not go with the bands.
+
+        Args:
+            points: (N, 3) points.
+            height: Their heights above the local ground, if there are any.
+            name: What messages call them.
+
+        Raises:
+            ValueError: None where bands are over the ground, any where they are over z; other than one for each point.
+        """
+        if height is None:
+            if self.band_frame == "ground" and len(points):
+                raise ValueError(f"{name}: bands over the ground need the heights of points above it; got none")
+        elif self.band_frame == "vehicle":
+            raise ValueError(f"{name}: of no use for bands over z of the vehicle; use BevGrid(band_frame='ground')")
+        elif height.shape != points.shape[:1]:
+            needed = f"({len(points)},), one for each point,"
+            raise ValueError(f"{name}: shape {needed} is needed; got {tuple(height.shape)}")
 
 
 def _check_bounds(name: str, bounds: tuple[float, float]) -> None:

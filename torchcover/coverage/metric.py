@@ -11,12 +11,14 @@ from torchcover.coverage.aggregations import Aggregation, BinnedStep, Layer, Mea
 from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.blocks import AreaSums, Blocks, BlockSumsT
 from torchcover.coverage.grid import BevGrid
+from torchcover.coverage.measures import Measure, estimate_area
 from torchcover.coverage.plotting import draw_coverage
 from torchcover.coverage.redundancy import PlaceSums, Redundancy, SensorFailures
 from torchcover.coverage.region_sums import IN_REGIONS, RegionSums
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.steps import CheckedStep, Clouds, SensorClouds, as_list, check_parameters, checked_steps
+from torchcover.estimation import Estimate
 from torchcover.metrics import SumsInBlocks, figure_of
 from torchcover.neighbors import nearest
 
@@ -42,7 +44,7 @@ class CoverageMetric(SumsInBlocks):
     The state is part of `state_dict()`; `metric.persistent(False)` takes it out.
 
     Args:
-        grid: Cells and height bands.
+        grid: Cells and height bands; its `band_frame` decides whether `update` needs heights above the ground.
         thresholds: Radii in metres up to which a point counts as detected, each of them finite, >= 0 and at most
             `max_radius`.
         max_radius: Saturation of r in metres. An empty sensor cloud gives r = `max_radius`: with the default,
@@ -85,6 +87,7 @@ class CoverageMetric(SumsInBlocks):
     saturated_points: Tensor
     inside_points: Tensor
     outside_points: Tensor
+    no_ground_points: Tensor
 
     def __init__(
         self,
@@ -159,6 +162,7 @@ class CoverageMetric(SumsInBlocks):
         reference: Clouds,
         *,
         weights: Clouds | None = None,
+        height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
     ) -> None:
         """Add one step, or one step for each entry of two lists.
@@ -171,14 +175,17 @@ class CoverageMetric(SumsInBlocks):
             weights: (M,) square metres that each reference point stands for (`frame.reference_weights`), or a list of
                 the same length: what it weighs in the mean over its cell in its step, and in the estimate by area. Not
                 given: all weigh the same.
+            height: (M,) height of each reference point above the local ground (`frame.reference_heights_m`), or a list
+                of the same length, for a grid whose `band_frame` is "ground", and no other. NaN, where there is no
+                ground at or below a point: it is in no band, and counted.
             place_in_time: Number of the step, 10^15 at most, or a list of them (`frame.place_in_time`); it decides
                 about the block, so that steps of one number, as of an instant that is seen again, share one. Not
                 given: counted on from the steps so far.
 
         Raises:
             ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights
-                that are not positive and finite, none where there is to be an estimate by area, a place in time that is
-                negative or too large.
+                that are not positive and finite, none where there is to be an estimate by area, heights that are
+                infinite, or missing or of no use for the grid, a place in time that is negative or too large.
             TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
         """
         if self.square_metres and weights is None:
@@ -186,7 +193,16 @@ class CoverageMetric(SumsInBlocks):
                 "weights: the square metres of each reference point are needed, as a SurfaceReference gives them; got "
                 "none (without square_metres=True, points may do without)"
             )
-        for step in checked_steps(sensor, reference, weights, place_in_time, names=self.sensors, first=int(self.steps)):
+        for step in checked_steps(
+            sensor,
+            reference,
+            weights,
+            height,
+            place_in_time,
+            grid=self.grid,
+            names=self.sensors,
+            first=int(self.steps),
+        ):
             self._add_step(step)
 
     def forward(
@@ -195,18 +211,21 @@ class CoverageMetric(SumsInBlocks):
         reference: Clouds,
         *,
         weights: Clouds | None = None,
+        height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
         if place_in_time is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
             place_in_time = [int(self.steps) + step for step in range(len(as_list(reference, "reference")))]
-        coverage: Coverage = super().forward(sensor, reference, weights=weights, place_in_time=place_in_time)
+        coverage: Coverage = super().forward(
+            sensor, reference, weights=weights, height=height, place_in_time=place_in_time
+        )
         return coverage
 
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
     def _add_step(self, step: CheckedStep) -> None:
-        sensors, reference, weights, place_in_time = step
-        inside, of, cell = self.grid.bins(reference)
+        sensors, reference, weights, height, place_in_time = step
+        inside, of, cell = self.grid.bins(reference, height)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
         each = [self._distance(reference[inside], cloud.to(reference.device)) for cloud in sensors.values()]
         of_sensors = torch.stack(each) if self.sensors else None
@@ -221,6 +240,7 @@ class CoverageMetric(SumsInBlocks):
         self.empty_reference_steps += len(reference) == 0
         self.inside_points += len(distance)
         self.outside_points += len(reference) - len(distance)
+        self.no_ground_points += 0 if height is None else height.isnan().sum().to(device)
         self.saturated_points += (distance >= self.max_radius).sum().to(device)
 
     def _distance(self, reference: Tensor, cloud: Tensor) -> Tensor:
@@ -259,6 +279,26 @@ class CoverageMetric(SumsInBlocks):
             aggregated=self._in_regions.numbers(self._sums_of(IN_REGIONS), self.max_radius),
             redundancy=self._redundancy(probed_steps) if self.sensors else None,
         )
+
+    def estimates(self, places: Sequence[tuple[Region, str]], measure: Measure) -> list[Estimate]:
+        """The numbers of regions in bands so far: those of `compute().estimate`, but no maps are made for them.
+
+        Args:
+            places: Regions within the grid, each with the name of a band.
+            measure: What the numbers are means over, as there.
+
+        Raises:
+            ValueError: As there.
+        """
+        if measure == "known" or not self.square_metres:
+            coverage = self.compute()
+            return [coverage.estimate(region, height, measure) for region, height in places]
+        area, quantities = self._listed(AreaSums, self.area_m2, self.area_sums), MeanOfMeans(self.thresholds).quantities
+        bands = list(self.grid.heights)
+        return [
+            estimate_area(quantities, area, bands.index(height), region.mask(self.grid).to(area.at.device))
+            for region, height in places
+        ]
 
     def _layers(self, aggregation: Aggregation, probed_steps: Tensor) -> list[Layer]:
         found = aggregation.layers(self._sums_of(aggregation.name), probed_steps, self.max_radius)

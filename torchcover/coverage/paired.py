@@ -16,14 +16,14 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
         coverages: By the name of the rig.
 
     Raises:
-        ValueError: Fewer than two, or two that differ in the grid, the thresholds, the limit of the radius, the steps
-            or the reference points of any cell, and so in the cells that they know.
+        ValueError: Fewer than two, or two that differ in the grid, its band frame, the thresholds, the limit of the
+            radius, the steps or the reference points of any cell, and so in the cells that they know.
     """
     if len(coverages) < 2:
         raise ValueError(f"a comparison needs at least two rigs; got {', '.join(coverages) or 'none'}")
     (first, expected), *others = coverages.items()
     for name, coverage in others:
-        for what in ("grid", "thresholds", "max_radius"):
+        for what in ("band_frame", "grid", "thresholds", "max_radius"):
             if getattr(coverage, what) != getattr(expected, what):
                 raise ValueError(f"{first!r} and {name!r} cannot be compared: they differ in their {what}")
         if coverage.measure != expected.measure or coverage.layers.keys() != expected.layers.keys():

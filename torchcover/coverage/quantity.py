@@ -50,9 +50,6 @@ def without(sensor: str, quantity: Quantity) -> Quantity:
 def by_area(quantity: Quantity) -> Quantity:
     """The same over the surface that the reference sees, where every square metre weighs the same.
 
-    Args:
-        quantity: That of the mean of means.
-
     Example:
         >>> by_area(detection(0.4)).key, by_area(RADIUS).title
         ('detection_area_0.4m', 'mean blind spot radius, by area')

@@ -94,15 +94,8 @@ class RegionSums:
             unknown = torch.full_like(each[0], math.nan)
             values.append(torch.stack(each if in_blocks else [*each, *[unknown] * (len(choices) - 1)]))
         found = torch.cat(values, dim=2)
-        quantities = tuple(quantity for one in self.aggregations for quantity in region_quantities(one))
+        quantities = tuple(quantity for one in self.aggregations for quantity in one.quantities)
         return PlaceNumbers(quantities, found[0], found[1:])
 
     def _of(self, aggregation: Aggregation, sums: Mapping[str, Tensor]) -> dict[str, Tensor]:
         return {name: sums[f"{aggregation.name}_{name}"] for name in aggregation.states(self.places.count)}
-
-
-def region_quantities(aggregation: Aggregation) -> tuple[Quantity, ...]:
-    """What an aggregation gives a number of each region of, before it has seen anything."""
-    empty = {name: state.initial.clone() for name, state in aggregation.states(1).items()}
-    nothing = torch.zeros(1, dtype=torch.int64)
-    return tuple(layer.quantity for layer in aggregation.layers(empty, nothing, math.inf))

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchcover.coverage.aggregations import Layer, MeanOfMeans
 from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
-from torchcover.coverage.grid import BevGrid
+from torchcover.coverage.grid import BandFrame, BevGrid
 from torchcover.coverage.measures import Measure, area_in_blocks, errors_of_cells, estimate_area, estimate_known
 from torchcover.coverage.quantity import RADIUS, by_area, over_known
 from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
@@ -56,6 +56,7 @@ class Coverage:
         "saturated_points",
         "inside_points",
         "outside_points",
+        "no_ground_points",
     )
 
     def __init__(
@@ -96,6 +97,11 @@ class Coverage:
     def quantities(self) -> tuple[Quantity, ...]:
         """What there is one number of for each region: the mean radius, then the detection at each threshold."""
         return MeanOfMeans(self.thresholds).quantities
+
+    @property
+    def band_frame(self) -> BandFrame:
+        """What the height bands are over: "ground", the local ground, or "vehicle", z of the vehicle frame."""
+        return self.grid.band_frame
 
     @property
     def radius(self) -> Tensor:
@@ -178,9 +184,7 @@ class Coverage:
     def _estimate(self, region: Region, height: str, measure: Measure) -> Estimate:
         check_regions([region], self.grid)
         cells = region.mask(self.grid).to(self.radius.device)
-        if height not in self.grid.heights:
-            raise ValueError(f"height {height!r}: the grid has {', '.join(self.grid.heights)}")
-        band = list(self.grid.heights).index(height)
+        band = self._band(height)
         if measure == "area":
             return estimate_area(self.quantities, self.area, band, cells)
         known = cells & (self.probed_steps[band] > 0)
@@ -246,17 +250,8 @@ class Coverage:
             `"radius_m/20m/ground"`, `"detection_0.4m/20m/ground"`, `"known_share/20m/ground"` and so on, and
             `"visible_m2/20m/ground"` if the reference points had square metres.
         """
-        flat = {}
-        for row in self.summary(regions):
-            place = f"{row.region}/{row.height}"
-            for key, number in row.numbers.items():
-                flat[f"{key}/{place}"] = number.value
-                if self.blocks is not None:
-                    flat[f"{key}_error/{place}"] = number.error
-            flat[f"known_share/{place}"] = row.known_share
-            if row.measure == "area":
-                flat[f"visible_m2/{place}"] = row.visible_m2
-        return flat
+        rows = self.summary(regions)
+        return {key: value for row in rows for key, value in row.scalars(errors=self.blocks is not None).items()}
 
     def save(self, path: str | Path) -> None:
         """Write everything to one `.npz` file, which NumPy reads too: maps and their errors by key, and the blocks.
@@ -279,7 +274,7 @@ class Coverage:
         return cls(**read_coverage(path))
 
     def _summarise(self, region: Region, height: str) -> RegionSummary:
-        cells, band = region.mask(self.grid), list(self.grid.heights).index(height)
+        cells, band = region.mask(self.grid), self._band(height)
         probed = self.probed_steps[band].cpu()[cells]
         known_cells = int((probed > 0).sum())
         numbers = partial(Estimate.numbers, count=known_cells, count_of="known cells")
@@ -312,6 +307,8 @@ class Coverage:
         return estimate_redundancy(self.redundancy, with_all, self._place(region, height), self._band(height), known)
 
     def _band(self, height: str) -> int:
+        if height not in self.grid.heights:
+            raise ValueError(f"height {height!r}: the grid has {', '.join(self.grid.heights)}")
         return list(self.grid.heights).index(height)
 
     def _place(self, region: Region, height: str) -> int | None:

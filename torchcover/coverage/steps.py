@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
+from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.quantity import detection
 from torchcover.coverage.redundancy import SensorFailures
 from torchcover.coverage.region_sums import IN_REGIONS
@@ -27,7 +28,7 @@ SensorClouds: TypeAlias = Clouds | Mapping[str, Tensor] | Sequence[Mapping[str, 
 
 
 class CheckedStep(NamedTuple):
-    """One step: clouds in the vehicle frame, weights of the reference points, and its number in time.
+    """One step: clouds in the vehicle frame, weights and heights of the reference points, and its number in time.
 
     `sensors` has those of the rig by the names of the sensors; one without a name if they are not told apart.
     """
@@ -35,6 +36,7 @@ class CheckedStep(NamedTuple):
     sensors: Mapping[str, Tensor]
     reference: Tensor
     weights: Tensor | None
+    height: Tensor | None
     number: int
 
 
@@ -77,8 +79,10 @@ def checked_steps(
     sensor: SensorClouds,
     reference: Clouds,
     weights: Clouds | None,
+    height: Clouds | None,
     place_in_time: int | Sequence[int] | None,
     *,
+    grid: BevGrid,
     names: Sequence[str] = (),
     first: int,
 ) -> list[CheckedStep]:
@@ -88,13 +92,16 @@ def checked_steps(
         sensor: As in `CoverageMetric.update`, and so are the others.
         reference: Reference points.
         weights: Their weights.
+        height: Their heights above the local ground.
         place_in_time: Numbers of the steps in time.
+        grid: Which needs heights, or does not.
         names: Of the sensors, where they are told apart.
         first: Number of the first step if `place_in_time` is not given.
 
     Raises:
         ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights that are
-            not positive and finite, a place in time that is negative or above 10^15.
+            not positive and finite, heights that are infinite or do not go with the grid, a place in time that is
+            negative or above 10^15.
         TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
     """
     rigs = [sensor] if isinstance(sensor, Mapping) else as_list(sensor, "sensor")
@@ -102,20 +109,23 @@ def checked_steps(
     references = as_list(reference, "reference")
     count = len(references)
     every_weights: Sequence[Tensor | None] = [None] * count if weights is None else as_list(weights, "weights")
+    every_height: Sequence[Tensor | None] = [None] * count if height is None else as_list(height, "height")
     numbers = list(range(first, first + count)) if place_in_time is None else _numbers(place_in_time)
     if len(sensors) != count:
         raise ValueError(f"{len(sensors)} sensor clouds for {count} reference clouds; one pair a step")
-    if len(every_weights) != count or len(numbers) != count:
+    if {len(every_weights), len(every_height), len(numbers)} != {count}:
         raise ValueError(
-            f"{len(every_weights)} weights and {len(numbers)} places in time for {count} reference clouds; one a step "
-            "each"
+            f"{len(every_weights)} weights, {len(every_height)} heights and {len(numbers)} places in time for {count} "
+            "reference clouds; one a step each"
         )
-    steps = [CheckedStep(*parts) for parts in zip(sensors, references, every_weights, numbers, strict=True)]
+    each = zip(sensors, references, every_weights, every_height, numbers, strict=True)
+    steps = [CheckedStep(*parts) for parts in each]
     for at, step in enumerate(steps):
         for name, cloud in step.sensors.items():
             check_cloud(cloud, f"sensor[{at}]" + f"[{name!r}]" * bool(name))
         check_cloud(step.reference, f"reference[{at}]")
         _check_weights(step.weights, len(step.reference), f"weights[{at}]")
+        _check_height(step.height, step.reference, grid, f"height[{at}]")
         if not 0 <= step.number <= MAX_NUMBER:
             raise ValueError(f"place_in_time[{at}]: a number from 0 to {MAX_NUMBER:,} is needed; got {step.number}")
     return steps
@@ -171,3 +181,11 @@ def _check_weights(weights: Tensor | None, points: int, name: str) -> None:
         )
     if not bool(((weights > 0) & weights.isfinite()).all()):
         raise ValueError(f"{name}: positive, finite numbers are needed")
+
+
+def _check_height(height: Tensor | None, points: Tensor, grid: BevGrid, name: str) -> None:
+    if height is not None:
+        check_tensor(height, name)
+    grid.check_height(points, height, name)
+    if height is not None and bool(height.isinf().any()):
+        raise ValueError(f"{name}: metres are needed, NaN where there is no ground; got infinite ones")

@@ -67,6 +67,18 @@ class RegionSummary:
         """Share of the region's cells that are known. `known` is about this share, and biased when it is low."""
         return self.known_cells / self.cells
 
+    def scalars(self, *, errors: bool) -> dict[str, float]:
+        """As `Coverage.scalars` has them, with or without errors."""
+        flat = {}
+        for key, number in self.numbers.items():
+            flat[key] = number.value
+            if errors:
+                flat[f"{key}_error"] = number.error
+        flat["known_share"] = self.known_share
+        if self.measure == "area":
+            flat["visible_m2"] = self.visible_m2
+        return {f"{key}/{self.region}/{self.height}": value for key, value in flat.items()}
+
 
 def estimate_redundancy(
     redundancy: Redundancy, with_all: Estimate, place: int | None, band: int, known: Tensor

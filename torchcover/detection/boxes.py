@@ -29,6 +29,8 @@ class Boxes:
         hits: Name of a rig -> (K,) int64 how many of its points lie in each box.
         drawn_points: (K,) int64 how many points the reference drew on each object, to ask whether they are seen; zeros
             where none were, as in recordings.
+        bottom_heights_m: (K,) height of the bottom of each box above the local ground, that is the highest ground below
+            its centre; NaN where unknown.
 
     Raises:
         ValueError: Shapes that do not fit, NaN or infinite places, a length, width or height that is not positive.
@@ -51,6 +53,7 @@ class Boxes:
     categories: tuple[str, ...] = ()
     hits: Mapping[str, Tensor] = field(default_factory=dict)
     drawn_points: Tensor = None  # type: ignore[assignment]  # nor this
+    bottom_heights_m: Tensor = None  # type: ignore[assignment]  # nor this
 
     def __post_init__(self) -> None:
         for name in ("centre_m", "size_m", "yaw_rad"):
@@ -61,6 +64,7 @@ class Boxes:
             "ids": ("",) * count,
             "categories": ("",) * count,
             "drawn_points": torch.zeros(count, dtype=torch.int64, device=self.yaw_rad.device),
+            "bottom_heights_m": self.centre_m.new_full((count,), math.nan),
         }
         for name, unknown in fill.items():
             given = getattr(self, name)
@@ -81,7 +85,7 @@ class Boxes:
 
     def _check_shapes(self, count: int) -> None:
         expected = {"centre_m": (count, 3), "size_m": (count, 3), "yaw_rad": (count,), "velocity_mps": (count, 2)}
-        expected["drawn_points"] = (count,)
+        expected |= {"drawn_points": (count,), "bottom_heights_m": (count,)}
         for name, shape in expected.items():
             if tuple(getattr(self, name).shape) != shape:
                 raise ValueError(
@@ -102,7 +106,7 @@ class Boxes:
 
         Args:
             rows: Metres and radians; further columns are not allowed.
-            others: `velocity_mps`, `ids`, `categories`, `hits`, `drawn_points`.
+            others: `velocity_mps`, `ids`, `categories`, `hits`, `drawn_points`, `bottom_heights_m`.
 
         Raises:
             ValueError: Another shape, or as the constructor.
@@ -230,6 +234,7 @@ class Boxes:
             categories=tuple(self.categories[number] for number in numbers),
             hits={rig: count[which] for rig, count in self.hits.items()},
             drawn_points=self.drawn_points[which],
+            bottom_heights_m=self.bottom_heights_m[which],
         )
 
     def of_category(self, *categories: str) -> "Boxes":
@@ -253,6 +258,7 @@ class Boxes:
             velocity_mps=move(self.velocity_mps),
             hits={rig: move(count) for rig, count in self.hits.items()},
             drawn_points=move(self.drawn_points),
+            bottom_heights_m=move(self.bottom_heights_m),
         )
 
 

@@ -78,5 +78,5 @@ def _shares(visibility: BoxVisibility | Tensor, count: int, name: str) -> Tensor
 
 
 def _hidden(visibility: BoxVisibility | Tensor, count: int) -> Tensor:
-    """(count,) whether the reference's places were asked, and saw nothing; of mere shares nobody knows."""
+    """(count,) whether the reference's places were asked, and saw nothing; which mere shares do not say."""
     return visibility.hidden.cpu() if isinstance(visibility, BoxVisibility) else torch.zeros(count, dtype=torch.bool)

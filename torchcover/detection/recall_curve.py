@@ -137,13 +137,7 @@ class DetectionCounts:
 
 
 def draw_recall(curve: Curve, row: int, ax: "Axes") -> None:
-    """Draw recall at one score threshold: a point and its interval for each bin that has objects.
-
-    Args:
-        curve: Recall over bins.
-        row: Number of the score threshold.
-        ax: Where to.
-    """
+    """Draw recall at one score threshold: a point and its interval for each bin that has objects."""
     value, low, high = (t[row].cpu().numpy() for t in (curve.recall.value, curve.recall.low, curve.recall.high))
     there = np.flatnonzero(curve.recall.trials[row].cpu().numpy())
     interval = np.stack([value - low, high - value])[:, there].clip(min=0.0)  # of rounding

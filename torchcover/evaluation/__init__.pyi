@@ -18,7 +18,6 @@ from .ranks import Ranks as Ranks
 from .ranks import joined_ranks as joined_ranks
 from .ranks import rank_count as rank_count
 from .result import Result as Result
-from .result_files import claimed as claimed
 from .result_page import Omission as Omission
 from .result_page import left_out as left_out
 from .result_page import sensor_views as sensor_views

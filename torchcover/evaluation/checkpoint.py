@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any, Protocol, Self
+from typing import IO, Any, Protocol, Self
 
 import numpy as np
 import torch
@@ -24,9 +24,6 @@ from torch import Tensor
 from torchcover.evaluation.observers import CoverageObserver, Stateful
 from torchcover.evaluation.transport import Bits, spread, words_of
 from torchcover.files import NpyHeader, check_memory, read_npz, reads, write_durably
-
-if TYPE_CHECKING:
-    from torchcover.evaluation.ranks import Ranks
 
 EVERY_S = 60.0
 # Writing takes at most this share of the time, though it may take seconds.
@@ -66,11 +63,9 @@ class Checkpoint:
     resume: bool = True
     keep: bool = True
 
-    def of(self, ranks: "Ranks | None") -> Self:
-        """Where this process keeps it: every rank has a file of its own."""
-        if ranks is None or ranks.rank == 0:
-            return self
-        return replace(self, path=self.path.with_stem(f"{self.path.stem}_rank{ranks.rank}"))
+    def of(self, rank: int) -> Self:
+        """That of one of several processes that share a run: each has a file of its own."""
+        return replace(self, path=self.path.with_stem(f"{self.path.stem}_rank{rank}")) if rank else self
 
 
 class Journal:
@@ -96,9 +91,6 @@ class Journal:
 
     def restore(self, run: Progressing) -> None:
         """Go on from the file, if there is one and that is wanted.
-
-        Args:
-            run: Gets the steps that are done.
 
         Raises:
             ValueError: It is the checkpoint of another run; the message says in what. Or, as `BadFileError`, it is
@@ -204,11 +196,6 @@ def read_header(path: Path) -> dict[str, Any]:
 @reads("a checkpoint")
 def read_state(path: Path, header: Mapping[str, Any], name: str) -> dict[str, Any]:
     """One of the states, bit for bit.
-
-    Args:
-        path: The file.
-        header: Its header.
-        name: Which.
 
     Raises:
         BadFileError: It is damaged, or takes more memory than `TORCHCOVER_MAX_FILE_GB` allows.

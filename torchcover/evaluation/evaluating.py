@@ -37,12 +37,13 @@ def evaluate(settings: Settings) -> Result:
     return measured(task_of(settings), settings)
 
 
-def compare(results: Sequence[Result | str | Path]) -> Result:
+def compare(results: Result | str | Path | Sequence[Result | str | Path]) -> Result:
     """Compare what is measured already: the others with the first, as `torchcover compare` does with saved coverages.
 
     Args:
         results: Results of `evaluate`, or `.npz` files of `Coverage.save`: two or more rigs that were measured in the
-            same frames, by one call or by several of the same scenario, steps, seed and reference sensor.
+            same frames, by one call or by several of the same scenario, steps, seed and reference sensor. One result
+            of several rigs is enough.
 
     Returns:
         As of `evaluate`, but how the runs went is unknown: `Result.run` is None.
@@ -58,7 +59,8 @@ def compare(results: Sequence[Result | str | Path]) -> Result:
         >>> list(compare([low, high]).coverages)
         ['front_grille_128', 'front_roof_128']
     """
-    measured_already = [one for given in results for one in _coverages(given)]
+    each = [results] if isinstance(results, Result | str | Path) else results
+    measured_already = [one for given in each for one in _coverages(given)]
     names = distinct([name for name, *_ in measured_already])
     if len(names) < 2:
         raise ValueError(f"a comparison needs at least two measured rigs; got {', '.join(names) or 'none'} only")

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchcover.coverage import Aggregation, CoverageMetric
+from torchcover.coverage import CoverageMetric
 from torchcover.evaluation.checkpoint import Checkpoint, Journal
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.other_metrics import compared, metrics_of
@@ -37,10 +37,6 @@ TOO_MANY_CELLS = "use larger cells, or a smaller grid"
 
 def measured(task: Task[FrameSource], settings: Settings) -> Result:
     """Measure it.
-
-    Args:
-        task: Which rigs in which frames.
-        settings: How.
 
     Raises:
         ValueError: As `evaluate`.
@@ -106,7 +102,7 @@ def _observed(task: Task[FrameSource], settings: Settings, others: Observers) ->
         journal = None
         if checkpoint is not None:
             place = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
-            place = place.of(ranks)
+            place = place.of(ranks.rank if ranks else 0)
             if ranks is None or ranks.rank == 0:
                 stack.enter_context(claimed(place.path.parent))
             journal = Journal(place, identity, _states(coverage, others, watch))
@@ -175,26 +171,42 @@ def metric_of(
         asked: What is asked about.
         sensors: Names of the sensors, for redundancy.
         square_metres: Whether the frames have the square metres of reference points.
-        blocks: For standard errors.
+        blocks: For standard errors; there are none with one.
 
     Raises:
-        ValueError: An estimate by area is wanted, and there are no square metres; a device that cannot be used; as
-            `new_metric`.
+        ValueError: An estimate by area is wanted, and there are no square metres; a device that cannot be used; a
+            threshold that makes no sense, or more cells than there is memory for.
     """
     if settings.estimate == "area" and not square_metres:
         raise ValueError(
             "estimate area: it needs the square metres of reference points, which the surface reference of a "
             "simulation gives; leave it out for means over the known cells"
         )
-    return new_metric(
-        asked,
+    device, grid = usable_device(settings.device), asked.grid
+    build = partial(
+        CoverageMetric,
+        grid,
         settings.thresholds_m,
-        usable_device(settings.device),
+        max_radius=grid.diagonal_m,
         blocks=blocks,
         aggregations=settings.aggregations,
+        regions=asked.regions,
         sensors=sensors,
         square_metres=square_metres and settings.estimate != "known",
+        sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
     )
+    try:
+        with torch.device("meta"):  # where tensors have a size and take no memory
+            need = STATE_COPIES * sum(
+                state.nbytes for state in build().metric_state.values() if isinstance(state, Tensor)
+            )
+        check_fits(f"the sums of {grid.cells:,} cells in {blocks} blocks", need, TOO_MANY_CELLS)
+        return build().to(device)
+    except RuntimeError as error:  # what torch raises when there is no memory left on the device
+        raise ValueError(
+            f"a cell of {grid.cell:g} m: there is not enough memory for the sums of {grid.cells:,} cells in {blocks} "
+            f"blocks; {TOO_MANY_CELLS}"
+        ) from error
 
 
 def usable_device(name: str) -> torch.device:
@@ -210,45 +222,3 @@ def usable_device(name: str) -> torch.device:
         said = str(error).splitlines()[0].partition(". ")[0]  # some go on for pages
         raise ValueError(f"device {name}: cannot be used here ({said}); try cpu") from error
     return device
-
-
-def new_metric(
-    asked: Asked,
-    thresholds: tuple[float, ...],
-    device: torch.device,
-    *,
-    blocks: int = BLOCKS,
-    aggregations: Sequence[Aggregation] = (),
-    sensors: Sequence[str] = (),
-    square_metres: bool = False,
-) -> CoverageMetric:
-    """An empty metric of what is asked about, with standard errors unless there is one block only.
-
-    Raises:
-        ValueError: A threshold that makes no sense, or more cells than there is memory for.
-    """
-    grid = asked.grid
-    build = partial(
-        CoverageMetric,
-        grid,
-        thresholds,
-        max_radius=grid.diagonal_m,
-        blocks=blocks,
-        aggregations=aggregations,
-        regions=asked.regions,
-        sensors=sensors,
-        square_metres=square_metres,
-        sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
-    )
-    try:
-        with torch.device("meta"):  # where tensors have a size and take no memory
-            need = STATE_COPIES * sum(
-                state.nbytes for state in build().metric_state.values() if isinstance(state, Tensor)
-            )
-        check_fits(f"the sums of {grid.cells:,} cells in {blocks} blocks", need, TOO_MANY_CELLS)
-        return build().to(device)
-    except RuntimeError as error:  # what torch raises when there is no memory left on the device
-        raise ValueError(
-            f"a cell of {grid.cell:g} m: there is not enough memory for the sums of {grid.cells:,} cells in {blocks} "
-            f"blocks; {TOO_MANY_CELLS}"
-        ) from error

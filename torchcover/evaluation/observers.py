@@ -80,15 +80,21 @@ class CoverageObserver:
         self.rig = rig
 
     def update(self, frame: Frame) -> None:
-        """Add a frame, with the weights of its reference points and its place in time.
+        """Add a frame, with the weights and the heights of its reference points and its place in time.
 
         Raises:
             ValueError: As `CoverageMetric.update`, several rigs and none was named, or reference points without the
-                square metres that the metric wants, or it is unknown which points are of which sensor and it wants
-                that.
+                square metres or the heights that the metric wants, or it is unknown which points are of which sensor
+                and it wants that.
         """
         sensor = self._by_sensor(frame) if self.metric.sensors else self._whole(frame)
-        self.metric.update(sensor, frame.reference, weights=frame.reference_weights, place_in_time=frame.place_in_time)
+        self.metric.update(
+            sensor,
+            frame.reference,
+            weights=frame.reference_weights,
+            height=frame.heights_in(self.metric.grid.band_frame),
+            place_in_time=frame.place_in_time,
+        )
 
     def _whole(self, frame: Frame) -> Tensor:
         return frame.sensor if self.rig is None else frame.cloud_of(self.rig)

@@ -166,7 +166,7 @@ def observe(
     except (Exception, KeyboardInterrupt) as error:  # hours of work are not lost to any of them
         with held_back() as signals:
             clear_frames(error.__traceback__)  # which would keep the workers alive
-            killed = _killed_worker(error, workers, run.steps)
+            killed = killed_worker(error, workers, run.steps)
             # Whoever ends workers too, as schedulers do, may have ended them first.
             run.failure = KeyboardInterrupt() if killed and not set(signals).isdisjoint(ENDS) else killed or error
             signals.clear()
@@ -193,7 +193,7 @@ def _threads_beside(workers: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _killed_worker(error: BaseException, workers: int, steps: int) -> ChildProcessError | None:
+def killed_worker(error: BaseException, workers: int, steps: int) -> ChildProcessError | None:
     """What torch says, wherever this process is, when a worker dies; as an error that a user can do something about."""
     told = isinstance(error, RuntimeError) and str(error).startswith("DataLoader worker (pid")
     # Or its last frame could not be fetched; what a worker itself raises is "Caught ... in DataLoader worker process".
@@ -226,18 +226,13 @@ def _left(indices: Iterator[int], run: Run, *, skip_bad_frames: bool) -> Iterato
 
 
 def made_together(indices: Iterable[int], world_of: Callable[[int], int]) -> Iterator[list[int]]:
-    """Which frames a worker makes in a row: those of one world, so that only one worker builds it.
-
-    Args:
-        indices: All frames, in order.
-        world_of: Which world a frame is of.
-    """
+    """Which frames a worker makes in a row: those of one world, so that only one worker builds it."""
     for _, of_world in groupby(indices, world_of):
         while together := list(islice(of_world, MOST_TOGETHER)):
             yield together
 
 
-class _FramesOrErrors(Dataset[Frame | ValueError]):
+class FramesOrErrors(Dataset[Frame | ValueError]):
     """Frames; what is wrong with one stands in its place, so that it costs none of those that are made with it."""
 
     def __init__(self, frames: Frames) -> None:
@@ -260,7 +255,7 @@ def _each(
 ) -> Iterator[Frame]:
     """One frame at a time; notes bad ones if they are to be skipped."""
     loader = DataLoader(
-        _FramesOrErrors(frames),
+        FramesOrErrors(frames),
         batch_sampler=tasks,
         collate_fn=list,
         num_workers=workers,

@@ -1,8 +1,8 @@
 """What an evaluation gives: numbers, maps and files of one rig or several. All that `report` is asked for is here."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +41,8 @@ from torchcover.report import (
 )
 from torchcover.simulation import Sensor
 
+# Where more places of the reference sensor are refused, something is wrong with the scene.
+REFUSED_SHARE = 0.2
 # What `summary.json` says of how the run went.
 RUN_KEYS = ("seconds", "complete", "frame_counts", "skipped_frames", "left_out")
 
@@ -199,29 +201,26 @@ class Result:
                 raise ValueError(f"{folder}: holds {path}, which is compared, and would lose it; choose another folder")
         with Publication(Path(folder)) as written:
             with held_back():  # the numbers are safe before anything ends this, and before the maps are drawn
-                for name, write in self._number_files.items() if "numbers" in wanted else ():
-                    written.add(name, write)
+                if "numbers" in wanted:
+                    self._add_numbers(written)
                 summary = self.record
                 written.publish(summary)
             if "page" in wanted:
                 written.add_text("report.html", page_html(self.page))
             for stem, figure in self.maps(errors=error_maps) if "maps" in wanted else ():
-                written.add(f"maps/{stem}.png", partial(figure.savefig, dpi=figure.dpi))
+                written.add_figure(f"maps/{stem}.png", figure)
             written.publish(summary)
         return written.paths
 
-    @property
-    def _number_files(self) -> dict[str, Callable[[Path], object]]:
-        """What writes each file of numbers, by its path in the folder; a rig may be called what no file can be."""
-        stems = file_stems(list(self.coverages))
-        of_rigs = {f"coverage/{stem}.npz": each.save for stem, each in zip(stems, self.coverages.values(), strict=True)}
-        texts = {"summary.csv": RENDERERS["csv"](self.table)}
+    def _add_numbers(self, files: Publication) -> None:
+        """Write the files of numbers; a rig may be called what no file can be."""
+        stems = file_stems(list(self.coverages)) if self.is_comparison else ["coverage"]
+        for stem, coverage in zip(stems, self.coverages.values(), strict=True):
+            files.add(f"coverage/{stem}.npz" if self.is_comparison else "coverage.npz", coverage.save)
+        files.add_text("summary.csv", RENDERERS["csv"](self.table))
         if self.metrics is not None:
-            texts |= {"metrics.csv": numbers_csv(self.metrics), "metrics_tau.csv": tau_csv(self.metrics)}
-        return {
-            **(of_rigs if self.is_comparison else {"coverage.npz": self.coverage.save}),
-            **{name: partial(_write, text) for name, text in texts.items()},
-        }
+            files.add_text("metrics.csv", numbers_csv(self.metrics))
+            files.add_text("metrics_tau.csv", tau_csv(self.metrics))
 
     @property
     def _outcome(self) -> tuple[dict[str, Any] | None, list[str]]:
@@ -260,7 +259,19 @@ class Result:
         rays, every_s = record["rays_per_step"], record["every_s"]
         sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
         carried = [f"Vehicle: {self.vehicle}."] if self.vehicle else []
-        return [*on_failure, *carried, sensor, *self._on_repetitions]
+        return [*on_failure, *carried, sensor, *record["notes"], *self._on_refused, *self._on_repetitions]
+
+    @property
+    def _on_refused(self) -> list[str]:
+        """That many places of the reference sensor were refused: then it looked from few of those that it should."""
+        assert self.run is not None  # asked of a reference that was used
+        refused, drawn = self.run.counts["reference_poses_redrawn"], self.run.counts["reference_poses"]
+        if refused < REFUSED_SHARE * drawn:
+            return []
+        return [
+            f"{refused:,} of {drawn:,} places of the reference sensor ({refused / drawn:.0%}) were refused: they lay "
+            "inside bodies or below the ground. Does the ego stand on the ground, and do faces point outwards?"
+        ]
 
     @property
     def cut_short(self) -> str:
@@ -296,7 +307,3 @@ class Result:
         cut_short = ", cut short" if self.run is not None and not self.run.complete else ""
         about = f"Result of {', '.join(self.coverages)}: {self._first.counts['steps']} steps{cut_short}"
         return f"{about}\n{RENDERERS['text'](self.table)}"
-
-
-def _write(text: str, path: Path) -> None:
-    path.write_text(text, encoding="utf-8")

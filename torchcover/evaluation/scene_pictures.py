@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from torchcover.evaluation.result_page import sensor_views
 from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
-from torchcover.report import ActorMark, Scenery, SkinPatch, draw_depths, draw_rig, draw_scene, draw_vehicle
+from torchcover.report import ActorMark, SkinPatch, StandingFaces, draw_depths, draw_rig, draw_scene, draw_vehicle
 from torchcover.simulation import GRID_X_M, GRID_Y_M, CameraSensor, PaperReference, Rig, Scenario, SimulatedFrames
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.mount_regions import MountRegion, Skin
@@ -50,7 +50,9 @@ def rig_pictures(
     if cameras := cameras_of(rig):
         instant = scene.at(step_of_world)
         images = {
-            camera.name: instant.range_image(camera.mount.matrix(), camera.directions(), max_range_m=camera.max_range_m)
+            camera.name: instant.range_image(
+                camera.mount.matrix(), camera.directions(), max_range_m=scenario.reach_m(camera)
+            )
             for camera in cameras
         }
         time_s = step_of_world * scene.world.time_step_s
@@ -124,7 +126,7 @@ def _frames(scenario: Scenario, rig: Rig, vehicle: str | None, step: int, seed: 
     return SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, vehicle=vehicle, reference_sensor=REFERENCE)
 
 
-def _standing(world: World, time_s: float) -> Scenery:
+def _standing(world: World, time_s: float) -> StandingFaces:
     """The scenery within the picture, from above, by its height over the ground below it."""
     vehicle_T_world = invert(world.ego.trajectory.at(time_s))
     low, high = np.array([(GRID_X_M[end], GRID_Y_M[end]) for end in (0, 1)])
@@ -137,7 +139,7 @@ def _standing(world: World, time_s: float) -> Scenery:
         (terrain if lies else standing).append(corners[inside])
     corners = np.concatenate(standing)
     ground_m = _ground_m(np.concatenate(terrain), corners.mean(axis=1)[:, :2])
-    return Scenery(corners[..., :2], _heights_m(corners) - ground_m)
+    return StandingFaces(corners[..., :2], _heights_m(corners) - ground_m)
 
 
 def _ground_m(terrain_m: Matrix, places_m: Matrix) -> Matrix:

@@ -171,8 +171,8 @@ class Settings:
     aggregations: Annotated[
         Read["str | Sequence[Aggregation | str]", "tuple[Aggregation, ...]"],
         Option(
-            "Maps and numbers of regions other than means: `maximum`, `pooled`, `quantiles:0.5,0.9`, "
-            "`step_quantiles:0.9`; may be repeated. In Python also objects, as in `CoverageMetric`.",
+            "Maps and numbers of regions other than means, as in `maximum` or `quantiles:0.5,0.9`; any other name "
+            "lists all; may be repeated. In Python also objects, as in `CoverageMetric`.",
             list[str],
         ),
     ] = Read(_aggregations, ())
@@ -195,6 +195,13 @@ class Settings:
         Option(
             "What the number of a region is a mean over: `area`, its visible surface (default; needs `surface`), or "
             "`known`, its known cells, as in the paper."
+        ),
+    ] = None
+    band_frame: Annotated[
+        Literal["ground", "vehicle"] | None,
+        Option(
+            "What height bands are over: `ground`, the local ground, or `vehicle`, z of the vehicle (default; `paper` "
+            "and recordings without heights have no other).",
         ),
     ] = None
     every_s: Annotated[
@@ -251,6 +258,10 @@ class Settings:
         check_fits(f"{self.workers:,} workers", BYTES_PER_WORKER * self.workers, "use fewer")
         if self.estimate not in (None, "area", "known"):
             raise ValueError(f"estimate {self.estimate}: `area` or `known` is needed")
+        if self.band_frame not in (None, "ground", "vehicle"):
+            raise ValueError(f"band_frame {self.band_frame}: `ground` or `vehicle` is needed")
+        if self.reference == "paper" and self.band_frame == "ground":
+            raise ValueError("band_frame ground: the paper's reference has bands over z of the vehicle; leave it out")
 
     @property
     def simulated_steps(self) -> int:

@@ -168,7 +168,7 @@ def long_run(plan: StudyPlan, *, progress: bool) -> Truth:
 
     Raises:
         FileNotFoundError: No such file.
-        ValueError: It is no coverage by area, or one with other thresholds.
+        ValueError: It is no coverage by area, or one with other settings.
     """
     if plan.long_run is None:
         observer = CoverageObserver(plan.metric(BLOCKS))
@@ -176,13 +176,15 @@ def long_run(plan: StudyPlan, *, progress: bool) -> Truth:
         observe(frames, [observer], progress=progress, title="long run")
         return Truth(observer.compute())
     coverage = Coverage.load(plan.long_run)
-    if coverage.thresholds != plan.settings.thresholds_m:
-        measured, wanted = (
-            " and ".join(f"{threshold:g} m" for threshold in each)
-            for each in (coverage.thresholds, plan.settings.thresholds_m)
-        )
-        raise ValueError(f"{plan.long_run}: measured within {measured}; wanted is {wanted}")
+    for name, wanted in _settings_of(plan.metric(blocks=1)).items():
+        if (there := _settings_of(coverage)[name]) != wanted:
+            raise ValueError(f"{plan.long_run}: {name} is {there} there; {wanted} is needed")
     return Truth(coverage)
+
+
+def _settings_of(measured: Coverage | CoverageMetric) -> dict[str, object]:
+    """Those of a study that a coverage file knows."""
+    return {"cell_m": measured.grid.cell, "thresholds_m": measured.thresholds, "max_radius": measured.max_radius}
 
 
 def _ratios(sums: Tensor) -> Tensor:

@@ -80,9 +80,6 @@ class TargetError:
         return cls(**found) if found else None
 
 
-AnyTargetError = TargetError | str | Sequence[str]
-
-
 @dataclass(frozen=True)
 class Standing:
     """How far a number is from the error that is good enough.

@@ -1,6 +1,6 @@
 """What a rig sees of a target: names and defaults in, a map and its files out."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from torchcover.report import (
     PageTable,
     Words,
     draw_targets,
+    json_record,
     page_html,
     percent,
 )
@@ -166,8 +167,7 @@ def save_targets(
         if "page" in wanted:
             written.add_text("report.html", page_html(target_page(seen, verdicts, sensors, not_checked)))
         if "maps" in wanted:
-            figure = target_picture(seen)
-            written.add("targets.png", lambda path: figure.savefig(path, dpi=figure.dpi))
+            written.add_figure("targets.png", target_picture(seen))
         written.publish(record)
     return written.paths
 
@@ -177,20 +177,16 @@ def target_record(seen: TargetMap, verdicts: Sequence[Verdict] = ()) -> dict[str
     return {
         **seen.settings(),
         "cells": seen.counts,
-        "sides": [_known(side._asdict()) for side in seen.sides()],
-        "unseen_to_m": _known(seen.unseen_to_m()),
-        "worst": [_known(place._asdict()) for place in seen.worst()],
+        "sides": [json_record(side._asdict()) for side in seen.sides()],
+        "unseen_to_m": json_record(seen.unseen_to_m()),
+        "worst": [json_record(place._asdict()) for place in seen.worst()],
         "requirements": [_judged(verdict) for verdict in verdicts],
     }
 
 
 def _judged(verdict: Verdict) -> dict[str, Any]:
-    worst = [_known(place._asdict()) for place in verdict.worst]
+    worst = [json_record(place._asdict()) for place in verdict.worst]
     return {**verdict._asdict(), "requirement": verdict.requirement.words, "worst": worst}
-
-
-def _known(record: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: None if isinstance(value, float) and np.isnan(value) else value for key, value in record.items()}
 
 
 def target_page(
@@ -208,8 +204,9 @@ def target_page(
         not_checked: Requirements that are about other targets, in words.
     """
     failed = [verdict for verdict in verdicts if not verdict.passed]
-    tables = [*([_verdicts(verdicts)] if verdicts else []), _sides(seen), _places(seen.worst(), "The worst places")]
-    tables += [_places(verdict.worst, f"Not met: {verdict.requirement.words}") for verdict in failed]
+    tables = [_verdicts(verdicts)] if verdicts else []
+    tables += [sides_table(seen), places_table(seen.worst(), "The worst places")]
+    tables += [places_table(verdict.worst, f"Not met: {verdict.requirement.words}") for verdict in failed]
     return Page(
         title=f"{seen.rig}: would it see {seen.target}?",
         lead=f"In {seen.scenario}, measured by torchcover."
@@ -258,7 +255,8 @@ def _maps(seen: TargetMap) -> list[PageMap]:
     ]
 
 
-def _sides(seen: TargetMap) -> PageTable:
+def sides_table(seen: TargetMap) -> PageTable:
+    """The share of the places on each side that have enough points, and how far out one has not."""
     sides, unseen_to_m = seen.sides(), seen.unseen_to_m()
     within = list(dict.fromkeys(side.within_m for side in sides))
     rows = []
@@ -276,7 +274,8 @@ def _unseen(to_m: float) -> str:
     return f"{to_m:.2f}" if to_m else "nowhere"
 
 
-def _places(places: Sequence[Place], title: str) -> PageTable:
+def places_table(places: Sequence[Place], title: str) -> PageTable:
+    """Where places are, and how much of a target is seen there."""
     headings = ("side", "x\n(m)", "y\n(m)", "distance\n(m)", "points", "sensors", "surface\n(%)")
     rows = [tuple(map(Words, _place(place))) for place in places]
     return PageTable(title, headings, rows)

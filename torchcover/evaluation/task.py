@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Generic, NamedTuple, TypeVar
 
 from torchcover import __version__
+from torchcover.coverage.grid import BandFrame
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, Settings
+from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, OPTIONS, Settings
 from torchcover.frames import ChosenRigs, FrameSource
 from torchcover.recordings import RecordedFrames
 from torchcover.simulation import (
@@ -24,6 +25,7 @@ from torchcover.simulation import (
     reference_called,
     with_ego,
 )
+from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
 
 AnyRig = Rig | str | Path
 SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
@@ -32,6 +34,9 @@ SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
 EVERY_S_IN_TRAFFIC = 10.0
 # Where warnings point to: the call of `evaluate`, beyond its own function, the one around that, and ours.
 CALLER = 4
+# Options that frames, what is asked and observers say by what they are, and those that change no result.
+TOLD_OTHERWISE = {"scenario", "seed", "vehicle", "reference", "rays", "every_s", "ask", "cell_m", "band_frame"}
+TOLD_OTHERWISE |= {"metrics", "steps", "device", "workers", "skip_bad_frames"}
 # Of an identity, what is longer is told by its hash.
 MAX_TOLD = 40
 
@@ -121,7 +126,9 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
     carried = {name: loaded(rig) for name, rig in zip(names, rigs, strict=True)}
     loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     world = with_ego(loaded_world, carried, settings.vehicle)
-    asked = (settings.ask or RegionsOfInterest()).around(world.ego_box().outline_m, settings.cell_m)
+    asked = (settings.ask or RegionsOfInterest()).around(
+        world.ego_box().outline_m, settings.cell_m, _band_frame(settings)
+    )
     frames = SimulatedFrames(
         world,
         rigs=carried,
@@ -136,6 +143,11 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
     # A path says more than the name within the file.
     description = {**frames.description, "scenario": world.name if loaded_world is scenario else str(scenario)}
     return Task(frames, given, frames.sensors, description, asked, _most_steps(frames, settings))
+
+
+def _band_frame(settings: Settings) -> BandFrame:
+    """Of a simulation."""
+    return settings.band_frame or ("vehicle" if settings.reference == "paper" else DEFAULT_BAND_FRAME)
 
 
 def _most_steps(frames: SimulatedFrames, settings: Settings) -> int | None:
@@ -156,7 +168,9 @@ def _recording(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
     # A name that is in the recording may be a name only; any other has to be that of a rig.
     documents = {name: rig for name, rig in named.items() if is_document(rig) or name not in frames.rigs}
     sensors = {**chosen.sensors, **{name: loaded(rig).sensors for name, rig in documents.items()}}
-    asked = (settings.ask or RegionsOfInterest()).around(frames.ego_outline_m, settings.cell_m)
+    asked = (settings.ask or RegionsOfInterest()).around(
+        frames.ego_outline_m, settings.cell_m, settings.band_frame or "vehicle"
+    )
     return Task(chosen, given, sensors, frames.description, asked, settings.steps)
 
 
@@ -271,11 +285,7 @@ def run_identity(
         **task.frames.content,
         "rigs": task.rigs,
         **_asked(task.asked),
-        "thresholds_m": settings.thresholds_m,
-        "aggregations": settings.aggregations,
-        "estimate": settings.estimate,
-        "redundancy": settings.redundancy,
-        "target_error": settings.target_error,
+        **{name: getattr(settings, name) for name in OPTIONS if name not in TOLD_OTHERWISE},
         "observers": kinds,
         "ranks": ranks,
     }
@@ -288,6 +298,7 @@ def _asked(asked: Asked) -> dict[str, object]:
         "cell_m": grid.cell,
         "grid": [grid.x, grid.y],
         "heights": list(grid.heights.items()),
+        "band_frame": grid.band_frame,
         "regions": [[region.name, region.x, region.y, region.corners_m] for region in asked.regions],
     }
 

@@ -14,8 +14,11 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from shutil import copyfile, rmtree
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 from uuid import uuid4
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # List the files of a result, and of a recording. Put in their places last, and taken away first: without one of them a
 # folder is not complete.
@@ -183,8 +186,12 @@ class Publication:
         self._names[name] = None
 
     def add_text(self, name: str, text: str) -> None:
-        """Write a file of text aside."""
+        """Write a text aside."""
         self.add(name, lambda path: path.write_text(text, encoding="utf-8"))
+
+    def add_figure(self, name: str, figure: "Figure") -> None:
+        """Draw a figure aside."""
+        self.add(name, lambda path: figure.savefig(path, dpi=figure.dpi))
 
     def note(self, record: Mapping[str, Any]) -> None:
         """Note that what was added until now is kept, and what else is to be known when this is gone on with."""

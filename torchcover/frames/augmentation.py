@@ -109,14 +109,17 @@ class Augmentation:
 
 def _moved(frame: Frame, similarity: Tensor) -> Frame:
     """Apply a (3, 3) float64 matrix that keeps shapes and z upright: a rotation about z, a mirror, a scale."""
-    weights = frame.reference_weights
+    weights, heights_m, factor = frame.reference_weights, frame.reference_heights_m, float(similarity[2, 2])
     if weights is not None:
-        weights = weights * float(similarity[2, 2]) ** 2
+        weights = weights * factor**2
+    if heights_m is not None:
+        heights_m = heights_m * factor
     return replace(
         frame,
         clouds={name: _times(similarity, cloud) for name, cloud in frame.clouds.items()},
         reference=_times(similarity, frame.reference),
         reference_weights=weights,
+        reference_heights_m=heights_m,
         boxes=None if frame.boxes is None else _moved_boxes(frame.boxes, similarity),
     )
 
@@ -131,6 +134,7 @@ def _moved_boxes(boxes: Boxes, similarity: Tensor) -> Boxes:
         size_m=boxes.size_m * factor,
         yaw_rad=torch.atan2(heading[:, 1], heading[:, 0]).to(boxes.yaw_rad.dtype),
         velocity_mps=_times(similarity[:2, :2], boxes.velocity_mps),
+        bottom_heights_m=boxes.bottom_heights_m * factor,
     )
 
 

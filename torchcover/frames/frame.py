@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from torchcover.coverage.grid import BandFrame
 from torchcover.detection.boxes import Boxes
 
 
@@ -22,6 +23,8 @@ class Frame:
         counts: What was left out on the way here, by name (`sensor_self_hits`, `reference_nonfinite`, ...).
         reference_weights: (M,) float32 visible square metres that each reference point stands for, as a
             `SurfaceReference` gives them; None if they are unknown, and all points count the same.
+        reference_heights_m: (M,) float32 heights of the reference points above the local ground, NaN where there is
+            none at or below; None if they are unknown: then height bands are those of the vehicle frame.
         boxes: The objects of that instant; None if they are unknown, which is not the same as none being there.
         sensor_points: Name of each rig -> name of each of its sensors -> how many of the rig's points are its own, in
             their order; None if it is unknown which points are whose.
@@ -38,6 +41,7 @@ class Frame:
     boxes: Boxes | None = None
     place_in_time: int = None  # type: ignore[assignment]  # filled in at once
     sensor_points: Mapping[str, Mapping[str, int]] | None = None
+    reference_heights_m: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.place_in_time is None:
@@ -90,10 +94,35 @@ class Frame:
         """A copy on another device."""
         return self._each(lambda cloud: cloud.to(device), None if self.boxes is None else self.boxes.to(device))
 
+    def heights_in(self, band_frame: BandFrame) -> Tensor | None:
+        """The heights of the reference points that such height bands need: None for those over z of the vehicle.
+
+        Args:
+            band_frame: What the bands are over.
+
+        Raises:
+            ValueError: Bands over the ground, and the heights above it are unknown.
+        """
+        if band_frame == "vehicle":
+            return None
+        if self.reference_heights_m is None:
+            raise ValueError(
+                f"frame {self.name!r}: the heights of its reference points above the ground (reference_heights_m) are "
+                "unknown; use the band frame vehicle"
+            )
+        return self.reference_heights_m
+
     def _each(self, change: Callable[[Tensor], Tensor], boxes: Boxes | None) -> "Frame":
         clouds = {name: change(cloud) for name, cloud in self.clouds.items()}
-        weights = None if self.reference_weights is None else change(self.reference_weights)
-        return replace(self, clouds=clouds, reference=change(self.reference), reference_weights=weights, boxes=boxes)
+        weights, heights_m = self.reference_weights, self.reference_heights_m
+        return replace(
+            self,
+            clouds=clouds,
+            reference=change(self.reference),
+            reference_weights=None if weights is None else change(weights),
+            reference_heights_m=None if heights_m is None else change(heights_m),
+            boxes=boxes,
+        )
 
 
 @dataclass(frozen=True)
@@ -133,12 +162,24 @@ class FrameBatch:
         Raises:
             ValueError: Some frames have them, and others have not.
         """
-        given = [frame.reference_weights for frame in self.frames if frame.reference_weights is not None]
+        return self._of_all("weights", "square metres", [frame.reference_weights for frame in self.frames])
+
+    @property
+    def heights_m(self) -> list[Tensor] | None:
+        """One (M,) tensor a frame, the heights of its reference points above the ground; None if no frame has any.
+
+        Raises:
+            ValueError: Some frames have them, and others have not.
+        """
+        return self._of_all("heights_m", "heights", [frame.reference_heights_m for frame in self.frames])
+
+    def _of_all(self, name: str, what: str, found: Sequence[Tensor | None]) -> list[Tensor] | None:
+        given = [values for values in found if values is not None]
         if given and len(given) < len(self.frames):
-            named = {frame.reference_weights is None: frame.name for frame in self.frames}
+            named = {values is None: frame.name for values, frame in zip(found, self.frames, strict=True)}
             raise ValueError(
-                f"weights: frame {named[False]!r} has the square metres of its reference points, and {named[True]!r} "
-                "has none; batch each kind of frames by itself"
+                f"{name}: frame {named[False]!r} has the {what} of its reference points, and {named[True]!r} has none; "
+                "batch each kind of frames by itself"
             )
         return given or None
 

@@ -82,7 +82,7 @@ class FrameSource(Protocol):
     def reference_record(self) -> Mapping[str, object] | None:
         """Where the reference comes from, for `summary.json`: `sensor` and its settings; None if unknown.
 
-        One that was simulated says `every_s`, any other `notes`: sentences that a reader of the numbers has to know.
+        It has `notes`, sentences that a reader of the numbers has to know, and if it was simulated `every_s`.
         """
         ...
 

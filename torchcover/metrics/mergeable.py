@@ -82,9 +82,13 @@ class MergeableMetric(Metric):
             return
         number = default[(0,) * default.dim()]
         super().add_state(name, number, *args, **kwargs)
-        state = torch.empty_like(default, memory_format=torch.contiguous_format)
-        # The device `meta` keeps no numbers, and would import half of torch to fill in none.
-        setattr(self, name, state if state.is_meta else state.fill_(number))
+        if default.device.type == "cpu" and not number:  # zeros that take memory once they are written to
+            state = torch.from_numpy(np.zeros(default.shape, number.numpy().dtype))
+        else:
+            state = torch.empty_like(default, memory_format=torch.contiguous_format)
+            # The device `meta` keeps no numbers, and would import half of torch to fill in none.
+            state = state if state.is_meta else state.fill_(number)
+        setattr(self, name, state)
         self._defaults[name] = default
 
     def add_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:

@@ -4,8 +4,7 @@ One entry, `nearest`; a backend is a file with one function `search(query, point
 that returns the index of a nearest point. What a distance is, and its gradient, is decided once, in `nearest`.
 """
 
-from torchcover.neighbors.checks import check_cloud, check_tensor
 from torchcover.neighbors.choice import BACKENDS
-from torchcover.neighbors.query import Nearest, blind_spot_radius, nearest
+from torchcover.neighbors.query import Nearest, blind_spot_radius, check_cloud, check_tensor, nearest
 
 __all__ = ["BACKENDS", "Nearest", "blind_spot_radius", "check_cloud", "check_tensor", "nearest"]

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from pykdtree.kdtree import KDTree
 from torch import Tensor
 
-from torchcover.neighbors.reach import reach
-
 # About how many points are looked at for equal ones.
 SAMPLE = 1024
 # Points in a leaf of the tree. Against pykdtree's 16, building it takes less than half the time; asking takes no more.
@@ -29,7 +27,7 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
     Returns:
         (N,) int64 indices into `points`, or -1.
     """
-    bound = None if math.isinf(max_distance) else reach(max_distance, query.dtype)
+    bound = None if math.isinf(max_distance) else max_distance
     coordinates, number = _distinct(np.ascontiguousarray(points.numpy()))
     _, index = KDTree(coordinates, leafsize=LEAF).query(np.ascontiguousarray(query.numpy()), distance_upper_bound=bound)
     found = torch.from_numpy(index.astype(np.int64))

@@ -1,13 +1,13 @@
-"""The blind spot radius, and the exact nearest-neighbour search beneath it."""
+"""The blind spot radius, the exact nearest-neighbour search beneath it, and what clouds have to be for both."""
 
 import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.neighbors.checks import check_cloud
 from torchcover.neighbors.choice import choose_search
 
 # Queries that are measured together on a CPU.
@@ -124,7 +124,8 @@ def _nearest(query: Tensor, points: Tensor, max_distance: float, backend: str, m
         else:
             # Under autocast a matrix product would be rounded to bfloat16.
             with torch.no_grad(), torch.autocast(query.device.type, enabled=False):
-                index = search(*_rescale(query, points, max_distance), memory_mb)
+                scaled, among, bound = _rescale(query, points, max_distance)
+                index = search(scaled, among, _reach(bound, scaled.dtype), memory_mb)
         return _distance_to(query, points, index, max_distance)
 
     return _in_parts_that_fit(found, query, points, memory_mb)
@@ -177,6 +178,14 @@ def _rescale(query: Tensor, points: Tensor, max_distance: float) -> tuple[Tensor
     return query.detach() * half * rest, points.detach() * half * rest, max_distance * half * rest
 
 
+def _reach(max_distance: float, dtype: torch.dtype) -> float:
+    """A little more than the bound: a search compares squares in its own type, and `_distance_to` the differences.
+
+    Its square does not vanish: a bound of 0 still finds a point at distance 0.
+    """
+    return max(max_distance * (1 + 1e-5), 2 * math.sqrt(torch.finfo(dtype).tiny))
+
+
 def _distance_to(query: Tensor, points: Tensor, index: Tensor, max_distance: float) -> Nearest:
     """Measure from the differences, in float64; mask what is out of reach."""
     if len(points) == 0:
@@ -207,3 +216,49 @@ def _scaled_norm(difference: Tensor) -> Tensor:
     scale = largest.clamp(max=torch.finfo(torch.float64).max)
     scale = scale.where(((scale < 1e-140) | (scale > 1e140)) & (scale > 0), 1.0)
     return _norm(difference / scale[:, None]) * scale
+
+
+def check_tensor(given: object, name: str, *, floating: bool = False) -> None:
+    """Raise unless what arrived is a tensor.
+
+    Args:
+        given: What arrived.
+        name: What the caller calls it, for the message.
+        floating: Whether it has to be of a floating-point type.
+
+    Raises:
+        TypeError: It is none; of an array of NumPy's the message says how it becomes one.
+
+    Example:
+        >>> check_tensor(np.zeros((2, 3)), "sensor")
+        Traceback (most recent call last):
+        TypeError: sensor: a torch tensor is needed; got a NumPy array of float64; torch.from_numpy(array) makes it one
+    """
+    if isinstance(given, Tensor) and (given.is_floating_point() or not floating):
+        return
+    wanted = "a floating-point torch tensor" if floating else "a torch tensor"
+    if isinstance(given, np.ndarray):
+        makes = "torch.from_numpy(array)" + (".float()" if floating and given.dtype.kind != "f" else "")
+        raise TypeError(f"{name}: {wanted} is needed; got a NumPy array of {given.dtype}; {makes} makes it one")
+    arrived = given.dtype if isinstance(given, Tensor) else type(given).__name__
+    raise TypeError(f"{name}: {wanted} is needed; got {arrived}")
+
+
+def check_cloud(cloud: Tensor, name: str) -> None:
+    """Raise unless `cloud` is a floating-point tensor of shape (N, 3) with finite coordinates.
+
+    Args:
+        cloud: What arrived.
+        name: What the caller calls it, for the message.
+
+    Raises:
+        TypeError: Not a tensor of a floating-point type.
+        ValueError: Another shape, or NaN or infinite coordinates (the message says how many points have them).
+    """
+    check_tensor(cloud, name, floating=True)
+    if cloud.ndim != 2 or cloud.shape[1] != 3:
+        raise ValueError(f"{name}: shape (N, 3) is needed; got {tuple(cloud.shape)}")
+    # A sum is finite only if all its terms are; one that overflows is looked at term by term.
+    if not cloud.detach().sum().isfinite() and not cloud.isfinite().all():
+        bad = int((~cloud.detach().isfinite()).any(dim=1).sum())
+        raise ValueError(f"{name}: {bad} of {len(cloud)} points have NaN or infinite coordinates; drop them first")

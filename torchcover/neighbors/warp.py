@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from torchcover.neighbors.box_tree import LEAF, NONE, along_the_curve, box_tree
-from torchcover.neighbors.reach import reach
 
 try:
     import warp as wp
@@ -50,8 +49,7 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
         (N,) int64 indices into `points`, or -1.
     """
     scalar = SCALARS[query.dtype]
-    bound = reach(max_distance, query.dtype)
-    bound = bound * bound if bound < torch.finfo(query.dtype).max ** 0.5 else torch.inf
+    bound = max_distance**2 if max_distance < torch.finfo(query.dtype).max ** 0.5 else torch.inf
     tree = box_tree(points)
     # Neighbours in the order walk much the same way, which is what makes a GPU fast.
     order = along_the_curve(query)

@@ -2,12 +2,10 @@
 
 import numpy as np
 
-from torchcover.coverage import Measure
-from torchcover.placement.evaluation import Evaluation, Float64
+from torchcover.placement.evaluation import Evaluation
 from torchcover.placement.optimisers import Cube, MakesOptimiser, Optimiser
 from torchcover.placement.pareto import chebyshev, non_dominated
-from torchcover.placement.racing import Paired, paired
-from torchcover.placement.scores import Scores
+from torchcover.placement.racing import Float64, Prefix, gains
 
 
 class Arm:
@@ -22,21 +20,13 @@ class Arm:
         cube: What is free.
         seed: Of the optimiser, and of the weights.
         start: Evaluation 0, scored at all instants.
-        measure: Which share counts, see `paired`.
-
-    Raises:
-        ValueError: The start has no scores.
     """
 
-    def __init__(
-        self, name: str, makes: MakesOptimiser, cube: Cube, seed: int, start: Evaluation, measure: Measure
-    ) -> None:
-        if start.scores is None:
-            raise ValueError("start: its scores are needed; it has none")
-        self.name, self.start = name, start.scores
-        self._makes, self._cube, self._seed, self._measure = makes, cube, seed, measure
+    def __init__(self, name: str, makes: MakesOptimiser, cube: Cube, seed: int, start: Evaluation) -> None:
+        self.name = name
+        self._makes, self._cube, self._seed = makes, cube, seed
         self._optimiser: Optimiser = makes(cube, seed)
-        nothing = np.zeros(len(self.start.objectives))
+        nothing = np.zeros(len(start.prefixes[-1].estimate.quantities))
         self._gains, self._lefts = [nothing], [nothing]
         self.evaluations: list[Evaluation] = [start]
 
@@ -47,7 +37,7 @@ class Arm:
 
     @property
     def gains(self) -> Float64:
-        """(evaluations, objectives) over the start; NaN for what cannot be."""
+        """(evaluations, objectives) better than the start by, in the objectives' units; NaN for what cannot be."""
         return np.array(self._gains)
 
     @property
@@ -58,7 +48,7 @@ class Arm:
     @property
     def complete(self) -> list[int]:
         """Positions of the candidates that can be, and were scored at all instants."""
-        count = len(self.start.instants)
+        count = self.evaluations[0].instants
         return [at for at, one in enumerate(self.evaluations) if not one.infeasible and one.instants == count]
 
     @property
@@ -84,17 +74,12 @@ class Arm:
         return front[int(np.argmax(chebyshev(scaled, np.full(len(low), 1 / len(low)))))]
 
     @property
-    def incumbents(self) -> list[Scores]:
-        """Scores of the front."""
-        scores = (self.evaluations[at].scores for at in self.front)
-        return [each for each in scores if each is not None]
+    def incumbents(self) -> list[tuple[Prefix, ...]]:
+        """What the front scored."""
+        return [self.evaluations[at].prefixes for at in self.front]
 
     def ask(self, number: int) -> Float64 | None:
-        """Where to look next, (variables,); None when there is nothing left.
-
-        Args:
-            number: Of the evaluation.
-        """
+        """Where to look next, (variables,); None when there is nothing left."""
         return (self._optimiser if len(self._gains[0]) == 1 else self._scalarised(number)).ask()
 
     def tell(self, evaluation: Evaluation) -> None:
@@ -106,25 +91,25 @@ class Arm:
         if len(gain) == 1 and evaluation.unit is not None:
             self._optimiser.tell(evaluation.unit, float(gain[0]), float(left[0]))
 
-    def against_start(self, at: int) -> Paired | None:
-        """A candidate against the start, at the instants that it was given; None if it was not scored."""
-        scores = self.evaluations[at].scores
-        return None if scores is None else paired(scores, self.start, self._measure)
+    def against_start(self, at: int) -> tuple[Float64, Float64] | None:
+        """Gains of a candidate over the start after the instants that it was given, and errors; None if it has none."""
+        prefixes = self.evaluations[at].prefixes
+        if not prefixes:
+            return None
+        return gains(prefixes[-1].estimate, self.evaluations[0].prefixes[len(prefixes) - 1].estimate)
 
     def _estimated(self, evaluation: Evaluation) -> tuple[Float64, Float64]:
         """Gain over the start at all instants, and the error that those have left which it was not scored at.
 
         It is paired with the best so far, which a candidate that was dropped late is more like than the start.
         """
-        if evaluation.infeasible or evaluation.scores is None:
+        prefixes = evaluation.prefixes
+        if evaluation.infeasible or not prefixes:
             return np.full(len(self._gains[0]), np.nan), np.zeros(len(self._gains[0]))
-        best = self.best
-        other = self.start if best is None else self.evaluations[best].scores
-        assert other is not None  # what is on the front was scored
-        found = paired(evaluation.scores, other, self._measure)
-        left = 1.0 - evaluation.instants / len(self.start.instants)
-        gain: Float64 = found.gain + (0.0 if best is None else self._gains[best])
-        return gain, np.nan_to_num(found.error * np.sqrt(left))
+        best = 0 if self.best is None else self.best
+        gain, error = gains(prefixes[-1].estimate, self.evaluations[best].prefixes[len(prefixes) - 1].estimate)
+        left = 1.0 - evaluation.instants / self.evaluations[0].instants
+        return gain + self._gains[best], np.nan_to_num(error * np.sqrt(left))
 
     def _scalarised(self, number: int) -> Optimiser:
         """A new one, that was told all there is in one number."""

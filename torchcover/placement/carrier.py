@@ -1,15 +1,49 @@
-"""What carries the rigs of a space: the skin that sensors are mounted on."""
+"""What carries the sensors of a space: its vehicle, in its worlds, and the skin that they are mounted on."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, BeforeValidator, Field, PlainValidator, ValidationInfo
 
 from torchcover.geometry import BoundingBox
-from torchcover.simulation import Scenario
+from torchcover.simulation import Document, Rig, Scenario, with_ego
 from torchcover.simulation.bodies import mount_regions_of
+from torchcover.simulation.documents import NameOrFile, beside, is_file_name, read_document
 from torchcover.simulation.mount_regions import MountRegion, Skin
+
+
+def _rig(given: Any, info: ValidationInfo) -> Rig:  # noqa: ANN401  (whatever stood in the file)
+    """A rig, or one by its name or its file."""
+    if isinstance(given, Rig):
+        return given
+    if not isinstance(given, str):
+        raise ValueError(f"the name of a rig, or the path of its file, is needed; got {type(given).__name__}")
+    try:
+        return Rig.load(beside(Path(given), info) if is_file_name(given) else given)
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from error
+
+
+def _vehicle(given: str) -> str:
+    if Path(given).suffix and not is_file_name(given):
+        raise ValueError(f"the name of a vehicle, or the path of its YAML file, is needed; got {given!r}")
+    return given
+
+
+def _listed(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
+    return (given,) if isinstance(given, str) else given
+
+
+# A rig, or the name or the file of one.
+NamedRig = Annotated[Rig, PlainValidator(_rig)]
+# One name or file, or several.
+Names = Annotated[tuple[NameOrFile, ...], BeforeValidator(_listed), Field(min_length=1)]
+# A vehicle's.
+NamedVehicle = Annotated[NameOrFile, AfterValidator(_vehicle)]
 
 
 class Carrier(NamedTuple):
@@ -55,3 +89,46 @@ class Carrier(NamedTuple):
             told = ", ".join(self.regions) or "none at all: add mount_regions to its document"
             raise ValueError(f"region: {self.name} has no {name!r}; it has {told}")
         return self.regions[name]
+
+
+class VehicleSpace(Document):
+    """What a search and a choice have in common: the worlds, and the vehicle in them.
+
+    Args:
+        name: What files and pages call it.
+        description: What it is.
+        scenario: One or several, by name or file: they count alike.
+        vehicle: What carries the sensors, by name or file; if not given, that of the rig that the space begins with, or
+            the scenario's own.
+    """
+
+    name: str
+    description: str = ""
+    scenario: Names
+    vehicle: NamedVehicle | None = None
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read it from a YAML file.
+
+        Raises:
+            FileNotFoundError: No such file.
+            BadFileError: Not YAML, or nothing that makes sense; the message names the file and the key.
+        """
+        return read_document(cls, Path(path))
+
+    @property
+    def first_rig(self) -> Rig | None:
+        """The rig that it begins with."""
+        raise NotImplementedError
+
+    @cached_property
+    def scenarios(self) -> tuple[Scenario, ...]:
+        """The scenarios, each with what carries the sensors as its ego."""
+        rigs = {self.first_rig.name: self.first_rig} if self.first_rig else {}
+        return tuple(with_ego(Scenario.load(each), rigs, self.vehicle) for each in self.scenario)
+
+    @cached_property
+    def carrier(self) -> Carrier:
+        """That ego."""
+        return Carrier.of(self.scenarios)

@@ -1,24 +1,128 @@
 """A choice: candidates at given places, how many of them may be taken, and what a good choice is."""
 
 from collections import Counter
+from collections.abc import Iterator
 from functools import cached_property
-from pathlib import Path
-from typing import Annotated, Self
+from itertools import product
+from typing import Annotated, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat, PositiveInt, model_validator
+from pydantic import (
+    Field,
+    NonNegativeFloat,
+    PlainValidator,
+    PositiveFloat,
+    PositiveInt,
+    ValidationInfo,
+    model_validator,
+)
 
-from torchcover.placement.candidate_group import MOST_CANDIDATES, CandidateGroup
-from torchcover.placement.carrier import Carrier
-from torchcover.placement.constraints import APART_M
-from torchcover.placement.named import NamedRig, NamedVehicle, Names
+from torchcover.placement.carrier import Carrier, NamedRig, VehicleSpace
+from torchcover.placement.constraints import APART_M, MOUNT
+from torchcover.placement.free_sensor import HEIGHT_M, pose_of
 from torchcover.placement.objective import Objective
-from torchcover.placement.prices import MOUNT
-from torchcover.placement.question_grid import QuestionGrid
+from torchcover.placement.questions import Questions
 from torchcover.placement.subsets import Limits
-from torchcover.simulation import Document, Rig, Scenario, Sensor, with_ego
-from torchcover.simulation.documents import read_document
+from torchcover.simulation import Document, Pose, Rig, Sensor
+from torchcover.simulation.rig import read_sensor
+
+MOST_CANDIDATES = 2000
+
+
+def _sensor(given: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whatever stood in the file)
+    """A sensor as a rig has it, without a name and a mount."""
+    if isinstance(given, dict) and (own := [key for key in ("name", "mount") if key in given]):
+        raise ValueError(f"{' and '.join(own)}: the places make them; leave them out")
+    return read_sensor({"name": "sensor", **given} if isinstance(given, dict) else given, info)
+
+
+class MountGrid(Document):
+    """Places all over mount regions of the vehicle, each with all of some headings and pitches.
+
+    Args:
+        region: The regions.
+        spacing_m: From one place to the next, about.
+        height_m: Above the skin.
+        yaw_deg: Headings, from where the region faces.
+        pitch_deg: Pitches; positive turns the nose down.
+    """
+
+    region: tuple[str, ...] = Field(min_length=1)
+    spacing_m: PositiveFloat
+    height_m: PositiveFloat = HEIGHT_M
+    yaw_deg: tuple[float, ...] = Field(default=(0.0,), min_length=1)
+    pitch_deg: tuple[float, ...] = Field(default=(0.0,), min_length=1)
+
+    def poses(self, carrier: Carrier) -> Iterator[tuple[str, Pose]]:
+        """Names and poses; where a window of a region has nothing of the body, there is none.
+
+        Raises:
+            ValueError: The vehicle has no such region.
+        """
+        for name in self.region:
+            region = carrier.region(name)
+            spans = [bounds[1] - bounds[0] for bounds in (region.x_m, region.y_m, region.z_m) if bounds is not None]
+            shares = [_middles(max(round(span / self.spacing_m), 1)) for span in spans]
+            for number, (u, v) in enumerate(product(*shares)):
+                try:
+                    point = region.on(carrier.skin, u, v)
+                except ValueError:
+                    continue
+                x, y, z = (point.place_m + self.height_m * point.outward).tolist()
+                for yaw, pitch in product(self.yaw_deg, self.pitch_deg):
+                    turned = f"_yaw{yaw:g}" * (len(self.yaw_deg) > 1) + f"_pitch{pitch:g}" * (len(self.pitch_deg) > 1)
+                    yield f"{name}_{number}{turned}", pose_of(x, y, z, region.heading_deg + yaw, pitch, 0.0)
+
+
+def _middles(count: int) -> list[float]:
+    shares: list[float] = ((np.arange(count) + 0.5) / count).tolist()
+    return shares
+
+
+class CandidateGroup(Document):
+    """A sensor, and where it may be.
+
+    Args:
+        sensor: As a rig has it, without name and mount.
+        places: Poses, by name; and, or,
+        grid: places all over mount regions.
+
+    Example:
+        >>> corner = CandidateGroup(
+        ...     sensor={"type": "lidar", "model": "velodyne_vlp16"},
+        ...     places={"left": {"x_m": 0.4, "y_m": 0.25, "z_m": 0.3}},
+        ... )
+        >>> corner.places["left"].y_m, corner.sensor.model
+        (0.25, 'velodyne_vlp16')
+    """
+
+    sensor: Annotated[Sensor, PlainValidator(_sensor)]
+    places: dict[str, Pose] = Field(default_factory=dict)
+    grid: MountGrid | None = None
+
+    @model_validator(mode="after")
+    def _check_places(self) -> Self:
+        if not self.places and self.grid is None:
+            raise ValueError("places, grid: at least one of the two is needed; got neither")
+        return self
+
+    def sensors(self, group: str, carrier: Carrier) -> Iterator[Sensor]:
+        """A sensor at each place, called after the group and the place.
+
+        Args:
+            group: Name of the group.
+            carrier: What it is mounted on.
+
+        Raises:
+            ValueError: The vehicle has no such region.
+        """
+        places = list(self.places.items())
+        if self.grid is not None:
+            places += self.grid.poses(carrier)
+        assert isinstance(self.sensor, Document)  # as all sensors of a rig
+        for place, pose in places:
+            yield self.sensor.model_copy(update={"name": f"{group}_{place}", "mount": pose})
 
 
 class ChoiceLimits(Document):
@@ -41,7 +145,7 @@ class ChoiceLimits(Document):
         return self
 
 
-class ChoiceSpace(Document):
+class ChoiceSpace(VehicleSpace):
     """Which and how many: some of many candidates, which are given.
 
     Args:
@@ -73,26 +177,12 @@ class ChoiceSpace(Document):
         ['end_front', 'end_rear']
     """
 
-    name: str
-    description: str = ""
     always: NamedRig | None = None
-    scenario: Names
-    vehicle: NamedVehicle | None = None
     candidates: dict[Annotated[str, Field(min_length=1)], CandidateGroup] = Field(min_length=1)
     choose: ChoiceLimits
     cost: dict[str, NonNegativeFloat] = Field(default_factory=dict)
     now: tuple[str, ...] | None = Field(default=None, min_length=1)
     objective: Objective
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read a choice from a YAML file.
-
-        Raises:
-            FileNotFoundError: No such file, or of one that it names.
-            BadFileError: Not YAML, or no choice that makes sense; the message names the file and the key.
-        """
-        return read_document(cls, Path(path))
 
     @model_validator(mode="after")
     def _check_candidates(self) -> Self:
@@ -113,7 +203,11 @@ class ChoiceSpace(Document):
             raise ValueError(f"now: {', '.join(unknown)}: no candidate; they are {', '.join(candidates[:20])}")
         if twice := [name for name, count in now.items() if count > 1]:
             raise ValueError(f"now: {twice[0]} is there once at most; it is named twice")
-        QuestionGrid.around(self._carrier.outline_m, {"objective": self.objective})
+        questions = Questions.around(self.carrier.outline_m, {"objective": self.objective})
+        if not self.objective.key.startswith("detection_") or "_without_" in self.objective.key:
+            wanted = f"a detection, as in detection: 0.4; got {self.objective.key!r}"
+            raise ValueError(f"objective: candidates are chosen by {wanted}")
+        questions.check(self.rig(self.sensors[:1], self.name))
         return self
 
     def _check_prices(self) -> None:
@@ -130,20 +224,15 @@ class ChoiceSpace(Document):
                 f"choose.max_cost_eur: {self.choose.max_cost_eur:g}, but the cheapest candidate costs {cheapest:g}"
             )
 
-    @cached_property
-    def scenarios(self) -> tuple[Scenario, ...]:
-        """The scenarios, each with what carries the sensors as its ego."""
-        rigs = {self.always.name: self.always} if self.always else {}
-        return tuple(with_ego(Scenario.load(each), rigs, self.vehicle) for each in self.scenario)
-
-    @cached_property
-    def _carrier(self) -> Carrier:
-        return Carrier.of(self.scenarios)
+    @property
+    def first_rig(self) -> Rig | None:
+        """Sensors that are there in any case."""
+        return self.always
 
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:
         """The candidates, group by group."""
-        carrier, found = self._carrier, list[Sensor]()
+        carrier, found = self.carrier, list[Sensor]()
         for name, group in self.candidates.items():
             try:
                 found += group.sensors(name, carrier)
@@ -157,7 +246,7 @@ class ChoiceSpace(Document):
         return tuple(
             self.cost.get(name, 0.0) + (self.cost.get(MOUNT, 0.0) if self.cost else 0.0)
             for name, group in self.candidates.items()
-            for _ in group.sensors(name, self._carrier)
+            for _ in group.sensors(name, self.carrier)
         )
 
     def limits(self, kept: list[int]) -> Limits:

@@ -1,36 +1,113 @@
-"""Instants of many worlds that any rig is scored on: held once, with their reference."""
+"""Instants of many worlds that any rig is scored at: held once, with their reference."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
+from torch.utils.data import DataLoader, Dataset
 
-from torchcover.evaluation.progress import held_back
-from torchcover.placement.bits import Bits
-from torchcover.placement.held_worlds import Look
+from torchcover.coverage import Measure
+from torchcover.detection.inside import with_hits
+from torchcover.estimation import Estimate
+from torchcover.evaluation.pipeline import FramesOrErrors, killed_worker
+from torchcover.frames import Frame
+from torchcover.placement.carrier import Carrier
 from torchcover.placement.objective import Objective
-from torchcover.placement.question_grid import ReferencePoints
-from torchcover.placement.scores import Scores
-from torchcover.placement.sites import Site, instants_of
-from torchcover.placement.world_process import Holder, WorldProcess, WorldsHere, answers
-from torchcover.simulation import Rig, Scenario, with_ego
+from torchcover.placement.questions import Questions, RigNumbers
+from torchcover.placement.racing import TOGETHER, Prefix, racing_order
+from torchcover.simulation import Rig, Scenario, SimulatedFrames, Simulator, with_ego
 
 WORLDS = 6
 PER_WORLD = 3
 EVERY_S = 20.0
 RAYS = 16_384
 BUDGET_BYTES = 2e9
+MEASURES: tuple[Measure, Measure] = ("area", "known")
+# What a simulation that looks at a few instants of many worlds is asked for.
+MANY = 10**9
 
 AnyScenario = Scenario | str | Path
+
+
+class HeldInstant(NamedTuple):
+    """Which instant: the number of its scenario, the step there, and its world among all worlds."""
+
+    scenario: int
+    step: int
+    world: int
+
+
+class HeldWorlds(Dataset[Frame]):
+    """Frames of any rig at some instants, whose worlds and references are kept in the process that is asked.
+
+    Args:
+        simulations: Of the scenarios, without rigs.
+        instants: Which instants.
+        questions: What is asked about: of the reference only these points are kept.
+    """
+
+    def __init__(
+        self, simulations: Sequence[SimulatedFrames], instants: Sequence[HeldInstant], questions: Questions
+    ) -> None:
+        self._simulations, self._instants, self._questions = simulations, instants, questions
+        self._held: dict[int, Frame] = {}
+        self._rig: Rig | None = None
+        self._mounted: dict[int, Simulator] = {}
+
+    def __getitem__(self, asked: tuple[Rig | None, int]) -> Frame:
+        """What a rig sees at an instant; of no rig: the reference, and in the counts the bytes of its world."""
+        rig, number = asked
+        instant = self._instants[number]
+        if number not in self._held:
+            self._held[number] = self._built(instant, number)
+        held = self._held[number]
+        if rig is None:
+            return held
+        scans = self._with(rig, instant.scenario).scans(instant.step)[rig.name]
+        clouds = {rig.name: torch.from_numpy(np.concatenate([scan.points for scan in scans]))}
+        names = [sensor.name for sensor in rig.sensors]
+        return replace(
+            held,
+            clouds=clouds,
+            sensor_points={rig.name: dict(zip(names, (len(scan.points) for scan in scans), strict=True))},
+            counts={"rays": sum(scan.rays for scan in scans), "self_hits": sum(scan.self_hits for scan in scans)},
+            boxes=None if held.boxes is None else with_hits(held.boxes, clouds),
+        )
+
+    def _built(self, instant: HeldInstant, number: int) -> Frame:
+        frames = self._simulations[instant.scenario]
+        seen = frames[instant.step]
+        heights_m = seen.heights_in(self._questions.grid.band_frame)
+        kept = self._questions.asked(seen.reference, heights_m)
+        assert seen.reference_weights is not None  # those of a SurfaceReference
+        return replace(
+            seen,
+            reference=seen.reference[kept],
+            reference_weights=seen.reference_weights[kept],
+            reference_heights_m=None if heights_m is None else heights_m[kept],
+            index=number,
+            place_in_time=instant.world,
+            counts={"world_bytes": frames.simulator.scene_of(instant.step)[0].bytes},
+        )
+
+    def _with(self, rig: Rig, scenario: int) -> Simulator:
+        """A scenario with the rig, which is kept until another one comes: a race asks about it again and again."""
+        if rig != self._rig:
+            self._rig, self._mounted = rig, {}
+        if scenario not in self._mounted:
+            self._mounted[scenario] = self._simulations[scenario].simulator.with_rigs({rig.name: rig})
+        return self._mounted[scenario]
 
 
 class CommonInstants:
     """Instants of many worlds, held once with the points of their reference; a rig costs one scan and one search each.
 
-    Every rig sees the same instants as `SimulatedFrames` shows them and is measured against the same reference points,
-    so that differences are paired. Scores depend on the arguments alone, and not on the number of workers.
+    Every rig sees the same instants as `SimulatedFrames` shows them, is measured against the same reference points, and
+    observed by `CoverageMetric` and the published metrics, so that differences are paired, and numbers are those of
+    `evaluate`. They depend on the arguments alone, and not on the number of workers.
 
     Args:
         scenarios: What is played, one or several.
@@ -40,33 +117,29 @@ class CommonInstants:
         worlds: Worlds of each scenario that has traffic; any other scenario is one world.
         per_world: Instants in each.
         every_s: Time between them.
-        seed: Seed of the traffic and of the reference.
+        seed: Seed of the traffic, of the reference, and of the order of the instants.
         rays: About how many rays the reference casts at each instant.
+        estimate: What numbers of the coverage are means over: "area", the visible surface, or "known", the known cells.
         budget_bytes: What all worlds may take, about 35 MB for one of `urban`. All are held: to build one again takes
             five times as long as to score a rig on three instants of it.
         workers: Processes that hold the worlds; 0 holds them in this one.
 
     Attributes:
-        sites: The scenarios with their egos, what is asked about around these, and the settings.
-        instants: Which step of which site each instant is, and its world.
-        references: What the reference points of each instant count for.
-        questions: All that the objectives ask: bands in regions, each with a threshold.
-        parts: For each objective, by name, the numbers of its questions.
-        thresholds_m: The thresholds, in the order of the rows of bits.
-        unknown_worlds: Name of each objective -> how many worlds show nothing of one of its regions and bands; they
-            have no value, of any rig, and are in no difference.
+        questions: What the objectives ask.
+        instants: Which step of which scenario each instant is, and its world.
+        order: (n,) int64 the one order in which all rigs are scored.
 
     Raises:
         FileNotFoundError: An unknown name or file.
-        ValueError: No scenario, objective or world; a region or a band that nobody knows; a run with fewer instants;
-            worlds beyond the budget; an objective that is unknown in every world.
+        ValueError: No scenario, objective or world; scenarios with different egos; a region or a band that is none; a
+            run with fewer instants; worlds beyond the budget.
 
     Example:
         >>> near = Objective(region="20m", band="ground")
         >>> instants = CommonInstants(["courtyard"], {"near": near}, per_world=1, rays=2048)
-        >>> scores = instants.score(Rig.load("front_roof_128"))
-        >>> len(instants), scores.area.shape, bool(0.5 < scores.area[0, 0] < 1)
-        (1, (1, 1), True)
+        >>> estimate = instants.estimates(Rig.load("front_roof_128"))["area"]
+        >>> len(instants), bool(0.5 < estimate.value[0] < 1)
+        (1, True)
     """
 
     def __init__(
@@ -80,6 +153,7 @@ class CommonInstants:
         every_s: float = EVERY_S,
         seed: int = 0,
         rays: int = RAYS,
+        estimate: Measure = "area",
         budget_bytes: float = BUDGET_BYTES,
         workers: int = 0,
     ) -> None:
@@ -93,58 +167,54 @@ class CommonInstants:
         if workers < 0:
             raise ValueError(f"workers: a number >= 0 is needed; got {workers}")
         self.scenarios = tuple(one if isinstance(one, Scenario) else Scenario.load(one) for one in given)
-        self.objectives = dict(objectives)
-        self.vehicle = vehicle
-        self.seed = seed
-        self._per_world, self._every_s, self._rays = per_world, every_s, rays
-        self._budget_bytes, self._workers = budget_bytes, workers
-        self.sites = [
-            Site.of(one, objectives, vehicle, rays=rays, seed=seed, every_s=every_s) for one in self.scenarios
+        self.seed, self.estimate, self.objectives = seed, estimate, dict(objectives)
+        self._settings: dict[str, Any] = {"vehicle": vehicle, "per_world": per_world, "every_s": every_s, "rays": rays}
+        self._settings |= {"estimate": estimate, "budget_bytes": budget_bytes, "workers": workers}
+        self._vehicles: set[str | None] = {None}  # that were found to be that of these worlds
+        self._worlds = [with_ego(one, {}, vehicle) for one in self.scenarios]
+        self.questions = Questions.around(Carrier.of(self._worlds).outline_m, objectives)
+        simulations = [
+            SimulatedFrames(
+                one,
+                rigs={},
+                steps=MANY,
+                seed=seed,
+                every_s=every_s,
+                reference_sensor=self.questions.reference_sensor(rays),
+                boxes=self.questions.boxes,
+                kept_bytes=float("inf"),
+            )
+            for one in self._worlds
         ]
-        self.instants = instants_of(self.sites, worlds, per_world)
-        self.questions = self.sites[0].grid.questions
-        self.parts = {name: tuple(map(self.questions.index, one.questions)) for name, one in objectives.items()}
-        self.thresholds_m = tuple(dict.fromkeys(question.threshold_m for question in self.questions))
-        self._holders = self._hold(budget_bytes)
-        held: dict[int, ReferencePoints] = {}
-        for of_holder in answers(self._holders):
-            held |= of_holder
-        self.references = tuple(held[number] for number in range(len(self)))
-        self._check_known()
-
-    def _hold(self, budget_bytes: float) -> list[Holder]:
-        """Build all worlds, here or in other processes, which take them in turn."""
-        worlds = self.instants[-1].world + 1
-        if self._workers == 0:
-            return [WorldsHere(self.sites, self.instants, budget_bytes)]
-        count = min(self._workers, worlds)
-        shares = [[one for one in self.instants if one.world % count == k] for k in range(count)]
-        return [
-            WorldProcess(self.sites, share, budget_bytes * len(range(k, worlds, count)) / worlds)
-            for k, share in enumerate(shares)
-        ]
-
-    def _check_known(self) -> None:
-        unseen = Bits(
-            np.arange(len(self), dtype=np.int64),
-            np.zeros((len(self.thresholds_m), sum(one.bytes_of_bits for one in self.references)), dtype=np.uint8),
-            np.zeros(len(self), dtype=np.int64),
-            rays=1,
+        self.instants = _instants_of([one.simulator for one in simulations], worlds, per_world)
+        self.order = racing_order([instant.world for instant in self.instants], seed)
+        self._batches: list[list[tuple[Rig | None, int]]] = []
+        self._processes = min(workers, self.instants[-1].world + 1)
+        self._loader = DataLoader(
+            FramesOrErrors(HeldWorlds(simulations, self.instants, self.questions)),
+            batch_sampler=self._batches,
+            collate_fn=list,
+            num_workers=self._processes,
+            prefetch_factor=1 if workers else None,
+            persistent_workers=workers > 0,
         )
-        unknown = np.isnan(self.scores(unseen).by_world())
-        self.unknown_worlds = dict(zip(self.objectives, unknown.sum(axis=0).tolist(), strict=True))
-        for column, (name, objective) in enumerate(self.objectives.items()):
-            if unknown[:, column].all():
-                asked = ", ".join(f"{one.band} in {one.region}" for one in objective.questions)
-                raise ValueError(
-                    f"objective {name!r}: of {len(unknown)} worlds, none shows some surface in each of: {asked}; use "
-                    "more worlds or instants, or larger regions"
-                )
+        self._hold(budget_bytes)
 
-    @property
-    def world_of(self) -> NDArray[np.int64]:
-        """(instants,) int64 which world each instant is of: worlds are independent of each other."""
-        return np.array([instant.world for instant in self.instants], dtype=np.int64)
+    def _hold(self, budget_bytes: float) -> None:
+        """Build all worlds, as many at a time as there are processes, unless they take more than there is room for."""
+        worlds, bytes_of = self.instants[-1].world + 1, dict[int, float]()
+        together = max(self._processes, 1)
+        for first in range(0, worlds, together):
+            some = [at for at, one in enumerate(self.instants) if first <= one.world < first + together]
+            for frame in self.frames(None, some):
+                bytes_of[frame.place_in_time] = frame.counts["world_bytes"]
+            largest = max(bytes_of.values())
+            expected = sum(bytes_of.values()) + largest * (worlds - len(bytes_of))
+            if expected > budget_bytes:
+                raise ValueError(
+                    f"budget_bytes: {worlds} worlds take about {expected / 1e6:.0f} MB, and there are "
+                    f"{budget_bytes / 1e6:.0f} MB, in which {int(budget_bytes // largest)} fit; use fewer worlds"
+                )
 
     def __len__(self) -> int:
         return len(self.instants)
@@ -164,23 +234,88 @@ class CommonInstants:
         if not (fresh := [one for one in self.scenarios if not one.repeats]):
             names = ", ".join(repr(one.name) for one in self.scenarios)
             raise ValueError(f"scenarios: one whose worlds are drawn is needed; {names} is the same for any seed")
-        return CommonInstants(
-            fresh,
-            self.objectives,
-            vehicle=self.vehicle,
-            worlds=worlds,
-            per_world=self._per_world,
-            every_s=self._every_s,
-            seed=seed,
-            rays=self._rays,
-            budget_bytes=self._budget_bytes,
-            workers=self._workers,
-        )
+        return CommonInstants(fresh, self.objectives, worlds=worlds, seed=seed, **self._settings)
+
+    def prefixes(self, rig: Rig) -> Iterator[Prefix]:
+        """What is known of a rig after three instants more at a time; nothing is scored before it is asked for.
+
+        Args:
+            rig: The sensors.
+
+        Raises:
+            ValueError: The rig cannot be mounted: a sensor inside the vehicle or another body, or below the ground.
+        """
+        numbers, rays, self_hits = self._observers(rig, [self.estimate]), 0, 0
+        for start in range(0, len(self), TOGETHER):
+            for frame in self.frames(rig, self.order[start : start + TOGETHER].tolist()):
+                numbers.update(frame)
+                rays, self_hits = rays + frame.counts["rays"], self_hits + frame.counts["self_hits"]
+            done = min(start + TOGETHER, len(self))
+            yield Prefix(done, numbers.estimate(self.estimate), self_hits / rays)
+
+    def estimates(self, rig: Rig) -> dict[Measure, Estimate]:
+        """What is known of a rig after all instants, by either measure; ValueError as `prefixes`."""
+        numbers = self._observers(rig, MEASURES)
+        for frame in self.frames(rig, self.order.tolist()):
+            numbers.update(frame)
+        return {measure: numbers.estimate(measure) for measure in MEASURES}
+
+    def _observers(self, rig: Rig, measures: Sequence[Measure]) -> RigNumbers:
+        ego = self._worlds[0].ego_mesh() if self.questions.metrics else None
+        return self.questions.numbers_of(rig, ego, measures)
+
+    def frames(self, rig: Rig | None = None, numbers: Sequence[int] | None = None) -> Iterator[Frame]:
+        """What a rig sees at some instants, in their order, with the points of the reference that are asked about.
+
+        Args:
+            rig: The sensors; none gives the reference alone.
+            numbers: Of the instants; all if not given.
+
+        Raises:
+            ValueError: As `prefixes`.
+        """
+        if rig is not None:
+            self._check_vehicle(rig)
+        wanted = range(len(self)) if numbers is None else numbers
+        for start in range(0, len(wanted), TOGETHER):
+            yield from self._made(rig, wanted[start : start + TOGETHER])
+
+    def _made(self, rig: Rig | None, numbers: Sequence[int]) -> list[Frame]:
+        shares: list[list[int]] = [[] for _ in range(max(self._processes, 1))]
+        for number in numbers:
+            shares[self.instants[number].world % len(shares)].append(number)
+        # The k-th batch goes to the k-th process, which has built these worlds.
+        self._batches[:] = [[(rig, number) for number in share] for share in shares]
+        made: dict[int, Frame | ValueError] = {}
+        try:
+            for share, batch in zip(shares, self._loader, strict=True):
+                made |= zip(share, batch, strict=True)
+        except Exception as error:
+            if killed := killed_worker(error, self._processes, steps=len(made)):
+                raise killed from error
+            raise
+        frames = []
+        for number in numbers:
+            if isinstance(one := made[number], ValueError):
+                raise one
+            frames.append(one)
+        return frames
+
+    def _check_vehicle(self, rig: Rig) -> None:
+        """The rig's own vehicle counts where nothing else decides: then it must have been known from the start."""
+        if rig.vehicle in self._vehicles or self._settings["vehicle"] is not None:
+            return
+        for scenario, world in zip(self.scenarios, self._worlds, strict=True):
+            if with_ego(scenario, {rig.name: rig}).ego != world.ego:
+                raise ValueError(
+                    f"rig {rig.name!r} is for the vehicle {rig.vehicle}, and these instants have {world.ego_name}: say "
+                    "which by vehicle="
+                )
+        self._vehicles.add(rig.vehicle)
 
     def close(self) -> None:
         """End the processes that hold the worlds; without it they end with this object."""
-        for holder in self._holders:
-            holder.close()
+        vars(self).pop("_loader", None)
 
     def __enter__(self) -> Self:
         return self
@@ -188,98 +323,36 @@ class CommonInstants:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def score(self, rig: Rig, instants: Sequence[int] | NDArray[np.int64] | None = None) -> Scores:
-        """What a rig scores.
 
-        Args:
-            rig: The sensors.
-            instants: Numbers of the instants; all if not given.
+def _instants_of(simulators: Sequence[Simulator], worlds: int, per_world: int) -> list[HeldInstant]:
+    """The instants of all scenarios, world by world.
 
-        Raises:
-            ValueError: The rig cannot be mounted: a sensor inside the vehicle or another body, or below the ground; an
-                instant that there is none of.
-        """
-        return self.scores(self.bits(rig, instants))
+    Raises:
+        ValueError: A run through a scenario has fewer instants.
+    """
+    of_worlds = [
+        (scenario, steps)
+        for scenario, simulator in enumerate(simulators)
+        for steps in _steps(simulator, worlds, per_world)
+    ]
+    return [HeldInstant(scenario, step, world) for world, (scenario, steps) in enumerate(of_worlds) for step in steps]
 
-    def bits(self, rig: Rig, instants: Sequence[int] | NDArray[np.int64] | None = None) -> Bits:
-        """Which reference points a rig sees; `scores` says what that is worth.
 
-        Args:
-            rig: The sensors.
-            instants: Numbers of the instants; all if not given.
-
-        Raises:
-            ValueError: As in `score`.
-        """
-        numbers = list(range(len(self))) if instants is None else [int(number) for number in instants]
-        if not numbers or not all(0 <= number < len(self) for number in numbers):
-            raise ValueError(f"instants: numbers from 0 to {len(self) - 1} are needed; got {numbers[:20]}")
-        self._check_vehicle(rig)
-        looks = self._looks(rig, numbers)
-        return Bits(
-            np.array(numbers, dtype=np.int64),
-            np.concatenate([looks[number].seen for number in numbers], axis=1),
-            np.array([looks[number].self_hits for number in numbers], dtype=np.int64),
-            looks[numbers[0]].rays,
+def _steps(simulator: Simulator, worlds: int, per_world: int) -> list[list[int]]:
+    """Numbers of the steps of each world."""
+    if simulator.scenario.repeats:
+        # Where nothing moves every step draws another reference.
+        distinct = simulator.distinct_steps
+        return [list(range(per_world if distinct in (None, 1) else min(per_world, distinct or 0)))]
+    of_worlds: list[list[int]] = [[] for _ in range(worlds)]
+    index = 0
+    while (world := simulator.run_of(index)) < worlds:
+        if len(of_worlds[world]) < per_world:
+            of_worlds[world].append(index)
+        index += 1
+    if (fewest := min(map(len, of_worlds))) < per_world:
+        raise ValueError(
+            f"per_world: a run of {simulator.scenario.name!r} has {fewest} instants that are {simulator.every_s:g} s "
+            f"apart; got {per_world}"
         )
-
-    def _check_vehicle(self, rig: Rig) -> None:
-        """The rig's own vehicle counts where nothing else decides: then it must have been known from the start."""
-        if rig.vehicle is None or self.vehicle is not None:
-            return
-        for scenario, site in zip(self.scenarios, self.sites, strict=True):
-            if with_ego(scenario, {rig.name: rig}).ego != site.scenario.ego:
-                raise ValueError(
-                    f"rig {rig.name!r} is for the vehicle {rig.vehicle}, and these instants have "
-                    f"{site.scenario.ego_name}: say which by vehicle="
-                )
-
-    def _looks(self, rig: Rig, numbers: Sequence[int]) -> dict[int, Look]:
-        shares: list[list[int]] = [[] for _ in self._holders]
-        for number in dict.fromkeys(numbers):
-            shares[self.instants[number].world % len(shares)].append(number)
-        asked = [(holder, share) for holder, share in zip(self._holders, shares, strict=True) if share]
-        with held_back():  # or an answer would be left for the next question
-            for holder, share in asked:
-                holder.ask(rig, share)
-            of_holders = answers([holder for holder, _ in asked])
-        looks: dict[int, Look] = {}
-        for (_, share), of_holder in zip(asked, of_holders, strict=True):
-            looks |= zip(share, of_holder, strict=True)
-        return looks
-
-    def scores(self, bits: Bits) -> Scores:
-        """What it is worth to see some reference points.
-
-        Args:
-            bits: From `bits`, or the OR of several.
-        """
-        numbers = bits.instants.tolist()
-        questions = self.questions
-        seen_m2, visible_m2, known = np.empty((3, len(numbers), len(questions)))
-        start = 0
-        for row, number in enumerate(numbers):
-            reference = self.references[number]
-            end = start + reference.bytes_of_bits
-            packed, start = bits.seen[:, start:end], end
-            seen = np.unpackbits(packed, axis=1, count=reference.points).astype(bool)
-            cell_seen_m2 = {
-                threshold: np.bincount(
-                    reference.cell, reference.m2 * hit[reference.of], minlength=len(reference.cell_m2)
-                )
-                for threshold, hit in zip(self.thresholds_m, seen, strict=True)
-            }
-            for column, (question, cells) in enumerate(zip(questions, reference.cells_of, strict=True)):
-                of_cells, cell_m2 = cell_seen_m2[question.threshold_m][cells], reference.cell_m2[cells]
-                seen_m2[row, column], visible_m2[row, column] = of_cells.sum(), cell_m2.sum()
-                known[row, column] = (of_cells / cell_m2).mean() if len(cells) else np.nan
-        return Scores(
-            instants=bits.instants,
-            world=self.world_of[numbers],
-            parts=self.parts,
-            seen_m2=seen_m2,
-            visible_m2=visible_m2,
-            known_share=known,
-            self_hit_share=float(bits.self_hits.sum() / (len(numbers) * bits.rays)),
-            rays=bits.rays,
-        )
+    return of_worlds

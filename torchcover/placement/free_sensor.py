@@ -8,7 +8,7 @@ from pydantic import Field, PlainValidator, model_validator
 
 from torchcover.geometry import euler_from_rotation
 from torchcover.placement.carrier import Carrier
-from torchcover.placement.variables import DECIMALS, Choice, Number, Value, Variable
+from torchcover.placement.variables import DECIMALS, FreeChoice, FreeNumber, Value, Variable
 from torchcover.simulation import Document, Lidar, Pose, Sensor
 from torchcover.simulation.documents import FARTHEST_M, NameOrFile
 
@@ -118,9 +118,9 @@ class FreeSensor(Document):
         free: list[Variable] = []
         for key, given in self._given().items():
             if key in ("present", "model") or (key == "region" and isinstance(given, tuple)):
-                free.append(Choice(f"{sensor}.{key}", given))
+                free.append(FreeChoice(f"{sensor}.{key}", given))
             elif isinstance(given, tuple):
-                free.append(Number(f"{sensor}.{key}", *given))
+                free.append(FreeNumber(f"{sensor}.{key}", *given))
         return tuple(free)
 
     def _given(self) -> dict[str, Any]:
@@ -169,7 +169,7 @@ class FreeSensor(Document):
     def start_values(self, start: Sensor, carrier: Carrier) -> dict[str, Value]:
         """What the variables are in the rig that the search starts from, whether they may be that or not.
 
-        On a region nobody knows: the sensor may be anywhere.
+        On an unknown region: the sensor may be anywhere.
 
         Args:
             start: The sensor in that rig.
@@ -187,12 +187,7 @@ class FreeSensor(Document):
 
 
 def mirrored(start: Sensor, other: Sensor | None) -> Sensor | None:
-    """A sensor as the mirror image of another, of the same model, beyond the vehicle's middle; None where that is not.
-
-    Args:
-        start: The sensor, of which the name stays.
-        other: The one that it is the image of.
-    """
+    """A sensor as the mirror image of another, of the same model, beyond the vehicle's middle; None without one."""
     if other is None:
         return None
     numbers = {key: -value if key in MIRRORED else value for key, value in numbers_of(other.mount).items()}

@@ -1,64 +1,61 @@
-"""The winner of a search against its start, in worlds that the search has never seen."""
+"""The winner of a search against its start, in worlds that the search has never seen, in numbers and words."""
 
 import math
 from collections.abc import Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from typing import Any, NamedTuple
 
-from torchcover.coverage import Measure
-from torchcover.placement.instants import Instants
-from torchcover.placement.racing import Paired, paired
+from torchcover.estimation import Difference
+from torchcover.placement.common_instants import CommonInstants
+from torchcover.report.wording import shown_unit
 from torchcover.simulation import Rig
 
-WORLDS = 16
-MEASURES: tuple[Measure, Measure] = ("area", "known")
 
-
-@dataclass(frozen=True)
-class FreshGain:
-    """What the winner scores more than the start, of one objective by one measure.
+class FreshGain(NamedTuple):
+    """What the winner has better than the start, of one objective by one estimate.
 
     Args:
-        gain: Mean over the fresh worlds of the difference, a share.
-        error: Its standard error, paired over these worlds.
-        t: Gain over error.
-        p: Probability of a t at least as large to either side if there were no difference (Student).
-        worlds: Worlds that know the objective.
-        better: In how many of them the winner scores more.
+        objective: Its name.
+        estimate: What its number is a mean over: "area", "known", or "-" where there is no such choice.
+        test: The difference on fresh worlds, paired.
         search_gain: The gain on the instants of the search, which chose the winner by it.
-        optimism: How much more that was than the gain on fresh worlds.
     """
 
-    gain: float
-    error: float
-    t: float
-    p: float
-    worlds: int
-    better: int
+    objective: str
+    estimate: str
+    test: Difference
     search_gain: float
-    optimism: float
 
+    @property
+    def optimism(self) -> float:
+        """How much more the search had promised."""
+        return self.search_gain - self.test.gain
 
-@dataclass(frozen=True)
-class FreshTest:
-    """Winner against start on fresh worlds.
+    @property
+    def t(self) -> float:
+        """Gain over error; NaN if the error is unknown, or 0."""
+        return self.test.gain / self.test.error if self.test.error > 0 else math.nan
 
-    Args:
-        search_seed: Seed of the worlds of the search.
-        test_seed: Seed of the fresh ones.
-        instants: How many fresh instants there were.
-        gains: Name of the objective -> measure ("area", "known") -> gain.
-    """
-
-    search_seed: int
-    test_seed: int
-    instants: int
-    gains: Mapping[str, Mapping[Measure, FreshGain]]
+    @property
+    def record(self) -> dict[str, Any]:
+        """All of it, for JSON."""
+        test = self.test
+        return {
+            "unit": test.quantity.unit,
+            "gain": test.gain,
+            "error": test.error,
+            "t": self.t,
+            "p": test.p,
+            "worlds": test.blocks,
+            "better": test.better,
+            "search_gain": self.search_gain,
+            "optimism": self.optimism,
+        }
 
 
 def fresh_test(
-    winners: Mapping[str, Rig], start: Rig, searched: Instants, *, test_seed: int, worlds: int = WORLDS
-) -> dict[str, FreshTest]:
+    winners: Mapping[str, Rig], start: Rig, searched: CommonInstants, *, test_seed: int, worlds: int
+) -> dict[str, tuple[FreshGain, ...]]:
     """Score rigs in worlds of another seed, instant by instant against the same reference.
 
     Args:
@@ -70,66 +67,78 @@ def fresh_test(
             left out.
 
     Returns:
-        The tests, by the names of the winners.
+        The gains by the names of the winners: in each objective by the estimate of the search, then by the other one
+        where that is a choice.
 
     Raises:
         ValueError: The seed of the search; no scenario with traffic; a rig that cannot be mounted in a fresh world.
     """
     with closing(searched.anew(test_seed, worlds)) as fresh:
-        start_by_test = fresh.score(start)
-        by_test = {name: fresh.score(winner) for name, winner in winners.items()}
-    start_by_search = searched.score(start)
+        start_by_test = fresh.estimates(start)
+        by_test = {name: fresh.estimates(winner) for name, winner in winners.items()}
+    start_by_search = searched.estimates(start)
+    own = {objective: asked.own_estimate for objective, asked in searched.objectives.items()}
     tests = {}
     for name, winner in winners.items():
-        scores, by_search = by_test[name], searched.score(winner)
-        pairs = {
-            measure: (paired(scores, start_by_test, measure), paired(by_search, start_by_search, measure))
-            for measure in MEASURES
-        }
-        gains = {
-            objective: {measure: _gain(*pair, column) for measure, pair in pairs.items()}
-            for column, objective in enumerate(scores.objectives)
-        }
-        tests[name] = FreshTest(searched.seed, test_seed, len(scores.instants), gains)
+        by_search = searched.estimates(winner)
+        tests[name] = tuple(
+            FreshGain(objective, own[objective] or estimate, test, in_search[objective].gain)
+            for estimate in sorted(start_by_search, key=lambda one: one != searched.estimate)
+            for in_search in [by_search[estimate].differences(start_by_search[estimate])]
+            for objective, test in by_test[name][estimate].differences(start_by_test[estimate]).items()
+            if estimate == searched.estimate or not own[objective]
+        )
     return tests
 
 
-def _gain(test: Paired, search: Paired, column: int) -> FreshGain:
-    gain, error, worlds = float(test.gain[column]), float(test.error[column]), int(test.worlds[column])
-    t = gain / error if error > 0 else math.nan
-    return FreshGain(
-        gain=gain,
-        error=error,
-        t=t,
-        p=student_p(t, worlds - 1),
-        worlds=worlds,
-        better=int(test.better[column]),
-        search_gain=float(search.gain[column]),
-        optimism=float(search.gain[column]) - gain,
-    )
-
-
-def student_p(t: float, degrees_of_freedom: int) -> float:
-    """Probability that Student's t lies farther from 0 than some value, to either side.
-
-    The finite series of Abramowitz & Stegun 1964, equations 26.7.3 and 26.7.4.
-
-    Args:
-        t: The value; NaN gives NaN.
-        degrees_of_freedom: 1 or more.
+def amount(value: float, unit: str, sign: str = "") -> str:
+    """A gain without its unit: shares in percentage points.
 
     Example:
-        >>> round(student_p(2.131, 15), 3), round(student_p(1.0, 1), 3)
-        (0.05, 0.5)
+        >>> amount(0.01234, "share", "+"), amount(0.01234, "m")
+        ('+1.23', '0.012')
     """
-    if math.isnan(t):
-        return math.nan
-    angle = math.atan(abs(t) / math.sqrt(degrees_of_freedom))
-    sine, cosine = math.sin(angle), math.cos(angle)
-    odd = degrees_of_freedom % 2
-    term, total = (cosine, 0.0) if odd else (1.0, 0.0)
-    for power in range(1 if odd else 0, degrees_of_freedom - 1, 2):
-        total += term
-        term *= cosine**2 * (power + 1) / (power + 2)
-    within = 2 / math.pi * (angle + sine * total) if odd else sine * total
-    return max(0.0, 1.0 - within)
+    return f"{shown_unit(unit).factor * value:{sign}.{2 if unit == 'share' else 3}f}"
+
+
+def unit_words(unit: str) -> str:
+    """What stands behind it."""
+    return "points" if unit == "share" else unit
+
+
+def told(gain: FreshGain, *, optimism: bool = False) -> str:
+    """A gain in words, which call it one only where it is told from chance: by Student's t at 95 %.
+
+    Args:
+        gain: It.
+        optimism: Whether to say how much more the search had promised.
+
+    Example:
+        >>> from torchcover.coverage.quantity import detection
+        >>> test = Difference(detection(0.4), 0.0132, 0.0024, significant=True, blocks=16, better=16)
+        >>> told(FreshGain("near", "area", test, 0.0148), optimism=True)
+        'gained 1.32 ± 0.24 points on 16 fresh worlds (t 5.5, better in 16), optimism +0.16'
+        >>> told(FreshGain("near", "area", test._replace(value=0.002, significant=False), 0.0148))
+        'no gain is shown: +0.20 ± 0.24 points on 16 fresh worlds (t 0.8, better in 16)'
+    """
+    test, unit = gain.test, gain.test.quantity.unit
+    if math.isnan(test.value):
+        return "unknown in the fresh worlds"
+    error = "± ?" if math.isnan(test.error) else f"± {amount(test.error, unit)}"
+    t = "t unknown" if math.isnan(gain.t) else f"t {gain.t:.1f}"
+    rest = f"{error} {unit_words(unit)} on {test.blocks} fresh worlds ({t}, better in {test.better})"
+    if optimism and not math.isnan(gain.optimism):
+        rest += f", optimism {amount(gain.optimism, unit, '+')}"
+    if test.significant:
+        verb = "gained" if test.gain > 0 else "lost"
+        return f"{verb} {amount(abs(test.gain), unit)} {rest}"
+    return f"no gain is shown: {amount(test.gain, unit, '+')} {rest}"
+
+
+def finite(value: Any) -> Any:  # noqa: ANN401  (whatever a record holds)
+    """A record as JSON can have it: what is unknown is None."""
+    if isinstance(value, Mapping):
+        return {key: finite(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(each) for each in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

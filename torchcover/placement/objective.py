@@ -1,58 +1,113 @@
-"""What a rig is scored by: detection in some regions and height bands."""
+"""A number of a result that a search makes better, as a space writes it."""
 
+import re
+import warnings
 from collections.abc import Mapping
-from typing import Annotated, NamedTuple
+from difflib import get_close_matches
+from typing import Annotated, Self
 
-from pydantic import Field, NonNegativeFloat
+from pydantic import Field, NonNegativeFloat, model_validator
 
 from torchcover.coverage import Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
-from torchcover.simulation import Document
+from torchcover.published import PUBLISHED, Setup
+from torchcover.simulation import Document, Rig
 from torchcover.simulation.regions_of_interest import RegionOfInterest
 
 Name = Annotated[str, Field(min_length=1)]
 
+THRESHOLD_M = 0.4
+# Numbers by area or over known cells.
+CHOSEN = re.compile(r"(radius_m|(detection|sensors|seen_by_two)_[\d.]+m)(_without_|$)")
 
-class Question(NamedTuple):
-    """A number of one region in one band: the detection within `threshold_m`."""
 
-    threshold_m: float
-    band: str
-    region: str
+def published_numbers() -> list[str]:
+    """Those of published metrics that may be objectives, of any rig."""
+    setup = Setup(sensors=Rig.load("front_roof_32").sensors)
+    with warnings.catch_warnings(action="ignore"):  # that they were fed with nothing
+        numbers = {name: each.make(setup).estimate().quantities for name, each in PUBLISHED.items()}
+    return [one.key for name, each in numbers.items() for one in each if one.key.startswith(name)]
 
 
 class Objective(Document):
-    """The mean of the detection over some regions and height bands, each weighing the same. Higher is better.
+    """A number of a rig that is made better: a mean over some regions and height bands, each weighing the same.
 
     Args:
-        detection: Threshold in metres: a reference point with a point of the rig within it counts as detected.
-        band: Name of a height band of the paper, "ground" or "obstacle", or several.
+        number: "radius_m", "detection_0.4m"; "known_radius_m" over known cells whatever the search is by;
+            "radius_maximum_m" of an aggregation; "seen_by_two_0.4m" or "detection_0.4m_without_roof" of redundancy,
+            where "any" stands for the sensor whose failure is worst; or a published metric's, as "s_mig_0.2m". Whether
+            more or less of it is better, it knows itself.
+        detection: Threshold in metres, in short for the number `detection_0.4m`: a reference point with a point of the
+            rig within it counts as detected. 0.4 if no number is given.
+        band: Name of a height band of the paper, "ground" or "obstacle", or several; both if not given.
         region: Name of a region, or several, as tables of `torchcover.evaluate` call them: "20m", "80m", "160m" ahead,
             "front_3m", "rear_3m", "left_3m", "right_3m" around the vehicle; or regions of one's own by name, written as
-            those in a YAML file of `RegionsOfInterest`.
+            those in a YAML file of `RegionsOfInterest`. Not of published metrics, whose names say what they are about.
 
     Example:
         >>> far = Objective(detection=0.4, band=["ground", "obstacle"], region="80m")
-        >>> [(each.band, each.region) for each in far.questions]
-        [('ground', '80m'), ('obstacle', '80m')]
-        >>> Objective(region={"behind": {"x_m": [-10.0, -3.0], "y_m": [-2.0, 2.0]}}).questions[0].region
+        >>> far.key, far.places
+        ('detection_0.4m', (('80m', 'ground'), ('80m', 'obstacle')))
+        >>> Objective(number="radius_m", region={"behind": {"x_m": [-10.0, -3.0], "y_m": [-2.0, 2.0]}}).places[0][0]
         'behind'
     """
 
-    detection: NonNegativeFloat = 0.4
-    band: Name | tuple[Name, ...] = tuple(PAPER_HEIGHTS)
+    number: Name | None = None
+    detection: NonNegativeFloat | None = None
+    band: Name | tuple[Name, ...] | None = None
     region: (
         Name
         | Annotated[tuple[Name, ...], Field(min_length=1)]
         | Annotated[dict[Name, RegionOfInterest], Field(min_length=1)]
-    )
+        | None
+    ) = None
+
+    @model_validator(mode="after")
+    def _check_one_of(self) -> Self:
+        if self.number is not None and self.detection is not None:
+            raise ValueError(f"number, detection: one of the two is possible; got {self.number!r} and a threshold")
+        if self.region is None and self.metric is None:
+            near = get_close_matches(self.key, published_numbers(), n=1)
+            meant = f"; near is {near[0]!r} of a published metric, which needs none" if near else ""
+            raise ValueError(f"region: it is needed for {self.key!r}{meant}")
+        if self.region is not None and self.metric is not None:
+            raise ValueError(f"region: {self.number!r} has none")
+        if self.metric is not None and self.band is not None:
+            raise ValueError(f"band: {self.number!r} has none")
+        return self
 
     @property
-    def questions(self) -> tuple[Question, ...]:
-        """What it is the mean of."""
-        bands = (self.band,) if isinstance(self.band, str) else self.band
-        regions = (self.region,) if isinstance(self.region, str) else tuple(self.region)
-        return tuple(Question(self.detection, band, region) for region in regions for band in bands)
+    def key(self) -> str:
+        """Of its number."""
+        return self.number or f"detection_{THRESHOLD_M if self.detection is None else self.detection:g}m"
+
+    @property
+    def metric(self) -> str | None:
+        """The published metric that gives it; None where the coverage does."""
+        return max((name for name in PUBLISHED if self.key.startswith(name)), key=len, default=None)
+
+    @property
+    def own_estimate(self) -> str:
+        """What its number is a mean over where that is no choice.
+
+        Returns:
+            "known" of a number over known cells, "-" of a published metric or an aggregation; else empty: "area" or
+            "known", as a search is asked.
+
+        Example:
+            >>> [Objective(number=key, region="20m").own_estimate for key in ("known_radius_m", "radius_maximum_m")]
+            ['known', '-']
+        """
+        if self.key.startswith("known_"):
+            return "known"
+        return "" if CHOSEN.match(self.key) else "-"
+
+    @property
+    def places(self) -> tuple[tuple[str, str], ...]:
+        """The regions and bands that it is the mean over; none of a published metric."""
+        bands = (self.band,) if isinstance(self.band, str) else tuple(PAPER_HEIGHTS) if self.band is None else self.band
+        regions = (self.region,) if isinstance(self.region, str) else tuple(self.region or ())
+        return tuple((region, band) for region in regions for band in bands)
 
     def regions(self, usual: Mapping[str, Region]) -> tuple[Region, ...]:
         """Its regions.
@@ -65,7 +120,18 @@ class Objective(Document):
         """
         if isinstance(self.region, dict):
             return tuple(region.called(name) for name, region in self.region.items())
-        names = (self.region,) if isinstance(self.region, str) else self.region
+        names = dict.fromkeys(region for region, _ in self.places)
         if unknown := [name for name in names if name not in usual]:
             raise ValueError(f"region {unknown[0]!r}: one of {', '.join(usual)} is needed, or {{name: {{x_m, y_m}}}}")
         return tuple(usual[name] for name in names)
+
+    def check_bands(self) -> None:
+        """Refuse a band that there is none of.
+
+        Raises:
+            ValueError: It is none of the paper's, or there is none at all.
+        """
+        if unknown := [band for _, band in self.places if band not in PAPER_HEIGHTS]:
+            raise ValueError(f"band {unknown[0]!r}: {' or '.join(map(repr, PAPER_HEIGHTS))} is needed")
+        if not self.places and self.metric is None:
+            raise ValueError("band: at least one is needed")

@@ -8,19 +8,18 @@ from typing import Any, cast
 
 from torchcover import __version__
 from torchcover.coverage import Measure
-from torchcover.placement.common_instants import EVERY_S, PER_WORLD, RAYS, WORLDS, CommonInstants
-from torchcover.placement.instants import Instants
+from torchcover.placement.common_instants import EVERY_S, MEASURES, PER_WORLD, RAYS, WORLDS, CommonInstants
 from torchcover.placement.optimisers import AUTO, OPTIMISERS, MakesOptimiser, optimiser_for
 from torchcover.placement.space import SearchSpace
-from torchcover.placement.variables import Choice
+from torchcover.placement.variables import FreeChoice
 
 FRESH_WORLDS = 16
-MEASURES: tuple[Measure, ...] = ("area", "known")
-
-MakesInstants = Callable[[SearchSpace, "SearchPlan", int, int], Instants]
 
 
-def common_instants(space: SearchSpace, plan: "SearchPlan", seed: int, worlds: int) -> Instants:
+MakesInstants = Callable[[SearchSpace, "SearchPlan", int, int], CommonInstants]
+
+
+def common_instants(space: SearchSpace, plan: "SearchPlan", seed: int, worlds: int) -> CommonInstants:
     """Instants of the worlds of a seed."""
     return CommonInstants(
         space.scenarios,
@@ -30,6 +29,7 @@ def common_instants(space: SearchSpace, plan: "SearchPlan", seed: int, worlds: i
         every_s=plan.every_s,
         seed=seed,
         rays=plan.rays,
+        estimate=plan.estimate,
         workers=plan.workers,
     )
 
@@ -39,19 +39,19 @@ class SearchPlan:
     """Budget, worlds and seeds of a placement search.
 
     Args:
-        evaluations: Candidates to look at beside the start, those of the control included; or
+        evaluations: Candidates to look at after the start, those of the control included; or
         budget_s: seconds for all of it, the instants and the test on fresh worlds included. One of the two is needed.
         optimiser: "auto", a name in `OPTIMISERS`, or whatever makes an `Optimiser` from a `Cube` and a seed.
         seed: Of the worlds that candidates are scored in, and of all that is drawn.
         test_seed: Of the fresh worlds; not given, the next.
-        measure: What a score is: "area", the share of the visible surface, or "known", the mean of the known cells.
+        estimate: What a score is: "area", the share of the visible surface, or "known", the mean of the known cells.
         worlds: Worlds of each scenario to search in.
         fresh_worlds: Worlds of each to test in.
         per_world: Instants of each world.
         every_s: Time between them.
         rays: About how many rays the reference casts at each.
         workers: Processes that score; 0 scores in this one. Results do not depend on it.
-        instants: What makes instants.
+        instants: What makes instants: `CommonInstants`, or anything that can be asked for the same.
 
     Raises:
         ValueError: Values that make no sense.
@@ -62,7 +62,7 @@ class SearchPlan:
     optimiser: str | MakesOptimiser = AUTO
     seed: int = 0
     test_seed: int | None = None
-    measure: Measure = "area"
+    estimate: Measure = "area"
     worlds: int = WORLDS
     fresh_worlds: int = FRESH_WORLDS
     per_world: int = PER_WORLD
@@ -83,8 +83,8 @@ class SearchPlan:
             raise ValueError(
                 f"test_seed: the worlds would not be fresh with the seed of the search; both are {self.seed}"
             )
-        if self.measure not in MEASURES:
-            raise ValueError(f"measure: one of {', '.join(MEASURES)} is needed; got {self.measure!r}")
+        if self.estimate not in MEASURES:
+            raise ValueError(f"estimate: one of {', '.join(MEASURES)} is needed; got {self.estimate!r}")
         if isinstance(self.optimiser, str) and self.optimiser not in (AUTO, *OPTIMISERS):
             raise ValueError(f"optimiser: one of {', '.join((AUTO, *OPTIMISERS))} is needed; got {self.optimiser!r}")
 
@@ -117,7 +117,7 @@ class SearchPlan:
             "space": space.name,
             "space_sha256": hashlib.sha256(text.encode()).hexdigest(),
             "optimiser": self.optimiser_in(space)[0],
-            "measure": self.measure,
+            "estimate": self.estimate,
             "seed": self.seed,
             "worlds": self.worlds,
             "per_world": self.per_world,
@@ -129,4 +129,4 @@ class SearchPlan:
 def levels_of(space: SearchSpace) -> tuple[int, ...]:
     """As of `Cube`."""
     variables = cast("Sequence[object]", space.variables)
-    return tuple(len(each.options) if isinstance(each, Choice) else 0 for each in variables)
+    return tuple(len(each.options) if isinstance(each, FreeChoice) else 0 for each in variables)

@@ -1,18 +1,15 @@
-"""Racing: rigs are scored on a few instants at a time, and those that are clearly worse are given up."""
+"""Racing: a rig is scored at a few instants more at a time, and given up when it is clearly worse than another."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.coverage import Measure
-from torchcover.placement.scores import Scores
+from torchcover.estimation import Estimate
 
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
-Candidate = TypeVar("Candidate")
 
 TOGETHER = 3
 ERRORS_BELOW = 2.0
@@ -20,43 +17,30 @@ ERRORS_BELOW = 2.0
 MIN_WORLDS = 3
 
 
-@dataclass(frozen=True, eq=False)
-class Paired:
-    """What one rig scores more than another at the same instants, for each objective.
+class Prefix(NamedTuple):
+    """What is known of a rig after the first instants, in the one order that all rigs are scored in.
 
     Args:
-        gain: (O,) mean over the worlds that know the objective of the difference there; NaN if none does.
-        error: (O,) its standard error, from the spread over these worlds; NaN for fewer than 3.
-        worlds: (O,) int64 how many these are.
-        better: (O,) int64 in how many of them it scores more.
+        instants: How many these are.
+        estimate: Of the objectives.
+        self_hit_share: Share of the rig's rays that the vehicle itself took.
     """
 
-    gain: Float64
-    error: Float64
-    worlds: Numbers
-    better: Numbers
+    instants: int
+    estimate: Estimate
+    self_hit_share: float
 
 
-def paired(scores: Scores, other: Scores, measure: Measure = "area") -> Paired:
-    """Compare two rigs.
+def gains(estimate: Estimate, other: Estimate) -> tuple[Float64, Float64]:
+    """What one rig has better than another after the same instants, and the standard errors of that.
 
-    Args:
-        scores: Of the one.
-        other: Of the other, at the same instants and perhaps more.
-        measure: Which share of the reference points counts, see `Scores.by_world`.
-
-    Raises:
-        ValueError: The other was not scored at all of these instants.
+    Returns:
+        (O,) gains in the units of the objectives, more is better; NaN where one is unknown. (O,) errors over worlds;
+        NaN for fewer than 3.
     """
-    difference = scores.by_world(measure) - other.at(scores.instants).by_world(measure)
-    known = ~np.isnan(difference)
-    worlds = known.sum(axis=0)
-    each = np.where(known, difference, 0.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        gain = each.sum(axis=0) / worlds
-        spread = np.where(known, difference - gain, 0.0)
-        error = np.sqrt((spread**2).sum(axis=0) / (worlds - 1) / worlds)
-    return Paired(gain, np.where(worlds >= MIN_WORLDS, error, np.nan), worlds, (each > 0).sum(axis=0))
+    between = estimate.minus(other)
+    sign = [quantity.gain(1.0) for quantity in between.quantities]
+    return between.value.numpy() * sign, between.errors(MIN_WORLDS).numpy()
 
 
 def racing_order(world_of: Sequence[int] | Numbers, seed: int) -> Numbers:
@@ -84,68 +68,26 @@ def racing_order(world_of: Sequence[int] | Numbers, seed: int) -> Numbers:
     return order
 
 
-@dataclass(frozen=True, eq=False)
-class Raced:
-    """What became of a rig in a race.
+def race(prefixes: Iterable[Prefix], incumbents: Sequence[Sequence[Prefix]] = ()) -> tuple[Prefix, ...]:
+    """Score a rig on until it is clearly below an incumbent after the same instants, or was scored at all of them.
+
+    Clearly is two standard errors of their paired difference, over worlds, in every objective.
 
     Args:
-        scores: At the instants that it was given.
-        dropped: Whether it was given up before the last one.
-    """
-
-    scores: Scores
-    dropped: bool
-
-
-def race(
-    score: Callable[[Candidate, Numbers], Scores],
-    candidates: Sequence[Candidate],
-    order: Sequence[int] | Numbers,
-    *,
-    incumbents: Sequence[Scores] = (),
-    measure: Measure = "area",
-    together: int = TOGETHER,
-) -> list[Raced]:
-    """Score rigs on a few more instants at a time; give up each that is clearly below another one.
-
-    That is two standard errors of their paired difference below it, over worlds, in every objective: below one of the
-    incumbents, or another candidate that is still in the race.
-
-    Args:
-        score: `CommonInstants.score`, or what asks it.
-        candidates: One or several.
-        order: Of the instants, as from `racing_order`.
-        incumbents: Scores of the best so far, at all of these instants; of several objectives there may be several.
-        measure: As in `paired`.
-        together: Instants that are added at a time.
+        prefixes: What is known of it after more and more instants; no more of them is asked for than is needed.
+        incumbents: The best so far, at all instants; of several objectives there may be several.
 
     Returns:
-        What became of each candidate.
-
-    Raises:
-        ValueError: What `score` raises, of a rig that cannot be mounted; no instant; fewer than one at a time.
+        What was asked for.
     """
-    instants = np.asarray(order, dtype=np.int64)
-    if len(instants) == 0 or together < 1:
-        raise ValueError(f"order, together: an instant, and one at a time, are needed; got {len(instants)}, {together}")
-    scores: dict[int, Scores] = {}
-    racing = list(range(len(candidates)))
-    for start in range(0, len(instants), together):
-        batch = instants[start : start + together]
-        for number in racing:
-            added = score(candidates[number], batch)
-            scores[number] = scores[number].joined(added) if start else added
-        if start + together < len(instants):
-            racing = _left(racing, scores, incumbents, measure)
-    return [Raced(scores[number], number not in racing) for number in range(len(candidates))]
+    known: list[Prefix] = []
+    for prefix in prefixes:
+        known.append(prefix)
+        if any(_is_below(prefix.estimate, other[len(known) - 1].estimate) for other in incumbents):
+            break
+    return tuple(known)
 
 
-def _left(
-    racing: Sequence[int], scores: dict[int, Scores], incumbents: Sequence[Scores], measure: Measure
-) -> list[int]:
-    def is_below(number: int) -> bool:
-        others = [*incumbents, *(scores[other] for other in racing if other != number)]
-        differences = (paired(scores[number], other, measure) for other in others)
-        return any(bool((one.gain < -ERRORS_BELOW * one.error).all()) for one in differences)
-
-    return [number for number in racing if not is_below(number)]
+def _is_below(estimate: Estimate, other: Estimate) -> bool:
+    gain, error = gains(estimate, other)
+    return bool((gain < -ERRORS_BELOW * error).all())

@@ -1,23 +1,26 @@
-"""What a search has found, in numbers and words."""
+"""What a search has found, in numbers, words and tables."""
 
-import math
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
-from torchcover.coverage import Measure
+from torchcover.evaluation.settings import FILES
 from torchcover.placement.arm import Arm
 from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
-from torchcover.placement.fresh import FreshGain, FreshTest
+from torchcover.placement.fresh import FreshGain, amount, told, unit_words
 from torchcover.placement.pareto import hypervolume
+from torchcover.placement.report_files import OF_THE_RUN, PlacementReport
+from torchcover.placement.result_pictures import search_pictures
 from torchcover.placement.search import PlacementSearch
+from torchcover.report import PageTable, Words, file_stems
 from torchcover.simulation import Rig
 
-# Otherwise, a gain is not told from chance; of few worlds, a large t is none yet.
-ENOUGH_T, ENOUGH_P = 2.0, 0.05
+HEADINGS = ("found by", "objective", "estimate", "gain in\nthe search", "gain on\nfresh worlds", "t",
+            "better in\n(worlds)", "optimism")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,14 +32,14 @@ class Pick:
         role: Of several objectives, "middle" of the front, or the name of the objective that it is best in; else empty.
         evaluation: It.
         rig: It, as it can be evaluated.
-        test: On fresh worlds; None if it was not tested, as the start itself is not.
+        gains: On fresh worlds, by the estimate of the search first; empty if it was not tested, as the start itself.
     """
 
     arm: str
     role: str
     evaluation: Evaluation
     rig: Rig
-    test: FreshTest | None = None
+    gains: Sequence[FreshGain] = ()
 
     @property
     def is_start(self) -> bool:
@@ -48,14 +51,10 @@ class Pick:
         """What tables call it."""
         return f"{self.arm}: {self.role}" if self.role else self.arm
 
-    def tested(self, test: FreshTest | None) -> Self:
-        """It, with its test."""
-        return replace(self, test=test)
-
 
 @dataclass(frozen=True, eq=False)
 class SearchResult:
-    """What `PlacementSearch.run` returns.
+    """What `run_search` returns.
 
     Args:
         search: With all its evaluations.
@@ -79,19 +78,17 @@ class SearchResult:
         """The best, or the start if nothing better was found."""
         return self.search.space.start if self.best is None else self.best.rig
 
-    def gains_of(self, pick: Pick) -> Iterator[tuple[str, Measure, FreshGain]]:
-        """What it gained on fresh worlds: objective by objective, in the measure of the search first."""
-        first = self.search.plan.measure
-        for objective, gains in pick.test.gains.items() if pick.test is not None else ():
-            for measure in sorted(gains, key=lambda each: each != first):
-                yield objective, measure, gains[measure]
-
     @property
     def hypervolumes(self) -> dict[str, float]:
         """Of the front of each arm, above the least that any candidate of both gained in each objective."""
         gains = {name: arm.gains[arm.complete] for name, arm in self.search.arms.items()}
         every = np.vstack([*gains.values(), np.zeros((1, len(self.search.space.objectives)))])
         return {name: hypervolume(values, every.min(axis=0)) for name, values in gains.items()}
+
+    @property
+    def units(self) -> list[str]:
+        """Of the objectives."""
+        return [each.unit for each in self.search.evaluations[0].prefixes[-1].estimate.quantities]
 
     @property
     def sentence(self) -> str:
@@ -109,10 +106,10 @@ class SearchResult:
             yield f"No candidate of the optimiser can be in {self._spent(OPTIMISER)}."
         elif best.is_start:
             yield f"Nothing better than {search.space.start.name} was found in {self._spent(OPTIMISER)}."
-        elif best.test is None:
+        elif not best.gains:
             yield f"Found in {self._spent(OPTIMISER)}, but not tested, so that no gain is shown: {self.untested}."
         else:
-            yield f"{'; '.join(self._told(best))}."
+            yield f"{self._told(best, optimism=True)}."
         yield self._control()
         yield f"Racing saved {search.share_saved:.0%} of the instants."
 
@@ -125,96 +122,154 @@ class SearchResult:
             )
             return f"Hypervolume of the fronts, with the same budget, in per cent of the larger: {shares}."
         other = next((pick for pick in self.picks if pick.arm == RANDOM), None)
-        if other is not None and other.test is not None:
-            return f"Random search with the same budget: {'; '.join(self._told(other, short=True))}."
+        if other is not None and other.gains:
+            return f"Random search with the same budget: {self._told(other, optimism=False)}."
         what = "no rig" if other is None else "nothing better" if other.is_start else "a rig that was not tested"
         return f"Random search with the same budget found {what} in {self._spent(RANDOM)}."
 
-    def _told(self, pick: Pick, *, short: bool = False) -> Iterator[str]:
-        for objective, measure, gain in self.gains_of(pick):
-            if measure != self.search.plan.measure:
-                continue
-            yield f"{objective}: {told(gain)}" + ("" if short else told_optimism(gain))
+    def _told(self, pick: Pick, *, optimism: bool) -> str:
+        gains = pick.gains[: len(self.search.space.objectives)]
+        return "; ".join(f"{gain.objective}: {told(gain, optimism=optimism)}" for gain in gains)
 
     def _spent(self, arm: str) -> str:
-        one = self.search.arms[arm]
-        return f"{len(one.evaluations) - 1} candidates"
+        return f"{len(self.search.arms[arm].evaluations) - 1} candidates"
 
     @property
-    def record(self) -> dict[str, Any]:
-        """All but the single evaluations: what stands in `search.json`; what nobody knows is None."""
-        search, plan = self.search, self.search.plan
+    def report(self) -> PlacementReport:
+        """For its files, its page, and the terminal."""
+        search, settings = self.search, self.search.plan.settings(self.search.space)
+        ends = [pick for pick in self.picks if pick.arm == OPTIMISER][1:]
+        best_of = zip(file_stems([pick.role for pick in ends]), ends, strict=True)
         several = len(search.space.objectives) > 1
-        record: dict[str, Any] = known(
-            {
-                **plan.settings(search.space),
-                "evaluations": plan.evaluations,
-                "budget_s": plan.budget_s,
-                "test_seed": plan.seed_of_test,
-                "fresh_worlds": plan.fresh_worlds,
+        volumes = self.hypervolumes if several else None
+        of_plan = {name: getattr(search.plan, name) for name in ("evaluations", "budget_s", "fresh_worlds")}
+        return PlacementReport(
+            title=f"{search.space.name}: where should the sensors go?",
+            sentence=self.sentence,
+            record={
+                **settings,
+                **of_plan,
+                "test_seed": search.plan.seed_of_test,
                 "seconds": round(self.seconds, 3),
                 "arms": {name: _arm_record(arm) for name, arm in search.arms.items()},
                 "share_of_instants_saved": search.share_saved,
-                "hypervolume": self.hypervolumes if several else None,
+                "hypervolume": volumes,
                 "found": [self._pick_record(pick) for pick in self.picks],
                 "untested": self.untested or None,
-                "sentence": self.sentence,
-            }
+            },
+            settings=[name for name in (*settings, *of_plan, "test_seed") if name not in OF_THE_RUN],
+            rigs={"best.yaml": self.rig} | {f"best_{stem}.yaml": end.rig for stem, end in best_of},
+            shown={"start": search.space.start, **{pick.name: pick.rig for pick in self.picks}},
+            tables=[
+                PageTable(f"{search.space.name}: against {search.space.start.name}", HEADINGS, self._gain_rows(), 3),
+                self._values(),
+                _spent_table(search, volumes),
+            ],
+            rows={"evaluations.csv": self._evaluation_rows(), "pareto.csv": self._pareto_rows()},
+            pictures=partial(search_pictures, search, None if self.best is None else self.best.evaluation),
+            ego_outline_m=search.space.scenarios[0].ego_box().outline_m,
         )
-        return record
+
+    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
+        """Write the files of the command line; see `PlacementReport.save`.
+
+        They are `best.yaml` (of several objectives also `best_OBJECTIVE.yaml`), `evaluations.csv`, `pareto.csv`,
+        `search.json`, `report.html`, the pictures, and `summary.json`.
+        """
+        return self.report.save(folder, files=files)
 
     def _pick_record(self, pick: Pick) -> dict[str, Any]:
+        gains: dict[str, dict[str, Any]] = {}
+        for gain in pick.gains:
+            gains.setdefault(gain.objective, {})[gain.estimate] = gain.record
         return {
             "arm": pick.arm,
             "role": pick.role or None,
             "evaluation": pick.evaluation.number,
             "values": pick.evaluation.values,
             "cost_eur": None if pick.is_start else self.search.space.cost_eur(pick.rig),
-            "fresh_instants": None if pick.test is None else pick.test.instants,
-            "gains": None
-            if pick.test is None
-            else {
-                name: {measure: asdict(gain) for measure, gain in gains.items()}
-                for name, gains in pick.test.gains.items()
-            },
+            "gains": gains or None,
         }
 
-    def save(self, folder: str | Path) -> list[Path]:
-        """Write the files of the command line; see `save_search`."""
-        from torchcover.placement.result_files import save_search
+    def _gain_rows(self) -> list[tuple[Words, ...]]:
+        """Cells below `HEADINGS`; of what was not tested too."""
+        rows, objectives = [], self.search.space.objectives
+        for pick in self.picks:
+            for gain in pick.gains:
+                test, unit = gain.test, gain.test.quantity.unit
+                words = (
+                    pick.name,
+                    f"{gain.objective} ({unit_words(unit)})",
+                    gain.estimate,
+                    amount(gain.search_gain, unit, "+"),
+                    f"{amount(test.gain, unit, '+')} ± {amount(test.error, unit)}",
+                    f"{gain.t:.1f}",
+                    f"{test.better} of {test.blocks}",
+                    amount(gain.optimism, unit, "+"),
+                )
+                known = ["-" if word in ("nan", "+nan") else word.replace("nan", "?") for word in words]
+                marked = ["significant" if at == 4 and test.significant else "" for at in range(len(words))]
+                rows.append(tuple(map(Words, known, marked)))
+            if not pick.gains:
+                arm = self.search.arms[pick.arm]
+                gained = arm.gains[arm.evaluations.index(pick.evaluation)].tolist()
+                name = pick.name + " (the start)" * pick.is_start
+                for (objective, asked), unit, each in zip(objectives.items(), self.units, gained, strict=True):
+                    estimate = asked.own_estimate or self.search.plan.estimate
+                    cells = (name, f"{objective} ({unit_words(unit)})", estimate, amount(each, unit, "+"), *"----")
+                    rows.append(tuple(map(Words, cells)))
+        return rows
 
-        return save_search(self, Path(folder))
+    def _values(self) -> PageTable:
+        columns: dict[str, Mapping[str, object]] = {"start": self.search.space.start_values()}
+        columns |= {pick.name: pick.evaluation.values for pick in self.picks}
+        names = [variable.name for variable in self.search.space.variables]
+        rows = [(Words(name), *(Words(_value(values.get(name))) for values in columns.values())) for name in names]
+        return PageTable("Values", ("variable", *columns), rows)
 
+    def _evaluation_rows(self) -> Iterator[Sequence[object]]:
+        """A row for each candidate, with a heading: gains over the start are in the units of the objectives."""
+        search = self.search
+        names, variables = list(search.space.objectives), [variable.name for variable in search.space.variables]
+        of_objectives = [f"{name}_{what}" for name in names for what in ("value", "gain", "gain_error")]
+        at_end = ("instants", "self_hit_share", "cost_eur", "seconds", "why")
+        yield ["number", "arm", "state", *variables, *of_objectives, *at_end]
+        places = {one.number: (arm, at) for arm in search.arms.values() for at, one in enumerate(arm.evaluations)}
+        for one in search.evaluations:
+            arm, at = places[one.number]
+            pair, unknown = arm.against_start(at), [None] * len(names)
+            values = one.prefixes[-1].estimate.value.tolist() if one.prefixes else unknown
+            errors = unknown if pair is None else pair[1].tolist()
+            each = [value for triple in zip(values, arm.gains[at].tolist(), errors, strict=True) for value in triple]
+            state, why = self._state(one)
+            hits = one.prefixes[-1].self_hit_share if one.prefixes else None
+            own = [one.values.get(name) for name in variables]
+            costs = self._cost(one), round(one.seconds, 3)
+            yield [one.number, one.arm, state, *own, *each, one.instants, hits, *costs, why]
 
-def is_shown(gain: FreshGain) -> bool:
-    """Whether a gain or a loss is told from chance: at least two standard errors, of enough worlds."""
-    return abs(gain.t) >= ENOUGH_T and gain.p < ENOUGH_P
+    def _pareto_rows(self) -> Iterator[Sequence[object]]:
+        """Candidates of each arm that no other of it beats, with a heading."""
+        search = self.search
+        variables = [variable.name for variable in search.space.variables]
+        yield ["arm", "number", *(f"{name}_gain" for name in search.space.objectives), "cost_eur", *variables]
+        for name, arm in search.arms.items():
+            for at in arm.front:
+                one = arm.evaluations[at]
+                values = [one.values.get(variable) for variable in variables]
+                yield [name, one.number, *arm.gains[at].tolist(), self._cost(one), *values]
 
+    def _state(self, one: Evaluation) -> tuple[str, str]:
+        if one.infeasible:
+            return "infeasible", one.infeasible
+        if one.instants < len(self.search.instants):
+            return "dropped", "two standard errors below the best so far"
+        return "complete", ""
 
-def told(gain: FreshGain) -> str:
-    """A gain in words, which call it one only where it is told from chance.
-
-    Example:
-        >>> told(FreshGain(0.0132, 0.0024, 5.5, 0.0001, 16, 16, 0.0148, 0.0016))
-        'gained 1.32 ± 0.24 points on 16 fresh worlds (t 5.5, better in 16)'
-        >>> told(FreshGain(0.003, 0.004, 0.75, 0.46, 16, 9, 0.0148, 0.0118))
-        'no gain is shown: +0.30 ± 0.40 points on 16 fresh worlds (t 0.8, better in 9)'
-    """
-    if math.isnan(gain.gain):
-        return "unknown in every fresh world"
-    error = "± ?" if math.isnan(gain.error) else f"± {100 * gain.error:.2f}"
-    t = "t unknown" if math.isnan(gain.t) else f"t {gain.t:.1f}"
-    rest = f"{error} points on {gain.worlds} fresh worlds ({t}, better in {gain.better})"
-    if is_shown(gain) and gain.t > 0:
-        return f"gained {100 * gain.gain:.2f} {rest}"
-    if is_shown(gain):
-        return f"lost {-100 * gain.gain:.2f} {rest}"
-    return f"no gain is shown: {100 * gain.gain:+.2f} {rest}"
-
-
-def told_optimism(gain: FreshGain) -> str:
-    """How much more the search had promised, to follow `told`; nothing where nobody knows."""
-    return "" if math.isnan(gain.optimism) else f", optimism {100 * gain.optimism:+.2f}"
+    def _cost(self, one: Evaluation) -> float | None:
+        space = self.search.space
+        if not space.cost or one.infeasible:
+            return None
+        return space.cost_eur(space.start if one.number == 0 else space.rig(one.values, str(one.number)))
 
 
 def _arm_record(arm: Arm) -> dict[str, Any]:
@@ -228,10 +283,16 @@ def _arm_record(arm: Arm) -> dict[str, Any]:
     }
 
 
-def known(value: Any) -> Any:  # noqa: ANN401  (whatever a record holds)
-    """A record as JSON can have it: what nobody knows is None."""
-    if isinstance(value, Mapping):
-        return {key: known(each) for key, each in value.items()}
-    if isinstance(value, list | tuple):
-        return [known(each) for each in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _value(value: object) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3f}" if isinstance(value, float) else str(value)
+
+
+def _spent_table(search: PlacementSearch, volumes: Mapping[str, float] | None) -> PageTable:
+    arms = {name: _arm_record(arm) for name, arm in search.arms.items()}
+    rows = [(Words(name), *(Words(f"{value:g}") for value in arm.values())) for name, arm in arms.items()]
+    notes = [f"Racing saved {search.share_saved:.0%} of the instants."]
+    if volumes:
+        notes.append("Hypervolume: " + ", ".join(f"{name} {volume:.3g}" for name, volume in volumes.items()) + ".")
+    return PageTable("What was spent", ("arm", *next(iter(arms.values()))), rows, notes=notes)

@@ -1,22 +1,28 @@
-"""A search from its start to the test on fresh worlds, within its budget, in files that it can go on from."""
+"""A search from its start to the test on fresh worlds, within its budget, with a checkpoint to go on from."""
 
 import math
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from torchcover.evaluation import claimed
+from torchcover.evaluation import Checkpoint
+from torchcover.evaluation.checkpoint import Journal
+from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.progress import held_back, progress_of
-from torchcover.files import BadFileError
-from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
-from torchcover.placement.fresh import FreshTest, fresh_test
-from torchcover.placement.journal import NAME, Journal
+from torchcover.files import BadFileError, claimed
+from torchcover.placement.evaluation import OPTIMISER, RANDOM
+from torchcover.placement.fresh import amount, fresh_test
 from torchcover.placement.result import Pick, SearchResult
 from torchcover.placement.search import PlacementSearch
+
+# What a search goes on from, in its folder.
+CHECKPOINT = "checkpoint.npz"
 
 Clock = Callable[[], float]
 
@@ -33,15 +39,15 @@ def run_search(
 
     Args:
         search: It, of which nothing was asked yet.
-        out: Folder of its journal: every evaluation is on the disk before the next one begins.
-        resume: Whether to go on from the journal that is there. With a number of evaluations, what comes of it is what
-            would have come of it without the end between.
+        out: Folder of its checkpoint: every evaluation is on the disk before the next one begins.
+        resume: Whether to go on from the checkpoint that is there. With a number of evaluations, what comes of it is
+            what would have come of it without the end between.
         progress: Whether to show a bar.
         clock: Seconds.
 
     Raises:
         ValueError: A budget below one evaluation of each arm; a start that cannot be scored.
-        BadFileError: A journal of another search.
+        BadFileError: A checkpoint of another search.
     """
     if search.evaluations:
         raise ValueError("search: one of which nothing was asked yet is needed; make another one")
@@ -57,45 +63,54 @@ def _run(search: PlacementSearch, out: Path | None, resume: bool, progress: bool
     began = clock()
     count = len(search.instants)
     build_s = (clock() - began) / count
-    start = search.ask()
-    assert start is not None  # there always is one
-    search.evaluate(start)
-    journal = None if out is None or not resume else _resumed(search, out / NAME)
+    journal = None if out is None else _Journal(search, Checkpoint(out / CHECKPOINT, resume))
+    if journal is not None:
+        journal.restore()
     earlier_s = sum(evaluation.seconds for evaluation in search.evaluations[1:])
+    if not search.evaluations:
+        start = search.ask()
+        assert start is not None  # there always is one
+        search.evaluate(start)
     budget = _Budget(search, clock, began - earlier_s, build_s)
     budget.check()
-    if out is not None and journal is None:  # an earlier one is lost only now
-        journal = Journal(out / NAME, search.plan.settings(search.space))
-        journal.add(search.evaluations[0])
     with progress_of(budget.expected, search.space.name, done=len(search.evaluations), shown=progress) as bar:
         _spend(search, budget, journal, bar.advance)
     picks, untested = _tested(search, _picks(search))
     return SearchResult(search, picks, untested, clock() - began + earlier_s)
 
 
-def _resumed(search: PlacementSearch, path: Path) -> Journal | None:
-    """The journal that is there, with the search where it ended; None if there is none."""
-    if not path.exists():
-        return None
-    start = search.evaluations[0]
-    assert start.scores is not None  # it was scored just now
-    journal, evaluations = Journal.resumed(path, search.plan.settings(search.space), start.scores)
-    if not evaluations:
-        journal.add(start)
-    elif _differs(start, evaluations[0]):
-        raise BadFileError(
-            f"{path}: the start scores something else than it did: another version of a package, or a file that the "
-            "space names has changed; begin anew, without --resume"
-        )
-    search.replay(evaluations[1:])
-    return journal
+class _Journal:
+    """The checkpoint of a search, as that of a run whose steps are its evaluations."""
 
+    def __init__(self, search: PlacementSearch, checkpoint: Checkpoint) -> None:
+        settings = search.plan.settings(search.space)
+        identity = {name: str(value) for name, value in settings.items()}
+        self._search, self._path = search, checkpoint.path
+        self._journal = Journal(checkpoint, identity, {"search": search})
 
-def _differs(start: Evaluation, earlier: Evaluation) -> bool:
-    if start.scores is None or earlier.scores is None:
-        return True
-    earlier_scores = earlier.scores.at(start.scores.instants)
-    return not np.array_equal(start.scores.seen_m2, earlier_scores.seen_m2)
+    def restore(self) -> None:
+        """Go on from what is there.
+
+        Raises:
+            ValueError: It is of another search.
+            BadFileError: The start scores something else than it did.
+        """
+        self._journal.restore(Run())
+        if not self._search.evaluations:
+            return
+        *_, now = self._search.instants.prefixes(self._search.space.start)
+        earlier = self._search.evaluations[0].prefixes[-1]
+        if not torch.equal(now.estimate.value, earlier.estimate.value):
+            raise BadFileError(
+                f"{self._path}: the start scores something else than it did: another version of a package, or a file "
+                "that the space names has changed; begin anew, without --resume"
+            )
+
+    def write(self) -> None:
+        """Put all evaluations on the disk."""
+        evaluations = self._search.evaluations
+        with held_back():
+            self._journal.write(Run(steps=len(evaluations), seconds=sum(one.seconds for one in evaluations)))
 
 
 class _Budget:
@@ -120,7 +135,7 @@ class _Budget:
 
     @property
     def expected(self) -> int:
-        """Evaluations in all, as far as anybody knows."""
+        """Evaluations in all, as far as is known."""
         plan = self._search.plan
         if plan.evaluations is not None:
             return plan.evaluations + 1
@@ -149,31 +164,25 @@ class _Budget:
 
 
 def _spend(
-    search: PlacementSearch, budget: _Budget, journal: Journal | None, advance: Callable[[int, str], Any]
+    search: PlacementSearch, budget: _Budget, journal: _Journal | None, advance: Callable[[int, str], Any]
 ) -> None:
-    written = len(search.evaluations)
     search.until = budget.until
     while budget.is_left() and (candidate := search.ask()) is not None:
         search.evaluate(candidate)
-        with held_back():
-            written = _write(search, journal, written)
+        if journal is not None:
+            journal.write()
         advance(budget.expected, _standing(search))
-    _write(search, journal, written)
-
-
-def _write(search: PlacementSearch, journal: Journal | None, written: int) -> int:
-    """All that is not written yet: candidates that keep to no constraint are noted while another is asked for."""
-    for evaluation in search.evaluations[written:] if journal is not None else ():
-        journal.add(evaluation)  # type: ignore[union-attr]  # there is one
-    return len(search.evaluations)
+    if journal is not None:  # what was refused while the last was asked for
+        journal.write()
 
 
 def _standing(search: PlacementSearch) -> str:
     arm = search.arms[OPTIMISER]
     if arm.best is None:
         return "nothing that can be yet"
-    gains = zip(search.space.objectives, arm.gains[arm.best].tolist(), strict=True)
-    return "  ".join(f"{name} {100 * gain:+.2f}" for name, gain in gains)
+    quantities = search.evaluations[0].prefixes[-1].estimate.quantities
+    gains = zip(quantities, arm.gains[arm.best].tolist(), strict=True)
+    return "  ".join(f"{quantity.key} {amount(gain, quantity.unit, '+')}" for quantity, gain in gains)
 
 
 def _picks(search: PlacementSearch) -> list[Pick]:
@@ -200,17 +209,14 @@ def _picks(search: PlacementSearch) -> list[Pick]:
 
 def _tested(search: PlacementSearch, picks: Sequence[Pick]) -> tuple[Sequence[Pick], str]:
     """Those that are not the start, on fresh worlds; and why not, if not."""
-    moved = {f"{at}": pick.rig for at, pick in enumerate(picks) if pick.evaluation.arm != START}
+    moved = {f"{at}": pick.rig for at, pick in enumerate(picks) if not pick.is_start}
     if not moved:
         return picks, ""
+    plan = search.plan
     try:
-        tests: dict[str, FreshTest] = fresh_test(
-            moved,
-            search.space.start,
-            search.instants,
-            test_seed=search.plan.seed_of_test,
-            worlds=search.plan.fresh_worlds,
+        tests = fresh_test(
+            moved, search.space.start, search.instants, test_seed=plan.seed_of_test, worlds=plan.fresh_worlds
         )
     except ValueError as error:
         return picks, str(error)
-    return [pick.tested(tests.get(f"{at}")) for at, pick in enumerate(picks)], ""
+    return [replace(pick, gains=tests.get(f"{at}", ())) for at, pick in enumerate(picks)], ""

@@ -2,39 +2,28 @@
 
 import math
 import time
-from collections.abc import Iterable
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from torchcover.placement.arm import Arm
-from torchcover.placement.evaluation import (
-    OPTIMISER,
-    RANDOM,
-    START,
-    Candidate,
-    Evaluation,
-    Numbers,
-)
-from torchcover.placement.instants import Instants
+from torchcover.placement.common_instants import CommonInstants
+from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
 from torchcover.placement.optimisers import Cube, RandomSearch
 from torchcover.placement.optimisers.optimiser import Unit
 from torchcover.placement.plan import SearchPlan, levels_of
-from torchcover.placement.racing import paired, race, racing_order
-from torchcover.placement.scores import Scores
+from torchcover.placement.racing import Prefix, race
 from torchcover.placement.space import SearchSpace
-
-if TYPE_CHECKING:
-    from torchcover.placement.result import SearchResult
 
 # What is drawn by the control is nothing that the optimiser draws.
 SEEDS = {OPTIMISER: 0, RANDOM: 1}
 
 
 class PlacementSearch:
-    """Looks for a better rig in a space, beside a random search with the same budget.
+    """Looks for a better rig in a space, next to a random search with the same budget.
 
     Evaluation 0 is the start. From then on the arm that has spent fewer instants asks, the optimiser first. What is
     asked for depends on the space, the seed and the scores so far, and on nothing else.
@@ -56,7 +45,7 @@ class PlacementSearch:
         ... )
         >>> search = PlacementSearch(space, evaluations=2, per_world=1, rays=1024)
         >>> while (candidate := search.ask()) is not None:
-        ...     search.tell(candidate, search.instants.score(candidate.rig))
+        ...     search.tell(candidate, tuple(search.instants.prefixes(candidate.rig)))
         >>> [evaluation.arm for evaluation in search.evaluations]
         ['start', 'optimiser', 'random']
     """
@@ -72,7 +61,7 @@ class PlacementSearch:
         self._makes_optimiser(self._cube(), self.plan.seed)  # fails now, if it does
 
     @cached_property
-    def instants(self) -> Instants:
+    def instants(self) -> CommonInstants:
         """What candidates are scored on: built when first asked for."""
         return self.plan.instants(self.space, self.plan, self.plan.seed, self.plan.worlds)
 
@@ -82,14 +71,8 @@ class PlacementSearch:
         spent = [one.instants for one in self.evaluations[1:] if one.instants]
         return 1.0 - sum(spent) / (len(spent) * len(self.instants)) if spent else 0.0
 
-    def run(self, out: str | Path | None = None, *, resume: bool = False, progress: bool = False) -> "SearchResult":
-        """Spend the budget and test what was found in fresh worlds; see `run_search`."""
-        from torchcover.placement.running import run_search
-
-        return run_search(self, None if out is None else Path(out), resume=resume, progress=progress)
-
-    def ask(self) -> Candidate | None:
-        """The next candidate that can be mounted and keeps to the constraints; those before are noted as infeasible.
+    def ask(self) -> Evaluation | None:
+        """The next rig that can be mounted and keeps to the constraints; those before are noted as infeasible.
 
         Returns:
             It; None when the evaluations are spent, or the optimiser has nothing left to ask for.
@@ -98,7 +81,7 @@ class PlacementSearch:
             if self.plan.budget_s is not None:
                 self.until = time.monotonic() + self.plan.budget_s
             values = self.space.start_values()
-            return Candidate(0, START, self._start_unit, values, self.space.start)
+            return Evaluation(0, START, self._start_unit, values, self.space.start)
         while self._is_budget_left():
             number = len(self.evaluations)
             arm = min(self.arms.values(), key=lambda each: each.charge)
@@ -114,27 +97,27 @@ class PlacementSearch:
             except ValueError as error:
                 why = str(error)
             if not why:
-                return Candidate(number, arm.name, unit, values, rig)
-            self._note(Evaluation(number, arm.name, unit, values, None, why))
+                return Evaluation(number, arm.name, unit, values, rig)
+            self._note(Evaluation(number, arm.name, unit, values, infeasible=why))
         return None
 
-    def tell(self, candidate: Candidate, scores: Scores, *, seconds: float = 0.0) -> None:
+    def tell(self, candidate: Evaluation, prefixes: tuple[Prefix, ...], *, seconds: float = 0.0) -> None:
         """What a candidate scored; with too many rays on the vehicle, it cannot be.
 
         Args:
             candidate: The last that was asked for.
-            scores: From `instants.score`, at all instants or at some; of the start at all.
+            prefixes: From `instants.prefixes`, all or the first of them; of the start all.
             seconds: What it took.
 
         Raises:
             ValueError: Another candidate; of the start, scores at some instants only, or an unknown objective.
         """
         self._check_turn(candidate)
-        wrong = [] if candidate.number else list(self.space.violations(candidate.rig))
-        wrong += [why] if (why := self._too_many_self_hits(scores)) else []
-        self._note(_evaluation(candidate, scores, "; ".join(wrong), seconds))
+        wrong = [] if candidate.number else list(self.space.violations(self.space.start))
+        wrong += [why] if (why := self._too_many_self_hits(prefixes[-1])) else []
+        self._note(replace(candidate, rig=None, prefixes=prefixes, infeasible="; ".join(wrong), seconds=seconds))
 
-    def refuse(self, candidate: Candidate, why: str, *, seconds: float = 0.0) -> None:
+    def refuse(self, candidate: Evaluation, why: str, *, seconds: float = 0.0) -> None:
         """Say that a candidate cannot be.
 
         Raises:
@@ -143,37 +126,40 @@ class PlacementSearch:
         self._check_turn(candidate)
         if candidate.number == 0:
             raise ValueError(f"the start, {self.space.start.name}, cannot be scored: {why}")
-        self._note(_evaluation(candidate, None, why, seconds))
+        self._note(replace(candidate, rig=None, infeasible=why, seconds=seconds))
 
-    def evaluate(self, candidate: Candidate) -> None:
+    def evaluate(self, candidate: Evaluation) -> None:
         """Score a candidate and tell it: at a few instants at a time, until it is beaten or was scored at all."""
         began = time.perf_counter()
-        draws = np.random.SeedSequence([self.plan.seed, candidate.number]).generate_state(1)
-        order = racing_order(self.instants.world_of, int(draws[0]))
         incumbents = self.arms[candidate.arm].incumbents if candidate.number else []
         try:
-            (raced,) = race(self._scored, [candidate], order, incumbents=incumbents, measure=self.plan.measure)
+            prefixes = race(self._scored(candidate), incumbents)
         except ValueError as error:
             self.refuse(candidate, str(error), seconds=time.perf_counter() - began)
         else:
-            self.tell(candidate, raced.scores, seconds=time.perf_counter() - began)
+            self.tell(candidate, prefixes, seconds=time.perf_counter() - began)
 
-    def replay(self, evaluations: Iterable[Evaluation]) -> None:
-        """Go on from those of a search that was ended, all of them from the start on."""
-        for evaluation in evaluations:
-            self._note(evaluation)
+    def _scored(self, candidate: Evaluation) -> Iterator[Prefix]:
+        assert candidate.rig is not None  # while it is asked for
+        for prefix in self.instants.prefixes(candidate.rig):
+            if candidate.number and (why := self._too_many_self_hits(prefix)):
+                raise ValueError(why)  # no need to look at more instants
+            yield prefix
 
-    def _scored(self, candidate: Candidate, instants: Numbers) -> Scores:
-        scores = self.instants.score(candidate.rig, instants)
-        if candidate.number and (why := self._too_many_self_hits(scores)):
-            raise ValueError(why)  # no need to look at more instants
-        return scores
+    def state_dict(self) -> dict[str, Any]:
+        """All that a checkpoint keeps: the evaluations."""
+        return {"evaluations": [evaluation.record() for evaluation in self.evaluations]}
 
-    def _too_many_self_hits(self, scores: Scores) -> str:
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        """Go on from those of a search that was ended."""
+        for record in state_dict["evaluations"]:
+            self._note(Evaluation.of_record(record))
+
+    def _too_many_self_hits(self, prefix: Prefix) -> str:
         most = self.space.constraints.max_self_hits
-        if most is None or scores.self_hit_share <= most:
+        if most is None or prefix.self_hit_share <= most:
             return ""
-        return f"{scores.self_hit_share:.1%} of its rays end on the vehicle; max_self_hits is {most:.1%}"
+        return f"{prefix.self_hit_share:.1%} of its rays end on the vehicle; max_self_hits is {most:.1%}"
 
     @cached_property
     def _start_unit(self) -> Unit | None:
@@ -187,7 +173,7 @@ class PlacementSearch:
             return False
         return self.plan.evaluations is None or len(self.evaluations) <= self.plan.evaluations
 
-    def _check_turn(self, candidate: Candidate) -> None:
+    def _check_turn(self, candidate: Evaluation) -> None:
         if candidate.number != len(self.evaluations):
             raise ValueError(f"candidate {len(self.evaluations)} is to be told next; got candidate {candidate.number}")
 
@@ -199,24 +185,18 @@ class PlacementSearch:
         self.evaluations.append(evaluation)
 
     def _begin(self, start: Evaluation) -> None:
-        scores = start.scores
-        if scores is None or len(scores.instants) != len(self.instants):
+        if start.instants != len(self.instants):
             raise ValueError(f"the start is to be scored at all {len(self.instants)} instants; got {start.instants}")
-        known = paired(scores, scores, self.plan.measure).worlds.tolist()
-        for name, worlds in zip(self.space.objectives, known, strict=True):
-            if not worlds:
-                raise ValueError(
-                    f"objectives.{name}: unknown at all {start.instants} instants: none shows all of its regions and "
-                    "bands; take larger ones, more worlds or more rays"
-                )
+        for name, value in zip(self.space.objectives, start.prefixes[-1].estimate.value.tolist(), strict=True):
+            if math.isnan(value):
+                why = "one of its regions and bands is never seen; take larger ones, more worlds or more rays"
+                if metric := self.space.objectives[name].metric:
+                    why = f"what {metric} is about is never there; take another scenario, or more worlds"
+                raise ValueError(f"objectives.{name}: unknown at all {start.instants} instants: {why}")
         makes = {OPTIMISER: self._makes_optimiser, RANDOM: RandomSearch}
         for name, each in makes.items():
             seed = int(np.random.SeedSequence([self.plan.seed, SEEDS[name]]).generate_state(1)[0])
-            self.arms[name] = Arm(name, each, self._cube(start.infeasible), seed, start, self.plan.measure)
+            self.arms[name] = Arm(name, each, self._cube(start.infeasible), seed, start)
 
     def _cube(self, start_infeasible: str = "") -> Cube:
         return Cube(levels_of(self.space), None if start_infeasible else self._start_unit)
-
-
-def _evaluation(candidate: Candidate, scores: Scores | None, infeasible: str, seconds: float) -> Evaluation:
-    return Evaluation(candidate.number, candidate.arm, candidate.unit, candidate.values, scores, infeasible, seconds)

@@ -4,29 +4,26 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cached_property
-from pathlib import Path
 from typing import Annotated, Self
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, model_validator
 
-from torchcover.placement.carrier import Carrier
-from torchcover.placement.constraints import Constraints, misplaced
+from torchcover.placement.carrier import NamedRig, VehicleSpace
+from torchcover.placement.constraints import Constraints, check_prices, misplaced, price_eur
 from torchcover.placement.free_sensor import FreeSensor, mirrored
-from torchcover.placement.named import NamedRig, NamedVehicle, Names
 from torchcover.placement.objective import Objective
-from torchcover.placement.prices import check_prices, price_eur
-from torchcover.placement.question_grid import QuestionGrid
+from torchcover.placement.questions import Questions
 from torchcover.placement.variables import Value, Variable
-from torchcover.simulation import Document, Lidar, LidarModel, Rig, Scenario, Sensor, with_ego
-from torchcover.simulation.documents import NameOrFile, read_document
+from torchcover.simulation import Lidar, LidarModel, Rig, Sensor
+from torchcover.simulation.documents import NameOrFile
 
 MAX_OBJECTIVES = 3
 # How many candidates are looked at before a space is refused as one without any that can be.
 TRIES = 256
 
 
-class SearchSpace(Document):
+class SearchSpace(VehicleSpace):
     """Where sensors may go, and what a good place is.
 
     Args:
@@ -56,30 +53,16 @@ class SearchSpace(Document):
         ...     objectives={"near": {"band": "ground", "region": "20m"}},
         ... )
         >>> space.variables
-        (Number(name='roof.pitch_deg', low=-10.0, high=15.0),)
+        (FreeNumber(name='roof.pitch_deg', low=-10.0, high=15.0),)
         >>> space.rig({"roof.pitch_deg": 5.0}, "found").sensors[0].mount.pitch_deg
         5.0
     """
 
-    name: str
-    description: str = ""
     start: NamedRig
-    scenario: Names
-    vehicle: NamedVehicle | None = None
     free: dict[str, FreeSensor] = Field(min_length=1)
     constraints: Constraints = Constraints()
     cost: dict[NameOrFile, NonNegativeFloat] = Field(default_factory=dict)
     objectives: dict[Annotated[str, Field(min_length=1)], Objective] = Field(min_length=1, max_length=MAX_OBJECTIVES)
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read a space from a YAML file.
-
-        Raises:
-            FileNotFoundError: No such file.
-            BadFileError: Not YAML, or no space in which a search makes sense; the message names the file and the key.
-        """
-        return read_document(cls, Path(path))
 
     @model_validator(mode="after")
     def _check_sensors(self) -> Self:
@@ -108,7 +91,7 @@ class SearchSpace(Document):
     @model_validator(mode="after")
     def _check_places(self) -> Self:
         try:
-            carrier = self._carrier
+            carrier = self.carrier
         except FileNotFoundError as error:
             raise ValueError(str(error)) from error
         for name, free in self.free.items():
@@ -119,7 +102,8 @@ class SearchSpace(Document):
                     raise ValueError(f"free.{name}.{error}") from error
         for name in self.free:
             self._check_place(name)
-        QuestionGrid.around(carrier.outline_m, self.objectives)
+        questions = Questions.around(carrier.outline_m, self.objectives)
+        questions.check(self.start, carrier.skin.mesh if questions.metrics else None)
         self._check_constraints()
         outside = self._outside()
         if outside:
@@ -138,7 +122,7 @@ class SearchSpace(Document):
             except ValueError as error:
                 complaint = str(error)
                 continue
-            wrong = misplaced(sensor, self._carrier.skin) if sensor is not None else complaint
+            wrong = misplaced(sensor, self.carrier.skin) if sensor is not None else complaint
             if wrong is None:
                 return
             complaint = wrong
@@ -174,15 +158,10 @@ class SearchSpace(Document):
         """What is free, in the order of the file."""
         return tuple(variable for name, free in self.free.items() for variable in free.variables(name))
 
-    @cached_property
-    def scenarios(self) -> tuple[Scenario, ...]:
-        """The scenarios, each with what carries the rigs as its ego."""
-        rigs = {self.start.name: self.start}
-        return tuple(with_ego(Scenario.load(each), rigs, self.vehicle) for each in self.scenario)
-
-    @cached_property
-    def _carrier(self) -> Carrier:
-        return Carrier.of(self.scenarios)
+    @property
+    def first_rig(self) -> Rig:
+        """The start."""
+        return self.start
 
     def rig(self, values: Mapping[str, Value], name: str) -> Rig:
         """The rig that values make.
@@ -226,7 +205,7 @@ class SearchSpace(Document):
             return start
         if free.mirror_of is not None:
             return mirrored(start, self._sensor(free.mirror_of, values))
-        return free.made(start, values, self._carrier)
+        return free.made(start, values, self.carrier)
 
     def start_values(self) -> dict[str, Value]:
         """Values of the rig that the search starts from, of those variables of which it has one in the space.
@@ -241,7 +220,7 @@ class SearchSpace(Document):
             name: value
             for sensor in self.start.sensors
             if sensor.name in self.free
-            for name, value in self.free[sensor.name].start_values(sensor, self._carrier).items()
+            for name, value in self.free[sensor.name].start_values(sensor, self.carrier).items()
         }
 
     def violations(self, rig: Rig) -> tuple[str, ...]:
@@ -250,7 +229,7 @@ class SearchSpace(Document):
         Args:
             rig: A rig of the space.
         """
-        wrong = (misplaced(sensor, self._carrier.skin) for sensor in rig.sensors if sensor.name in self.free)
+        wrong = (misplaced(sensor, self.carrier.skin) for sensor in rig.sensors if sensor.name in self.free)
         places = tuple(each for each in wrong if each is not None)
         return (*places, *self.constraints.broken_by(rig, self.free, self.cost_eur(rig)))
 

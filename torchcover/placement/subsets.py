@@ -14,12 +14,42 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.placement.worth import Bytes, Worth
+Float64 = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
 
 # Sets whose value is looked up before the exact search gives up; deterministic, other than a time.
 MOST_LOOKS = 50_000
 # Values of sums of many thousand weights that agree to this are equal.
 SAME = 1e-12
+LOW_HALF = np.uint8(15)
+# Row k has the bits of k, the highest first, as `numpy.packbits` has them.
+BITS_OF_HALF = np.unpackbits(np.arange(16, dtype=np.uint8)[:, None], axis=1)[:, 4:].astype(np.float64)
+
+
+class Worth:
+    """Sums of what points are worth, from their bits.
+
+    An objective that is a detection is a sum of weights over the points that the rig sees, by either measure, since it
+    has the same denominators for every rig: so it is monotone and submodular in the set of its sensors.
+
+    Args:
+        of_bits: (8 B,) float64 weight of each bit; of padding 0.
+
+    Example:
+        >>> worth = Worth(np.array([0.5, 0.25, 0.125, 0, 0, 0, 0, 0]))
+        >>> worth.of(np.array([0b1010_0000], dtype=np.uint8)), worth.total
+        (0.625, 0.875)
+    """
+
+    def __init__(self, of_bits: Float64) -> None:
+        self.total = float(of_bits.sum())
+        halves = of_bits.reshape(-1, 2, 4) @ BITS_OF_HALF.T
+        self._high, self._low = halves[:, 0].copy(), halves[:, 1].copy()
+        self._at = np.arange(len(halves))
+
+    def of(self, seen: Bytes) -> float:
+        """The sum over the points that are seen, (B,) uint8, eight points a byte."""
+        return float(self._high[self._at, seen >> 4].sum() + self._low[self._at, seen & LOW_HALF].sum())
 
 
 @dataclass(frozen=True)
@@ -73,7 +103,7 @@ class Candidates:
 
     Args:
         worth: What points are worth.
-        seen: One (thresholds, B) array of bits for each.
+        seen: One (B,) array of bits for each.
         always: Bits of what is always there.
     """
 

@@ -8,7 +8,7 @@ Value = float | str | bool
 DECIMALS = 6
 
 
-class Number(NamedTuple):
+class FreeNumber(NamedTuple):
     """A number between two others.
 
     Args:
@@ -17,7 +17,7 @@ class Number(NamedTuple):
         high: The highest.
 
     Example:
-        >>> Number("roof.pitch_deg", -10.0, 15.0).at(0.5)
+        >>> FreeNumber("roof.pitch_deg", -10.0, 15.0).at(0.5)
         2.5
     """
 
@@ -49,7 +49,7 @@ class Number(NamedTuple):
         return isinstance(value, int | float) and not isinstance(value, bool) and self.low <= value <= self.high
 
 
-class Choice(NamedTuple):
+class FreeChoice(NamedTuple):
     """One of several, between which there is nothing: each has an equal part of the way from 0 to 1.
 
     Args:
@@ -57,7 +57,7 @@ class Choice(NamedTuple):
         options: What there is to choose from.
 
     Example:
-        >>> model = Choice("roof.model", ("a", "b"))
+        >>> model = FreeChoice("roof.model", ("a", "b"))
         >>> model.at(0.49), model.at(0.5), model.unit("b")
         ('a', 'b', 0.75)
     """
@@ -89,7 +89,7 @@ class Choice(NamedTuple):
         return any(value == option and type(value) is type(option) for option in self.options)
 
 
-Variable = Number | Choice
+Variable = FreeNumber | FreeChoice
 
 
 def _check_share(name: str, u: float) -> None:

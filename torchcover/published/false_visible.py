@@ -3,6 +3,7 @@
 import hashlib
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -112,7 +113,7 @@ def coarse_grid(grid: BevGrid, cell_m: float) -> BevGrid:
         (-1.0, 2.0)
     """
     x, y = ((math.floor(low / cell_m) * cell_m, math.ceil(high / cell_m) * cell_m) for low, high in (grid.x, grid.y))
-    return BevGrid(x, y, cell_m, grid.heights)
+    return BevGrid(x, y, cell_m, grid.heights, grid.band_frame)
 
 
 def field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego: Mesh | None = None) -> Tensor:
@@ -135,6 +136,7 @@ def field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego: Mesh | None = N
         >>> [bool(seen[0, 5, x]) for x in (0, 6, 30)]           # behind it, too close, and ahead
         [False, False, True]
     """
+    grid = replace(grid, band_frame="vehicle")  # of a ground that is level, which both are the same for
     seen = np.zeros(grid.cells, dtype=bool)
     caster = None if ego is None else RayCaster([ego])
     for sensor in sensors:

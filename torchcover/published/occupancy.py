@@ -63,12 +63,6 @@ class Occupancy:
     steps: NDArray[np.int64]
     boxes: int
 
-    @property
-    def probability(self) -> NDArray[np.float64]:
-        """(K,) share of all frames in which each was."""
-        share: NDArray[np.float64] = self.counts.sum(axis=1)[self.pattern] / self.steps.sum()
-        return share
-
     def entropy_nats(self, times: NDArray[np.float64 | np.bool_], weights: NDArray[np.float64]) -> NDArray[np.float64]:
         """(R,) sum over the voxels of Hb(p) = -p ln p - (1 - p) ln(1 - p).
 

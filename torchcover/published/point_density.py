@@ -1,6 +1,7 @@
 """How many points a rig has, how dense they are, and how evenly they lie."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -21,7 +22,8 @@ class PointDensity(WorldRatios):
     et al. (2023) look at; their own formula of uniformity could not be read.
 
     Args:
-        grid: Where points count: its extent, its height bands, and the cells of the uniformity.
+        grid: Where points count: its extent, its height bands, over z of the vehicle whatever its band frame is, and
+            the cells of the uniformity.
         regions: Those that have numbers of their own.
         rig: Whose clouds; those of the only rig if not given.
         kwargs: For `torchmetrics.Metric`.
@@ -52,8 +54,10 @@ class PointDensity(WorldRatios):
             *(said(f"point_density{name}", "points/m2", "frames") for name in names),
             *(said(f"point_uniformity_{grid.cell:g}m{name}", "share", "frames") for name in names),
         ]
-        super().__init__(ratios, {"grid": grid, "regions": tuple(regions)}, rig, **kwargs)
-        self.grid = grid
+        super().__init__(
+            ratios, {"grid": replace(grid, band_frame="vehicle"), "regions": tuple(regions)}, rig, **kwargs
+        )
+        self.grid = replace(grid, band_frame="vehicle")
         everywhere = torch.ones(grid.shape[1:], dtype=torch.bool)
         self._members = torch.stack([everywhere, *(region.mask(grid) for region in regions)]).flatten(1).double()
 

@@ -179,12 +179,7 @@ def spearman(first: ArrayLike, second: ArrayLike) -> Array:
 
 
 def orders(count: int, seed: int = 0) -> NDArray[np.int64]:
-    """(P, n) orders of n things: all of them up to n = 8, else as many as 8 have, drawn.
-
-    Args:
-        count: n.
-        seed: Of the draw.
-    """
+    """(P, n) orders of n things: all of them up to n = 8, else as many as 8 have, drawn."""
     if math.factorial(count) <= MOST_TRIED:
         return np.array(list(permutations(range(count))), dtype=np.int64)
     generator = np.random.default_rng(seed)

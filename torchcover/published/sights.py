@@ -96,7 +96,7 @@ class Sights:
 
     def bins(self, frame: Frame, grid: BevGrid) -> Bins:
         """In which cells of a grid the reference points are."""
-        return self.once(frame, ("bins", grid), lambda: grid.bins(frame.reference))
+        return self.once(frame, ("bins", grid), lambda: grid.bins(frame.reference, frame.heights_in(grid.band_frame)))
 
     def once(self, frame: Frame, what: tuple[Any, ...], find: Callable[[], Found]) -> Found:
         """Whatever is to be found in a frame; looked for when it is first asked for."""

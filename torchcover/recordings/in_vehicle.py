@@ -24,11 +24,13 @@ class InVehicle(NamedTuple):
         dropped: How many points were left out: `nonfinite`, `no_return`, `own_vehicle`; of an accumulated reference
             also `gone`, those of objects that are not labelled at the instant.
         weights: (N,) float32 what each point counts for; None if all count the same.
+        heights_m: (N,) float32 above the local ground, NaN where there is none at or below; None if that is unknown.
     """
 
     points_m: NDArray[np.float32]
     dropped: Counter[str]
     weights: NDArray[np.float32] | None = None
+    heights_m: NDArray[np.float32] | None = None
 
 
 def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
@@ -44,9 +46,9 @@ def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
     Example:
         >>> scan = Scan(np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [np.nan, 0.0, 0.0]]), None, "a.npy")
         >>> in_vehicle(scan)
-        InVehicle(points_m=array([[5., 0., 0.]], dtype=float32), dropped=Counter({...}), weights=None)
+        InVehicle(points_m=array([[5., 0., 0.]], dtype=float32), dropped=Counter({...}), weights=None, heights_m=None)
     """
-    points_m, weights = scan.points_m, scan.weights
+    points_m, weights, heights_m = scan.points_m, scan.weights, scan.heights_m
     finite, returned = _finite(points_m), _returned(points_m)
     if scan.min_range_m:
         returned &= ~(np.linalg.norm(points_m, axis=1) < scan.min_range_m)
@@ -54,6 +56,7 @@ def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
     dropped = Counter({"nonfinite": int((~finite).sum()), "no_return": int((finite & ~returned).sum())})
     if len(kept) < len(points_m):
         points_m, weights = points_m[kept], None if weights is None else weights[kept]
+        heights_m = None if heights_m is None else heights_m[kept]
     moved_m, count = np.empty(points_m.shape, np.float32), 0
     farthest_m, own = 0.0, [np.empty(0, np.intp)]
     for rows in blocks(len(points_m)):
@@ -71,8 +74,11 @@ def in_vehicle(scan: Scan, body: BoundingBox | None = None) -> InVehicle:
     _check_range(farthest_m, scan.source)
     if body is not None:
         dropped["own_vehicle"] = len(points_m) - count
-    of_points = None if weights is None else np.delete(weights, np.concatenate(own)).astype(np.float32)
-    return InVehicle(moved_m[:count], dropped, of_points)
+    of_points = (
+        None if values is None else np.delete(values, np.concatenate(own)).astype(np.float32)
+        for values in (weights, heights_m)
+    )
+    return InVehicle(moved_m[:count], dropped, *of_points)
 
 
 def joined(clouds: Sequence[InVehicle]) -> InVehicle:
@@ -81,10 +87,12 @@ def joined(clouds: Sequence[InVehicle]) -> InVehicle:
         return clouds[0]
     dropped = sum((cloud.dropped for cloud in clouds), Counter[str]())
     weights = [cloud.weights for cloud in clouds if cloud.weights is not None]
+    heights_m = [cloud.heights_m for cloud in clouds if cloud.heights_m is not None]
     return InVehicle(
         np.concatenate([np.empty((0, 3), np.float32), *(cloud.points_m for cloud in clouds)]),
         dropped,
         np.concatenate(weights) if weights else None,
+        np.concatenate(heights_m) if heights_m else None,
     )
 
 

@@ -184,6 +184,7 @@ class RecordedFrames(FrameDataset):
             name,
             counts=counts,
             reference_weights=None if reference.weights is None else torch.from_numpy(reference.weights),
+            reference_heights_m=None if reference.heights_m is None else torch.from_numpy(reference.heights_m),
             boxes=boxes,
             place_in_time=position if self.recording.instants is None else self.recording.instants[instant],
             sensor_points={

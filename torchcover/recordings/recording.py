@@ -31,6 +31,8 @@ class Scan:
         source: Where it was read from, for messages.
         min_range_m: What is nearer to the sensor is a return that never came.
         weights: (N,) what each point of a reference counts for, positive; None if all count the same.
+        heights_m: (N,) height of each point of a reference above the local ground, NaN where there is none at or below;
+            None if it is unknown.
     """
 
     points_m: Points
@@ -38,6 +40,7 @@ class Scan:
     source: str
     min_range_m: float = 0.0
     weights: NDArray[np.float64] | None = None
+    heights_m: NDArray[np.float32] | None = None
 
 
 def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArray[np.float64]:

@@ -22,6 +22,7 @@ RemarkName = Literal[
     "empty_reference_steps",
     "saturated_points",
     "outside_points",
+    "no_ground_points",
 ]
 
 # Buildings and trees are above every band; where more than such a share is outside, the clouds may be elsewhere.
@@ -46,7 +47,7 @@ class Remark:
 def remarks_on(table: CoverageTable, rig: str) -> tuple[Remark, ...]:
     """What is to be known about the numbers of a rig, of that which did happen."""
     counts, inside = table.conditions[rig].counts, table.conditions[rig].points
-    rows = table.rows[rig]
+    rows, every = table.rows[rig], inside + counts["outside_points"]
     found = [
         Remark("no_region", int(not rows), 1),
         *_on_measure(table, rig),
@@ -54,7 +55,8 @@ def remarks_on(table: CoverageTable, rig: str) -> tuple[Remark, ...]:
         Remark("empty_sensor_steps", counts["empty_sensor_steps"], counts["steps"]),
         Remark("empty_reference_steps", counts["empty_reference_steps"], counts["steps"]),
         Remark("saturated_points", counts["saturated_points"], inside),
-        Remark("outside_points", counts["outside_points"], inside + counts["outside_points"]),
+        Remark("outside_points", counts["outside_points"] - counts["no_ground_points"], every),
+        Remark("no_ground_points", counts["no_ground_points"], every),
     ]
     return tuple(remark for remark in found if remark.count)
 
@@ -102,7 +104,7 @@ def marks_on(table: CoverageTable) -> dict[str, str]:
 
 
 def _of_rig(table: CoverageTable, rig: str) -> list[str]:
-    bands = ", ".join(f"{name} z {span(band)}" for name, band in table.grid.heights.items())
+    bands = ", ".join(f"{name} {span(table.grid, name)}" for name in table.grid.heights)
     first = f"{steps_and_cell(table.conditions[rig].counts['steps'], table.grid)}; {bands}."
     sentences = (SENTENCES[remark.name](remark, table, rig) for remark in remarks_on(table, rig))
     failure = single_point_of_failure(table, rig)
@@ -150,5 +152,8 @@ SENTENCES: Mapping[RemarkName, Callable[[Remark, CoverageTable, str], str]] = Ma
         "empty_reference_steps": lambda remark, *_: f"{_some(remark)} steps had no reference point: they say nothing.",
         "saturated_points": _saturated,
         "outside_points": _outside,
+        "no_ground_points": lambda remark, *_: (
+            f"{_some(remark)} reference points have no ground at or below them: in no band."
+        ),
     }
 )

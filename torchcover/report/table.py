@@ -150,9 +150,6 @@ def _best(rigs: Sequence[RegionSummary]) -> list[frozenset[str]]:
 def best_of(numbers: Sequence[Number]) -> list[bool]:
     """Which numbers are the best of their row.
 
-    Args:
-        numbers: One for each rig, of one quantity.
-
     Returns:
         True for the best and for all that look the same as they are shown; never for an unknown one.
 

@@ -264,9 +264,11 @@ def capitalised(words: str) -> str:
     return words[:1].upper() + words[1:]
 
 
-def span(bounds_m: tuple[float, float]) -> str:
-    """Two bounds in metres, as in `-0.5 to 0.5 m`."""
-    return f"{bounds_m[0]:g} to {bounds_m[1]:g} m"
+def span(grid: BevGrid, height: str) -> str:
+    """The bounds of a height band, as in `z -0.5 to 0.5 m` or `-0.5 to 0.5 m above ground`."""
+    low, high = grid.heights[height]
+    metres = f"{low:g} to {high:g} m"
+    return f"{metres} above ground" if grid.band_frame == "ground" else f"z {metres}"
 
 
 def steps_and_cell(steps: int, grid: BevGrid) -> str:

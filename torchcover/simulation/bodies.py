@@ -13,6 +13,7 @@ from torchcover.simulation import shapes
 from torchcover.simulation.documents import Document, NameOrFile, Pose, is_file_name, load_document
 from torchcover.simulation.mount_regions import MountRegion
 from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.sound import told
 
 # No building, and no terrain within a sensor's range, is higher.
 TALLEST_SCENERY_M = 1000.0
@@ -100,6 +101,11 @@ Shape = Annotated[
 ]
 
 
+def sound_mesh(shape: Shape, owner: str) -> Mesh:
+    """The form of a body, with warnings if a file has lies in it; see `told`."""
+    return told(owner, shape.mesh()) if isinstance(shape, shapes.MeshFile) else shape.mesh()
+
+
 class Body(Document):
     """A shape with a name, at one or more places.
 
@@ -107,15 +113,19 @@ class Body(Document):
         name: What messages call it.
         shape: Its form, in its own frame.
         poses: Where its frame lies in that of the document; one copy for each.
+        ground: In a scenario: whether one drives or walks on it, so that heights are measured from its level faces. If
+            no body of a scenario is, the ground is what is level under the ego and connected with that by steps of at
+            most 0.3 m.
     """
 
     name: str
     shape: Shape
     poses: tuple[Pose, ...] = Field(default=(Pose(),), min_length=1)
+    ground: bool = False
 
     def meshes(self) -> list[Mesh]:
         """One mesh for each pose."""
-        mesh = self.shape.mesh()
+        mesh = sound_mesh(self.shape, f"body {self.name!r}")
         warn_of_scenery(f"body {self.name!r}", mesh)
         return [mesh.moved(pose.matrix()) for pose in self.poses]
 
@@ -141,6 +151,8 @@ class Vehicle(Document):
     @model_validator(mode="after")
     def _check_parts(self) -> Self:
         for part in self.parts:
+            if part.ground:
+                raise ValueError(f"part {part.name!r} is ground; only the bodies of a scenario can be, for they rest")
             if isinstance(part.shape, VehicleShape):
                 raise ValueError(
                     f"part {part.name!r} is the vehicle {part.shape.vehicle!r}; a vehicle is put together from other "
@@ -184,7 +196,7 @@ def mover_mesh(name: str, shape: Shape, category: str = "ego") -> Mesh:
         shape: Its form, in its own frame.
         category: What it is: "ego", or that of an actor.
     """
-    mesh = in_vehicle_frame(shape.mesh())
+    mesh = in_vehicle_frame(sound_mesh(shape, name))
     warn_of_mover(name, mesh, category)
     return mesh
 

@@ -182,9 +182,9 @@ def _misspelt(details: Sequence[ErrorDetails]) -> dict[Place, Place]:
 def _told(detail: ErrorDetails, meant: Place | None = None) -> str:
     if meant:
         return f"{'.'.join(map(str, detail['loc']))}: unknown key; {meant[-1]} is meant, which is missing"
-    key = ".".join(str(part)[:MAX_QUOTED] for part in detail["loc"]) or "document"
+    key = "".join(f"{str(part)[:MAX_QUOTED]}." for part in detail["loc"])  # none of what is about the whole document
     arrived = "" if detail["type"] in ("missing", "value_error") else f" (got {_shorten(detail['input'])})"
-    return f"{key}: {detail['msg'].removeprefix('Value error, ')}{arrived}"
+    return f"{key[:-1]}{': ' * bool(key)}{detail['msg'].removeprefix('Value error, ')}{arrived}"
 
 
 def _follows_from_another(detail: ErrorDetails) -> bool:

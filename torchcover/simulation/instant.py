@@ -2,22 +2,22 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry import transform
-from torchcover.simulation.culling import Outlines, outlines
+from torchcover.simulation.local_ground import LocalGround
 from torchcover.simulation.moving import Moving
 from torchcover.simulation.raycaster import Hits, RayCaster
-from torchcover.simulation.rays import TILE_ROWS, Tile, into_tiles, rotate, unit_directions
+from torchcover.simulation.rays import TILE_ROWS, Outlines, Tile, into_tiles, outlines, rotate, unit_directions
 
 # Directions all around, to find out whether a place lies inside a body.
 ALL_AROUND = unit_directions(np.linspace(-85.0, 85.0, 12)[:, None], np.arange(0.0, 360.0, 30.0)[None])
 ALL_AROUND_RAYS = ALL_AROUND.reshape(3, -1).astype(np.float32)
-# Above the ground no ray meets the back of a face; below it, those that go up do.
+# From outside of all closed bodies no ray meets the back of a face of one.
 BURIED_SHARE = 0.25
 # Seen from farther than this many radii, fewer of those directions than that share point at a ball.
 CLEAR_RADII = 2.0
@@ -25,8 +25,10 @@ CLEAR_RADII = 2.0
 Matrix = NDArray[np.float64]
 Float32 = NDArray[np.float32]
 
+NO_GROUND = LocalGround([], np.zeros(3))
 
-class Scan(NamedTuple):
+
+class SensorScan(NamedTuple):
     """What one sensor saw: `points` (N, 3) float32 in the vehicle frame, and how many rays went where.
 
     `ray` (N,) says which ray, counted over the tiles, made each point, and `range_m` (N,) how far it went. `body_casts`
@@ -51,6 +53,8 @@ class Instant:
         moving: The bodies that move and are near.
         ego: Number of the ego.
         out_of_range: How many bodies that move are not near, or not there.
+        ground: What one drives or walks on; none if not given.
+        world_T_vehicle: (4, 4) where the vehicle is in the frame that the ground is given in.
     """
 
     static: RayCaster
@@ -58,6 +62,27 @@ class Instant:
     moving: Moving
     ego: int
     out_of_range: int = 0
+    ground: LocalGround = NO_GROUND
+    world_T_vehicle: Matrix = field(default_factory=lambda: np.eye(4))
+
+    def heights_m(self, points_m: NDArray[np.floating]) -> Float32:
+        """(N,) heights above the local ground of (N, 3) points of the vehicle frame; see `LocalGround.heights_m`."""
+        return self.ground.heights_m(points_m, self.world_T_vehicle)
+
+    def first_faces(self, points_m: Float32, normals: Float32, within_m: float) -> NDArray[np.int64]:
+        """Which face that never moves lies at each of some points of such faces, or above it.
+
+        Args:
+            points_m: (N, 3) in the vehicle frame.
+            normals: (N, 3) of length one, on the side that is looked at.
+            within_m: How far above at most.
+
+        Returns:
+            (N,) numbers of the faces, as `RayCaster.faces_met` counts them, -1 for none.
+        """
+        starts_m = transform(self.static_T_vehicle, points_m + np.float32(within_m) * normals)
+        towards = -(normals @ self.static_T_vehicle[:3, :3].T)
+        return self.static.faces_met(starts_m, towards, 2 * within_m)
 
     def scan(
         self,
@@ -68,7 +93,7 @@ class Instant:
         own_m: Sequence[Float32] = (),
         ego_points: bool = False,
         threads: int = 1,
-    ) -> Scan:
+    ) -> SensorScan:
         """Cast the rays of one sensor. The ego occludes, but its own points are left out unless they are wanted.
 
         Args:
@@ -81,7 +106,7 @@ class Instant:
             threads: Number of threads; the result does not depend on it.
 
         Returns:
-            A `Scan`, the points in the order of the tiles.
+            A `SensorScan`, the points in the order of the tiles.
         """
         bodies = self.outlines(vehicle_T_sensor[:3, 3])
 
@@ -99,7 +124,7 @@ class Instant:
             with ThreadPoolExecutor(threads) as pool:
                 scans = list(pool.map(scan_tile, tiles, own))
         points, seen, range_m, self_hits, casts = zip(*scans, strict=True)
-        return Scan(
+        return SensorScan(
             points=np.concatenate(points),
             ray=np.flatnonzero(np.concatenate(seen)),
             range_m=np.concatenate(range_m),
@@ -132,6 +157,8 @@ class Instant:
 
     def buried(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies below the ground or inside a wall or another body than the ego."""
+        if self.ground.is_above(position_m, self.world_T_vehicle):
+            return True
         if self._inside(self.static, transform(self.static_T_vehicle, position_m[None])[0], self.ego):
             return True
         moving, others = self.moving, self.moving.body != self.ego

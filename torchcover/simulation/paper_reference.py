@@ -8,9 +8,11 @@ from typing import ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.coverage.grid import BandFrame
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.simulation.rays import Tile, into_tiles, unit_directions
 from torchcover.simulation.reference_sensor import (
+    DEFAULT_BAND_FRAME,
     PAPER_BANDS_M,
     Areas,
     Bands,
@@ -71,13 +73,20 @@ class PaperReference:
         check_reach(self.shell_m, self.max_range_m)
 
     @classmethod
-    def from_rays(cls, areas: Areas, rays: int | None, bands_m: Bands = PAPER_BANDS_M) -> Self:
+    def from_rays(
+        cls,
+        areas: Areas,
+        rays: int | None,
+        bands_m: Bands = PAPER_BANDS_M,
+        band_frame: BandFrame = DEFAULT_BAND_FRAME,
+    ) -> Self:
         """The paper's, or a smaller or larger square of rows and columns; it looks everywhere, whatever is asked about.
 
         Args:
             areas: Not used.
             rays: About how many rays; 1024 x 1024 if not given.
             bands_m: Not used.
+            band_frame: Not used.
 
         Raises:
             ValueError: Fewer than 1 ray.

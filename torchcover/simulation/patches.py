@@ -1,5 +1,6 @@
 """Patches: triangles of surfaces, cut small, so that they are drawn from by place; and which faces are outward."""
 
+from collections.abc import Callable
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -46,15 +47,10 @@ def outward_faces(mesh: Mesh) -> NDArray[np.bool_]:
         >>> outward_faces(Plane(type="plane", size_m=(1, 1)).mesh()).tolist()
         [False, False]
     """
-    corners = _welded(mesh.vertices_m)[mesh.faces]
-    start, end = corners.ravel(), corners[:, [1, 2, 0]].ravel()
-    lower, upper = np.minimum(start, end), np.maximum(start, end)
-    _, edge = np.unique(lower * len(mesh.vertices_m) + upper, return_inverse=True)
-    edge = edge.reshape(-1)
+    edge, way = edges_of(mesh)
     face = np.repeat(np.arange(len(mesh.faces)), 3)
-    surface = _connected(edge, face, len(mesh.faces))
-    # An edge from a corner to itself goes no way.
-    turns = np.bincount(edge, weights=np.sign(end - start))
+    surface = connected(edge, face, len(mesh.faces))
+    turns = np.bincount(edge, weights=way)
     open_edges = np.bincount(surface[face], weights=turns[edge] != 0, minlength=len(mesh.faces))
     first, second, third = (mesh.vertices_m - mesh.vertices_m.mean(axis=0))[mesh.faces].transpose(1, 0, 2)
     volumes = np.einsum("fc,fc->f", first, np.cross(second, third))
@@ -62,6 +58,18 @@ def outward_faces(mesh: Mesh) -> NDArray[np.bool_]:
     rounding = VOLUME_ROUNDING * np.bincount(surface, weights=np.abs(volumes), minlength=len(mesh.faces))
     outward: NDArray[np.bool_] = ((open_edges == 0) & (volume >= -rounding))[surface]
     return outward
+
+
+def edges_of(mesh: Mesh) -> tuple[Int64, Int64]:
+    """(3 F,) the number of each edge of each face, shared by the faces that it borders, and (3 F,) which way it runs.
+
+    The ways are 1 and -1, and 0 from a corner to itself. Vertices at the same place are one.
+    """
+    corners = _welded(mesh.vertices_m)[mesh.faces]
+    start, end = corners.ravel(), corners[:, [1, 2, 0]].ravel()
+    lower, upper = np.minimum(start, end), np.maximum(start, end)
+    _, edge = np.unique(lower * len(mesh.vertices_m) + upper, return_inverse=True)
+    return edge.reshape(-1), np.sign(end - start)
 
 
 def _welded(vertices_m: NDArray[np.float64]) -> Int64:
@@ -73,8 +81,8 @@ def _welded(vertices_m: NDArray[np.float64]) -> Int64:
     return number
 
 
-def _connected(edge: Int64, face: Int64, faces: int) -> Int64:
-    """(faces,) number of the surface of each face: the smallest number of a face of it."""
+def connected(edge: Int64, face: Int64, faces: int) -> Int64:
+    """(faces,) number of the surface of each face, of those that share edges: the smallest number of a face of it."""
     order = np.argsort(edge, kind="stable")
     shared = np.flatnonzero(np.diff(edge[order]) == 0)
     one, other = face[order[shared]], face[order[shared + 1]]
@@ -111,6 +119,9 @@ class Patches(NamedTuple):
     `corner_m`, `first_m` and `second_m` (3, N) float32: one corner, and the edges from there to the other two; float64
     would say no more, for rays meet float32 triangles. `outward` (N,): whether they are seen from the side only to
     which first x second points. `of_object` (N,) int32: number of the object that they belong to, -1 for none.
+    `heights_m` (2, N) float32: between which heights above the local ground all of their points lie; (0, N) where that
+    was not asked. `face` (1, N) int32: of which of all faces that never move each is a part, if that coincides with
+    another, else -1; (0, N) where none does.
     """
 
     corner_m: Float32
@@ -118,27 +129,52 @@ class Patches(NamedTuple):
     second_m: Float32
     outward: Bools
     of_object: Int32
+    heights_m: Float32
+    face: Int32
 
     @classmethod
-    def of(cls, mesh: Mesh, bounds: Bounds | None = None) -> Self:
-        """Cut a mesh.
+    def of(cls, mesh: Mesh) -> Self:
+        """Those of all of a mesh, of no object; faces without an area are left out."""
+        return cls.cut(mesh)
+
+    @classmethod
+    def cut(
+        cls,
+        mesh: Mesh,
+        bounds: Bounds | None = None,
+        heights: Callable[[Float64, Int64], tuple[Float32, Bools]] | None = None,
+        coincident: Int32 | None = None,
+    ) -> Self:
+        """Cut a mesh, or what is wanted of it.
 
         Args:
             mesh: Any, of no object; faces without an area are left out.
             bounds: What lies outside of these boxes is left out; all is wanted if not given.
+            heights: Of (3, 3, N) corners, coordinates, triangles and (N,) the faces that they are parts of: their
+                `heights_m`, and (N,) whether any of that is wanted.
+            coincident: (F,) what patches of each face have as `face`, if any coincides.
         """
         extent_m = 0.0 if bounds is not None else float(np.ptp(mesh.vertices_m, axis=0).max())
         corners_m = np.ascontiguousarray(mesh.vertices_m[mesh.faces].transpose(1, 2, 0))
-        (corner, second, third), face = _cut(corners_m, bounds, max(LONGEST_M, LONGEST_SHARE * extent_m))
+        longest_m = max(LONGEST_M, LONGEST_SHARE * extent_m)
+        (corner, second, third), face, heights_m = _cut(corners_m, bounds, longest_m, heights)
         first_m, second_m = (second - corner).astype(np.float32), (third - corner).astype(np.float32)
         nobodys = np.full(len(face), -1, dtype=np.int32)
-        return cls(corner.astype(np.float32), first_m, second_m, outward_faces(mesh)[face], nobodys)
+        outward = outward_faces(mesh)[face]
+        of_face = np.empty((0, len(face)), dtype=np.int32) if coincident is None else coincident[None, face]
+        return cls(corner.astype(np.float32), first_m, second_m, outward, nobodys, heights_m, of_face)
 
     @classmethod
     def joined(cls, parts: "list[Patches]") -> Self:
         """Those of several, one after the other."""
-        none = np.empty((3, 0), dtype=np.float32)
-        parts = [Patches(none, none, none, np.empty(0, dtype=bool), np.empty(0, dtype=np.int32)), *parts]
+        none, rows = np.empty((3, 0), dtype=np.float32), len(parts[0].heights_m) if parts else 0
+        nobodys = np.empty(0, dtype=np.int32)
+        # What moves has no faces that coincide.
+        faces = max((len(part.face) for part in parts), default=0)
+        of_none = (part._replace(face=np.full((faces, len(part.outward)), -1, dtype=np.int32)) for part in parts)
+        parts = [part if len(part.face) == faces else other for part, other in zip(parts, of_none, strict=True)]
+        no_face = np.empty((faces, 0), dtype=np.int32)
+        parts = [Patches(none, none, none, np.empty(0, dtype=bool), nobodys, none[:rows], no_face), *parts]
         return cls._make(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
 
     def taken(self, numbers: NDArray[np.int64]) -> Self:
@@ -156,6 +192,11 @@ class Patches(NamedTuple):
     def given_to(self, number: int) -> Self:
         """Them as those of an object."""
         return self._replace(of_object=np.full_like(self.of_object, number))
+
+    @property
+    def corners_m(self) -> Float32:
+        """(3, 3, N) corners, coordinates, patches."""
+        return np.stack([self.corner_m, self.corner_m + self.first_m, self.corner_m + self.second_m])
 
     @property
     def lower_m(self) -> Float32:
@@ -177,27 +218,38 @@ class Patches(NamedTuple):
         return normals
 
 
-def _cut(triangles: Float64, bounds: Bounds | None, longest_m: float) -> tuple[Float64, Int64]:
-    """(3, 3, N) triangles with short edges, and (N,) of which one of those given, (3, 3, M), each is a part.
+def _cut(
+    triangles: Float64,
+    bounds: Bounds | None,
+    longest_m: float,
+    heights: Callable[[Float64, Int64], tuple[Float32, Bools]] | None,
+) -> tuple[Float64, Int64, Float32]:
+    """(3, 3, N) triangles with short edges, (N,) of which one of those given, (3, 3, M), each is a part, and heights.
 
     Axes are the corner, the coordinate, the triangle: NumPy is quick along the last one.
     """
     face, area_m2 = np.arange(triangles.shape[2]), _areas(triangles)
     done, done_face = [np.empty((3, 3, 0))], [np.empty(0, dtype=np.int64)]
+    done_heights_m = [np.empty((0 if heights is None else 2, 0), dtype=np.float32)]
     while len(face):
         kept = area_m2 >= SMALLEST_M2
         if bounds is not None:
             kept &= bounds.meet(triangles.min(axis=0).T, triangles.max(axis=0).T)
+        heights_m = np.empty((0, len(face)), dtype=np.float32)
+        if heights is not None:
+            triangles, face, area_m2 = triangles[..., kept], face[kept], area_m2[kept]
+            heights_m, kept = heights(triangles, face)
         edges_m = np.linalg.norm(triangles[[1, 2, 0]] - triangles, axis=1)
         small = edges_m.max(axis=0) <= longest_m
         ready, large = np.flatnonzero(kept & small), np.flatnonzero(kept & ~small)
         done.append(triangles.take(ready, axis=2))
         done_face.append(face[ready])
+        done_heights_m.append(heights_m.take(ready, axis=1))
         triangles = _halved(triangles.take(large, axis=2), edges_m.take(large, axis=1).argmax(axis=0))
         face, area_m2 = np.tile(face[large], 2), np.tile(area_m2[large] / 2, 2)
         unsure = np.flatnonzero(area_m2 < SURE_M2)
         area_m2[unsure] = _areas(triangles[..., unsure])
-    return np.concatenate(done, axis=2), np.concatenate(done_face)
+    return np.concatenate(done, axis=2), np.concatenate(done_face), np.concatenate(done_heights_m, axis=1)
 
 
 def _halved(triangles: Float64, longest: Int64) -> Float64:

@@ -78,11 +78,6 @@ class Radar(Ranging):
         return math.ceil(self.horizontal_fov_deg / self.azimuth_cell_deg - ROUNDING)
 
     @property
-    def range_cells(self) -> int:
-        """How many cells there are one behind the other; the last one may be cut by the range."""
-        return math.ceil(self.max_range_m / self.range_cell_m - ROUNDING)
-
-    @property
     def rays(self) -> int:
         """How many rays there are, of all cells."""
         rows, columns = self._raster()

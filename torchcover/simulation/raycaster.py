@@ -6,6 +6,7 @@ interpreter lock, so that threads add up. An origin may lie on a face, as far as
 """
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
+from torchcover.simulation.patches import outward_faces
 from torchcover.simulation.shapes import Mesh
 
 Float32 = NDArray[np.float32]
@@ -101,8 +103,10 @@ class RayCaster:
             raise ValueError(
                 f"bodies within {MAX_M:g} m of the origin are needed; a vertex has the coordinate {reach_m}"
             )
-        self._faces = Faces(bodies, reach_m)
+        self._reach_m = reach_m
         self._first_face = np.cumsum([0] + [len(body.faces) for body in bodies])
+        self._bodies = bodies
+        self._closed: dict[int, NDArray[np.bool_]] = {}  # asked of few: hardly any ray meets a face from behind
         self._last_asked: tuple[bytes, NDArray[np.int64]] = b"", np.empty(0, dtype=np.int64)
         # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
         self._scene = EmbreeScene(robust=True)
@@ -110,6 +114,11 @@ class RayCaster:
             TriangleMesh(self._scene, body.vertices_m.astype(np.float32), body.faces.astype(np.int32))
         # embreex commits the scene when it is first used; do it before several threads do.
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
+
+    @cached_property
+    def _faces(self) -> Faces:
+        """Asked where rays have a common origin, which may lie on a face."""
+        return Faces(self._bodies, self._reach_m)
 
     def cast(self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32) -> Hits:
         """Cast rays from one origin. A ray that starts on a face does not hit that face.
@@ -145,6 +154,25 @@ class RayCaster:
         """
         answer = self._scene.run(origins_m, directions.T, dists=limit_m.copy(), output=True)
         return Hits(answer["tfar"], answer["geomID"])
+
+    def faces_met(
+        self, origins_m: NDArray[np.floating], directions: NDArray[np.floating], limit_m: float
+    ) -> NDArray[np.int64]:
+        """Which face each of some rays meets first, counted through the faces of all bodies.
+
+        Args:
+            origins_m: (N, 3) where they start.
+            directions: (N, 3) unit directions.
+            limit_m: Where they end.
+
+        Returns:
+            (N,) numbers, -1 for none.
+        """
+        starts_m, towards = origins_m.astype(np.float32), directions.astype(np.float32)
+        ends_m = np.full(len(starts_m), limit_m, dtype=np.float32)
+        answer = self._scene.run(starts_m, towards, dists=ends_m, output=True)
+        met: NDArray[np.int64] = np.where(answer["geomID"] >= 0, self._numbers(answer), -1)
+        return met
 
     def _numbers(self, answer: dict[str, NDArray[Any]]) -> NDArray[np.int64]:
         """(N,) which of all faces each ray hit; any number where it hit none."""
@@ -194,18 +222,24 @@ class RayCaster:
             rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
 
     def met_from_behind(self, origin_m: NDArray[np.floating], directions: Float32) -> NDArray[np.int32]:
-        """Which bodies rays first meet from behind, as rays that start inside a closed body do.
+        """Which closed bodies rays first meet from behind, as those do that start inside: a sheet has no inside.
 
         Args:
             origin_m: (3,) common origin of the rays, or (N, 3) of each.
             directions: (3, N) unit directions.
 
         Returns:
-            (N,) number of the body of which a ray first hits the back of a face; -1 if it hits a front, or nothing.
+            (N,) number of the body of which a ray first hits the back of a face, if that face is one of a closed
+            surface that is turned outwards; else -1.
         """
         origins = np.ascontiguousarray(np.broadcast_to(origin_m.astype(np.float32), (directions.shape[1], 3)))
         answer = self._scene.run(origins, directions.T, output=True)
         # Embree's Ng points to where the corners of the face turn counter-clockwise.
         behind = (answer["Ng"] * directions.T).sum(axis=1) > 0
         bodies: NDArray[np.int32] = np.where(behind, answer["geomID"], -1)
+        for number in np.unique(bodies[behind]).tolist():
+            if number not in self._closed:
+                self._closed[number] = outward_faces(self._bodies[number])
+            of_body = np.flatnonzero(bodies == number)
+            bodies[of_body[~self._closed[number][answer["primID"][of_body]]]] = -1
         return bodies

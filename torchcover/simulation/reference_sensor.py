@@ -11,6 +11,7 @@ from typing import ClassVar, NamedTuple, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.coverage.grid import BandFrame
 from torchcover.geometry import BoundingBox
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.scene import Scene
@@ -24,6 +25,8 @@ Bands = tuple[tuple[float, float], ...]
 # From the ego's bounding box and the random numbers to a (4, 4) pose in the vehicle frame.
 DrawPose = Callable[[BoundingBox, np.random.Generator], NDArray[np.float64]]
 
+# What height bands are over, where nothing else is said.
+DEFAULT_BAND_FRAME: BandFrame = "vehicle"
 # The paper's heights: ground, and what stands on it.
 PAPER_BANDS_M: Bands = ((-0.5, 0.5), (0.5, 2.0))
 # A place inside a body is drawn again, at most this often.
@@ -80,9 +83,11 @@ class ReferenceScan(NamedTuple):
         rays: How many rays were cast.
         self_hits: How many of them the ego took.
         body_casts: At how many pairs of a ray and a moving body; the other pairs could not meet.
-        redrawn: How often its place was drawn again, because it lay inside a body.
+        redrawn: How often its place was drawn again, because it lay inside a body or below the ground.
         drawn: (objects,) int64 how many points were drawn on each of `World.objects`, be they seen or not; None from a
             sensor that draws none.
+        heights_m: (M,) heights of the points above the local ground, from a sensor that has asked for them.
+        places: From how many places it has looked.
     """
 
     points: NDArray[np.float32]
@@ -92,6 +97,8 @@ class ReferenceScan(NamedTuple):
     body_casts: int
     redrawn: int
     drawn: NDArray[np.int64] | None = None
+    heights_m: NDArray[np.float32] | None = None
+    places: int = 1
 
 
 class ReferenceSensor(Protocol):
@@ -107,13 +114,20 @@ class ReferenceSensor(Protocol):
     """Whether its points have weights, the square metres that they stand for. The same in every scan."""
 
     @classmethod
-    def from_rays(cls, areas: Areas, rays: int | None, bands_m: Bands = PAPER_BANDS_M) -> Self:
+    def from_rays(
+        cls,
+        areas: Areas,
+        rays: int | None,
+        bands_m: Bands = PAPER_BANDS_M,
+        band_frame: BandFrame = DEFAULT_BAND_FRAME,
+    ) -> Self:
         """The sensor for a question.
 
         Args:
             areas: The rectangles of the ground that are asked about; they may overlap.
             rays: About how many rays it casts at a step; None for the number that it does best with.
             bands_m: The heights that are asked about; they may overlap too.
+            band_frame: What they are measured from: "ground", the local ground, or "vehicle", z = 0 of its frame.
 
         Raises:
             ValueError: Areas or a number of rays that it cannot do with.

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, Field, PositiveFloat, model_validator
 
 from torchcover.coverage import BevGrid, Region, check_regions, forward_regions, near_field_regions
-from torchcover.coverage.grid import PAPER_HEIGHTS
+from torchcover.coverage.grid import PAPER_HEIGHTS, BandFrame
 from torchcover.simulation.documents import Coordinate, Document, read_document
-from torchcover.simulation.reference_sensor import Areas, Bands
+from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME, Areas, Bands
 
 # Holds the paper's regions, and the space beside and behind the vehicle.
 GRID_X_M = (-40.0, 160.0)
@@ -107,12 +107,18 @@ class RegionsOfInterest(Document):
         """
         return read_document(cls, Path(path))
 
-    def around(self, ego_outline_m: NDArray[np.float64] | None = None, cell_m: float | None = None) -> "Asked":
+    def around(
+        self,
+        ego_outline_m: NDArray[np.float64] | None = None,
+        cell_m: float | None = None,
+        band_frame: BandFrame = DEFAULT_BAND_FRAME,
+    ) -> "Asked":
         """What follows for one vehicle.
 
         Args:
             ego_outline_m: (K, 2) corners x, y of the vehicle; None if unknown: then there is no near field.
             cell_m: Side of a cell, whatever `grid` says.
+            band_frame: What the height bands are over, as in `BevGrid`.
 
         Raises:
             ValueError: A region that the grid does not hold, or that holds no cell centre; a grid that cannot be.
@@ -123,7 +129,7 @@ class RegionsOfInterest(Document):
         vehicle = None if ego_outline_m is None else _bounds(ego_outline_m)
         cell_m = cell_m or self.grid.cell_m or CELL_M
         named = tuple(region.called(name) for name, region in self.regions.items())
-        grid = self._grid(named, cell_m)
+        grid = self._grid(named, cell_m, band_frame)
         if named:
             check_regions(named, grid)
             _warn_of_hidden(named, vehicle)
@@ -137,10 +143,10 @@ class RegionsOfInterest(Document):
         usual = (*forward, *near) or (Region("grid", grid.x, grid.y),)
         return Asked(grid, usual, (*map(_area, forward), *around, (grid.x, grid.y)), forward or usual)
 
-    def _grid(self, regions: tuple[Region, ...], cell_m: float) -> BevGrid:
+    def _grid(self, regions: tuple[Region, ...], cell_m: float, band_frame: BandFrame) -> BevGrid:
         x = self.grid.x_m or _holding(GRID_X_M, [region.x for region in regions], cell_m)
         y = self.grid.y_m or _holding(GRID_Y_M, [region.y for region in regions], cell_m)
-        return BevGrid(x, y, cell_m, self.heights or PAPER_HEIGHTS)
+        return BevGrid(x, y, cell_m, self.heights or PAPER_HEIGHTS, band_frame)
 
 
 class Asked(NamedTuple):

@@ -7,14 +7,17 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import NonNegativeFloat, PlainValidator, PositiveFloat, TypeAdapter, ValidationInfo, model_validator
 
-from torchcover.geometry import BoundingBox
+from torchcover.geometry import BoundingBox, rigid
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, called, mover_mesh
 from torchcover.simulation.documents import Document, PathBeside, Pose, load_document
 from torchcover.simulation.kinds import TRAFFIC
+from torchcover.simulation.local_ground import STEEPEST_DEG, level_faces
 from torchcover.simulation.recorded.bodies import read_boxes
-from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.sensor import Sensor
+from torchcover.simulation.shapes import Mesh, MeshFile
+from torchcover.simulation.sound import coincident_faces, warn_of_coincidence
 from torchcover.simulation.traffic.kind import Traffic
 from torchcover.simulation.world import Actor, World, steps_of
 
@@ -138,6 +141,10 @@ class Scenario(Document):
         episode, step = divmod(index, self.steps)
         return (0 if self.repeats else episode), step
 
+    def reach_m(self, sensor: Sensor) -> float:
+        """How far the rays of a sensor are cast in it: whatever limits sight is decided here."""
+        return sensor.max_range_m
+
     @property
     def repeats(self) -> bool:
         """Whether the same plays again beyond its end: a given world, a recording.
@@ -188,6 +195,16 @@ class Scenario(Document):
             )
         return steps
 
+    @property
+    def says_ground(self) -> bool:
+        """Whether what one drives or walks on is known: of traffic always, else if a body says so.
+
+        Example:
+            >>> Scenario.load("courtyard").says_ground
+            True
+        """
+        return self.traffic is not None or any(body.ground for body in self.bodies)
+
     def ego_mesh(self) -> Mesh:
         """The body of the vehicle that carries the rig, in the vehicle frame; no world is built for it.
 
@@ -232,11 +249,26 @@ class Scenario(Document):
             own_seed = int(np.random.SeedSequence([seed, episode]).generate_state(1, np.uint64)[0])
             return self.traffic.world(own_seed, self.ego_mesh() if ego is None else ego)
         assert self.ego is not None  # checked in _check_given_or_procedural
+        static = [(mesh, body) for body in self.bodies for mesh in body.meshes()]
+        ground = tuple(number for number, (_, body) in enumerate(static) if body.ground)
+        for number in ground:
+            if not level_faces(static[number][0]).any():
+                raise ValueError(
+                    f"body {static[number][1].name!r} is ground, but none of its faces is an upper side that one could "
+                    f"stand on, at most {STEEPEST_DEG:g} degrees steep; is z up?"
+                )
+        driver = self.ego.actor("ego", "ego")
         actors = tuple(actor.actor(actor.name, actor.category) for actor in self.actors)
+        static_T_world = rigid(np.eye(3), -driver.trajectory.positions_m[0])
+        within = [isinstance(body.shape, MeshFile) for _, body in static]
+        coincident = coincident_faces([mesh.moved(static_T_world) for mesh, _ in static], within)
+        warn_of_coincidence([body.name for _, body in static], coincident)
         return World(
-            static=tuple(mesh for body in self.bodies for mesh in body.meshes()),
-            ego=self.ego.actor("ego", "ego"),
+            static=tuple(mesh for mesh, _ in static),
+            ego=driver,
             actors=actors + (read_boxes(self.boxes) if self.boxes else ()),
             time_step_s=self.time_step_s,
             duration_s=self.duration_s,
+            ground=ground or None,
+            coincident=tuple(coincident) if any(mask.any() for mask in coincident) else (),
         )

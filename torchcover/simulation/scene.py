@@ -1,6 +1,7 @@
 """A world as geometry that rays can be cast at."""
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,14 +9,14 @@ from numpy.typing import NDArray
 from torchcover.geometry import BoundingBox, invert, overlap
 from torchcover.geometry.trajectory import poses_at
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
+from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces
 from torchcover.simulation.memory import check_fits
-from torchcover.simulation.moving import Moving
+from torchcover.simulation.moving import Moving, Solids
 from torchcover.simulation.patches import Bounds
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import Tile, rotate
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.solids import Solids
-from torchcover.simulation.surface import SceneSurface, bounds_along
+from torchcover.simulation.surface import AboveGround, SceneSurface, bounds_along
 from torchcover.simulation.world import Actor, World
 
 Matrix = NDArray[np.float64]
@@ -25,6 +26,8 @@ Float32 = NDArray[np.float32]
 BYTES_PER_POSITION = 96
 # Of what never moves, as rays are cast at it.
 BYTES_PER_FACE = 300
+# Of the ground, so many places under the ego are looked at.
+GROUND_LOOKS = 64
 
 
 class Scene:
@@ -71,7 +74,27 @@ class Scene:
     def _scenery(self) -> list[Mesh]:
         return [mesh.moved(invert(self._world_T_local)) for mesh in self.world.static]
 
-    def surface(self, lower_m: Matrix, upper_m: Matrix) -> SceneSurface:
+    @cached_property
+    def ground(self) -> LocalGround:
+        """The ground of the world; what is level and connected with that under the ego, if the world does not say."""
+        faces = zip(self.world.static, self.is_ground, strict=True)
+        meshes = [Mesh(mesh.vertices_m, mesh.faces[mask]) for mesh, mask in faces]
+        return LocalGround(meshes, self._world_T_local[:3, 3])
+
+    @cached_property
+    def is_ground(self) -> Sequence[NDArray[np.bool_]]:
+        """For each static mesh (F,) which of its faces are ground."""
+        static, known = self.world.static, self.world.ground
+        if known is None:
+            looks = np.unique(np.linspace(0, self.world.steps - 1, GROUND_LOOKS).astype(np.int64))
+            times_s = self.world.time_step_s * looks.astype(np.float64)
+            return ground_under(static, self.world.ego.trajectory.positions_at(times_s))
+        return [
+            level_faces(mesh) if number in known else np.zeros(len(mesh.faces), dtype=bool)
+            for number, mesh in enumerate(static)
+        ]
+
+    def surface(self, lower_m: Matrix, upper_m: Matrix, heights_m: tuple[float, float] | None = None) -> SceneSurface:
         """The surface of everything but the ego, for questions about a box that the vehicle carries along.
 
         It is cut when first asked for, once for each box.
@@ -79,8 +102,9 @@ class Scene:
         Args:
             lower_m: (3,) smallest coordinates of the box in the vehicle frame.
             upper_m: (3,) largest.
+            heights_m: Lowest and highest above the local ground that are asked about in it; all if not given.
         """
-        box = (*lower_m.tolist(), *upper_m.tolist())
+        box = (*lower_m.tolist(), *upper_m.tolist(), *(heights_m or ()))
         if box not in self._surfaces:
             ego, step_s = self.world.ego, self.world.time_step_s
             poses = np.stack([ego.trajectory.at(step * step_s) for step in range(self.world.steps)])
@@ -97,8 +121,25 @@ class Scene:
                 },
                 {self._first_moving + k: number[id(actor)] for k, actor in enumerate(self._moving) if actor is not ego},
                 bounds,
+                None if heights_m is None else self._above_ground(*heights_m),
+                self.coincident,
             )
         return self._surfaces[box]
+
+    @cached_property
+    def coincident(self) -> Sequence[NDArray[np.int32]]:
+        """For each static mesh (F,) numbers of its faces that coincide with others among all that never move, or -1."""
+        first = sum(len(actor.mesh.faces) for actor in self._resting)
+        ends = first + np.cumsum([len(mask) for mask in self.world.coincident])
+        return [
+            np.where(mask, np.arange(end - len(mask), end), -1).astype(np.int32)
+            for mask, end in zip(self.world.coincident, ends.tolist(), strict=True)
+        ]
+
+    def _above_ground(self, lowest_m: float, highest_m: float) -> AboveGround:
+        squares_T_static = self._world_T_local.copy()
+        squares_T_static[:3, 3] -= self.ground.origin_m
+        return AboveGround(self.ground.squares, squares_T_static, self.is_ground, lowest_m, highest_m)
 
     def at(self, step: int, within_m: float = np.inf) -> "Instant":
         """Place everything for one step.
@@ -126,7 +167,7 @@ class Scene:
         else:
             static_T_vehicle, ego = np.eye(4), 0
         out_of_range = len(self._moving) - len(moving)
-        return Instant(self._static, static_T_vehicle, moving, ego, out_of_range)
+        return Instant(self._static, static_T_vehicle, moving, ego, out_of_range, self.ground, world_T_vehicle)
 
     def check_apart(self, steps: NDArray[np.int64]) -> None:
         """Refuse time steps at which an actor overlaps the ego, as `at` does for one.

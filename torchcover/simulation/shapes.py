@@ -1,6 +1,5 @@
 """Shapes: primitives, and meshes from files."""
 
-import warnings
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -142,7 +141,7 @@ class MeshFile(Document):
     metres_per_unit: PositiveFloat = 1.0
 
     def mesh(self) -> Mesh:
-        """All geometry of the file in one mesh; a warning if it is not closed.
+        """All geometry of the file in one mesh.
 
         Raises:
             FileNotFoundError: No such file.
@@ -150,13 +149,6 @@ class MeshFile(Document):
             BadFileError: trimesh cannot read it, it has no faces, a vertex is NaN or infinite, or it is too large.
         """
         vertices, faces = _read_mesh(self.path)
-        if openings := _open_edges(vertices, faces):
-            warnings.warn(
-                f"{self.path}: the mesh is not closed ({openings} edges have a face on one side only): rays pass "
-                "through the holes, and whether a sensor or the reference lies inside it cannot be told; close it in a "
-                "modelling tool, or go on if it is a sheet on purpose, such as terrain",
-                stacklevel=2,
-            )
         return Mesh(vertices * self.metres_per_unit, faces)
 
 
@@ -180,17 +172,6 @@ def _read_mesh(path: Path) -> Mesh:
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise ValueError(f"faces have vertices {faces.min()} to {faces.max()}; there are {len(vertices)}")
     return Mesh(vertices, faces)
-
-
-def _open_edges(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> int:
-    """Number of edges that an odd number of faces share; 0 if the mesh is closed, whichever way its faces turn."""
-    # Files repeat a vertex for each face (STL), or for each texture (OBJ).
-    _, number = np.unique(vertices, axis=0, return_inverse=True)
-    corners = number.reshape(-1)[faces]
-    edges = np.sort(corners[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
-    # A face without area has an edge from a corner to itself, and one twice.
-    _, count = np.unique(edges[edges[:, 0] != edges[:, 1]], axis=0, return_counts=True)
-    return int((count % 2).sum())
 
 
 def _rectangle(size_m: tuple[float, float], z_m: float) -> NDArray[np.float64]:

@@ -25,7 +25,6 @@ from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.simulator import Observation, Simulator
 from torchcover.simulation.surface_reference import SurfaceReference
-from torchcover.simulation.world import Label
 
 DEFAULT_REFERENCE = "surface"
 # With so many points on an object, of which half are seen, its visibility has a standard error of 0.09 at most.
@@ -46,7 +45,7 @@ class SimulatedFrames(FrameDataset):
     Args:
         scenario: The world, the name of a built-in one, or the path of a YAML file.
         rig: The sensors, the name of a built-in rig, or the path of a YAML file.
-        rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds.
+        rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds; `{}`: the reference alone.
         steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
             traffic, the same instants are seen again, which `Frame.place_in_time` and `Frame.counts` say.
         seed: Seed of the traffic and of the reference sensor's poses.
@@ -61,6 +60,7 @@ class SimulatedFrames(FrameDataset):
             scenario.
         vehicle: What carries the rigs: a built-in vehicle, the YAML file of one, or a mesh file. Not given: the
             scenario's own ego, else the vehicle that the rigs name, else an SUV.
+        kept_bytes: As in `Simulator`.
 
     Raises:
         FileNotFoundError: An unknown name or file.
@@ -86,6 +86,7 @@ class SimulatedFrames(FrameDataset):
         every_s: float | None = None,
         boxes: bool = False,
         vehicle: str | Path | None = None,
+        kept_bytes: float | None = None,
     ) -> None:
         if not 1 <= steps <= MAX_STEPS:
             raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
@@ -100,6 +101,7 @@ class SimulatedFrames(FrameDataset):
             reference_sensor,
             seed=seed,
             every_s=every_s,
+            kept_bytes=kept_bytes,
         )
         self.steps = steps
         self.boxes = boxes
@@ -173,8 +175,9 @@ class SimulatedFrames(FrameDataset):
 
     @property
     def reference_record(self) -> Mapping[str, object]:
-        """The name of the reference sensor and the time between two frames."""
-        return {"sensor": self.reference_sensor.name, "every_s": self.every_s}
+        """The name of the reference sensor, the time between two frames, and what was taken for the ground."""
+        words = self.simulator.ground_words
+        return {"sensor": self.reference_sensor.name, "every_s": self.every_s, "notes": [words] if words else []}
 
     @property
     def content(self) -> Mapping[str, object]:
@@ -216,16 +219,31 @@ class SimulatedFrames(FrameDataset):
             clouds=clouds,
             reference=torch.from_numpy(seen.reference),
             reference_weights=None if weights is None else torch.from_numpy(weights),
+            reference_heights_m=torch.from_numpy(seen.reference_heights_m),
             index=index,
             name=f"{self.scenario.name} step {index}",
             counts=seen.counts,
-            boxes=_boxes(self.simulator.labels(index), clouds, seen.drawn) if self.boxes else None,
+            boxes=self._boxes(index, clouds, seen.drawn) if self.boxes else None,
             place_in_time=self.simulator.place_in_time(index),
             sensor_points={
                 name: dict(zip((sensor.name for sensor in self.rigs[name].sensors), points, strict=True))
                 for name, points in seen.sensor_points.items()
             },
         )
+
+    def _boxes(self, index: int, clouds: Mapping[str, torch.Tensor], drawn: NDArray[np.int64] | None) -> Boxes:
+        found = self.simulator.labels(index)
+        rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
+        velocities = np.array([label.velocity_mps for label in found])
+        boxes = Boxes.from_rows(
+            torch.tensor(rows, dtype=torch.float32).view(-1, 7),
+            velocity_mps=torch.tensor(velocities, dtype=torch.float32).view(-1, 2),
+            ids=tuple(label.name for label in found),
+            categories=tuple(label.category for label in found),
+            drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
+            bottom_heights_m=torch.from_numpy(self.simulator.bottom_heights_m(index, found)),
+        )
+        return with_hits(boxes, clouds)
 
 
 def reference_called(name: str | None = None, rays: int | None = None, asked: Asked | None = None) -> ReferenceSensor:
@@ -249,7 +267,7 @@ def reference_called(name: str | None = None, rays: int | None = None, asked: As
     if kind is None:
         raise ValueError(f"reference {name}: {' or '.join(f'`{known}`' for known in REFERENCE_SENSORS)} is needed")
     asked = asked or RegionsOfInterest().around()
-    return kind.from_rays(asked.areas, rays, asked.bands_m)
+    return kind.from_rays(asked.areas, rays, asked.bands_m, asked.grid.band_frame)
 
 
 def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
@@ -263,12 +281,14 @@ def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
         64
     """
     asked = asked or RegionsOfInterest().around()
-    return SurfaceReference(asked.areas, bands_m=asked.bands_m, object_points=OBJECT_POINTS)
+    return SurfaceReference(
+        asked.areas, bands_m=asked.bands_m, object_points=OBJECT_POINTS, band_frame=asked.grid.band_frame
+    )
 
 
 def _rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | None) -> dict[str, Rig]:
     """One rig by its own name, or several by the names that they are given."""
-    if (rig is None) == (not rigs):
+    if (rig is None) == (rigs is None):
         raise ValueError("give one rig, or several as rigs={name: rig}")
     if rig is not None:
         only = _load(rig)
@@ -278,15 +298,3 @@ def _rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | N
 
 def _load(rig: Rig | str | Path) -> Rig:
     return rig if isinstance(rig, Rig) else Rig.load(rig)
-
-
-def _boxes(found: Sequence[Label], clouds: Mapping[str, torch.Tensor], drawn: NDArray[np.int64] | None) -> Boxes:
-    rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
-    boxes = Boxes.from_rows(
-        torch.tensor(rows, dtype=torch.float32).view(-1, 7),
-        velocity_mps=torch.tensor(np.array([label.velocity_mps for label in found]), dtype=torch.float32).view(-1, 2),
-        ids=tuple(label.name for label in found),
-        categories=tuple(label.category for label in found),
-        drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
-    )
-    return with_hits(boxes, clouds)

@@ -11,14 +11,14 @@ import torch
 from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox
-from torchcover.simulation.instant import Instant, Scan
+from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.memory import check_fits
-from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.reference_sensor import ReferenceScan, ReferenceSensor, Surroundings
 from torchcover.simulation.rig import Rig, with_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws
+from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.stage import Stage, Stages
 from torchcover.simulation.standing import warn_of_floating
 from torchcover.simulation.world import Label, labels
@@ -38,6 +38,8 @@ class Observation:
         sensor_points: Name of each rig -> how many of its points are of each of its sensors.
         reference: (M, 3) float32 points of the reference sensor.
         reference_weights: (M,) float32 square metres that each of them stands for; None if they count the same.
+        reference_heights_m: (M,) float32 heights of the reference points above the local ground, along the vertical of
+            the world; NaN where there is no ground at or below.
         drawn: (objects,) how many points the reference drew on each of `World.objects`, from `ReferenceScan`.
         counts: How many rays there were, how many of them the ego took, and what was left out, by name.
     """
@@ -46,6 +48,7 @@ class Observation:
     sensor_points: Mapping[str, Sequence[int]]
     reference: Float32
     reference_weights: Float32 | None
+    reference_heights_m: Float32
     drawn: NDArray[np.int64] | None
     counts: Mapping[str, int]
 
@@ -142,7 +145,7 @@ class Simulator:
         other._check_size()
         return other
 
-    def scans(self, index: int) -> Mapping[str, Sequence[Scan]]:
+    def scans(self, index: int) -> Mapping[str, Sequence[SensorScan]]:
         """What the sensors see at one step, as in `step`, bit for bit; the reference is not cast.
 
         Args:
@@ -179,15 +182,18 @@ class Simulator:
         stage, instant = self._placed(index)
         scans = self._scans(stage, instant, index)
         reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
+        heights_m = instant.heights_m(reference.points) if reference.heights_m is None else reference.heights_m
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
         return Observation(
             clouds={name: np.concatenate([scan.points for scan in of_rig]) for name, of_rig in scans.items()},
             sensor_points={name: [len(scan.points) for scan in of_rig] for name, of_rig in scans.items()},
             reference=reference.points,
             reference_weights=reference.weights,
+            reference_heights_m=heights_m,
             drawn=reference.drawn,
             counts={
                 **_counts_of(stage.scene, instant, of_all_rigs, reference),
+                "reference_no_ground": int(np.isnan(heights_m).sum()),
                 "repeated_instants": int(self.distinct_steps is not None and index >= self.distinct_steps),
             },
         )
@@ -213,10 +219,39 @@ class Simulator:
             stage.check_mounts(stage.scene.at(0))
             warn_of_floating(self.scenario.name, stage.scene, seen)
 
+    @property
+    def ground_words(self) -> str:
+        """What is taken for the ground of a scenario that does not say it; no words if it does.
+
+        Example:
+            >>> from torchcover.simulation import PaperReference
+            >>> Simulator(Scenario.load("urban"), {}, PaperReference(rows=16, columns=16)).ground_words
+            ''
+        """
+        if self.scenario.says_ground:
+            return ""
+        names = [body.name for body in self.scenario.bodies for _ in body.poses]
+        found = zip(names, self.scene_of(0)[0].is_ground, strict=True)
+        taken = dict.fromkeys(repr(name) for name, is_ground in found if is_ground.any())
+        if not taken:
+            return (
+                "Ground: none was found under the ego, so that no point has a height above it; mark bodies as ground."
+            )
+        what = "level faces under the ego, and what is level and connected with them"
+        return f"Ground: {what}, of {', '.join(taken)}; bodies with `ground: true` say it otherwise."
+
     def labels(self, index: int) -> list[Label]:
         """The objects within the reference sensor's range at one step; names are an object's own within a run."""
         scene, step = self.scene_of(index)
         return labels(scene.world, step, self.reference_sensor.max_range_m)
+
+    def bottom_heights_m(self, index: int, found: Sequence[Label]) -> Float32:
+        """(K,) height of the bottom of each label's box at a step above the highest ground below its centre."""
+        scene, step = self.scene_of(index)
+        world_T_vehicle = scene.world.ego.trajectory.at(step * scene.world.time_step_s)
+        centres_m = np.array([label.centre_m for label in found]).reshape(-1, 3)
+        halves_m = np.array([label.size_m[2] / 2 for label in found], dtype=np.float32)
+        return scene.ground.heights_m(centres_m, world_T_vehicle) - halves_m
 
     def scene_of(self, index: int) -> tuple[Scene, int]:
         """The geometry of the world in which a step plays, and the time step in it.
@@ -256,16 +291,16 @@ class Simulator:
         """How far from the origin of the vehicle frame a sensor can see: its range starts where it is mounted."""
         farthest_m = np.abs(ego.corners_m).max(axis=0) + self.reference_sensor.shell_m
         reaches = [
-            float(np.linalg.norm(sensor.mount.matrix()[:3, 3])) + sensor.max_range_m
+            float(np.linalg.norm(sensor.mount.matrix()[:3, 3])) + self.scenario.reach_m(sensor)
             for rig in self.rigs.values()
             for sensor in rig.sensors
         ]
         return max([float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches])
 
-    def _scans(self, stage: Stage, instant: Instant, index: int) -> dict[str, list[Scan]]:
+    def _scans(self, stage: Stage, instant: Instant, index: int) -> dict[str, list[SensorScan]]:
         return {name: self._scan_rig(sensors, instant, index) for name, sensors in stage.mounted.items()}
 
-    def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[Scan]:
+    def _scan_rig(self, sensors: Sequence[MountedSensor], instant: Instant, index: int) -> list[SensorScan]:
         scans = []
         for k, mounted in enumerate(sensors, 1):
             draws = Draws(np.random.default_rng([self.seed, index, k]))
@@ -278,7 +313,7 @@ class Simulator:
         return Surroundings(scene, instant, generator, name, threads=torch.get_num_threads())
 
 
-def _counts_of(scene: Scene, instant: Instant, scans: Sequence[Scan], reference: ReferenceScan) -> dict[str, int]:
+def _counts_of(scene: Scene, instant: Instant, scans: Sequence[SensorScan], reference: ReferenceScan) -> dict[str, int]:
     """What the rays of all sensors and of the reference met, and what was left out, next to all that there was."""
     rays, self_hits = sum(scan.rays for scan in scans), sum(scan.self_hits for scan in scans)
     pairs = (rays + reference.rays) * len(instant.moving)
@@ -287,6 +322,7 @@ def _counts_of(scene: Scene, instant: Instant, scans: Sequence[Scan], reference:
         "sensor_self_hits": self_hits,
         "reference_rays": reference.rays,
         "reference_self_hits": reference.self_hits,
+        "reference_poses": reference.places + reference.redrawn,
         "reference_poses_redrawn": reference.redrawn,
         "moving_bodies": len(instant.moving) + instant.out_of_range,
         "moving_bodies_out_of_range": instant.out_of_range,

@@ -13,12 +13,12 @@ from torch.utils.data import get_worker_info
 
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.memory import machine_bytes
-from torchcover.simulation.mounted import MountedSensor
+from torchcover.simulation.moving import Solids
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.solids import Solids
+from torchcover.simulation.sight import MountedSensor
 
 # A sensor on the ground is asked about a place this far above it: whether it is inside of something else.
 LIFT_M = np.array([0.0, 0.0, 0.01])
@@ -177,7 +177,11 @@ class Stages:
     def _on(self, scene: Scene) -> Mapping[str, Sequence[MountedSensor]]:
         """The rigs' sensors on the ego of a scene."""
         self._check_mounts(scene)
-        return {name: [MountedSensor(sensor, scene) for sensor in rig.sensors] for name, rig in self._rigs.items()}
+        reach_m = self._scenes.scenario.reach_m
+        return {
+            name: [MountedSensor(sensor, scene, reach_m(sensor)) for sensor in rig.sensors]
+            for name, rig in self._rigs.items()
+        }
 
     def _check_mounts(self, scene: Scene) -> None:
         scenario = self._scenes.scenario

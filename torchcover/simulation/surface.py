@@ -1,6 +1,6 @@
 """The surface of a world, cut small once; what is near the vehicle is looked up at every step."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -8,13 +8,19 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import invert, transform
 from torchcover.simulation.instant import Instant
+from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
+from torchcover.simulation.local_ground import TOLERANCE_M, GroundSquares, height_bounds
 from torchcover.simulation.patches import Bounds, Patches
 from torchcover.simulation.rays import rotate_each
 from torchcover.simulation.shapes import Mesh
 
+Bools = NDArray[np.bool_]
+Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 
+# Between which heights above the ground the ground itself lies.
+OF_GROUND_M = np.array([[-TOLERANCE_M - HEIGHT_SLACK_M], [HEIGHT_SLACK_M]], dtype=np.float32)
 # Side of the squares of the ground by which patches are looked up.
 CELL_M = 16  # a power of two
 # A drive is followed by boxes around stretches of it of this length.
@@ -38,6 +44,54 @@ class Groups(NamedTuple):
         return np.repeat(first - np.concatenate([[0], np.cumsum(count)[:-1]]), count) + np.arange(count.sum())
 
 
+class AboveGround(NamedTuple):
+    """What is asked about the surface by height above the local ground.
+
+    `squares` of the ground; `squares_T_static` (4, 4) from the frame of what never moves to theirs; `ground` for each
+    mesh that never moves (F,) which of its faces are ground; `lowest_m` and `highest_m` of all heights that are wanted.
+    """
+
+    squares: GroundSquares
+    squares_T_static: Float64
+    ground: Sequence[Bools]
+    lowest_m: float
+    highest_m: float
+
+    def of_scenery(self, number: int) -> Callable[[Float64, Numbers], tuple[Float32, Bools]]:
+        """From triangles of a mesh that never moves and their faces to (2, N) heights, and (N,) whether any is wanted.
+
+        That of the ground itself is none, but for other ground a few centimetres above it.
+        """
+
+        def heights(triangles_m: Float64, face: Numbers) -> tuple[Float32, Bools]:
+            heights_m = OF_GROUND_M.repeat(len(face), axis=1)
+            others = np.flatnonzero(~self.ground[number][face])
+            corners_m = _moved_corners(self.squares_T_static, triangles_m.take(others, axis=2))
+            heights_m[:, others] = self.squares.heights_m(corners_m)
+            wanted: Bools = (heights_m[1] >= self.lowest_m) & (heights_m[0] <= self.highest_m)
+            return heights_m, wanted
+
+        return heights
+
+    def of_objects(self, patches: Patches, static_T_patches: Float64, corners_m: Float64, count: Numbers) -> Patches:
+        """Patches of objects with their heights above the ground that is anywhere below the object.
+
+        Args:
+            patches: All of one object, then all of the next.
+            static_T_patches: Where their frame is.
+            corners_m: (J, 8, 3) of boxes around the objects in that frame.
+            count: (J,) how many patches each has.
+        """
+        squares_T_patches = self.squares_T_static @ static_T_patches
+        corners_m = transform(squares_T_patches, corners_m.reshape(-1, 3)).reshape(-1, 8, 3)
+        lowest_m, highest_m = self.squares.between_m(corners_m.min(axis=1).T[:2], corners_m.max(axis=1).T[:2])
+        up, columns = squares_T_patches[2], (patches.corner_m, patches.first_m, patches.second_m)
+        corner_m, first_m, second_m = (up[:3] @ column for column in columns)
+        low_m = corner_m + np.minimum(np.minimum(first_m, second_m), 0.0) + up[3] - highest_m.repeat(count)
+        high_m = corner_m + np.maximum(np.maximum(first_m, second_m), 0.0) + up[3] - lowest_m.repeat(count)
+        return patches._replace(heights_m=height_bounds(low_m, high_m))
+
+
 class SceneSurface:
     """The surface of what never moves, in the order of places on the ground, and of each object that moves.
 
@@ -47,6 +101,9 @@ class SceneSurface:
         resting: By number, `static_T_object` of those that never move.
         moving: Of the others the number of the object, by that of the body in an instant.
         bounds: Boxes in the frame of what never moves, outside of which no scenery is ever asked for.
+        above: What is asked by height above the local ground; None if nothing is.
+        coincident: For each mesh that never moves (F,) numbers of its faces that coincide with others, -1 for the rest;
+            empty if none does.
     """
 
     def __init__(
@@ -56,10 +113,19 @@ class SceneSurface:
         resting: Mapping[int, Float64],
         moving: Mapping[int, int],
         bounds: Bounds,
+        above: AboveGround | None = None,
+        coincident: Sequence[NDArray[np.int32]] = (),
     ) -> None:
+        self._above = above
         self._moving = {body: (objects[number], number) for body, number in moving.items()}
         placed = [objects[number].moved(pose).given_to(number) for number, pose in resting.items()]
-        patches = Patches.joined([Patches.of(mesh, bounds) for mesh in scenery] + placed)
+        if above is not None:
+            placed = [above.of_objects(patches, np.eye(4), *_box_of(patches)) for patches in placed]
+        cut = [
+            Patches.cut(mesh, bounds, above and above.of_scenery(number), coincident[number] if coincident else None)
+            for number, mesh in enumerate(scenery)
+        ]
+        patches = Patches.joined(cut + placed)
         order, cell = _by_place(patches)
         self._static = patches.taken(order)
         self._cells = _groups(self._static, cell)
@@ -94,8 +160,12 @@ class SceneSurface:
         meets |= np.linalg.norm(moving.centre_m, axis=1) - moving.radius_m <= objects_within_m
         bodies = np.flatnonzero(meets & (moving.body != instant.ego))
         placed = [self._moving[number] for number in moving.body[bodies].tolist()]
-        near.append(placed_each(placed, moving.vehicle_T_part[bodies]))
-        return Patches.joined(near)
+        of_moving = placed_each(placed, moving.vehicle_T_part[bodies])
+        if self._above is not None:
+            count = np.array([len(patches.outward) for patches, _ in placed], dtype=np.int64)
+            corners_m = moving.corners_m[bodies]
+            of_moving = self._above.of_objects(of_moving, instant.static_T_vehicle, corners_m, count)
+        return Patches.joined([*near, of_moving])
 
 
 def placed_each(kinds: Sequence[tuple[Patches, int]], destination_T_source: Float64) -> Patches:
@@ -111,6 +181,8 @@ def placed_each(kinds: Sequence[tuple[Patches, int]], destination_T_source: Floa
         second_m=rotate_each(rotation, all_parts.second_m),
         outward=all_parts.outward,
         of_object=np.array([number for _, number in kinds], dtype=np.int32).repeat(count),
+        heights_m=all_parts.heights_m,
+        face=all_parts.face,
     )
 
 
@@ -161,6 +233,19 @@ def _groups(patches: Patches, group: Numbers | NDArray[np.int32]) -> Groups:
     lower_m = np.minimum.reduceat(patches.lower_m, first, axis=1).T.astype(np.float64)
     upper_m = np.maximum.reduceat(patches.upper_m, first, axis=1).T.astype(np.float64)
     return Groups(np.append(first, len(group)), Bounds(lower_m - SLACK_M, upper_m + SLACK_M))
+
+
+def _box_of(patches: Patches) -> tuple[Float64, Numbers]:
+    """(1, 8, 3) corners of a box around all of some patches, and (1,) how many there are."""
+    sides = np.stack([patches.lower_m.min(axis=1), patches.upper_m.max(axis=1)]).astype(np.float64)
+    corner = np.indices((2, 2, 2)).reshape(3, -1).T
+    return sides[corner, np.arange(3)][None], np.array([len(patches.outward)])
+
+
+def _moved_corners(destination_T_source: Float64, corners_m: NDArray[np.floating]) -> Float64:
+    """(3, 3, N) corners, coordinates, triangles in another frame."""
+    moved_m: Float64 = destination_T_source[:3, :3] @ corners_m.astype(np.float64) + destination_T_source[:3, 3:]
+    return moved_m
 
 
 def _moved_bounds(destination_T_source: Float64, bounds: Bounds) -> tuple[Float64, Float64]:

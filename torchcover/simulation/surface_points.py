@@ -1,10 +1,12 @@
 """Points drawn evenly over a surface, stratified by boxes and by objects."""
 
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
 from torchcover.simulation.patches import Bounds, Patches
 
 Bools = NDArray[np.bool_]
@@ -24,15 +26,24 @@ MOST_DRAWN = 16.0
 class SurfacePoints(NamedTuple):
     """K points of a surface.
 
-    `points_m` (K, 3) where; `normals` (K, 3) of length one on the side from which they are looked at; `per_m2` (K,) how
-    many points a square metre was given there, from all strata together; `of_object` (K,) number of the object that
-    they are on, -1 for none.
+    `points_m` (K, 3) where; `heights_m` (K,) above what bands are measured from; `normals` (K, 3) of length one on the
+    side from which they are looked at; `per_m2` (K,) how many points a square metre was given there, from all strata
+    together; `of_object` (K,) number of the object that they are on, -1 for none; `face` (1, K) or (0, K) as in
+    `Patches`.
     """
 
     points_m: Float32
+    heights_m: Float32
     normals: Float32
     per_m2: Float64
     of_object: Int32
+    face: Int32
+
+    def some(self, which: Bools) -> Self:
+        """Those of them for which (K,) is true."""
+        turned = self._replace(face=self.face.T)
+        some = type(self)._make(part[which] for part in turned)
+        return some._replace(face=some.face.T)
 
 
 class Stratum(NamedTuple):
@@ -64,16 +75,21 @@ class SurfaceStrata:
     Args:
         patches: The surface in the frame of the boxes.
         boxes: Strata, half-open: lower bounds belong to them.
+        heights_m: From (K, 3) points to (K,) heights, NaN for none, which the third bounds of the boxes are about, as
+            `Patches.heights_m` are; their z if not given.
     """
 
-    def __init__(self, patches: Patches, boxes: Bounds) -> None:
+    def __init__(self, patches: Patches, boxes: Bounds, heights_m: Callable[[Float32], Float32] | None = None) -> None:
         self._patches = patches
         self._boxes = boxes
+        self._heights_m = heights_m
         normals = patches.normals_m2
         twice_m2 = np.sqrt((normals**2).sum(axis=0))
         self._normals = normals / np.maximum(twice_m2, np.finfo(np.float32).tiny)
         self._plane_m = (self._normals * patches.corner_m).sum(axis=0)
         lower_m, upper_m = patches.lower_m - np.float32(SLACK_M), patches.upper_m + np.float32(SLACK_M)
+        if heights_m is not None:
+            lower_m[2], upper_m[2] = patches.heights_m
         self._strata = _strata(twice_m2 / 2, lower_m, upper_m, boxes)
         self._objects = _objects(patches.of_object, twice_m2 / 2)
 
@@ -97,7 +113,9 @@ class SurfaceStrata:
         of_objects, object_per_m2 = _drawn_on_objects(self._objects, front, on_objects, generator)
         patch = np.concatenate([*(patch for patch, _ in drawn), of_objects])
         points_m = self._points(patch, generator)
-        inside = np.stack([_inside(points_m, low, high) for low, high in zip(*self._boxes, strict=True)])
+        heights_m = self._heights_of(points_m, patch)
+        placed_m = points_m[0], points_m[1], heights_m
+        inside = np.stack([_inside(placed_m, low, high) for low, high in zip(*self._boxes, strict=True)])
         kept = np.ones(len(patch), dtype=bool)
         kept[: len(number)] = inside[number, np.arange(len(number))]
         patch, of_object = patch[kept], self._patches.of_object[patch[kept]]
@@ -105,10 +123,22 @@ class SurfaceStrata:
         side = np.where(self._patches.outward[patch], np.float32(1), np.sign(height_m[patch]))
         return SurfacePoints(
             np.ascontiguousarray(points_m[:, kept].T),
+            heights_m[kept],
             (self._normals[:, patch] * side).T,
             np.array([density for _, density in drawn]) @ inside[:, kept] + object_per_m2[of_object],
             of_object,
+            self._patches.face.take(patch, axis=1),
         )
+
+    def _heights_of(self, points_m: Float32, patch: Numbers) -> Float32:
+        """(K,) what the third bounds of the boxes are about, of (3, K) points on the patches."""
+        if self._heights_m is None:
+            z_m: Float32 = points_m[2]
+            return z_m
+        asked = np.flatnonzero(self._patches.heights_m[1].take(patch) > HEIGHT_SLACK_M)  # the others are the ground
+        heights_m = np.zeros(len(patch), dtype=np.float32)
+        heights_m[asked] = self._heights_m(points_m.take(asked, axis=1).T)
+        return heights_m
 
     def _points(self, patch: Numbers, generator: np.random.Generator) -> Float32:
         """(3, K) one point on each of the patches."""
@@ -121,10 +151,10 @@ class SurfaceStrata:
         return points_m
 
 
-def _inside(points_m: Float32, low: Float64, high: Float64) -> Bools:
-    inside = np.ones(points_m.shape[1], dtype=bool)
-    for axis in range(3):
-        inside &= (points_m[axis] >= low[axis]) & (points_m[axis] < high[axis])
+def _inside(placed_m: Sequence[Float32], low: Float64, high: Float64) -> Bools:
+    inside = np.ones(len(placed_m[0]), dtype=bool)
+    for along_m, least_m, most_m in zip(placed_m, low, high, strict=True):
+        inside &= (along_m >= least_m) & (along_m < most_m)
     return inside
 
 

@@ -2,14 +2,16 @@
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Self
+from typing import ClassVar, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from torchcover.coverage.grid import BandFrame
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation.patches import Bounds
 from torchcover.simulation.reference_sensor import (
+    DEFAULT_BAND_FRAME,
     PAPER_BANDS_M,
     Areas,
     Bands,
@@ -20,6 +22,7 @@ from torchcover.simulation.reference_sensor import (
     position_in_shell,
 )
 from torchcover.simulation.sight import Sight, sight
+from torchcover.simulation.sound import COINCIDE_M
 from torchcover.simulation.surface_points import SurfacePoints, SurfaceStrata
 
 Float32 = NDArray[np.float32]
@@ -43,8 +46,8 @@ class SurfaceReference:
         E_place[ integral of f over the surface that the place sees ],
 
     whatever the number of rays and of places. A face of a closed body is seen from its outer side; a face of anything
-    open, such as a plane, from both. Where two faces coincide and look the same way, both count. Outside of all areas
-    and bands there are points on objects only.
+    open, such as a plane, from both. Of faces that never move and lie within 1 mm of each other, one counts. Outside
+    of all areas and bands there are points on objects only.
 
     Args:
         areas: Rectangles x, y in the vehicle frame in metres, ((x_low, x_high), (y_low, y_high)) each. They may
@@ -54,6 +57,8 @@ class SurfaceReference:
         bands_m: Height bands (low, high) in metres; half-open, as areas are. They may overlap too.
         shell_m: Thickness of the shell around the ego in which the places are.
         max_range_m: Farther points are not seen.
+        band_frame: What heights are measured from: "ground", the local ground (`LocalGround`), or "vehicle", z = 0 of
+            the vehicle frame.
         object_points: How many more points at least are drawn on each object (`World.objects`) whose surface lies
             within that range of the places, in any area and at any height, from all places together; in addition to
             `rays`.
@@ -80,6 +85,7 @@ class SurfaceReference:
     shell_m: float = 0.5
     max_range_m: float = 250.0
     object_points: int = 0
+    band_frame: BandFrame = DEFAULT_BAND_FRAME
 
     def __post_init__(self) -> None:
         check_areas(self.areas)
@@ -91,36 +97,53 @@ class SurfaceReference:
             raise ValueError(f"places: at least 1 is needed; got {self.places}")
         if self.object_points < 0:
             raise ValueError(f"object_points: a number >= 0 is needed; got {self.object_points}")
+        if self.band_frame not in get_args(BandFrame):
+            raise ValueError(f"band_frame: ground or vehicle is needed; got {self.band_frame!r}")
         check_reach(self.shell_m, self.max_range_m)
 
     @classmethod
-    def from_rays(cls, areas: Areas, rays: int | None, bands_m: Bands = PAPER_BANDS_M) -> Self:
+    def from_rays(
+        cls,
+        areas: Areas,
+        rays: int | None,
+        bands_m: Bands = PAPER_BANDS_M,
+        band_frame: BandFrame = DEFAULT_BAND_FRAME,
+    ) -> Self:
         """One that asks about some areas.
 
         Args:
             areas: As above.
             rays: About how many rays; 16,384 if not given.
             bands_m: As above.
+            band_frame: As above.
 
         Raises:
             ValueError: As for the class.
         """
-        return cls(areas, DEFAULT_RAYS if rays is None else rays, bands_m=bands_m)
+        return cls(areas, DEFAULT_RAYS if rays is None else rays, bands_m=bands_m, band_frame=band_frame)
 
     def scan(self, surroundings: Surroundings) -> ReferenceScan:
         """Draw points, and keep those that are seen; see `ReferenceSensor.scan`."""
         boxes = self._boxes()
         instant = surroundings.instant
-        surface = surroundings.scene.surface(boxes.lower_m.min(axis=0), boxes.upper_m.max(axis=0))
         # All places before the first point: they are the same for any number of rays.
         drawn = [surroundings.free_pose(self._pose) for _ in range(self.places)]
         places_m = [pose[:3, 3] for pose, _ in drawn]
-        strata = SurfaceStrata(surface.near(instant, boxes, self._objects_within_m(places_m)), boxes)
+        lower_m, upper_m = boxes.lower_m.min(axis=0), boxes.upper_m.max(axis=0)
+        if self.band_frame == "vehicle":
+            surface, around, heights_m = surroundings.scene.surface(lower_m, upper_m), boxes, None
+        else:
+            around, heights_m = self._at_any_height(boxes, surroundings.scene.ego_box), instant.heights_m
+            surface = surroundings.scene.surface(
+                around.lower_m.min(axis=0), around.upper_m.max(axis=0), (float(lower_m[2]), float(upper_m[2]))
+            )
+        patches = surface.near(instant, around, self._objects_within_m(places_m))
+        strata = SurfaceStrata(patches, boxes, heights_m)
         above_m = max(ABOVE_M, ABOVE_SHARE * float(np.abs(instant.static_T_vehicle[:3, 3]).max()))
         on_objects, looks = math.ceil(self.object_points / self.places), []
         for place_m in places_m:
             found = strata.draw(place_m, self._rays_each, surroundings.generator, on_objects=on_objects)
-            found = self._in_range(found, place_m)
+            found = self._in_range(_uncovered(found, surroundings), place_m)
             targets_m = found.points_m + np.float32(above_m) * found.normals
             looks.append((found, sight(instant, place_m, targets_m, threads=surroundings.threads)))
         objects = len(surroundings.scene.world.objects)
@@ -130,6 +153,13 @@ class SurfaceReference:
         sides = [(*area, band) for area in self.areas for band in self.bands_m]
         lower_m, upper_m = np.array(sides, dtype=np.float64).transpose(2, 0, 1)
         return Bounds(lower_m, upper_m)
+
+    def _at_any_height(self, boxes: Bounds, ego: BoundingBox) -> Bounds:
+        """The same areas, as far up and down in the vehicle frame as a point can be seen from a place."""
+        reach_m = self.max_range_m + self.shell_m + float(np.abs(ego.corners_m).max())
+        areas = np.unique(np.stack([boxes.lower_m[:, :2], boxes.upper_m[:, :2]], axis=1), axis=0)
+        ends_m = np.broadcast_to(np.array([[[-reach_m], [reach_m]]]), (len(areas), 2, 1))
+        return Bounds(*np.concatenate([areas, ends_m], axis=2).swapaxes(0, 1))
 
     @property
     def _rays_each(self) -> float:
@@ -147,12 +177,13 @@ class SurfaceReference:
 
     def _in_range(self, drawn: SurfacePoints, place_m: Float64) -> SurfacePoints:
         near = np.linalg.norm(drawn.points_m - place_m, axis=1) <= self.max_range_m
-        return drawn if near.all() else SurfacePoints(*(part[near] for part in drawn))
+        return drawn if near.all() else drawn.some(near)
 
     def _gathered(self, looks: list[tuple[SurfacePoints, Sight]], objects: int, redrawn: int) -> ReferenceScan:
         # One place stands for one of so many: every place's points are a surface of their own.
         weights = [1.0 / (self.places * found.per_m2[look.seen]) for found, look in looks]
         of_object = np.concatenate([found.of_object for found, _ in looks])
+        heights_m = np.concatenate([found.heights_m[look.seen] for found, look in looks])
         return ReferenceScan(
             points=np.concatenate([found.points_m[look.seen] for found, look in looks]),
             weights=np.concatenate(weights).astype(np.float32),
@@ -161,4 +192,19 @@ class SurfaceReference:
             body_casts=sum(look.body_casts for _, look in looks),
             redrawn=redrawn,
             drawn=np.bincount(of_object[of_object >= 0], minlength=objects),
+            places=self.places,
+            heights_m=heights_m if self.band_frame == "ground" else None,
         )
+
+
+def _uncovered(found: SurfacePoints, surroundings: Surroundings) -> SurfacePoints:
+    """The points but those whose face is not the first from above of faces that coincide."""
+    asked = np.flatnonzero(found.face[0] >= 0) if len(found.face) else np.empty(0, dtype=np.int64)
+    if len(asked) == 0:
+        return found
+    uncovered = np.ones(len(found.points_m), dtype=bool)
+    first = surroundings.instant.first_faces(found.points_m[asked], found.normals[asked], COINCIDE_M)
+    # Between two faces of one surface rounding decides; these are not covered by another.
+    coincident = np.concatenate(surroundings.scene.coincident)
+    uncovered[asked] = (first == found.face[0, asked]) | (first < 0) | ~np.isin(first, coincident[coincident >= 0])
+    return found.some(uncovered)

@@ -45,6 +45,10 @@ class World:
         time_step_s: Time between two frames.
         duration_s: Time after which the trajectories end.
         parked: Objects that never move, of which there may be many.
+        ground: Numbers of the static meshes that one drives or walks on: their level faces are the ground. None if
+            that is not known: then `Scene.ground` finds it.
+        coincident: For each static mesh (F,) which of its faces lie within 1 mm of others, of which one counts; empty
+            if none do.
     """
 
     static: tuple[Mesh, ...]
@@ -53,6 +57,8 @@ class World:
     time_step_s: float = 0.1
     duration_s: float = 0.0
     parked: tuple[Actor, ...] = ()
+    ground: tuple[int, ...] | None = None
+    coincident: tuple[NDArray[np.bool_], ...] = ()
 
     @property
     def objects(self) -> tuple[Actor, ...]:

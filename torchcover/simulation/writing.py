@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover import __version__
 from torchcover.files import RECORDING, Publication, noted
 from torchcover.recordings.recorders import RECORDERS
 from torchcover.recordings.recorders.recorder import RecordedStep, RecordingSetup
@@ -85,7 +84,7 @@ def write_recording(
             steps.append(recorder.write(_step(frames, index)))
             files.note({"step": steps[-1]})
         recorder.finish(steps)
-        files.publish({"torchcover": __version__, "content": content, "frames": names})
+        files.publish({"content": content, "frames": names})
 
 
 def _check_same(

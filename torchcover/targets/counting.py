@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchcover.simulation.culling import outlines
-from torchcover.simulation.mounted import Ends, MountedSensor
 from torchcover.simulation.moving import Moving
-from torchcover.simulation.rays import rotate
+from torchcover.simulation.rays import outlines, rotate
 from torchcover.simulation.sensor import RayHits
+from torchcover.simulation.sight import Ends, MountedSensor
+from torchcover.targets.placing import standing
 from torchcover.targets.steps import SensorStep, Step
 from torchcover.targets.surface import Surface
 from torchcover.targets.target import Target
@@ -44,6 +44,13 @@ class Sums(NamedTuple):
     near: Numbers
     least_points: Numbers
     least_sensors: Numbers
+
+    @classmethod
+    def none(cls, sensors: int, positions: int) -> Self:
+        """Those of no step."""
+        zeros = np.zeros((5, positions), dtype=np.int64)
+        never = np.full((2, positions), NEVER)
+        return cls(np.zeros((sensors, positions), dtype=np.int64), *zeros, *never)
 
 
 class _Met(NamedTuple):
@@ -121,7 +128,7 @@ def count(
     Args:
         target: The body.
         surface: Its surface.
-        vehicle_T_target: (P, 4, 4) where it stands.
+        vehicle_T_target: (P, 4, 4) where it stands, but for the height of the ground there, which is that of the step.
         mounted: The sensors.
         steps: What `Steps` gives.
         hits: How many points are enough.
@@ -135,10 +142,17 @@ def count(
 
     def count_some(first: int) -> Sums:
         some = slice(first, first + CHUNK)
-        poses = vehicle_T_target[some]
-        met = [_meetings(target, poses, *sensor) for sensor in zip(mounted, farthest_m, strict=True)]
-        cut = [Step(step.sensors, step.free[some], step.visible[:, some]) for step in steps]
-        return _sums(surface, poses, mounted, beams, met, cut, hits, threshold_m)
+        poses, sums = vehicle_T_target[some], Sums.none(len(mounted), len(vehicle_T_target[some]))
+        on_ground: _OnGround | None = None
+        for step in steps:
+            z_m = step.ground_z_m[some]
+            if on_ground is None or not np.array_equal(on_ground.vehicle_T_target[:, 2, 3], z_m):
+                standing_there = standing(poses, z_m)
+                met = [_meetings(target, standing_there, *sensor) for sensor in zip(mounted, farthest_m, strict=True)]
+                on_ground = _OnGround.of(surface, standing_there, mounted, met, threshold_m)
+            cut = Step(step.sensors, z_m, step.free[some], step.visible[:, some])
+            _count_step(sums, surface, on_ground, mounted, beams, cut, hits, threshold_m)
+        return sums
 
     firsts, threads = range(0, max(len(vehicle_T_target), 1), CHUNK), torch.get_num_threads()
     if threads <= 1 or len(firsts) <= 1:
@@ -167,47 +181,56 @@ def _meetings(target: Target, vehicle_T_target: Float64, mounted: MountedSensor,
     return _Met._make(column[once] for column in together)
 
 
-def _sums(
+class _OnGround(NamedTuple):
+    """What the rays meet of the target at some positions, where the ground is as it is: the same for many steps.
+
+    `vehicle_T_target` (P, 4, 4); `met` by each sensor, and of that the points of the surface that are near, without
+    errors of the range: `exact`.
+    """
+
+    vehicle_T_target: Float64
+    met: Sequence[_Met]
+    exact: Sequence[NDArray[np.uint8]]
+
+    @classmethod
+    def of(
+        cls,
+        surface: Surface,
+        vehicle_T_target: Float64,
+        mounted: Sequence[MountedSensor],
+        met: Sequence[_Met],
+        threshold_m: float,
+    ) -> Self:
+        exact = [
+            surface.near(_in_target(sensor, one, vehicle_T_target, None), threshold_m)
+            for sensor, one in zip(mounted, met, strict=True)
+        ]
+        return cls(vehicle_T_target, met, exact)
+
+
+def _count_step(
+    sums: Sums,
     surface: Surface,
-    vehicle_T_target: Float64,
+    there: _OnGround,
     mounted: Sequence[MountedSensor],
     beams: Sequence[_Beams | None],
-    met: Sequence[_Met],
-    steps: Sequence[Step],
+    step: Step,
     hits: int,
     threshold_m: float,
-) -> Sums:
-    count = len(vehicle_T_target)
-    zeros, never = np.zeros(count, dtype=np.int64), np.full(count, NEVER)
-    sums = Sums(
-        points=np.zeros((len(mounted), count), dtype=np.int64),
-        sensors=zeros,
-        seen=zeros.copy(),
-        steps=zeros.copy(),
-        visible=zeros.copy(),
-        near=zeros.copy(),
-        least_points=never,
-        least_sensors=never.copy(),
-    )
-    # Without errors a ray meets the target at the same place in every step.
-    exact = [
-        surface.near(_in_target(sensor, one, vehicle_T_target, None), threshold_m)
-        for sensor, one in zip(mounted, met, strict=True)
-    ]
-    for step in steps:
-        points = np.zeros_like(sums.points)
-        near = np.zeros((count, exact[0].shape[1]), dtype=np.uint8)
-        for k, (sensor, one, seen) in enumerate(zip(mounted, met, step.sensors, strict=True)):
-            measured, error_m = _measured(sensor, beams[k], one, seen)
-            points[k] = np.bincount(one.position[measured], minlength=count)
-            if error_m is None:
-                bits = exact[k][measured]
-            else:
-                erring = _Met._make(column[measured] for column in one)
-                bits = surface.near(_in_target(sensor, erring, vehicle_T_target, error_m), threshold_m)
-            near |= _any_of_each(one.position[measured], bits, count)
-        _add(sums, step, points, near, hits)
-    return sums
+) -> None:
+    count = len(there.vehicle_T_target)
+    points = np.zeros_like(sums.points)
+    near = np.zeros((count, there.exact[0].shape[1]), dtype=np.uint8)
+    for k, (sensor, one, seen) in enumerate(zip(mounted, there.met, step.sensors, strict=True)):
+        measured, error_m = _measured(sensor, beams[k], one, seen)
+        points[k] = np.bincount(one.position[measured], minlength=count)
+        if error_m is None:
+            bits = there.exact[k][measured]
+        else:
+            erring = _Met._make(column[measured] for column in one)
+            bits = surface.near(_in_target(sensor, erring, there.vehicle_T_target, error_m), threshold_m)
+        near |= _any_of_each(one.position[measured], bits, count)
+    _add(sums, step, points, near, hits)
 
 
 def _measured(

@@ -16,6 +16,9 @@ Float64 = NDArray[np.float64]
 # "narrow" turns the narrower side of the target's box to the vehicle, "wide" the wider one; degrees are its yaw.
 Heading = Literal["narrow", "wide"] | float
 
+# Where a target may stand above the plane of the vehicle: near it, and at the end of a slope that leads there.
+NEAR_M, STEEPEST_WAY = 1.0, 0.15
+LEVEL_M = 1e-3
 # A kerb, and ground that rises: what is lower than this under a target takes no room from it.
 STEP_UP_M = 0.2
 # A wall may touch the outermost of a target: by this share of the way from its middle.
@@ -53,12 +56,34 @@ def yaws(heading: Heading, target: BoundingBox, vehicle: BoundingBox, positions_
 
 
 def poses(positions_m: Float64, yaw_rad: Float64) -> Float64:
-    """(P, 4, 4) `vehicle_T_target` of targets on the plane z = 0 of the vehicle frame."""
+    """(P, 4, 4) `vehicle_T_target` of targets on the plane z = 0 of the vehicle frame, until the ground is known."""
     matrices = np.tile(np.eye(4), (len(positions_m), 1, 1))
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1] = cos, -sin, sin, cos
     matrices[:, :2, 3] = positions_m
     return matrices
+
+
+def ground_under(instant: Instant, positions_m: Float64) -> Float64:
+    """(P,) z of the ground in the vehicle frame at (P, 2) places; NaN where there is none.
+
+    Of several grounds above each other that counts which somebody walks on who comes from the vehicle: the highest that
+    is no farther above its plane than a metre and a slope of 15 %.
+    """
+    away_m = np.linalg.norm(positions_m, axis=1)
+    z_m = NEAR_M + STEEPEST_WAY * away_m
+    # The vertical of the world is not that of the vehicle: where the first look ends, a second one looks down.
+    for _ in range(2):
+        z_m = z_m - instant.heights_m(np.column_stack([positions_m, z_m]))
+    # Rounding makes no slope.
+    return np.where(np.abs(z_m) < LEVEL_M, 0.0, z_m)
+
+
+def standing(vehicle_T_target: Float64, z_m: Float64) -> Float64:
+    """(P, 4, 4) the same poses at other heights, (P,)."""
+    poses = vehicle_T_target.copy()
+    poses[:, 2, 3] = z_m
+    return poses
 
 
 def overlapping(box: BoundingBox, vehicle_T_target: Float64, corners_m: Float64) -> Bools:

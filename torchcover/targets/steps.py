@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation.instant import Instant
-from torchcover.simulation.mounted import Ends, MountedSensor
 from torchcover.simulation.reference_sensor import Surroundings, position_in_shell
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws
+from torchcover.simulation.sight import Ends, MountedSensor
 from torchcover.simulation.stage import Stages
-from torchcover.targets.placing import blocked
+from torchcover.targets.placing import blocked, ground_under, standing
 from torchcover.targets.surface import SAMPLES, Surface
 from torchcover.targets.target import Target
 
@@ -39,9 +39,14 @@ class SensorStep(NamedTuple):
 
 
 class Step(NamedTuple):
-    """One step: `sensors` of the rig; `free` (P,) where there is room; `visible` (places, P, bytes) as `seen_from`."""
+    """One step.
+
+    `sensors` of the rig; `ground_z_m` (P,) where the target stands, in the vehicle frame; `free` (P,) where there is
+    ground, and room; `visible` (places, P, bytes) as `seen_from`.
+    """
 
     sensors: Sequence[SensorStep]
+    ground_z_m: Float64
     free: Bools
     visible: NDArray[np.uint8]
 
@@ -54,7 +59,7 @@ class Steps:
         scenario: The world.
         target: What is placed.
         surface: Its surface.
-        vehicle_T_target: (P, 4, 4) where.
+        vehicle_T_target: (P, 4, 4) where, but for the height of the ground there.
         steps: How many steps.
         every_steps: Time steps of the scenario between one and the next.
         seed: Of traffic, random places, noise and drop-out.
@@ -76,7 +81,7 @@ class Steps:
         self._steps, self._every_steps, self._seed = steps, every_steps, seed
         self.places = max(1, -(-PLACES // steps))
         self._stages = Stages(scenario, {RIG: rig}, seed)
-        sensor_reach_m = [float(np.linalg.norm(s.mount.matrix()[:3, 3])) + s.max_range_m for s in rig.sensors]
+        sensor_reach_m = [float(np.linalg.norm(s.mount.matrix()[:3, 3])) + scenario.reach_m(s) for s in rig.sensors]
         raster_reach_m = float(np.linalg.norm(vehicle_T_target[:, :3, 3], axis=1).max(initial=0.0))
         self._within_m = max([raster_reach_m + target.solid.reach_m, *sensor_reach_m])
 
@@ -92,29 +97,33 @@ class Steps:
             FileNotFoundError: A mesh, vehicle or trajectory file is missing.
             ValueError: A sensor or an actor that is where none can be.
         """
-        resting: tuple[list[Ends], Bools] | None = None
+        resting: tuple[list[Ends], Float64, Bools] | None = None
         for index in range(self._steps):
             run, step = self._scenario.locate(index * self._every_steps)
             stage = self._stages.of_run(run)
             instant = stage.scene.at(step, within_m=self._within_m)
             stage.check_mounts(instant)
             # Where nothing moves, the first answer holds.
-            ends, free = resting or ([m.ends(instant) for m in stage.mounted[RIG]], self._free(instant))
+            ends, ground_z_m, free = resting or ([m.ends(instant) for m in stage.mounted[RIG]], *self._free(instant))
             if not stage.scene.moves and self._scenario.repeats:
-                resting = ends, free
+                resting = ends, ground_z_m, free
             # The numbers of each ray: all places see the same rays err and drop out.
             sensors = [
                 SensorStep(one, Draws(np.random.default_rng([self._seed, index, k]), rays=len(one.range_m)))
                 for k, one in enumerate(ends, 1)
             ]
-            yield Step(sensors, free, self._visible(stage.scene, instant, index))
+            visible = self._visible(stage.scene, instant, standing(self._poses, ground_z_m), index)
+            yield Step(sensors, ground_z_m, free, visible)
 
-    def _free(self, instant: Instant) -> Bools:
+    def _free(self, instant: Instant) -> tuple[Float64, Bools]:
+        """Where the ground is, 0 where there is none, and where there is some, with room on it."""
         box, samples_m = self._target.solid.box, self._surface.points_m
-        taken = [blocked(instant, box, samples_m, poses) for poses in _chunks(self._poses)]
-        return ~np.concatenate([np.empty(0, dtype=bool), *taken])
+        z_m = ground_under(instant, self._poses[:, :2, 3])
+        there, z_m = np.isfinite(z_m), np.nan_to_num(z_m)
+        taken = [blocked(instant, box, samples_m, poses) for poses in _chunks(standing(self._poses, z_m))]
+        return z_m, there & ~np.concatenate([np.empty(0, dtype=bool), *taken])
 
-    def _visible(self, scene: Scene, instant: Instant, index: int) -> NDArray[np.uint8]:
+    def _visible(self, scene: Scene, instant: Instant, vehicle_T_target: Float64, index: int) -> NDArray[np.uint8]:
         generator = np.random.default_rng([self._seed, index])
         surroundings = Surroundings(
             scene, instant, generator, f"{self._scenario.name} step {index}", torch.get_num_threads()
@@ -125,7 +134,7 @@ class Steps:
             seen.append(
                 [
                     self._surface.seen_from(pose[:3, 3], self._target, poses, instant, threads=surroundings.threads)
-                    for poses in _chunks(self._poses)
+                    for poses in _chunks(vehicle_T_target)
                 ]
             )
         # Some of none, where the vehicle is everywhere.

@@ -50,7 +50,7 @@ def survey(
     Args:
         rig: The sensors.
         scenario: The world, whose ego carries them. The target is in none of it: other targets hide nothing.
-        target: What is placed, on the plane z = 0 of the vehicle frame.
+        target: What is placed, upright on the local ground; where there is none, the place is `OUTSIDE`.
         raster: Where; within 5 m of the vehicle in steps of 0.2 m if not given.
         steps: How many steps are averaged.
         every_s: Time between two of them; the scenario's time step if not given.

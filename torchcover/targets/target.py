@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Self
 
 from torchcover.simulation.bodies import body_called, mover_mesh
+from torchcover.simulation.moving import Solid
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.solids import Solid
 
 # What people say -> the built-in body that is meant, whose name has its size.
 TARGETS = {

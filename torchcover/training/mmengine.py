@@ -77,7 +77,13 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         rank, processes = get_dist_info()
         for frame in self._once.new(frames, Shard(rank, processes, size)):
             index = None if frame.index == UNKNOWN_INDEX else frame.place_in_time
-            self.metric.update(sensor_of(frame), frame.reference, weights=frame.reference_weights, place_in_time=index)
+            self.metric.update(
+                sensor_of(frame),
+                frame.reference,
+                weights=frame.reference_weights,
+                height=frame.heights_in(self.metric.grid.band_frame),
+                place_in_time=index,
+            )
 
     def compute_metrics(self, results: list[Any]) -> dict[str, float]:
         """The coverage so far of all processes; `results` stays empty."""

@@ -78,7 +78,7 @@ def test_workers_see_the_same_frames_and_each_run_is_another_town():
 def test_drawn_streets_go_on_everywhere_and_have_all_that_was_asked_for(network, tmp_path):
     streets = DrawnStreets(network=network, lanes=3, hills_m=0.0)
     town = read_network(streets.build(tmp_path, np.random.default_rng(2)))
-    assert town.flat_at_m == 0.0
+    assert not any(lane.line_m[:, 2].any() for lane in town.lanes)
     assert {lane.use for lane in town.lanes} == {"road", "turn", "bay", "sidewalk", "crossing", "corner"}
     follow = town.follow("passenger")
     assert len(follow) > 10

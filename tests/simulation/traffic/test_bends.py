@@ -55,14 +55,6 @@ def test_it_is_as_long_as_its_stations_and_heads_where_it_goes(street):
     assert np.allclose(street.poses(0.0, 0.0), 0.0, atol=1e-9)
 
 
-@pytest.mark.parametrize("left_m", [-12.0, 0.0, 9.0])
-def test_projecting_is_the_inverse(street, left_m):
-    places = street.poses(STATIONS_M, left_m)[:, :2]
-    found = street.project(places, (-400.0, 1300.0))
-    np.testing.assert_allclose(found[:, 0], STATIONS_M, atol=1e-6)
-    np.testing.assert_allclose(found[:, 1], left_m, atol=1e-6)
-
-
 @pytest.mark.parametrize("way", [1, -1])
 @pytest.mark.parametrize("left_m", [-12.0, 9.0])
 def test_beside_it_one_goes_as_far_as_one_gets(street, left_m, way):
@@ -150,7 +142,6 @@ def test_hills_are_what_their_slopes_say_and_their_mesh_is_near():
     for way, angle in ((ahead, -pitch), (left, roll)):
         rise = hills.heights_m(places + way) - hills.heights_m(places - way)
         np.testing.assert_allclose(np.rad2deg(np.arctan(rise)), angle, atol=0.02)
-        assert np.abs(rise).max() <= hills.steepest
     way_m = np.stack([np.linspace(-200, 200, 11), np.zeros(11)], axis=1)
     mesh = hills.mesh(way_m, 250.0)
     down = np.tile(np.array([[0.0], [0.0], [-1.0]], dtype=np.float32), 500)

@@ -13,7 +13,7 @@ from torchcover.simulation.traffic.flow import (
     Lane,
     Simulation,
 )
-from torchcover.simulation.traffic.idm import Driver, acceleration, advance
+from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, tightness
 from torchcover.simulation.traffic.roads import Polyline, loop
 from torchcover.simulation.traffic.signals import CROSS, MAIN, Gate, Signals
 
@@ -152,7 +152,12 @@ def twin(lanes, agents, lights, times_s):
             stop = line + driver.standstill_gap_m - STOP_BEFORE_LINE_M
             closing = speed[n] - speed[m] if np.isfinite(at) else 0.0
             behind, before = (
-                acceleration(driver, np.array([speed[n]]), np.array([room]), np.array([approach]))
+                acceleration_in(
+                    driver,
+                    np.array([speed[n]]),
+                    tightness(driver, np.array([speed[n]]), np.array([room]), np.array([approach])),
+                    driver.desired_speed_mps,
+                )
                 for room, approach in ((gap, closing), (stop, speed[n]))
             )
             wanted, room = np.minimum(behind, before), np.array([min(gap, line)])

@@ -1,7 +1,5 @@
 """Aggregations: how radii become maps and numbers of regions. A new one is a class and a line here."""
 
-from dataclasses import fields
-
 from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedStep, Layer, State
 from torchcover.coverage.aggregations.maximum import Maximum
 from torchcover.coverage.aggregations.means import MeanOfMeans, PooledMean, VisibleArea
@@ -12,28 +10,24 @@ AGGREGATIONS: tuple[type[Aggregation], ...] = (Maximum, Quantiles, StepQuantiles
 
 
 def aggregation_named(words: str) -> Aggregation:
-    """One of `AGGREGATIONS` by its name, with its levels behind a colon.
+    """One of `AGGREGATIONS` by its name, with its parameters behind a colon.
 
     Raises:
-        ValueError: There is none of this name; levels that it does not take, or lacks.
+        ValueError: There is none of this name; parameters that it does not take, or lacks.
 
     Example:
         >>> aggregation_named("maximum"), aggregation_named("quantiles:0.5,0.9")
         (Maximum(), Quantiles(levels=(0.5, 0.9)))
     """
-    name, _, levels = words.partition(":")
-    kinds = {kind.name: kind for kind in AGGREGATIONS}
-    if name not in kinds:
-        raise ValueError(f"aggregation {name}: one of {', '.join(kinds)} is needed")
-    kind = kinds[name]
-    if not fields(kind):
-        if levels:
-            raise ValueError(f"aggregation {words}: {name} takes no levels; leave out what is behind the colon")
-        return kind()
+    name, _, parameters = words.partition(":")
+    kind = next((kind for kind in AGGREGATIONS if kind.name == name), None)
+    if kind is None:
+        forms = (f"{kind.name}{':' * bool(kind.example)}{kind.example}" for kind in AGGREGATIONS)
+        raise ValueError(f"aggregation {name}: one of {' or '.join(forms)} is needed")
     try:
-        return kind(tuple(map(float, levels.split(","))))  # type: ignore[call-arg]  # each that has a field has levels
+        return kind.parse(parameters)
     except ValueError as error:
-        raise ValueError(f"aggregation {words}: levels are needed, as in {name}:0.5,0.9 ({error})") from error
+        raise ValueError(f"aggregation {words}: {error}") from error
 
 
 __all__ = [

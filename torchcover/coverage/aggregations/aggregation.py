@@ -1,10 +1,13 @@
 """What an aggregation is: its sums, how a step enters them, and the layers that they make."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple, Self
 
+import torch
 from torch import Tensor
 
 from torchcover.coverage.binning import CellMeans
@@ -72,15 +75,41 @@ class Aggregation(ABC):
 
     It gives maps, and numbers of regions: a region in a height band is one large cell. The numbers have errors where
     all its states are added up. An aggregation is a frozen dataclass: its fields are part of what the sums of a metric
-    mean. A new one is a class and a line in `AGGREGATIONS`.
+    mean. A new one is a class and a line in `AGGREGATIONS`; one with fields reads them in `parse` and `of_keys`.
 
     Attributes:
         name: Tells it from the others; its states begin with it.
         words: What it gives, in the plural, for what a run says that it left out.
+        example: Its parameters as they are written behind its name; empty if it has none.
     """
 
     name: ClassVar[str]
     words: ClassVar[str]
+    example: ClassVar[str] = ""
+
+    @classmethod
+    def parse(cls, words: str) -> Self:
+        """The one with these parameters, which are written as in `example`.
+
+        Raises:
+            ValueError: Others than it takes.
+        """
+        if words:
+            raise ValueError(f"{cls.name} takes no parameters; leave out what is behind the colon")
+        return cls()
+
+    @classmethod
+    def of_keys(cls, keys: AbstractSet[str]) -> Self | None:
+        """The one that gives those of some numbers that this kind can give; None if there are none."""
+        one = cls.parse("")
+        return None if keys.isdisjoint(quantity.key for quantity in one.quantities) else one
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """What it gives a map, and a number of each region of, whatever it has seen."""
+        empty = {name: state.initial.clone() for name, state in self.states(1).items()}
+        nothing = torch.zeros(1, dtype=torch.int64)
+        return tuple(layer.quantity for layer in self.layers(empty, nothing, math.inf))
 
     @abstractmethod
     def states(self, cells: int) -> dict[str, State]:

@@ -1,9 +1,11 @@
 """Quantiles over points and over steps, from histograms, whose size does not grow with the steps."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import torch
 from torch import Tensor
@@ -77,7 +79,54 @@ def check_levels(levels: Sequence[float]) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True)
-class Quantiles(Aggregation):
+class AtLevels(Aggregation):
+    """Quantiles at some levels, from a `histogram` (bins, C).
+
+    Args:
+        levels: Which, in [0, 1].
+
+    Raises:
+        ValueError: No level, or one outside [0, 1].
+    """
+
+    example: ClassVar[str] = "0.5,0.9"
+    # Of the keys and titles: what stands before a level, and behind it.
+    before: ClassVar[str]
+    behind: ClassVar[str]
+
+    levels: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "levels", check_levels(self.levels))
+
+    @classmethod
+    def parse(cls, words: str) -> Self:
+        """That at levels with commas between them."""
+        try:
+            return cls(tuple(map(float, words.split(","))))
+        except ValueError as error:
+            raise ValueError(f"levels are needed, as in {cls.name}:{cls.example} ({error})") from error
+
+    @classmethod
+    def of_keys(cls, keys: AbstractSet[str]) -> Self | None:
+        """That at the levels of the keys."""
+        found = (re.fullmatch(rf"radius_{cls.before}(0(?:\.\d+)?|1)_m", key) for key in keys)
+        levels = sorted({float(each[1]) for each in found if each})
+        return cls(tuple(levels)) if levels else None
+
+    @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """One for each level."""
+        return tuple(radius(f"{self.before}{level:g}", f"{level:g} {self.behind}") for level in self.levels)
+
+    def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
+        """A map for each level."""
+        values = histogram_quantiles(sums["histogram"].double(), RADIUS_EDGES_M, self.levels).clamp(max=max_radius)
+        return list(map(Layer, self.quantities, values))
+
+
+@dataclass(frozen=True)
+class Quantiles(AtLevels):
     """Quantiles of r over the points of a cell, steps weighing the same, from a histogram whose size is fixed.
 
     The histogram has 20 bins a decade from 1 cm to 100 m. The error is at most a bin: 12 % of the value, or 1 cm; a
@@ -96,16 +145,8 @@ class Quantiles(Aggregation):
 
     name: ClassVar[str] = "quantiles"
     words: ClassVar[str] = "quantiles"
-
-    levels: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "levels", check_levels(self.levels))
-
-    @property
-    def quantities(self) -> list[Quantity]:
-        """One for each level."""
-        return [radius(f"q{level:g}", f"{level:g} quantile of the") for level in self.levels]
+    before: ClassVar[str] = "q"
+    behind: ClassVar[str] = "quantile of the"
 
     def states(self, cells: int) -> dict[str, State]:
         """`histogram` (bins, C): for each step that has probed the cell, shares that add up to 1."""
@@ -118,14 +159,9 @@ class Quantiles(Aggregation):
         bin_and_cell = bin_of(step.radius.clamp(max=1e300), RADIUS_EDGES_M) * step.cells + step.cell
         sums["histogram"].view(-1).index_add_(0, bin_and_cell, share)
 
-    def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
-        """A map for each level."""
-        values = histogram_quantiles(sums["histogram"], RADIUS_EDGES_M, self.levels).clamp(max=max_radius)
-        return list(map(Layer, self.quantities, values))
-
 
 @dataclass(frozen=True)
-class StepQuantiles(Aggregation):
+class StepQuantiles(AtLevels):
     """Quantiles over the steps that have probed a cell of the mean radius of its points in the step.
 
     Where `Quantiles` asks for the bad points of a cell, this asks for its bad moments: at level 0.9, one step in ten
@@ -140,11 +176,8 @@ class StepQuantiles(Aggregation):
 
     name: ClassVar[str] = "step_quantiles"
     words: ClassVar[str] = "quantiles over steps"
-
-    levels: tuple[float, ...]
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "levels", check_levels(self.levels))
+    before: ClassVar[str] = "step_q"
+    behind: ClassVar[str] = "quantile over steps of the mean"
 
     def states(self, cells: int) -> dict[str, State]:
         """`histogram` (bins, C): in how many steps the mean radius of the cell fell into each bin."""
@@ -154,9 +187,3 @@ class StepQuantiles(Aggregation):
         """Count the step in every cell that it has probed; a cell comes once."""
         bins = bin_of(step.means.mean[0].clamp(max=1e300), RADIUS_EDGES_M)
         sums["histogram"][bins, step.means.cell] += 1
-
-    def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
-        """A map for each level."""
-        values = histogram_quantiles(sums["histogram"].double(), RADIUS_EDGES_M, self.levels).clamp(max=max_radius)
-        quantities = [radius(f"step_q{level:g}", f"{level:g} quantile over steps of the mean") for level in self.levels]
-        return list(map(Layer, quantities, values))

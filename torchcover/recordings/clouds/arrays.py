@@ -38,13 +38,26 @@ def read_archive(path: Path) -> Points:
 def read_weighted_archive(path: Path) -> tuple[Points, NDArray[np.float64]]:
     """Read the arrays `points` and `weights` of a `.npz` file: (N, 3) and (N,), what each point counts for."""
     (points,) = read_npz(path, _check, _only("points")).values()
-    (weights,) = read_npz(path, _check_weights, _only("weights")).values()
+    (weights,) = read_npz(path, partial(_check_values, "weights"), _only("weights")).values()
     if len(points) != len(weights):
         raise ValueError(f"one weight for each point is needed; got {len(weights)} for {len(points)}")
     bad = int((~(np.isfinite(weights) & (weights > 0))).sum())
     if bad:
         raise ValueError(f"weights have to be positive and finite; {bad} of {len(weights)} are not")
     return _coordinates(points), weights.astype(np.float64)
+
+
+def read_heights_of_archive(path: Path, count: int) -> NDArray[np.float32] | None:
+    """Read the array `heights_m` of a `.npz` file, one for each of its points; None if there is none."""
+    if "heights_m" not in npz_headers(path):
+        return None
+    (heights_m,) = read_npz(path, partial(_check_values, "heights_m"), _only("heights_m")).values()
+    if len(heights_m) != count:
+        raise ValueError(f"one of heights_m for each point is needed; got {len(heights_m)} for {count}")
+    bad = int(np.isinf(heights_m).sum())
+    if bad:
+        raise ValueError(f"heights_m: metres are needed, NaN where there is no ground; {bad} of {count} are infinite")
+    return heights_m.astype(np.float32)
 
 
 def _coordinates(points: NDArray[np.floating]) -> Points:
@@ -91,7 +104,7 @@ def _check(header: NpyHeader) -> None:
         raise ValueError(f"shape (N, 3), or up to (N, {MAX_COLUMNS}) with x y z first, is needed; got {shape}")
 
 
-def _check_weights(header: NpyHeader) -> None:
+def _check_values(name: str, header: NpyHeader) -> None:
     shape, dtype = header
     if not _is_float(dtype) or len(shape) != 1:
-        raise ValueError(f"weights: shape (N,) of float16, float32 or float64 is needed; got {shape} of {dtype}")
+        raise ValueError(f"{name}: shape (N,) of float16, float32 or float64 is needed; got {shape} of {dtype}")

@@ -70,10 +70,6 @@ def check_same_names(folder: Path, files: Mapping[str, Mapping[str, object]]) ->
 def check_frames(frames: Sequence[str], names: Sequence[str]) -> list[int]:
     """Which row of a table belongs to each frame.
 
-    Args:
-        frames: The frame of each row.
-        names: The frames, in order.
-
     Raises:
         ValueError: A frame that is missing, doubled or unknown.
     """

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from torchcover.detection.boxes import Boxes
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.clouds.readers import read_cloud, read_weighted_cloud
+from torchcover.recordings.clouds.readers import read_cloud, read_heights, read_weighted_cloud
 from torchcover.recordings.formats.file_names import check_same_names, frame_files, natural
 from torchcover.recordings.formats.folder_settings import FolderSettings, PlaceSettings, read_folder_settings
 from torchcover.recordings.formats.folder_tables import PoseTable, read_boxes
@@ -25,7 +25,8 @@ class FolderRecording:
     Several sensors of one rig have `sensors/NAME/FRAME.*` each, several rigs `rigs/NAME/FRAME.*`. Any format of
     `read_cloud` will do, and places may differ. All that follows is optional:
 
-    * `reference/FRAME.*`, what the reference sensor saw;
+    * `reference/FRAME.*`, what the reference sensor saw; a `.npz` may have the array `heights_m` beside its points,
+      their heights above the local ground, NaN where there is none at or below;
     * `poses.csv`, time and place of the vehicle in each frame, see `PoseTable`: `world_T_vehicle`;
     * `PLACE/poses.csv`, where that sensor was on the vehicle in each frame: `vehicle_T_sensor`;
     * `boxes/FRAME.csv`, the objects of each frame, see `read_boxes`;
@@ -102,11 +103,12 @@ class FolderRecording:
             points_m, weights = read_weighted_cloud(path)
         else:
             points_m = read_cloud(path)
+        heights_m = read_heights(path, len(points_m)) if sensor == REFERENCE else None
         settings, moving = self._settings.places.get(place, PlaceSettings()), self._moving[place]
         if settings.flip_y:
             points_m[:, 1] *= -1
         vehicle_T_sensor = settings.vehicle_T_sensor if moving is None else moving[index]
-        return Scan(points_m, vehicle_T_sensor, str(path), min_range_m=settings.min_range_m, weights=weights)
+        return Scan(points_m, vehicle_T_sensor, str(path), settings.min_range_m, weights, heights_m)
 
     def world_T_vehicle(self, index: int) -> Matrix | None:
         """Where the vehicle was, if there is a `poses.csv`."""

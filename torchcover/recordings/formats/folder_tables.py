@@ -17,7 +17,7 @@ from torchcover.recordings.formats.file_names import check_frames, some_of
 
 PLACE, ROTATION = ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")
 BOX = (*PLACE, "length_m", "width_m", "height_m", "yaw_rad")
-VELOCITY, DRAWN = ("vx_mps", "vy_mps"), "drawn_points"
+VELOCITY, DRAWN, BOTTOM = ("vx_mps", "vy_mps"), "drawn_points", "bottom_height_m"
 NAMES = ("id", "category")
 
 
@@ -68,13 +68,13 @@ def read_boxes(path: Path) -> Boxes:
     Args:
         path: A table with the columns `x_m, y_m, z_m, length_m, width_m, height_m, yaw_rad, id, category`: the centre,
             half-way up, in the vehicle frame; `id` and `category` may be empty. `vx_mps, vy_mps` may be there too, the
-            velocity over ground along the vehicle's x and y, and `drawn_points`, see `Boxes`.
+            velocity over ground along the vehicle's x and y, and `drawn_points` and `bottom_height_m`, see `Boxes`.
 
     Raises:
         FileNotFoundError: No such file.
         BadFileError: Not such a table, or a name that is there twice; what `Boxes` refuses.
     """
-    table = read_csv(path, BOX, NAMES, (*VELOCITY, DRAWN))
+    table = read_csv(path, BOX, NAMES, (*VELOCITY, DRAWN, BOTTOM))
     numbers, ids = table.numbers, table.words["id"]
     with naming(path, "a table of boxes"):
         doubled = [name for name, count in Counter(ids).items() if name and count > 1]
@@ -87,6 +87,8 @@ def read_boxes(path: Path) -> Boxes:
             known["velocity_mps"] = torch.from_numpy(velocity_mps).float()
         if DRAWN in numbers:
             known["drawn_points"] = torch.tensor(_whole_numbers(DRAWN, numbers[DRAWN]))
+        if BOTTOM in numbers:
+            known["bottom_heights_m"] = torch.from_numpy(numbers[BOTTOM]).float()
         return Boxes.from_rows(torch.from_numpy(np.column_stack([numbers[name] for name in BOX])).float(), **known)
 
 
@@ -95,6 +97,8 @@ def write_boxes(path: Path, boxes: Boxes) -> None:
     columns = dict(zip(BOX, boxes.rows.T.tolist(), strict=True))
     if boxes.velocity_mps.isfinite().all():
         columns |= dict(zip(VELOCITY, boxes.velocity_mps.T.tolist(), strict=True))
+    if boxes.bottom_heights_m.isfinite().all():
+        columns[BOTTOM] = boxes.bottom_heights_m.tolist()
     columns |= {DRAWN: boxes.drawn_points.tolist(), "id": boxes.ids, "category": boxes.categories}
     with path.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([list(columns), *zip(*columns.values(), strict=True)])

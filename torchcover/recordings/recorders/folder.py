@@ -48,6 +48,8 @@ class FolderRecorder:
         arrays = {"points": frame.reference.numpy()}
         if frame.reference_weights is not None:
             arrays["weights"] = frame.reference_weights.numpy()
+        if frame.reference_heights_m is not None:
+            arrays["heights_m"] = frame.reference_heights_m.numpy()
         self._add(f"{REFERENCE}/{step.name}.npz", partial(write_npz, arrays=arrays))
         if frame.boxes is not None:
             self._add(f"{BOXES}/{step.name}.csv", partial(write_boxes, boxes=frame.boxes))

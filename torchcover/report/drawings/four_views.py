@@ -82,9 +82,9 @@ def draw_four_views(
     scale = scale_of(RADIUS, radius)
     together = radius.cpu().double().numpy()
     opaque = [None] * len(maps) if opacity is None else list(opacity.cpu().double().numpy())
-    for sheet, values, shown, (name, band) in zip(maps, together, opaque, grid.heights.items(), strict=True):
+    for sheet, values, shown, name in zip(maps, together, opaque, grid.heights, strict=True):
         draw_colour_bar(sheet, draw_cells(sheet.axes, values, scale, opacity=shown), together, scale)
-        write_heading(sheet.axes, f"blind spot radius, {name}: z {span(band)}")
+        write_heading(sheet.axes, f"blind spot radius, {name}: {span(grid, name)}")
     entries += cell_entries(together, unknown)
     if opacity is not None:
         entries.append(paler_entry())

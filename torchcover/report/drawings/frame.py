@@ -66,7 +66,7 @@ class ActorMark:
 
 
 @dataclass(frozen=True, eq=False)
-class Scenery:
+class StandingFaces:
     """What stands in a frame and never moves.
 
     Args:
@@ -82,7 +82,7 @@ def draw_scene(
     x: Bounds,
     y: Bounds,
     *,
-    standing: Scenery,
+    standing: StandingFaces,
     ego_outline_m: Points,
     actors: Sequence[ActorMark],
     sensor: Points,
@@ -125,7 +125,7 @@ def draw_scene(
     return figure
 
 
-def _draw_standing(axes: Axes, standing: Scenery) -> list[Artist]:
+def _draw_standing(axes: Axes, standing: StandingFaces) -> list[Artist]:
     """Faces from above, the highest last; the ground itself is not drawn."""
     stands = standing.height_m > LOWEST_STANDING_M
     height_m = standing.height_m[stands]

@@ -1,4 +1,4 @@
-"""A search for a better rig: how it went on, what each variable does, what its objectives cost each other."""
+"""A search for a better rig, how it went on and what its variables do; a choice of sensors, what more of them bring."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -7,6 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 Float64 = NDArray[np.float64]
@@ -15,6 +16,7 @@ COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7")
 MARKERS = "osD^"
 BEST = "#000000"
 COLUMNS = 3
+BOUND = "#999999"
 
 
 class Slice(NamedTuple):
@@ -118,6 +120,56 @@ def draw_fronts(
         axes.set_ylabel(names[other], parse_math=False)
         axes.grid(visible=True, alpha=0.2)
     figure.legend(*grid[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False)
+    return figure
+
+
+class ChoiceSize(NamedTuple):
+    """The best choice of so many sensors that was found.
+
+    Args:
+        sensors: How many.
+        value: What they are worth, a share.
+        upper_bound: No choice of so many is worth more.
+    """
+
+    sensors: int
+    value: float
+    upper_bound: float
+
+
+def draw_choice(
+    sizes: Sequence[ChoiceSize], drawn: Sequence[float], drawn_sensors: int, best: float, *, title: str
+) -> Figure:
+    """Draw what choices are worth over the number of their sensors.
+
+    Args:
+        sizes: Choices that were found.
+        drawn: What random choices are worth.
+        drawn_sensors: How many sensors these have, about.
+        best: What the best choice is worth.
+        title: What there was to choose from.
+
+    Returns:
+        A figure of its own, outside pyplot.
+    """
+    figure = Figure(figsize=(6.4, 4.0), dpi=120, layout="constrained")
+    axes = figure.subplots()
+    if sizes:
+        numbers, values, bounds = 100 * np.array(sizes).T
+        numbers = numbers / 100
+        axes.fill_between(numbers, values, bounds, color=BOUND, alpha=0.3, linewidth=0, label="where the best lies")
+        axes.plot(numbers, values, color=COLOURS[0], marker="o", markersize=4, label="found")
+    parts = axes.violinplot(100 * np.array(drawn), [drawn_sensors], widths=0.5, showmedians=True)
+    for part in (*parts["bodies"], *(parts[key] for key in ("cmins", "cmaxes", "cbars", "cmedians"))):  # type: ignore[misc]
+        part.set_color(COLOURS[1])
+    axes.plot([], [], color=COLOURS[1], label=f"{len(drawn):,} random choices")
+    axes.plot(
+        [drawn_sensors], [100 * best], color=COLOURS[0], marker="*", markersize=12, linestyle="none", label="best"
+    )
+    axes.set(title=title, xlabel="sensors", ylabel="objective (%)")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.grid(visible=True, alpha=0.2)
+    axes.legend(frameon=False)
     return figure
 
 

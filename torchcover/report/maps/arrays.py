@@ -73,9 +73,9 @@ def draw_map(
             raise ValueError(
                 f"{name}: shape {grid.shape[1:]} is needed, as of a band of the grid; got {tuple(given.shape)}"
             )
-    array = _array(values)
+    array = as_array(values)
     (sheet,) = lay_out(grid)
-    cells = draw_cells(sheet.axes, array, scale, opacity=None if opacity is None else _array(opacity))
+    cells = draw_cells(sheet.axes, array, scale, opacity=None if opacity is None else as_array(opacity))
     draw_colour_bar(sheet, cells, array, scale)
     entries = cell_entries(array, unknown)
     if opacity is not None:
@@ -122,8 +122,8 @@ def draw_side_by_side(
     Raises:
         ValueError: An outline of another shape.
     """
-    arrays = {name: _array(value) for name, value in values.items()}
-    opaque = {name: _array(value) for name, value in (opacity or {}).items()}
+    arrays = {name: as_array(value) for name, value in values.items()}
+    opaque = {name: as_array(value) for name, value in (opacity or {}).items()}
     sheets = lay_out(grid, len(arrays))
     images = [
         draw_cells(sheet.axes, array, scale, opacity=opaque.get(name))
@@ -146,5 +146,6 @@ def draw_side_by_side(
     return sheets[0].figure
 
 
-def _array(values: Tensor) -> NDArray[np.float64]:
+def as_array(values: Tensor) -> NDArray[np.float64]:
+    """Numbers of cells as matplotlib takes them."""
     return values.detach().cpu().double().numpy()

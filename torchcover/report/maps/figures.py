@@ -17,7 +17,7 @@ from torchcover.files import write_durably
 from torchcover.report.maps.arrays import draw_map, draw_side_by_side
 from torchcover.report.maps.colours import difference_scale, scale_of
 from torchcover.report.maps.overlay import SensorView
-from torchcover.report.maps.subjects import Subject, error_subjects_of, subjects_of
+from torchcover.report.maps.subjects import Subject, difference, error_subjects_of, subjects_of
 from torchcover.report.maps.window import Window, asked_and_known, near_field
 from torchcover.report.wording import capitalised, span
 
@@ -75,7 +75,7 @@ def band_figures(coverage: Coverage) -> Iterator[Named]:
     Args:
         coverage: What `CoverageMetric.compute` returned.
     """
-    headings = [f"{name}, z {span(band)}" for name, band in coverage.grid.heights.items()]
+    headings = [f"{name}, {span(coverage.grid, name)}" for name in coverage.grid.heights]
     shown = asked_and_known(coverage)
     for whole in subjects_of({"": coverage}):
         subject = _within(whole, shown)
@@ -180,8 +180,8 @@ def _within(subject: Subject, shown: Window) -> Subject:
 
 
 def _bands(grid: BevGrid) -> list[_Band]:
-    named = zip(grid.heights.items(), file_stems(list(grid.heights)), strict=True)
-    return [_Band(at, name, stem, f"z {span(z)}") for at, ((name, z), stem) in enumerate(named)]
+    named = zip(grid.heights, file_stems(list(grid.heights)), strict=True)
+    return [_Band(at, name, stem, span(grid, name)) for at, (name, stem) in enumerate(named)]
 
 
 def _draw_one(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[Named]:
@@ -245,15 +245,14 @@ def _draw_differences(subject: Subject, grid: BevGrid, bands: Sequence[_Band], s
     (first, expected), *others = subject.values.items()
     if not others:
         return
-    # Where both are infinite there is no difference, rather than NaN, which means unknown.
-    differences = [(values - expected).where(values != expected, 0.0) for _, values in others]
+    differences = [difference(values, expected) for _, values in others]
     scale = difference_scale(subject.quantity, torch.stack(differences))
     first_stem, *stems = file_stems(list(subject.values))
-    for (rig, _), stem, difference in zip(others, stems, differences, strict=True):
+    for (rig, _), stem, change in zip(others, stems, differences, strict=True):
         for band in bands:
             figure = draw_map(
                 # What is infinite takes the last colour: it is better or worse, not a step without a point.
-                difference[band.number].clamp(2 * scale.low, 2 * scale.high),
+                change[band.number].clamp(2 * scale.low, 2 * scale.high),
                 grid,
                 scale,
                 title=f"{rig} minus {first}: {subject.quantity.title}, {band.name}",

@@ -166,10 +166,6 @@ def draw_places(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
 def draw_sectors(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
     """Fill the horizontal field of view of each sensor, as if nothing were in its way: all that geometry alone says.
 
-    Args:
-        sheet: The sheet of an empty map.
-        sensors: What to draw.
-
     Returns:
         Legend entries.
     """

@@ -64,6 +64,11 @@ def quantities_shown(coverage: Coverage) -> list[tuple[Quantity, bool]]:
     return [*((one, coverage.measure == "area") for one in of_measure), *((one, False) for one in others)]
 
 
+def difference(values: Tensor, expected: Tensor) -> Tensor:
+    """Where both are infinite there is no difference, rather than NaN, which means unknown."""
+    return (values - expected).where(values != expected, 0.0)
+
+
 def error_subjects_of(coverages: Mapping[str, Coverage]) -> Iterator[Subject]:
     """The standard errors of the quantities of the measure; none without blocks.
 

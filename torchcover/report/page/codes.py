@@ -64,7 +64,7 @@ class CellBytes:
 
 
 def encoded(values: NDArray[np.float64], bits: int) -> tuple[NDArray[np.uint16], Mapping[str, Any]]:
-    """Codes of numbers that are not NaN, and what `decoded` needs.
+    """Codes of numbers that are not NaN, and what a reader needs to have them back (`cells.js`).
 
     Example:
         >>> codes, scale = encoded(np.array([0.0, 1.0, 3.0, np.inf]), 8)
@@ -84,17 +84,3 @@ def encoded(values: NDArray[np.float64], bits: int) -> tuple[NDArray[np.uint16],
     codes = 1 + np.rint((top - 2) * share)
     codes = np.where(endless, top, np.where(nothing, 0, codes)).astype(np.uint16)
     return codes, {"log": bool(logarithmic), "low": low, "high": high}
-
-
-def decoded(codes: NDArray[np.uint16], bits: int, scale: Mapping[str, Any]) -> NDArray[np.float64]:
-    """What `encoded` kept, as the page reads it.
-
-    Example:
-        >>> decoded(*[np.array([0, 1, 254, 255], dtype=np.uint16), 8, {"log": False, "low": 1.0, "high": 3.0}])
-        array([ 0.,  1.,  3., inf])
-    """
-    top = 2**bits - 1
-    share = (codes.astype(np.float64) - 1) / (top - 2)
-    low, high = scale["low"], scale["high"]
-    values = low * (high / low) ** share if scale["log"] else low + share * (high - low)
-    return np.where(codes == top, np.inf, np.where(codes == 0, 0.0, values))

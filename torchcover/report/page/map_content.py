@@ -19,12 +19,7 @@ FARTHEST_M = 1e6
 
 
 def map_content(page: Page, cells: CellBytes) -> dict[str, Any]:
-    """What the script reads.
-
-    Args:
-        page: What the page shows.
-        cells: Where the numbers of cells go.
-    """
+    """What the script reads."""
     rasters: dict[tuple[Any, ...], list[PageMap]] = {}
     for one in page.maps:
         rasters.setdefault((one.x, one.y, one.cell_m), []).append(one)

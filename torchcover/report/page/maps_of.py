@@ -8,8 +8,9 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage, Layer
+from torchcover.report.maps.arrays import as_array
 from torchcover.report.maps.colours import NEVER_PROBED, difference_scale, scale_of
-from torchcover.report.maps.subjects import NOTHING_FOUND, quantities_shown
+from torchcover.report.maps.subjects import NOTHING_FOUND, difference, quantities_shown
 from torchcover.report.maps.surface import square_sides
 from torchcover.report.page.content import Array, PageMap, Sides
 from torchcover.report.wording import shown_unit, span
@@ -54,32 +55,27 @@ def _of_quantity(
     values = {rig: factor * layer.values for rig, layer in layers.items()}
     scale = scale_of(quantity, torch.stack(list(values.values())))
     expected, *others = values.values()
-    differences = [_difference(one, expected) for one in others]
+    differences = [difference(one, expected) for one in others]
     against = difference_scale(quantity, torch.stack(differences)) if differences else None
-    for band, (height, z) in enumerate(grid.heights.items()):
+    for band, height in enumerate(grid.heights):
         for at, rig in enumerate(values):
             yield PageMap(
                 quantity=quantity.title,
-                band=f"{height}, z {span(z)}",
+                band=f"{height}, {span(grid, height)}",
                 rig=rig,
                 x=grid.x,
                 y=grid.y,
                 cell_m=grid.cell,
-                values=_array(values[rig][band]),
+                values=as_array(values[rig][band]),
                 scale=scale,
                 unknown=NEVER_PROBED if weights.sides is None else NOTHING_FOUND,
-                errors=factor * _array(errors[rig][band]) if rig in errors else None,
+                errors=factor * as_array(errors[rig][band]) if rig in errors else None,
                 weights=weights.values[band],
                 weight_name=weights.name,
                 full_weight=weights.full,
                 sides=None if weights.sides is None else weights.sides[band],
                 difference=against if at else None,
             )
-
-
-def _difference(values: Tensor, expected: Tensor) -> Tensor:
-    """Where both are infinite there is no difference, rather than NaN, which means unknown."""
-    return (values - expected).where(values != expected, 0.0)
 
 
 def _weights(first: Coverage) -> Weights | None:
@@ -92,9 +88,5 @@ def _weights(first: Coverage) -> Weights | None:
 
 
 def _known(counts: Tensor) -> Array:
-    array = _array(counts)
+    array = as_array(counts)
     return np.where(array > 0, array, np.nan)
-
-
-def _array(values: Tensor) -> Array:
-    return values.detach().cpu().double().numpy()

@@ -185,7 +185,7 @@ def _broken(heading: str) -> str:
 
 def _rig(rig: PageRig, ego_outline_m: Array | None, number: int) -> str:
     drawing = rig_drawing(rig.sensors, ego_outline_m, number) if rig.sensors else ""
-    table = table_html(sensor_table(rig.sensors)) if rig.sensors else "<p>Nobody knows its sensors.</p>"
+    table = table_html(sensor_table(rig.sensors)) if rig.sensors else "<p>Its sensors are unknown.</p>"
     document = f"<details><summary>{escape(rig.name)} as YAML</summary><pre>{escape(rig.document)}</pre></details>"
     return f'<h3>{escape(rig.name)}</h3><div class="rig"><div>{drawing}</div><div>{table}</div></div>' + (
         document if rig.document else ""

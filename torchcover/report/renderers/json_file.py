@@ -28,6 +28,7 @@ def table_dict(table: CoverageTable) -> dict[str, Any]:
     grid = table.grid
     counts = {rig: dict(conditions.counts) for rig, conditions in table.conditions.items()}
     return {
+        "band_frame": grid.band_frame,
         "grid": {
             "x_m": list(grid.x),
             "y_m": list(grid.y),

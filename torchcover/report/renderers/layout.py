@@ -1,15 +1,14 @@
 """A table in words, before it is text: the parts of a page, which renderers for readers have in common."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from textwrap import fill
 from types import MappingProxyType
 from typing import NamedTuple
 
-from torchcover.coverage import RegionSummary
-from torchcover.coverage.measures import Measure
 from torchcover.estimation import Quantity
 from torchcover.report.failures import decisive, failure_headings, failure_title, failure_words, sensors_of
+from torchcover.report.renderers.records import COLUMNS
 from torchcover.report.table import CoverageTable, Row
 from torchcover.report.wording import (
     capitalised,
@@ -17,13 +16,10 @@ from torchcover.report.wording import (
     difference_words,
     heading,
     number_words,
-    percent,
-    square_metres,
 )
 
 MAX_HEADING_CHARS = 16
 PLACE_HEADINGS = ("region", "height")
-BASIS_HEADINGS: Mapping[Measure, str] = MappingProxyType({"known": "known cells\n(%)", "area": "visible surface\n(m2)"})
 # What the marks look like, and what the legend calls that, where text may be bold.
 BOLD_MARKS: Mapping[str, str] = MappingProxyType({"best": "In bold", "significant": "In bold among the differences"})
 
@@ -54,17 +50,6 @@ class Part:
     headings: tuple[str, ...]
     rows: tuple[tuple[Words, ...], ...]
     bands: int
-
-    def with_column(self, heading: str, cells: Sequence[str]) -> "Part":
-        """The part with one more column.
-
-        Raises:
-            ValueError: Another number of cells than of rows.
-        """
-        if len(cells) != len(self.rows):
-            raise ValueError(f"column {heading!r}: {len(self.rows)} cells are needed; got {len(cells)}")
-        rows = tuple((*row, Words(cell)) for row, cell in zip(self.rows, cells, strict=True))
-        return replace(self, headings=(*self.headings, heading), rows=rows)
 
 
 def parts_of(table: CoverageTable) -> list[Part]:
@@ -124,18 +109,14 @@ def _part(
     *,
     of_differences: bool = False,
 ) -> Part:
-    """A part with the columns that every part has: the place first, how much the numbers are means over last."""
+    """A part with the columns that every part has: the place first, those of `COLUMNS` that are shown last."""
+    shown = [column for column in COLUMNS if column.heading and column.measure in (None, table.measure)]
     rows = []
     for (row, *_), cells in zip(table.places, numbers, strict=True):
-        summary = row.summary
-        rows.append((Words(summary.region), Words(summary.height), *cells, _basis(summary)))
-    every = (*PLACE_HEADINGS, *headings, BASIS_HEADINGS[table.measure])
+        last = [Words(column.words(column.of(table, row))) for column in shown]
+        rows.append((Words(row.summary.region), Words(row.summary.height), *cells, *last))
+    every = (*PLACE_HEADINGS, *headings, *(column.heading for column in shown))
     return Part(title, quantities, of_differences, every, tuple(rows), len(table.grid.heights))
-
-
-def _basis(summary: RegionSummary) -> Words:
-    """How much the numbers are means over."""
-    return Words(percent(summary.known_share) if summary.measure == "known" else square_metres(summary.visible_m2))
 
 
 def _number(row: Row, quantity: Quantity) -> Words:

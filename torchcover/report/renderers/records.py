@@ -2,14 +2,71 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
 
+from torchcover.coverage.measures import Measure
 from torchcover.coverage.redundancy import redundancy_quantities
 from torchcover.estimation import Difference, Number
 from torchcover.report.failures import sensors_of
 from torchcover.report.table import CoverageTable, Row
+from torchcover.report.wording import percent, square_metres
 
 Record = dict[str, object]
 Columns = dict[str, Callable[[Row], object]]
+
+
+class Column(NamedTuple):
+    """What stands in a row besides its numbers and their errors.
+
+    Args:
+        key: Its name in CSV and JSON.
+        meaning: What it is, for the documentation.
+        of: The value.
+        heading: Above it where a table is in words; empty if it is not shown there.
+        words: Makes text of the value there.
+        measure: Of which tables it is shown; None for all.
+    """
+
+    key: str
+    meaning: str
+    of: Callable[[CoverageTable, Row], object]
+    heading: str = ""
+    words: Callable[[Any], str] = str
+    measure: Measure | None = None
+
+
+COLUMNS = (
+    Column("measure", "what the numbers are means over: `area` or `known`", lambda _, row: row.summary.measure),
+    Column(
+        "visible_m2",
+        "mean of the square metres that the reference sees in a step",
+        lambda _, row: row.summary.visible_m2,
+        "visible surface\n(m2)",
+        square_metres,
+        "area",
+    ),
+    Column(
+        "known_share",
+        "share of the cells that are known",
+        lambda _, row: row.summary.known_share,
+        "known cells\n(%)",
+        percent,
+        "known",
+    ),
+    Column("known_cells", "how many are known", lambda _, row: row.summary.known_cells),
+    Column("cells", "how many cells the region has", lambda _, row: row.summary.cells),
+    Column("cell_m", "side of a cell", lambda table, _: table.grid.cell),
+    Column("steps", "how many were measured", lambda table, row: table.conditions[row.rig].counts["steps"]),
+    Column("blocks", "how many the errors come from", lambda table, row: table.conditions[row.rig].blocks),
+    Column("steps_per_block", "of a full one", lambda table, row: table.conditions[row.rig].steps_per_block),
+    Column("x_min_m", "where the region begins", lambda _, row: row.region.x[0]),
+    Column("x_max_m", "where it ends", lambda _, row: row.region.x[1]),
+    Column("y_min_m", "its right border", lambda _, row: row.region.y[0]),
+    Column("y_max_m", "its left border", lambda _, row: row.region.y[1]),
+    Column("z_min_m", "where the band begins", lambda table, row: table.grid.heights[row.summary.height][0]),
+    Column("z_max_m", "where it ends", lambda table, row: table.grid.heights[row.summary.height][1]),
+)
 
 
 def records_of(table: CoverageTable) -> list[Record]:
@@ -31,7 +88,7 @@ def columns_of(table: CoverageTable) -> Columns:
         columns |= _numbers(key)
     for key in means if table.measure == "area" else ():
         columns |= _known(key)
-    columns |= _conditions(table)
+    columns |= {column.key: partial(column.of, table) for column in COLUMNS}
     for key in keys if len(table.rigs) > 1 else ():
         columns |= _compared(key)
     sensors = dict.fromkeys(sensor for rows in table.rows.values() for sensor in sensors_of(rows))
@@ -47,18 +104,14 @@ def columns_of(table: CoverageTable) -> Columns:
 
 def _numbers(key: str) -> Columns:
     return {
-        key: lambda row: row.summary.numbers[key].value,
-        f"{key}_error": lambda row: row.summary.numbers[key].error,
+        **_with_error(key, lambda row: row.summary.numbers[key]),
         f"{key}_low": lambda row: row.summary.numbers[key].low,
         f"{key}_high": lambda row: row.summary.numbers[key].high,
     }
 
 
 def _known(key: str) -> Columns:
-    return {
-        f"known_{key}": lambda row: row.summary.known[key].value,
-        f"known_{key}_error": lambda row: row.summary.known[key].error,
-    }
+    return _with_error(f"known_{key}", lambda row: row.summary.known[key])
 
 
 def _compared(key: str) -> Columns:
@@ -78,58 +131,26 @@ def _seen_by(key: str) -> Columns:
     def number(row: Row) -> Number | None:
         return row.summary.redundancy.seen_by[key] if row.summary.redundancy else None
 
-    return {key: lambda row: _value(number(row)), f"{key}_error": lambda row: _error(number(row))}
+    return _with_error(key, number)
 
 
 def _without(sensor: str, key: str) -> Columns:
     """NaN for a rig that has no such sensor."""
 
     def number(row: Row) -> Number | None:
-        redundancy = row.summary.redundancy
-        return redundancy.without.get(sensor, {}).get(key) if redundancy else None
+        return row.summary.redundancy.without.get(sensor, {}).get(key) if row.summary.redundancy else None
 
     def change(row: Row) -> Difference | None:
-        redundancy = row.summary.redundancy
-        return redundancy.change.get(sensor, {}).get(key) if redundancy else None
-
-    def significant(row: Row) -> bool | None:
-        found = change(row)
-        return None if found is None else found.significant
+        return row.summary.redundancy.change.get(sensor, {}).get(key) if row.summary.redundancy else None
 
     without = f"{key}_without_{sensor}"
+    significant = f"{without}_change_significant"
+    columns = _with_error(without, number) | _with_error(f"{without}_change", change)
+    return {**columns, significant: lambda row: getattr(change(row), "significant", None)}
+
+
+def _with_error(key: str, number: Callable[[Row], Number | Difference | None]) -> Columns:
     return {
-        without: lambda row: _value(number(row)),
-        f"{without}_error": lambda row: _error(number(row)),
-        f"{without}_change": lambda row: _value(change(row)),
-        f"{without}_change_error": lambda row: _error(change(row)),
-        f"{without}_change_significant": significant,
-    }
-
-
-def _value(number: Number | Difference | None) -> float:
-    return math.nan if number is None else number.value
-
-
-def _error(number: Number | Difference | None) -> float:
-    return math.nan if number is None else number.error
-
-
-def _conditions(table: CoverageTable) -> Columns:
-    heights = table.grid.heights
-    return {
-        "measure": lambda row: row.summary.measure,
-        "visible_m2": lambda row: row.summary.visible_m2,
-        "known_share": lambda row: row.summary.known_share,
-        "known_cells": lambda row: row.summary.known_cells,
-        "cells": lambda row: row.summary.cells,
-        "cell_m": lambda _: table.grid.cell,
-        "steps": lambda row: table.conditions[row.rig].counts["steps"],
-        "blocks": lambda row: table.conditions[row.rig].blocks,
-        "steps_per_block": lambda row: table.conditions[row.rig].steps_per_block,
-        "x_min_m": lambda row: row.region.x[0],
-        "x_max_m": lambda row: row.region.x[1],
-        "y_min_m": lambda row: row.region.y[0],
-        "y_max_m": lambda row: row.region.y[1],
-        "z_min_m": lambda row: heights[row.summary.height][0],
-        "z_max_m": lambda row: heights[row.summary.height][1],
+        key: lambda row: getattr(number(row), "value", math.nan),
+        f"{key}_error": lambda row: getattr(number(row), "error", math.nan),
     }

@@ -48,9 +48,6 @@ def rich_tables(table: CoverageTable) -> list[Table]:
 
     The best number of each row is bold and marked `*`; a difference that is more than chance is bold and marked `!`.
 
-    Args:
-        table: The table.
-
     Returns:
         A table for each part; what they hold under, and what went wrong, is the caption of the last.
     """

@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Iterator
 from functools import cached_property
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
@@ -14,6 +15,7 @@ from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats import read_objects
 from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects
+from torchcover.simulation.bodies import sound_mesh
 from torchcover.simulation.documents import PathBeside, Pose, builtin_hashes
 from torchcover.simulation.recorded.bodies import Bodies
 from torchcover.simulation.recorded.ground import ground_below, stood_on
@@ -98,8 +100,8 @@ class RecordedTraffic(Traffic):
         mesh = bodies["suv"] if ego is None else ego
         driver = Actor(EGO, "car", mesh, Trajectory(drive.times_s, drive.positions_m, drive.angles_deg))
         others = self._apart(driver, list(self._actors(driver.trajectory, Bodies(bodies))))
-        ground = self._fitted(driver) if self.ground is None else MeshFile(type="mesh", path=self.ground).mesh()
-        return World((ground,), driver, tuple(others), self.time_step_s, run.duration_s)
+        ground = self._fitted(driver) if self.ground is None else self._read(self.ground)
+        return World((ground,), driver, tuple(others), self.time_step_s, run.duration_s, ground=(0,))
 
     @cached_property
     def _objects(self) -> RecordedObjects:
@@ -167,6 +169,11 @@ class RecordedTraffic(Traffic):
                 stacklevel=2,
             )
         return [other for other in others if other.name not in met]
+
+    @staticmethod
+    def _read(ground: Path) -> Mesh:
+        """The ground from a file."""
+        return sound_mesh(MeshFile(type="mesh", path=ground), str(ground))
 
     def _fitted(self, ego: Actor) -> Mesh:
         """The ground below all road users of the recording."""

@@ -67,12 +67,6 @@ class Network(NamedTuple):
     connections: tuple[tuple[int, int], ...]
     left_hand: bool
 
-    @property
-    def flat_at_m(self) -> float | None:
-        """The height of everything, if it is the same everywhere."""
-        heights = np.concatenate([lane.line_m[:, 2] for lane in self.lanes])
-        return float(heights[0]) if (heights == heights[0]).all() else None
-
     def follow(self, vehicle_class: str) -> dict[str, tuple[str, ...]]:
         """Of each edge that vehicles of a class may use, the names of those on which they may go on from there."""
         roads = [lane.use == "road" and lane.allows(vehicle_class) for lane in self.lanes]

@@ -29,10 +29,6 @@ ALWAYS = ("--xml-validation", "never")
 def run(program: str, *options: str | Path) -> None:
     """Run a program to its end.
 
-    Args:
-        program: "netgenerate", "netconvert" or "sumo".
-        options: Its options.
-
     Raises:
         ImportError: SUMO is not installed.
         ValueError: It fails; with its own message.

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from torchcover.simulation.documents import PathBeside
-from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.crowd import crowd, types_of
 from torchcover.simulation.sumo.demand import EGO_TYPE, write_routes
 from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
@@ -22,7 +21,7 @@ from torchcover.simulation.sumo.streets import DrawnStreets
 from torchcover.simulation.sumo.vicinity import OFF_STREET_M, Vicinity
 from torchcover.simulation.traffic.fleet import EGO, Fleet
 from torchcover.simulation.traffic.procedural import Procedural
-from torchcover.simulation.traffic.scenery import few
+from torchcover.simulation.traffic.scenery import Scenery, few
 from torchcover.simulation.world import Actor
 
 Numbers = NDArray[np.float64]
@@ -74,7 +73,7 @@ class Sumo(Procedural):
 
     def _build(
         self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
-    ) -> tuple[tuple[Mesh, ...], Actor, tuple[Actor, ...]]:
+    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         with TemporaryDirectory() as folder:
             network_file = self._network_file(Path(folder), generator)
             network = read_network(network_file)
@@ -95,11 +94,13 @@ class Sumo(Procedural):
         ground = ground_of(vicinity)
         pavement = Pavement(vicinity, ground)
         frontage = StreetScenery(vicinity, ground, self.built_share, generator)
-        static = (ground.mesh(), *few(pavement.meshes(), decks(vicinity)), *frontage.meshes())
+        raised = few(pavement.meshes(), decks(vicinity))
+        static = (ground.mesh(), *raised, *frontage.meshes())
         park(vicinity, ground, fleet, self.parked_share, generator)
         placing = Placing(ground, pavement, origin_m)
         driver = placing.ego(found.ego, times_s, fleet.meshes[EGO], generator)
-        return static, driver, placing.actors(found.others, fleet, float(times_s[-1]))
+        scenery = Scenery(static, tuple(range(1 + len(raised))))
+        return scenery, driver, placing.actors(found.others, fleet, float(times_s[-1]))
 
     def _network_file(self, folder: Path, generator: np.random.Generator) -> Path:
         """The network in SUMO's own format."""

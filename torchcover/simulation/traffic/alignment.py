@@ -88,19 +88,6 @@ class Alignment:
         turned = self.headings(stations_m) - self.headings(0.0)
         return np.asarray(stations_m, dtype=np.float64) - np.asarray(left_m, dtype=np.float64) * turned
 
-    def project(self, places_m: Numbers, span_m: tuple[float, float]) -> Numbers:
-        """(N, 2) station and distance to the left of the nearest place on a stretch of the line, of (N, 2) places."""
-        samples = np.arange(*span_m, 2 * KNOT_EVERY_M)
-        station = samples[squared_distances(places_m, self.poses(samples, 0.0)[:, :2]).argmin(axis=1)]
-        for _ in range(8):  # Newton's rule, from close by
-            x, y, yaw_deg = self.poses(station, 0.0).T
-            yaw = np.deg2rad(yaw_deg)
-            away = places_m - np.stack([x, y], axis=1)
-            along = away[:, 0] * np.cos(yaw) + away[:, 1] * np.sin(yaw)
-            left = away[:, 1] * np.cos(yaw) - away[:, 0] * np.sin(yaw)
-            station = station + along / np.maximum(1.0 - self.curvatures(station) * left, 0.1)
-        return np.stack([station, left], axis=1)
-
     def _knot(self, stations_m: Numbers) -> tuple[Knots, Numbers]:
         """(...) numbers of the last knots before stations, and how far beyond these they are."""
         knot = np.maximum(np.searchsorted(self.stations_m, stations_m, side="right") - 1, 0)

@@ -10,7 +10,7 @@ from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import SAMPLE_EVERY_M, Territory
 from torchcover.simulation.traffic.fleet import Fleet
 from torchcover.simulation.traffic.hills import Hills
-from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, box, few, ground, post, tree
+from torchcover.simulation.traffic.scenery import PAVEMENT_M, Scenery, block, box, few, ground, post, tree
 from torchcover.simulation.traffic.site import Bounds, BuildingSite
 from torchcover.simulation.traffic.streets import GUTTER_M, Streets
 
@@ -88,7 +88,7 @@ class City:
         self._generator = generator
         self._shapes = shapes
 
-    def static(self, seen_m: Bounds) -> tuple[Mesh, ...]:
+    def static(self, seen_m: Bounds) -> Scenery:
         """The ground, the blocks, buildings and furniture; cars are parked among them.
 
         Args:
@@ -102,7 +102,9 @@ class City:
         found += [self._built(*self._corner(index)) for index in np.flatnonzero(turns).tolist()]
         kinds = [[mesh for pieces in found for mesh in pieces[kind]] for kind in range(len(Pieces._fields))]
         blocks, houses, furniture, trees = kinds
-        return (self._ground(seen_m), *few(blocks, houses, furniture + trees))
+        pavements = few(blocks)
+        static = (self._ground(seen_m), *pavements, *few(houses, furniture + trees))
+        return Scenery(static, tuple(range(1 + len(pavements))))
 
     def _ground(self, seen_m: Bounds) -> Mesh:
         """Under everything: as far as lanes go, or as far as it can be seen."""

@@ -234,10 +234,6 @@ class _Limits:
 def check_crowd(agents: float, steps: int) -> None:
     """Refuse more agents than a simulation has memory for, before any of them is made.
 
-    Args:
-        agents: How many there are, about.
-        steps: For how many times their state is kept.
-
     Raises:
         ValueError: There is not so much memory.
     """

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.assemble import actors, ego_actor, paths
 from torchcover.simulation.traffic.fleet import EGO, Fleet
 from torchcover.simulation.traffic.flow import Agent, Lane, Simulation, check_crowd
@@ -14,6 +13,7 @@ from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.procedural import MostVehicles, Procedural
 from torchcover.simulation.traffic.roads import Polyline
 from torchcover.simulation.traffic.roadside import LANE_CENTRES_M, roadside
+from torchcover.simulation.traffic.scenery import Scenery
 from torchcover.simulation.traffic.signals import Signals
 from torchcover.simulation.world import Actor
 
@@ -55,7 +55,7 @@ class Highway(Procedural):
 
     def _build(
         self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
-    ) -> tuple[tuple[Mesh, ...], Actor, tuple[Actor, ...]]:
+    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         middle = self._middle_line(generator)
         lanes = _lanes(middle)
         agents = self._traffic(lanes, fleet)
@@ -64,7 +64,7 @@ class Highway(Procedural):
         driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator)
         first, last = (_nearest(middle, position) for position in driver.trajectory.positions_m[[0, -1], :2])
         static = roadside(middle, (first - BEHIND_M, last + AHEAD_M), moving.positions_m, generator)
-        return static, driver, actors(times_s, [moving], driver, fleet)
+        return Scenery(static, (0,)), driver, actors(times_s, [moving], driver, fleet)
 
     @property
     def _ego_starts_m(self) -> float:

@@ -36,11 +36,6 @@ class Hills:
         """Whether there are none."""
         return bool(self._wave_m == 0.0)
 
-    @property
-    def steepest(self) -> float:
-        """A slope that is nowhere exceeded."""
-        return float(self._wave_m * np.linalg.norm(self._waves_per_m, axis=0).sum())
-
     def heights_m(self, places_m: Numbers) -> Numbers:
         """(...) at (..., 2) places, rounded to some micrometres."""
         if self.are_flat:

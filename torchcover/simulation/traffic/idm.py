@@ -43,24 +43,15 @@ class Driver:
         return 2 * np.sqrt(self.acceleration_mps2 * self.deceleration_mps2)
 
 
-def acceleration(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: Numbers) -> Numbers:
-    """Acceleration of N drivers.
+def tightness(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: Numbers) -> Numbers:
+    """The gap that N drivers would like to have as a multiple of the one that they have.
 
     Args:
         driver: The drivers.
         speed_mps: (N,) their speeds.
         gap_m: (N,) free road to the one ahead, bumper to bumper; infinite on an empty road.
         closing_mps: (N,) own speed minus that of the one ahead.
-
-    Returns:
-        (N,) m/s², at least -9.
     """
-    tight = tightness(driver, speed_mps, gap_m, closing_mps)
-    return acceleration_in(driver, speed_mps, tight, driver.desired_speed_mps)
-
-
-def tightness(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: Numbers) -> Numbers:
-    """(N,) the gap that drivers would like to have as a multiple of the one that they have; see `acceleration`."""
     # In place, here and below: what is written anew has to come from farther away than what was read just now.
     gaps = speed_mps * closing_mps
     gaps /= driver._braking_mps2
@@ -72,7 +63,7 @@ def tightness(driver: Driver, speed_mps: Numbers, gap_m: Numbers, closing_mps: N
 
 
 def acceleration_in(driver: Driver, speed_mps: Numbers, tightness: Numbers, desired_mps: Quantity) -> Numbers:
-    """Acceleration of N drivers; of several things ahead the one with the largest tightness counts.
+    """(N,) acceleration of N drivers, at least -9 m/s²; of several things ahead the largest tightness counts.
 
     `desired_mps` is what they want to drive here: less than elsewhere in a curve.
     """
@@ -82,17 +73,6 @@ def acceleration_in(driver: Driver, speed_mps: Numbers, tightness: Numbers, desi
     wanted -= tightness**2
     wanted *= driver.acceleration_mps2
     return np.maximum(wanted, -HARDEST_BRAKING_MPS2, out=wanted)
-
-
-def equilibrium_gap_m(driver: Driver, speed_mps: Quantity) -> Quantity:
-    """Gap at which a driver behind another of constant speed neither brakes nor accelerates.
-
-    Example:
-        >>> round(float(equilibrium_gap_m(Driver(desired_speed_mps=14.0), 10.0)), 2)
-        16.28
-    """
-    slack = 1.0 - (speed_mps / driver.desired_speed_mps) ** FREE_ROAD_EXPONENT
-    return (driver.standstill_gap_m + speed_mps * driver.headway_s) / slack**0.5
 
 
 def advance(speed_mps: Numbers, acceleration_mps2: Numbers, room_m: Numbers, step_s: float) -> tuple[Numbers, Numbers]:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet
-from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, box, few, ground, post, tree
+from torchcover.simulation.traffic.scenery import PAVEMENT_M, Scenery, block, box, few, ground, post, tree
 
 Numbers = NDArray[np.float64]
 
@@ -55,7 +55,7 @@ class Lot:
         """Side (1 is the aisle at positive y) and x of each place where people cross."""
         return [(side, _stall_x(column)) for side in (1, -1) for column in sorted(self._empty[side])]
 
-    def static(self) -> tuple[Mesh, ...]:
+    def static(self) -> Scenery:
         """Everything but the cars, with ground for 300 m around; the cars are parked."""
         low = []
         for side in (1, -1):
@@ -67,7 +67,8 @@ class Lot:
                         low += self._occupant(*place)
         islands, trees = self._islands()
         around = self._surroundings()
-        return (ground((-300.0, -300.0), (300.0, 300.0)), *few(low, self._bollards(), islands, trees, around))
+        level, kerbs = ground((-300.0, -300.0), (300.0, 300.0)), few(islands)
+        return Scenery((level, *few(low, self._bollards()), *kerbs, *few(trees, around)), (0, 3))
 
     def _wheel_stop(self, x: float, y: float) -> Mesh:
         return box((x, y), (1.8, 0.15, 0.1))

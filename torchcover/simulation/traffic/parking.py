@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.assemble import Paths, actors, ego_actor, paths
 from torchcover.simulation.traffic.crossing import Footpath, free_for, walk
 from torchcover.simulation.traffic.fleet import EGO, WALKING, Fleet
@@ -15,6 +14,7 @@ from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.lot import AISLE_M, ISLAND_M, STALLS_M, WALKWAYS_M, Lot
 from torchcover.simulation.traffic.procedural import Procedural
 from torchcover.simulation.traffic.roads import loop
+from torchcover.simulation.traffic.scenery import Scenery
 from torchcover.simulation.traffic.signals import Signals
 from torchcover.simulation.world import Actor
 
@@ -48,7 +48,7 @@ class Parking(Procedural):
 
     def _build(
         self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
-    ) -> tuple[tuple[Mesh, ...], Actor, tuple[Actor, ...]]:
+    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         lanes = [Lane(loop(ROUND_M, 2 * AISLE_MIDDLE_M, CORNER_RADIUS_M))]
         agents = self._traffic(lanes[0].line.length_m, fleet, generator)
         flow = Simulation(lanes, agents, Signals.none()).run(times_s, WARM_UP_S)

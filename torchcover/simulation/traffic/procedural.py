@@ -12,6 +12,7 @@ from torchcover.simulation.documents import builtin_hashes
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
 from torchcover.simulation.traffic.kind import Traffic
+from torchcover.simulation.traffic.scenery import Scenery
 from torchcover.simulation.world import Actor, World, steps_of
 
 # Streets are as long as the ego's way: what moves on them grows with the square of the duration.
@@ -52,8 +53,10 @@ class Procedural(Traffic):
         fleet = Fleet(load_bodies() if bodies is None else bodies, ego, generator)
         steps = max(1, int(np.ceil(self.duration_s / self.time_step_s - 1e-9)))
         times_s = self.time_step_s * np.arange(steps + 1, dtype=np.float64)
-        static, driver, others = self._build(fleet, times_s, generator)
-        return World(static, driver, others, self.time_step_s, self.duration_s, tuple(fleet.parked))
+        scenery, driver, others = self._build(fleet, times_s, generator)
+        return World(
+            scenery.static, driver, others, self.time_step_s, self.duration_s, tuple(fleet.parked), scenery.ground
+        )
 
     def content(self) -> dict[str, Any]:
         """Its keys, and the vehicles that may be in it."""
@@ -67,5 +70,5 @@ class Procedural(Traffic):
     @abstractmethod
     def _build(
         self, fleet: Fleet, times_s: NDArray[np.float64], generator: np.random.Generator
-    ) -> tuple[tuple[Mesh, ...], Actor, tuple[Actor, ...]]:
+    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         """What rests, the ego, and who else moves, at (T,) times from 0 to the end, T >= 2."""

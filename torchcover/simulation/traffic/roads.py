@@ -86,13 +86,7 @@ class Polyline:
 
 
 def loop(length_m: float, width_m: float, corner_radius_m: float) -> Polyline:
-    """A rounded rectangle about the origin, run counter-clockwise from the middle of its lower side.
-
-    Args:
-        length_m: Extent along x.
-        width_m: Extent along y.
-        corner_radius_m: Radius of its corners.
-    """
+    """A rounded rectangle about the origin, run counter-clockwise from the middle of its lower side."""
     across, up = length_m / 2 - corner_radius_m, width_m / 2 - corner_radius_m
     points = [np.array([[0.0, -width_m / 2]])]
     for quarter, (x, y) in enumerate([(across, -up), (across, up), (-across, up), (-across, -up)]):

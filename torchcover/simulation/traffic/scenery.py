@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +17,13 @@ Numbers = NDArray[np.float64]
 PAVEMENT_M = 0.15
 POST_SIDES = 6
 CROWN_SIDES = 6
+
+
+class Scenery(NamedTuple):
+    """`static` meshes that never move, and the numbers of those that one drives or walks on: `ground`."""
+
+    static: tuple[Mesh, ...]
+    ground: tuple[int, ...]
 
 
 def ground(lower_m: ArrayLike, upper_m: ArrayLike) -> Mesh:

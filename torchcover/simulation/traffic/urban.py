@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import Beside, Territory
 from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, come_near, ego_actor, paths
 from torchcover.simulation.traffic.city import City
@@ -17,6 +16,7 @@ from torchcover.simulation.traffic.flow import Agent, Flow, Lane, Simulation, ch
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles, Procedural
+from torchcover.simulation.traffic.scenery import Scenery
 from torchcover.simulation.traffic.signals import CROSS, MAIN
 from torchcover.simulation.traffic.streets import (
     FOOTPATHS_M,
@@ -86,7 +86,7 @@ class Urban(Procedural):
 
     def _build(
         self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
-    ) -> tuple[tuple[Mesh, ...], Actor, tuple[Actor, ...]]:
+    ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
         # What the streets are like is drawn apart from what happens in them.
         (shapes,) = generator.spawn(1)
         hills, section = Hills(self.hills_m, shapes), self._section(shapes)

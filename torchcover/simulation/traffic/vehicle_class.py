@@ -33,11 +33,7 @@ class VehicleType(NamedTuple):
     length_m: float
 
     def body(self, lengths_m: Mapping[str, float]) -> str | None:
-        """The kind of body whose length is nearest among those of the class; None if there is none of this class.
-
-        Args:
-            lengths_m: Of each kind of body.
-        """
+        """The kind of body whose length is nearest among those of the class; None if there is none of this class."""
         if self.vehicle_class in LEFT_OUT:
             return None
         kinds = BODIES.get(self.vehicle_class, CARS)

@@ -9,10 +9,10 @@ from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Draws, Lidar, Pose
 from torchcover.simulation.bodies import in_vehicle_frame
 from torchcover.simulation.instant import Instant
-from torchcover.simulation.mounted import MountedSensor
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Plane
+from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.world import Actor, World
 
 UTM = np.array([513_248.37, 5_403_655.81, 312.5])
@@ -54,7 +54,7 @@ def afresh(instant):
 @pytest.mark.parametrize("ego_moves", [False, True])
 def test_every_step_is_that_of_a_scan_afresh(ego_moves, actor_moves, origin_m):
     scene = Scene(world(ego_moves, actor_moves, origin_m))
-    mounted, self_hits = MountedSensor(LIDAR, scene), []
+    mounted, self_hits = MountedSensor(LIDAR, scene, LIDAR.max_range_m), []
     for step in (0, 3, 4, 5, 9):
         instant = scene.at(step, within_m=40.0)
         seen, expected = mounted.scan(instant, EXACT), afresh(instant)
@@ -70,8 +70,8 @@ def test_every_step_is_that_of_a_scan_afresh(ego_moves, actor_moves, origin_m):
 @pytest.mark.parametrize("moves", [False, True])
 def test_hits_that_are_too_close_give_no_points_and_hide_what_lies_behind(moves):
     scene = Scene(world(moves, moves))
-    instant, exact = scene.at(3), MountedSensor(LIDAR, scene).scan(scene.at(3), EXACT)
-    mounted = MountedSensor(LIDAR.model_copy(update={"min_range_m": 4.0}), scene)
+    instant, exact = scene.at(3), MountedSensor(LIDAR, scene, LIDAR.max_range_m).scan(scene.at(3), EXACT)
+    mounted = MountedSensor(LIDAR.model_copy(update={"min_range_m": 4.0}), scene, LIDAR.max_range_m)
     seen, again = mounted.scan(instant, EXACT), mounted.scan(instant, EXACT)
     far = exact.range_m >= 4.0
     assert 0 < far.sum() < len(far) - 20
@@ -89,7 +89,7 @@ def test_a_scan_is_made_again_only_where_something_moves(monkeypatch):
     for moves, expected in [((False, False), 1), ((False, True), 3), ((True, False), 3)]:
         scans.clear()
         scene = Scene(world(*moves))
-        mounted = MountedSensor(LIDAR, scene)
+        mounted = MountedSensor(LIDAR, scene, LIDAR.max_range_m)
         for step in (0, 1, 2):
             mounted.scan(scene.at(step), EXACT)
         assert len(scans) == expected
@@ -98,7 +98,10 @@ def test_a_scan_is_made_again_only_where_something_moves(monkeypatch):
 def test_rays_that_the_ego_ends_are_not_cast_at_it():
     scene = Scene(world())
     instant = scene.at(0)
-    assert MountedSensor(LIDAR, scene).scan(instant, EXACT).body_casts < afresh(instant).body_casts - 500
+    assert (
+        MountedSensor(LIDAR, scene, LIDAR.max_range_m).scan(instant, EXACT).body_casts
+        < afresh(instant).body_casts - 500
+    )
 
 
 def test_the_ego_is_at_its_own_place_to_the_last_bit():

@@ -1,0 +1,123 @@
+"""Bands over the local ground, and over z of the vehicle: closed forms, and what is refused."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+
+from torchcover import BevGrid, Coverage, CoverageMetric
+from torchcover.coverage import Maximum, check_paired
+from torchcover.data import Frame
+from torchcover.evaluation import CoverageObserver
+from torchcover.published import KCover
+
+EXTENT = {"x": (0.0, 40.0), "y": (0.0, 1.0), "cell": 1.0}
+GROUND, VEHICLE = (BevGrid(**EXTENT, band_frame=band_frame) for band_frame in ("ground", "vehicle"))
+# A ramp of 1 in 10 from x = 0 on: a point on it, and one that stands 1 m above it, in every cell.
+ALONG_M = torch.arange(40) + 0.5
+ON_RAMP = torch.stack([ALONG_M, torch.full_like(ALONG_M, 0.5), 0.1 * ALONG_M], dim=1)
+ABOVE = ON_RAMP + torch.tensor([0.0, 0.0, 1.0])
+REFERENCE = torch.cat([ON_RAMP, ABOVE])
+HEIGHT = torch.cat([torch.zeros(40), torch.ones(40)])
+
+
+def measured(grid, height=None, **parameters):
+    metric = CoverageMetric(grid, **parameters)
+    metric.update(ON_RAMP, REFERENCE, height=height)
+    return metric.compute()
+
+
+def test_on_a_ramp_bands_follow_the_ground():
+    """By height the ramp is ground and what stands on it obstacle; by z the road is an obstacle from 5 to 20 m."""
+    by_ground, by_z = measured(GROUND, HEIGHT), measured(VEHICLE)
+    assert (by_ground.points == 1).all()
+    torch.testing.assert_close(by_ground.radius[:, 0].float(), torch.tensor([[0.0] * 40, [1.0] * 40]))
+    road = by_z.points[:, 0]
+    assert road[0].tolist() == [1] * 5 + [0] * 35
+    assert road[1].tolist() == [1] * 5 + [2] * 5 + [1] * 10 + [0] * 20
+    assert (by_ground.band_frame, by_z.band_frame) == ("ground", "vehicle")
+
+
+def test_on_level_ground_both_are_the_same():
+    points = REFERENCE * torch.tensor([1.0, 1.0, 0.0]) + torch.tensor([0.0, 0.0, 1.0]) * HEIGHT[:, None]
+    both = []
+    for grid, height in ((GROUND, HEIGHT), (VEHICLE, None)):
+        metric = CoverageMetric(grid, aggregations=(Maximum(),), sensors=("low", "high"))
+        metric.update({"low": ON_RAMP, "high": ABOVE}, points, height=height)
+        both.append(metric.compute())
+    by_ground, by_z = both
+    for key, layer in by_ground.layers.items():
+        assert torch.equal(layer.values, by_z.layers[key].values)
+    assert by_ground.counts == by_z.counts
+    assert repr(by_ground.summary()) == repr(by_z.summary())
+
+
+def test_points_without_ground_are_in_no_band_and_counted():
+    holes = HEIGHT.clone()
+    holes[:10] = math.nan
+    result = measured(GROUND, holes)
+    assert result.points[:, 0].sum(dim=1).tolist() == [30, 40]
+    assert (result.counts["no_ground_points"], result.counts["outside_points"]) == (10, 10)
+    many = BevGrid(**EXTENT, heights={f"b{k}": (float(k), k + 1.0) for k in range(40)}, band_frame="ground")
+    assert len(many.bins(REFERENCE, holes).inside) == 70
+    assert GROUND.points_by_column(REFERENCE, holes).sum() == 70
+
+
+@pytest.mark.parametrize(
+    ("grid", "height", "message"),
+    [
+        (GROUND, None, r"height\[0\]: bands over the ground need the heights of points above it; got none"),
+        (
+            VEHICLE,
+            HEIGHT,
+            r"height\[0\]: of no use for bands over z of the vehicle; use BevGrid\(band_frame='ground'\)",
+        ),
+        (GROUND, HEIGHT[:3], r"height\[0\]: shape \(80,\), one for each point, is needed; got \(3,\)"),
+        (GROUND, HEIGHT / 0, r"height\[0\]: metres are needed, NaN where there is no ground; got infinite ones"),
+        (GROUND, [HEIGHT, HEIGHT], "1 weights, 2 heights and 1 places in time for 1 reference clouds"),
+    ],
+)
+def test_heights_that_do_not_go_with_the_grid_are_refused(grid, height, message):
+    with pytest.raises(ValueError, match=message) as refused:
+        measured(grid, height)
+    assert "\n" not in str(refused.value)
+    with pytest.raises(ValueError, match="band_frame: ground or vehicle is needed; got 'world'"):
+        BevGrid(**EXTENT, band_frame="world")
+
+
+def test_a_step_without_points_needs_no_heights():
+    metric = CoverageMetric(GROUND)
+    metric.update([], [], weights=[])
+    metric.update(ON_RAMP, torch.zeros(0, 3))
+    assert metric.compute().counts["empty_reference_steps"] == 1
+
+
+def test_results_of_two_band_frames_are_neither_merged_nor_compared(tmp_path):
+    ground, vehicle = CoverageMetric(GROUND), CoverageMetric(VEHICLE)
+    ground.update(ON_RAMP, REFERENCE, height=HEIGHT)
+    with pytest.raises(ValueError, match="cannot merge metrics with different grid"):
+        vehicle.merge_state(ground)
+    with pytest.raises(ValueError, match=r"made by another metric .* or with other grid"):
+        vehicle.load_state_dict(ground.metric_state)
+    path = tmp_path / "coverage.npz"
+    ground.compute().save(path)
+    loaded = Coverage.load(path)
+    assert (loaded.band_frame, loaded.grid) == ("ground", GROUND)
+    with pytest.raises(ValueError, match="'a' and 'b' cannot be compared: they differ in their band_frame"):
+        check_paired({"a": loaded, "b": measured(VEHICLE)})
+
+
+def test_what_looks_at_frames_takes_their_heights():
+    frame = Frame(
+        {"rig": ON_RAMP}, REFERENCE, 0, "ramp", sensor_points={"rig": {"one": 40}}, reference_heights_m=HEIGHT
+    )
+    observer, k_cover = CoverageObserver(CoverageMetric(GROUND)), KCover(GROUND, (), square_metres=False)
+    for one in (observer, k_cover):
+        one.update(frame)
+    assert torch.equal(observer.compute().points, measured(GROUND, HEIGHT).points)
+    assert k_cover.compute()[0].value == 0.5
+    unknown = dataclasses.replace(frame, reference_heights_m=None)
+    for one in (observer, k_cover):
+        with pytest.raises(ValueError, match=r"frame 'ramp': the heights .* are unknown; use the band frame vehicle"):
+            one.update(unknown)

@@ -1,0 +1,218 @@
+"""What objectives ask: which points and cells, which numbers of a result, and in which direction."""
+
+import numpy as np
+import pytest
+import torch
+
+from tests.placement.worlds import held, lidar, rig
+from torchcover.coverage import CoverageMetric, Maximum, Quantiles
+from torchcover.estimation import Estimate
+from torchcover.evaluation import CoverageObserver
+from torchcover.placement import Objective, Questions
+from torchcover.placement.racing import gains
+from torchcover.published import PUBLISHED, Setup
+
+OUTLINE_M = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
+LANE = {"lane": {"x_m": [-7.3, -2.0], "y_m": [-1.2, 1.6]}}
+TWO = rig(lidar(), lidar("low", mount={"x_m": 2.2, "z_m": 0.6}), name="two")
+
+
+def test_the_points_that_are_kept_are_those_in_the_cells_of_the_regions():
+    near = Objective(region="20m", band="obstacle"), Objective(region="20m")
+    asked = Questions.around(OUTLINE_M, {"a": near[0], "b": Objective(region=LANE, detection=0.1), "c": near[1]})
+    assert asked.thresholds_m == (0.1, 0.4)
+    assert asked.max_radius_m == 0.4
+    # Cells of half a metre whose centres lie in the lane.
+    assert asked.areas == (((0.0, 20.0), (-5.0, 5.0)), ((-7.5, -2.0), (-1.0, 1.5)))
+    assert (asked.grid.x, asked.grid.y) == ((-7.5, 20.0), (-5.0, 5.0))
+    generator = np.random.default_rng(0)
+    points = generator.uniform([-50, -45, -1], [30, 45, 3], (40_000, 3)).astype(np.float32)
+    kept = asked.asked(torch.from_numpy(points)).numpy()
+    boxes = [((0, 20), (-5, 5), (-0.5, 2)), ((-7.5, -2.0), (-1.0, 1.5), (-0.5, 2))]
+    inside = [
+        np.logical_and.reduce([(p >= low) & (p < high) for p, (low, high) in zip(points.T, box, strict=True)])
+        for box in boxes
+    ]
+    np.testing.assert_array_equal(kept, np.logical_or.reduce(inside))
+    assert 10 < inside[1].sum() < inside[0].sum() < len(points) / 10
+
+
+NUMBERS = {
+    "detection_0.4m": Objective(region="20m", band="ground"),
+    "radius_m": Objective(number="radius_m", region="20m", band="ground"),
+    "seen_by_two_0.4m": Objective(number="seen_by_two_0.4m", region="20m", band="ground"),
+    "detection_0.4m_without_top": Objective(number="detection_0.4m_without_top", region="20m", band="ground"),
+    "detection_0.4m_without_any": Objective(number="detection_0.4m_without_any", region="20m", band="ground"),
+    "radius_maximum_m": Objective(number="radius_maximum_m", region="20m", band="ground"),
+    "radius_q0.9_m": Objective(number="radius_q0.9_m", region="20m", band="ground"),
+    "radius_q0.5_m": Objective(number="radius_q0.5_m", region="20m", band="ground"),
+    "radius_m_without_any": Objective(number="radius_m_without_any", region="20m", band="ground"),
+}
+
+
+@pytest.fixture(scope="module")
+def several():
+    return held(objectives=NUMBERS)
+
+
+def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several):
+    one, two = (several.estimates(each)["area"] for each in (rig(), TWO))
+    value = dict(zip(NUMBERS, two.value.tolist(), strict=True))
+    region = several.questions.regions["20m"]
+    metric = CoverageMetric(
+        several.questions.grid,
+        max_radius=several.questions.max_radius_m,
+        blocks=16,
+        aggregations=[Maximum(), Quantiles((0.5, 0.9))],
+        regions=[region],
+        sensors=["top", "low"],
+        square_metres=True,
+    )
+    observer = CoverageObserver(metric)
+    for frame in several.frames(TWO, several.order.tolist()):
+        observer.update(frame)
+    (row,) = (row for row in observer.compute().summary() if row.height == "ground")
+    assert value["radius_m"] == row.numbers["radius_m"].value
+    for key in ("radius_maximum_m", "radius_q0.5_m", "radius_q0.9_m"):
+        assert value[key] == row.numbers[key].value
+    assert value["seen_by_two_0.4m"] == row.redundancy.seen_by["seen_by_two_0.4m"].value
+    without = {sensor: numbers["detection_0.4m"].value for sensor, numbers in row.redundancy.without.items()}
+    assert value["detection_0.4m_without_top"] == without["top"]
+    assert value["detection_0.4m_without_any"] == min(without.values()) < row.numbers["detection_0.4m"].value
+    assert value["radius_m_without_any"] == max(
+        numbers["radius_m"].value for numbers in row.redundancy.without.values()
+    )
+    # Of a rig that has no such sensor, none is lost; of one with a single sensor, all.
+    assert dict(zip(NUMBERS, one.value.tolist(), strict=True))["detection_0.4m_without_any"] == 0
+    low = several.estimates(rig(lidar("low")))["area"].value.tolist()
+    assert low[3] == low[0]
+    # Fewer metres and more detection are both a gain of the second sensor.
+    gain, error = gains(two, one)
+    assert (gain > 0).all()
+    assert (error[[0, 1]] > 0).all()
+
+
+def test_what_a_failure_leaves_is_over_known_cells_where_evaluate_has_it_so(several):
+    estimates = several.estimates(TWO)
+    by_area, by_cells = (dict(zip(NUMBERS, estimates[one].value.tolist(), strict=True)) for one in ("area", "known"))
+    region = several.questions.regions["20m"]
+    metric = CoverageMetric(
+        several.questions.grid, max_radius=several.questions.max_radius_m, regions=[region], sensors=["top", "low"]
+    )
+    observer = CoverageObserver(metric)
+    for frame in several.frames(TWO, several.order.tolist()):
+        observer.update(frame)
+    for key in ("detection_0.4m", "radius_m", "seen_by_two_0.4m", "detection_0.4m_without_top"):
+        assert by_cells[key] == float(observer.compute().estimate_of(key, region, "ground").value)
+        assert by_cells[key] != by_area[key]
+    # An aggregation is over all points of the region, whatever the means are over.
+    assert by_cells["radius_q0.9_m"] == by_area["radius_q0.9_m"]
+
+
+def test_a_search_over_known_cells_scores_what_it_is_tested_by():
+    objectives = {key: NUMBERS[key] for key in ("detection_0.4m", "detection_0.4m_without_any")}
+    found = held(objectives=objectives, estimate="known")
+    last = list(found.prefixes(TWO))[-1].estimate
+    for name in ("value", "left_out", "steps"):
+        np.testing.assert_array_equal(getattr(last, name), getattr(found.estimates(TWO)["known"], name))
+
+
+def test_a_number_without_any_sensor_says_so(several):
+    titles = dict(zip(NUMBERS, (one.title for one in several.estimates(TWO)["area"].quantities), strict=True))
+    assert titles["detection_0.4m_without_any"] == "detection within 0.4 m, without any one sensor"
+    assert titles["detection_0.4m_without_top"] == "detection within 0.4 m, without top"
+
+
+def test_numbers_that_are_by_no_choice_of_estimate_are_the_same_by_both(several):
+    both = several.estimates(TWO)
+    objectives = {
+        "known": Objective(number="known_radius_m", region="20m"),
+        "theirs": Objective(number="k_cover_2_0.4m"),
+    }
+    more = held(objectives=objectives).estimates(TWO)
+    for estimates, asked in ((both, NUMBERS), (more, objectives)):
+        pairs = zip(asked.values(), estimates["area"].value, estimates["known"].value, strict=True)
+        for objective, by_area, by_cells in pairs:
+            assert (by_area == by_cells) == (objective.own_estimate != ""), objective.key
+    assert [one.own_estimate for one in objectives.values()] == ["known", "-"]
+
+
+def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
+    estimate = several.estimates(TWO)["area"]
+    assert estimate.left_out.shape == (3, len(NUMBERS))
+    unknown = ~torch.isfinite(estimate.left_out).all(dim=0)
+    # Of a largest value no error is known.
+    assert [key for key, one in zip(NUMBERS, unknown.tolist(), strict=True) if one] == ["radius_maximum_m"]
+
+
+@pytest.mark.parametrize("key", ["object_coverage_0.4m", "k_cover_2_0.4m", "s_mig_0.2m"])
+def test_a_published_metric_says_what_it_says_of_the_same_frames(key):
+    found = held(objectives={"theirs": Objective(number=key)}, worlds=2, per_world=1)
+    estimate = found.estimates(TWO)["area"]
+    asked = found.questions
+    setup = Setup(
+        rig="two", sensors=TWO.sensors, ego=found.scenarios[0].ego_mesh(), grid=asked.grid,
+        regions=tuple(asked.regions.values()), square_metres=True,
+    )  # fmt: skip
+    name = max((name for name in PUBLISHED if key.startswith(name)), key=len)
+    metric = PUBLISHED[name].make(setup)
+    for frame in found.frames(TWO, found.order.tolist()):
+        metric.update(frame)
+    (number,) = (number for number in metric.compute() if number.quantity.key == key)
+    assert estimate.value.tolist() == [number.value]
+    (quantity,) = estimate.quantities
+    assert (quantity.key, quantity.unit) == ("theirs", number.quantity.unit)
+    assert quantity.lower_is_better == number.quantity.lower_is_better
+
+
+@pytest.mark.parametrize(
+    ("given", "near"),
+    [
+        ("detektion_0.4m", "detection_0.4m"),
+        ("radius", "radius_m"),
+        ("detection_0.4m_without_roof", "detection_0.4m_without_top"),
+        ("seen_by_too_0.4m", "seen_by_two_0.4m"),
+        ("detection_0.40m", "detection_0.4m"),
+        ("radius_maximal_m", "radius_maximum_m"),
+        ("detection_0.4.1m", "detection_0.4m"),
+        ("radius_q0.9.1_m", "radius_q0.9_m"),
+        ("s_mgi_0.2m", "s_mig_0.2m"),
+    ],
+)
+def test_a_number_that_no_result_has_is_refused_with_the_nearest(given, near):
+    asked = Questions.around(OUTLINE_M, {"odd": Objective(number=given, region="20m")})
+    with pytest.raises(ValueError, match=f"objective 'odd': no result has a number '{given}'; near is '{near}'"):
+        asked.check(TWO)
+
+
+def test_a_number_of_a_metric_that_it_does_not_have_is_refused_with_the_nearest():
+    asked = Questions.around(OUTLINE_M, {"odd": Objective(number="s_mig_0.3m")})
+    with pytest.raises(ValueError, match=r"no result has a number 's_mig_0\.3m'; near is 's_mig_0\.2m'"):
+        asked.check(TWO)
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"number": "radius_m", "detection": 0.4, "region": "20m"}, "number, detection: one of the two"),
+        ({"number": "radius_m"}, r"region: it is needed for 'radius_m' \["),
+        ({"number": "s_mgi_0.2m"}, "region: it is needed for 's_mgi_0.2m'; near is 's_mig_0.2m' of a published"),
+        ({"number": "s_mig_0.2m", "region": "20m"}, "region: 's_mig_0.2m' has none"),
+        ({"number": "s_mig_0.2m", "band": "ground"}, "band: 's_mig_0.2m' has none"),
+    ],
+)
+def test_an_objective_that_makes_no_sense_is_refused(given, message):
+    with pytest.raises(ValueError, match=message):
+        Objective(**given)
+
+
+def test_the_worst_sensor_is_the_worst_without_each_block_too():
+    from torchcover.coverage.quantity import RADIUS, detection
+    from torchcover.placement.questions import _worst
+
+    value, left_out = torch.tensor([0.4]), torch.tensor([[0.3], [0.6]])
+    other = torch.tensor([0.5]), torch.tensor([[0.5], [0.5]])
+    for quantity, expected in ((detection(0.4), [0.4, 0.3, 0.5]), (RADIUS, [0.5, 0.5, 0.6])):
+        each = [Estimate((quantity,), *one, torch.ones(2)) for one in ((value, left_out), other)]
+        worst = _worst(each)
+        assert [*worst.value.tolist(), *worst.left_out[:, 0].tolist()] == pytest.approx(expected)

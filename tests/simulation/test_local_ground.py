@@ -1,0 +1,351 @@
+"""Heights above the local ground: closed forms; neither the ego's attitude nor hills make obstacles of roads."""
+
+import dataclasses
+import math
+import pickle
+
+import numpy as np
+import pytest
+import torch
+
+from torchcover.data import RecordedFrames, SimulatedFrames, collate_frames
+from torchcover.frames.augmentation import scale
+from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.simulation import Scenario, Simulator, SurfaceReference
+from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces
+from torchcover.simulation.reference_sensor import Surroundings
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.shapes import Box, Cylinder, Mesh
+from torchcover.simulation.world import Actor, World
+from torchcover.simulation.writing import write_recording
+
+from .small_worlds import EGO, FLOOR, agrees, box, scenario, sums
+
+EGO_MESH = Box(type="box", size_m=(4, 2, 1.5)).mesh()
+
+
+def sheet(heights, half=60.0, every=5.0, down=False):
+    """A terrain over a square; `heights` of x and y."""
+    side = np.arange(-half, half + every / 2, every)
+    x, y = np.meshgrid(side, side, indexing="ij")
+    number = np.arange(x.size).reshape(x.shape)
+    here, right, above, across = number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]
+    faces = np.concatenate([np.stack(f, -1).reshape(-1, 3) for f in ((here, right, across), (here, across, above))])
+    vertices = np.stack([x.ravel(), y.ravel(), heights(x, y).ravel()], axis=1)
+    return Mesh(vertices, faces[:, ::-1] if down else faces)
+
+
+def solid(size, x=0.0, y=0.0, z=0.0, yaw=0.0):
+    return Box(type="box", size_m=size).mesh().moved(rigid(rotation_from_euler(yaw, 0, 0), [x, y, z]))
+
+
+def wedge(x, y, z):
+    """A closed ramp that rises along x."""
+    (x0, x1), (y0, y1), (z0, z1) = x, y, z
+    bottom = [[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]]
+    top = [[x1, y0, z1], [x1, y1, z1]]
+    faces = [[0, 3, 2], [0, 2, 1], [0, 5, 3], [0, 4, 5], [1, 2, 5], [1, 5, 4], [0, 1, 4], [3, 5, 2]]
+    return Mesh(np.array(bottom + top, dtype=float), np.array(faces))
+
+
+def ground_of(static, places=((0.0, 0.0, 0.0),)):
+    masks = ground_under(static, np.array(places))
+    return LocalGround([Mesh(m.vertices_m, m.faces[k]) for m, k in zip(static, masks, strict=True)], np.zeros(3))
+
+
+def heights(ground, *points):
+    return ground.heights_m(np.array(points, dtype=np.float64)).tolist()
+
+
+PLANE = sheet(lambda x, y: 0 * x)
+
+
+def test_roofs_are_no_ground_and_pavements_are():
+    house, pavement, car = solid((9, 9, 6), 20), solid((9, 3, 0.15), -20), solid((4, 2, 1.4), 0, 10)
+    ground = ground_of([PLANE, house, pavement, car])
+    found = heights(ground, [20, 0, 7], [-20, 0, 1.15], [0, 10, 1.4], [5, 5, 2], [5, 5, -1], [5, 5, -0.02])
+    np.testing.assert_allclose(found, [7, 1, 1.4, 2, np.nan, -0.02], atol=1e-5)
+    assert math.isnan(heights(ground, [500, 0, 2])[0])
+
+
+def test_a_ramp_a_bridge_and_the_road_below_it():
+    up = wedge((10, 30), (-3, 3), (0, 5))
+    deck = solid((20, 6, 0.8), 40, 0, 4.2)
+    down = wedge((10, 30), (-3, 3), (0, 5)).moved(rigid(rotation_from_euler(180, 0, 0), [80, 0, 0]))
+    ground = ground_of([PLANE, up, deck, down])
+    found = heights(ground, [20, 0, 2.5], [20, 0, 3.5], [40, 0, 6], [40, 0, 2], [40, 0, 4.6], [40, 10, 6], [55, 0, 6])
+    # On the ramp, above it, above the deck, below it, in it (where the road is the ground), beside, on the way down.
+    np.testing.assert_allclose(found, [0, 1, 1, 2, 4.6, 6, 6 - 3.75], atol=1e-5)
+    # A bridge without a ramp is a roof.
+    np.testing.assert_allclose(heights(ground_of([PLANE, deck]), [40, 0, 6]), [6], atol=1e-5)
+
+
+def test_the_decks_of_a_car_park_and_the_stairs_between_them():
+    stairs = [solid((0.3, 2, 0.18 * (k + 1)), 5 + 0.3 * k, 12) for k in range(16)]
+    deck = solid((30, 20, 0.3), 24.65, 12, 0.18 * 17 - 0.3)
+    pillar = Cylinder(type="cylinder", radius_m=0.3, height_m=2.76).mesh().moved(rigid(np.eye(3), [24, 14, 0]))
+    ground = ground_of([PLANE, *stairs, deck, pillar])
+    top = 0.18 * 17
+    found = heights(ground, [24, 12, 1.5], [24, 12, top + 1.5], [6.5, 12, 2.0], [8, 0, 1.0])
+    np.testing.assert_allclose(found, [1.5, 1.5, 2.0 - 0.18 * 6, 1.0], atol=1e-5)
+
+
+@pytest.mark.parametrize("down", [False, True])
+def test_a_terrain_whichever_way_its_faces_look(down):
+    slope = sheet(lambda x, y: 0.1 * x - 0.05 * y, down=down)
+    ground = ground_of([slope])
+    rng = np.random.default_rng(1)
+    points = np.column_stack([rng.uniform(-59, 59, (300, 2)), np.full(300, 30.0)])
+    expected = 30 - 0.1 * points[:, 0] + 0.05 * points[:, 1]
+    np.testing.assert_allclose(ground.heights_m(points), expected, atol=1e-4)
+    assert np.isnan(ground.heights_m(points - [0, 0, 60])).all()
+    assert ground.is_above(np.array([0.0, 0.0, -0.5]))
+    assert not ground.is_above(np.array([0.0, 0.0, 0.5]))
+
+
+def test_heights_are_those_along_the_vertical_of_the_world_in_any_frame():
+    ground = ground_of([PLANE, solid((9, 3, 0.15), -20)])
+    rng = np.random.default_rng(2)
+    world = np.column_stack([rng.uniform(-50, 50, (200, 2)), rng.uniform(-0.03, 9, 200)])
+    pose = rigid(rotation_from_euler(70, 3, -2), [4, -7, 1.0])
+    inside = (world - pose[:3, 3]) @ pose[:3, :3]
+    np.testing.assert_allclose(ground.heights_m(inside, pose), ground.heights_m(world), atol=1e-4)
+
+
+def test_steep_faces_and_what_is_far_above_are_nobodys_ground():
+    assert level_faces(wedge((0, 1), (0, 1), (0, 0.9))).sum() == 2
+    assert level_faces(wedge((0, 1), (0, 1), (0, 1.1))).sum() == 0
+    walls = [solid((0.2, 40, 5), 5), solid((0.2, 40, 5), -5)]
+    assert np.isnan(heights(ground_of(walls), [0, 0, 1])).all()
+    roof = solid((9, 9, 0.2), 0, 0, 3)
+    assert np.isnan(heights(ground_of([*walls, roof]), [0, 0, 4])).all()
+    # Far below, or a sheet above if there is nothing else: the ego is below the ground.
+    for z in (0.9, 1.5, -30.0):
+        assert math.isclose(heights(ground_of([PLANE, roof], [(0, 0, z)]), [20, 0, 1])[0], 1, abs_tol=1e-5)
+    assert math.isclose(heights(ground_of([PLANE, roof], [(0, 0, 3.3)]), [0, 0, 4])[0], 0.8, abs_tol=1e-5)
+
+
+def test_bounds_of_heights_hold_every_point_of_a_triangle():
+    bumpy = sheet(lambda x, y: 2 * np.sin(x / 9) + np.cos(y / 7) + 0.02 * x, half=100, every=4)
+    ground = ground_of([bumpy, solid((9, 9, 0.15), 30, 0, 3.0), solid((20, 20, 1), -40, 0, 6.0)], [(0, 0, 1)])
+    rng = np.random.default_rng(3)
+    middle = np.column_stack([rng.uniform(-110, 110, (4000, 2)), rng.uniform(-4, 9, 4000)])
+    triangles = (middle + rng.normal(0, 1, (3, 4000, 3)) * rng.choice([0.1, 1, 6], 4000)[:, None]).swapaxes(1, 2)
+    low, high = ground.squares.heights_m(triangles)
+    for _ in range(20):
+        share = rng.dirichlet([0.5] * 3)
+        found = ground.heights_m(np.einsum("c,cin->ni", share, triangles))
+        known = np.isfinite(found)
+        assert (found[known] >= low[known]).all()
+        assert (found[known] <= high[known]).all()
+
+
+def scan(world, sensor, seed, step=0):
+    scene = Scene(world)
+    return sensor.scan(Surroundings(scene, scene.at(step), np.random.default_rng(seed), "a test"))
+
+
+def resting(static, **pose):
+    place = [pose.pop(key, 0.0) for key in ("x", "y", "z")]
+    matrix = rigid(rotation_from_euler(*(pose.get(key, 0.0) for key in ("yaw", "pitch", "roll"))), place)
+    return World(tuple(static), Actor("ego", "ego", EGO_MESH, Trajectory.from_poses([0.0], matrix[None])))
+
+
+AREA = (((5.0, 45.0), (-10.0, 10.0)),)
+OBSTACLE = SurfaceReference(AREA, rays=600, places=2, bands_m=((0.5, 2.0),), band_frame="ground")
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.06, -0.06])
+def test_the_wall_on_a_slope_is_cut_at_heights_above_the_slope(at, slope):
+    at([2.6, 0.0, 1.0])
+    wall = Mesh(np.array([[25, -8, -5], [25, 8, -5], [25, 8, 9], [25, -8, 9.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    world = resting([sheet(lambda x, y: slope * x + 0.04 * y), wall], pitch=-math.degrees(math.atan(slope)))
+    found = [scan(world, OBSTACLE, seed) for seed in range(40)]
+    for one in found:
+        assert ((one.heights_m >= 0.5) & (one.heights_m < 2)).all()
+        np.testing.assert_allclose(one.points[:, 0] - 25 * math.hypot(1, slope), 0, atol=1.0)
+    agrees(np.array([one.weights.astype(np.float64).sum() for one in found]), 16 * 1.5)
+
+
+def test_drawing_by_height_is_unbiased_for_any_number_of_rays_and_bands_that_overlap():
+    waves = sheet(lambda x, y: np.sin(x / 11), every=2)
+    made = resting([waves, solid((4, 4, 3), 20, 0, -1), solid((2, 9, 2), 30, 3, -1)])
+    areas = (((5.0, 45.0), (-10.0, 10.0)), ((15.0, 25.0), (-5.0, 5.0)))
+    bands = ((0.5, 2.0), (-0.5, 0.5), (0.2, 1.0))
+
+    def both(rays, places, count):
+        sensor = SurfaceReference(areas, rays, places, bands, band_frame="ground")
+        sums = []
+        for seed in range(count):
+            one = scan(made, sensor, seed)
+            low = (one.heights_m < 0.5) & (one.points[:, 0] > 6)
+            sums.append([one.weights[low].sum(), one.weights[one.heights_m >= 0.5].sum()])
+        return np.array(sums, dtype=np.float64)
+
+    many = both(20_000, 8, 25)
+    for rays, places, count in ((400, 2, 200), (30, 1, 500)):
+        few = both(rays, places, count)
+        error = np.hypot(*(kind.std(axis=0, ddof=1) / math.sqrt(len(kind)) for kind in (few, many)))
+        assert (np.abs(few.mean(axis=0) - many.mean(axis=0)) < 4 * error).all()
+        assert (error < 0.1 * many.mean(axis=0)).all()
+
+
+def test_on_level_ground_both_frames_are_one(at):
+    at([2.6, 0.0, 1.0])
+    wall = box([0.2, 10, 3], x_m=20)
+    made = scenario({**FLOOR, "ground": True}, wall)
+    for frame in ("ground", "vehicle"):
+        sensor = SurfaceReference((((15.0, 25.0), (-6.0, 6.0)),), 500, 1, ((0.5, 2.0),), band_frame=frame)
+        agrees(sums(made, sensor), 15.0)
+
+
+def test_bodies_that_move_are_cut_at_heights_above_the_ground_below_them(at):
+    at([2.6, 0.0, 1.0])
+    hill = sheet(lambda x, y: 0.08 * x)
+    times = np.array([0.0, 1.0])
+    lane = np.array([[20.0, -4, 1.6], [21, -4, 1.68]])
+    truck = Actor("t", "truck", solid((6, 2, 3)), Trajectory(times, lane, np.zeros((2, 3))))
+    drive = Trajectory(times, np.array([[0.0, 0, 0], [1, 0, 0.08]]), np.zeros((2, 3)))
+    world = World((hill,), Actor("ego", "ego", EGO_MESH, drive), (truck,), 1.0, 1.0)
+    only = [scan(world, OBSTACLE, seed) for seed in range(60)]
+    for one in only:
+        assert ((one.heights_m >= 0.5) & (one.heights_m < 2)).all()
+    # The side that is turned to the ego, and the rear, which is upright: 1.5 m of each, within a bevel of the slope.
+    weights = np.array([one.weights[one.points[:, 1] > -3.001].sum() for one in only], dtype=np.float64)
+    agrees(weights, 6 * 1.5, within=0.05)
+
+
+def attitudes():
+    return [{}, {"pitch": 2.0}, {"pitch": -2.0}, {"roll": 2.0}, {"pitch": 1.5, "roll": -1.5}]
+
+
+def test_heights_and_bands_do_not_know_the_attitude_of_the_ego():
+    """The same places in the world, whichever way the ego leans."""
+    static = [sheet(lambda x, y: 0.03 * x), solid((3, 3, 2.5), 20, 2), solid((8, 3, 0.15), -20, 0, -0.6)]
+    rng = np.random.default_rng(4)
+    places = np.column_stack([rng.uniform(-50, 50, (2000, 2)), rng.uniform(-1, 4, 2000)])
+    found = []
+    for pose in attitudes():
+        world = resting(static, z=0.1, **pose)
+        instant = Scene(world).at(0)
+        inside = (places - instant.world_T_vehicle[:3, 3]) @ instant.world_T_vehicle[:3, :3]
+        found.append(instant.heights_m(inside.astype(np.float32)))
+    for other in found[1:]:
+        np.testing.assert_allclose(other, found[0], atol=2e-4)
+
+
+@pytest.mark.parametrize("scenario_name", ["urban"])
+def test_no_static_surface_changes_its_band_in_a_hundred_steps_of_a_hilly_street(scenario_name):
+    frames = SimulatedFrames(scenario_name, "front_roof_32", steps=100, seed=5, every_s=0.2)
+    scene, _ = frames.simulator.scene_of(0)
+    rng = np.random.default_rng(6)
+    static = scene.world.static
+    ground_m, house_m = (mesh.vertices_m[mesh.faces].mean(axis=1) for mesh in (static[0], static[2]))
+    start = scene.world.ego.trajectory.at(0.0)[:3, 3]
+    near = [p[np.linalg.norm(p - start, axis=1) < 200] for p in (ground_m, house_m)]
+    places = np.concatenate([p[rng.integers(len(p), size=1500)] for p in near])
+    places[:, 2] += rng.uniform(0, 3, len(places))
+    bands = np.array([-0.5, 0.5, 2.0])
+    first = None
+    tilts = []
+    for index in range(100):
+        at, step = frames.simulator.scene_of(index)
+        assert at is scene
+        instant = scene.at(step)
+        inside = (places - instant.world_T_vehicle[:3, 3]) @ instant.world_T_vehicle[:3, :3]
+        found = instant.heights_m(inside.astype(np.float32)).astype(np.float64)
+        first = found if first is None else first
+        clear = (np.abs(first[:, None] - bands) > 1e-3).all(axis=1)
+        assert (np.digitize(found, bands) == np.digitize(first, bands))[clear].all()
+        tilts.append(np.digitize(inside[:, 2], bands))
+    assert (np.ptp(tilts, axis=0) > 0).mean() > 0.1  # by z of the vehicle frame many change
+
+
+def test_who_stands_below_the_ground_is_refused_and_a_sheet_buries_nobody():
+    flat = {True: sheet(lambda x, y: 0 * x, down=True), False: PLANE}
+    for mesh in flat.values():
+        instant = Scene(resting([mesh])).at(0)
+        assert not instant.buried(np.array([3.0, 0.0, 0.3]))
+        assert instant.buried(np.array([3.0, 0.0, -0.3]))
+    roof = sheet(lambda x, y: 0 * x + 3, half=5)
+    inside = solid((4, 4, 2), 8)
+    instant = Scene(resting([PLANE, roof, inside])).at(0)
+    assert not instant.buried(np.array([3.0, 0.0, 0.5]))  # under an open roof whose faces look up
+    assert instant.buried(np.array([8.0, 0.0, 1.0]))
+
+
+def test_a_terrain_sheet_gives_the_same_numbers_whichever_way_its_faces_look():
+    """Waves, walls and a rig's worth of points; what is refused is the same, too."""
+    found = {}
+    for down in (False, True):
+        world = resting([sheet(lambda x, y: 0.3 * np.sin(x / 8), down=down), solid((1, 6, 2), 15, 2, -0.5)])
+        sensor = SurfaceReference(AREA, 2000, 4, ((-0.5, 0.5), (0.5, 2.0)), band_frame="ground")
+        scans = [scan(world, sensor, seed) for seed in range(12)]
+        found[down] = [[one.weights.sum(), one.points.sum(), one.redrawn] for one in scans]
+    np.testing.assert_allclose(np.sum(found[True], axis=0), np.sum(found[False], axis=0), rtol=1e-2)
+    assert [row[2] for row in found[True]] == [row[2] for row in found[False]]
+
+
+def test_frames_carry_heights_everywhere_they_go(tmp_path):
+    frames = SimulatedFrames("courtyard", "front_roof_32", steps=2, boxes=True)
+    frame = frames[0]
+    assert frame.reference_heights_m.shape == frame.reference_weights.shape
+    assert frame.counts["reference_no_ground"] == int(frame.reference_heights_m.isnan().sum())
+    assert torch.equal(pickle.loads(pickle.dumps(frame)).reference_heights_m, frame.reference_heights_m)
+    assert torch.equal(frame.to("cpu").reference_heights_m, frame.reference_heights_m)
+    batch = collate_frames([frame, frames[1]])
+    assert [len(h) for h in batch.heights_m] == [len(points) for points in batch.reference]
+    with pytest.raises(ValueError, match="heights_m: frame"):
+        _ = collate_frames([frame, dataclasses.replace(frame, reference_heights_m=None)]).heights_m
+    assert collate_frames([dataclasses.replace(frame, reference_heights_m=None)]).heights_m is None
+    torch.testing.assert_close(scale(frame, 2.0).reference_heights_m, 2 * frame.reference_heights_m)
+    write_recording(frames, tmp_path / "there")
+    again = RecordedFrames(tmp_path / "there")[0]
+    assert torch.equal(again.reference_heights_m, frame.reference_heights_m)
+    torch.testing.assert_close(again.boxes.bottom_heights_m, frame.boxes.bottom_heights_m)
+
+
+def test_boxes_know_how_high_their_bottoms_are():
+    frames = SimulatedFrames("urban", "front_roof_32", steps=1, seed=2, boxes=True)
+    boxes = frames[0].boxes
+    assert len(boxes) > 20
+    assert boxes.bottom_heights_m.abs().max() < 0.3
+    assert (boxes.centre_m[:, 2] - boxes.size_m[:, 2] / 2).abs().max() > 1.0
+
+
+def test_a_scenario_says_its_ground_or_is_told_what_was_taken():
+    wall = box([0.2, 10, 3], x_m=20)
+    deck = {"name": "deck", "shape": {"type": "box", "size_m": [9, 9, 4]}, "poses": [{"x_m": -30}]}
+    guessed = Simulator(scenario(FLOOR, wall, deck), {}, OBSTACLE)
+    assert "of 'floor'; bodies with" in guessed.ground_words
+    said = Simulator(scenario(FLOOR, wall, {**deck, "ground": True}), {}, OBSTACLE)
+    assert said.ground_words == ""
+    assert [bool(mask.any()) for mask in said.scene_of(0)[0].is_ground] == [False, False, True]
+    nothing = Simulator(scenario(wall, ego={**EGO, "pose": {"z_m": 30}}), {}, OBSTACLE)
+    assert "none was found" in nothing.ground_words
+    seen = nothing.step(0)
+    assert len(seen.reference) == 0
+
+
+def test_what_cannot_be_ground_is_refused():
+    part = {"name": "p", "ground": True, "shape": {"type": "box", "size_m": [1, 1, 1]}}
+    with pytest.raises(ValueError, match="part 'p' is ground"):
+        Vehicle.model_validate({"name": "v", "parts": [part]})
+    upright = {
+        "name": "wall",
+        "ground": True,
+        "shape": {"type": "plane", "size_m": [9, 9]},
+        "poses": [{"roll_deg": 90}],
+    }
+    with pytest.raises(ValueError, match="body 'wall' is ground, but none of its faces"):
+        scenario(FLOOR, upright).world()
+    with pytest.raises(ValueError, match="band_frame: ground or vehicle is needed; got 'world'"):
+        SurfaceReference(AREA, band_frame="world")
+
+
+def test_the_courtyard_says_what_would_have_been_found():
+    world = Scenario.load("courtyard").world()
+    said, found = (Scene(dataclasses.replace(world, ground=known)).is_ground for known in (world.ground, None))
+    assert [mask.tolist() for mask in said] == [mask.tolist() for mask in found]

@@ -1,0 +1,136 @@
+"""Meshes that lie: sheets that face the wrong way, faces that are there twice, decals, bodies with holes."""
+
+import warnings
+
+import numpy as np
+import pytest
+import trimesh
+
+from torchcover.geometry import rigid
+from torchcover.simulation import SurfaceReference
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.shapes import Box, Ellipsoid, Mesh, Plane
+from torchcover.simulation.sound import coincident_faces, told
+
+from .small_worlds import AHEAD, ALL_HEIGHTS, FLOOR, agrees, box, scenario, sums
+
+CUBE = Box(type="box", size_m=(2, 2, 2)).mesh()
+
+
+def file_body(folder, mesh, name="body"):
+    path = folder / f"{name}.ply"
+    trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False).export(path)
+    return {"name": name, "shape": {"type": "mesh", "path": str(path)}}
+
+
+def grid(n=8, half=40.0):
+    side = np.linspace(-half, half, n + 1)
+    x, y = np.meshgrid(side, side, indexing="ij")
+    number = np.arange(x.size).reshape(x.shape)
+    here, right, above, across = number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]
+    faces = np.concatenate([np.stack(f, -1).reshape(-1, 3) for f in ((here, right, across), (here, across, above))])
+    return Mesh(np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1), faces)
+
+
+def turned(mesh, which):
+    faces = mesh.faces.copy()
+    faces[which] = faces[which, ::-1]
+    return Mesh(mesh.vertices_m, faces)
+
+
+@pytest.mark.parametrize(
+    "mesh",
+    [CUBE, Ellipsoid(type="ellipsoid", size_m=(2, 1, 1)).mesh(), Plane(type="plane", size_m=(3, 3)).mesh(), grid()],
+)
+@pytest.mark.parametrize("inside_out", [False, True])
+def test_sound_meshes_are_told_nothing_about(mesh, inside_out):
+    mesh = turned(mesh, slice(None)) if inside_out else mesh
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert told("it", mesh) is mesh
+
+
+def test_what_is_wrong_is_said_with_the_name_and_the_share():
+    with pytest.warns(UserWarning, match=r"body 'a': 3 of 15 of its faces are there more than once"):
+        once = told("body 'a'", Mesh(CUBE.vertices_m, np.concatenate([CUBE.faces, CUBE.faces[[0, 5, 5], ::1]])))
+    assert len(once.faces) == 12
+    with pytest.warns(UserWarning, match=r"body 'b': the normals of neighbours disagree at 3 of 18 of its inner edges"):
+        told("body 'b'", turned(CUBE, [4]))
+    with pytest.warns(UserWarning, match=r"body 'c': 6 of 18 of its edges have a face on one side only"):
+        told("body 'c'", Mesh(CUBE.vertices_m, CUBE.faces[2:]))
+
+
+def test_faces_coincide_with_what_looks_the_same_way():
+    plane, cube = Plane(type="plane", size_m=(30, 30)).mesh(), CUBE
+    decal = Plane(type="plane", size_m=(0.5, 0.5)).mesh().moved(rigid(np.eye(3), [9, 9, 5e-4]))
+    far = decal.moved(rigid(np.eye(3), [0, 0, 2e-3]))
+
+    def counts(*meshes):
+        return [int(mask.sum()) for mask in coincident_faces(meshes, [False] * len(meshes))]
+
+    assert counts(plane, cube) == [0, 0]  # it stands on the plane, and nobody sees its bottom
+    assert counts(plane, decal)[1] == 2
+    assert counts(plane, decal)[0] >= 1
+    assert counts(plane, far) == [0, 0]
+    assert counts(plane, plane) == [2, 2]
+    assert counts(cube, cube) == [12, 12]
+    # A pavement whose top is in the plane of a sheet, whichever way the sheet looks.
+    sunk = Mesh(cube.vertices_m - [0, 0, 2], cube.faces)
+    assert counts(turned(plane, slice(None)), sunk)[1] == counts(plane, sunk)[1] == 2
+
+
+@pytest.mark.filterwarnings("ignore:.*faces lie within 1 mm")
+@pytest.mark.parametrize("rays", [400, 20])
+@pytest.mark.parametrize("raised_m", [5e-4, 0.0, -5e-4])
+def test_a_decal_on_the_road_counts_once(at, raised_m, rays):
+    at([2.5, 0.3, 1.0])
+    decal = {"name": "decal", "shape": {"type": "plane", "size_m": [8, 6]}, "poses": [{"x_m": 12, "z_m": raised_m}]}
+    sensor = SurfaceReference((AHEAD,), rays=rays, places=1, bands_m=ALL_HEIGHTS)
+    agrees(sums(scenario(FLOOR, decal), sensor, steps=200), 200.0)
+    agrees(sums(scenario(FLOOR, decal), sensor, lambda points: points[:, 0].astype(float), steps=200), 200.0 * 14)
+
+
+def test_doubled_faces_count_once(at, tmp_path):
+    at([2.5, 3.0, 2.5])
+    cube = Mesh(CUBE.vertices_m * [1, 1, 0.75] + [10, 0, 0], CUBE.faces)
+    twice = file_body(tmp_path, Mesh(cube.vertices_m, np.tile(cube.faces, (2, 1))))
+    sensor = SurfaceReference((AHEAD,), rays=1000, places=1, bands_m=((0.5, 2.0),))
+    with pytest.warns(UserWarning, match=r"body 'body': 12 of 24 of its faces are there more than once"):
+        found = sums(scenario(twice, FLOOR), sensor)
+    agrees(found, 2.0 + 2.0 + 4.0)
+
+
+def test_two_bodies_at_one_place_count_once_and_are_named(at):
+    at([2.5, 3.0, 2.5])
+    one = box([2, 2, 1.5], x_m=10)
+    other = {**one, "name": "again"}
+    sensor = SurfaceReference((AHEAD,), rays=1000, places=1, bands_m=((0.5, 2.0),))
+    with pytest.warns(
+        UserWarning, match=r"'box' \(10 of 12 of the faces\), 'again' \(10 of 12 of the faces\): faces lie"
+    ):
+        found = sums(scenario(one, other, FLOOR), sensor)
+    agrees(found, 2.0 + 2.0 + 4.0)
+
+
+@pytest.mark.parametrize("flipped", [slice(0, 0), slice(None, None, 2)])
+def test_scenarios_and_movers_name_the_body_of_a_file(tmp_path, flipped):
+    lying = file_body(tmp_path, turned(Mesh(CUBE.vertices_m, CUBE.faces[2:]), flipped))
+    what = "normals of neighbours disagree" if flipped.step else "6 of 18 of its edges"
+    with pytest.warns(UserWarning, match=f"body 'body': .*{what}"):
+        scenario({**lying, "poses": [{"z_m": 0.5}]}, FLOOR).world()
+    with pytest.warns(UserWarning, match=f"ego: .*{what}"):
+        scenario(FLOOR, ego={"shape": lying["shape"]}).world()
+
+
+@pytest.mark.filterwarnings("ignore:.*normals of neighbours disagree")
+@pytest.mark.parametrize("kind", ["up", "down", "mixed"])
+def test_a_terrain_sheet_gives_its_area_whichever_way_its_faces_look(at, tmp_path, kind):
+    mesh = grid()
+    which = {"up": [], "down": slice(None), "mixed": slice(None, None, 2)}[kind]
+    at([2.5, 0.3, 1.0])
+    sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=ALL_HEIGHTS)
+    body = file_body(tmp_path, turned(mesh, which))
+    agrees(sums(scenario(body), sensor), 200.0)
+    instant = Scene(scenario(body).world()).at(0)
+    assert not instant.buried(np.array([3.0, 0.0, 0.4]))
+    assert instant.buried(np.array([3.0, 0.0, -0.4]))

@@ -1,0 +1,29 @@
+"""Names mean one thing: what a reader has learnt of one in a room holds in all others."""
+
+import ast
+from collections import defaultdict
+from pathlib import Path
+
+PACKAGE = Path(__file__).parents[1] / "torchcover"
+
+
+def public_classes(folder):
+    """Name of each public class -> the files that define one."""
+    found = defaultdict(list)
+    for path in sorted(folder.rglob("*.py")):
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                found[node.name].append(path.relative_to(folder).as_posix())
+    return found
+
+
+def test_no_two_public_classes_share_a_name():
+    found = public_classes(PACKAGE)
+    assert len(found) > 200
+    assert {name: files for name, files in found.items() if len(files) > 1} == {}
+
+
+def test_a_second_class_of_a_name_would_be_found(tmp_path):
+    for file in ("one.py", "other.py"):
+        Path(tmp_path, file).write_text("class Scan: ...\nclass _Own: ...\n", encoding="utf-8")
+    assert public_classes(tmp_path) == {"Scan": ["one.py", "other.py"]}

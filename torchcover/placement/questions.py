@@ -1,0 +1,325 @@
+"""What objectives ask around one vehicle, and what observes a rig for it: who observes it in `evaluate`, too."""
+
+import math
+import re
+import warnings
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, CoverageMetric, MeanOfMeans, Measure, Region
+from torchcover.coverage.grid import PAPER_HEIGHTS
+from torchcover.coverage.quantity import RADIUS, detection, without
+from torchcover.estimation import Estimate
+from torchcover.evaluation import CoverageObserver
+from torchcover.evaluation.measuring import BLOCKS
+from torchcover.frames import Frame
+from torchcover.placement.objective import THRESHOLD_M, Objective, published_numbers
+from torchcover.published import PUBLISHED, FrameMetric, Setup, Sights
+from torchcover.simulation import Areas, RegionsOfInterest, Rig, SurfaceReference
+from torchcover.simulation.regions_of_interest import RegionOfInterest
+from torchcover.simulation.shapes import Mesh
+
+# Of the cells of a search.
+CELL_M = 0.5
+# What stands in a key for the sensor without which the number is worst.
+ANY = "any"
+SEEN_WITHIN = re.compile(r"(?:detection|sensors|seen_by_two)_(\d+(?:\.\d+)?)m")
+FAILURE = re.compile(r"(.+)_without_(.+)")
+
+
+class Questions(NamedTuple):
+    """What objectives ask around one vehicle.
+
+    Args:
+        objectives: By name.
+        regions: By name, all that are asked about.
+        grid: Cells of 0.5 m around these, or as `evaluate` has them where a published metric is asked for.
+        max_radius_m: Where radii saturate: as in `evaluate`, or at the largest threshold if no radius is asked for.
+        thresholds_m: Of all detections.
+    """
+
+    objectives: Mapping[str, Objective]
+    regions: Mapping[str, Region]
+    grid: BevGrid
+    max_radius_m: float
+    thresholds_m: tuple[float, ...]
+
+    @classmethod
+    def around(cls, ego_outline_m: NDArray[np.float64], objectives: Mapping[str, Objective]) -> Self:
+        """What follows for one vehicle.
+
+        Args:
+            ego_outline_m: (K, 2) its corners x, y.
+            objectives: By name.
+
+        Raises:
+            ValueError: A region or a band that is none; two regions of one name; one that holds no cell centre.
+        """
+        usual = {region.name: region for region in RegionsOfInterest().around(ego_outline_m).regions}
+        regions: dict[str, Region] = {}
+        for name, objective in objectives.items():
+            try:
+                for region in objective.regions(usual):
+                    if regions.setdefault(region.name, region) != region:
+                        raise ValueError(f"region {region.name!r}: another objective calls another region so")
+                objective.check_bands()
+            except ValueError as error:
+                raise ValueError(f"objective {name!r}: {error}") from error
+        published = any(objective.metric for objective in objectives.values())
+        regions = regions or usual
+        bands = [band for objective in objectives.values() for _, band in objective.places]
+        written = {name: _written(region) for name, region in regions.items()}
+        heights = {band: PAPER_HEIGHTS[band] for band in (PAPER_HEIGHTS if published else bands)}
+        grid = RegionsOfInterest(regions=written, heights=heights).around(ego_outline_m, CELL_M).grid
+        keys = [objective.key for objective in objectives.values()]
+        thresholds = sorted({float(each) for key in keys for each in SEEN_WITHIN.findall(key)})
+        within = all(SEEN_WITHIN.match(key) for key in keys) and max(thresholds) > 0
+        max_radius_m = max(thresholds) if within else grid.diagonal_m
+        return cls(
+            objectives, regions, grid if published else _around(grid, regions.values()), max_radius_m, tuple(thresholds)
+        )
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """The published metrics that are asked for."""
+        return tuple(dict.fromkeys(one.metric for one in self.objectives.values() if one.metric is not None))
+
+    @property
+    def boxes(self) -> bool:
+        """Whether one of them is about objects."""
+        return any("boxes" in PUBLISHED[name].needs for name in self.metrics)
+
+    @property
+    def areas(self) -> Areas:
+        """Rectangles of whole cells around the regions: a cell counts as a whole, so that all of it is to be probed."""
+        return tuple(_whole_cells(self.grid, region.mask(self.grid)) for region in self.regions.values())
+
+    def reference_sensor(self, rays: int) -> SurfaceReference:
+        """One that is aimed at what is asked about."""
+        return SurfaceReference.from_rays(self.areas, rays, tuple(self.grid.heights.values()), self.grid.band_frame)
+
+    def asked(self, points: Tensor, height: Tensor | None = None) -> Tensor:
+        """(M,) bool: which of (M, 3) points lie in a region and band that is asked about, or any for other metrics.
+
+        Args:
+            points: In the vehicle frame.
+            height: As in `BevGrid.bins`.
+        """
+        if self.metrics:
+            return torch.ones(len(points), dtype=torch.bool)
+        cells = torch.zeros(self.grid.shape, dtype=torch.bool)
+        bands = list(self.grid.heights)
+        for objective in self.objectives.values():
+            for region, band in objective.places:
+                cells[bands.index(band)] |= self.regions[region].mask(self.grid)
+        inside, of, cell = self.grid.bins(points, height)
+        kept = torch.zeros(len(points), dtype=torch.bool)
+        kept[inside[of[cells.view(-1)[cell]]]] = True
+        return kept
+
+    def check(self, rig: Rig, ego: Mesh | None = None) -> None:
+        """Refuse objectives that are numbers of no result.
+
+        Args:
+            rig: One that may be scored.
+            ego: The body that carries it.
+
+        Raises:
+            ValueError: Such a one; the message has the nearest name.
+        """
+        asked = self._replace(thresholds_m=self.thresholds_m or (THRESHOLD_M,))
+        numbers = asked.numbers_of(rig, ego)
+        with warnings.catch_warnings(action="ignore"):  # that they were fed with nothing
+            of_coverage = [one.key for one in numbers.coverage["area"].compute().every_quantity]
+            known = {name: [one.key for one in metric.estimate().quantities] for name, metric in numbers.others.items()}
+        single = (RADIUS, *map(detection, asked.thresholds_m))
+        others = [one.key for kind in AGGREGATIONS for one in kind.parse(kind.example).quantities]
+        of_coverage += [one.key for one in (*single, *(without(ANY, each) for each in single))] + others
+        for name, objective in self.objectives.items():
+            keys = known.get(objective.metric or "", of_coverage)
+            if objective.key not in keys:
+                keys = keys if objective.metric else [*keys, *published_numbers()]
+                near = get_close_matches(objective.key, keys, n=1, cutoff=0.0)
+                raise ValueError(f"objective {name!r}: no result has a number {objective.key!r}; near is {near[0]!r}")
+
+    @property
+    def aggregations(self) -> tuple[Aggregation, ...]:
+        """Those whose numbers are asked for."""
+        keys = {objective.key for objective in self.objectives.values()}
+        return tuple(one for kind in AGGREGATIONS if (one := kind.of_keys(keys)))
+
+    def numbers_of(self, rig: Rig, ego: Mesh | None = None, measures: Sequence[Measure] = ("area",)) -> "RigNumbers":
+        """What observes a rig, fed with nothing yet.
+
+        Args:
+            rig: The sensors.
+            ego: The body that carries it.
+            measures: What numbers of the coverage are means over.
+        """
+        keys = [one.key for one in self.objectives.values() if one.metric is None]
+        failures = any(map(_of_failures, keys))
+        regions = tuple(self.regions.values())
+        observers: dict[Measure, CoverageObserver] = {}
+        for measure in measures:
+            if "area" in observers and not failures:  # which has the means over known cells, too
+                observers[measure] = observers["area"]
+                continue
+            coverage = CoverageMetric(
+                self.grid,
+                self.thresholds_m,
+                max_radius=self.max_radius_m,
+                blocks=BLOCKS,
+                aggregations=self.aggregations,
+                regions=regions,
+                sensors=_names(rig) if failures else (),
+                square_metres=measure == "area",
+                sync_on_compute=False,
+            )
+            observers[measure] = CoverageObserver(coverage, rig.name)
+        setup = Setup(
+            rig=rig.name,
+            sensors=rig.sensors,
+            ego=ego,
+            grid=self.grid,
+            regions=regions,
+            square_metres=True,
+            threshold_m=max(self.thresholds_m, default=THRESHOLD_M),
+            sights=Sights(),
+            sync_on_compute=False,
+        )
+        others = {name: PUBLISHED[name].make(setup) for name in self.metrics}
+        return RigNumbers(self, rig, observers, others)
+
+
+@dataclass(frozen=True, eq=False)
+class RigNumbers:
+    """What observes a rig for its objectives: those who observe it in `evaluate`.
+
+    Args:
+        questions: What is asked.
+        rig: The sensors.
+        coverage: Its coverage, by what its numbers are means over; one for both where that knows both.
+        others: Published metrics, by name.
+    """
+
+    questions: Questions
+    rig: Rig
+    coverage: Mapping[Measure, CoverageObserver]
+    others: Mapping[str, FrameMetric]
+
+    def update(self, frame: Frame) -> None:
+        """Add a frame."""
+        for observer in dict.fromkeys(self.coverage.values()):
+            observer.update(frame)
+        for metric in self.others.values():
+            metric.update(frame)
+
+    def estimate(self, measure: Measure) -> Estimate:
+        """The objectives so far, each a quantity under its own name.
+
+        Args:
+            measure: What numbers of the coverage are means over; one of those that it was made for.
+        """
+        answers = self._answers(measure)
+        steps = max((one.steps for each in answers.values() for one in each), key=len)
+        quantities, values, left_out = [], [], []
+        for name, each in answers.items():
+            quantities.append(each[0].quantities[0]._replace(key=name))
+            values.append(torch.cat([one.value for one in each]).mean())
+            whole = all(len(one.left_out) == len(steps) for one in each)
+            unknown = torch.full((len(steps),), math.nan, dtype=torch.float64)
+            left_out.append(torch.cat([one.left_out for one in each], dim=1).mean(dim=1) if whole else unknown)
+        return Estimate(tuple(quantities), torch.stack(values), torch.stack(left_out, dim=1), steps)
+
+    def _answers(self, measure: Measure) -> dict[str, list[Estimate]]:
+        """Name of each objective -> its number in each of its places."""
+        metric, objectives, regions = self.coverage[measure].metric, self.questions.objectives, self.questions.regions
+        plain = [quantity.key for quantity in MeanOfMeans(metric.thresholds).quantities]
+        places = list(dict.fromkeys(place for one in objectives.values() for place in one.places))
+        if measure == "area" and all(one.metric or one.key in plain for one in objectives.values()):
+            by_area = metric.estimates([(regions[region], band) for region, band in places], measure)
+            found = dict(zip(places, by_area, strict=True))
+
+            def number(key: str, place: tuple[str, str]) -> Estimate:
+                return _chosen(found[place], key)
+        else:
+            coverage = metric.compute()
+
+            def number(key: str, place: tuple[str, str]) -> Estimate:
+                if not metric.square_metres:
+                    key = key.removeprefix("known_")
+                elif measure == "known" and key in plain:
+                    key = f"known_{key}"
+                return coverage.estimate_of(key, regions[place[0]], place[1])
+
+        def answer(key: str, place: tuple[str, str]) -> Estimate:
+            alone, sensor = failed.groups() if (failed := FAILURE.match(key)) else (key, "")
+            if sensor == ANY:
+                worst = _worst([number(f"{alone}_without_{one}", place) for one in metric.sensors])
+                title = worst.quantities[0].title.removesuffix(metric.sensors[0]) + "any one sensor"
+                return replace(worst, quantities=(worst.quantities[0]._replace(title=title),))
+            return number(key if sensor in ("", *metric.sensors) else alone, place)  # what is not there cannot fail
+
+        return {
+            name: [answer(one.key, place) for place in one.places]
+            or [_chosen(self.others[str(one.metric)].estimate(), one.key)]
+            for name, one in objectives.items()
+        }
+
+
+def _of_failures(key: str) -> bool:
+    """Whether only a metric that is told of the sensors gives the number."""
+    return FAILURE.match(key) is not None or not key.startswith(("radius", "detection", "known_"))
+
+
+def _chosen(estimate: Estimate, key: str) -> Estimate:
+    at = [quantity.key for quantity in estimate.quantities].index(key)
+    return estimate[at : at + 1]
+
+
+def _worst(each: Sequence[Estimate]) -> Estimate:
+    """The worst of one number of several rigs, and so without each block."""
+    quantity = each[0].quantities[0]
+    value, left_out = (torch.stack(parts) for parts in zip(*((one.value, one.left_out) for one in each), strict=True))
+    worst: Any = torch.amax if quantity.lower_is_better else torch.amin
+    return Estimate(each[0].quantities, worst(value, dim=0), worst(left_out, dim=0), each[0].steps)
+
+
+def _names(rig: Rig) -> tuple[str, ...]:
+    return tuple(sensor.name for sensor in rig.sensors)
+
+
+def _written(region: Region) -> RegionOfInterest:
+    if region.corners_m:
+        return RegionOfInterest(polygon_m=region.corners_m)
+    return RegionOfInterest(x_m=region.x, y_m=region.y)
+
+
+def _around(grid: BevGrid, regions: Collection[Region]) -> BevGrid:
+    """The part of a grid that holds some regions: the same cells, but fewer."""
+
+    def outside(edges: Tensor, bounds: Sequence[tuple[float, float]]) -> tuple[float, float]:
+        low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
+        return float(edges[edges <= low].max()), float(edges[edges >= high].min())
+
+    x, y = outside(grid.x_edges_m, [one.x for one in regions]), outside(grid.y_edges_m, [one.y for one in regions])
+    return BevGrid(x, y, grid.cell, grid.heights, grid.band_frame)
+
+
+def _whole_cells(grid: BevGrid, mask: Tensor) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The rectangle around cells."""
+    (y_low, y_high), (x_low, x_high) = (
+        (float(edges[used.min()]), float(edges[used.max() + 1]))
+        for edges, used in (
+            (grid.y_edges_m, mask.any(dim=1).nonzero()),
+            (grid.x_edges_m, mask.any(dim=0).nonzero()),
+        )
+    )
+    return (x_low, x_high), (y_low, y_high)

@@ -1,0 +1,122 @@
+"""What a search, and a choice, write: the same kinds of files and one page."""
+
+import csv
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from torchcover import __version__
+from torchcover.evaluation import sensor_views
+from torchcover.evaluation.progress import held_back
+from torchcover.evaluation.result_page import rig_document, words_of
+from torchcover.evaluation.settings import FILES, wanted_files
+from torchcover.files import Publication
+from torchcover.placement.fresh import finite
+from torchcover.report import Page, PagePicture, PageRig, PageTable, page_html
+from torchcover.simulation import Rig
+
+OF_THE_RUN = ("seconds", "torchcover", "space_sha256")
+
+
+@dataclass(frozen=True, eq=False)
+class PlacementReport:
+    """What was found, for its files, its page, and the terminal.
+
+    Args:
+        title: Of the page.
+        sentence: The last line of all.
+        record: What stands in `search.json`; what is unknown may be NaN.
+        settings: The names in it that the page shows.
+        rigs: Those that were found, by the name of their file.
+        shown: Rigs that the page shows, by what they are.
+        tables: On the page; the first is printed, too.
+        rows: Tables by the name of their CSV file, each with its headings.
+        pictures: Makes the stem of the file, what it shows and a figure of its own, one after the other.
+        ego_outline_m: (K, 2) corners x, y of the vehicle.
+    """
+
+    title: str
+    sentence: str
+    record: Mapping[str, Any]
+    settings: Sequence[str]
+    rigs: Mapping[str, Rig]
+    shown: Mapping[str, Rig]
+    tables: Sequence[PageTable]
+    rows: Mapping[str, Iterable[Iterable[object]]]
+    pictures: Callable[[], Iterator[tuple[str, str, Figure]]]
+    ego_outline_m: NDArray[np.float64]
+
+    def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
+        """Write the files of the command line: first what was found, then the pictures and the page.
+
+        Args:
+            folder: Where to write the rigs, the tables, `search.json`, the pictures, `report.html`, and, last,
+                `summary.json`. Made if it does not exist; files of an earlier run that its `summary.json` lists are
+                deleted.
+            files: What to write beside `summary.json`, as in `Result.save`; "maps" are the pictures.
+
+        Returns:
+            The files.
+        """
+        wanted = wanted_files(files)
+        summary = {"torchcover": __version__, "complete": True, "sentence": self.sentence}
+        with Publication(Path(folder)) as written:
+            with held_back():  # what was found is safe before anything ends this
+                if "numbers" in wanted:
+                    self._add_numbers(written)
+                written.publish(summary)
+            pictures = []
+            for stem, words, figure in self.pictures() if wanted & {"maps", "page"} else ():
+                png = BytesIO()
+                figure.savefig(png, dpi=figure.dpi)
+                pictures.append(PagePicture(words, png.getvalue()))
+                if "maps" in wanted:
+                    written.add(f"{stem}.png", partial(Path.write_bytes, data=png.getvalue()))
+            if "page" in wanted:
+                written.add_text("report.html", page_html(self._page(pictures)))
+            written.publish(summary)
+        return written.paths
+
+    def _add_numbers(self, files: Publication) -> None:
+        for name, rig in self.rigs.items():
+            files.add(name, rig.save)
+        for name, rows in self.rows.items():
+            files.add(name, partial(_write_rows, rows))
+        record = json.dumps(finite({**self.record, "sentence": self.sentence}), indent=2, allow_nan=False)
+        files.add_text("search.json", f"{record}\n")
+
+    def _page(self, pictures: Sequence[PagePicture]) -> Page:
+        record = finite(self.record)
+        facts = {"Settings": self.settings, "Run": [name for name in OF_THE_RUN if name in record]}
+        return Page(
+            title=self.title,
+            lead=self.sentence,
+            tables=self.tables,
+            pictures=pictures,
+            rigs=[
+                PageRig(f"{what}: {rig.name}", sensor_views(rig.sensors), rig_document(rig.name, rig.sensors))
+                for what, rig in self.shown.items()
+            ],
+            ego_outline_m=self.ego_outline_m,
+            facts={title: words_of({name: record[name] for name in names}) for title, names in facts.items()},
+        )
+
+
+def _write_rows(rows: Iterable[Iterable[object]], path: Path) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows([*map(_cell, row)] for row in rows)
+
+
+def _cell(value: object) -> object:
+    """What stands in a table; nothing for what is unknown."""
+    if value is None or value != value:
+        return ""
+    return f"{value:.9g}" if isinstance(value, float) else value

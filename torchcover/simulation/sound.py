@@ -1,0 +1,161 @@
+"""What is wrong with meshes, said by name: normals that disagree, bodies that are open, surfaces that coincide."""
+
+import warnings
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.simulation.patches import connected, edges_of, outward_faces
+from torchcover.simulation.raycaster import RayCaster
+from torchcover.simulation.shapes import Mesh
+
+Bools = NDArray[np.bool_]
+Float64 = NDArray[np.float64]
+
+# Surfaces that are nearer to each other are one; nearer than the other, float32 cannot tell that they are two.
+COINCIDE_M = 1e-3
+APART_M = 1e-4
+# The cosine of the angle between two that coincide, at least.
+ALIKE = 0.9
+# Of a face so many points are asked along each side, of one that is longer than the other many.
+SIDE_POINTS, LONG_SIDE_POINTS, LONG_M = 2, 10, 4.0
+# Of a sheet all normals add up to its area, of what is nearly closed to nothing: what is below is meant to be closed.
+BODY_SHARE = 0.5
+
+
+def told(owner: str, mesh: Mesh) -> Mesh:
+    """A mesh with each face once, and warnings of what else is wrong with it.
+
+    Args:
+        owner: What the warnings call it.
+        mesh: Vertices and faces.
+
+    Warns:
+        UserWarning: Faces that are there twice, neighbours whose normals disagree, or a body that is not closed.
+    """
+    edge, way = edges_of(mesh)
+    once = _first_of_each(edge, way)
+    if len(once) < len(mesh.faces):
+        doubled = len(mesh.faces) - len(once)
+        _warn(owner, f"{_share(doubled, len(mesh.faces))} of its faces are there more than once, and count once")
+        mesh = Mesh(mesh.vertices_m, mesh.faces[once])
+        edge, way = edges_of(mesh)
+    faces = np.bincount(edge, weights=way != 0)
+    turns = np.bincount(edge, weights=way)
+    shared = faces == 2
+    disagree = shared & (np.abs(turns) == 2)
+    if disagree.any():
+        _warn(
+            owner,
+            f"the normals of neighbours disagree at {_share(int(disagree.sum()), int(shared.sum()))} of its inner "
+            "edges: both sides of its faces count, and nothing lies inside of it; make its normals consistent in a "
+            "modelling tool",
+        )
+    elif (faces % 2 == 1).any():
+        surface = connected(edge, np.arange(len(edge)) // 3, len(mesh.faces))
+        is_open = np.bincount(surface[np.flatnonzero((faces % 2 == 1)[edge]) // 3], minlength=len(mesh.faces)) > 0
+        missing = is_open[surface] & _encloses(mesh, surface)[surface]
+        if missing.any():
+            _warn(
+                owner,
+                f"{_share(int((faces % 2 == 1).sum()), int((faces > 0).sum()))} of its edges have a face on one side "
+                "only, though it looks like a body: rays pass through the holes, and nothing lies inside of it; close "
+                "it in a modelling tool",
+            )
+    return mesh
+
+
+def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Bools]:
+    """Which faces coincide with another one that looks the same way, or may be seen from both sides, within 1 mm.
+
+    Points of the faces are asked; of two surfaces that cover each other in a small part only, that may be overlooked.
+
+    Args:
+        meshes: What never moves, near the origin.
+        within: For each mesh, whether its faces may coincide with each other, too: parts of a vehicle that end in one
+            plane are no lie.
+
+    Returns:
+        One (F,) mask for each mesh.
+    """
+    corners_m = np.concatenate([mesh.vertices_m[mesh.faces] for mesh in meshes])
+    outward = np.concatenate([outward_faces(mesh) for mesh in meshes])
+    across = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    length = np.linalg.norm(across, axis=1, keepdims=True)
+    normals = across / np.where(length == 0, 1.0, length)
+    number = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
+    longest_m = np.linalg.norm(corners_m - np.roll(corners_m, 1, axis=1), axis=2).max(axis=1)
+    caster, found = RayCaster(meshes), np.zeros(len(corners_m), dtype=bool)
+    for is_long, points in ((False, SIDE_POINTS), (True, LONG_SIDE_POINTS)):
+        faces = np.flatnonzero(((longest_m > LONG_M) == is_long) & (length[:, 0] > 0))
+        for shares in _inner_points(points):
+            places_m = np.einsum("c,fcd->fd", shares, corners_m[faces])
+            # From above, to what lies on it or is the same; from within, to what lies below.
+            for start_m in (COINCIDE_M, -APART_M):
+                met = caster.faces_met(
+                    places_m + start_m * normals[faces], -normals[faces], COINCIDE_M + max(start_m, -COINCIDE_M / 2)
+                )
+                other = (met >= 0) & (met != faces)
+                other &= (number[met] != number[faces]) | np.array(within, dtype=bool)[number[faces]]
+                one, two = faces[other], met[other]
+                cosine = (normals[one] * normals[two]).sum(axis=1)
+                # Back to back they are seen from different sides: by nobody, that of a body that stands on a sheet.
+                apart = (outward[one] & outward[two]) | (outward[one] & (normals[one, 2] < -ALIKE))
+                apart |= outward[two] & (normals[two, 2] < -ALIKE)
+                same = (cosine > ALIKE) | ((cosine < -ALIKE) & ~apart)
+                found[one[same]] = found[two[same]] = True
+    return np.split(found, np.cumsum([len(mesh.faces) for mesh in meshes])[:-1])
+
+
+def warn_of_coincidence(names: Sequence[str], coincident: Sequence[Bools]) -> None:
+    """Warn of bodies whose surfaces coincide with others.
+
+    Args:
+        names: Of the bodies, one for each mesh.
+        coincident: From `coincident_faces`.
+    """
+    shares = {
+        name: f"{name!r} ({_share(int(mask.sum()), len(mask))} of the faces)"
+        for name, mask in zip(names, coincident, strict=True)
+        if mask.any()
+    }
+    if shares:
+        warnings.warn(
+            f"{', '.join(list(shares.values())[:5])}: faces lie within {COINCIDE_M * 1000:g} mm of others that look "
+            "the same way; of those that cover each other one counts",
+            stacklevel=3,
+        )
+
+
+def _first_of_each(edge: NDArray[np.int64], way: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Numbers of the faces but those that have the same edges as one before, run through the same way."""
+    triples = edge.reshape(-1, 3) * 3 + 1 + way.reshape(-1, 3)
+    _, first = np.unique(np.sort(triples, axis=1), axis=0, return_index=True)
+    return np.sort(first)
+
+
+def _encloses(mesh: Mesh, surface: NDArray[np.int64]) -> Bools:
+    """(F,) whether the surface of that number looks like a body: its normals point to all sides."""
+    first, second, third = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
+    normals = np.cross(second - first, third - first)
+    sums = np.stack([np.bincount(surface, axis, minlength=len(mesh.faces)) for axis in normals.T])
+    area = np.bincount(surface, np.linalg.norm(normals, axis=1), minlength=len(mesh.faces))
+    encloses: Bools = np.linalg.norm(sums, axis=0) < BODY_SHARE * area
+    return encloses
+
+
+def _inner_points(side: int) -> Float64:
+    """(N, 3) shares of the corners of a triangle, of points spread over it."""
+    a, b = np.indices((side, side)).reshape(2, -1)
+    inside = a + b < side
+    second, third = (a[inside] + 1 / 3) / side, (b[inside] + 1 / 3) / side
+    return np.stack([1 - second - third, second, third], axis=1)
+
+
+def _share(count: int, of: int) -> str:
+    return f"{count:,} of {of:,}"
+
+
+def _warn(owner: str, what: str) -> None:
+    warnings.warn(f"{owner}: {what}", stacklevel=4)
