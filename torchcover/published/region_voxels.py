@@ -11,7 +11,7 @@ from torchcover.simulation import Sensor
 from torchcover.simulation.memory import check_fits
 
 # 60 x 40 x 4 m about the vehicle, as Hu et al. 2022 and those after them.
-REGION = BoundingBox((-30.0, -20.0, -0.5), (30.0, 20.0, 3.5))
+REGION: BoundingBox = BoundingBox((-30.0, -20.0, -0.5), (30.0, 20.0, 3.5))
 
 
 def checked_grid(region: BoundingBox, voxel_m: float, bytes_a_voxel: int) -> VoxelGrid:
