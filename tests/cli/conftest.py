@@ -8,8 +8,9 @@ from torchcover.cli import app
 
 
 @pytest.fixture
-def torchcover(monkeypatch, capsys):
-    """Run the command in this process; returns exit code, stdout, stderr."""
+def torchcover(monkeypatch, capsys, tmp_path):
+    """Run the command in this process, in a folder of its own; returns exit code, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["torchcover", *map(str, arguments)])
