@@ -25,7 +25,8 @@ sys.addaudithook(_told)
 
 @pytest.fixture
 def torchcover(monkeypatch, capsys, tmp_path):
-    """Run the command in this process, which may write nothing in place; returns exit code, stdout, stderr."""
+    """Run the command in a folder of its own, where it writes nothing in place; returns exit code, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
 
     def run(*arguments):
         monkeypatch.setattr(sys, "argv", ["torchcover", *map(str, arguments)])

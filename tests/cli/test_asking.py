@@ -78,7 +78,8 @@ def test_the_sensor_behind_is_what_the_place_behind_depends_on(evaluate, torchco
         found = by_place[row["region"], row["height"]]
         for key in ("radius_m", "detection_2m"):
             assert float(found[f"{key}_without_rear"]) == pytest.approx(float(row[key]), rel=1e-12)
-    code, printed, _ = torchcover("compare", worlds / "out" / "coverage.npz", worlds / "alone" / "coverage.npz")
+    files = [worlds / name / "coverage.npz" for name in ("out", "alone")]
+    code, printed, _ = torchcover("compare", *files, "--out", worlds / "compared")
     assert code == 0
     assert "behind" in printed
     assert "out: change of detection" in " ".join(printed.split())
