@@ -1,16 +1,13 @@
-"""Are results safe from kills? Runs into a folder that holds a good result, killed at random and at every file.
+"""Are results safe from kills? Every command, killed at each of its file operations, and real runs killed at random.
 
-Every run is a fork of this process, so that it need not import anything. Of four, three are killed as they write,
-rename or delete a file of the folder, at places spread over the whole run; the others at random.
-
-What is there afterwards is *the earlier result*; *the new one*, perhaps without maps or cut short, which it says;
-*incomplete*: no `summary.json`; or BROKEN: a `summary.json` that lists files which are missing or of another run, or a
-folder that the next run cannot use.
+Every run is a fork of this process, so that it need not import anything, into a folder that holds an earlier result.
+What a reader then finds is *the earlier* result, *the new* one, perhaps without its maps, or neither: *lost*. Of a
+recording, which has no earlier one, it is lost if what is there is read although it is a part, or `--resume` does not
+make it whole.
 """
 
 import argparse
 import importlib
-import itertools
 import json
 import os
 import random
@@ -20,147 +17,221 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from contextlib import redirect_stderr, redirect_stdout, suppress
+from functools import partial
 from pathlib import Path
-from unittest import mock
 
+import torch
 from matplotlib.figure import Figure
 
 from benchmarks.timing import table
 from tests.cli.hostile import RIG, YARD
-from torchcover import Coverage
-from torchcover.cli import app
-from torchcover.files import claimed
+from tests.killing import operations_of
+from tests.placement.surfaces import Surface
+from torchcover import evaluation
+from torchcover.cli import app, search_run
+from torchcover.data import open_recording
+from torchcover.evaluation import result
+from torchcover.files import SUMMARY, claimed, reads
+from torchcover.placement import SearchPlan
 
-SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT)
-# Of Python's audit events.
-TOUCHES = ("open", "os.rename", "os.remove", "os.rmdir")
-EARLIER_STEPS, STEPS = 2, 12
-COMMAND = ("torchcover", "evaluate", "rig.yaml", "--scenario", "yard.yaml", "--rays", "64", "--cell-m", "8")
+SPACE = """name: roof
+start: rig.yaml
+scenario: urban
+free: {top: {x_m: [-0.6, 0.8], z_m: 1.8}}
+objectives: {near: {region: 20m}}
+"""
+CHOICE = """name: corners
+scenario: yard.yaml
+candidates:
+  small:
+    sensor: {type: lidar, channels: 8, vertical_fov_deg: [-30, 0], horizontal_fov_deg: 180, columns: 9, max_range_m: 9}
+    places: {front: {x_m: 2.1, z_m: 1.0}, rear: {x_m: -2.1, z_m: 1.0, yaw_deg: 180}, roof: {z_m: 2.0}}
+choose: {at_most: 2}
+cost: {small: 1}
+objective: {detection: 1.0, band: ground, region: 20m}
+"""
+WORLD = ("--scenario", "yard.yaml")
+SMALL = (*WORLD, "--rays", "64", "--cell-m", "8", "--steps", "2")
+# Each with a seed, so that an earlier result is another one.
+RESULTS = {
+    "evaluate": ("evaluate", "rig.yaml", *SMALL),
+    "evaluate --resume": ("evaluate", "rig.yaml", *SMALL, "--resume"),
+    "compare": ("compare", "rig.yaml", "other.yaml", *SMALL),
+    "targets": ("targets", "rig.yaml", "--raster", "3,5,-1,1,1"),
+    "search": ("search", "space.yaml", "--evaluations", "2"),
+    "search, a choice": ("search", "choice.yaml", "--rays", "256", "--per-world", "1"),
+    "study": ("study", "rig.yaml", *WORLD, "--rays", "64", "--steps", "2", "--long-run-steps", "8"),
+    "agree": ("agree", "place3d2024", "--scenario", "courtyard", "--metrics", "point_density", "--steps", "1"),
+}
+RECORDINGS = {
+    "record": ("record", "rig.yaml", *WORLD, "--rays", "64", "--steps", "2"),
+    "record --format kitti": ("record", "rig.yaml", *WORLD, "--rays", "64", "--steps", "2", "--format", "kitti"),
+}
+REAL = ("evaluate", "front_roof_32", "--scenario", "urban", "--steps", "4", "--workers", "2")
+# What takes long in a command, and touches no file of its result.
+SLOW = {"study": "error_against_time", "agree": "agree"}
+SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+VERDICTS = ("the earlier", "the new", "lost")
+DOCUMENTS = {
+    "rig": RIG,
+    "other": RIG.replace("name: r", "name: other").replace("z_m: 2.0", "z_m: 1.0"),
+    "yard": YARD,
+    "space": SPACE,
+    "choice": CHOICE,
+}
 # What a run imports late; a fork has it already.
-IMPORTED = ("torchcover.evaluation.study", "torchcover.cli.printing", "pykdtree.kdtree")
-# Blank ones: drawing takes most of the time.
-MAPS = mock.patch(
-    "torchcover.evaluation.result.map_figures", return_value=[(name, Figure((1, 1))) for name in ("map1", "map2")]
-)
+IMPORTED = ("torchcover.evaluation.study", "torchcover.cli.printing", "torchcover.recordings", "pykdtree.kdtree")
 
 
 def main():
-    """Print what is there after how many kills."""
+    """Print what is there after each kill, and how much is lost of all."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=60)
+    parser.add_argument("--commands", default=";".join([*RECORDINGS, *RESULTS]), help="separated by semicolons")
+    parser.add_argument("--kills", type=int, default=70, help="of real runs, at random")
     options, _ = parser.parse_known_args()
     for name in IMPORTED:
         importlib.import_module(name)
-    chance, found, codes = random.Random(0), Counter(), Counter()
+    torch.set_num_threads(1)  # others do not survive a fork
     with tempfile.TemporaryDirectory() as place:
-        good, whole, log = Path(place, "good"), Path(place, "whole"), Path(place, "log")
-        Path(place, "rig.yaml").write_text(RIG)
-        Path(place, "yard.yaml").write_text(YARD)
         os.chdir(place)
-        assert code_of(started(good, EARLIER_STEPS)) == 0
-        shutil.copytree(good, whole)
-        start = time.perf_counter()
-        assert code_of(started(whole, STEPS, lambda name: log.open("a").write(f"{name}\n"))) == 0
-        seconds, touched = time.perf_counter() - start, log.read_text().splitlines()
-        at_files = options.kills * 3 // 4
-        for kill in range(options.kills):
-            out, number = Path(place, f"out{kill}"), SIGNALS[kill % 3]
-            shutil.copytree(good, out)
-            if kill < at_files:
-                at = kill * len(touched) // at_files
-                when, code = named(touched[at]), code_of(started(out, STEPS, kills_at(at, number)))
-            else:
-                when, pid = "at random", started(out, STEPS)
-                time.sleep(chance.uniform(0.0, seconds))
-                os.kill(pid, number)
-                code = code_of(pid)
-            found[when, number.name, verdict(out, next_run=number == signal.SIGKILL)] += 1
-            codes[number.name, code] += 1
-    table(("killed at", "signal", "what is there", "runs"), [(*what, count) for what, count in sorted(found.items())])
-    print("\nExit codes (below 0: the signal's): ", end="")
-    print("; ".join(f"{name} {code}: {count}" for (name, code), count in sorted(codes.items())))
+        for name, text in DOCUMENTS.items():
+            Path(f"{name}.yaml").write_text(text)
+        at_random = killed_at_random(options.kills) if options.kills else []
+        rows = [
+            (name, *(killed_result(RESULTS[name]) if name in RESULTS else killed_recording(RECORDINGS[name])))
+            for name in options.commands.split(";")
+        ]
+        os.chdir("/")
+    table(("command", "file operations", "the earlier", "the new", "lost"), rows)
+    print()
+    table(("real runs, killed at random", "runs", "the earlier", "the new", "lost"), at_random)
+    print(f"\nLost: {sum(row[-1] for row in (*rows, *at_random))}")
 
 
-def started(out, steps, on_touch=None):
-    """Run the command line in a fork; its process id.
-
-    Args:
-        out: The folder of its result.
-        steps: Steps.
-        on_touch: Called with the event and the file before a file in the folder is written, renamed or deleted.
-    """
-    if pid := os.fork():
-        return pid
+def run(command, out, *options):
+    """Run the command line in this process, which is to be a fork."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # which is ignored where this runs in the background
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 1)
     os.dup2(nowhere, 2)
-    inside = f"{out}{os.sep}"
-
-    def told(event, arguments):
-        # Where a file is opened for reading nothing can break.
-        if event in TOUCHES and str(arguments[0]).startswith(inside) and arguments[1] not in ("r", "rb"):
-            on_touch(f"{event} {str(arguments[0]).removeprefix(inside)}")
-
-    if on_touch:
-        sys.addaudithook(told)
-    sys.argv = [*COMMAND, "--steps", str(steps), "--out", str(out)]
-    code = 1
+    sys.argv = ["torchcover", *command, *options, "--out", str(out)]
+    if "space.yaml" in command:  # instants are made up
+        makes = lambda space, plan, seed, worlds: Surface(seed, worlds, plan.per_world)  # noqa: E731
+        search_run.SearchPlan = partial(SearchPlan, instants=makes)
+    if command is not REAL:  # drawing takes most of the time
+        result.map_figures = lambda *_, **__: [("map1", Figure((1, 1)))]
     try:
-        with MAPS:
-            app.main()
+        app.main()
     except SystemExit as end:
-        code = end.code
-    finally:
-        os._exit(code)
+        os._exit(end.code or 0)
 
 
-def kills_at(place, number):
-    """Send a signal to this process at a touch of this place in their order."""
-    touches = itertools.count()
-    return lambda _: os.kill(os.getpid(), number) if next(touches) == place else None
+def killed_result(command):
+    """How many operations a command has, and how often what is there after a kill at each is what."""
+    if command[0] in SLOW:  # and touches no file of a result: done once, after which nothing else is computed here
+        remember(SLOW[command[0]], command)
+    place = Path(tempfile.mkdtemp(dir="."))
+    earlier, whole = place / "earlier", place / "whole"
+    assert operations_of(lambda: run(command, earlier, "--seed", "1"))[1] == 0
+    shutil.copytree(earlier, whole)
+    count, code = operations_of(lambda: run(command, whole))
+    assert code == 0
+    found = Counter()
+    for at in range(count):
+        out = place / str(at)
+        shutil.copytree(earlier, out)
+        operations_of(lambda out=out: run(command, out), at)
+        found[verdict(out, files_of(earlier), files_of(whole))] += 1
+        shutil.rmtree(out)
+    return count, *(found[name] for name in VERDICTS)
 
 
-def code_of(pid):
-    """The exit code of a process, once it has ended; minus the signal's number, if one has ended it."""
-    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+def remember(name, command):
+    """Have what a command computes computed now."""
+    done, compute = [], getattr(evaluation, name)
+
+    def once(*given, **more):
+        if not done:
+            done.append(compute(*given, **more))
+        return done[0]
+
+    setattr(evaluation, name, once)
+    sys.argv = ["torchcover", *command, "--out", tempfile.mkdtemp(dir=".")]
+    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere), suppress(SystemExit):
+        app.main()
 
 
-def named(touch):
-    """Where a touch is, without what changes from run to run: the name of the partial folder."""
-    event, name = touch.split(" ", 1)
-    first, _, rest = name.partition("/")
-    if first.startswith(".partial_"):
-        return f"{event} {rest or 'what is left of it'}, aside"
-    return f"{event} {name}"
+def killed_recording(command):
+    """The same of a recording: the earlier is none, or a part that is not read and gone on with."""
+    place = Path(tempfile.mkdtemp(dir="."))
+    count, code = operations_of(lambda: run(command, place / "whole"))
+    assert code == 0
+    frames = len(open_recording(place / "whole").names)
+    found = Counter()
+    for at in range(count):
+        out = place / str(at)
+        operations_of(lambda out=out: run(command, out), at)
+        name = "the new"
+        try:
+            if len(open_recording(out).names) != frames:
+                name = "lost"
+        except (ValueError, OSError):
+            name = "the earlier"
+        if operations_of(lambda out=out: run(command, out, "--resume"))[1]:
+            name = "lost"
+        found[name if len(open_recording(out).names) == frames else "lost"] += 1
+    return count, *(found[name] for name in VERDICTS)
 
 
-def verdict(out, *, next_run):
-    """What a user finds, and the next run."""
-    with claimed(out):  # which puts in their places what could not be put there
-        found = _found(out)
-    if next_run and (code_of(started(out, EARLIER_STEPS)) or _found(out) != "the earlier result"):
-        return "BROKEN: not for the next run"
-    return found
+def killed_at_random(kills):
+    """Runs in a city, with workers, ended by each signal in turn."""
+    place, chance = Path(tempfile.mkdtemp(dir=".")), random.Random(0)
+    earlier, whole = place / "earlier", place / "whole"
+    assert operations_of(lambda: run(REAL, earlier, "--seed", "1"))[1] == 0
+    shutil.copytree(earlier, whole)
+    start = time.perf_counter()
+    assert operations_of(lambda: run(REAL, whole))[1] == 0
+    seconds, found = time.perf_counter() - start, {number: Counter() for number in SIGNALS}
+    for kill in range(kills):
+        out, number = place / str(kill), SIGNALS[kill % len(SIGNALS)]
+        shutil.copytree(earlier, out)
+        if not (pid := os.fork()):
+            run(REAL, out)
+            os._exit(1)
+        time.sleep(chance.uniform(0.0, seconds))
+        os.kill(pid, number)
+        os.waitpid(pid, 0)
+        found[number][verdict(out, files_of(earlier), files_of(whole))] += 1
+        shutil.rmtree(out)
+    return [(one.name, each.total(), *(each[name] for name in VERDICTS)) for one, each in found.items()]
 
 
-def _found(out):
-    if not (out / "summary.json").exists():
-        return "incomplete"
-    try:
-        summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-        steps = Coverage.load(out / "coverage.npz").counts["steps"]
-        missing = [name for name in summary["files"] if not (out / name).is_file()]
-    except (OSError, ValueError, KeyError) as error:
-        return f"BROKEN: {error!r}"
-    maps = {path.relative_to(out).as_posix() for path in out.glob("maps/*")}
-    if missing or summary["counts"]["steps"] != steps or (steps == EARLIER_STEPS and not maps):
-        return "BROKEN: mixed"
-    if steps == EARLIER_STEPS:
-        return "the earlier result"
-    if steps != STEPS or not summary["complete"]:
-        return "BROKEN: claims to be complete" if summary["complete"] else "the new one, cut short"
-    return "the new one" if maps.issubset(summary["files"]) and maps else "the new one, without maps"
+@reads("a file of a result")
+def content(path):
+    """What a reader finds."""
+    return path.read_bytes()
+
+
+def files_of(out):
+    """The files of a result, as a reader finds them, by name."""
+    names = json.loads(content(out / SUMMARY))["files"]
+    return {name: content(out / name) for name in (*names, SUMMARY)}
+
+
+def verdict(out, earlier, whole):
+    """What a reader finds, and still does once all files are in their places."""
+    verdicts = set()
+    for _ in range(2):
+        try:
+            found = files_of(out)
+        except (OSError, ValueError, KeyError):
+            found = {}
+        mixed = [name for name in found if found[name] == earlier.get(name) != whole.get(name)]
+        verdicts.add("the earlier" if found == earlier else "lost" if mixed or not found else "the new")
+        with claimed(out):
+            pass
+    return verdicts.pop() if len(verdicts) == 1 else "lost"
 
 
 if __name__ == "__main__":
