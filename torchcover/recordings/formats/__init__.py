@@ -74,6 +74,8 @@ def open_recording(path: str | os.PathLike[str], format_name: str | None = None)
 
 def _frames_written(path: Path) -> set[str] | None:
     """The frames of a recording that torchcover has written; None of any other one."""
+    if not path.is_dir():  # a bag may be one file
+        return None
     for folder in (path, path / "training"):  # which is KITTI's
         if notes := noted(folder):
             raise ValueError(
