@@ -47,10 +47,8 @@ def test_points_are_those_of_a_simulation_with_the_target_in_the_world(name, hea
         assert seen.state[row, column] == FREE
         x_m, y_m = seen.x_m[column], seen.y_m[row]
         simulator = Simulator(with_target(scenario, target.name, x_m, y_m, yaw[row, column]), {"r": sensors}, REFERENCE)
-        step = simulator.step(0)
-        ends = np.cumsum(step.sensor_points["r"])
-        clouds = np.split(step.clouds["r"], ends[:-1])
-        counts = [on_target(cloud, target, x_m, y_m, yaw[row, column]) for cloud in clouds]
+        scans = simulator.step(0).scans["r"]
+        counts = [on_target(scan.points, target, x_m, y_m, yaw[row, column]) for scan in scans]
         assert seen.sensor_points[:, row, column].tolist() == counts
         assert seen.sensors[row, column] == sum(count >= 5 for count in counts)
         compared += sum(count > 0 for count in counts)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.frames import Frame
+from torchcover.frames.frame import ON_OBJECT_WITHIN_M
 from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
 from torchcover.published.sights import Sights, count_in_boxes, rig_of
@@ -118,9 +119,10 @@ class PerceptionEntropy(WorldRatios):
         hits = self.sights.hits(frame, rig)
         if not self.cameras:
             return standard_deviation(hits, "lidar")
-        of_cameras = [cloud for name, cloud in frame.clouds_by_sensor(rig).items() if name in self.cameras]
+        clouds = frame.clouds_by_sensor(rig, within_m=ON_OBJECT_WITHIN_M)
+        of_cameras = [cloud for name, cloud in clouds.items() if name in self.cameras]
         pixels = count_in_boxes(torch.cat(of_cameras), self.sights.boxes(frame)).to(hits)
         kinds = [standard_deviation(pixels, "camera")]
-        if len(of_cameras) < len(frame.clouds_by_sensor(rig)):
+        if len(of_cameras) < len(clouds):
             kinds.append(standard_deviation(hits - pixels, "lidar"))
         return late_fusion(kinds)
