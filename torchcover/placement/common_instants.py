@@ -67,7 +67,7 @@ class HeldWorlds(Dataset[Frame]):
         scans = self._with(rig, instant.scenario).scans(instant.step)[rig.name]
         counts = {"rays": sum(scan.rays for scan in scans), "self_hits": sum(scan.self_hits for scan in scans)}
         frame = replace(held, **of_rigs({rig.name: rig}, {rig.name: scans}), counts=counts)
-        return frame if held.boxes is None else with_boxes(frame, held.boxes)
+        return frame if held.boxes is None else with_boxes(frame, held.boxes, {rig.name: rig})
 
     def _built(self, instant: HeldInstant, number: int) -> Frame:
         frames = self._simulations[instant.scenario]

@@ -225,7 +225,7 @@ class SimulatedFrames(FrameDataset):
             counts=seen.counts,
             place_in_time=self.simulator.place_in_time(index),
         )
-        return with_boxes(frame, self._boxes(index, seen.drawn)) if self.boxes else frame
+        return with_boxes(frame, self._boxes(index, seen.drawn), self.rigs) if self.boxes else frame
 
     def _boxes(self, index: int, drawn: NDArray[np.int64] | None) -> Boxes:
         found = self.simulator.labels(index)
@@ -264,10 +264,16 @@ def of_rigs(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) 
     return {"clouds": clouds, "measured": measured, "sensor_points": points}
 
 
-def with_boxes(frame: Frame, boxes: Boxes) -> Frame:
+def with_boxes(frame: Frame, boxes: Boxes, rigs: Mapping[str, Rig]) -> Frame:
     """The frame with its objects, and how many points each of its rigs has on them."""
-    clouds = {rig: frame.cloud_of(rig, within_m=ON_OBJECT_WITHIN_M) for rig in frame.clouds}
-    return replace(frame, boxes=with_hits(boxes, clouds))
+    clouds = {name: frame.cloud_of(name, within_m=ON_OBJECT_WITHIN_M) for name in frame.clouds}
+    counts_as = {}
+    for name, rig in rigs.items():
+        if any(sensor.counts_as > 1 for sensor in rig.sensors):
+            of_sensors = frame.clouds_by_sensor(name, within_m=ON_OBJECT_WITHIN_M).values()
+            each = torch.tensor([sensor.counts_as for sensor in rig.sensors])
+            counts_as[name] = each.repeat_interleave(torch.tensor([len(cloud) for cloud in of_sensors]))
+    return replace(frame, boxes=with_hits(boxes, clouds, counts_as))
 
 
 def _error_m(scan: SensorScan) -> NDArray[np.float32]:
