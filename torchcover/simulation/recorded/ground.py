@@ -38,15 +38,17 @@ def ground_below(places_m: Numbers, ego_m: Numbers) -> Plain | Slopes:
     if (places_m[:, 2] == base_m).all():
         return Plain(base_m, lower_m, upper_m)
     inside = ((places_m[:, :2] > lower_m) & (places_m[:, :2] < upper_m)).all(axis=1)
-    across_m, heights_m = places_m[inside, :2] - lower_m, places_m[inside, 2] - base_m
+    across_m, over_m = places_m[inside, :2] - lower_m, places_m[inside, 2] - base_m
     rows, columns = corners_of(lower_m, upper_m)
-    field = fitted(across_m, heights_m, upper_m - lower_m, SCALES_M, trusted=trusted[inside])
+    field = fitted(across_m, over_m, upper_m - lower_m, SCALES_M, trusted=trusted[inside])
     corners: Numbers = CELL_M * np.indices((rows, columns))[::-1].reshape(2, -1).T.astype(np.float64)
     way_m = ego_m[:, :2] if len(ego_m) > 1 else np.repeat(ego_m[:, :2], 2, axis=0)
     way = shapely.LineString(way_m - lower_m).simplify(0.5)
     shapely.prepare(way)
     seen = shapely.dwithin(shapely.points(middles_m(np.zeros(2), rows, columns)), way, HORIZON_M + BEYOND_M)
-    return Slopes(lower_m, base_m + field.heights_m(corners).reshape(rows, columns), seen.reshape(rows - 1, columns - 1))
+    return Slopes(
+        lower_m, base_m + field.heights_m(corners).reshape(rows, columns), seen.reshape(rows - 1, columns - 1)
+    )
 
 
 def thinned(places_m: Numbers) -> Numbers:
