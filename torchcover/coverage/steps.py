@@ -85,6 +85,7 @@ def checked_steps(
     *,
     within_m: float,
     grid: BevGrid,
+    square_metres: bool,
     names: Sequence[str] = (),
     first: int,
 ) -> list[CheckedStep]:
@@ -99,6 +100,7 @@ def checked_steps(
         error: How far off the points of the rig were measured.
         within_m: Those that are farther off are left out.
         grid: Which needs heights, or does not.
+        square_metres: Whether weights are needed.
         names: Of the sensors, where they are told apart.
         first: Number of the first step if `place_in_time` is not given.
 
@@ -108,6 +110,11 @@ def checked_steps(
             in time that is negative or above 10^15.
         TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
     """
+    if square_metres and weights is None:
+        raise ValueError(
+            "weights: the square metres of each reference point are needed, as a SurfaceReference gives them; got "
+            "none (without square_metres=True, points may do without)"
+        )
     rigs = [sensor] if isinstance(sensor, Mapping) else as_list(sensor, "sensor")
     sensors = [_by_name(rig, names) for rig in rigs]
     references = as_list(reference, "reference")
