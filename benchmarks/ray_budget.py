@@ -5,6 +5,7 @@ of detection / per cent of the radius.
 """
 
 import argparse
+from dataclasses import replace
 
 import torch
 
@@ -48,8 +49,13 @@ def measured(options):
     runs = {}
     for kind in kinds:
         for rays in RAYS:
-            frames = base.with_reference_sensor(REFERENCE_SENSORS[kind].from_rays(AREAS, rays))
-            metric = CoverageMetric(GRID, max_radius=GRID.diagonal_m, square_metres=kind == "surface")
+            reference = REFERENCE_SENSORS[kind].from_rays(AREAS, rays)
+            frames = base.with_reference_sensor(reference)
+            metric = CoverageMetric(
+                replace(GRID, band_frame=reference.band_frame),
+                max_radius=GRID.diagonal_m,
+                square_metres=kind == "surface",
+            )
             runs[kind, rays] = frames, CoverageObserver(metric)
     for index in range(options.steps):
         for frames, observer in runs.values():
