@@ -41,7 +41,7 @@ def make(page, root=ROOT):
     def printed(found):
         text, seconds = run(found["commands"], root)
         times_s.append(seconds)
-        return f"{found[1]}\n{text}*Printed in {seconds:.0f} s of processor time.*\n{found[3]}"
+        return f"{found[1]}\n{text}*Printed in {seconds:.0f} s of processor time.*\n\n{found[3]}"
 
     text = COMMANDS.sub(printed, page.read_text(encoding="utf-8"))
     page.write_text(text, encoding="utf-8")
