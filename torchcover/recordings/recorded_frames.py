@@ -109,6 +109,16 @@ class RecordedFrames(FrameDataset):
                 continue  # whoever measures it will say so
         return False
 
+    def has_heights(self) -> bool:
+        """Whether the first frame whose recorded reference can be read has them."""
+        if isinstance(self.reference, RecordedReference):
+            for instant in self.recording.frames:
+                try:
+                    return self.recording.scan(self.recording.reference_sensors[0], instant).heights_m is not None
+                except (OSError, ValueError):
+                    continue
+        return False
+
     def doubts(self, steps: int | None) -> Sequence[str]:
         """As `torchcover.recordings.suspicion` says."""
         from torchcover.recordings.suspicion import suspicions  # only before a measurement
