@@ -14,7 +14,9 @@ from torchcover.simulation import Rig, SurfaceReference
 from torchcover.targets import Raster, Target, survey
 
 AREA = Region("20m", (2.0, 22.0), (-6.0, 6.0))
-GRID = BevGrid(x=AREA.x, y=AREA.y, cell=0.5, heights={"ground": (-0.5, 0.2), "obstacle": (0.2, 2.0)})
+GRID = BevGrid(
+    x=AREA.x, y=AREA.y, cell=0.5, heights={"ground": (-0.5, 0.2), "obstacle": (0.2, 2.0)}, band_frame="ground"
+)
 CAR = {"category": "car", "shape": {"type": "box", "size_m": [4, 1.8, 1.5]}}
 CARS = [{"name": f"car {x_m}", "pose": {"x_m": x_m, "y_m": y_m}, **CAR} for x_m, y_m in ((9, -3), (17, 2))]
 WORLD = scenario(FLOOR, box([0.5, 12, 4], x_m=21.0), actors=CARS)
