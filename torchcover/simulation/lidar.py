@@ -9,7 +9,7 @@ from pydantic import Field, ValidationInfo, model_validator
 
 from torchcover.simulation.documents import Pose, beside, is_file_name, load_document
 from torchcover.simulation.rays import unit_directions
-from torchcover.simulation.sensor import Elevation, Ranging
+from torchcover.simulation.sensor import Elevation, Ranging, Scan
 
 # Two ways to write rows: a sensor that chooses one of them takes nothing of the other from its model.
 SPACED_ROWS = ("channels", "vertical_fov_deg")
@@ -32,6 +32,7 @@ class ScanPattern(Ranging):
         azimuth_offsets_deg: Offset of each row; positive is left. None if not given.
         horizontal_fov_deg: Field of view about the x axis, 360 for a full turn.
         columns: Number of columns.
+        scan: When its columns are cast; all at once if not given.
         min_range_m, max_range_m, range_noise_m, dropout: As in `Ranging`.
     """
 
@@ -41,6 +42,7 @@ class ScanPattern(Ranging):
     azimuth_offsets_deg: tuple[float, ...] | None = None
     horizontal_fov_deg: Annotated[float, Field(gt=0.0, le=360.0)]
     columns: Annotated[int, Field(gt=0, le=MAX_COLUMNS)]
+    scan: Scan | None = None
 
     @model_validator(mode="after")
     def _check_rows(self) -> Self:
@@ -68,6 +70,11 @@ class ScanPattern(Ranging):
         assert self.channels is not None  # checked in _check_rows
         assert self.vertical_fov_deg is not None
         return np.linspace(*self.vertical_fov_deg, self.channels)
+
+    def times_s(self) -> NDArray[np.float64] | None:
+        """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
+        rows = len(self.rows_deg())
+        return None if self.scan is None else np.tile(self.scan.times_s(self.columns), (rows, 1))
 
     def directions(self) -> NDArray[np.float64]:
         """(3, rows, columns) unit directions in the LiDAR's frame."""

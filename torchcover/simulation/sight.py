@@ -1,5 +1,6 @@
 """What is seen from a place on the ego: by the rays of a sensor, or of given points."""
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.rays import BLOCK, Tile, into_tiles, pixels_in_tiles
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws, RayHits, Sensor
+from torchcover.simulation.sweep import RayTimes
 
 # Rays in a tile: of neighbours all, so that a tile is narrow. A constant, so that nothing depends on threads.
 TILE_RAYS = 8192
@@ -44,6 +46,13 @@ class MountedSensor:
         directions = sensor.directions()
         self.tiles = into_tiles(directions)
         self.pixel_of_ray = pixels_in_tiles(directions)
+        self._times = ray_times(sensor, self.tiles, self.pixel_of_ray) if scene.moves else None
+        taken_s = max((float(np.ptp(each.at_s)) for each in self._times or () if len(each.at_s)), default=0.0)
+        if taken_s > scene.world.time_step_s:
+            raise ValueError(
+                f"sensor {sensor.name!r}: a scan of {taken_s:g} s is longer than the time step of the scenario, "
+                f"{scene.world.time_step_s:g} s; shorten its period, or make the time steps longer"
+            )
         self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
         self._at_rest = not scene.moves
         self._resting: tuple[SensorScan, RayHits] | None = None
@@ -60,12 +69,13 @@ class MountedSensor:
         hit, error_m = self.sensor.measure(hits, draws)
         scan = scan._replace(struck=None)
         if hit is not None:
-            scan = scan._replace(points=scan.points[hit], ray=scan.ray[hit], range_m=scan.range_m[hit])
+            scan = scan.some(hit)
         if error_m is None:
             return scan
-        ways_m = scan.points.astype(np.float64) - self.vehicle_T_sensor[:3, 3]
+        landed = scan.points if scan.landed is None else scan.landed
+        ways_m = landed - (self.vehicle_T_sensor[:3, 3] if scan.from_m is None else scan.from_m.astype(np.float64))
         along = error_m[:, None] / np.linalg.norm(ways_m, axis=1, keepdims=True)
-        landed = (scan.points + ways_m * along).astype(np.float32)
+        landed = (landed + ways_m * along).astype(np.float32)
         return scan._replace(error_m=error_m.astype(np.float32), landed=landed)
 
     def _cast(self, instant: Instant, threads: int) -> tuple[SensorScan, RayHits]:
@@ -76,6 +86,7 @@ class MountedSensor:
             self.tiles,
             max_range_m=self.reach_m,
             own_m=self._own_m,
+            times=self._times,
             threads=threads,
         )
         hits = RayHits(scan.ray, scan.range_m, self.pixel_of_ray, find=scan.struck)
@@ -97,6 +108,16 @@ class MountedSensor:
             range_m.append(hits.range_m)
             is_hit.append((hits.body >= 0) & (hits.body != instant.ego))
         return Ends(np.concatenate(range_m), np.concatenate(is_hit))
+
+
+def ray_times(sensor: Sensor, tiles: Sequence[Tile], pixel_of_ray: NDArray[np.int64]) -> list[RayTimes] | None:
+    """When the rays of each tile of a sensor are cast; None if all are at once."""
+    times_s = sensor.times_s()
+    if times_s is None:
+        return None
+    ends = np.cumsum([tile.directions.shape[1] for tile in tiles])
+    of_tiles = np.split(times_s.ravel()[pixel_of_ray], ends[:-1])
+    return [RayTimes(*np.unique(of_tile, return_inverse=True)) for of_tile in of_tiles]
 
 
 class Sight(NamedTuple):
