@@ -1,5 +1,6 @@
 """A scene at one time, which sensors scan."""
 
+import operator
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -34,9 +35,9 @@ class SensorScan(NamedTuple):
 
     `ray` (N,) says which ray, counted over the tiles, made each point, and `range_m` (N,) how far it went. `body_casts`
     is the number of pairs of a ray and a moving body at which it was cast: the other pairs could not meet. `struck`
-    finds out what they hit, for who asks; None of what a sensor has measured. `error_m` (N,) is how far off it measured
-    them, along their rays, None if they are exact; `landed` (N, 3) where that is, None if where they are; and `from_m`
-    (N, 3) where their rays started, None if all at the sensor's mount.
+    finds out what they hit, for who asks, and `ways` the (N, 3) directions of their rays in the vehicle frame; both are
+    None of what a sensor has measured. `error_m` (N,) is how far off it measured them, along their rays, None if they
+    are exact, and `landed` (N, 3) where that is, None if where they are.
     """
 
     points: Float32
@@ -48,11 +49,11 @@ class SensorScan(NamedTuple):
     struck: Callable[[], Struck] | None = None
     error_m: Float32 | None = None
     landed: Float32 | None = None
-    from_m: Float32 | None = None
+    ways: Callable[[], Float32] | None = None
 
     def some(self, which: NDArray[np.int64]) -> "SensorScan":
         """Some of its points."""
-        names = ("points", "ray", "range_m", "error_m", "landed", "from_m")
+        names = ("points", "ray", "range_m", "landed")
         given = {name: value[which] for name in names if (value := getattr(self, name)) is not None}
         return self._replace(**given)
 
@@ -135,13 +136,16 @@ class Instant:
             if sweep is None or when is None:
                 directions, hits, casts = self.cast(vehicle_T_sensor, tile, limit_m, bodies, own_m)
                 seen = self._seen(hits, ego_points)
-                points = _points(origin_m, directions, hits.range_m, seen)
-                return _TileScan(points, seen, hits.range_m[seen], directions, hits, casts, None, None)
+                points = _points(origin_m.astype(np.float32), directions, hits.range_m, seen)
+                return _TileScan(points, points, seen, hits.range_m[seen], directions, hits, casts)
             swept = sweep.cast(vehicle_T_sensor, tile, when, limit_m, bodies, self.ego, own_m)
             hits, seen = swept.hits, self._seen(swept.hits, ego_points)
-            landed, from_m = swept.landed[seen], swept.from_m[seen]
-            points, range_m = swept.points[seen], hits.range_m[seen]
-            return _TileScan(points, seen, range_m, swept.directions, hits, swept.casts, landed, from_m)
+            starts_m = swept.starts_m.take(when.of_ray, axis=0)
+            points = landed = _points(starts_m, swept.directions, hits.range_m, seen)
+            if len(swept.on_body):
+                points = landed.copy()
+                points[np.cumsum(seen)[swept.on_body] - 1] = swept.points
+            return _TileScan(points, landed, seen, hits.range_m[seen], swept.directions, hits, swept.casts)
 
         own: Sequence[Float32 | None] = own_m or [None] * len(tiles)
         whens: Sequence[RayTimes | None] = times or [None] * len(tiles)
@@ -151,12 +155,15 @@ class Instant:
             # A pool for each scan: threads do not survive the fork that makes a DataLoader worker.
             with ThreadPoolExecutor(threads) as pool:
                 scans = list(pool.map(scan_tile, tiles, own, whens))
-        points, seen, range_m, directions, hits, casts, landed, from_m = zip(*scans, strict=True)
+        points, landed, seen, range_m, directions, hits, casts = zip(*scans, strict=True)
+
+        def towards(tile: int) -> Float32:
+            return directions[tile].take(np.flatnonzero(seen[tile]), axis=1)  # type: ignore[no-any-return]
 
         def struck() -> Struck:
             parts = [
-                self.struck(of.body[there], of.triangle[there], towards.take(there, axis=1))
-                for of, there, towards in zip(hits, map(np.flatnonzero, seen), directions, strict=True)
+                self.struck(of.body[there], of.triangle[there], towards(tile))
+                for tile, (of, there) in enumerate(zip(hits, seen, strict=True))
             ]
             return Struck._make(np.concatenate(column) for column in zip(*parts, strict=True))
 
@@ -168,8 +175,8 @@ class Instant:
             self_hits=sum(int(np.count_nonzero(of.body == self.ego)) for of in hits),
             body_casts=sum(casts),
             struck=struck,
-            landed=None if sweep is None else np.concatenate(landed),
-            from_m=None if sweep is None else np.concatenate(from_m),
+            ways=lambda: np.concatenate([towards(tile) for tile in range(len(tiles))], axis=1).T,
+            landed=np.concatenate(landed) if any(map(operator.is_not, landed, points)) else None,
         )
 
     def _seen(self, hits: Hits, ego_points: bool) -> NDArray[np.bool_]:
@@ -302,27 +309,26 @@ class Instant:
 
 
 class _TileScan(NamedTuple):
-    """What n rays of a tile saw: `points` (K, 3), `range_m` (K,), `landed` and `from_m` (K, 3) of those that did."""
+    """What n rays of a tile saw: `points` and `landed` (K, 3) and `range_m` (K,) of those that did."""
 
     points: Float32
+    landed: Float32
     seen: NDArray[np.bool_]
     range_m: Float32
     directions: Float32
     hits: Hits
     casts: int
-    landed: Float32 | None
-    from_m: Float32 | None
 
 
 def _limit(tile: Tile, max_range_m: float) -> Float32:
     return np.full(tile.directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
 
 
-def _points(origin_m: Matrix, directions: Float32, range_m: Float32, seen: NDArray[np.bool_]) -> Float32:
-    """(K, 3) where the rays that saw something ended."""
+def _points(origin_m: Float32, directions: Float32, range_m: Float32, seen: NDArray[np.bool_]) -> Float32:
+    """(K, 3) where the rays that saw something ended, which start at (3,) one place or (n, 3) one each."""
     points = np.empty((np.count_nonzero(seen), 3), dtype=np.float32)
     for axis in range(3):
         coordinate = directions[axis] * range_m
-        coordinate += np.float32(origin_m[axis])
+        coordinate += origin_m[..., axis]
         points[:, axis] = coordinate[seen]
     return points

@@ -67,15 +67,14 @@ class MountedSensor:
         """
         scan, hits = self._cast(instant, threads)
         hit, error_m = self.sensor.measure(hits, draws)
-        scan = scan._replace(struck=None)
+        ways = scan.ways() if error_m is not None and scan.ways else None
+        scan = scan._replace(struck=None, ways=None)
         if hit is not None:
             scan = scan.some(hit)
-        if error_m is None:
+        if error_m is None or ways is None:
             return scan
-        landed = scan.points if scan.landed is None else scan.landed
-        ways_m = landed - (self.vehicle_T_sensor[:3, 3] if scan.from_m is None else scan.from_m.astype(np.float64))
-        along = error_m[:, None] / np.linalg.norm(ways_m, axis=1, keepdims=True)
-        landed = (landed + ways_m * along).astype(np.float32)
+        landed, ways = scan.points if scan.landed is None else scan.landed, ways if hit is None else ways[hit]
+        landed = (landed + error_m[:, None] * ways).astype(np.float32)
         return scan._replace(error_m=error_m.astype(np.float32), landed=landed)
 
     def _cast(self, instant: Instant, threads: int) -> tuple[SensorScan, RayHits]:

@@ -49,16 +49,22 @@ def no_motion(*_: float) -> tuple[Float64, Sequence[Poses]]:
 
 
 class SweptHits(NamedTuple):
-    """What n rays hit; `directions` (3, n), `from_m` and `points` (n, 3) are in the vehicle frame at the frame's time.
+    """What n rays of a tile hit.
 
-    A point on a body has travelled with it to that time; `landed` (n, 3) has not. `casts` were at bodies that move.
+    Args:
+        hits: Of each.
+        directions: (3, n) in the vehicle frame at the frame's time.
+        starts_m: (g, 3) where they start at each of the tile's times, likewise.
+        on_body: (K,) the rays that hit a body that moves, and is not the ego.
+        points: (K, 3) where these points are at the frame's time: they have travelled with their body.
+        casts: How many rays were cast at bodies that move.
     """
 
     hits: Hits
     directions: Float32
-    from_m: Float32
+    starts_m: Float32
+    on_body: Numbers
     points: Float32
-    landed: Float32
     casts: int
 
 
@@ -186,17 +192,13 @@ class Sweep:
             self.moving.nearer(hits, Meetings(part[there], ray[there], met.range_m[there], met.triangle[there]))
         now_T_vehicle = invert(self.now.static_T_vehicle) @ static_T_vehicle
         turned = _turned(now_T_vehicle, of_ray, directions)
-        from_m = (now_T_vehicle[:, :3, :3] @ origin_m + now_T_vehicle[:, :3, 3]).astype(np.float32)[of_ray]
-        landed = from_m + (turned * hits.range_m).T
-        points, on_body = landed, np.flatnonzero((hits.body >= self.static.bodies) & (hits.body != ego))
-        if len(on_body):
-            points, part = landed.copy(), np.searchsorted(self.moving.body, hits.body[on_body])
-            there_m = origin_m + (directions[:, on_body] * hits.range_m[on_body]).T
-            then_T_vehicle = self._parts(weights[of_ray[on_body]], part)
-            on_part_m = np.einsum("kij,kj->ki", then_T_vehicle[:, :3, :3], there_m) + then_T_vehicle[:, :3, 3]
-            vehicle_T_part = self.now.vehicle_T_part[part]
-            points[on_body] = np.einsum("kij,kj->ki", vehicle_T_part[:, :3, :3], on_part_m) + vehicle_T_part[:, :3, 3]
-        return SweptHits(hits, turned, from_m, points, landed, len(ray))
+        starts_m = (now_T_vehicle[:, :3, :3] @ origin_m + now_T_vehicle[:, :3, 3]).astype(np.float32)
+        on_body = np.flatnonzero((hits.body >= self.static.bodies) & (hits.body != ego))
+        part = np.searchsorted(self.moving.body, hits.body[on_body])
+        there_m = origin_m + (directions[:, on_body] * hits.range_m[on_body]).T
+        on_part_m = _moved(self._parts(weights[of_ray[on_body]], part), there_m)
+        points = _moved(self.now.vehicle_T_part[part], on_part_m).astype(np.float32)
+        return SweptHits(hits, turned, starts_m, on_body, points, len(ray))
 
     def _cast_at_static(
         self, static_T_vehicle: Float64, of_ray: Numbers, origin_m: Float64, directions: Float32, limit_m: Float32
@@ -205,12 +207,18 @@ class Sweep:
             return cast_from(self.static, self.now.static_T_vehicle, origin_m, directions, limit_m)
         starts_m = (static_T_vehicle[:, :3, :3] @ origin_m + static_T_vehicle[:, :3, 3]).astype(np.float32)
         towards = _turned(static_T_vehicle, of_ray, directions)
-        return self.static.cast_from_each(starts_m[of_ray], towards, limit_m)
+        return self.static.cast_from_each(starts_m.take(of_ray, axis=0), towards, limit_m)
 
     def _parts(self, weights: Float64, part: Numbers) -> Float64:
         """(K, 4, 4) `part_T_vehicle` of some bodies at times with these weights, (K, 3)."""
         poses: Float64 = np.einsum("ks,skij->kij", weights, self.part_T_vehicle[:, part])
         return poses
+
+
+def _moved(poses: Float64, places_m: Float64) -> Float64:
+    """(K, 3) places, each moved by its own of (K, 4, 4) poses."""
+    moved: Float64 = (poses[:, :3, :3] @ places_m[:, :, None])[:, :, 0] + poses[:, :3, 3]
+    return moved
 
 
 def _turned(poses: Float64, of_ray: Numbers, directions: Float32) -> Float32:
