@@ -149,6 +149,10 @@ class SimulatedFrames(FrameDataset):
         """Whether they were asked for."""
         return self.boxes
 
+    def has_heights(self) -> bool:
+        """All of them."""
+        return True
+
     def ego_mesh(self) -> Mesh:
         """What carries the rigs, in the vehicle frame; no world is built for it."""
         return self.scenario.ego_mesh()
