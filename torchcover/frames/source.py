@@ -107,7 +107,7 @@ class FrameSource(Protocol):
         ...
 
     def has_heights(self) -> bool:
-        """Whether frames have `Frame.reference_heights_m`, and a point in the first one has a height."""
+        """Whether frames have `Frame.reference_heights_m`: then height bands are over the ground by default."""
         ...
 
     def ego_mesh(self) -> "Mesh | None":
@@ -240,7 +240,7 @@ class ChosenRigs(FrameDataset):
         return self.frames.has_boxes()
 
     def has_heights(self) -> bool:
-        """As the source."""
+        """As there."""
         return self.frames.has_heights()
 
     def ego_mesh(self) -> "Mesh | None":
