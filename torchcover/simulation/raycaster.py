@@ -146,7 +146,8 @@ class RayCaster:
     @cached_property
     def _normals(self) -> Float32:
         """(3, F) normals of all faces."""
-        return self._faces.normals.astype(np.float32)
+        normals: Float32 = self._faces.normals.astype(np.float32)
+        return normals
 
     @cached_property
     def _materials(self) -> NDArray[np.uint8]:

@@ -131,21 +131,6 @@ class Sweep:
             np.concatenate(list(corners_m + outwards), axis=1),
         )
 
-    def _weights(self, times_s: Float64) -> Float64:
-        """(T, 3) how much the poses at the samples weigh at (T,) times: Lagrange's parabolas."""
-        a, b, c = self.samples_s
-        if a == c:
-            return np.tile([1.0, 0.0, 0.0], (len(times_s), 1))
-        from_a, from_b, from_c = times_s - a, times_s - b, times_s - c
-        return np.stack(
-            [
-                from_b * from_c / ((a - b) * (a - c)),
-                from_a * from_c / ((b - a) * (b - c)),
-                from_a * from_b / ((c - a) * (c - b)),
-            ],
-            axis=1,
-        )
-
     def outlines(self, origin_m: Float64) -> Outlines:
         """The bodies that move, as they look from a place on the vehicle at any of the times."""
         return outlines(self.corners_m, origin_m)
@@ -175,7 +160,7 @@ class Sweep:
         directions = rotate(vehicle_R_sensor, tile.directions)
         if own_m is not None:
             limit_m = np.minimum(limit_m, own_m)
-        weights = self._weights(times.at_s)
+        weights = parabola_weights(self.samples_s, times.at_s)
         static_T_vehicle = np.tensordot(weights, self.static_T_vehicle, 1)
         hits = self._cast_at_static(static_T_vehicle, of_ray, origin_m, directions, limit_m)
         if own_m is not None:
@@ -213,6 +198,25 @@ class Sweep:
         """(K, 4, 4) `part_T_vehicle` of some bodies at times with these weights, (K, 3)."""
         poses: Float64 = np.einsum("ks,skij->kij", weights, self.part_T_vehicle[:, part])
         return poses
+
+
+def parabola_weights(samples_s: Float64, times_s: Float64) -> Float64:
+    """(T, 3) how much poses at three times weigh at (T,) others near them: Lagrange's parabola through them.
+
+    Example:
+        >>> parabola_weights(np.array([0.0, 1.0, 2.0]), np.array([0.5])).tolist()
+        [[0.375, 0.75, -0.125]]
+    """
+    a, b, c = samples_s
+    if a == c:
+        return np.tile([1.0, 0.0, 0.0], (len(times_s), 1))
+    from_a, from_b, from_c = times_s - a, times_s - b, times_s - c
+    weights = (
+        from_b * from_c / ((a - b) * (a - c)),
+        from_a * from_c / ((b - a) * (b - c)),
+        from_a * from_b / ((c - a) * (c - b)),
+    )
+    return np.stack(weights, axis=1)
 
 
 def _moved(poses: Float64, places_m: Float64) -> Float64:
