@@ -211,7 +211,7 @@ def test_the_ray_budget_does_not_move_it():
     ahead = Region("ahead", x=(0.0, 40.0), y=(-10.0, 10.0))
     few, many = (
         simulated(ahead, SurfaceReference(((ahead.x, ahead.y),), rays), steps=steps)
-        for rays, steps in ((1024, 64), (16_384, 64))
+        for rays, steps in ((512, 32), (4096, 32))
     )
     for height in ("ground", "obstacle"):
         for ours, theirs in zip(few[height], many[height], strict=True):
