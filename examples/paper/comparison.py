@@ -92,14 +92,15 @@ def _table(known, area):
         cells = [region, height, lidar]
         for quantity in QUANTITIES:
             place = Place(quantity, lidar, region, height)
-            ratio = known[place]._replace(value=known[place].value / paper[place], error=math.nan)
+            ratio = known[place]._replace(value=known[place].value / paper[place], low=math.nan)
             cells += [_words(known[place]), f"{paper[place]:.2f}", _words(ratio), _words(area[place])]
         lines.append(f"| {' | '.join(cells)} |")
     return [*lines, ""]
 
 
 def _words(number):
-    """Two decimals, as in the paper."""
+    """Two decimals, as in the paper, and the interval."""
     if math.isnan(number.value):
         return "unknown"
-    return f"{number.value:.2f}" if math.isnan(number.error) else f"{number.value:.2f} ± {number.error:.2f}"
+    ends = "" if math.isnan(number.low) else f" [{number.low:.2f}, {number.high:.2f}]"
+    return f"{number.value:.2f}{ends}"
