@@ -32,8 +32,9 @@ def numbers_of(coverages, regions):
         for region in regions:
             for height in coverage.grid.heights:
                 estimate = coverage.estimate(region, height)
-                radius, share = estimate.numbers(intervals=False).values()
-                percent = share._replace(value=100 * share.value, error=100 * share.error)
+                radius, share = estimate.numbers().values()
+                in_percent = {part: 100 * getattr(share, part) for part in ("value", "error", "low", "high")}
+                percent = share._replace(**in_percent)
                 for quantity, number in zip(QUANTITIES, (percent, radius), strict=True):
                     numbers[Place(quantity, lidar, region.name, height)] = number
     return numbers
