@@ -8,11 +8,13 @@ from torchcover.cli.printing import advice
 from torchcover.evaluation import Settings, StudyPlan, WorkPoint
 
 
-def test_a_small_study_writes_a_table_a_diagram_and_an_advice(torchcover, tmp_path):
+def test_a_small_study_writes_a_table_a_diagram_and_an_advice(torchcover, worlds, tmp_path):
     out = tmp_path / "out"
     rays = ["--rays", "256", "--rays", "64", "--rays", "64"]
-    options = [*rays, "--steps", "2", "--runs", "2", "--long-run-steps", "8", "--cell-m", "4"]
-    code, text, complaints = torchcover("study", "front_roof_32", "--scenario", "courtyard", *options, "--out", out)
+    options = [*rays, "--steps", "2", "--runs", "1", "--long-run-steps", "8", "--cell-m", "4"]
+    code, text, complaints = torchcover(
+        "study", worlds / "low.yaml", "--scenario", worlds / "yard.yaml", *options, "--out", out
+    )
     assert code == 0, complaints
     assert "percentage points" in text
     assert "…" not in text

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import Coverage, CoverageMetric, forward_regions
+from torchcover.coverage.measures import area_in_blocks
 from torchcover.evaluation.measuring import BLOCKS, metric_of
 from torchcover.evaluation.observers import CoverageObserver
 from torchcover.evaluation.pipeline import observe
@@ -158,9 +159,10 @@ def area_sums(coverage: Coverage) -> Tensor:
 
     The square metres, then those times each of Q quantities.
     """
-    assert coverage.area is not None  # no other is studied
-    sums = coverage.area.totals()
-    return torch.stack([sums[:, :, region.mask(coverage.grid)].sum(dim=2) for region in forward_regions()])
+    places = [[(region, height) for height in coverage.grid.heights] for region in forward_regions()]
+    return torch.stack(
+        [torch.stack([area_in_blocks(coverage, *place)[1].sum(dim=0) for place in row], 1) for row in places]
+    )
 
 
 def long_run(plan: StudyPlan, *, progress: bool) -> Truth:
