@@ -33,8 +33,8 @@ PROBES = np.array([0.1, 0.5, 0.9])
 NEAR_M = 1.0
 # Ground that is nowhere higher or lower than that is looked at as a whole, and not square by square.
 LEVEL_M = 0.3
-# Side of the smallest squares in which the height of the ground is known roughly, of how many at most. The ground of own
-# cities is made of squares of 10 m whose corners have round coordinates: so have these.
+# Side of the smallest squares in which the height of the ground is known roughly, of how many at most. Those that the
+# ground of own cities is made of lie like them: at multiples of 10 m.
 SQUARE_M = 10.0
 MOST_SQUARES = 65_536
 # Points are rounded to float32, and so are their heights: so little above or below the ground they lie on it.
