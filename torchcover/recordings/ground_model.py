@@ -187,7 +187,8 @@ def _a_fifth_below(square: Numbers, heights_m: Float64) -> Numbers:
     order = np.lexsort((heights_m, square))
     first = np.flatnonzero(np.diff(square[order], prepend=-1))
     count = np.diff(np.append(first, len(order)))
-    return order[first + (FIFTH * count).astype(np.int64)]
+    chosen: Numbers = order[first + (FIFTH * count).astype(np.int64)]
+    return chosen
 
 
 def _around() -> tuple[Numbers, Float64]:
