@@ -17,10 +17,8 @@ from benchmarks.timing import table
 from torchcover import forward_regions, nearest
 from torchcover.coverage import BevGrid, MeanOfMeans
 from torchcover.coverage.binning import mean_per_cell
-from torchcover.coverage.blocks import AreaSums
-from torchcover.coverage.measures import estimate_area
 from torchcover.data import SimulatedFrames
-from torchcover.estimation import ratio_errors, student
+from torchcover.estimation import Estimate, ratio_errors, student
 from torchcover.evaluation.measuring import BLOCKS
 from torchcover.evaluation.target_error import LOOKS_IN_A_ROW, MAX_GROWTH, MIN_GROWTH, MIN_STEPS
 from torchcover.simulation.regions_of_interest import GRID_X_M, GRID_Y_M
@@ -144,10 +142,9 @@ class Cities:
         """Value, error and degrees of freedom of the radius and detection of each place."""
         sums = torch.stack([self.over_regions[block].sum(dim=0) for block in blocks])
         lengths = torch.tensor([len(block) for block in blocks])
-        area = AreaSums.of(lengths, sums[:, None, None, :, 0], sums[..., 1:].movedim(2, 1)[:, :, None, None])
         found = []
         for at in places:
-            estimate = estimate_area(QUANTITIES, area, 0, torch.arange(len(PLACES))[None] == at)
+            estimate = Estimate.of_ratios(QUANTITIES, sums[:, at, 0], sums[:, at, 1:], lengths)
             found += zip(estimate.value.tolist(), estimate.error.tolist(), strict=True)
         return [(value, error, len(blocks) - 1) for value, error in found]
 
