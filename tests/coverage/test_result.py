@@ -206,7 +206,6 @@ def saved(tmp_path):
     return path
 
 
-# What follows may be cut off, where a damaged name has made it long.
 NOT_ONE = r"coverage\.npz: (not a coverage file as Coverage\.save writes it \(.+|an empty file)"
 
 

@@ -27,7 +27,9 @@ def test_the_points_that_are_kept_are_those_in_the_regions_and_in_their_cells():
     assert (asked.grid.x, asked.grid.y) == ((-7.5, 20.0), (-5.0, 5.0))
     generator = np.random.default_rng(0)
     points = generator.uniform([-50, -45, -1], [30, 45, 3], (40_000, 3)).astype(np.float32)
-    kept = asked.asked(torch.from_numpy(points)).numpy()
+    # Bands are over the ground, which is 5 m below the vehicle there.
+    height = torch.from_numpy(points[:, 2].copy())
+    kept = asked.asked(torch.from_numpy(points - np.float32([0, 0, 5])), height).numpy()
     # The lane, and the cells whose centres lie in it.
     lane = [((-7.3, -2.0), (-1.2, 1.6), (-0.5, 2)), ((-7.5, -2.0), (-1.0, 1.5), (-0.5, 2))]
     boxes = [((0, 20), (-5, 5), (-0.5, 2)), *lane]

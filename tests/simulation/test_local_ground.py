@@ -292,14 +292,16 @@ def test_frames_carry_heights_everywhere_they_go(tmp_path):
     frames = SimulatedFrames("courtyard", "front_roof_32", steps=2, boxes=True)
     frame = frames[0]
     assert frame.reference_heights_m.shape == frame.reference_weights.shape
-    assert frame.counts["reference_no_ground"] == int(frame.reference_heights_m.isnan().sum())
     assert torch.equal(pickle.loads(pickle.dumps(frame)).reference_heights_m, frame.reference_heights_m)
     assert torch.equal(frame.to("cpu").reference_heights_m, frame.reference_heights_m)
     batch = collate_frames([frame, frames[1]])
-    assert [len(h) for h in batch.heights_m] == [len(points) for points in batch.reference]
-    with pytest.raises(ValueError, match="heights_m: frame"):
-        _ = collate_frames([frame, dataclasses.replace(frame, reference_heights_m=None)]).heights_m
-    assert collate_frames([dataclasses.replace(frame, reference_heights_m=None)]).heights_m is None
+    assert [len(h) for h in batch.heights_in("ground")] == [len(points) for points in batch.reference]
+    with pytest.raises(ValueError, match=r"drawn for bands over the ground; use the band frame ground$"):
+        batch.heights_in("vehicle")
+    unknown = dataclasses.replace(frame, reference_heights_m=None)
+    with pytest.raises(ValueError, match=r"courtyard step 0.* are unknown; use the band frame vehicle$"):
+        collate_frames([frame, unknown]).heights_in("ground")
+    assert collate_frames([unknown]).heights_in("vehicle") is None
     torch.testing.assert_close(scale(frame, 2.0).reference_heights_m, 2 * frame.reference_heights_m)
     write_recording(frames, tmp_path / "there")
     again = RecordedFrames(tmp_path / "there")[0]

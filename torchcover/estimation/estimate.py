@@ -202,12 +202,10 @@ class Estimate:
         enough: list[bool] = (self.effective > MIN_BLOCKS - ROUND_OFF).tolist()
         return enough
 
-    def numbers(self, *, intervals: bool = True, count: int = 0, count_of: str = "") -> dict[str, Number]:
-        """The numbers by the keys of their quantities.
+    def numbers(self, *, count: int = 0, count_of: str = "") -> dict[str, Number]:
+        """The numbers by the keys of their quantities; of fewer than 8 blocks in effect without intervals.
 
         Args:
-            intervals: Whether they have intervals: not where how often such an interval holds the truth has
-                not been measured, nor where fewer than 8 blocks are in effect.
             count: How many they are over.
             count_of: What these are.
         """
@@ -215,7 +213,7 @@ class Estimate:
         each = zip(self.quantities, self.value.tolist(), self.error.tolist(), self.has_intervals, strict=True)
         for quantity, value, error, has_interval in each:
             known = error if error > ROUND_OFF else math.nan  # blocks that all say the same prove nothing
-            ends = interval95(value, known if intervals and has_interval else math.nan, freedom, quantity)
+            ends = interval95(value, known if has_interval else math.nan, freedom, quantity)
             found[quantity.key] = Number(quantity, value, known, *ends, count, count_of)
         return found
 

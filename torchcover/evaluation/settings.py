@@ -204,7 +204,7 @@ class Settings:
     band_frame: Annotated[
         Literal["ground", "vehicle"] | None,
         Option(
-            "What height bands are over: `ground`, the local ground, or `vehicle`, z of the vehicle (default; `paper` "
+            "What height bands are over: `ground`, the local ground (default), or `vehicle`, z of the vehicle (`paper` "
             "and recordings without heights have no other).",
             in_study="tried",
         ),
