@@ -122,7 +122,7 @@ class Cities:
     def __init__(self, sums, places):
         self.sums, self.places = torch.from_numpy(sums), places
         self.names = [f"{place} {rig} {what.key}" for rig, what in VALUES for place in places]
-        self.whole = self.estimate(self.sums.sum(dim=1)[None], torch.full((len(sums),), STEPS_OF_A_CITY))
+        self.whole = self.over_all()
 
     @classmethod
     def of(cls, scenario, cities, seed):
@@ -135,6 +135,11 @@ class Cities:
             steps = [np.flatnonzero(file["city"] == one)[:STEPS_OF_A_CITY] for one in np.unique(file["city"])]
             whole = np.array([one for one in steps if len(one) == STEPS_OF_A_CITY])
             return cls(file["S"][whole], [str(name) for name in file["places"]])
+
+    def over_all(self, every=1):
+        """What all cities say, by so many of their steps."""
+        of_city = self.sums[:, ::every]
+        return self.estimate(of_city.sum(dim=1)[None], torch.full((len(of_city),), of_city.shape[1]))
 
     def drawn(self, random, steps, runs=1, every=1):
         """What runs say, as one estimate: whole cities, the last one as far as the steps go."""
@@ -160,13 +165,11 @@ class Cities:
 
     def judged(self, random, steps, runs):
         """Kind, name, share of one city, share of intervals that cover (0: most runs have none), relative width."""
-        truths = self._rows(self.whole)
-        draws = {"": self._rows(self.drawn(random, steps, runs))}
-        if steps == LENGTHS[0]:  # as a search tests its winner: in 16 fresh worlds, three instants in each
-            draws["gain"] = self._rows(self.drawn(random, 48, runs, every=2))
-        parts = self.whole.left_out - self.whole.value
-        tops = self._rows(replace(self.whole, left_out=parts), _share_of_one_city)
-        for gain, found in draws.items():
+        # As a search tests its winner: in 16 fresh worlds, three instants in each.
+        for gain, many, every in (("", steps, 1), ("gain", 48, 2))[: 1 + (steps == LENGTHS[0])]:
+            whole, found = self.over_all(every), self._rows(self.drawn(random, many, runs, every))
+            truths = self._rows(whole)
+            tops = self._rows(replace(whole, left_out=whole.left_out - whole.value), _share_of_one_city)
             for (kind, name), each in found.items():
                 if not gain or kind == "difference":
                     yield gain or kind, name, float(tops[kind, name][0]), *_covered(each, truths[kind, name][0, 0])
