@@ -25,7 +25,9 @@ TRIED = [name for name, option in OPTIONS.items() if option.in_study == "tried"]
 )
 def study(
     rig: options.Rig,
-    steps: Annotated[int, typer.Option(min=8, help="Steps of every setting, all of them on the same instants.")] = 256,
+    steps: Annotated[
+        int, typer.Option(min=8, help="Steps of the first setting; the others see the first quarter of these instants.")
+    ] = 512,
     explain: Annotated[bool, typer.Option("--explain", help="Say where the seconds go.")] = False,
     out: options.Out = Path("out"),
     **settings: Any,  # noqa: ANN401

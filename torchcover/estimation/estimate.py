@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchcover.estimation.jackknife import MIN_BLOCKS, ROUND_OFF, jackknife_error, pseudo_values
 from torchcover.estimation.quantity import Quantity
@@ -163,6 +164,13 @@ class Estimate:
         some = self.value[which], self.left_out[:, which], self.steps, again, self.effective[which]
         return Estimate(self.quantities[which], *some)
 
+    def after(self, blocks: int) -> "Estimate":
+        """What it was after the first blocks alone."""
+        again = self.again
+        assert again is not None  # known of all that is a ratio of sums
+        rest = len(self.steps) - blocks
+        return Estimate.of_blocks(self.quantities, lambda some: again(pad(some, (0, rest))), self.steps[:blocks])
+
     def resampled(self, weights: Tensor) -> Tensor | None:
         """What the numbers were if other worlds had come, for intervals of what is made from numbers of several rigs.
 
@@ -195,7 +203,7 @@ class Estimate:
         return enough
 
     def numbers(self, *, count: int = 0, count_of: str = "") -> dict[str, Number]:
-        """The numbers by the keys of their quantities; with intervals unless fewer than 8 blocks are in effect.
+        """The numbers by the keys of their quantities; of fewer than 8 blocks in effect without intervals.
 
         Args:
             count: How many they are over.
@@ -249,8 +257,8 @@ class Estimate:
 def _without_each(sums: Tensor) -> Tensor:
     """(g, ...) what all blocks but each add up to; not by a difference, which infinite radii would not survive."""
     none = sums.new_zeros((1, *sums.shape[1:]))
-    before = torch.cat([none, sums[:-1]]).cumsum(dim=0)
-    after = torch.cat([sums[1:], none]).flip(0).cumsum(dim=0).flip(0)
+    before = torch.cat([none, sums])[:-1].cumsum(dim=0)
+    after = torch.cat([sums, none])[1:].flip(0).cumsum(dim=0).flip(0)
     return before + after
 
 
