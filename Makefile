@@ -3,7 +3,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lowest lint types doctest docs smoke bench paper clean
+.PHONY: demo test lowest lint types doctest docs smoke bench measured paper clean
 
 demo: STEPS ?= 24
 demo: $(VENV)/.ready  ## evaluate a built-in rig in city traffic; writes to out/demo
@@ -47,6 +47,9 @@ smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the r
 
 bench: $(VENV)/.ready  ## the speed and memory figures of docs/measured/performance.md
 	$(BIN)/python -m benchmarks
+
+measured: $(VENV)/.ready  ## the tables and pictures that README and the pages quote, with their pages, within 20 minutes
+	$(BIN)/python -m benchmarks.measured
 
 paper: STEPS ?= 128
 paper: $(VENV)/.ready  ## the paper's experiments, with the assumed LiDARs and both fits (docs/measured/paper.md)

@@ -182,6 +182,7 @@ def killed_at_random(kills):
         os.kill(pid, number)
         os.waitpid(pid, 0)
         found[number][verdict(out, files_of(earlier), files_of(whole))] += 1
+        print(f"{number.name}: {dict(found[number])}", file=sys.stderr, flush=True)
         shutil.rmtree(out)
     return [(one.name, each.total(), *(each[name] for name in VERDICTS)) for one, each in found.items()]
 

@@ -93,6 +93,18 @@ def test_the_second_is_refused_while_the_first_lives_and_not_when_it_was_killed(
     assert in_place(tmp_path / "out") == {"a.txt", "b.txt", "summary.json"}
 
 
+def test_a_folder_without_locks_is_named_and_read_all_the_same(tmp_path, monkeypatch):
+    whole = killed_in_the_middle(tmp_path)
+
+    def flock(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", flock)  # as on a network disk
+    with pytest.raises(OSError, match=rf"No locks available: '{tmp_path}/.lock'"):
+        publish(tmp_path, MAPS)
+    assert found(tmp_path) == whole
+
+
 def test_a_process_may_write_where_it_has_claimed(tmp_path):
     with claimed(tmp_path / "out"):
         publish(tmp_path / "out", NUMBERS)
