@@ -74,10 +74,11 @@ class AboveGround(NamedTuple):
             others = np.flatnonzero(~is_ground[face])
             wanted = np.full(len(face), self.lowest_m <= OF_GROUND_M[1, 0])
             if len(others):
-                corners_m = _moved_corners(self.squares_T_static, triangles_m.take(others, axis=2))
-                heights_m[:, others] = of_others_m = self.squares.heights_m(corners_m)
+                of_others_m = triangles_m if len(others) == len(face) else triangles_m.take(others, axis=2)
+                corners_m = self.squares_T_static[:3, :3] @ of_others_m + self.squares_T_static[:3, 3:]
+                heights_m[:, others] = others_m = self.squares.heights_m(corners_m)
                 least_m = np.maximum(self.lowest_m, np.where(is_down[face[others]], ON_GROUND_M, 0.0))
-                wanted[others] = (of_others_m[1] > least_m) & (of_others_m[0] <= self.highest_m)
+                wanted[others] = (others_m[1] > least_m) & (others_m[0] <= self.highest_m)
             return heights_m, wanted
 
         return heights
@@ -257,12 +258,6 @@ def _box_of(patches: Patches) -> tuple[Float64, Numbers]:
     sides = np.stack([patches.lower_m.min(axis=1), patches.upper_m.max(axis=1)]).astype(np.float64)
     corner = np.indices((2, 2, 2)).reshape(3, -1).T
     return sides[corner, np.arange(3)][None], np.array([len(patches.outward)])
-
-
-def _moved_corners(destination_T_source: Float64, corners_m: NDArray[np.floating]) -> Float64:
-    """(3, 3, N) corners, coordinates, triangles in another frame."""
-    moved_m: Float64 = destination_T_source[:3, :3] @ corners_m.astype(np.float64) + destination_T_source[:3, 3:]
-    return moved_m
 
 
 def _moved_bounds(destination_T_source: Float64, bounds: Bounds) -> tuple[Float64, Float64]:
