@@ -132,7 +132,8 @@ class SceneSurface:
         self._moving = {body: (objects[number], number) for body, number in moving.items()}
         placed = [objects[number].moved(pose).given_to(number) for number, pose in resting.items()]
         if above is not None:
-            placed = [above.of_objects(patches, np.eye(4), *_box_of(patches)) for patches in placed]
+            count = np.array([len(patches.outward) for patches in placed], dtype=np.int64)
+            placed = [above.of_objects(Patches.joined(placed), np.eye(4), _boxes_around(placed), count)]
         cut = [
             Patches.cut(
                 mesh,
@@ -253,11 +254,11 @@ def _groups(patches: Patches, group: Numbers | NDArray[np.int32]) -> Groups:
     return Groups(np.append(first, len(group)), Bounds(lower_m - SLACK_M, upper_m + SLACK_M))
 
 
-def _box_of(patches: Patches) -> tuple[Float64, Numbers]:
-    """(1, 8, 3) corners of a box around all of some patches, and (1,) how many there are."""
-    sides = np.stack([patches.lower_m.min(axis=1), patches.upper_m.max(axis=1)]).astype(np.float64)
+def _boxes_around(parts: Sequence[Patches]) -> Float64:
+    """(J, 8, 3) corners of J upright boxes, each around all patches of one part."""
+    sides = [[patches.lower_m.min(axis=1), patches.upper_m.max(axis=1)] for patches in parts]
     corner = np.indices((2, 2, 2)).reshape(3, -1).T
-    return sides[corner, np.arange(3)][None], np.array([len(patches.outward)])
+    return np.array(sides, dtype=np.float64).reshape(-1, 2, 3)[:, corner, np.arange(3)]
 
 
 def _moved_bounds(destination_T_source: Float64, bounds: Bounds) -> tuple[Float64, Float64]:
