@@ -24,6 +24,7 @@ from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
 from torchcover.coverage.regions import Region
 from torchcover.estimation import Quantity
 from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
+from torchcover.metrics.blocks import FINER
 
 FORMAT_VERSION = 8
 Arrays = dict[str, NDArray[Any]]
@@ -185,6 +186,7 @@ def _redundancy(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> Redund
 def _places(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> PlaceSums:
     places = PlaceSums(*(torch.from_numpy(arrays[name]) for name in OVER_PLACES))
     blocks, count = header["blocks"], len(header["regions"]) * len(grid.heights)
+    blocks *= FINER if blocks > 1 else 1
     values = 1 + len(header["thresholds"]) + len(header["redundancy"])
     if [tuple(one.shape) for one in places] != [(blocks,), (blocks, count), (blocks, values, count)]:
         raise ValueError(f"sums over {count} regions and bands of shape {tuple(places.sums.shape)}")
