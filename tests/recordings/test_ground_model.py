@@ -223,9 +223,7 @@ def test_without_ground_bands_are_over_the_vehicle_and_the_result_says_so():
     assert result.coverage.band_frame == "vehicle"
     assert "Ground: none was found near the vehicle" in " ".join(result.table.notes)
     assert RecordedFrames(Drive())[0].reference_heights_m.isnan().all()
-    assert (
-        RecordedFrames(Road(steps=2), ground=False)[0].reference_heights_m is None
-    )
+    assert RecordedFrames(Road(steps=2), ground=False)[0].reference_heights_m is None
 
 
 def test_with_ground_bands_are_over_it():
