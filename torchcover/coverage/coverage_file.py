@@ -26,7 +26,7 @@ from torchcover.estimation import Quantity
 from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
 from torchcover.metrics.blocks import FINER
 
-FORMAT_VERSION = 7
+FORMAT_VERSION = 8
 Arrays = dict[str, NDArray[Any]]
 # Steps, cells, what is divided by, sums.
 IN_BLOCKS = ("block_steps", "block_cell", "block_probed_steps", "block_sums")
@@ -121,7 +121,9 @@ def read_coverage(path: Path) -> CoverageParts:
         reason = str(error) or type(error).__name__
         raise ValueError(f"not a coverage file as Coverage.save writes it ({reason})") from error
     if parts is None:
-        raise ValueError(f"coverage format {version}; this torchcover reads format {FORMAT_VERSION}")
+        older = version in range(FORMAT_VERSION)
+        bands = "; height bands of older ones were over z of the vehicle: measure again" if older else ""
+        raise ValueError(f"coverage format {version}; this torchcover reads format {FORMAT_VERSION}{bands}")
     return parts
 
 
