@@ -9,6 +9,9 @@ demo: STEPS ?= 24
 demo: $(VENV)/.ready  ## evaluate a built-in rig in city traffic; writes to out/demo
 	$(BIN)/torchcover evaluate front_roof_128 --scenario urban --steps $(STEPS) --workers 2 --out out/demo
 
+# Whoever forbids Python to keep what it has compiled has every process of the tests compile all of it again.
+unexport PYTHONDONTWRITEBYTECODE
+
 # One thread in each process: the tests are dealt out to as many processes as there are cores.
 test: $(VENV)/.ready  ## every test
 	OMP_NUM_THREADS=1 OMP_WAIT_POLICY=passive $(BIN)/python -m pytest --numprocesses auto --dist worksteal

@@ -253,7 +253,8 @@ class Training(lightning.LightningModule):
 
 def coverage_metric(*, square_metres):
     """The metric of the region; with the defaults as many blocks as drives, which know nothing of each other."""
-    grid = BevGrid(x=X_M, y=Y_M, cell=1.6, heights={"body": (0.3, 2.0)})
+    band_frame = "ground" if square_metres else "vehicle"
+    grid = BevGrid(x=X_M, y=Y_M, cell=1.6, heights={"body": (0.3, 2.0)}, band_frame=band_frame)
     return CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=16, square_metres=square_metres)
 
 

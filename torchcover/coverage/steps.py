@@ -83,6 +83,7 @@ def checked_steps(
     place_in_time: int | Sequence[int] | None,
     *,
     grid: BevGrid,
+    square_metres: bool,
     names: Sequence[str] = (),
     first: int,
 ) -> list[CheckedStep]:
@@ -95,6 +96,7 @@ def checked_steps(
         height: Their heights above the local ground.
         place_in_time: Numbers of the steps in time.
         grid: Which needs heights, or does not.
+        square_metres: Whether weights are needed.
         names: Of the sensors, where they are told apart.
         first: Number of the first step if `place_in_time` is not given.
 
@@ -104,6 +106,11 @@ def checked_steps(
             negative or above 10^15.
         TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
     """
+    if square_metres and weights is None:
+        raise ValueError(
+            "weights: the square metres of each reference point are needed, as a SurfaceReference gives them; got "
+            "none (without square_metres=True, points may do without)"
+        )
     rigs = [sensor] if isinstance(sensor, Mapping) else as_list(sensor, "sensor")
     sensors = [_by_name(rig, names) for rig in rigs]
     references = as_list(reference, "reference")

@@ -101,9 +101,15 @@ class Frame:
             band_frame: What the bands are over.
 
         Raises:
-            ValueError: Bands over the ground, and the heights above it are unknown.
+            ValueError: Bands over the ground, and the heights above it are unknown; bands over z, and the points have
+                square metres and heights: that is how points are drawn within bands over the ground.
         """
         if band_frame == "vehicle":
+            if None not in (self.reference_weights, self.reference_heights_m):
+                raise ValueError(
+                    f"frame {self.name!r}: its reference points have heights above the ground, and square metres: they "
+                    "were drawn for bands over the ground; use the band frame ground"
+                )
             return None
         if self.reference_heights_m is None:
             raise ValueError(
@@ -129,7 +135,8 @@ class Frame:
 class FrameBatch:
     """Frames side by side, as `CoverageMetric.update` takes them.
 
-    `metric.update(batch.sensor, batch.reference, weights=batch.weights, place_in_time=batch.place_in_time)`.
+    `metric.update(batch.sensor, batch.reference, weights=batch.weights, height=batch.heights_in(grid.band_frame),
+    place_in_time=batch.place_in_time)`.
 
     Args:
         frames: The frames in order.
@@ -162,26 +169,23 @@ class FrameBatch:
         Raises:
             ValueError: Some frames have them, and others have not.
         """
-        return self._of_all("weights", "square metres", [frame.reference_weights for frame in self.frames])
-
-    @property
-    def heights_m(self) -> list[Tensor] | None:
-        """One (M,) tensor a frame, the heights of its reference points above the ground; None if no frame has any.
-
-        Raises:
-            ValueError: Some frames have them, and others have not.
-        """
-        return self._of_all("heights_m", "heights", [frame.reference_heights_m for frame in self.frames])
-
-    def _of_all(self, name: str, what: str, found: Sequence[Tensor | None]) -> list[Tensor] | None:
-        given = [values for values in found if values is not None]
+        given = [frame.reference_weights for frame in self.frames if frame.reference_weights is not None]
         if given and len(given) < len(self.frames):
-            named = {values is None: frame.name for values, frame in zip(found, self.frames, strict=True)}
+            named = {frame.reference_weights is None: frame.name for frame in self.frames}
             raise ValueError(
-                f"{name}: frame {named[False]!r} has the {what} of its reference points, and {named[True]!r} has none; "
-                "batch each kind of frames by itself"
+                f"weights: frame {named[False]!r} has the square metres of its reference points, and {named[True]!r} "
+                "has none; batch each kind of frames by itself"
             )
         return given or None
+
+    def heights_in(self, band_frame: BandFrame) -> list[Tensor] | None:
+        """One (M,) tensor a frame, as `Frame.heights_in`; None for bands over z of the vehicle.
+
+        Raises:
+            ValueError: As there.
+        """
+        given = [frame.heights_in(band_frame) for frame in self.frames]
+        return [heights_m for heights_m in given if heights_m is not None] or None
 
     @property
     def place_in_time(self) -> list[int]:

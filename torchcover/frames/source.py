@@ -106,6 +106,10 @@ class FrameSource(Protocol):
         """Whether frames have `Frame.boxes`."""
         ...
 
+    def has_heights(self) -> bool:
+        """Whether frames have `Frame.reference_heights_m`: then height bands are over the ground by default."""
+        ...
+
     def ego_mesh(self) -> "Mesh | None":
         """The body of the ego in the vehicle frame; None if unknown."""
         ...
@@ -165,6 +169,10 @@ class FrameDataset(Dataset[Frame]):
         return {}
 
     def has_boxes(self) -> bool:
+        """None of them."""
+        return False
+
+    def has_heights(self) -> bool:
         """None of them."""
         return False
 
@@ -230,6 +238,10 @@ class ChosenRigs(FrameDataset):
     def has_boxes(self) -> bool:
         """As there."""
         return self.frames.has_boxes()
+
+    def has_heights(self) -> bool:
+        """As there."""
+        return self.frames.has_heights()
 
     def ego_mesh(self) -> "Mesh | None":
         """As there."""

@@ -149,6 +149,10 @@ class SimulatedFrames(FrameDataset):
         """Whether they were asked for."""
         return self.boxes
 
+    def has_heights(self) -> bool:
+        """Whether the reference sensor finds them."""
+        return self.reference_sensor.band_frame == "ground"
+
     def ego_mesh(self) -> Mesh:
         """What carries the rigs, in the vehicle frame; no world is built for it."""
         return self.scenario.ego_mesh()
@@ -214,12 +218,12 @@ class SimulatedFrames(FrameDataset):
     def frame_of(self, seen: Observation, index: int) -> Frame:
         """The frame of what the simulator saw at a step."""
         clouds = {name: torch.from_numpy(points) for name, points in seen.clouds.items()}
-        weights = seen.reference_weights
+        weights, heights_m = seen.reference_weights, seen.reference_heights_m
         return Frame(
             clouds=clouds,
             reference=torch.from_numpy(seen.reference),
             reference_weights=None if weights is None else torch.from_numpy(weights),
-            reference_heights_m=torch.from_numpy(seen.reference_heights_m),
+            reference_heights_m=None if heights_m is None else torch.from_numpy(heights_m),
             index=index,
             name=f"{self.scenario.name} step {index}",
             counts=seen.counts,

@@ -136,7 +136,7 @@ class CoverageCallback(Callback):
             [sensor_of(frame, self.rig) for frame in new.frames],
             new.reference,
             weights=new.weights,
-            height=new.heights_m if self.metric.grid.band_frame == "ground" else None,
+            height=new.heights_in(self.metric.grid.band_frame),
             place_in_time=None if UNKNOWN_INDEX in indices else new.place_in_time,
         )
 
