@@ -1,9 +1,9 @@
 """Make pages of `docs/measured` again: run the commands that stand there, and put what they print below them.
 
-`python -m benchmarks.measured [page ...]`, as in `heights`; without names, those of `QUOTED`: what README and the pages on
-definitions, accuracy and the paper quote and is made within 20 minutes of two cores. A command stands in a block of `console`;
-what it prints goes between `<!-- printed -->` and `<!-- /printed -->` behind the block, with the processor time that it
-took. A page that quotes the first table of another one has it between `<!-- first table of PAGE -->` and
+`python -m benchmarks.measured [page ...]`, as in `heights`; without names, those of `QUOTED`: what README and the pages
+on definitions, accuracy and the paper quote and is made within 20 minutes of two cores. A command stands in a block of
+`console`; what it prints goes between `<!-- printed -->` and `<!-- /printed -->` behind the block, with the processor
+time that it took. A page that quotes the first table of another one has it between `<!-- first table of PAGE -->` and
 `<!-- /first table -->`.
 """
 

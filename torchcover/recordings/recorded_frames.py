@@ -226,7 +226,8 @@ class RecordedFrames(FrameDataset):
         return in_vehicle(self.recording.scan(sensor, instant), self.recording.body)
 
     def _heights_m(self, instant: int, reference: InVehicle) -> NDArray[np.float32] | None:
-        if reference.heights_m is not None or not self.ground:
+        # Points with square metres, but without heights, were drawn for bands over z.
+        if reference.heights_m is not None or reference.weights is not None or not self.ground:
             return reference.heights_m
         ground = self._sweeps.ground(self.recording, instant)
         if ground is None:

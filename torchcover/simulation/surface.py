@@ -21,6 +21,8 @@ Numbers = NDArray[np.int64]
 
 # Between which heights above the ground the ground itself lies.
 OF_GROUND_M = np.array([[-TOLERANCE_M - HEIGHT_SLACK_M], [HEIGHT_SLACK_M]], dtype=np.float32)
+# What is nowhere higher above it, by bounds that are wider than it is, lies on it.
+ON_GROUND_M = 3 * HEIGHT_SLACK_M
 # Side of the squares of the ground by which patches are looked up.
 CELL_M = 16  # a power of two
 # A drive is followed by boxes around stretches of it of this length.
@@ -47,28 +49,35 @@ class Groups(NamedTuple):
 class AboveGround(NamedTuple):
     """What is asked about the surface by height above the local ground.
 
-    `squares` of the ground; `squares_T_static` (4, 4) from the frame of what never moves to theirs; `ground` for each
-    mesh that never moves (F,) which of its faces are ground; `lowest_m` and `highest_m` of all heights that are wanted.
+    `squares` of the ground; `squares_T_static` (4, 4) from the frame of what never moves to theirs; for each mesh that
+    never moves (F,) which of its faces are `ground`, and which look `down` and are seen from below only; `lowest_m` and
+    `highest_m` of all heights that are wanted.
     """
 
     squares: GroundSquares
     squares_T_static: Float64
     ground: Sequence[Bools]
+    down: Sequence[Bools]
     lowest_m: float
     highest_m: float
 
     def of_scenery(self, number: int) -> Callable[[Float64, Numbers], tuple[Float32, Bools]]:
         """From triangles of a mesh that never moves and their faces to (2, N) heights, and (N,) whether any is wanted.
 
-        That of the ground itself is none, but for other ground a few centimetres above it.
+        That of the ground itself is none, but for other ground a few centimetres above it. What lies below the ground
+        is hidden by it, and so is what lies on it and looks down.
         """
+        is_ground, is_down = self.ground[number], self.down[number]
 
         def heights(triangles_m: Float64, face: Numbers) -> tuple[Float32, Bools]:
             heights_m = OF_GROUND_M.repeat(len(face), axis=1)
-            others = np.flatnonzero(~self.ground[number][face])
-            corners_m = _moved_corners(self.squares_T_static, triangles_m.take(others, axis=2))
-            heights_m[:, others] = self.squares.heights_m(corners_m)
-            wanted: Bools = (heights_m[1] >= self.lowest_m) & (heights_m[0] <= self.highest_m)
+            others = np.flatnonzero(~is_ground[face])
+            wanted = np.full(len(face), self.lowest_m <= OF_GROUND_M[1, 0])
+            if len(others):
+                corners_m = _moved_corners(self.squares_T_static, triangles_m.take(others, axis=2))
+                heights_m[:, others] = of_others_m = self.squares.heights_m(corners_m)
+                least_m = np.maximum(self.lowest_m, np.where(is_down[face[others]], ON_GROUND_M, 0.0))
+                wanted[others] = (of_others_m[1] > least_m) & (of_others_m[0] <= self.highest_m)
             return heights_m, wanted
 
         return heights
@@ -101,6 +110,7 @@ class SceneSurface:
         resting: By number, `static_T_object` of those that never move.
         moving: Of the others the number of the object, by that of the body in an instant.
         bounds: Boxes in the frame of what never moves, outside of which no scenery is ever asked for.
+        outward: For each mesh of the scenery (F,) what `outward_faces` says of it.
         above: What is asked by height above the local ground; None if nothing is.
         coincident: For each mesh that never moves (F,) numbers of its faces that coincide with others, -1 for the rest;
             empty if none does.
@@ -113,6 +123,7 @@ class SceneSurface:
         resting: Mapping[int, Float64],
         moving: Mapping[int, int],
         bounds: Bounds,
+        outward: Sequence[Bools],
         above: AboveGround | None = None,
         coincident: Sequence[NDArray[np.int32]] = (),
     ) -> None:
@@ -122,7 +133,13 @@ class SceneSurface:
         if above is not None:
             placed = [above.of_objects(patches, np.eye(4), *_box_of(patches)) for patches in placed]
         cut = [
-            Patches.cut(mesh, bounds, above and above.of_scenery(number), coincident[number] if coincident else None)
+            Patches.cut(
+                mesh,
+                bounds,
+                above and above.of_scenery(number),
+                coincident[number] if coincident else None,
+                outward[number],
+            )
             for number, mesh in enumerate(scenery)
         ]
         patches = Patches.joined(cut + placed)
