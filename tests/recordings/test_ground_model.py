@@ -91,8 +91,8 @@ def test_what_stands_and_what_hangs_is_no_ground():
 
 
 def test_a_few_reflections_below_the_road_do_not_lower_it():
-    below = seen(level, 600, 40.0, seed=5) - [0.0, 0.0, 2.0]
-    below[:300] = below[300:] + np.array([0.05, 0.05, -0.05])  # in pairs
+    below = seen(level, 1600, 40.0, seed=5) - [0.0, 0.0, 2.0]
+    below[:800] = below[800:] + np.array([0.05, 0.05, -0.05])  # in pairs
     ground = ground_of(np.concatenate([seen(level), below]))
     assert rms_m(ground, level)[0] < 0.01
     assert (ground.heights_m(below) < -1.5).all()
