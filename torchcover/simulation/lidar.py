@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationInfo, model_validator
+from pydantic import Field, PositiveFloat, ValidationInfo, model_validator
 
 from torchcover.simulation.documents import Pose, beside, is_file_name, load_document
 from torchcover.simulation.rays import unit_directions
@@ -13,7 +13,7 @@ from torchcover.simulation.sensor import Elevation, Ranging
 
 # Two ways to write rows: a sensor that chooses one of them takes nothing of the other from its model.
 SPACED_ROWS = ("channels", "vertical_fov_deg")
-ROW_TABLE = ("elevations_deg", "azimuth_offsets_deg")
+ROW_TABLE = ("elevations_deg", "azimuth_offsets_deg", "range_factors")
 # A hundred times what there is on the market.
 MAX_ROWS, MAX_COLUMNS = 100_000, 1_000_000
 
@@ -32,6 +32,10 @@ class ScanPattern(Ranging):
         azimuth_offsets_deg: Offset of each row; positive is left. None if not given.
         horizontal_fov_deg: Field of view about the x axis, 360 for a full turn.
         columns: Number of columns.
+        range_at_10_percent_m: Range at which a surface of reflectivity 10 %, met head-on, returns every other ray; see
+            `log_excess`. None: every hit within `max_range_m` returns.
+        spread: Standard deviation of ln of that range between one ray and the next.
+        range_factors: Of each row, what its range at 10 % is multiplied with; 1 if not given.
         min_range_m, max_range_m, range_noise_m, dropout: As in `Ranging`.
     """
 
@@ -41,6 +45,9 @@ class ScanPattern(Ranging):
     azimuth_offsets_deg: tuple[float, ...] | None = None
     horizontal_fov_deg: Annotated[float, Field(gt=0.0, le=360.0)]
     columns: Annotated[int, Field(gt=0, le=MAX_COLUMNS)]
+    range_at_10_percent_m: PositiveFloat | None = None
+    spread: PositiveFloat = 0.3
+    range_factors: tuple[PositiveFloat, ...] | None = None
 
     @model_validator(mode="after")
     def _check_rows(self) -> Self:
@@ -51,9 +58,11 @@ class ScanPattern(Ranging):
             raise ValueError("the rows are missing: give channels and vertical_fov_deg, or elevations_deg")
         if self.vertical_fov_deg is not None and self.vertical_fov_deg[0] > self.vertical_fov_deg[1]:
             raise ValueError(f"vertical_fov_deg: the lower elevation comes first; got {self.vertical_fov_deg}")
-        rows, offsets = len(self.rows_deg()), self.azimuth_offsets_deg
-        if offsets is not None and len(offsets) != rows:
-            raise ValueError(f"azimuth_offsets_deg: one for each of the {rows} rows is needed; got {len(offsets)}")
+        rows = len(self.rows_deg())
+        for key in ("azimuth_offsets_deg", "range_factors"):
+            given = getattr(self, key)
+            if given is not None and len(given) != rows:
+                raise ValueError(f"{key}: one for each of the {rows} rows is needed; got {len(given)}")
         return self
 
     @property
