@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from torchcover.geometry import invert
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Draws, Lidar, Pose
 from torchcover.simulation.bodies import in_vehicle_frame
@@ -110,3 +111,36 @@ def test_the_ego_is_at_its_own_place_to_the_last_bit():
     turned = replace(made, ego=replace(made.ego, trajectory=driving(UTM, (10, 0, 0), yaw_deg=37.3)), actors=())
     for step in (0, 3, 7):
         np.testing.assert_array_equal(Scene(turned).at(step).moving.part_T_vehicle, np.eye(4)[None])
+
+
+@pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), UTM])
+@pytest.mark.parametrize(("ego_moves", "actor_moves"), [(False, False), (False, True), (True, True)])
+def test_a_hit_lies_on_the_face_that_it_says_at_the_angle_that_it_says(ego_moves, actor_moves, origin_m):
+    made = world(ego_moves, actor_moves, origin_m)
+    bar, ground = made.static
+    bar = bar._replace(material=np.arange(len(bar.faces), dtype=np.uint8))
+    car = replace(made.actors[0], mesh=made.actors[0].mesh._replace(material=np.full(12, 77, dtype=np.uint8)))
+    turning = Trajectory.from_arrays([0.0, 10.0], [origin_m, np.add(origin_m, (3, 1, 0))], [[0, 0, 0], [40, 0, 0]])
+    ego = replace(made.ego, trajectory=turning if ego_moves else made.ego.trajectory)
+    scene, time_s = Scene(replace(made, static=(bar, ground), actors=(car,), ego=ego)), 3.0
+    scan = afresh(scene.at(3))
+    struck, origin = scan.struck(), LIDAR.mount.matrix()[:3, 3]
+    vehicle_T_world = invert(ego.trajectory.at(time_s))
+    there = {0: bar.moved(vehicle_T_world), 1: ground.moved(vehicle_T_world)}
+    there[2] = car.mesh.moved(vehicle_T_world @ car.trajectory.at(time_s))
+    # Resting bodies before what never was one, which is before those that move.
+    of_body = {(False, False): [-1, 2, 0, 1], (False, True): [-1, 0, 1, 2], (True, True): [0, 1, -1, 2]}
+    number = np.array(of_body[ego_moves, actor_moves])[struck.body]
+    assert set(number) == {0, 1, 2}
+    for one, mesh in there.items():
+        some = number == one
+        points, triangle = scan.points[some].astype(np.float64), struck.triangle[some]
+        first, second, third = mesh.vertices_m[mesh.faces[triangle]].transpose(1, 0, 2)
+        across = np.cross(second - first, third - first)
+        normals = across / np.linalg.norm(across, axis=1, keepdims=True)
+        assert np.abs(((points - first) * normals).sum(axis=1)).max() < 1e-4
+        for start, end in ((first, second), (second, third), (third, first)):
+            assert (np.cross(end - start, points - start) * normals).sum(axis=1).min() > -1e-3
+        ways = (points - origin) / np.linalg.norm(points - origin, axis=1, keepdims=True)
+        np.testing.assert_allclose(struck.cos_incidence[some], np.abs((ways * normals).sum(axis=1)), atol=1e-5)
+        assert (struck.material[some] == mesh.materials[triangle]).all()

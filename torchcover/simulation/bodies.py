@@ -232,4 +232,5 @@ def merge(meshes: list[Mesh]) -> Mesh:
     return Mesh(
         np.concatenate([mesh.vertices_m for mesh in meshes]),
         np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]),
+        np.concatenate([mesh.materials for mesh in meshes]),
     )

@@ -1,6 +1,6 @@
 """A scene at one time, which sensors scan."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import transform
 from torchcover.simulation.local_ground import LocalGround
 from torchcover.simulation.moving import Moving
-from torchcover.simulation.raycaster import Hits, RayCaster
+from torchcover.simulation.raycaster import Hits, RayCaster, Struck
 from torchcover.simulation.rays import TILE_ROWS, Outlines, Tile, into_tiles, outlines, rotate, unit_directions
 
 # Directions all around, to find out whether a place lies inside a body.
@@ -32,7 +32,8 @@ class SensorScan(NamedTuple):
     """What one sensor saw: `points` (N, 3) float32 in the vehicle frame, and how many rays went where.
 
     `ray` (N,) says which ray, counted over the tiles, made each point, and `range_m` (N,) how far it went. `body_casts`
-    is the number of pairs of a ray and a moving body at which it was cast: the other pairs could not meet.
+    is the number of pairs of a ray and a moving body at which it was cast: the other pairs could not meet. `struck`
+    finds out what they hit, for who asks; None of what a sensor has measured.
     """
 
     points: Float32
@@ -41,6 +42,7 @@ class SensorScan(NamedTuple):
     rays: int
     self_hits: int
     body_casts: int = 0
+    struck: Callable[[], Struck] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,11 +112,13 @@ class Instant:
         """
         bodies = self.outlines(vehicle_T_sensor[:3, 3])
 
-        def scan_tile(tile: Tile, own_m: Float32 | None) -> tuple[Float32, NDArray[np.bool_], Float32, int, int]:
+        def scan_tile(
+            tile: Tile, own_m: Float32 | None
+        ) -> tuple[Float32, NDArray[np.bool_], Float32, Float32, Hits, int]:
             directions, hits, casts = self.cast(vehicle_T_sensor, tile, _limit(tile, max_range_m), bodies, own_m)
             seen = (hits.body >= 0) & (ego_points | (hits.body != self.ego))
             points = _points(vehicle_T_sensor[:3, 3], directions, hits.range_m, seen)
-            return points, seen, hits.range_m[seen], int(np.count_nonzero(hits.body == self.ego)), casts
+            return points, seen, hits.range_m[seen], directions, hits, casts
 
         own: Sequence[Float32 | None] = own_m or [None] * len(tiles)
         if threads <= 1 or len(tiles) <= 1:
@@ -123,15 +127,43 @@ class Instant:
             # A pool for each scan: threads do not survive the fork that makes a DataLoader worker.
             with ThreadPoolExecutor(threads) as pool:
                 scans = list(pool.map(scan_tile, tiles, own))
-        points, seen, range_m, self_hits, casts = zip(*scans, strict=True)
+        points, seen, range_m, directions, hits, casts = zip(*scans, strict=True)
+
+        def struck() -> Struck:
+            parts = [
+                self.struck(of.body[there], of.triangle[there], towards.take(there, axis=1))
+                for of, there, towards in zip(hits, map(np.flatnonzero, seen), directions, strict=True)
+            ]
+            return Struck._make(np.concatenate(column) for column in zip(*parts, strict=True))
+
         return SensorScan(
             points=np.concatenate(points),
             ray=np.flatnonzero(np.concatenate(seen)),
             range_m=np.concatenate(range_m),
             rays=sum(tile.directions.shape[1] for tile in tiles),
-            self_hits=sum(self_hits),
+            self_hits=sum(int(np.count_nonzero(of.body == self.ego)) for of in hits),
             body_casts=sum(casts),
+            struck=struck,
         )
+
+    def struck(self, body: NDArray[np.int32], triangle: NDArray[np.int32], directions: Float32) -> Struck:
+        """What the rays hit that ended on some faces.
+
+        Args:
+            body: (N,) numbers of the bodies, as `cast` gives them, none of them -1.
+            triangle: (N,) likewise.
+            directions: (3, N) unit directions of these rays in the vehicle frame.
+        """
+        moved = np.flatnonzero(body >= self.static.bodies)
+        # What moves is looked up as any face of what does not, and then put right.
+        rests = np.where(body < self.static.bodies, triangle, 0) if len(moved) else triangle
+        towards = rotate(self.static_T_vehicle[:3, :3], directions)
+        found = self.static.struck(np.minimum(body, self.static.bodies - 1), rests, towards)
+        if len(moved):
+            part = np.searchsorted(self.moving.body, body[moved])
+            others = self.moving.struck(part, triangle[moved], directions[:, moved])
+            found.cos_incidence[moved], found.material[moved] = others.cos_incidence, others.material
+        return found._replace(body=body, triangle=triangle)
 
     def range_image(
         self, vehicle_T_sensor: Matrix, directions: NDArray[np.float64], *, max_range_m: float = np.inf
@@ -228,7 +260,7 @@ class Instant:
         The hits are brought up to date.
         """
         leaving_out = self.ego if ego_is_known else None
-        (part, ray, range_m), casts = self.moving.meetings(
+        (part, ray, range_m, triangle), casts = self.moving.meetings(
             origin_m, vehicle_R_sensor, tile, directions, hits.range_m, bodies, leaving_out=leaving_out
         )
         if casts == 0:
@@ -238,7 +270,7 @@ class Instant:
         np.minimum.at(nearest_m, ray, range_m)
         first = range_m == nearest_m[ray]
         hits.range_m[ray[first]] = range_m[first]
-        hits.body[ray[first]] = self.moving.body[part[first]]
+        hits.body[ray[first]], hits.triangle[ray[first]] = self.moving.body[part[first]], triangle[first]
         return casts
 
 

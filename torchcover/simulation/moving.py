@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, invert
 from torchcover.simulation.patches import Patches
-from torchcover.simulation.raycaster import RayCaster
+from torchcover.simulation.raycaster import Hits, RayCaster, Struck
 from torchcover.simulation.rays import (
     SLACK_M,
     SLACK_SHARE,
@@ -75,11 +75,15 @@ class Solids:
 
 
 class Meetings(NamedTuple):
-    """L times that a ray meets a body: (L,) number of the body in `Moving`, of the ray in its tile, and where."""
+    """L times that a ray meets a body: (L,) number of the body in `Moving`, of the ray in its tile, and where.
+
+    `triangle` (L,) says on which face of the body.
+    """
 
     part: Numbers
     ray: Numbers
     range_m: Float32
+    triangle: NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,14 +182,32 @@ class Moving:
             of_near, block = np.nonzero(blocks_towards(bodies.kept(near), tile, vehicle_R_sensor, limit_m))
             part, ray = rays_towards(bodies, near[of_near], tile.blocks[block], directions, limit_m)
         if len(ray) == 0:
-            return Meetings(part, ray, np.empty(0, dtype=np.float32)), 0
-        range_m, met = self._cast_pairs(origin_m, directions, part, ray, limit_m)
-        return Meetings(part[met], ray[met], range_m[met]), len(met)
+            return Meetings(part, ray, np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int32)), 0
+        hits = self._cast_pairs(origin_m, directions, part, ray, limit_m)
+        met = hits.body >= 0
+        return Meetings(part[met], ray[met], hits.range_m[met], hits.triangle[met]), len(met)
+
+    def struck(self, part: Numbers, triangle: NDArray[np.int32], directions: Float32) -> Struck:
+        """What the rays hit that met some of the bodies.
+
+        Args:
+            part: (N,) of `Meetings`.
+            triangle: (N,) likewise.
+            directions: (3, N) unit directions of these rays in the vehicle frame.
+        """
+        towards = rotate_each(self.part_T_vehicle[:, :3, :3].astype(np.float32)[part], directions)
+        casters, kind = self.kinds
+        cosine, material = np.empty(len(part), dtype=np.float32), np.empty(len(part), dtype=np.uint8)
+        for number in np.unique(kind[part]).tolist():
+            some = np.flatnonzero(kind[part] == number)
+            alone = casters[number].struck(np.zeros(len(some), dtype=np.int32), triangle[some], towards[:, some])
+            cosine[some], material[some] = alone.cos_incidence, alone.material
+        return Struck(self.body[part].astype(np.int32), triangle, cosine, material)
 
     def _cast_pairs(
         self, origin_m: Float64, directions: Float32, part: Numbers, ray: Numbers, limit_m: Float32
-    ) -> tuple[Float32, NDArray[np.bool_]]:
-        """Cast K pairs of a ray and a body: (K,) where the ray ends, and whether it met the body."""
+    ) -> Hits:
+        """Cast K pairs of a ray and a body, each as if it were alone."""
         places_m = self.from_there_m(origin_m)
         casters, kind = self.kinds
         touched = self.touched_by(origin_m, places_m)
@@ -203,7 +225,6 @@ class Moving:
             else:
                 caster = casters[group[start]]
                 answers.append(caster.cast_from_each(starts_m[some], towards[:, some], limit_m[some]))
-        range_m, met = np.empty_like(limit_m), np.empty(len(order), dtype=bool)
-        range_m[order] = np.concatenate([answer.range_m for answer in answers])
-        met[order] = np.concatenate([answer.body for answer in answers]) >= 0
-        return range_m, met
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        return Hits._make(np.concatenate(column)[back] for column in zip(*answers, strict=True))

@@ -3,7 +3,9 @@
 Another kind is a class with the members of `Sensor` and a line in `kinds.py`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from threading import Lock
 from typing import Annotated, NamedTuple, Protocol, Self
 
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from torchcover.simulation.documents import Document, Pose
+from torchcover.simulation.raycaster import Struck
 
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -27,18 +30,31 @@ class RayHits:
         range_m: (N,) how far it went, up to the sensor's range.
         pixel_of_ray: (rays,) where each ray stands in `Sensor.directions`, row by row.
         place: (N,) in which of several worlds, of which a sensor sees each alone; None if there is one.
+        find: Finds out what they ended on.
     """
 
     ray: Numbers
     range_m: NDArray[np.floating]
     pixel_of_ray: Numbers
     place: Numbers | None = None
+    find: Callable[[], Struck] | None = None
 
     @property
     def pixel(self) -> Numbers:
         """(N,) row * columns + column of each ray in `Sensor.directions`."""
         pixels: Numbers = self.pixel_of_ray[self.ray]
         return pixels
+
+    @cached_property
+    def struck(self) -> Struck:
+        """What they ended on: bodies, faces, angles of incidence, materials. A sensor that does not ask does not pay.
+
+        Raises:
+            ValueError: Hits of which that is unknown.
+        """
+        if self.find is None:
+            raise ValueError("the hits know where they are, and not on what; give RayHits its `find`")
+        return self.find()
 
 
 class Returns(NamedTuple):

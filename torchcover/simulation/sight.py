@@ -46,7 +46,7 @@ class MountedSensor:
         self.pixel_of_ray = pixels_in_tiles(directions)
         self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
         self._at_rest = not scene.moves
-        self._hits: SensorScan | None = None
+        self._resting: tuple[SensorScan, RayHits] | None = None
 
     def scan(self, instant: Instant, draws: Draws, *, threads: int = 1) -> SensorScan:
         """What it makes of what its rays hit at one time of the scene.
@@ -56,29 +56,31 @@ class MountedSensor:
             draws: The random numbers of its measuring.
             threads: Number of threads; the result does not depend on it.
         """
-        hits = self._cast(instant, threads)
-        hit, error_m = self.sensor.measure(RayHits(hits.ray, hits.range_m, self.pixel_of_ray), draws)
+        scan, hits = self._cast(instant, threads)
+        hit, error_m = self.sensor.measure(hits, draws)
+        scan = scan._replace(struck=None)
         if hit is not None:
-            hits = hits._replace(points=hits.points[hit], ray=hits.ray[hit], range_m=hits.range_m[hit])
+            scan = scan._replace(points=scan.points[hit], ray=scan.ray[hit], range_m=scan.range_m[hit])
         if error_m is None:
-            return hits
-        ways_m = hits.points.astype(np.float64) - self.vehicle_T_sensor[:3, 3]
+            return scan
+        ways_m = scan.points.astype(np.float64) - self.vehicle_T_sensor[:3, 3]
         along = error_m[:, None] / np.linalg.norm(ways_m, axis=1, keepdims=True)
-        return hits._replace(points=(hits.points + ways_m * along).astype(np.float32))
+        return scan._replace(points=(scan.points + ways_m * along).astype(np.float32))
 
-    def _cast(self, instant: Instant, threads: int) -> SensorScan:
-        if self._hits is not None:
-            return self._hits
-        hits = instant.scan(
+    def _cast(self, instant: Instant, threads: int) -> tuple[SensorScan, RayHits]:
+        if self._resting is not None:
+            return self._resting
+        scan = instant.scan(
             self.vehicle_T_sensor,
             self.tiles,
             max_range_m=self.reach_m,
             own_m=self._own_m,
             threads=threads,
         )
+        hits = RayHits(scan.ray, scan.range_m, self.pixel_of_ray, find=scan.struck)
         if self._at_rest:
-            self._hits = hits
-        return hits
+            self._resting = scan, hits
+        return scan, hits
 
     def ends(self, instant: Instant) -> Ends:
         """Where each of its rays ends: at what it hits first, the ego's body included, or at its reach.

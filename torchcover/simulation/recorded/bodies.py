@@ -54,7 +54,7 @@ class Bodies:
         if kind is None:
             return box_mesh(size_m)
         mesh = self._meshes[kind]
-        return Mesh(mesh.vertices_m * (np.array(size_m) / self._sizes_m[kind]), mesh.faces)
+        return mesh._replace(vertices_m=mesh.vertices_m * (np.array(size_m) / self._sizes_m[kind]))
 
 
 @reads("a file of boxes")

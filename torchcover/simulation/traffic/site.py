@@ -103,7 +103,7 @@ class BuildingSite:
         places_m = self.street.poses(x_m, y_m)[:, :2]
         if not self._hills.are_flat:
             height_m = height_m + self._hills.heights_m(places_m) - np.where(height_m <= bottom_m, FOOT_M, 0.0)
-        return [Mesh(np.column_stack([places_m, height_m]), merged.faces)]
+        return [merged._replace(vertices_m=np.column_stack([places_m, height_m]))]
 
     def _reach_m(self, x_m: Numbers, side: int, kerb_m: float) -> Numbers:
         """(N,) how far from the middle it goes there."""
