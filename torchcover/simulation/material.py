@@ -1,12 +1,20 @@
 """What surfaces are made of, as far as a LiDAR can tell."""
 
+from functools import cache
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Literal, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat
 
+from torchcover.simulation.builtin import builtin_names
 from torchcover.simulation.documents import Document, load_document
+
+# What nobody said the material of is scenery: walls for the most part.
+UNSAID = "brick"
+# A body has its own tone, the same at every time and for every rig: that of its number among so many.
+TONES = np.random.default_rng(905).standard_normal(4096)
 
 
 class Material(Document):
@@ -48,3 +56,45 @@ class Material(Document):
     def share(self) -> float:
         """The reflectivity as a number: infinite for a retroreflector."""
         return np.inf if self.reflectivity == "retroreflective" else float(self.reflectivity)
+
+
+class Materials(NamedTuple):
+    """What all materials are, by number: `reflectivity`, `exponent`, and `spread` of ln reflectivity by what varies."""
+
+    reflectivity: NDArray[np.float64]
+    exponent: NDArray[np.float64]
+    spread_of_places: NDArray[np.float64]
+    spread_of_bodies: NDArray[np.float64]
+
+
+@cache
+def material_number(name: str) -> int:
+    """The number of a built-in material, which meshes have; 0 is where none was said.
+
+    Raises:
+        FileNotFoundError: No such material; the message has the nearest name.
+    """
+    known = builtin_names("materials")
+    if name not in known:
+        Material.load(name)
+    return 1 + known.index(name)
+
+
+@cache
+def materials() -> Materials:
+    """All built-in materials, that for number 0 ahead."""
+    each = [Material.load(name) for name in (UNSAID, *builtin_names("materials"))]
+    spread = np.array([one.spread for one in each])
+    is_of_body = np.array([one.varies_by == "body" for one in each])
+    return Materials(
+        np.array([one.share for one in each]),
+        np.array([one.incidence_exponent for one in each]),
+        np.where(is_of_body, 0.0, spread),
+        np.where(is_of_body, spread, 0.0),
+    )
+
+
+def tone(body: NDArray[np.integer]) -> NDArray[np.float64]:
+    """(N,) by how many spreads each body is brighter than its material, by its number; 0 for what is no body, -1."""
+    tones: NDArray[np.float64] = np.where(body < 0, 0.0, TONES[body % len(TONES)])
+    return tones
