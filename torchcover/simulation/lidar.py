@@ -8,8 +8,10 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, ValidationInfo, model_validator
 
 from torchcover.simulation.documents import Pose, beside, is_file_name, load_document
+from torchcover.simulation.material import material_number, materials, tone
 from torchcover.simulation.rays import unit_directions
-from torchcover.simulation.sensor import Elevation, Ranging
+from torchcover.simulation.returns import log_excess, return_probability
+from torchcover.simulation.sensor import Draws, Elevation, Ranging, RayHits, Returns
 
 # Two ways to write rows: a sensor that chooses one of them takes nothing of the other from its model.
 SPACED_ROWS = ("channels", "vertical_fov_deg")
@@ -64,6 +66,38 @@ class ScanPattern(Ranging):
             if given is not None and len(given) != rows:
                 raise ValueError(f"{key}: one for each of the {rows} rows is needed; got {len(given)}")
         return self
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether it has neither noise nor drop-out, and every hit returns."""
+        return self.range_at_10_percent_m is None and super().is_exact
+
+    def measure(self, hits: RayHits, draws: Draws) -> Returns:
+        """A point for each hit that returns enough light and is not too close; see `Ranging.measure`."""
+        if self.range_at_10_percent_m is None:
+            return super().measure(hits, draws)
+        returned = draws.chance(hits.ray) < self._return_probability(hits, self.range_at_10_percent_m)
+        return self.erring(hits.ray, np.flatnonzero(returned & (hits.range_m >= self.min_range_m)), draws)
+
+    def _return_probability(self, hits: RayHits, range_at_10_percent_m: float) -> NDArray[np.floating]:
+        material, weather = hits.struck.material, hits.weather
+        if weather.road == "wet":
+            material = np.where(material == material_number("road"), material_number("wet_road"), material)
+        known = materials()
+        reach_m: float | NDArray[np.float32] = range_at_10_percent_m
+        if self.range_factors is not None:
+            of_rows_m = range_at_10_percent_m * np.array(self.range_factors, dtype=np.float32)
+            reach_m = of_rows_m[hits.pixel // self.columns]
+        excess = log_excess(
+            hits.range_m,
+            hits.struck.cos_incidence,
+            known.reflectivity[material],
+            known.exponent[material],
+            reach_m,
+            weather.extinction_per_m,
+        )
+        excess += known.spread_of_bodies[material] * tone(hits.struck.body)
+        return return_probability(excess, self.spread, known.spread_of_places[material])
 
     @property
     def rays(self) -> int:

@@ -14,7 +14,7 @@ from torchcover.simulation.documents import Document, load_document
 # What nobody said the material of is scenery: walls for the most part.
 UNSAID = "brick"
 # A body has its own tone, the same at every time and for every rig: that of its number among so many.
-TONES = np.random.default_rng(905).standard_normal(4096)
+TONES = np.append(np.random.default_rng(905).standard_normal(4095), 0.0).astype(np.float32)
 
 
 class Material(Document):
@@ -61,10 +61,10 @@ class Material(Document):
 class Materials(NamedTuple):
     """What all materials are, by number: `reflectivity`, `exponent`, and `spread` of ln reflectivity by what varies."""
 
-    reflectivity: NDArray[np.float64]
-    exponent: NDArray[np.float64]
-    spread_of_places: NDArray[np.float64]
-    spread_of_bodies: NDArray[np.float64]
+    reflectivity: NDArray[np.float32]
+    exponent: NDArray[np.float32]
+    spread_of_places: NDArray[np.float32]
+    spread_of_bodies: NDArray[np.float32]
 
 
 @cache
@@ -84,17 +84,13 @@ def material_number(name: str) -> int:
 def materials() -> Materials:
     """All built-in materials, that for number 0 ahead."""
     each = [Material.load(name) for name in (UNSAID, *builtin_names("materials"))]
-    spread = np.array([one.spread for one in each])
-    is_of_body = np.array([one.varies_by == "body" for one in each])
-    return Materials(
-        np.array([one.share for one in each]),
-        np.array([one.incidence_exponent for one in each]),
-        np.where(is_of_body, 0.0, spread),
-        np.where(is_of_body, spread, 0.0),
-    )
+    of_body = [one.spread if one.varies_by == "body" else 0.0 for one in each]
+    of_place = [one.spread - spread for one, spread in zip(each, of_body, strict=True)]
+    columns = ([one.share for one in each], [one.incidence_exponent for one in each], of_place, of_body)
+    return Materials._make(np.array(column, dtype=np.float32) for column in columns)
 
 
-def tone(body: NDArray[np.integer]) -> NDArray[np.float64]:
+def tone(body: NDArray[np.integer]) -> NDArray[np.float32]:
     """(N,) by how many spreads each body is brighter than its material, by its number; 0 for what is no body, -1."""
-    tones: NDArray[np.float64] = np.where(body < 0, 0.0, TONES[body % len(TONES)])
+    tones: NDArray[np.float32] = TONES[body % len(TONES)]
     return tones

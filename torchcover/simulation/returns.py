@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
-Float64 = NDArray[np.float64]
+Floats = NDArray[np.floating]
 
 # Of the strongest returns as many come back: 98 to 99 % of near road in sweeps of VLP-32C, HDL-32E and HDL-64E.
 SURE = 0.985
@@ -26,8 +26,10 @@ def log_excess(
     incidence_exponent: ArrayLike,
     range_at_10_percent_m: ArrayLike,
     extinction_per_m: float = 0.0,
-) -> Float64:
+) -> Floats:
     """(N,) ln q of N hits, above 0 where what comes back is more than enough.
+
+    In the type of the ranges: logarithms of float32 are good to 1e-6.
 
     Args:
         range_m: (N,) how far they are.
@@ -43,15 +45,15 @@ def log_excess(
         >>> round(float(np.exp(log_excess(100.0, 0.5, 0.4, 1.0, 100.0))), 12)    # four times as bright, aslant
         2.0
     """
-    range_m = np.asarray(range_m, dtype=np.float64)
-    cosine = np.maximum(np.asarray(cos_incidence, dtype=np.float64), LEAST_COSINE)
+    range_m = np.asarray(range_m)
     with np.errstate(divide="ignore"):  # of what reflects nothing: minus infinity
-        of_surface = np.log(np.asarray(reflectivity, dtype=np.float64) / 0.1)
-    excess: Float64 = of_surface + incidence_exponent * np.log(cosine) + 2.0 * np.log(range_at_10_percent_m / range_m)
-    return excess - 2.0 * extinction_per_m * range_m
+        excess: Floats = np.log(np.asarray(reflectivity) / 0.1)
+    excess = excess + incidence_exponent * np.log(np.maximum(cos_incidence, LEAST_COSINE))
+    excess = excess + 2.0 * np.log(range_at_10_percent_m / range_m)
+    return excess - 2.0 * extinction_per_m * range_m if extinction_per_m else excess
 
 
-def return_probability(log_excess: ArrayLike, spread: ArrayLike, reflectivity_spread: ArrayLike = 0.0) -> Float64:
+def return_probability(log_excess: ArrayLike, spread: ArrayLike, reflectivity_spread: ArrayLike = 0.0) -> Floats:
     """(N,) P(return) of hits with these ln q.
 
     Args:
@@ -63,8 +65,7 @@ def return_probability(log_excess: ArrayLike, spread: ArrayLike, reflectivity_sp
         >>> float(return_probability(0.0, 0.3)) == SURE / 2
         True
     """
-    widths = np.hypot(2.0 * np.asarray(spread, dtype=np.float64), reflectivity_spread)
-    probability: Float64 = SURE * ndtr(np.asarray(log_excess, dtype=np.float64) / widths)
+    probability: Floats = SURE * ndtr(log_excess / np.hypot(2.0 * np.asarray(spread), reflectivity_spread))
     return probability
 
 

@@ -15,6 +15,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from torchcover.simulation.documents import Document, Pose
 from torchcover.simulation.raycaster import Struck
+from torchcover.simulation.weather import CLEAR, Weather
 
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -31,6 +32,7 @@ class RayHits:
         pixel_of_ray: (rays,) where each ray stands in `Sensor.directions`, row by row.
         place: (N,) in which of several worlds, of which a sensor sees each alone; None if there is one.
         find: Finds out what they ended on.
+        weather: What they went through.
     """
 
     ray: Numbers
@@ -38,6 +40,7 @@ class RayHits:
     pixel_of_ray: Numbers
     place: Numbers | None = None
     find: Callable[[], Struck] | None = None
+    weather: Weather = CLEAR
 
     @property
     def pixel(self) -> Numbers:
@@ -92,21 +95,25 @@ class Draws:
 
     def normal(self, ray: Numbers) -> Float64:
         """(N,) of a normal distribution with standard deviation 1, for hits of these rays."""
-        return np.zeros(len(ray)) if self._generator is None else self._drawn("standard_normal", ray)
+        return np.zeros(len(ray)) if self._generator is None else self._drawn("error", "standard_normal", ray)
 
     def uniform(self, ray: Numbers) -> Float64:
         """(N,) evenly from [0, 1), for hits of these rays; 1 where there is no source."""
-        return np.ones(len(ray)) if self._generator is None else self._drawn("random", ray)
+        return np.ones(len(ray)) if self._generator is None else self._drawn("dropout", "random", ray)
 
-    def _drawn(self, kind: str, ray: Numbers) -> Float64:
+    def chance(self, ray: Numbers) -> Float64:
+        """(N,) evenly from [0, 1), others than `uniform`, for hits of these rays; 1/2 where there is no source."""
+        return np.full(len(ray), 0.5) if self._generator is None else self._drawn("return", "random", ray)
+
+    def _drawn(self, purpose: str, kind: str, ray: Numbers) -> Float64:
         draw = getattr(self._generator, kind)
         if self._rays is None:
             drawn: Float64 = draw(len(ray))
             return drawn
         with self._lock:  # whichever thread asks first draws for all
-            if kind not in self._of_rays:
-                self._of_rays[kind] = draw(self._rays)
-            return self._of_rays[kind][ray]
+            if purpose not in self._of_rays:
+                self._of_rays[purpose] = draw(self._rays)
+            return self._of_rays[purpose][ray]
 
 
 class Sensor(Protocol):
@@ -216,7 +223,7 @@ class Ranging(Document):
             hit: (K,) which hits would give a point; None for all.
             draws: Source of the random numbers.
         """
-        if self.is_exact:
+        if not (self.range_noise_m or self.dropout):
             return Returns(hit, None)
         ray = ray if hit is None else ray[hit]
         error_m = self.range_noise_m * draws.normal(ray) if self.range_noise_m else None

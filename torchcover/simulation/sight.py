@@ -11,6 +11,7 @@ from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.rays import BLOCK, Tile, into_tiles, pixels_in_tiles
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sensor import Draws, RayHits, Sensor
+from torchcover.simulation.weather import CLEAR, Weather
 
 # Rays in a tile: of neighbours all, so that a tile is narrow. A constant, so that nothing depends on threads.
 TILE_RAYS = 8192
@@ -35,11 +36,13 @@ class MountedSensor:
         sensor: The sensor.
         scene: Where it is.
         reach_m: How far its rays are cast there; `Scenario.reach_m`.
+        weather: What they go through.
     """
 
-    def __init__(self, sensor: Sensor, scene: Scene, reach_m: float) -> None:
+    def __init__(self, sensor: Sensor, scene: Scene, reach_m: float, weather: Weather = CLEAR) -> None:
         self.sensor = sensor
         self.reach_m = reach_m
+        self.weather = weather
         self.vehicle_T_sensor = sensor.mount.matrix()
         directions = sensor.directions()
         self.tiles = into_tiles(directions)
@@ -77,7 +80,7 @@ class MountedSensor:
             own_m=self._own_m,
             threads=threads,
         )
-        hits = RayHits(scan.ray, scan.range_m, self.pixel_of_ray, find=scan.struck)
+        hits = RayHits(scan.ray, scan.range_m, self.pixel_of_ray, find=scan.struck, weather=self.weather)
         if self._at_rest:
             self._resting = scan, hits
         return scan, hits
