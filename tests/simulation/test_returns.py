@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+import yaml
 from pydantic import ValidationError
 
-from torchcover.simulation import Lidar, Material, builtin_names
+from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator, builtin_names
 from torchcover.simulation.returns import SURE, extinction_per_m, log_excess, return_probability
 
 KEYS = {
@@ -90,3 +91,146 @@ def test_bad_materials_are_told():
 def test_bad_keys_of_a_lidar_are_told(given, told):
     with pytest.raises(ValidationError, match=told):
         Lidar.model_validate(KEYS | given)
+
+
+PLAIN = {
+    "name": "plain",
+    "ego": {"pose": {}, "shape": {"type": "box", "size_m": [0.5, 0.5, 0.5]}},
+    "bodies": [
+        {"name": "plain", "ground": True, "shape": {"type": "plane", "size_m": [400.0, 400.0]}},
+        {"name": "wall", "shape": {"type": "box", "size_m": [1.0, 30.0, 8.0]}, "poses": [{"x_m": 60.0}]},
+    ],
+}
+ROOF = {
+    "name": "roof",
+    "mount": {"z_m": 2.0},
+    "channels": 40,
+    "vertical_fov_deg": [-8.0, -1.5],
+    "columns": 720,
+    "horizontal_fov_deg": 360.0,
+    "max_range_m": 150.0,
+    "range_at_10_percent_m": 60.0,
+    "spread": 0.25,
+}
+
+
+def seen(weather=None, index=0, bodies=None, **keys):
+    """Which rays of a LiDAR on a plain return at a step."""
+    scenario = Scenario.model_validate(PLAIN | {"weather": weather or {}} | ({"bodies": bodies} if bodies else {}))
+    rig = Rig.model_validate({"name": "rig", "sensors": [ROOF | keys]})
+    return Simulator(scenario, {"rig": rig}, PaperReference(rows=2, columns=2)).scans(index)["rig"][0]
+
+
+def test_as_many_return_from_a_plain_as_the_law_says():
+    every, returned = seen(range_at_10_percent_m=None), seen()
+    road = Material.load("road")
+    is_road = every.points[:, 2] < 1e-3
+    excess = log_excess(
+        every.range_m.astype(float),
+        2.0 / every.range_m,
+        road.share,
+        road.incidence_exponent,
+        ROOF["range_at_10_percent_m"],
+    )
+    expected = return_probability(excess, ROOF["spread"], road.spread)
+    there = np.isin(every.ray, returned.ray)
+    for low_m in range(15, 75, 15):
+        some = is_road & (every.range_m > low_m) & (every.range_m < low_m + 15)
+        error = np.sqrt((expected * (1 - expected))[some].sum()) / some.sum()
+        assert there[some].mean() == pytest.approx(expected[some].mean(), abs=4 * error + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("worse", "keys"),
+    [
+        ({"visibility_m": 100.0}, {}),
+        ({"rain_mm_h": 50.0}, {}),
+        ({"road": "wet"}, {}),
+        (None, {"range_at_10_percent_m": 40.0}),
+        (None, {"range_factors": [0.5] * 40}),
+        (None, {"dropout": 0.3}),
+    ],
+    ids=["fog", "rain", "wet", "short", "factors", "dropout"],
+)
+def test_no_ray_returns_because_something_is_worse(worse, keys):
+    """The same random numbers: not one return more, and fewer in all."""
+    clear, bad = seen(), seen(worse, **keys)
+    assert set(bad.ray.tolist()) < set(clear.ray.tolist())
+
+
+def test_rows_have_their_own_factors():
+    """The lower half of them hardly sees anything."""
+    factors = np.where(np.arange(40) < 20, 1e-3, 1.0).tolist()
+    lower, every = seen(range_factors=factors).points, seen().points
+    assert len(lower) < 0.6 * len(every)
+    assert np.hypot(*lower[:, :2].T).min() > 20 > np.hypot(*every[:, :2].T).min()
+
+
+def test_what_reflects_returns_from_farther():
+    """Paint, a sign and nothing at all in place of the road."""
+
+    def of(material):
+        ground = {"name": "plain", "shape": {"type": "plane", "size_m": [400.0, 400.0]}, "material": material}
+        return len(seen(bodies=[ground]).ray)
+
+    assert of("glass") < of("tyre") < of("road") < of("lane_paint") < of("sign")
+    assert of("sign") == pytest.approx(
+        SURE * len(seen(range_at_10_percent_m=None, bodies=PLAIN["bodies"][:1]).ray), rel=0.01
+    )
+
+
+def test_a_body_is_as_dark_all_over_and_always():
+    """Of black cars, hardly one ray returns; and a step later it is the same cars."""
+    bodies = [
+        PLAIN["bodies"][0],
+        *(
+            {
+                "name": f"car {number}",
+                "material": "car_paint",
+                "shape": {"type": "box", "size_m": [4.0, 1.8, 1.5]},
+                "poses": [{"x_m": 40.0 * np.cos(number / 4), "y_m": 40.0 * np.sin(number / 4)}],
+            }
+            for number in range(24)
+        ),
+    ]
+    every, shares = seen(range_at_10_percent_m=None, bodies=bodies), []
+    on_car = every.points[:, 2] > 0.01
+    car = np.round(np.arctan2(every.points[:, 1], every.points[:, 0]) * 4).astype(int)
+    for index in (0, 1):
+        there = np.isin(every.ray, seen(index=index, bodies=bodies).ray)
+        shares.append(np.array([there[on_car & (car == number)].mean() for number in np.unique(car[on_car])]))
+    assert np.ptp(shares[0]) > 0.9
+    assert np.abs(shares[0] - shares[1]).max() < 0.25
+
+
+def test_an_ideal_rig_is_the_one_without_a_range_at_10_percent():
+    rig = Rig.model_validate({"name": "rig", "sensors": [ROOF]})
+    ideal = rig.sensing("ideal")
+    assert (rig.sensor_model, ideal.sensor_model, ideal.sensing(None).sensor_model) == ("real", "ideal", "ideal")
+    assert not rig.sensors[0].is_exact
+    assert ideal.sensors[0].is_exact
+    with pytest.raises(ValueError, match="no LiDAR of the rig 'rig' has a range_at_10_percent_m"):
+        ideal.sensing("real")
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"weather": {"visibility_m": 0.0}}, "visibility_m: Input should be greater than 0"),
+        ({"weather": {"rain_mm_h": -1.0}}, "greater than or equal to 0"),
+        ({"bodies": [PLAIN["bodies"][0] | {"material": "raod"}]}, "is 'road' meant"),
+    ],
+)
+def test_bad_weather_and_materials_of_a_scenario_are_told(given, told, tmp_path):
+    path = tmp_path / "world.yaml"
+    path.write_text(yaml.safe_dump(PLAIN | given))
+    with pytest.raises(ValueError, match=told):
+        Scenario.load(path)
+
+
+def test_cameras_see_as_far_as_people_and_radars_through_fog():
+    foggy = Scenario.model_validate(PLAIN | {"weather": {"visibility_m": 50.0}})
+    camera, radar = Rig.load("three_cameras").sensors[0], Rig.load("nuscenes_radars").sensors[0]
+    assert foggy.reach_m(camera) == 50.0
+    assert foggy.reach_m(radar) == radar.max_range_m
+    assert foggy.reach_m(Rig.load("kitti").sensors[0]) == Rig.load("kitti").sensors[0].max_range_m

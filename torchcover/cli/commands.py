@@ -54,7 +54,7 @@ def study(
     print_study(found, files, out)
 
 
-@with_options(of_evaluate("scenario", "seed", "vehicle", "reference", "rays", "every_s"))
+@with_options(of_evaluate("scenario", "seed", "vehicle", "sensor_model", "reference", "rays", "every_s"))
 def record(
     rig: options.Rig,
     out: Annotated[
@@ -165,7 +165,7 @@ def show(
     run(name, scenario=scenario, rig=rig, step=step, seed=seed, film=film, out=out, **settings)
 
 
-@with_options(of_evaluate("vehicle", "every_s", "seed"))
+@with_options(of_evaluate("vehicle", "sensor_model", "every_s", "seed"))
 def targets(
     rig: options.Rig,
     target: Annotated[

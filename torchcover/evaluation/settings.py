@@ -153,6 +153,14 @@ class Settings:
             in_study=True,
         ),
     ] = None
+    sensor_model: Annotated[
+        Literal["ideal", "real"] | None,
+        Option(
+            "What sensors make of their hits: `real`, a LiDAR has no point where too little light returns (default "
+            "where its range at 10 % is known), or `ideal`, every hit is a point (default of the `paper` reference).",
+            in_study=True,
+        ),
+    ] = None
     ask: Annotated[
         Read["RegionsOfInterest | str | Path | None", "RegionsOfInterest | None"],
         Option(
@@ -260,6 +268,8 @@ class Settings:
             raise ValueError(f"estimate {self.estimate}: `area` or `known` is needed")
         if self.band_frame not in (None, "ground", "vehicle"):
             raise ValueError(f"band_frame {self.band_frame}: `ground` or `vehicle` is needed")
+        if self.sensor_model not in (None, "ideal", "real"):
+            raise ValueError(f"sensor_model {self.sensor_model}: `ideal` or `real` is needed")
         if self.reference == "paper" and self.band_frame == "ground":
             raise ValueError("band_frame ground: the paper's reference has bands over z of the vehicle; leave it out")
 
@@ -283,8 +293,10 @@ class Settings:
         """Find out whether anything was set that a recording decides itself.
 
         Raises:
-            ValueError: The vehicle, the reference sensor, its rays or the time between steps was set.
+            ValueError: The vehicle, the sensor model, the reference sensor, its rays or the time between steps was set.
         """
+        if self.sensor_model is not None:
+            raise ValueError("sensor_model: for simulations; a recording has the points that returned")
         if self.vehicle is not None:
             raise ValueError("vehicle: for simulations; a recording has its own")
         if any(setting is not None for setting in (self.reference, self.rays, self.every_s)):

@@ -36,7 +36,7 @@ EVERY_S_IN_TRAFFIC = 10.0
 CALLER = 4
 # Options that frames, what is asked and observers say by what they are, and those that change no result.
 TOLD_OTHERWISE = {"scenario", "seed", "vehicle", "reference", "rays", "every_s", "ask", "cell_m", "band_frame"}
-TOLD_OTHERWISE |= {"metrics", "steps", "device", "workers", "skip_bad_frames"}
+TOLD_OTHERWISE |= {"sensor_model", "metrics", "steps", "device", "workers", "skip_bad_frames"}
 # Of an identity, what is longer is told by its hash.
 MAX_TOLD = 40
 
@@ -123,7 +123,8 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
     if not rigs:
         raise ValueError("which rig? Give a built-in name (see `torchcover list`) or a YAML file, or a recording")
     names = distinct_names(rigs)
-    carried = {name: loaded(rig) for name, rig in zip(names, rigs, strict=True)}
+    sensor_model = settings.sensor_model or ("ideal" if settings.reference == "paper" else None)
+    carried = {name: loaded(rig).sensing(sensor_model) for name, rig in zip(names, rigs, strict=True)}
     loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     world = with_ego(loaded_world, carried, settings.vehicle)
     asked = (settings.ask or RegionsOfInterest()).around(

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationInfo, model_validator
 
@@ -81,6 +81,37 @@ class Rig(Document):
             keys["vehicle"] = str(Path(self.vehicle).resolve())
         keys["sensors"] = [_written(sensor) for sensor in self.sensors]
         write_durably(Path(path), lambda aside: aside.write_text(as_yaml(keys), encoding="utf-8"))
+
+    @property
+    def sensor_model(self) -> Literal["ideal", "real"]:
+        """`real` if what returns too little light to one of its LiDARs is no point; else every hit is one."""
+        return "real" if any(isinstance(one, Lidar) and one.range_at_10_percent_m for one in self.sensors) else "ideal"
+
+    def sensing(self, sensor_model: Literal["ideal", "real"] | None) -> Self:
+        """The rig with ideal sensors, or as it is.
+
+        Args:
+            sensor_model: `ideal` takes the range at 10 % from every LiDAR.
+
+        Raises:
+            ValueError: `real` of a rig of which no range at 10 % is known.
+
+        Example:
+            >>> Rig.load("kitti").sensor_model, Rig.load("kitti").sensing("ideal").sensor_model
+            ('real', 'ideal')
+        """
+        if sensor_model == "real" and self.sensor_model == "ideal":
+            raise ValueError(
+                f"sensor_model real: no LiDAR of the rig {self.name!r} has a range_at_10_percent_m; take it from a "
+                "data sheet, or fit it to a recording by `torchcover calibrate`"
+            )
+        if sensor_model != "ideal":
+            return self
+        sensors = [
+            one.model_copy(update={"range_at_10_percent_m": None}) if isinstance(one, Lidar) else one
+            for one in self.sensors
+        ]
+        return self.model_copy(update={"sensors": tuple(sensors)})
 
     def content(self) -> dict[str, Any]:
         """Its sensors; the vehicle is in the scenario that it is simulated in, if it is the one."""
