@@ -3,11 +3,14 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lowest lint types doctest docs smoke bench paper clean
+.PHONY: demo test lowest lint types doctest docs smoke bench measured paper clean
 
 demo: STEPS ?= 24
 demo: $(VENV)/.ready  ## evaluate a built-in rig in city traffic; writes to out/demo
 	$(BIN)/torchcover evaluate front_roof_128 --scenario urban --steps $(STEPS) --workers 2 --out out/demo
+
+# Whoever forbids Python to keep what it has compiled has every process of the tests compile all of it again.
+unexport PYTHONDONTWRITEBYTECODE
 
 # One thread in each process: the tests are dealt out to as many processes as there are cores.
 test: $(VENV)/.ready  ## every test
@@ -44,6 +47,9 @@ smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the r
 
 bench: $(VENV)/.ready  ## the speed and memory figures of docs/measured/performance.md
 	$(BIN)/python -m benchmarks
+
+measured: $(VENV)/.ready  ## the tables and pictures that README and the pages quote, with their pages, within 20 minutes
+	$(BIN)/python -m benchmarks.measured
 
 paper: STEPS ?= 128
 paper: $(VENV)/.ready  ## the paper's experiments, with the assumed LiDARs and both fits (docs/measured/paper.md)

@@ -15,6 +15,8 @@ BENCHMARKS = (
     "trade_offs",
     "moving_actors",
     "urban_throughput",
+    "heights",
+    "settings",
     "five_rigs",
     "omissions",
     "metric_omissions",

@@ -14,7 +14,14 @@ from pykdtree.kdtree import KDTree
 from benchmarks.recorded_measure import distance
 from benchmarks.timing import table
 from torchcover import BevGrid, CoverageMetric, forward_regions
-from torchcover.data import AccumulatedReference, RecordedFrames, Scan, SimulatedFrames, reference_called
+from torchcover.data import (
+    AccumulatedReference,
+    RecordedFrames,
+    RegionsOfInterest,
+    Scan,
+    SimulatedFrames,
+    reference_called,
+)
 from torchcover.geometry import invert, transform
 from torchcover.simulation import Lidar, PaperReference, Rig
 
@@ -103,7 +110,7 @@ def main():
         reference_sensor=PaperReference(rows=4, columns=4),
         boxes=True,
     )
-    surface = sweeps.with_reference_sensor(reference_called())
+    surface = sweeps.with_reference_sensor(reference_called(asked=RegionsOfInterest().around(band_frame="vehicle")))
     references = {"other, 0 s": AccumulatedReference(0.0, sensors=("other",))}
     for window_s in options.windows:
         for sensors in (("other",), ("judged", "other"), ("judged",)):

@@ -17,16 +17,14 @@ from benchmarks.timing import table
 from torchcover import forward_regions, nearest
 from torchcover.coverage import BevGrid, MeanOfMeans
 from torchcover.coverage.binning import mean_per_cell
-from torchcover.coverage.blocks import AreaSums
-from torchcover.coverage.measures import estimate_area
 from torchcover.data import SimulatedFrames
-from torchcover.estimation import ratio_errors, student
+from torchcover.estimation import Estimate, ratio_errors, student
 from torchcover.evaluation.measuring import BLOCKS
 from torchcover.evaluation.target_error import LOOKS_IN_A_ROW, MAX_GROWTH, MIN_GROWTH, MIN_STEPS
 from torchcover.simulation.regions_of_interest import GRID_X_M, GRID_Y_M
 
 RIG, EVERY_S = "front_roof_128", 10.0
-GRID = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=0.25)
+GRID = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=0.25, band_frame="ground")
 REGIONS = forward_regions()
 PLACES = [(region, height) for region in REGIONS for height in GRID.heights]
 ALL = range(len(PLACES))
@@ -81,12 +79,13 @@ def simulated(steps, scenario, seed):
     city, over_regions, cells = [], [], []
     for index in steps:
         frame = frames[index]
-        points, m2 = frame.reference.double(), frame.reference_weights.double()
+        height, m2 = frame.reference_heights_m, frame.reference_weights.double()
+        points = torch.cat([frame.reference[:, :2], height[:, None]], dim=1).double()
         radius = nearest(frame.reference, frame.sensor, max_distance=GRID.diagonal_m).distance.double()
         each = torch.stack([radius.clamp(max=GRID.diagonal_m), (radius <= 0.4).double()])
         city.append(frame.place_in_time)
         over_regions.append([_sums(points, m2, each, *place) for place in PLACES])
-        cell = GRID.cell_of(frame.reference)
+        cell = GRID.cell_of(frame.reference, height)
         inside = cell >= 0
         means = mean_per_cell(cell[inside], each[:, inside], GRID.cells, m2[inside])
         seen_m2 = torch.bincount(cell[inside], m2[inside], minlength=GRID.cells)[means.cell]
@@ -144,10 +143,9 @@ class Cities:
         """Value, error and degrees of freedom of the radius and detection of each place."""
         sums = torch.stack([self.over_regions[block].sum(dim=0) for block in blocks])
         lengths = torch.tensor([len(block) for block in blocks])
-        area = AreaSums.of(lengths, sums[:, None, None, :, 0], sums[..., 1:].movedim(2, 1)[:, :, None, None])
         found = []
         for at in places:
-            estimate = estimate_area(QUANTITIES, area, 0, torch.arange(len(PLACES))[None] == at)
+            estimate = Estimate.of_ratios(QUANTITIES, sums[:, at, 0], sums[:, at, 1:], lengths)
             found += zip(estimate.value.tolist(), estimate.error.tolist(), strict=True)
         return [(value, error, len(blocks) - 1) for value, error in found]
 

@@ -8,6 +8,7 @@ import argparse
 import csv
 import statistics
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -122,7 +123,8 @@ def measured(scenario, rigs, reference, steps, seed, *, area):
     frames = SimulatedFrames(
         scenario, rigs={rig: rig for rig in rigs}, steps=steps, seed=seed, every_s=EVERY_S, reference_sensor=reference
     )
-    metrics = {rig: CoverageMetric(GRID, max_radius=GRID.diagonal_m, square_metres=area) for rig in rigs}
+    grid = replace(GRID, band_frame=reference.band_frame)
+    metrics = {rig: CoverageMetric(grid, max_radius=GRID.diagonal_m, square_metres=area) for rig in rigs}
     observers = {rig: CoverageObserver(metric, rig) for rig, metric in metrics.items()}
     observe(frames, observers.values())
     found = {}

@@ -1,9 +1,9 @@
 """Are results safe from kills? Every command, killed at each of its file operations, and real runs killed at random.
 
 Every run is a fork of this process, so that it need not import anything, into a folder that holds an earlier result.
-What a reader then finds is *the earlier* result, *the new* one, perhaps without its maps, or neither: *lost*. Of a
-recording, which has no earlier one, it is lost if what is there is read although it is a part, or `--resume` does not
-make it whole.
+A copy of that folder just before each operation is what a kill leaves there. What a reader then finds is *the earlier*
+result, *the new* one, perhaps without its maps, or neither: *lost*. Of a recording, which has no earlier one, it is
+lost if what is there is read although it is a part, or `--resume` does not make it whole.
 """
 
 import argparse
@@ -17,7 +17,6 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from contextlib import redirect_stderr, redirect_stdout, suppress
 from functools import partial
 from pathlib import Path
 
@@ -28,7 +27,6 @@ from benchmarks.timing import table
 from tests.cli.hostile import RIG, YARD
 from tests.killing import operations_of
 from tests.placement.surfaces import Surface
-from torchcover import evaluation
 from torchcover.cli import app, search_run
 from torchcover.data import open_recording
 from torchcover.evaluation import result
@@ -53,7 +51,6 @@ objective: {detection: 1.0, band: ground, region: 20m}
 """
 WORLD = ("--scenario", "yard.yaml")
 SMALL = (*WORLD, "--rays", "64", "--cell-m", "8", "--steps", "2")
-# Each with a seed, so that an earlier result is another one.
 RESULTS = {
     "evaluate": ("evaluate", "rig.yaml", *SMALL),
     "evaluate --resume": ("evaluate", "rig.yaml", *SMALL, "--resume"),
@@ -68,14 +65,15 @@ RECORDINGS = {
     "record": ("record", "rig.yaml", *WORLD, "--rays", "64", "--steps", "2"),
     "record --format kitti": ("record", "rig.yaml", *WORLD, "--rays", "64", "--steps", "2", "--format", "kitti"),
 }
+# How an earlier result differs.
+EARLIER = {"evaluate --resume": ("--steps", "1")}
+OTHERWISE = ("--seed", "1")
 REAL = ("evaluate", "front_roof_32", "--scenario", "urban", "--steps", "4", "--workers", "2")
-# What takes long in a command, and touches no file of its result.
-SLOW = {"study": "error_against_time", "agree": "agree"}
 SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 VERDICTS = ("the earlier", "the new", "lost")
 DOCUMENTS = {
     "rig": RIG,
-    "other": RIG.replace("name: r", "name: other").replace("z_m: 2.0", "z_m: 1.0"),
+    "other": RIG.replace("name: r", "name: other").replace("z_m: 2.0", "z_m: 2.4"),
     "yard": YARD,
     "space": SPACE,
     "choice": CHOICE,
@@ -98,10 +96,11 @@ def main():
         for name, text in DOCUMENTS.items():
             Path(f"{name}.yaml").write_text(text)
         at_random = killed_at_random(options.kills) if options.kills else []
-        rows = [
-            (name, *(killed_result(RESULTS[name]) if name in RESULTS else killed_recording(RECORDINGS[name])))
-            for name in options.commands.split(";")
-        ]
+        rows = []
+        for name in options.commands.split(";"):
+            killed = killed_result(name) if name in RESULTS else killed_recording(RECORDINGS[name])
+            rows.append((name, *killed))
+            print(f"{name}: {killed}", file=sys.stderr, flush=True)
         os.chdir("/")
     table(("command", "file operations", "the earlier", "the new", "lost"), rows)
     print()
@@ -127,68 +126,48 @@ def run(command, out, *options):
         os._exit(end.code or 0)
 
 
-def killed_result(command):
+def killed_result(name):
     """How many operations a command has, and how often what is there after a kill at each is what."""
-    if command[0] in SLOW:  # and touches no file of a result: done once, after which nothing else is computed here
-        remember(SLOW[command[0]], command)
+    command = RESULTS[name]
     place = Path(tempfile.mkdtemp(dir="."))
     earlier, whole = place / "earlier", place / "whole"
-    assert operations_of(lambda: run(command, earlier, "--seed", "1"))[1] == 0
+    assert operations_of(lambda: run(command, earlier, *EARLIER.get(name, OTHERWISE)))[1] == 0
     shutil.copytree(earlier, whole)
-    count, code = operations_of(lambda: run(command, whole))
+    count, code = operations_of(lambda: run(command, whole), copied=(whole, place / "killed"))
     assert code == 0
-    found = Counter()
-    for at in range(count):
-        out = place / str(at)
-        shutil.copytree(earlier, out)
-        operations_of(lambda out=out: run(command, out), at)
-        found[verdict(out, files_of(earlier), files_of(whole))] += 1
-        shutil.rmtree(out)
+    contents = files_of(earlier), files_of(whole)
+    assert contents[0] != contents[1]
+    found = Counter(verdict(place / "killed" / str(at), *contents) for at in range(count))
     return count, *(found[name] for name in VERDICTS)
-
-
-def remember(name, command):
-    """Have what a command computes computed now."""
-    done, compute = [], getattr(evaluation, name)
-
-    def once(*given, **more):
-        if not done:
-            done.append(compute(*given, **more))
-        return done[0]
-
-    setattr(evaluation, name, once)
-    sys.argv = ["torchcover", *command, "--out", tempfile.mkdtemp(dir=".")]
-    with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere), suppress(SystemExit):
-        app.main()
 
 
 def killed_recording(command):
     """The same of a recording: the earlier is none, or a part that is not read and gone on with."""
     place = Path(tempfile.mkdtemp(dir="."))
-    count, code = operations_of(lambda: run(command, place / "whole"))
+    whole = place / "whole"
+    count, code = operations_of(lambda: run(command, whole), copied=(whole, place / "killed"))
     assert code == 0
-    frames = len(open_recording(place / "whole").names)
-    found = Counter()
-    for at in range(count):
-        out = place / str(at)
-        operations_of(lambda out=out: run(command, out), at)
-        name = "the new"
-        try:
-            if len(open_recording(out).names) != frames:
-                name = "lost"
-        except (ValueError, OSError):
-            name = "the earlier"
-        if operations_of(lambda out=out: run(command, out, "--resume"))[1]:
-            name = "lost"
-        found[name if len(open_recording(out).names) == frames else "lost"] += 1
+    frames, found = frames_of(whole), Counter()
+    for out in (place / "killed" / str(at) for at in range(count)):
+        name = {None: "the earlier", frames: "the new"}.get(frames_of(out), "lost")
+        went_on = operations_of(lambda out=out: run(command, out, "--resume"))[1] == 0
+        found[name if went_on and frames_of(out) == frames else "lost"] += 1
     return count, *(found[name] for name in VERDICTS)
+
+
+def frames_of(recording):
+    """How many frames are read; None where a reader finds no recording, or is told that it is a part."""
+    try:
+        return len(open_recording(recording).names)
+    except (ValueError, OSError):
+        return None
 
 
 def killed_at_random(kills):
     """Runs in a city, with workers, ended by each signal in turn."""
     place, chance = Path(tempfile.mkdtemp(dir=".")), random.Random(0)
     earlier, whole = place / "earlier", place / "whole"
-    assert operations_of(lambda: run(REAL, earlier, "--seed", "1"))[1] == 0
+    assert operations_of(lambda: run(REAL, earlier, *OTHERWISE))[1] == 0
     shutil.copytree(earlier, whole)
     start = time.perf_counter()
     assert operations_of(lambda: run(REAL, whole))[1] == 0
@@ -203,6 +182,7 @@ def killed_at_random(kills):
         os.kill(pid, number)
         os.waitpid(pid, 0)
         found[number][verdict(out, files_of(earlier), files_of(whole))] += 1
+        print(f"{number.name}: {dict(found[number])}", file=sys.stderr, flush=True)
         shutil.rmtree(out)
     return [(one.name, each.total(), *(each[name] for name in VERDICTS)) for one, each in found.items()]
 

@@ -75,7 +75,7 @@ def simulate(steps, seed, reference, name, keep_clouds):
     kept = []
     for index in track(range(steps), description=f"simulating {name}"):
         frame = frames[index]
-        fed = {f"network {rig}": thinned(cloud) for rig, cloud in frame.clouds.items()}
+        fed = {f"network {rig}": thinned(frame.landed(rig)) for rig in frame.clouds}
         clouds = {**frame.clouds, **fed} if keep_clouds else fed
         kept.append(replace(frame, clouds=clouds, boxes=in_region(frame.boxes)))
     return kept
@@ -253,7 +253,8 @@ class Training(lightning.LightningModule):
 
 def coverage_metric(*, square_metres):
     """The metric of the region; with the defaults as many blocks as drives, which know nothing of each other."""
-    grid = BevGrid(x=X_M, y=Y_M, cell=1.6, heights={"body": (0.3, 2.0)})
+    band_frame = "ground" if square_metres else "vehicle"
+    grid = BevGrid(x=X_M, y=Y_M, cell=1.6, heights={"body": (0.3, 2.0)}, band_frame=band_frame)
     return CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=16, square_metres=square_metres)
 
 

@@ -2,11 +2,12 @@
 the surface for the mean over the visible square metres."""
 
 import math
+from dataclasses import replace
 
 from rich.progress import track
 
 from examples.paper.thinning import thinned
-from torchcover import BevGrid, CoverageMetric
+from torchcover import CoverageMetric
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import PaperReference, SurfaceReference
 
@@ -53,7 +54,7 @@ class Measurement:
         Returns:
             Rig and measure, "known" or "area" -> `Coverage`.
         """
-        reach_m, coarse = self.grid.diagonal_m, BevGrid(self.grid.x, self.grid.y, CELL_OF_AREAS_M)
+        reach_m, coarse = self.grid.diagonal_m, replace(self.grid, cell=CELL_OF_AREAS_M, band_frame="ground")
         known = {rig: CoverageMetric(self.grid, max_radius=reach_m, blocks=blocks) for rig in self.frames.rigs}
         area = {
             rig: CoverageMetric(coarse, max_radius=reach_m, blocks=blocks, square_metres=True)
@@ -64,7 +65,13 @@ class Measurement:
             reference = thinned(frame.reference, self.grid, POINTS_PER_CELL, seed=index)
             for rig, cloud in frame.clouds.items():
                 known[rig].update(cloud, reference, place_in_time=index)
-                area[rig].update(cloud, surface.reference, weights=surface.reference_weights, place_in_time=index)
+                area[rig].update(
+                    cloud,
+                    surface.reference,
+                    weights=surface.reference_weights,
+                    height=surface.reference_heights_m,
+                    place_in_time=index,
+                )
             for observer in also:
                 observer.update(frame)
         metrics = {"known": known, "area": area}

@@ -11,6 +11,7 @@ import torch
 from torchcover import Coverage
 from torchcover.coverage import Layer
 from torchcover.coverage.blocks import AreaSums, Blocks
+from torchcover.coverage.region_sums import PlaceSums
 
 
 def check_conditions(folder, conditions):
@@ -71,9 +72,13 @@ def merged(pieces):
         layers=map(Layer, first.quantities, whole),
         counts={name: sum(piece.counts[name] for piece in pieces) for name in Coverage.COUNTS},
         blocks=Blocks.of(steps, probed_steps, sums),
-        area=_merged_area([piece.area for piece in pieces], steps) if first.area is not None else None,
+        area=_merged([piece.area for piece in pieces], steps, AreaSums.of),
+        regions=first.regions,
+        places=_merged([piece.places for piece in pieces], steps, PlaceSums),
     )
 
 
-def _merged_area(areas, steps):
-    return AreaSums.of(steps, torch.cat([area.m2 for area in areas]), torch.cat([area.sums for area in areas]))
+def _merged(pieces, steps, of):
+    if pieces[0] is None:
+        return None
+    return of(steps, torch.cat([piece.m2 for piece in pieces]), torch.cat([piece.sums for piece in pieces]))

@@ -46,7 +46,7 @@ def test_two_evaluations_of_the_same_frames_are_a_comparison(torchcover, worlds,
         ({"steps": 15}, "different reference points"),
         ({"thresholds_m": (1.0,)}, "differ in their thresholds"),
         ({"cell_m": 8.0}, "differ in their grid"),
-        ({"band_frame": "ground"}, "differ in their band_frame"),
+        ({"band_frame": "vehicle"}, "differ in their band_frame"),
     ],
 )
 def test_results_that_are_not_paired_are_refused(torchcover, worlds, saved, change, message):

@@ -233,7 +233,7 @@ def test_it_prints_where_the_numbers_of_a_rig_come_from(torchcover, tmp_path):
 
 
 def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
-    monkeypatch.setattr(show, "FILM_S", 0.6)
+    monkeypatch.setattr(show, "FILM_S", 0.3)
     code, printed, _ = torchcover(
         "show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--film", worlds / "new" / "a.gif", "--step", 1
     )

@@ -13,6 +13,7 @@ import torch
 from tests.killing import operations_of
 from torchcover import Coverage, CoverageMetric
 from torchcover.cli import app
+from torchcover.evaluation import progress
 from torchcover.report.maps import figures
 
 
@@ -99,6 +100,7 @@ def test_one_between_two_rigs_leaves_a_paired_result(
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_one_that_is_sent_again_changes_nothing(torchcover, worlds, at_update, monkeypatch, number):
     """To the process and to its group, by the system and by the shell."""
+    monkeypatch.setattr(progress, "TOGETHER_S", 600.0)  # on a machine that is as slow as it likes
     at_update(3, lambda: send(number, times=2))
     draw = figures.draw_side_by_side
     monkeypatch.setattr(figures, "draw_side_by_side", lambda *given, **more: (send(number), draw(*given, **more))[1])

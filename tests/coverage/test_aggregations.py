@@ -221,9 +221,7 @@ def test_any_number_of_a_result_has_an_estimate():
         # Three worlds are too few to show an error, and enough to race with.
         assert found.left_out.shape == (3, 1)
         assert math.isnan(found.error)
-        (difference,) = compared.differences(found, least=3).values()
-        assert difference.blocks == 3
-        assert math.isnan(difference.error) == (key == "radius_maximum_m")
+        assert compared.minus(found).errors(3).isnan().tolist() == [key == "radius_maximum_m"]
     with pytest.raises(ValueError, match=r"radius_q0\.8_m: the result has no such number; it has radius_q0"):
         one.estimate_of("radius_q0.8_m", NEAR, "all")
 

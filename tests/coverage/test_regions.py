@@ -120,3 +120,15 @@ def test_a_polygon_has_the_bounds_of_its_corners():
 def test_a_name_is_given_once():
     with pytest.raises(ValueError, match="regions: each name may be given once; got 'r' again"):
         check_regions([Region("r", (0.0, 1.0), (0.0, 1.0)), Region("r", (0.0, 2.0), (0.0, 1.0))], GRID)
+
+
+def test_points_belong_to_one_of_two_polygons_that_share_an_edge():
+    # Corners, points of the edge to the last bit, and some around it.
+    left = Region.polygon("left", [(-4.0, -2.0), (0.3, -2.0), (2.1, 2.0), (-4.0, 2.0)])
+    right = Region.polygon("right", [(0.3, -2.0), (4.0, -2.0), (4.0, 2.0), (2.1, 2.0)])
+    share = torch.linspace(0, 1, 1001, dtype=torch.float64)
+    y = torch.cat([-2 + 4 * share, 4 * share - 2.5])
+    x = torch.cat([0.3 + 1.8 * share, 8 * share.roll(500) - 4])
+    inside = (x >= -4) & (x < 4) & (y >= -2) & (y < 2)
+    assert torch.equal(left.contains(x, y) ^ right.contains(x, y), inside)
+    assert not (left.contains(x, y) & right.contains(x, y)).any()

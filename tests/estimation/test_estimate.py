@@ -9,6 +9,7 @@ from scipy import stats
 
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.estimation import Estimate
+from torchcover.estimation.student import BLIND_SIDE
 
 BOTH = (RADIUS, detection(0.4))
 
@@ -36,24 +37,42 @@ def test_a_ratio_without_a_block_is_that_of_the_others_and_unused_blocks_do_not_
     np.testing.assert_allclose(of_each.left_out, found.left_out, rtol=1e-12)
 
 
-@pytest.mark.parametrize(("blocks", "least"), [(8, 8), (3, 3), (5, 2)])
-def test_differences_of_means_over_worlds_are_a_paired_t_test(blocks, least):
+@pytest.mark.parametrize("blocks", [8, 19, 200])
+def test_differences_of_means_over_worlds_are_a_paired_t_test(blocks):
     random = np.random.default_rng(blocks)
     own, other = random.random((2, blocks, 2))
     one, two = (estimate(np.ones(blocks), each) for each in (own, other))
-    found = list(two.differences(one, least=least).values())
-    for at, difference in enumerate(found):
+    found, mirrored = list(two.differences(one).values()), list(one.differences(two).values())
+    for at, (difference, back) in enumerate(zip(found, mirrored, strict=True)):
         test = stats.ttest_rel(other[:, at], own[:, at])
         low, high = test.confidence_interval()
         assert difference.value == pytest.approx((other - own)[:, at].mean(), rel=1e-9)
         assert difference.value / difference.error == pytest.approx(test.statistic, rel=1e-9)
         assert difference.p == pytest.approx(test.pvalue, rel=1e-9)
-        assert (difference.low, difference.high) == pytest.approx((low, high), rel=1e-4)
+        # Of radii the side away from 0 is longer.
+        below = BLIND_SIDE if at == 0 and difference.value < 0 else 1.0
+        above = BLIND_SIDE if at == 0 and difference.value > 0 else 1.0
+        middle = difference.value
+        expected = middle - below * (middle - low), middle + above * (high - middle)
+        assert (difference.low, difference.high) == pytest.approx(expected, rel=1e-3)
+        assert (back.low, back.high) == pytest.approx((-difference.high, -difference.low), rel=1e-9)
         assert difference.significant is bool(test.pvalue < 0.05)
     # Less of a radius is better, more of a detection.
     assert [each.better for each in found] == [(other < own)[:, 0].sum(), (other > own)[:, 1].sum()]
     assert [each.gain for each in found] == [-found[0].value, found[1].value]
     assert {each.blocks for each in found} == {blocks}
+
+
+def test_blocks_of_which_few_decide_have_errors_and_no_intervals():
+    m2, each = sums(12)
+    m2[3:] *= 1e-3
+    each[3:] *= 1e-3
+    lopsided = estimate(m2, each)
+    assert float(lopsided.effective[0]) == pytest.approx(m2.sum() ** 2 / (m2**2).sum(), rel=1e-12)
+    numbers, differences = lopsided.numbers().values(), lopsided.differences(estimate(m2, 0.5 * each)).values()
+    assert all(number.error > 0 and math.isnan(number.low) for number in numbers)
+    assert all(math.isnan(one.low) and one.significant is None and math.isnan(one.p) for one in differences)
+    assert estimate(np.ones(8), each[:8]).has_intervals == [True, True]
 
 
 def test_too_few_blocks_show_no_error_and_say_so_of_nothing():

@@ -1,37 +1,19 @@
-"""A study of error against run time."""
+"""A study: what its trials say is what runs say, its model is theirs, and it recommends what prints an error."""
 
+import json
 import math
 from dataclasses import replace
 
 import pytest
-import torch
 
-from torchcover.coverage import BevGrid, CoverageMetric
-from torchcover.evaluation import (
-    CoverageObserver,
-    Settings,
-    StudyPlan,
-    Truth,
-    area_sums,
-    error_against_time,
-    evaluate,
-)
-from torchcover.evaluation.study_runs import tried
+from torchcover.coverage.quantity import detection
+from torchcover.estimation import ErrorModel
+from torchcover.evaluation import Settings, StudyPlan, Trial, error_against_time, evaluate
+from torchcover.evaluation.study import Studied, Study
 from torchcover.simulation import Rig
 
-GRID = BevGrid(x=(-40.0, 160.0), y=(-40.0, 40.0), cell=8.0)
-SMALL = {"settings": Settings("front_roof_32", steps=2, cell_m=4.0), "rays": (64,), "runs": 2, "long_run_steps": 8}
-
-
-def coverage(shift_m, steps=1, **settings):
-    """All cells, seen from everywhere; the rig's points are that far above them."""
-    x, y = torch.meshgrid(torch.arange(-36.0, 160.0, 8.0), torch.arange(-36.0, 40.0, 8.0), indexing="ij")
-    floor = torch.stack([x.flatten(), y.flatten(), torch.zeros(x.numel())], dim=1)
-    both = torch.cat([floor, floor + torch.tensor([0.0, 0.0, 1.0])])
-    metric = CoverageMetric(GRID, (0.4,), max_radius=GRID.diagonal_m, **{"square_metres": True, **settings})
-    for _ in range(steps):
-        metric.update(both + torch.tensor([0.0, 0.0, shift_m]), both, weights=torch.ones(len(both)))
-    return metric.compute()
+DETECTION = detection(0.4)
+SMALL = Settings("front_roof_32", "courtyard", steps=8, cell_m=4.0, rays=256)
 
 
 @pytest.fixture(autouse=True)
@@ -39,104 +21,118 @@ def no_command(monkeypatch):
     monkeypatch.setattr("torchcover.evaluation.study.command_s", lambda plan: 100.0)
 
 
-def test_the_long_run_itself_has_no_distance_and_a_shifted_one_its_shift():
-    true = coverage(0.0, blocks=16)
-    truth = Truth(true)
-    assert truth.distances(area_sums(true)[None]) == {"radius_m": 0.0, "detection_0.4m": 0.0}
-    near = truth.distances(area_sums(coverage(0.25))[None])
-    assert near == {"radius_m": pytest.approx(0.25, rel=1e-6), "detection_0.4m": 0.0}
-    each = torch.stack([area_sums(coverage(shift)) for shift in (0.0, 0.5)])
-    far = truth.distances(each)  # root mean squares of 0 and 0.5, and of 0 and 1
-    assert far == {"radius_m": pytest.approx(0.5**1.5, rel=1e-6), "detection_0.4m": pytest.approx(0.5**0.5)}
+@pytest.fixture(scope="module")
+def study():
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("torchcover.evaluation.study.command_s", lambda plan: 100.0)
+        return error_against_time(StudyPlan(SMALL, ({"rays": 64}, {"reference": "paper", "rays": 1024})))
 
 
-def test_a_run_that_has_not_seen_a_region_has_no_distance():
-    sums = area_sums(coverage(0.25))
-    sums[0, :, 0] = 0.0
-    assert all(map(math.isnan, Truth(coverage(0.0)).distances(sums[None]).values()))
+def trial(a, seconds=64.0, bias=0.0, options="", least=64):
+    """64 steps of one number that is awaited, and of one that is not."""
+    error = ErrorModel(a, bias)
+    other = Studied("3m", "ground", False, DETECTION, 0.5, ErrorModel(9.0), None, False)
+    return Trial(
+        options, 64, least, seconds, 1.0, [Studied("20m", "ground", True, DETECTION, 0.5, error, None, False), other]
+    )
 
 
-def test_sums_of_parts_are_those_of_the_whole():
-    parts = area_sums(coverage(0.25, steps=2)) + area_sums(coverage(0.5, steps=3))
-    assert torch.allclose(parts[:, 0], area_sums(coverage(0.0, steps=5))[:, 0], rtol=1e-12)
+@pytest.mark.parametrize("a", [0.01, 0.36, 25.0])
+def test_the_model_falls_to_the_bias_and_says_which_steps_reach_an_error(a):
+    model = ErrorModel(a, bias=0.003)
+    assert model.error_after(10**12) == pytest.approx(0.003, rel=1e-3)
+    assert ErrorModel(a).error_after(400) == pytest.approx(0.5 * ErrorModel(a).error_after(100), rel=1e-12)
+    steps = model.steps_for(0.01)
+    assert model.error_after(steps) <= 0.01 < model.error_after(steps - 1) or steps == 1
+    assert model.steps_for(0.003) is None
+    assert ErrorModel(math.nan).steps_for(0.01) is None
+    assert ErrorModel.of(ErrorModel(a).error_after(77), 77).a == pytest.approx(a, rel=1e-12)
 
 
-def test_only_square_metres_can_be_a_long_run():
-    with pytest.raises(ValueError, match="no square metres"):
-        Truth(coverage(0.0, square_metres=False))
+def test_a_study_says_of_the_same_steps_what_an_evaluation_says(study):
+    first, fewer, _ = study.trials
+    for each, rays in ((first, 256), (fewer, 64)):
+        coverage = evaluate(*SMALL.rigs, "courtyard", steps=8, cell_m=4.0, rays=rays).coverage
+        rows = {(row.region, row.height): row.numbers for row in coverage.summary()}
+        for one in each.numbers:
+            number = rows[one.region, one.height][one.quantity.key]
+            assert (one.value == number.value) or math.isnan(one.value)
+            if not math.isnan(number.error):
+                assert one.error.error_after(8) == pytest.approx(math.hypot(number.error, one.error.bias), rel=1e-9)
+    assert all(one.difference is None and one.error.bias == 0.0 for one in first.numbers)
+    assert any(one.difference.value != 0.0 for one in fewer.numbers)
 
 
-def test_a_study_says_of_the_same_steps_what_an_evaluation_says():
-    plan = StudyPlan(**SMALL)
-    same = evaluate("front_roof_32", steps=4, cell_m=4.0, rays=64).coverage
-    (trial,) = tried(plan, 100.0, progress=False).trials
-    whole, again = trial.sums(4)[0], area_sums(same)
-    assert torch.allclose(whole, again, rtol=1e-12, atol=0)
+def test_numbers_of_another_definition_are_not_held_against_each_other(study):
+    paper = study.trials[2]
+    assert all(math.isnan(one.difference.value) and math.isnan(one.error.bias) for one in paper.numbers)
+    assert paper.steps_for(0.02) is None
 
 
-def test_more_steps_cost_more_time_and_the_start_is_in_it():
-    study = error_against_time(StudyPlan(**SMALL))
-    assert [(point.rays, point.steps, point.runs) for point in study.points] == [(64, 1, 4), (64, 2, 2)]
-    one, two = study.points
-    assert study.start_s < 100 < study.start_s + 50
-    assert study.start_s < one.seconds < two.seconds
-    assert two.seconds - one.seconds == pytest.approx(one.seconds - study.start_s)
-    (stage,) = study.stages
-    assert sum(stage[part] for part in ("worlds", "casting", "measuring")) == pytest.approx(two.seconds - one.seconds)
-    assert study.record["long_run"]["steps"] == 8
-    assert set(study.recommended) == {0.05, 0.02, 0.01, 0.005}
+def test_times_are_those_of_a_whole_command(study):
+    first = study.trials[0]
+    assert first.seconds_for(16, study.start_s) - first.seconds_for(8, study.start_s) == pytest.approx(first.seconds)
+    assert study.start_s == pytest.approx(100.0 - first.seconds / 8)
+    assert 0 < first.measuring_s < first.seconds
 
 
-def test_runs_are_looked_at_whenever_their_steps_have_doubled():
-    assert StudyPlan(Settings("rig", steps=100)).lengths == [6, 12, 24, 48, 96]
-    assert StudyPlan(Settings("rig", steps=5)).lengths == [1, 2, 4]
+def test_the_worst_awaited_number_decides_and_what_prints_no_error_is_not_recommended():
+    assert trial(0.04).steps_for(0.01) == 400
+    assert trial(0.0004).steps_for(0.01) == 64  # fewer print no error
+    assert trial(0.0123456).steps_for(0.01) == 130  # in two digits, never fewer
+    assert trial(math.nan).steps_for(0.01) is None
+    assert trial(0.04, bias=0.02).steps_for(0.01) is None
+
+
+def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
+    plan = StudyPlan(SMALL)
+    for seconds, expected in ((60.0, ""), (40.0, "--rays=64")):
+        found = Study(plan, [trial(0.04), trial(0.04, seconds, options="--rays=64")], 1.0).recommended(0.01)
+        assert (found[0].options, found[1]) == (expected, 400)
+    biased = Study(plan, [trial(0.04), trial(0.04, 1.0, bias=0.02, options="--rays=64")], 1.0)
+    assert biased.recommended(0.01)[0].options == ""
+    assert Study(plan, [trial(math.nan)], 1.0).recommended(0.01) is None
+    assert "not reached, or not known" in Study(plan, [trial(math.nan)], 1.0).advice(0.01)
+    assert Study(plan, [trial(0.04)], 1.0).advice(0.01) == (
+        "For 1 percentage point of every detection: front_roof_32 --scenario=courtyard --cell-m=4.0 --rays=256 "
+        "--steps=400 (401 s)."
+    )
+
+
+def test_only_a_bias_beyond_chance_counts_and_is_marked(study):
+    for one in study.trials[1].numbers:
+        if not math.isnan(one.difference.value):
+            assert one.is_biased is (one.difference.p * len(study.trials[1].numbers) < 0.05)
+            assert one.error.bias == (abs(one.difference.value) if one.is_biased else 0.0)
+
+
+def test_records_are_json_without_nan_and_the_files_are_written(study, tmp_path):
+    paths = study.save(tmp_path / "out")
+    assert [path.name for path in paths] == ["work_precision.png", "summary.json"]
+    record = json.loads(json.dumps(study.record, allow_nan=False))
+    assert [one["options"] for one in record["trials"]] == ["", "--rays=64", "--reference=paper --rays=1024"]
+    assert [one["error"] for one in record["recommended"]] == [0.02, 0.01, 0.005]
 
 
 def test_the_command_that_is_timed_has_every_option_that_is_not_as_usual():
-    settings = Settings("rig", "urban", cell_m=0.5, thresholds_m=(0.2, 1), every_s=5.0, steps=7)
+    settings = Settings("rig", "urban", cell_m=0.5, thresholds_m=(0.2, 1), every_s=5.0, steps=7, workers=2)
     assert StudyPlan(settings).command == [
         "evaluate", "rig", "--scenario=urban", "--cell-m=0.5", "--thresholds-m=0.2", "--thresholds-m=1.0",
-        "--every-s=5.0",
+        "--every-s=5.0", "--workers=2",
     ]  # fmt: skip
+    assert StudyPlan(replace(settings, steps=None)).each[""].steps == 256
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"rays": ()}, "rays: at least one is needed"),
-        ({"runs": 0}, "runs: at least 1 is needed; got 0"),
-        ({"long_run_steps": 0}, "long_run_steps: at least 1"),
-        ({"settings": Settings()}, "one rig and a scenario are needed, by names or paths"),
-        ({"settings": Settings(Rig.load("front_roof_32"))}, "one rig and a scenario are needed, by names or paths"),
-    ],
-)
-def test_a_plan_that_makes_no_sense_is_refused_at_once(changes, message):
-    with pytest.raises(ValueError, match=message):
-        StudyPlan(**{**SMALL, **changes})
+@pytest.mark.parametrize("settings", [Settings(), Settings(Rig.load("front_roof_32"))])
+def test_what_cannot_be_timed_as_a_command_is_refused_at_once(settings):
+    with pytest.raises(ValueError, match="one rig and a scenario are needed, by names or paths"):
+        StudyPlan(settings)
 
 
-def test_a_saved_long_run_is_used_and_one_with_other_settings_refused(tmp_path):
-    saved = tmp_path / "long_run.npz"
-    coverage(0.0, blocks=16).save(saved)
-    plan = StudyPlan(**SMALL | {"settings": Settings("front_roof_32", steps=2, cell_m=8.0)}, long_run=saved)
-    assert torch.equal(error_against_time(plan).truth.coverage.radius, coverage(0.0).radius)
-    for changes, message in (
-        ({"thresholds_m": 0.2}, r"thresholds_m is \(0.4,\) there; \(0.2,\) is needed"),
-        ({"cell_m": 4.0}, "cell_m is 8.0 there; 4.0 is needed"),
-    ):
-        with pytest.raises(ValueError, match=f"long_run.npz: {message}"):
-            error_against_time(replace(plan, settings=replace(plan.settings, **changes)))
-
-
-def test_a_long_run_that_was_cut_short_is_no_truth(monkeypatch):
+def test_a_run_that_was_cut_short_is_no_study(monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    update, calls = CoverageObserver.update, []
-    monkeypatch.setattr(
-        CoverageObserver,
-        "update",
-        lambda self, frame: interrupted() if calls else calls.append(frame) or update(self, frame),
-    )
+    monkeypatch.setattr("torchcover.evaluation.observers.CoverageObserver.update", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        error_against_time(StudyPlan(**SMALL))
+        error_against_time(StudyPlan(SMALL))

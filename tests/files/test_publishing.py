@@ -3,6 +3,7 @@
 import errno
 import json
 import os
+import re
 import resource
 import shutil
 import signal
@@ -92,6 +93,18 @@ def test_the_second_is_refused_while_the_first_lives_and_not_when_it_was_killed(
     assert in_place(tmp_path / "out") == {"a.txt", "b.txt", "summary.json"}
 
 
+def test_a_folder_without_locks_is_named_and_read_all_the_same(tmp_path, monkeypatch):
+    whole = killed_in_the_middle(tmp_path)
+
+    def flock(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("fcntl.flock", flock)  # as on a network disk
+    with pytest.raises(OSError, match=rf"No locks available: '{tmp_path}/.lock'"):
+        publish(tmp_path, MAPS)
+    assert found(tmp_path) == whole
+
+
 def test_a_process_may_write_where_it_has_claimed(tmp_path):
     with claimed(tmp_path / "out"):
         publish(tmp_path / "out", NUMBERS)
@@ -121,14 +134,12 @@ def test_what_is_published_is_the_content_of_the_folder(tmp_path):
 
 def test_a_kill_at_any_file_operation_leaves_the_earlier_or_the_new(tmp_path, monkeypatch):
     wholes = with_earlier(tmp_path / "earlier")
-    counted = copied(tmp_path / "earlier", tmp_path / "counted")
-    count, code = operations_of(lambda: publish(counted, NUMBERS, MAPS))
+    out = copied(tmp_path / "earlier", tmp_path / "out")
+    count, code = operations_of(lambda: publish(out, NUMBERS, MAPS), copied=(out, tmp_path / "copies"))
     assert (count > 40, code) == (True, 0)
     seen = []
     for at in range(count):
-        folder = copied(tmp_path / "earlier", tmp_path / str(at))
-        killed = operations_of(lambda at=folder: publish(at, NUMBERS, MAPS), at)
-        assert killed == (at, -signal.SIGKILL)
+        folder = tmp_path / "copies" / str(at)
         with monkeypatch.context() as patched:
             patched.setattr("filelock.FileLock.acquire", lambda *_, at=folder, **__: denied(at))
             seen.append(wholes.index(found(folder)))
@@ -144,15 +155,30 @@ def test_a_kill_at_any_file_operation_leaves_the_earlier_or_the_new(tmp_path, mo
     assert set(seen) == {0, 1, 2}
 
 
+@pytest.mark.parametrize("at", [9, 24, 33])
+def test_what_a_kill_leaves_is_what_is_there_in_that_moment(tmp_path, at):
+    trees = []
+    for name in ("copied", "killed"):
+        out = tmp_path / name / "out"
+        with_earlier(out)
+        ended = operations_of(
+            lambda out=out: publish(out, NUMBERS, MAPS),
+            at if name == "killed" else None,
+            copied=(out, tmp_path / name / "copies"),
+        )
+        left = out if name == "killed" else tmp_path / name / "copies" / str(at)
+        trees.append(sorted(re.sub("partial_.*?/", "/", path) for path in in_place(left)))
+    assert ended == (at, -signal.SIGKILL)
+    assert trees[0] == trees[1]
+
+
 def test_whoever_puts_files_in_their_places_may_be_killed_too(tmp_path):
-    whole = killed_in_the_middle(tmp_path / "waiting")
-    counted = copied(tmp_path / "waiting", tmp_path / "counted")
-    count, code = operations_of(lambda: read(counted / "a.txt"))
+    out = tmp_path / "out"
+    whole = killed_in_the_middle(out)
+    count, code = operations_of(lambda: read(out / "a.txt"), copied=(out, tmp_path / "copies"))
     assert (count > 12, code) == (True, 0)
     for at in range(count):
-        folder = copied(tmp_path / "waiting", tmp_path / str(at))
-        assert operations_of(lambda at=folder: read(at / "a.txt"), at)[1] == -signal.SIGKILL
-        assert found(folder) == whole
+        assert found(tmp_path / "copies" / str(at)) == whole
 
 
 def copied(folder, place):
@@ -392,12 +418,11 @@ def test_what_was_noted_is_gone_on_with(tmp_path):
 
 
 def test_a_kill_at_any_file_operation_costs_a_part_at_most(tmp_path):
-    count, _ = operations_of(lambda: parts(tmp_path / "counted", 2))
-    all_parts(tmp_path / "counted", 2)
+    out = tmp_path / "out"
+    count, _ = operations_of(lambda: parts(out, 2), copied=(out, tmp_path / "copies"))
+    all_parts(out, 2)
     kept = []
-    for at in range(count):
-        folder = tmp_path / str(at)
-        operations_of(lambda folder=folder: parts(folder, 2), at)
+    for folder in (tmp_path / "copies" / str(at) for at in range(count)):
         kept.append(len(noted(folder)))
         with claimed(folder):
             is_whole = (folder / "recording.json").exists()

@@ -327,10 +327,10 @@ def test_the_state_can_be_left_out_of_the_state_dict(case):
 
 @pytest.mark.parametrize("as_dict", [False, True], ids=["metric", "state"])
 @pytest.mark.parametrize("last_first", [False, True], ids=["in order", "last first"])
-@pytest.mark.parametrize("cut", [0, 1, 5, None])
+@pytest.mark.parametrize("cut", [0, 1])
 @EVERY
 def test_merged_parts_are_the_whole_in_any_order_and_leave_the_other_alone(case, cut, last_first, as_dict):
-    parts = [case.over(case.steps[:cut]), case.over(case.steps[cut:] if cut is not None else [])]
+    parts = [case.over(case.steps[:cut]), case.over(case.steps[cut:])]
     first, second = parts[::-1] if last_first else parts
     if first.update_called:
         first.compute()  # outdated by the merge
@@ -431,11 +431,12 @@ def test_a_collection_keeps_metrics_apart_that_agree_at_first(case):
     """torchmetrics lets metrics share one state if theirs are equal after the first step (its issue 2596)."""
     wanted = {"one": {}, "the same": {}, **case.changes}
     collection = MetricCollection({name: case.make(**changes) for name, changes in wanted.items()})
-    for step in (case.bland, *case.steps):
+    steps = [case.bland, *case.steps[:3]]
+    for step in steps:
         collection.update(**step)
     results = collection.compute()
     for name, changes in wanted.items():
-        assert_same(results[name], case.over([case.bland, *case.steps], **changes).compute())
+        assert_same(results[name], case.over(steps, **changes).compute())
 
 
 @EVERY

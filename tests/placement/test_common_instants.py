@@ -90,7 +90,11 @@ def test_every_prefix_is_the_coverage_of_its_instants(instants):
     for prefix in instants.prefixes(TWO):
         for frame in (next(frames) for _ in range(3)):
             metric.update(
-                frame.sensor, frame.reference, weights=frame.reference_weights, place_in_time=frame.place_in_time
+                frame.sensor,
+                frame.reference,
+                weights=frame.reference_weights,
+                place_in_time=frame.place_in_time,
+                height=frame.reference_heights_m,
             )
         (near,) = metric.estimates([(questions.regions["bay"], "ground")], "area")
         (other,) = metric.estimates([(questions.regions["bay"], "obstacle")], "area")

@@ -17,24 +17,28 @@ LANE = {"lane": {"x_m": [-7.3, -2.0], "y_m": [-1.2, 1.6]}}
 TWO = rig(lidar(), lidar("low", mount={"x_m": 2.2, "z_m": 0.6}), name="two")
 
 
-def test_the_points_that_are_kept_are_those_in_the_cells_of_the_regions():
+def test_the_points_that_are_kept_are_those_in_the_regions_and_in_their_cells():
     near = Objective(region="20m", band="obstacle"), Objective(region="20m")
     asked = Questions.around(OUTLINE_M, {"a": near[0], "b": Objective(region=LANE, detection=0.1), "c": near[1]})
     assert asked.thresholds_m == (0.1, 0.4)
     assert asked.max_radius_m == 0.4
-    # Cells of half a metre whose centres lie in the lane.
-    assert asked.areas == (((0.0, 20.0), (-5.0, 5.0)), ((-7.5, -2.0), (-1.0, 1.5)))
+    # Cells of half a metre that the lane touches.
+    assert asked.areas == (((0.0, 20.0), (-5.0, 5.0)), ((-7.5, -2.0), (-1.5, 2.0)))
     assert (asked.grid.x, asked.grid.y) == ((-7.5, 20.0), (-5.0, 5.0))
     generator = np.random.default_rng(0)
     points = generator.uniform([-50, -45, -1], [30, 45, 3], (40_000, 3)).astype(np.float32)
-    kept = asked.asked(torch.from_numpy(points)).numpy()
-    boxes = [((0, 20), (-5, 5), (-0.5, 2)), ((-7.5, -2.0), (-1.0, 1.5), (-0.5, 2))]
+    # Bands are over the ground, which is 5 m below the vehicle there.
+    height = torch.from_numpy(points[:, 2].copy())
+    kept = asked.asked(torch.from_numpy(points - np.float32([0, 0, 5])), height).numpy()
+    # The lane, and the cells whose centres lie in it.
+    lane = [((-7.3, -2.0), (-1.2, 1.6), (-0.5, 2)), ((-7.5, -2.0), (-1.0, 1.5), (-0.5, 2))]
+    boxes = [((0, 20), (-5, 5), (-0.5, 2)), *lane]
     inside = [
         np.logical_and.reduce([(p >= low) & (p < high) for p, (low, high) in zip(points.T, box, strict=True)])
         for box in boxes
     ]
     np.testing.assert_array_equal(kept, np.logical_or.reduce(inside))
-    assert 10 < inside[1].sum() < inside[0].sum() < len(points) / 10
+    assert 10 < inside[2].sum() < inside[0].sum() < len(points) / 10
 
 
 NUMBERS = {

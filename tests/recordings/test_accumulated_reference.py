@@ -93,7 +93,7 @@ def test_a_frame_does_not_depend_on_those_read_before():
     copied = [pickle.loads(pickle.dumps(one))[index].reference for index in range(8)]
     for others in zip(forward, backward, fresh, copied, strict=True):
         assert all(torch.equal(others[0], other) for other in others[1:])
-    assert len(one.reference._kept) <= 2 * 5
+    assert len(one.reference.sweeps._kept) <= 2 * 5
 
 
 def test_one_reference_serves_several_recordings():

@@ -62,8 +62,8 @@ def colours(figure: Figure) -> np.ndarray:
 
 
 def test_there_is_a_figure_for_each_quantity_and_band(tmp_path):
-    coverage = coverage_of(SQUARE, thresholds=(0.4, 1.0))
-    keys = ("radius_m", "detection_0.4m", "detection_1m")
+    coverage = coverage_of(SQUARE, thresholds=(1.0,))
+    keys = ("radius_m", "detection_1m")
     paths = write_figures(map_figures({"a": coverage}, ego_outline_m=EGO), tmp_path / "new" / "maps")
     stems = [name for key in keys for name in (*(f"{key}_{band}" for band in BANDS), f"near_{key}")]
     assert [path.stem for path in paths] == stems
@@ -149,6 +149,7 @@ def test_the_bands_of_a_quantity_share_their_colours():
     assert np.abs(low - high).max() > 0.5
 
 
+@pytest.mark.usefixtures("blank_maps")
 def test_any_band_name_becomes_a_file_in_the_folder_and_no_two_share_one(tmp_path):
     bands = ["../up", "a/b", "a\\b", "A b", "a_b_3", "$x$", "long" * 99, "Höhe", "\n"]
     heights = {name: (float(at), at + 1.0) for at, name in enumerate(bands)}
@@ -183,6 +184,7 @@ def test_the_bands_of_a_quantity_lie_side_by_side_for_loggers():
 
 
 @pytest.mark.parametrize("rigs", ["a", "ab"])
+@pytest.mark.usefixtures("blank_maps")
 def test_errors_are_drawn_only_if_asked_for_and_never_as_differences(rigs):
     coverages = dict.fromkeys(rigs, blocked(16))
     plain, more = names(coverages), names(coverages, errors=True)
@@ -213,6 +215,7 @@ def test_a_map_of_errors_says_what_it_shows_in_which_unit_and_why_cells_are_unkn
 # Several rigs
 
 
+@pytest.mark.usefixtures("blank_maps")
 def test_there_is_a_difference_for_each_rig_but_the_first(pair, measure, points, tmp_path):
     three = {**pair, "a/b": measure(points(40, 5))}
     paths = write_figures(map_figures(three, ego_outline_m=EGO), tmp_path)

@@ -26,7 +26,10 @@ def pixels(figure: Figure) -> np.ndarray:
 
 def panel(figure: Figure, at: int) -> np.ndarray:
     """The pixels of one map, row 0 at the top."""
-    everything = pixels(figure)
+    return cut(pixels(figure), figure, at)
+
+
+def cut(everything: np.ndarray, figure: Figure, at: int) -> np.ndarray:
     (left, bottom), (right, top) = figure.axes[at].get_window_extent().get_points().round().astype(int)
     return everything[len(everything) - top : len(everything) - bottom, left:right]
 
@@ -64,7 +67,8 @@ def test_every_panel_has_whole_pixels_for_each_cell_and_overlaps_no_other(count,
     values = torch.rand(grid.shape[1:], generator=generator)
     figure = side_by_side(grid, {f"rig {k}": values for k in range(count)}, subtitle="where")
     _, rows_, columns = grid.shape
-    shown = [panel(figure, at) for at in range(count)]
+    everything = pixels(figure)
+    shown = [cut(everything, figure, at) for at in range(count)]
     for one in shown:
         assert one.shape == shown[0].shape
         assert (one.shape[0] % rows_, one.shape[1] % columns) == (0, 0)
@@ -74,8 +78,7 @@ def test_every_panel_has_whole_pixels_for_each_cell_and_overlaps_no_other(count,
     boxes = [axes.get_tightbbox() for axes in figure.axes]
     for at, one in enumerate(boxes):
         assert not any(one.overlaps(other) for other in boxes[at + 1 :])
-    border = pixels(figure)
-    for edge in (border[:5], border[-5:], border[:, :5], border[:, -5:]):
+    for edge in (everything[:5], everything[-5:], everything[:, :5], everything[:, -5:]):
         assert (edge == 1.0).all()
 
 

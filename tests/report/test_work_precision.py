@@ -1,6 +1,5 @@
 """The diagram of error against run time."""
 
-import math
 from itertools import pairwise
 
 from torchcover.report import WorkPanel, draw_work_precision
@@ -8,19 +7,18 @@ from torchcover.report import WorkPanel, draw_work_precision
 POINTS = [(1.0, 3.0), (2.0, 1.0)]
 
 
-def panel(names, floor: float = math.nan) -> WorkPanel:
-    return WorkPanel("error (%)", dict.fromkeys(names, POINTS), POINTS, floor)
+def panel(names):
+    return WorkPanel("error (%)", dict.fromkeys(names, POINTS))
 
 
 def lines(figure, at: int = 0):
     return {line.get_label(): line for line in figure.axes[at].get_lines()}
 
 
-def test_it_has_a_line_for_each_setting_the_front_and_the_floor_where_there_is_one():
-    figure = draw_work_precision([panel("ab", 0.5), panel("ab")], title="rig in $scene$", legend_title="rays")
+def test_it_has_a_line_for_each_setting():
+    figure = draw_work_precision([panel("ab"), panel("ab")], title="rig in $scene$", legend_title="rays")
     first, second = lines(figure, 0), lines(figure, 1)
-    assert list(second) == ["a", "b", "Pareto front"]
-    assert list(first) == [*second, "standard error of the long run"]
+    assert list(first) == list(second) == ["a", "b"]
     assert first["a"].get_xydata().tolist() == [list(one) for one in POINTS]
     assert [(axes.get_xscale(), axes.get_yscale(), axes.get_ylabel()) for axes in figure.axes] == [
         ("log", "log", "error (%)")
@@ -30,11 +28,11 @@ def test_it_has_a_line_for_each_setting_the_front_and_the_floor_where_there_is_o
 
 def test_lines_look_different_and_more_than_there_are_markers_are_drawn_too():
     drawn = lines(draw_work_precision([panel("abcdefghij")], title=""))
-    assert len({(line.get_color(), line.get_marker()) for line in drawn.values()}) == 11
+    assert len({(line.get_color(), line.get_marker()) for line in drawn.values()}) == 10
 
 
 def test_no_number_of_an_axis_lies_on_another():
-    figure = draw_work_precision([WorkPanel("error (%)", {"a": [(3.0, 0.9), (60.0, 0.3)]}, [], math.nan)], title="")
+    figure = draw_work_precision([WorkPanel("error (%)", {"a": [(3.0, 0.9), (60.0, 0.3)]})], title="")
     figure.canvas.draw()
     (axes,) = figure.axes
     for axis, side in ((axes.xaxis, 0), (axes.yaxis, 1)):

@@ -171,7 +171,7 @@ def test_the_wall_on_a_slope_is_cut_at_heights_above_the_slope(at, slope):
 
 def test_drawing_by_height_is_unbiased_for_any_number_of_rays_and_bands_that_overlap():
     waves = sheet(lambda x, y: np.sin(x / 11), every=2)
-    made = resting([waves, solid((4, 4, 3), 20, 0, -1), solid((2, 9, 2), 30, 3, -1)])
+    scene = Scene(resting([waves, solid((4, 4, 3), 20, 0, -1), solid((2, 9, 2), 30, 3, -1)]))
     areas = (((5.0, 45.0), (-10.0, 10.0)), ((15.0, 25.0), (-5.0, 5.0)))
     bands = ((0.5, 2.0), (-0.5, 0.5), (0.2, 1.0))
 
@@ -179,12 +179,12 @@ def test_drawing_by_height_is_unbiased_for_any_number_of_rays_and_bands_that_ove
         sensor = SurfaceReference(areas, rays, places, bands, band_frame="ground")
         sums = []
         for seed in range(count):
-            one = scan(made, sensor, seed)
+            one = sensor.scan(Surroundings(scene, scene.at(0), np.random.default_rng(seed), "a test"))
             low = (one.heights_m < 0.5) & (one.points[:, 0] > 6)
             sums.append([one.weights[low].sum(), one.weights[one.heights_m >= 0.5].sum()])
         return np.array(sums, dtype=np.float64)
 
-    many = both(20_000, 8, 25)
+    many = both(10_000, 8, 25)
     for rays, places, count in ((400, 2, 200), (30, 1, 500)):
         few = both(rays, places, count)
         error = np.hypot(*(kind.std(axis=0, ddof=1) / math.sqrt(len(kind)) for kind in (few, many)))
@@ -292,14 +292,16 @@ def test_frames_carry_heights_everywhere_they_go(tmp_path):
     frames = SimulatedFrames("courtyard", "front_roof_32", steps=2, boxes=True)
     frame = frames[0]
     assert frame.reference_heights_m.shape == frame.reference_weights.shape
-    assert frame.counts["reference_no_ground"] == int(frame.reference_heights_m.isnan().sum())
     assert torch.equal(pickle.loads(pickle.dumps(frame)).reference_heights_m, frame.reference_heights_m)
     assert torch.equal(frame.to("cpu").reference_heights_m, frame.reference_heights_m)
     batch = collate_frames([frame, frames[1]])
-    assert [len(h) for h in batch.heights_m] == [len(points) for points in batch.reference]
-    with pytest.raises(ValueError, match="heights_m: frame"):
-        _ = collate_frames([frame, dataclasses.replace(frame, reference_heights_m=None)]).heights_m
-    assert collate_frames([dataclasses.replace(frame, reference_heights_m=None)]).heights_m is None
+    assert [len(h) for h in batch.heights_in("ground")] == [len(points) for points in batch.reference]
+    with pytest.raises(ValueError, match=r"drawn for bands over the ground; use the band frame ground$"):
+        batch.heights_in("vehicle")
+    unknown = dataclasses.replace(frame, reference_heights_m=None)
+    with pytest.raises(ValueError, match=r"courtyard step 0.* are unknown; use the band frame vehicle$"):
+        collate_frames([frame, unknown]).heights_in("ground")
+    assert collate_frames([unknown]).heights_in("vehicle") is None
     torch.testing.assert_close(scale(frame, 2.0).reference_heights_m, 2 * frame.reference_heights_m)
     write_recording(frames, tmp_path / "there")
     again = RecordedFrames(tmp_path / "there")[0]

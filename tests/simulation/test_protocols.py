@@ -56,6 +56,7 @@ class DownReference:
 
     name: ClassVar[str] = "down"
     square_metres: ClassVar[bool] = True
+    band_frame: ClassVar[str] = "vehicle"
 
     rays: int
     shell_m: float = 0.5

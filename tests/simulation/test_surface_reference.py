@@ -97,7 +97,7 @@ def test_the_egos_own_surface_is_in_no_cloud_but_hides(at):
 def test_a_vehicle_that_pitches_takes_its_boxes_along(at):
     at([2.6, 0.0, 1.0])
     ego = {**EGO, "pose": {"z_m": 3.0, "pitch_deg": 5.0}}
-    sensor = SurfaceReference((AHEAD,), rays=1000, places=2, bands_m=((-6.0, 0.0),))
+    sensor = SurfaceReference((AHEAD,), rays=1000, places=2, bands_m=((-6.0, 0.0),), band_frame="vehicle")
     agrees(sums(scenario(FLOOR, ego=ego), sensor), 200.0 / math.cos(math.radians(5)))
 
 

@@ -161,7 +161,8 @@ def random_frames(steps, seed, reference, name, keep_clouds):
         clouds = {**sensors, **{f"network {rig}": cloud for rig, cloud in sensors.items()}}
         weights = torch.rand(160, generator=generator) + 0.1
         reference = points[:, 40:].reshape(-1, 3)
-        frames.append(Frame(clouds, reference, index, "f", reference_weights=weights, boxes=boxes))
+        drawn = {"reference_weights": weights, "reference_heights_m": reference[:, 2]}
+        frames.append(Frame(clouds, reference, index, "f", **drawn, boxes=boxes))
     return frames
 
 

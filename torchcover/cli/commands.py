@@ -14,44 +14,43 @@ from torchcover.evaluation.settings import OPTIONS
 UNITS_S = {"s": 1.0, "min": 60.0, "h": 3600.0}
 
 
-@with_options(of_evaluate(*(name for name, option in OPTIONS.items() if option.in_study)))
+TRIED = [name for name, option in OPTIONS.items() if option.in_study == "tried"]
+
+
+@with_options(
+    [
+        *of_evaluate(*(name for name, option in OPTIONS.items() if option.in_study == "once")),
+        *of_evaluate(*TRIED, several=True),
+    ]
+)
 def study(
     rig: options.Rig,
-    rays: Annotated[
-        list[int] | None,
-        typer.Option(min=1, help="Rays of the reference at each step; may be repeated (1024, 4096 and 16384)."),
-    ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Most steps of a run.")] = 128,
-    runs: Annotated[int, typer.Option(min=1, help="Runs of so many steps that errors are averaged over.")] = 2,
-    long_run: Annotated[
-        Path | None,
-        typer.Option(
-            help="What runs are measured against: coverage.npz of `evaluate` with another seed, or long_run.npz of an "
-            "earlier study. Not given: a run is made for it."
-        ),
-    ] = None,
-    long_run_steps: Annotated[int, typer.Option(min=8, help="Steps of that run.")] = 512,
+    steps: Annotated[int, typer.Option(min=8, help="Steps of every setting, all of them on the same instants.")] = 256,
+    explain: Annotated[bool, typer.Option("--explain", help="Say where the seconds go.")] = False,
     out: options.Out = Path("out"),
     **settings: Any,  # noqa: ANN401
 ) -> None:
-    """Measure error against run time for numbers of rays and of steps, and recommend a setting."""
+    """Find the setting for a wanted error: what each costs, how far it is off, and how many steps it needs.
+
+    Options such as --rays, --workers or --cell-m may be given several times: each further value is tried with
+    everything else as in the first setting. None given: 16384, 4096 and 1024 rays.
+    """
     from torchcover.cli.printing import print_study
     from torchcover.evaluation import Settings, StudyPlan, error_against_time, rank_count
     from torchcover.files import claimed
 
     if rank_count() > 1:
         raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
-    plan = StudyPlan(
-        Settings(rig, steps=steps, **settings),
-        rays=tuple(sorted(set(rays or StudyPlan.rays))),
-        runs=runs,
-        long_run=long_run,
-        long_run_steps=long_run_steps,
-    )
+    given = {name: settings.pop(name) for name in TRIED if name in settings}
+    first = {name: values[0] for name, values in given.items() if values}
+    others = tuple({name: value} for name, values in given.items() for value in values[1:])
+    if not others and "rays" not in first and first.get("reference") != "paper":
+        others = StudyPlan.others
+    plan = StudyPlan(Settings(rig, steps=steps, **settings, **first), others)
     with claimed(out):
         found = error_against_time(plan, progress=True)
         files = found.save(out)
-    print_study(found, files, out)
+    print_study(found, files, out, explain=explain)
 
 
 @with_options(of_evaluate("scenario", "seed", "vehicle", "sensor_model", "reference", "rays", "every_s"))

@@ -7,21 +7,12 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from torchcover.evaluation import (
-    AgreementStudy,
-    Result,
-    Study,
-    StudyPlan,
-    WorkPoint,
-    relation,
-    stage_table,
-    study_table,
-    verdict,
-)
+from torchcover.evaluation import AgreementStudy, Result, Study, relation, verdict
 from torchcover.evaluation.agreeing import NOTES
 from torchcover.evaluation.result_page import left_out_table
+from torchcover.evaluation.study import WANTED
 from torchcover.published.comparison import text_tables
-from torchcover.report import PageTable, error_words, narrowest_width, print_table, shown_unit, text_table
+from torchcover.report import PageTable, narrowest_width, print_table, text_table
 
 
 def print_whole(tables: Sequence[Table]) -> None:
@@ -46,6 +37,11 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
         print_whole(text_tables(result.metrics))
     if explain and result.left_out:
         print_whole([in_words(left_out_table(result.left_out))])
+    if explain and result.run:
+        frames_s = result.run.seconds - result.run.measuring_s
+        console.print(
+            f"{frames_s:.1f} s for worlds and rays, {result.run.measuring_s:.1f} s for the search and the sums."
+        )
     for line in result.run.skipped if result.run else ():
         console.print(f"skipped: {line}", style="yellow", markup=False)
     for line in result.target_lines:
@@ -63,21 +59,12 @@ def print_files(files: Sequence[Path], out: Path, console: Console) -> None:
     console.print(f"Wrote {', '.join(words)} to {out}", markup=False, soft_wrap=True)
 
 
-def print_study(study: Study, files: Sequence[Path], out: Path) -> None:
+def print_study(study: Study, files: Sequence[Path], out: Path, *, explain: bool) -> None:
     """The tables, and the settings that are recommended."""
-    console, quantities = Console(), study.quantities
-    print_whole([study_table(study.points, quantities), stage_table(study.stages)])
-    floor = [
-        f"{error_words(study.truth.errors[one.key], one.unit)} {shown_unit(one.unit).difference_name}"
-        for one in quantities
-    ]
-    console.print(
-        f"Times are those of `torchcover evaluate` from start to end: {study.start_s:.1f} s of each for Python, "
-        f"imports, maps and files. The long run of {study.truth.coverage.counts['steps']:,} steps has itself an error "
-        f"of {' and '.join(floor)}."
-    )
-    for wanted, point in study.recommended.items():
-        console.print(advice(wanted, point, study.plan), soft_wrap=True)
+    console = Console()
+    print_whole(study.tables(explain=explain))
+    for wanted in WANTED:
+        console.print(study.advice(wanted), markup=False, soft_wrap=True)
     print_files(files, out, console)
 
 
@@ -104,14 +91,3 @@ def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> 
     for note in NOTES:
         console.print(note, markup=False, soft_wrap=True)
     print_files(files, out, console)
-
-
-def advice(wanted: float, point: WorkPoint | None, plan: StudyPlan) -> str:
-    """The options of `evaluate` that reach an error."""
-    if point is None:
-        return f"For {100 * wanted:g} percentage points of detection: not reached within {plan.lengths[-1]:,} steps."
-    every = "" if plan.settings.every_s is None else f" --every-s {plan.settings.every_s:g}"
-    return (
-        f"For {100 * wanted:g} percentage points of detection: --rays {point.rays} --steps {point.steps}{every} "
-        f"({point.seconds:.0f} s)."
-    )

@@ -19,13 +19,13 @@ from torch import Tensor
 from torchcover.coverage.aggregations import Layer
 from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums, BlockSumsT
 from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.redundancy import PlaceSums, Redundancy, redundancy_quantities
-from torchcover.coverage.region_sums import PlaceNumbers
+from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
+from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
 from torchcover.coverage.regions import Region
 from torchcover.estimation import Quantity
 from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
 
-FORMAT_VERSION = 6
+FORMAT_VERSION = 7
 Arrays = dict[str, NDArray[Any]]
 # Steps, cells, what is divided by, sums.
 IN_BLOCKS = ("block_steps", "block_cell", "block_probed_steps", "block_sums")
@@ -48,6 +48,7 @@ class CoverageParts(TypedDict):
     blocks: Blocks | None
     area: AreaSums | None
     regions: Sequence[Region]
+    places: PlaceSums | None
     aggregated: PlaceNumbers | None
     redundancy: Redundancy | None
 
@@ -61,7 +62,7 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         path: The file.
     """
     grid, blocks, area, redundancy = parts["grid"], parts["blocks"], parts["area"], parts["redundancy"]
-    aggregated = parts["aggregated"]
+    places, aggregated = parts["places"], parts["aggregated"]
     header = {
         "format": FORMAT_VERSION,
         "grid": {
@@ -78,6 +79,7 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         "blocks": 1 if blocks is None else len(blocks.steps),
         "square_metres": area is not None,
         "regions": [asdict(region) for region in parts["regions"]],
+        "by_area": places is not None,
         "aggregated": [] if aggregated is None else [quantity._asdict() for quantity in aggregated.quantities],
         "sensors": None if redundancy is None else redundancy.sensors,
         "redundancy": [] if redundancy is None else [layer.quantity._asdict() for layer in redundancy.layers.values()],
@@ -89,8 +91,8 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         tensors |= dict(zip(AGGREGATED, aggregated[1:], strict=True))
     if redundancy is not None:
         tensors |= {key: layer.values for key, layer in redundancy.layers.items()}
-        if redundancy.places is not None:
-            tensors |= dict(zip(OVER_PLACES, redundancy.places, strict=True))
+    if places is not None:
+        tensors |= dict(zip(OVER_PLACES, places, strict=True))
     arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
     arrays |= {} if blocks is None else _listed(blocks, IN_BLOCKS)
     arrays |= {} if area is None else _listed(area, OVER_AREA)
@@ -115,7 +117,7 @@ def read_coverage(path: Path) -> CoverageParts:
     except (TooLargeError, MemoryError):
         raise
     except Exception as error:  # damage shows anywhere: in the zip, zlib, NumPy, JSON, or as a missing part
-        reason = str(error) or type(error).__name__
+        reason = " ".join(str(error).split()) or type(error).__name__
         raise ValueError(f"not a coverage file as Coverage.save writes it ({reason})") from error
     if parts is None:
         raise ValueError(f"coverage format {version}; this torchcover reads format {FORMAT_VERSION}")
@@ -153,6 +155,7 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
         "blocks": None if header["blocks"] == 1 else _read_listed(Blocks, IN_BLOCKS, header, grid, arrays),
         "area": _read_listed(AreaSums, OVER_AREA, header, grid, arrays) if header["square_metres"] else None,
         "regions": [_region(stored) for stored in header["regions"]],
+        "places": _places(header, grid, arrays) if header["by_area"] else None,
         "aggregated": _aggregated(header, grid, arrays) if header["aggregated"] else None,
         "redundancy": None if header["sensors"] is None else _redundancy(header, grid, arrays),
     }
@@ -174,15 +177,16 @@ def _redundancy(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> Redund
     sensors = tuple(header["sensors"])
     if [layer.quantity for layer in layers] != list(redundancy_quantities(sensors, header["thresholds"])):
         raise ValueError(f"other layers of redundancy than those of the sensors {', '.join(sensors)}")
-    places = None
-    if header["square_metres"]:
-        places = PlaceSums(*(torch.from_numpy(arrays[name]) for name in OVER_PLACES))
-        count = len(header["regions"]) * len(grid.heights)
-        values = 1 + len(header["thresholds"]) + len(layers)
-        blocks = header["blocks"]
-        if [tuple(one.shape) for one in places] != [(blocks,), (blocks, count), (blocks, values, count)]:
-            raise ValueError(f"sums over {count} regions and bands of shape {tuple(places.sums.shape)}")
-    return Redundancy(sensors, {layer.quantity.key: layer for layer in layers}, places)
+    return Redundancy(sensors, {layer.quantity.key: layer for layer in layers})
+
+
+def _places(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> PlaceSums:
+    places = PlaceSums(*(torch.from_numpy(arrays[name]) for name in OVER_PLACES))
+    blocks, count = header["blocks"], len(header["regions"]) * len(grid.heights)
+    values = 1 + len(header["thresholds"]) + len(header["redundancy"])
+    if [tuple(one.shape) for one in places] != [(blocks,), (blocks, count), (blocks, values, count)]:
+        raise ValueError(f"sums over {count} regions and bands of shape {tuple(places.sums.shape)}")
+    return places
 
 
 def _layers(stored: Sequence[dict[str, Any]], grid: BevGrid, arrays: Arrays) -> list[Layer]:

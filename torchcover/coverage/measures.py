@@ -3,69 +3,104 @@
 import math
 from collections.abc import Sequence
 from functools import partial
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
-from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums
+from torchcover.coverage.blocks import Blocks, BlockSums
+from torchcover.coverage.regions import Region
 from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Estimate, Quantity, ratio_errors
+
+if TYPE_CHECKING:
+    from torchcover.coverage.result import Coverage
 
 # What the number of a region is a mean over: its visible surface, or its known cells.
 Measure = Literal["area", "known"]
 
 
-def estimate_known(
-    quantities: Sequence[Quantity], probed: Tensor, sums: Tensor, blocks: Blocks | None, band: int, cells: Tensor
-) -> Estimate:
+def estimate_known(coverage: "Coverage", region: Region, height: str) -> Estimate:
     """The unweighted means over the known cells of a region, and what they become without each block.
 
     Args:
-        quantities: What the numbers are: the mean radius, then the detection at each threshold.
-        probed: (K,) steps that had a reference point in each cell of the region; cells without may be left out.
-        sums: (Q, K) sums over these steps of the radius and of the detection at each threshold.
-        blocks: The same in blocks, over the whole grid, if there are any.
-        band: Number of the height band.
-        cells: (Y, X) bool, the K cells of the region.
+        coverage: Whose numbers: the mean radius, then the detection at each threshold.
+        region: A region within the grid.
+        height: Name of the band.
 
     Returns:
         NaN where no cell is known.
     """
+    band, cells, blocks = coverage.band_of(height), coverage.known_cells(region, height), coverage.blocks
+    probed = coverage.probed_steps[band][cells]
+    sums = probed * torch.stack([coverage.layers[one.key].values[band][cells] for one in coverage.quantities])
     whole = known_mean(probed, sums)
     if blocks is None:
-        return Estimate.of(quantities, whole)
+        return Estimate.of(coverage.quantities, whole)
     used = blocks.steps.nonzero().flatten().tolist()
     own_probed, own_sums = blocks.spread_over(_in_band(blocks, band, cells))
     left_out = [known_mean(probed - own_probed[block], sums - own_sums[:, block]) for block in used]
     without = torch.stack(left_out) if left_out else whole[None][:0]
-    return Estimate(tuple(quantities), whole, without, blocks.steps[used], partial(_known_again, blocks, band, cells))
+    return Estimate(coverage.quantities, whole, without, blocks.steps[used], partial(_known_again, blocks, band, cells))
 
 
-def estimate_area(quantities: Sequence[Quantity], area: AreaSums | None, band: int, cells: Tensor) -> Estimate:
-    """The ratio of sums over the visible surface of a region, and what it becomes without each block.
+def estimate_area(coverage: "Coverage", region: Region, height: str) -> Estimate:
+    """The ratios of `area_in_blocks`; NaN where no square metre was seen."""
+    steps, sums = area_in_blocks(coverage, region, height)
+    return Estimate.of_ratios(coverage.quantities, sums[:, 0], sums[:, 1:], steps)
+
+
+def area_in_blocks(coverage: "Coverage", region: Region, height: str) -> tuple[Tensor, Tensor]:
+    """The sums over the visible surface of one region in one band, in blocks.
 
     R = E[ sum of r dA ] / E[ sum of dA ]: a ratio of additive sums, so that the number of points, the size of cells and
     the share of known ones do not move it.
 
     Args:
-        quantities: What the numbers are, as in `estimate_known`.
-        area: The sums over the whole grid, if there are any.
-        band: Number of the height band.
-        cells: (Y, X) bool, the cells of the region.
+        coverage: Whose sums.
+        region: One of its regions, over which points were summed up by their own place; or one whose bounds are edges
+            of cells, which have the same points.
+        height: Name of the band.
 
     Returns:
-        NaN where no square metre was seen.
+        (B,) int64 steps of each block; (B, 1 + Q) float64 its square metres, then those times each of the quantities.
 
     Raises:
-        ValueError: There are no such sums.
+        ValueError: There are no square metres; another region.
     """
-    if area is None:
+    if coverage.area is None:
         raise ValueError(
             "no estimate by area: the reference points had no square metres; take them from a SurfaceReference and "
             "give the metric square_metres=True"
         )
-    each = area_in_blocks(area, band, cells)
-    return Estimate.of_ratios(quantities, each[:, 0], each[:, 1:], area.steps)
+    place, places, steps = coverage.place_of(region, height), coverage.places, coverage.area.steps
+    if places is not None and place is not None:
+        own = places.sums[:, : len(coverage.quantities), place]
+        return steps, torch.cat([places.m2[:, place, None], own], dim=1)
+    if not region.has_whole_cells(coverage.grid):
+        raise ValueError(
+            f"region {region.name!r}: no points were summed up over it, and cells of {coverage.grid.cell:g} m cannot "
+            "tell, for its edges are not theirs; ask for it when measuring, or move its edges"
+        )
+    cells = region.mask(coverage.grid).to(coverage.area.at.device)
+    return steps, coverage.area.over(_in_band(coverage.area, coverage.band_of(height), cells))
+
+
+def estimate_redundancy(coverage: "Coverage", region: Region, height: str) -> Estimate:
+    """The numbers of a region with all sensors, then those of `redundancy_quantities`.
+
+    By area they are unknown where the metric was not told of the region. Over known cells they have no errors.
+    """
+    assert coverage.redundancy is not None
+    layers = coverage.redundancy.layers.values()
+    quantities = (*coverage.quantities, *(layer.quantity for layer in layers))
+    place = coverage.place_of(region, height)
+    if coverage.places is not None and place is not None:
+        return coverage.places.estimate(quantities, place)
+    if coverage.measure == "area":
+        return Estimate.of(quantities, coverage.radius.new_full((len(quantities),), math.nan))
+    band, known = coverage.band_of(height), coverage.known_cells(region, height)
+    own = torch.stack([layer.values[band][known].mean() for layer in layers])
+    return Estimate.of(quantities, torch.cat([coverage.estimate(region, height).value, own]))
 
 
 def errors_of_cells(quantities: Sequence[Quantity], blocks: BlockSums) -> dict[str, Tensor]:
@@ -77,11 +112,6 @@ def errors_of_cells(quantities: Sequence[Quantity], blocks: BlockSums) -> dict[s
         errors[quantity.key] = sums.new_full(blocks.shape[1:], math.nan)
         errors[quantity.key][where] = ratio_errors(base, own, quantity.unit)
     return errors
-
-
-def area_in_blocks(area: AreaSums, band: int, cells: Tensor) -> Tensor:
-    """(B, 1 + Q) the square metres of a region in each block, then those times each quantity; as `estimate_area`."""
-    return area.over(_in_band(area, band, cells))
 
 
 def _in_band(blocks: BlockSums, band: int, cells: Tensor) -> Tensor:

@@ -11,9 +11,9 @@ from torchcover.coverage.aggregations import Aggregation, BinnedStep, Layer, Mea
 from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.blocks import AreaSums, Blocks, BlockSumsT
 from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.measures import Measure, estimate_area
+from torchcover.coverage.measures import Measure
 from torchcover.coverage.plotting import draw_coverage
-from torchcover.coverage.redundancy import PlaceSums, Redundancy, SensorFailures
+from torchcover.coverage.redundancy import Redundancy, SensorFailures
 from torchcover.coverage.region_sums import IN_REGIONS, RegionSums
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
@@ -34,14 +34,11 @@ class CoverageMetric(SumsInBlocks):
         detection[h, y, x] = E_t[ E_q in cell [ 1(r(q) <= threshold) ] ]
 
     with r(q) from `torchcover.blind_spot_radius`; a step counts in a cell only if it had a reference point there
-    (Uecker & Zöllner 2024). The state is a few sums for each cell, whatever the number of steps: two metrics over
-    different steps merge exactly (`merge_state`), and ranks are added up when `compute` is called.
+    (Uecker & Zöllner 2024). The state is a few sums for each cell and region, whatever the number of steps: two metrics
+    over different steps merge exactly (`merge_state`), and ranks are added up when `compute` is called.
 
-    With `blocks` the sums are kept in as many blocks of contiguous steps, and the result has standard errors. Steps
-    that follow each other are alike, so that their number says little about the error; blocks that are longer than
-    the likeness lasts are independent.
-
-    The state is part of `state_dict()`; `metric.persistent(False)` takes it out.
+    With `blocks` the sums are kept in as many blocks of contiguous steps, and the result has standard errors: steps
+    that follow each other are alike, blocks that are longer than the likeness lasts are independent.
 
     Args:
         grid: Cells and height bands; its `band_frame` decides whether `update` needs heights above the ground.
@@ -49,13 +46,13 @@ class CoverageMetric(SumsInBlocks):
             `max_radius`.
         max_radius: Saturation of r in metres. An empty sensor cloud gives r = `max_radius`: with the default,
             infinity, such a step makes the radius of its cells infinite.
-        blocks: 1 for no errors, or an even number from 8 on: at least half as many blocks are in use at the end of a
-            long run. The state grows with it: 24 bytes a cell and block.
+        blocks: 1 for no errors, or an even number from 8 on, half of which at least are in use at the end of a long
+            run. The state grows with it: 24 bytes a cell and block.
         aggregations: Others than the mean of means, from `torchcover.coverage`: `Maximum()`, `PooledMean()`,
             `Quantiles(levels)`, `StepQuantiles(levels)`, or a class of one's own; at most one of each. Each gives maps,
             and numbers of `regions`.
-        regions: What the result gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
-            the grid if not given. Sums depend on it only with `aggregations` or `sensors`.
+        regions: What the result gives numbers for; the paper's `forward_regions()` that fit the grid if not given. By
+            area, a reference point belongs to a region by its own place, so that cells decide about maps only.
         sensors: Names of the rig's sensors, for `Coverage.redundancy`: then `update` takes a cloud for each by its
             name, and what the rig is without each of them is known as well.
         square_metres: Whether there is to be an estimate by area too; then every step needs the square metres of its
@@ -107,40 +104,34 @@ class CoverageMetric(SumsInBlocks):
         check_parameters(thresholds, max_radius, aggregations)
         regions = regions_within(grid) if regions is None else tuple(regions)
         check_regions(regions, grid)
+        thresholds, max_radius = tuple(float(threshold) for threshold in thresholds), float(max_radius)
         meaning = {
             "grid": grid,
-            "thresholds": tuple(float(threshold) for threshold in thresholds),
-            "max_radius": float(max_radius),
+            "thresholds": thresholds,
+            "max_radius": max_radius,
             "blocks": blocks,
             "aggregations": tuple(aggregations),
             "square_metres": square_metres,
             **({"sensors": tuple(sensors)} if sensors else {}),
-            **({"regions": regions} if sensors or aggregations else {}),
+            **({"regions": regions} if square_metres or aggregations else {}),
         }
         super().__init__(blocks, meaning, **kwargs)
-        self.grid = grid
-        self.regions = regions
-        self.sensors = tuple(sensors)
-        self.thresholds: tuple[float, ...] = tuple(float(threshold) for threshold in thresholds)
-        self.max_radius = float(max_radius)
-        self.square_metres = square_metres
-        over_area = [VisibleArea(self.thresholds, blocks)] if square_metres else []
-        places = Places(regions, grid)
-        self._in_regions = RegionSums(aggregations, places, blocks)
-        self._failures = SensorFailures(self.sensors, self.thresholds, places, self.max_radius, blocks, square_metres)
-        redundancy = [self._failures] if sensors else []
-        self._of_grid: tuple[Aggregation, ...] = (MeanOfMeans(self.thresholds, blocks), *over_area, *aggregations)
-        self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *redundancy)
-        self.backend = backend
-        self.memory_mb = memory_mb
+        self.grid, self.thresholds, self.max_radius = grid, thresholds, max_radius
+        self.regions, self.sensors, self.square_metres = regions, tuple(sensors), square_metres
+        self.backend, self.memory_mb = backend, memory_mb
+        over_area = [VisibleArea(thresholds, blocks)] if square_metres else []
+        self._of_grid: tuple[Aggregation, ...] = (MeanOfMeans(thresholds, blocks), *over_area, *aggregations)
+        self._failures = SensorFailures(self.sensors, thresholds, square_metres) if sensors else None
+        self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *([self._failures] if self._failures else []))
+        values = 1 + len(thresholds) + (len(self._failures.quantities) if self._failures else 0)
+        self._in_regions = RegionSums(aggregations, Places(regions, grid), blocks, values if square_metres else 0)
         self._add_states()
 
     def _add_states(self) -> None:
         self.add_block_sum("probed_steps", (self.grid.cells,), torch.int64)
         self.add_sum("points", (self.grid.cells,), torch.int64)
-        for name in Coverage.COUNTS:
-            if name != "steps":
-                self.add_sum(name, (), torch.int64)
+        for name in Coverage.COUNTS[1:]:  # but for the steps
+            self.add_sum(name, (), torch.int64)
         self._state_names: dict[str, list[str]] = {}
         for aggregation in self.aggregations:
             self._add_states_of(aggregation.name, aggregation.states(self.grid.cells))
@@ -164,12 +155,14 @@ class CoverageMetric(SumsInBlocks):
         weights: Clouds | None = None,
         height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
+        error: SensorClouds | None = None,
     ) -> None:
         """Add one step, or one step for each entry of two lists.
 
         Args:
-            sensor: (N, 3) points of the rig in the vehicle frame in metres, or a list of them. N = 0: a blind step.
-                Of a metric with `sensors`: name of the sensor -> its points, or a list of such dicts.
+            sensor: (N, 3) points of the rig in the vehicle frame in metres, where they truly are if that is known, or a
+                list of them. N = 0: a blind step. Of a metric with `sensors`: name of the sensor -> its points, or a
+                list of such dicts.
             reference: (M, 3) points of the reference sensor in the same frame, or a list of the same length. M = 0:
                 the step says nothing.
             weights: (M,) square metres that each reference point stands for (`frame.reference_weights`), or a list of
@@ -181,28 +174,17 @@ class CoverageMetric(SumsInBlocks):
             place_in_time: Number of the step, 10^15 at most, or a list of them (`frame.place_in_time`); it decides
                 about the block, so that steps of one number, as of an instant that is seen again, share one. Not
                 given: counted on from the steps so far.
+            error: (N,) by how many metres each point of the rig was measured off its place, along its ray, or as
+                `sensor` in a dict or a list. One that is off by more than `within_m` is no point. Not given: none is.
 
         Raises:
-            ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights
-                that are not positive and finite, none where there is to be an estimate by area, heights that are
-                infinite, or missing or of no use for the grid, a place in time that is negative or too large.
+            ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates; weights,
+                heights, places in time or errors as `torchcover.coverage.steps.checked_steps` refuses them.
             TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
         """
-        if self.square_metres and weights is None:
-            raise ValueError(
-                "weights: the square metres of each reference point are needed, as a SurfaceReference gives them; got "
-                "none (without square_metres=True, points may do without)"
-            )
-        for step in checked_steps(
-            sensor,
-            reference,
-            weights,
-            height,
-            place_in_time,
-            grid=self.grid,
-            names=self.sensors,
-            first=int(self.steps),
-        ):
+        given = (sensor, reference, weights, height, place_in_time, error)
+        how: dict[str, Any] = {"grid": self.grid, "square_metres": self.square_metres, "names": self.sensors}
+        for step in checked_steps(*given, within_m=self.within_m, first=int(self.steps), **how):
             self._add_step(step)
 
     def forward(
@@ -213,28 +195,35 @@ class CoverageMetric(SumsInBlocks):
         weights: Clouds | None = None,
         height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
+        error: SensorClouds | None = None,
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
         if place_in_time is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
             place_in_time = [int(self.steps) + step for step in range(len(as_list(reference, "reference")))]
-        coverage: Coverage = super().forward(
-            sensor, reference, weights=weights, height=height, place_in_time=place_in_time
-        )
-        return coverage
+        given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
+        return super().forward(sensor, reference, **given)  # type: ignore[no-any-return]
+
+    @property
+    def within_m(self) -> float:
+        """How far off a point may be measured: the largest threshold; any distance if there is none."""
+        return max(self.thresholds, default=math.inf)
 
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
     def _add_step(self, step: CheckedStep) -> None:
         sensors, reference, weights, height, place_in_time = step
         inside, of, cell = self.grid.bins(reference, height)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
-        each = [self._distance(reference[inside], cloud.to(reference.device)) for cloud in sensors.values()]
-        of_sensors = torch.stack(each) if self.sensors else None
-        distance = each[0] if of_sensors is None else of_sensors.amin(dim=0)
-        device = self.points.device
+        how: dict[str, Any] = {"backend": self.backend, "memory_mb": self.memory_mb, "max_distance": self.max_radius}
+        each = [nearest(reference[inside], one.to(reference.device), **how).distance for one in sensors.values()]
+        of_sensors = torch.stack(each)
+        distance, device = of_sensors.amin(dim=0), self.points.device
         weights = None if weights is None else weights.to(reference.device)[inside[of]].to(device)
-        block = self._block_of(place_in_time)
-        of_sensors = None if of_sensors is None else of_sensors[:, of].to(device)
-        self._accumulate(block, cell.to(device), distance[of].to(device), weights, of_sensors)
+        binned = self._binned(place_in_time, cell.to(device), of_sensors[:, of].to(device), weights)
+        for aggregation in self.aggregations:
+            aggregation.update(self._sums_of(aggregation.name), binned)
+        self._in_regions.update(self._sums_of(IN_REGIONS), binned, reference[inside[of]].to(device))
+        self.probed_steps[binned.block, binned.means.cell] += 1
+        self.points[binned.means.cell] += binned.means.points
         self.steps += 1
         self.empty_sensor_steps += not any(map(len, sensors.values()))
         self.empty_reference_steps += len(reference) == 0
@@ -243,28 +232,22 @@ class CoverageMetric(SumsInBlocks):
         self.no_ground_points += 0 if height is None else height.isnan().sum().to(device)
         self.saturated_points += (distance >= self.max_radius).sum().to(device)
 
-    def _distance(self, reference: Tensor, cloud: Tensor) -> Tensor:
-        found = nearest(reference, cloud, max_distance=self.max_radius, backend=self.backend, memory_mb=self.memory_mb)
-        return found.distance
-
-    def _accumulate(
-        self, block: int, cell: Tensor, distance: Tensor, weights: Tensor | None, of_sensors: Tensor | None
-    ) -> None:
+    def _binned(self, place_in_time: int, cell: Tensor, of_sensors: Tensor, weights: Tensor | None) -> BinnedStep:
+        """The values of points in cells, from their distances to each sensor, or to all of them as one."""
+        distance = of_sensors.amin(dim=0)
         # Before saturation: a point with nothing within `max_radius` is not detected at a threshold of `max_radius`.
         detected = [(distance <= threshold).double() for threshold in self.thresholds]
         radius = distance.clamp(max=distance.new_tensor(self.max_radius)).double()
         values = torch.stack([radius, *detected])
+        if self._failures:
+            values = torch.cat([values, self._failures.values(of_sensors, self.max_radius)])
         means = mean_per_cell(cell, values, self.grid.cells, weights)
-        self.probed_steps[block, means.cell] += 1
-        self.points[means.cell] += means.points
-        step = BinnedStep(cell, values, weights, means, block, self.grid.cells, of_sensors)
-        for aggregation in self.aggregations:
-            aggregation.update(self._sums_of(aggregation.name), step)
-        self._in_regions.update(self._sums_of(IN_REGIONS), step)
+        return BinnedStep(cell, values, weights, means, self._block_of(place_in_time), self.grid.cells)
 
     def compute(self) -> Coverage:
         """The coverage so far. Cells that no reference point ever probed are NaN with count 0."""
         probed_steps = self.probed_steps.sum(dim=0)
+        failures = [] if self._failures is None else self._layers(self._failures, probed_steps)
         return Coverage(
             grid=self.grid,
             thresholds=self.thresholds,
@@ -276,8 +259,9 @@ class CoverageMetric(SumsInBlocks):
             area=self._listed(AreaSums, self.area_m2, self.area_sums) if self.square_metres else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
             regions=self.regions,
+            places=self._in_regions.area(self._sums_of(IN_REGIONS), self.block_steps),
             aggregated=self._in_regions.numbers(self._sums_of(IN_REGIONS), self.max_radius),
-            redundancy=self._redundancy(probed_steps) if self.sensors else None,
+            redundancy=Redundancy(self.sensors, {one.quantity.key: one for one in failures}) if failures else None,
         )
 
     def estimates(self, places: Sequence[tuple[Region, str]], measure: Measure) -> list[Estimate]:
@@ -290,27 +274,17 @@ class CoverageMetric(SumsInBlocks):
         Raises:
             ValueError: As there.
         """
-        if measure == "known" or not self.square_metres:
-            coverage = self.compute()
-            return [coverage.estimate(region, height, measure) for region, height in places]
-        area, quantities = self._listed(AreaSums, self.area_m2, self.area_sums), MeanOfMeans(self.thresholds).quantities
-        bands = list(self.grid.heights)
-        return [
-            estimate_area(quantities, area, bands.index(height), region.mask(self.grid).to(area.at.device))
-            for region, height in places
-        ]
+        sums = self._in_regions.area(self._sums_of(IN_REGIONS), self.block_steps)
+        numbers = [self._in_regions.places.number_of(*place) for place in places]
+        if measure == "area" and sums and None not in numbers:
+            quantities = MeanOfMeans(self.thresholds).quantities
+            return [sums.estimate(quantities, number) for number in numbers if number is not None]
+        coverage = self.compute()
+        return [coverage.estimate(region, height, measure) for region, height in places]
 
     def _layers(self, aggregation: Aggregation, probed_steps: Tensor) -> list[Layer]:
         found = aggregation.layers(self._sums_of(aggregation.name), probed_steps, self.max_radius)
         return [Layer(layer.quantity, layer.values.view(self.grid.shape)) for layer in found]
-
-    def _redundancy(self, probed_steps: Tensor) -> Redundancy:
-        layers = {layer.quantity.key: layer for layer in self._layers(self._failures, probed_steps)}
-        if not self.square_metres:
-            return Redundancy(self.sensors, layers, None)
-        sums = self._sums_of(self._failures.name)
-        places = PlaceSums(self.block_steps.clone(), sums["place_m2"].clone(), sums["place_sums"].clone())
-        return Redundancy(self.sensors, layers, places)
 
     def plot(
         self,
@@ -320,16 +294,13 @@ class CoverageMetric(SumsInBlocks):
         layer: str | None = None,
         height: str | None = None,
     ) -> "tuple[Figure, Axes]":
-        """Draw one layer in one height band, seen from above; see `torchcover.coverage.plotting.draw_coverage`.
+        """Draw one layer in one height band, seen from above, as `torchcover.coverage.plotting.draw_coverage` does.
 
         Args:
             val: What `compute` or `forward` returned; the coverage so far if not given.
             ax: Where to; a new figure of pyplot's if not given.
             layer: A key of `Coverage.layers`; the detection at the first threshold if not given.
             height: Name of the band; the first if not given.
-
-        Returns:
-            The figure and the axes.
         """
         fig, ax = figure_of(ax)
         draw_coverage(self.compute() if val is None else val, ax, layer, height)

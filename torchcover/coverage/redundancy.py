@@ -2,28 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, BinnedStep, Layer, State
-from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.quantity import RADIUS, detection, seen_by_two, sensors_seeing, without
-from torchcover.coverage.regions import Places
 from torchcover.estimation import Quantity
-
-
-class PlaceSums(NamedTuple):
-    """Sums over the visible surface of P regions and bands, region by region, in B blocks of steps.
-
-    `steps` (B,) int64 steps in each block; `m2` (B, P) float64 square metres; `sums` (B, Q + V, P) those times the
-    radius and the detections with all sensors, then times each of `redundancy_quantities`.
-    """
-
-    steps: Tensor
-    m2: Tensor
-    sums: Tensor
 
 
 @dataclass(frozen=True)
@@ -36,12 +22,10 @@ class Redundancy:
             cell are seen ("sensors_0.4m") and the share that two or more see ("seen_by_two_0.4m"); for each sensor the
             radius and the detection without it ("radius_m_without_roof"). By area if the coverage is, else means of
             means.
-        places: The sums behind the numbers of the regions; None unless the coverage is by area.
     """
 
     sensors: tuple[str, ...]
     layers: Mapping[str, Layer]
-    places: PlaceSums | None
 
 
 def redundancy_quantities(sensors: Sequence[str], thresholds: Sequence[float]) -> tuple[Quantity, ...]:
@@ -64,11 +48,8 @@ class SensorFailures(Aggregation):
     the others', and no search is made for it.
 
     Args:
-        sensors: Names of the sensors, in the order of `BinnedStep.of_sensors`.
+        sensors: Names of the sensors.
         thresholds: Detection thresholds in metres.
-        places: Regions and bands whose numbers have errors.
-        max_radius: Saturation of the radius in metres.
-        blocks: Blocks of contiguous steps for the errors.
         square_metres: Whether weights are square metres.
     """
 
@@ -77,9 +58,6 @@ class SensorFailures(Aggregation):
 
     sensors: tuple[str, ...]
     thresholds: tuple[float, ...]
-    places: Places
-    max_radius: float
-    blocks: int = 1
     square_metres: bool = False
 
     @property
@@ -88,34 +66,26 @@ class SensorFailures(Aggregation):
         return redundancy_quantities(self.sensors, self.thresholds)
 
     def states(self, cells: int) -> dict[str, State]:
-        """`sums` (V, C): means of each step, or with square metres those times them, and `m2` (C); both by region."""
-        values, places = len(self.quantities), self.places.count
-        with_all = 1 + len(self.thresholds)
+        """`sums` (V, C): means of each step, or with square metres those times them, and `m2` (C)."""
         zero = torch.zeros((), dtype=torch.float64)
-        states = {"sums": State(zero.expand(values, cells))}
-        if self.square_metres:
-            states["m2"] = State(zero.expand(cells))
-            states["place_m2"] = State(zero.expand(self.blocks, places), in_blocks=True)
-            states["place_sums"] = State(zero.expand(self.blocks, with_all + values, places), in_blocks=True)
-        return states
+        m2 = {"m2": State(zero.expand(cells))} if self.square_metres else {}
+        return {"sums": State(zero.expand(len(self.quantities), cells)), **m2}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
-        """Add the points of a step."""
-        assert step.of_sensors is not None  # a metric with this aggregation has them
-        cell, _, weight, mean = mean_per_cell(step.cell, self._values(step.of_sensors), step.cells, step.weight)
-        if not self.square_metres:
-            sums["sums"][:, cell] += mean
-            return
-        sums["m2"][cell] += weight
-        sums["sums"][:, cell] += mean * weight
-        # Row by row in one order, so that what a sensor adds nothing to is the same without it, to the last bit.
-        products = torch.cat([step.means.mean, mean]) * weight
-        for place, member in enumerate(self.places.members(cell)):
-            sums["place_m2"][step.block, place] += weight[member].sum()
-            sums["place_sums"][step.block, :, place] += products[:, member].sum(dim=1)
+        """Add the points of a step, whose last values are those of `values`."""
+        cell, _, weight, mean = step.means
+        own = mean[-len(self.quantities) :]
+        sums["sums"][:, cell] += own * weight if self.square_metres else own
+        if self.square_metres:
+            sums["m2"][cell] += weight
 
-    def _values(self, of_sensors: Tensor) -> Tensor:
-        """(V, N) float64 of (S, N) distances to the nearest point of each sensor, infinite where none is near."""
+    def values(self, of_sensors: Tensor, max_radius: float) -> Tensor:
+        """(V, N) float64 what there is to say of each point.
+
+        Args:
+            of_sensors: (S, N) distances to the nearest point of each sensor, infinite where none is near.
+            max_radius: Saturation of the radius in metres.
+        """
         nearest, which = of_sensors.min(dim=0)
         rows = []
         for threshold in self.thresholds:
@@ -125,7 +95,7 @@ class SensorFailures(Aggregation):
         second = of_sensors.scatter(0, which[None], torch.inf).amin(dim=0)
         for number in range(len(self.sensors)):
             radius = torch.where(which == number, second, nearest)
-            rows.append(radius.clamp(max=radius.new_tensor(self.max_radius)).double())
+            rows.append(radius.clamp(max=radius.new_tensor(max_radius)).double())
             rows += [(radius <= threshold).double() for threshold in self.thresholds]
         return torch.stack(rows)
 

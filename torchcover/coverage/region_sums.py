@@ -1,4 +1,4 @@
-"""Aggregations over regions: a region in a height band is one large cell, whose sums are kept in blocks."""
+"""Sums over regions: a region in a height band is one large cell of the points in it, whose sums are kept in blocks."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ from torch import Tensor
 from torchcover.coverage.aggregations import Aggregation, BinnedStep, State
 from torchcover.coverage.binning import mean_per_cell
 from torchcover.coverage.regions import Places
-from torchcover.estimation import Quantity
+from torchcover.estimation import Estimate, Quantity
 
 # The states that are about regions begin with it.
 IN_REGIONS = "regions"
@@ -28,29 +28,54 @@ class PlaceNumbers(NamedTuple):
     left_out: Tensor
 
 
-class RegionSums:
-    """The states of aggregations over regions, for their numbers there and the errors of these.
+class PlaceSums(NamedTuple):
+    """Sums over the visible surface of P regions and bands, region by region, in B blocks of steps.
 
-    An aggregation is asked as for a map, but for one cell a region and band: its number is what it makes of all points
-    there. States that are added up are kept in blocks; of a largest value no error is known, for it is the same
-    whichever block is left out but one.
+    `steps` (B,) int64 steps in each block; `m2` (B, P) float64 square metres; `sums` (B, V, P) those times the radius
+    and the detections, then, of a metric that knows the sensors, times each of `redundancy_quantities`.
+    """
+
+    steps: Tensor
+    m2: Tensor
+    sums: Tensor
+
+    def estimate(self, quantities: Sequence[Quantity], place: int) -> Estimate:
+        """The ratios of one place: the first of the V, as many as there are quantities."""
+        return Estimate.of_ratios(quantities, self.m2[:, place], self.sums[:, : len(quantities), place], self.steps)
+
+
+class RegionSums:
+    """The states over regions: sums by area, and those of aggregations; for numbers there, and their errors.
+
+    A point belongs to a region by its own place, whatever the cells are. An aggregation is asked as for a map, but for
+    one cell a region and band: its number is what it makes of all points there. States that are added up are kept in
+    blocks; of a largest value no error is known, for it is the same whichever block is left out but one.
 
     Args:
         aggregations: Whose numbers.
         places: Regions and bands.
         blocks: Blocks of contiguous steps.
+        by_area: How many values of each point are summed up with its square metres; none without these.
     """
 
-    def __init__(self, aggregations: Sequence[Aggregation], places: Places, blocks: int) -> None:
+    def __init__(self, aggregations: Sequence[Aggregation], places: Places, blocks: int, by_area: int) -> None:
         self.aggregations = tuple(aggregations) if places.count else ()
         self.places = places
         self.blocks = blocks
+        self.by_area = by_area if places.count else 0
 
     def states(self) -> dict[str, State]:
-        """`probed` (B, P): steps of a block with a point in the place; and those of each aggregation, (B, ..., P)."""
-        if not self.aggregations:
-            return {}
-        states = {"probed": self._in_blocks(State(torch.zeros((), dtype=torch.int64).expand(self.places.count)))}
+        """The empty sums, by name.
+
+        By area `m2` (B, P) and `sums` (B, V, P), as in `PlaceSums`. With aggregations `probed` (B, P), steps of a block
+        with a point in the place, and those of each, (B, ..., P).
+        """
+        zero, states = torch.zeros((), dtype=torch.float64), dict[str, State]()
+        if self.by_area:
+            states["m2"] = self._in_blocks(State(zero.expand(self.places.count)))
+            states["sums"] = self._in_blocks(State(zero.expand(self.by_area, self.places.count)))
+        if self.aggregations:
+            states["probed"] = self._in_blocks(State(zero.long().expand(self.places.count)))
         for aggregation in self.aggregations:
             for name, state in aggregation.states(self.places.count).items():
                 states[f"{aggregation.name}_{name}"] = self._in_blocks(state)
@@ -61,20 +86,28 @@ class RegionSums:
         shape = (self.blocks if added else 1, *state.initial.shape)
         return State(state.initial.expand(shape), state.reduction, in_blocks=added)
 
-    def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
-        """Add the points of a step to all regions that they lie in."""
-        if not self.aggregations:
+    def update(self, sums: Mapping[str, Tensor], step: BinnedStep, points: Tensor) -> None:
+        """Add the points of a step, (N, 3) in metres, to all regions that they lie in."""
+        if not sums:
             return
-        place, point = self.places.of_points(step.cell)
+        place, point = self.places.of_points(points, step.cell)
         values = step.values[:, point]
         weight = None if step.weight is None else step.weight[point]
-        of_sensors = None if step.of_sensors is None else step.of_sensors[:, point]
         means = mean_per_cell(place, values, self.places.count, weight)
+        if self.by_area:
+            sums["m2"][step.block, means.cell] += means.weight
+            sums["sums"][step.block][:, means.cell] += means.mean * means.weight
+        if not self.aggregations:
+            return
         sums["probed"][step.block, means.cell] += 1
-        there = BinnedStep(place, values, weight, means, 0, self.places.count, of_sensors)
+        there = BinnedStep(place, values, weight, means, 0, self.places.count)
         for aggregation in self.aggregations:
             own = self._of(aggregation, sums)
             aggregation.update({name: state[min(step.block, len(state) - 1)] for name, state in own.items()}, there)
+
+    def area(self, sums: Mapping[str, Tensor], steps: Tensor) -> PlaceSums | None:
+        """A copy of the sums by area; None without them."""
+        return PlaceSums(steps.clone(), sums["m2"].clone(), sums["sums"].clone()) if self.by_area else None
 
     def numbers(self, sums: Mapping[str, Tensor], max_radius: float) -> PlaceNumbers | None:
         """What the sums say; None without aggregations."""

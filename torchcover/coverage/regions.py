@@ -1,29 +1,26 @@
-"""Regions: named rectangles and polygons of cells that a number is given for."""
+"""Regions: named rectangles and polygons that a number is given for, and which points belong to them."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import TYPE_CHECKING
+from itertools import pairwise
 
 import torch
 from torch import Tensor
 
 from torchcover.coverage.grid import BevGrid
 
-if TYPE_CHECKING:
-    from shapely import Polygon
-
 # How far around the vehicle its near field reaches.
 NEAR_FIELD_M = 3.0
-# A centre on an edge counts as this share of a cell further along x and y: it belongs to one of two neighbours, as in
-# the half-open bins of a rectangle.
-ON_AN_EDGE = 1e-6, 0.6e-6
+# A bound lies on an edge of a cell if it is within this share of one: both are written in decimals.
+ON_AN_EDGE = 1e-6
 
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle in the vehicle frame, half-open on both axes, or a polygon. A cell belongs to it if its centre does.
+    """A rectangle in the vehicle frame, half-open on both axes, or a polygon.
+
+    By area, a point belongs to it by its own place; over known cells, a cell belongs to it if its centre does.
 
     Args:
         name: What tables and loggers call it.
@@ -81,7 +78,7 @@ class Region:
     def _check_polygon(self) -> None:
         import shapely
 
-        polygon = self._polygon
+        polygon = shapely.Polygon(self.corners_m)
         if not polygon.is_valid:
             raise ValueError(
                 f"region {self.name!r}: its edges cross or touch each other ({shapely.is_valid_reason(polygon)}); give "
@@ -91,11 +88,38 @@ class Region:
         if (x_low, y_low, x_high, y_high) != bounds:
             raise ValueError(f"region {self.name!r}: its corners have other bounds than x = {self.x}, y = {self.y}")
 
-    @property
-    def _polygon(self) -> "Polygon":
-        from shapely import Polygon
+    def contains(self, x: Tensor, y: Tensor) -> Tensor:
+        """Which places belong to it: the one function that decides, of points as of the centres of cells.
 
-        return Polygon(self.corners_m)
+        A polygon holds a place if an odd number of its edges lie further along x: of two regions that share an edge,
+        one has it, the one further along x and y.
+
+        Args:
+            x: Metres forward, any floating-point type.
+            y: Metres to the left; of a shape that goes with that of x.
+
+        Returns:
+            bool of the shape that both have together.
+
+        Example:
+            >>> lane = Region("lane", x=(0.0, 20.0), y=(-1.5, 1.5))
+            >>> lane.contains(torch.tensor([0.0, 3.0, 20.0]), torch.tensor([-1.5, 1.5, 0.0]))
+            tensor([ True, False, False])
+        """
+        x, y = x.double(), y.double()
+        within = (x >= self.x[0]) & (x < self.x[1]) & (y >= self.y[0]) & (y < self.y[1])
+        if not self.corners_m:
+            return within
+        x, y = (each.expand(within.shape)[within] for each in (x, y))
+        inside = torch.zeros_like(x, dtype=torch.bool)
+        for edge in pairwise((*self.corners_m, self.corners_m[0])):
+            # From below in either direction, so that two regions round alike.
+            (x_low, y_low), (x_high, y_high) = sorted(edge, key=lambda corner: corner[1])
+            beside = ((y >= y_low) & (y < y_high)).nonzero().squeeze(1)
+            if len(beside):
+                share = (y[beside] - y_low) / (y_high - y_low)
+                inside[beside] ^= x[beside] < x_low + share * (x_high - x_low)
+        return within.masked_scatter(within, inside)
 
     def fits(self, grid: BevGrid) -> bool:
         """Whether it lies within the grid.
@@ -124,17 +148,19 @@ class Region:
                 f"region {self.name!r} spans {axis} = {region[0]:g} to {region[1]:g} m, beyond the grid's "
                 f"{bounds[0]:g} to {bounds[1]:g} m; enlarge the grid or leave the region out"
             )
-        x, y = grid.x_centres_m, grid.y_centres_m
-        if not self.corners_m:
-            return ((y >= self.y[0]) & (y < self.y[1]))[:, None] & ((x >= self.x[0]) & (x < self.x[1]))
-        import shapely
+        return self.contains(grid.x_centres_m[None, :], grid.y_centres_m[:, None])
 
-        polygon = self._polygon
-        shapely.prepare(polygon)
-        further_x, further_y = (share * grid.cell for share in ON_AN_EDGE)
-        return torch.from_numpy(
-            shapely.contains_xy(polygon, (x + further_x)[None, :].numpy(), (y + further_y)[:, None].numpy())
-        )
+    def has_whole_cells(self, grid: BevGrid) -> bool:
+        """Whether its bounds are edges of cells, so that the points in its cells are those that belong to it.
+
+        Example:
+            >>> grid = BevGrid(x=(0.0, 4.0), y=(0.0, 1.0), cell=0.5)
+            >>> [Region("ahead", (0.0, far), (0.0, 1.0)).has_whole_cells(grid) for far in (2.5, 2.6)]
+            [True, False]
+        """
+        sides = ((self.x, grid.x_edges_m), (self.y, grid.y_edges_m))
+        off = [float((edges - bound).abs().min()) for bounds, edges in sides for bound in bounds]
+        return not self.corners_m and max(off) <= ON_AN_EDGE * grid.cell
 
 
 class Places:
@@ -150,31 +176,26 @@ class Places:
         self.grid = grid
         self.count = len(self.regions) * len(grid.heights)
 
-    def of_points(self, cell: Tensor) -> tuple[Tensor, Tensor]:
+    def number_of(self, region: Region, height: str) -> int | None:
+        """Which place a region and a band are; None if they are none."""
+        if region not in self.regions:
+            return None
+        return self.regions.index(region) * len(self.grid.heights) + list(self.grid.heights).index(height)
+
+    def of_points(self, points: Tensor, cell: Tensor) -> tuple[Tensor, Tensor]:
         """For each place that a point lies in, (K,) the place and (K,) which point; a point may lie in several.
 
         Args:
-            cell: (N,) int64 cell of each point.
+            points: (N, 3) points in metres, or (N, 2).
+            cell: (N,) int64 cell of each point, which says in which band it is.
         """
-        band, column = cell // self._columns, cell % self._columns
-        region, point = self._masks.to(cell.device)[:, column].nonzero(as_tuple=True)
-        return region * len(self.grid.heights) + band[point], point
-
-    def members(self, cell: Tensor) -> Tensor:
-        """(P, K) bool: whether each of (K,) cells is of a place."""
-        of_band = torch.arange(len(self.grid.heights), device=cell.device)[:, None] == cell // self._columns
-        of_region = self._masks.to(cell.device)[:, cell % self._columns]
-        return (of_region[:, None] & of_band).flatten(0, 1)
-
-    @property
-    def _columns(self) -> int:
-        return math.prod(self.grid.shape[1:])
-
-    @cached_property
-    def _masks(self) -> Tensor:
-        """(R, Y * X) bool."""
-        empty = torch.empty((0, *self.grid.shape[1:]), dtype=torch.bool)
-        return torch.cat([empty, *(region.mask(self.grid)[None] for region in self.regions)]).flatten(1)
+        band = cell // math.prod(self.grid.shape[1:])
+        x, y = points[:, 0].double(), points[:, 1].double()
+        place, point = [band[:0]], [band[:0]]
+        for number, region in enumerate(self.regions):
+            point.append(region.contains(x, y).nonzero().squeeze(1))
+            place.append(number * len(self.grid.heights) + band[point[-1]])
+        return torch.cat(place), torch.cat(point)
 
 
 def check_regions(regions: Sequence[Region], grid: BevGrid) -> None:

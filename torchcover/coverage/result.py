@@ -15,12 +15,12 @@ from torchcover.coverage.aggregations import Layer, MeanOfMeans
 from torchcover.coverage.blocks import AreaSums, Blocks
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
 from torchcover.coverage.grid import BandFrame, BevGrid
-from torchcover.coverage.measures import Measure, area_in_blocks, errors_of_cells, estimate_area, estimate_known
+from torchcover.coverage.measures import Measure, errors_of_cells, estimate_area, estimate_known, estimate_redundancy
 from torchcover.coverage.quantity import RADIUS, by_area, over_known
 from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
-from torchcover.coverage.region_sums import PlaceNumbers
-from torchcover.coverage.regions import Region, check_regions, regions_within
-from torchcover.coverage.summary import RegionRedundancy, RegionSummary, estimate_redundancy, region_redundancy
+from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
+from torchcover.coverage.regions import Places, Region, check_regions, regions_within
+from torchcover.coverage.summary import RegionSummary, summarise
 from torchcover.estimation import Estimate, Quantity
 from torchcover.files import write_durably
 
@@ -42,6 +42,7 @@ class Coverage:
         area: The sums over the visible surface, if the reference points had square metres.
         regions: What `summary` gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
             the grid if not given.
+        places: The sums by area over `regions`, point by point; None if the reference points had no square metres.
         aggregated: What other aggregations than the mean of means say of `regions`, if there were any.
         redundancy: What each sensor of the rig adds, if the metric was told of the sensors.
 
@@ -72,6 +73,7 @@ class Coverage:
         blocks: Blocks | None = None,
         area: AreaSums | None = None,
         regions: Sequence[Region] | None = None,
+        places: PlaceSums | None = None,
         aggregated: PlaceNumbers | None = None,
         redundancy: Redundancy | None = None,
     ) -> None:
@@ -85,6 +87,7 @@ class Coverage:
         self.blocks = blocks
         self.area = area
         self.regions = regions_within(grid) if regions is None else tuple(regions)
+        self.places = places
         self.aggregated = aggregated
         self.redundancy = redundancy
         self._estimates: dict[tuple[Region, str, Measure], Estimate] = {}
@@ -152,7 +155,7 @@ class Coverage:
             ValueError: A region reaches beyond the grid, or holds no cell centre.
         """
         wanted = self.regions if regions is None else regions
-        return [self._summarise(region, height) for region in wanted for height in self.grid.heights]
+        return [summarise(self, region, height) for region in wanted for height in self.grid.heights]
 
     @property
     def measure(self) -> Measure:
@@ -165,39 +168,29 @@ class Coverage:
         Args:
             region: A region within the grid.
             height: Name of the band.
-            measure: "area", the mean over the visible surface (`torchcover.coverage.measures.estimate_area`), for
-                points that have square metres, or "known", the paper's unweighted mean over the known cells. Not given:
-                that of this result.
+            measure: "area", the mean over the visible surface (`torchcover.coverage.measures.area_in_blocks`), or
+                "known", the paper's unweighted mean over the known cells. Not given: that of this result.
 
         Returns:
             That of `quantities`.
 
         Raises:
             ValueError: A region that reaches beyond the grid, or holds no cell centre; no such band; "area" of points
-                without square metres.
+                without square metres, or of a region that was not asked for and whose edges are not those of cells.
         """
         key = region, height, measure or self.measure
         if key not in self._estimates:
-            self._estimates[key] = self._estimate(*key)
+            check_regions([region], self.grid)
+            of_measure = estimate_area if key[2] == "area" else estimate_known
+            self._estimates[key] = of_measure(self, region, height)
         return self._estimates[key]
-
-    def _estimate(self, region: Region, height: str, measure: Measure) -> Estimate:
-        check_regions([region], self.grid)
-        cells = region.mask(self.grid).to(self.radius.device)
-        band = self._band(height)
-        if measure == "area":
-            return estimate_area(self.quantities, self.area, band, cells)
-        known = cells & (self.probed_steps[band] > 0)
-        probed = self.probed_steps[band][known]
-        sums = probed * torch.stack([self.layers[quantity.key].values[band][known] for quantity in self.quantities])
-        return estimate_known(self.quantities, probed, sums, self.blocks, band, known)
 
     def estimate_aggregated(self, region: Region, height: str) -> Estimate:
         """The numbers of other aggregations in one region and band; unknown where the metric was not told of it."""
         if self.aggregated is None:
             return self.estimate(region, height)[:0]
         quantities, value, left_out = self.aggregated
-        place = self._place(region, height)
+        place = self.place_of(region, height)
         if place is None or self.blocks is None:
             return Estimate.of(quantities, torch.full_like(value[0], math.nan) if place is None else value[place])
         used = self.blocks.steps > 0
@@ -237,7 +230,7 @@ class Coverage:
             estimators[tuple(map(over_known, self.quantities))] = partial(self.estimate, measure="known")
         if self.redundancy is not None:
             own = redundancy_quantities(self.redundancy.sensors, self.thresholds)
-            estimators[own] = lambda region, height: self._estimate_redundancy(region, height)[len(self.quantities) :]
+            estimators[own] = lambda *place: estimate_redundancy(self, *place)[len(self.quantities) :]
         return estimators
 
     def scalars(self, regions: Sequence[Region] | None = None) -> dict[str, float]:
@@ -273,50 +266,17 @@ class Coverage:
         """
         return cls(**read_coverage(path))
 
-    def _summarise(self, region: Region, height: str) -> RegionSummary:
-        cells, band = region.mask(self.grid), self._band(height)
-        probed = self.probed_steps[band].cpu()[cells]
-        known_cells = int((probed > 0).sum())
-        numbers = partial(Estimate.numbers, count=known_cells, count_of="known cells")
-        return RegionSummary(
-            region=region.name,
-            height=height,
-            cells=len(probed),
-            known_cells=known_cells,
-            measure=self.measure,
-            # How often other intervals than those by area hold the truth has not been measured.
-            numbers=numbers(self.estimate(region, height), intervals=self.measure == "area")
-            | numbers(self.estimate_aggregated(region, height), intervals=False),
-            known=numbers(self.estimate(region, height, "known"), intervals=False),
-            visible_m2=math.nan if self.area is None else self._visible_m2(self.area, band, cells),
-            redundancy=self._without_each(region, height),
-        )
+    def place_of(self, region: Region, height: str) -> int | None:
+        """Which of `regions` and bands it is, region by region; None if it is none."""
+        self.band_of(height)
+        return Places(self.regions, self.grid).number_of(region, height)
 
-    def _without_each(self, region: Region, height: str) -> RegionRedundancy | None:
-        """What each sensor adds; by area it is known of the regions only that the metric was told of."""
-        redundancy = self.redundancy
-        if redundancy is None or (redundancy.places is not None and region not in self.regions):
-            return None
-        return region_redundancy(redundancy, self.thresholds, self._estimate_redundancy(region, height))
+    def known_cells(self, region: Region, height: str) -> Tensor:
+        """(Y, X) bool: the known cells of a region in a band."""
+        return region.mask(self.grid).to(self.radius.device) & (self.probed_steps[self.band_of(height)] > 0)
 
-    def _estimate_redundancy(self, region: Region, height: str) -> Estimate:
-        """With all sensors, then of `redundancy_quantities`; unknown by area where the metric was not told of it."""
-        assert self.redundancy is not None
-        with_all = self.estimate(region, height, "known" if self.redundancy.places is None else "area")
-        known = region.mask(self.grid).to(self.radius.device) & (self.probed_steps[self._band(height)] > 0)
-        return estimate_redundancy(self.redundancy, with_all, self._place(region, height), self._band(height), known)
-
-    def _band(self, height: str) -> int:
+    def band_of(self, height: str) -> int:
+        """The number of a band; ValueError if there is none of this name."""
         if height not in self.grid.heights:
             raise ValueError(f"height {height!r}: the grid has {', '.join(self.grid.heights)}")
         return list(self.grid.heights).index(height)
-
-    def _place(self, region: Region, height: str) -> int | None:
-        """Which place of `Places` it is; None if it is none."""
-        if region not in self.regions:
-            return None
-        return self.regions.index(region) * len(self.grid.heights) + self._band(height)
-
-    def _visible_m2(self, area: AreaSums, band: int, cells: Tensor) -> float:
-        total = float(area_in_blocks(area, band, cells.to(area.at.device))[:, 0].sum())
-        return total / self.counts["steps"] if self.counts["steps"] else math.nan

@@ -3,15 +3,18 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-
-import torch
-from torch import Tensor
+from functools import partial
+from typing import TYPE_CHECKING
 
 from torchcover.coverage.aggregations import MeanOfMeans
-from torchcover.coverage.measures import Measure
+from torchcover.coverage.measures import Measure, area_in_blocks, estimate_redundancy
 from torchcover.coverage.quantity import without
 from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
+from torchcover.coverage.regions import Region
 from torchcover.estimation import Difference, Estimate, Number
+
+if TYPE_CHECKING:
+    from torchcover.coverage.result import Coverage
 
 
 @dataclass(frozen=True)
@@ -80,37 +83,45 @@ class RegionSummary:
         return {f"{key}/{self.region}/{self.height}": value for key, value in flat.items()}
 
 
-def estimate_redundancy(
-    redundancy: Redundancy, with_all: Estimate, place: int | None, band: int, known: Tensor
-) -> Estimate:
-    """The numbers of one region with all sensors, then those of `redundancy_quantities`.
+def summarise(coverage: "Coverage", region: Region, height: str) -> RegionSummary:
+    """The numbers of one region in one band.
 
     Args:
-        redundancy: What is known of the sensors.
-        with_all: The numbers of the region by the measure of the coverage.
-        place: Which of `redundancy.places` it is; None if it is none of them.
-        band: Number of the height band.
-        known: (Y, X) bool, the known cells of the region, whose unweighted means they are where there are no places;
-            the errors of those are unknown.
+        coverage: Whose numbers.
+        region: A region within the grid.
+        height: Name of the band.
+
+    Raises:
+        ValueError: As `Coverage.estimate`.
     """
-    quantities = (*with_all.quantities, *(layer.quantity for layer in redundancy.layers.values()))
-    if redundancy.places is None:
-        values = torch.stack([layer.values[band][known].mean() for layer in redundancy.layers.values()])
-        return Estimate.of(quantities, torch.cat([with_all.value, values]))
-    if place is None:
-        return Estimate.of(quantities, with_all.value.new_full((len(quantities),), math.nan))
-    steps, m2, sums = redundancy.places
-    return Estimate.of_ratios(quantities, m2[:, place], sums[:, :, place], steps)
+    cells, known_cells = (
+        int(each.sum()) for each in (region.mask(coverage.grid), coverage.known_cells(region, height))
+    )
+    numbers = partial(Estimate.numbers, count=known_cells, count_of="known cells")
+    by_area, steps = coverage.measure == "area", coverage.counts["steps"]
+    redundancy = coverage.redundancy
+    if by_area and region not in coverage.regions:
+        redundancy = None  # which is known of the regions only that the metric was told of
+    return RegionSummary(
+        region=region.name,
+        height=height,
+        cells=cells,
+        known_cells=known_cells,
+        measure=coverage.measure,
+        # How often other intervals than those by area hold the truth has not been measured.
+        numbers=numbers(coverage.estimate(region, height), intervals=by_area)
+        | numbers(coverage.estimate_aggregated(region, height), intervals=False),
+        known=numbers(coverage.estimate(region, height, "known"), intervals=False),
+        visible_m2=float(area_in_blocks(coverage, region, height)[1][:, 0].sum()) / steps
+        if by_area and steps
+        else math.nan,
+        redundancy=None if redundancy is None else region_redundancy(redundancy, coverage, region, height),
+    )
 
 
-def region_redundancy(redundancy: Redundancy, thresholds: tuple[float, ...], estimate: Estimate) -> RegionRedundancy:
-    """The numbers of a region without each sensor.
-
-    Args:
-        redundancy: Whose sensors.
-        thresholds: Detection thresholds in metres.
-        estimate: From `estimate_redundancy`.
-    """
+def region_redundancy(redundancy: Redundancy, coverage: "Coverage", region: Region, height: str) -> RegionRedundancy:
+    """The numbers of a region without each sensor; as `summarise`."""
+    thresholds, estimate = coverage.thresholds, estimate_redundancy(coverage, region, height)
     single, several = MeanOfMeans(thresholds).quantities, redundancy_quantities((), thresholds)
     numbers, count = estimate.numbers(intervals=False), len(single)
     each, change = {}, {}

@@ -1,3 +1,4 @@
+from .error_model import ErrorModel as ErrorModel
 from .estimate import Difference as Difference
 from .estimate import Estimate as Estimate
 from .estimate import Number as Number

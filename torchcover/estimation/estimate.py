@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchcover.estimation.jackknife import MIN_BLOCKS, ROUND_OFF, jackknife_error, pseudo_values
 from torchcover.estimation.quantity import Quantity
-from torchcover.estimation.student import interval95, is_significant, student_p, student_t95
+from torchcover.estimation.student import interval95, is_significant, student_p
 
 
 class Number(NamedTuple):
@@ -58,7 +58,7 @@ class Difference(NamedTuple):
         value: In its unit, a share in [-1, 1]; NaN if unknown.
         error: Standard error of `value` itself, which is less than that of the two numbers: what makes a step easy or
             hard for both rigs cancels out. NaN if there are not enough blocks.
-        low: Lower end of its 95 % interval, Student's t errors below it.
+        low: Lower end of its 95 % interval, as from `torchcover.estimation.interval95`.
         high: Upper end.
         significant: Whether the difference is more than chance, by Student's t at 95 %; None if that is unknown.
         p: Probability of a t at least as large to either side if there were no difference.
@@ -92,6 +92,8 @@ class Estimate:
         left_out: (g, Q) without each block.
         steps: (g,) int64 steps in these blocks, each above 0.
         again: From (R, g) how often each block comes to (R, Q) what the numbers were then; None if that is unknown.
+        effective: (Q,) how many blocks of equal weight would say as much: Kish's (sum of w)^2 / sum of w^2 over what is
+            divided by in each. With fewer than 8 there is no interval. The number of blocks if not given.
 
     Example:
         >>> detection = Quantity("detection_0.4m", "detection within 0.4 m", "share", lower_is_better=False)
@@ -114,6 +116,11 @@ class Estimate:
     left_out: Tensor
     steps: Tensor
     again: Callable[[Tensor], Tensor] | None = None
+    effective: Tensor = None  # type: ignore[assignment]  # until the next line
+
+    def __post_init__(self) -> None:
+        if self.effective is None:
+            object.__setattr__(self, "effective", torch.full_like(self.value, len(self.steps)))
 
     @classmethod
     def of(cls, quantities: Sequence[Quantity], value: Tensor) -> "Estimate":
@@ -131,10 +138,11 @@ class Estimate:
             steps: (B,) steps in each block; 0 in blocks that are not in use.
         """
         whole = sums.sum(dim=0) / base.sum(dim=0)
-        used = steps.nonzero().flatten().tolist() if len(steps) > 1 else []
-        left_out = [_without(sums, block).sum(dim=0) / _without(base, block).sum(dim=0) for block in used]
-        without = torch.stack(left_out) if left_out else whole[None][:0]
-        return cls(tuple(quantities), whole, without, steps[used], partial(_ratios_again, base[used], sums[used]))
+        used = steps.nonzero().flatten() if len(steps) > 1 else steps[:0]
+        base, sums = (base if base.dim() == 2 else base[:, None])[used], sums[used]
+        without = _without_each(sums) / _without_each(base)
+        effective = (base.sum(dim=0) ** 2 / base.square().sum(dim=0)).expand(len(whole))
+        return cls(tuple(quantities), whole, without, steps[used], partial(_ratios_again, base, sums), effective)
 
     @classmethod
     def of_blocks(cls, quantities: Sequence[Quantity], again: Callable[[Tensor], Tensor], steps: Tensor) -> "Estimate":
@@ -152,7 +160,8 @@ class Estimate:
     def __getitem__(self, which: slice) -> "Estimate":
         """Some of the numbers."""
         again = None if self.again is None else partial(_some_again, self.again, which)
-        return Estimate(self.quantities[which], self.value[which], self.left_out[:, which], self.steps, again)
+        some = self.value[which], self.left_out[:, which], self.steps, again, self.effective[which]
+        return Estimate(self.quantities[which], *some)
 
     def resampled(self, weights: Tensor) -> Tensor | None:
         """What the numbers were if other worlds had come, for intervals of what is made from numbers of several rigs.
@@ -179,61 +188,76 @@ class Estimate:
         """
         return jackknife_error(self.left_out, self.value, self.steps, least)
 
+    @property
+    def has_intervals(self) -> list[bool]:
+        """Whether 8 blocks or more are in effect, of each number."""
+        enough: list[bool] = (self.effective > MIN_BLOCKS - ROUND_OFF).tolist()
+        return enough
+
     def numbers(self, *, intervals: bool = True, count: int = 0, count_of: str = "") -> dict[str, Number]:
         """The numbers by the keys of their quantities.
 
         Args:
             intervals: Whether they have intervals: not where how often such an interval holds the truth has
-                not been measured.
+                not been measured, nor where fewer than 8 blocks are in effect.
             count: How many they are over.
             count_of: What these are.
         """
         found, freedom = {}, len(self.steps) - 1
-        for quantity, value, error in zip(self.quantities, self.value.tolist(), self.error.tolist(), strict=True):
+        each = zip(self.quantities, self.value.tolist(), self.error.tolist(), self.has_intervals, strict=True)
+        for quantity, value, error, has_interval in each:
             known = error if error > ROUND_OFF else math.nan  # blocks that all say the same prove nothing
-            low, high = interval95(value, error, freedom, quantity) if intervals else (math.nan, math.nan)
-            found[quantity.key] = Number(quantity, value, known, low, high, count, count_of)
+            ends = interval95(value, known if intervals and has_interval else math.nan, freedom, quantity)
+            found[quantity.key] = Number(quantity, value, known, *ends, count, count_of)
         return found
 
     def minus(self, other: "Estimate") -> "Estimate":
         """The difference to another rig over the same steps: what both share cancels out, block by block."""
-        return Estimate(self.quantities, self.value - other.value, self.left_out - other.left_out, self.steps)
+        both = self.value - other.value, self.left_out - other.left_out, self.steps, None
+        return Estimate(self.quantities, *both, torch.minimum(self.effective, other.effective))
 
-    def differences(self, other: "Estimate", least: int = MIN_BLOCKS) -> dict[str, Difference]:
+    def differences(self, other: "Estimate") -> dict[str, Difference]:
         """The differences to another rig over the same steps, by the keys of the quantities.
+
+        What is from fewer than 8 blocks in effect has no interval, and is neither significant nor chance.
 
         Args:
             other: The same numbers of the other rig.
-            least: As in `errors`.
         """
         # Two infinite numbers are equal; their difference would be NaN, which means unknown.
         values = (self.value - other.value).where(self.value != other.value, 0.0)
         between, blocks = self.minus(other), len(self.steps)
-        errors, t = between.errors(least).tolist(), student_t95(blocks - 1)
         each = pseudo_values(between.left_out, between.value, self.steps)
         found = {}
-        for at, (quantity, value, error) in enumerate(zip(self.quantities, values.tolist(), errors, strict=True)):
+        for at, (quantity, value, error) in enumerate(
+            zip(self.quantities, values.tolist(), between.error.tolist(), strict=True)
+        ):
+            judged = error if between.has_intervals[at] else math.nan
+            low, high = interval95(value, judged, blocks - 1, quantity, is_difference=True)
             found[quantity.key] = Difference(
                 quantity=quantity,
                 value=value,
                 error=error,
-                low=value - t * error,
-                high=value + t * error,
-                significant=is_significant(value, error, blocks - 1),
-                p=student_p(value / error, blocks - 1) if error > ROUND_OFF else math.nan,
+                low=low,
+                high=high,
+                significant=is_significant(value, judged, blocks - 1),
+                p=student_p(value / judged, blocks - 1) if judged > ROUND_OFF else math.nan,
                 blocks=blocks,
                 better=int((-each[:, at] if quantity.lower_is_better else each[:, at]).gt(ROUND_OFF).sum()),
             )
         return found
 
 
-def _without(sums: Tensor, block: int) -> Tensor:
-    # Not by a difference: infinite radii, and what is left of nearly everything, would not survive it.
-    return torch.cat([sums[:block], sums[block + 1 :]])
+def _without_each(sums: Tensor) -> Tensor:
+    """(g, ...) what all blocks but each add up to; not by a difference, which infinite radii would not survive."""
+    none = sums.new_zeros((1, *sums.shape[1:]))
+    before = torch.cat([none, sums[:-1]]).cumsum(dim=0)
+    after = torch.cat([sums[1:], none]).flip(0).cumsum(dim=0).flip(0)
+    return before + after
 
 
 def _ratios_again(base: Tensor, sums: Tensor, weights: Tensor) -> Tensor:
-    return (weights @ sums) / (weights @ base.to(sums)).view(len(weights), -1)
+    return (weights @ sums) / (weights @ base.to(sums))
 
 
 def _some_again(again: Callable[[Tensor], Tensor], which: slice, weights: Tensor) -> Tensor:

@@ -9,25 +9,28 @@ from torchcover.estimation.quantity import Quantity
 NORMAL_QUANTILE = 1.959963984540054
 # Of Student's distribution with 1 to 6 degrees of freedom, likewise; there the expansion below is off.
 FEW = 12.7062047362, 4.3026527297, 3.1824463053, 2.7764451052, 2.5705818356, 2.4469118511
-# Scenes in which a rig is all but blind are rare and missing from most short runs, so that the truth lies far on that
-# side more often than on the other (docs/measured/error_bars.md).
-BLIND_SIDE = 1.75
+# Scenes in which a rig is all but blind are rare and missing from most short runs, so that the true mean of a length
+# lies on that side more often than on the other (docs/measured/error_bars.md).
+BLIND_SIDE = 1.25
 # exp of more is no float64.
 MOST = 700.0
 
 
-def interval95(value: float, error: float, degrees_of_freedom: int, quantity: Quantity) -> tuple[float, float]:
-    """The 95 % interval around a number.
+def interval95(
+    value: float, error: float, degrees_of_freedom: int, quantity: Quantity, *, is_difference: bool = False
+) -> tuple[float, float]:
+    """The 95 % interval around a number, or around a difference of two.
 
-    With Student's t, on the scale of the logarithm for a length and of the logit for a share, so that neither leaves
-    its range; on the worse side, of larger radii and lower detections, 1.75 times as long on that scale. Any other
-    unit has no range to leave: value plus and minus t errors.
+    With Student's t: of a length on the scale of the logarithm, of a share on that of the logit, so that neither leaves
+    its range; of any other unit, and of differences, value plus and minus t errors. Of lengths 1.25 times as far on the
+    side of scenes in which a rig is all but blind: the worse one, of differences that away from 0.
 
     Args:
         value: In the unit of the quantity.
         error: Its standard error.
         degrees_of_freedom: Blocks that the error comes from, less one.
         quantity: Its unit decides the scale, its direction the worse side.
+        is_difference: Of two such numbers. The interval holds 0 just where Student's test finds nothing.
 
     Returns:
         Its ends; NaN if the error is, or 0: blocks that all say the same do not prove that others would.
@@ -36,24 +39,27 @@ def interval95(value: float, error: float, degrees_of_freedom: int, quantity: Qu
         >>> radius = Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True)
         >>> detection = Quantity("detection_0.4m", "detection within 0.4 m", "share", lower_is_better=False)
         >>> [round(end, 3) for end in interval95(2.0, 0.1, 10, radius)]
-        [1.789, 2.431]
+        [1.789, 2.299]
         >>> [round(end, 3) for end in interval95(0.9, 0.02, 10, detection)]
-        [0.791, 0.937]
+        [0.846, 0.937]
+        >>> [round(end, 3) for end in interval95(-0.3, 0.1, 10, radius, is_difference=True)]
+        [-0.579, -0.077]
     """
-    if math.isnan(error) or error <= ROUND_OFF or (quantity.unit == "m" and value <= 0):
+    t, unit = student_t95(degrees_of_freedom), quantity.unit
+    if math.isnan(error) or error <= ROUND_OFF or (unit == "m" and not is_difference and value <= 0):
         return math.nan, math.nan
-    below, above = (1.0, BLIND_SIDE) if quantity.lower_is_better else (BLIND_SIDE, 1.0)
-    t = student_t95(degrees_of_freedom)
-    if quantity.unit == "m":
-        reach = t * error / value
-        return value * math.exp(-below * reach), value * math.exp(min(above * reach, MOST))
-    if quantity.unit != "share":
-        return value - t * error, value + t * error
+    below = above = t * error
+    if unit == "m":
+        farther_above = value > 0 if is_difference else quantity.lower_is_better
+        below, above = (below, BLIND_SIDE * above) if farther_above else (BLIND_SIDE * below, above)
+    if is_difference or unit not in ("m", "share"):
+        return value - below, value + above
+    if unit == "m":
+        return value * math.exp(-below / value), value * math.exp(min(above / value, MOST))
     if not 0 < value < 1:  # rounding may have put it there; nothing is known of the other side
         return 0.0, 1.0
-    against = (1 - value) / value
-    reach = t * error / (value * (1 - value))
-    return 1 / (1 + against * math.exp(min(below * reach, MOST))), 1 / (1 + against * math.exp(-above * reach))
+    against, slope = (1 - value) / value, value * (1 - value)
+    return 1 / (1 + against * math.exp(min(below / slope, MOST))), 1 / (1 + against * math.exp(-above / slope))
 
 
 def student_t95(degrees_of_freedom: int) -> float:

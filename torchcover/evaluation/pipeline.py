@@ -38,6 +38,7 @@ class Run:
         failure: What ended it before its time, if anything did: a bad frame, Ctrl-C, a worker that was killed, an error
             of an observer.
         seconds: How long it took.
+        measuring_s: That part of it that went into the observers.
     """
 
     steps: int = 0
@@ -46,6 +47,7 @@ class Run:
     reached: bool = False
     failure: Exception | KeyboardInterrupt | None = None
     seconds: float = 0.0
+    measuring_s: float = 0.0
 
     @property
     def complete(self) -> bool:
@@ -206,8 +208,10 @@ def killed_worker(error: BaseException, workers: int, steps: int) -> ChildProces
 
 
 def _feed(frame: Frame, observers: Sequence[AnyObserver], run: Run) -> None:
+    start = time.perf_counter()
     for observer in observers:
         observer.update(frame)
+    run.measuring_s += time.perf_counter() - start
     run.counts.update(frame.counts)
     run.steps += 1
 

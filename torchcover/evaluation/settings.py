@@ -130,7 +130,7 @@ class Settings:
     ] = Read(_rigs, None)
     scenario: Annotated[
         "Scenario | str | Path | None",
-        Option("Scenario: a built-in name or a YAML file (courtyard).", str, in_study=True),
+        Option("Scenario: a built-in name or a YAML file (courtyard).", str, in_study="once"),
     ] = None
     _: KW_ONLY
     frames: Annotated[
@@ -143,14 +143,14 @@ class Settings:
             minimum=1,
         ),
     ] = None
-    seed: Annotated[int, Option("Seed of the simulation.", minimum=0, in_study=True)] = 0
+    seed: Annotated[int, Option("Seed of the simulation.", minimum=0, in_study="once")] = 0
     vehicle: Annotated[
         str | Path | None,
         Option(
             "What carries the rigs: a built-in vehicle, a YAML file or a mesh in metres. Not given: the scenario's own "
             "ego, else the vehicle that the rigs name, else an SUV.",
             str,
-            in_study=True,
+            in_study="once",
         ),
     ] = None
     sensor_model: Annotated[
@@ -167,14 +167,15 @@ class Settings:
             "Regions, also polygons, height bands and grid, in a YAML file. Not given: the paper's regions in front, "
             "and the near field on the four sides of the vehicle.",
             Path,
+            in_study="once",
         ),
     ] = Read(_asked, None)
     cell_m: Annotated[
-        float | None, Option("Side of a grid cell in metres, whatever `ask` says (0.25).", in_study=True)
+        float | None, Option("Side of a grid cell in metres, whatever `ask` says (0.25).", in_study="tried")
     ] = None
     thresholds_m: Annotated[
         Read[float | Iterable[float], tuple[float, ...]],
-        Option("Detection thresholds in metres (0.4); may be repeated.", list[float], in_study=True),
+        Option("Detection thresholds in metres (0.4); may be repeated.", list[float], in_study="once"),
     ] = Read(_thresholds, (0.4,))
     aggregations: Annotated[
         Read["str | Sequence[Aggregation | str]", "tuple[Aggregation, ...]"],
@@ -188,7 +189,8 @@ class Settings:
         str | None,
         Option(
             "Reference sensor: `surface`, points drawn evenly on what can be seen (default), or `paper`. On the "
-            "command line with --frames: `recorded`, or `accumulated` from the recording itself."
+            "command line with --frames: `recorded`, or `accumulated` from the recording itself.",
+            in_study="tried",
         ),
     ] = None
     rays: Annotated[
@@ -196,20 +198,23 @@ class Settings:
         Option(
             "Rays of the reference sensor at each step (surface: 16384; paper: 1048576, a square).",
             minimum=1,
+            in_study="tried",
         ),
     ] = None
     estimate: Annotated[
         Literal["area", "known"] | None,
         Option(
             "What the number of a region is a mean over: `area`, its visible surface (default; needs `surface`), or "
-            "`known`, its known cells, as in the paper."
+            "`known`, its known cells, as in the paper.",
+            in_study="tried",
         ),
     ] = None
     band_frame: Annotated[
         Literal["ground", "vehicle"] | None,
         Option(
-            "What height bands are over: `ground`, the local ground, or `vehicle`, z of the vehicle (default; `paper` "
+            "What height bands are over: `ground`, the local ground (default), or `vehicle`, z of the vehicle (`paper` "
             "and recordings without heights have no other).",
+            in_study="tried",
         ),
     ] = None
     every_s: Annotated[
@@ -217,7 +222,7 @@ class Settings:
         Option(
             "Seconds between one step and the next; steps that follow each other are alike. Not given: 10 in traffic, "
             "which starts anew in another city every minute, else what spreads the steps over the scenario.",
-            in_study=True,
+            in_study="tried",
         ),
     ] = None
     target_error: Annotated[
@@ -240,9 +245,12 @@ class Settings:
         ),
     ] = Read(_metrics, ())
     device: Annotated[
-        Read["str | torch.device", str], Option("Where the search and the sums run: cpu, cuda, cuda:1, ...", str)
+        Read["str | torch.device", str],
+        Option("Where the search and the sums run: cpu, cuda, cuda:1, ...", str, in_study="tried"),
     ] = Read(_device, "cpu")
-    workers: Annotated[int, Option("Processes that make frames; 0 makes them in this one.", minimum=0)] = 0
+    workers: Annotated[
+        int, Option("Processes that make frames; 0 makes them in this one.", minimum=0, in_study="tried")
+    ] = 0
     skip_bad_frames: Annotated[bool, Option("Skip and count frames that cannot be read, instead of stopping.")] = False
     observers: Annotated[
         "Mapping[str, AnyObserver]",

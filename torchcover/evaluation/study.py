@@ -1,144 +1,160 @@
-"""Error against run time, and the setting to use for a wanted error."""
+"""Error against run time: what settings cost, how far each is off, and the steps that reach a wanted error."""
 
 import math
+import subprocess
+import sys
+import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import groupby
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 from matplotlib.figure import Figure
 from rich.table import Table
 
 from torchcover import __version__
-from torchcover.estimation import Quantity
-from torchcover.evaluation.study_runs import StudyPlan, Truth, command_s, long_run, tried
-from torchcover.files import Publication
+from torchcover.coverage import Coverage, Region
+from torchcover.estimation import MIN_BLOCKS, Difference, ErrorModel, Estimate, Quantity
+from torchcover.evaluation.measuring import measured
+from torchcover.evaluation.settings import DEFAULT_SCENARIO, OPTIONS, Settings
+from torchcover.evaluation.target_error import MIN_STEPS, rounded_up
+from torchcover.evaluation.task import Task, simulation
+from torchcover.files import Publication, end_with_parent
 from torchcover.report import (
     WorkPanel,
     difference_heading,
+    difference_words,
     draw_work_precision,
     error_words,
     json_record,
     shown_unit,
     text_table,
 )
+from torchcover.simulation import SimulatedFrames
 
-# Detection errors that a setting is recommended for.
-WANTED = (0.05, 0.02, 0.01, 0.005)
+DEFAULT_STEPS = 256
+FEWER_RAYS: tuple[Mapping[str, Any], ...] = ({"rays": 4096}, {"rays": 1024})
+# Errors of the detection that settings are recommended for.
+WANTED = (0.02, 0.01, 0.005)
+# Another setting than the first is recommended only where it saves a fifth of the time.
+WORTH = 0.8
+# A bias is one if chance gives the largest of all numbers less than this often.
+LEVEL = 0.05
+DOUBLINGS = 6
 
 
 @dataclass(frozen=True)
-class WorkPoint:
-    """What a setting reached in a time.
+class StudyPlan:
+    """What is tried, on the same instants.
 
     Args:
-        rays: Rays of the reference sensor at each step.
-        steps: Steps.
-        runs: How many runs of so many steps there were.
-        seconds: Time that a command with this setting takes, from its start to its end.
-        errors: By the key of the quantity, the root mean square of the distance to a long run, over regions, bands and
-            runs.
+        settings: Of `evaluate`: one rig and a scenario, by names or paths; 256 steps if not given. The others are held
+            against it.
+        others: What each other setting has different, by the name of the argument of `evaluate`.
+
+    Raises:
+        ValueError: Not one rig by its name.
     """
 
-    rays: int
-    steps: int
-    runs: int
-    seconds: float
-    errors: Mapping[str, float]
+    settings: Settings
+    others: tuple[Mapping[str, Any], ...] = FEWER_RAYS
 
+    def __post_init__(self) -> None:
+        if not all(isinstance(one, str | Path) for one in self.named) or len(self.settings.rigs) != 1:
+            raise ValueError(
+                "study: one rig and a scenario are needed, by names or paths: a command is timed with them"
+            )
 
-def pareto_front(points: Sequence[WorkPoint], key: str) -> list[WorkPoint]:
-    """The points that no other beats in both time and error, fastest first; none whose error is unknown.
+    @property
+    def named(self) -> tuple[Any, ...]:
+        """What the rig and the scenario were called."""
+        return (*self.settings.rigs, self.settings.scenario or DEFAULT_SCENARIO)
 
-    Args:
-        points: Measured points.
-        key: Of the quantity whose error counts.
+    @property
+    def each(self) -> dict[str, Settings]:
+        """Options -> settings of every trial, that without any first."""
+        first = replace(self.settings, steps=self.settings.steps or DEFAULT_STEPS)
+        return {"": first} | {" ".join(_options(other)): replace(first, **other) for other in self.others}
 
-    Example:
-        >>> points = [WorkPoint(1, 1, 1, seconds, {"radius_m": error}) for seconds, error in ((1, 3), (2, 4), (3, 1))]
-        >>> [one.seconds for one in pareto_front(points, "radius_m")]
-        [1, 3]
-    """
-    front: list[WorkPoint] = []
-    known = [point for point in points if not math.isnan(point.errors[key])]
-    for point in sorted(known, key=lambda point: (point.seconds, point.errors[key])):
-        if not front or point.errors[key] < front[-1].errors[key]:
-            front.append(point)
-    return front
-
-
-def cheapest(points: Sequence[WorkPoint], key: str, at_most: float) -> WorkPoint | None:
-    """The fastest point with an error of at most this; None if there is none.
-
-    Example:
-        >>> cheapest([], "detection_0.4m", 0.01) is None
-        True
-    """
-    good = [point for point in points if point.errors[key] <= at_most]
-    return min(good, key=lambda point: point.seconds, default=None)
-
-
-def study_table(points: Sequence[WorkPoint], quantities: Sequence[Quantity]) -> Table:
-    """A row for each point, the Pareto front of the last quantity marked `*`."""
-    front = pareto_front(points, quantities[-1].key)
-    by_rays = (list(of_rays) for _, of_rays in groupby(points, lambda point: point.rays))
-    return text_table(
-        ("rays", "steps", "runs", "time (s)", *(f"error of {difference_heading(one)}" for one in quantities)),
-        [[_row(point, quantities, is_best=point in front) for point in section] for section in by_rays],
-        caption=f"* no other setting is both faster and more accurate ({quantities[-1].title})",
-    )
-
-
-def _row(point: WorkPoint, quantities: Sequence[Quantity], *, is_best: bool) -> list[str]:
-    errors = [error_words(point.errors[one.key], one.unit) for one in quantities]
-    rays = f"{point.rays:,}{' *' * is_best}"
-    return [rays, f"{point.steps:,}", f"{point.runs:,}", f"{point.seconds:.1f}", *errors]
-
-
-def stage_table(stages: Sequence[Mapping[str, Any]]) -> Table:
-    """How a step of each setting divides into its parts; `Study.stages`."""
-    rows = []
-    for stage in stages:
-        parts = [stage["worlds"], stage["casting"], stage["measuring"]]
-        shares = [f"{100 * part / sum(parts):.0f}" for part in parts]
-        rows.append((f"{stage['rays']:,}", f"{1000 * sum(parts):.0f}", *shares))
-    headings = ("rays", "step (ms)", "worlds (%)", "casting (%)", "search and sums (%)")
-    return text_table(headings, [rows], title="One step: where the time goes")
-
-
-def work_panels(
-    points: Sequence[WorkPoint], quantities: Sequence[Quantity], floor: Mapping[str, float]
-) -> Iterator[WorkPanel]:
-    """What the work-precision diagram shows of them.
-
-    Args:
-        points: Measured points.
-        quantities: What errors are of: a panel each.
-        floor: Standard errors of the long run, likewise by key: errors below them say nothing.
-    """
-    for quantity in quantities:
-        key, factor = quantity.key, shown_unit(quantity.unit).factor
-
-        def line(of: Sequence[WorkPoint], key: str = key, factor: float = factor) -> list[tuple[float, float]]:
-            return [(point.seconds, factor * point.errors[key]) for point in of]
-
-        lines = {f"{rays:,}": line(list(of)) for rays, of in groupby(points, lambda point: point.rays)}
-        label = f"error of the {difference_heading(quantity)}"
-        yield WorkPanel(label, lines, line(pareto_front(points, key)), factor * floor[key])
-
-
-def study_records(points: Sequence[WorkPoint], quantities: Sequence[Quantity]) -> list[dict[str, object]]:
-    """The points for `study.json`."""
-    fronts = {quantity.key: pareto_front(points, quantity.key) for quantity in quantities}
-    return [
-        {
-            **{name: getattr(point, name) for name in ("rays", "steps", "runs", "seconds")},
-            "errors": json_record(point.errors),
-            "best": [key for key, front in fronts.items() if point in front],
+    @property
+    def command(self) -> list[str]:
+        """What `torchcover` is told to do the same: the command, the rig, and the options that are not as usual."""
+        usual, given = Settings(), {name: getattr(self.settings, name) for name in OPTIONS if name != "steps"}
+        others = {
+            name: value for name, value in given.items() if OPTIONS[name].in_study and value != getattr(usual, name)
         }
-        for point in points
-    ]
+        return ["evaluate", str(self.named[0]), *_options(others)]
+
+
+def _options(settings: Mapping[str, Any]) -> Iterator[str]:
+    for name, value in settings.items():
+        for one in value if isinstance(value, tuple) else (value,):
+            yield f"--{name.replace('_', '-')}={one}"
+
+
+class Studied(NamedTuple):
+    """A number as one setting has it.
+
+    Args:
+        region: Name of the region.
+        height: Name of the band.
+        awaited: Whether `--target-error` waits for it.
+        quantity: What it is.
+        value: In its unit.
+        error: What its error becomes.
+        difference: To the first setting on the same instants; None of the first itself.
+        is_biased: Whether that is beyond chance.
+    """
+
+    region: str
+    height: str
+    awaited: bool
+    quantity: Quantity
+    value: float
+    error: ErrorModel
+    difference: Difference | None
+    is_biased: bool
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A setting at work.
+
+    Args:
+        options: What is different from the first, as on the command line; empty for the first.
+        steps: How many were measured.
+        least_steps: The fewest that print an error of every number that is awaited.
+        seconds: What they took.
+        measuring_s: That part of it that went into the search and the sums.
+        numbers: Of all regions and bands.
+    """
+
+    options: str
+    steps: int
+    least_steps: int
+    seconds: float
+    measuring_s: float
+    numbers: Sequence[Studied]
+
+    def of(self, unit: str) -> list[Studied]:
+        """The awaited numbers of a unit, but for those that are unknown."""
+        return [one for one in self.numbers if one.awaited and one.quantity.unit == unit and not math.isnan(one.value)]
+
+    def error_after(self, steps: int, unit: str) -> float:
+        """The largest error of a unit after so many steps; NaN if one is unknown."""
+        errors = [one.error.error_after(steps) for one in self.of(unit)]
+        return math.nan if any(map(math.isnan, errors)) else max(errors, default=math.nan)
+
+    def steps_for(self, error: float) -> int | None:
+        """Steps after which every detection is this good, in two digits; None if there are none, or that is unknown."""
+        needed = [one.error.steps_for(error) for one in self.of("share")]
+        known = [steps for steps in needed if steps is not None]
+        return rounded_up(max(self.least_steps, *known)) if known and len(known) == len(needed) else None
+
+    def seconds_for(self, steps: int, start_s: float) -> float:
+        """What a command of so many steps takes."""
+        return start_s + self.seconds * steps / self.steps
 
 
 @dataclass(frozen=True)
@@ -147,79 +163,152 @@ class Study:
 
     Args:
         plan: What it was about.
-        vehicle: What carried the rig.
-        every_s: Time between two steps in seconds.
-        truth: The long run.
-        points: What each number of rays and of steps costs, and how far it is off.
+        trials: What was tried, the first first.
         start_s: What a command takes whatever its steps: Python, imports, maps and files. It is in all times.
-        stages: Where the time of a step goes: records with `rays`, and in seconds `worlds`, `casting` and `measuring`.
     """
 
     plan: StudyPlan
-    vehicle: str
-    every_s: float
-    truth: Truth
-    points: Sequence[WorkPoint]
+    trials: Sequence[Trial]
     start_s: float
-    stages: Sequence[dict[str, Any]]
 
-    @property
-    def quantities(self) -> Sequence[Quantity]:
-        """What errors are of: the radius and the detection."""
-        return self.truth.coverage.quantities
+    def recommended(self, error: float) -> tuple[Trial, int] | None:
+        """The setting to use for an error of every detection, and its steps; None if none is good enough."""
+        reached = [(trial, steps) for trial in self.trials if (steps := trial.steps_for(error)) is not None]
+        times = [trial.seconds_for(steps, self.start_s) for trial, steps in reached]
+        if not reached:
+            return None
+        first = reached[0][0] is self.trials[0] and WORTH * times[0] <= min(times)
+        return reached[0 if first else times.index(min(times))]
 
-    @property
-    def recommended(self) -> dict[float, WorkPoint | None]:
-        """The cheapest point for each wanted error of the detection; None where none is good enough."""
-        return {wanted: cheapest(self.points, self.quantities[1].key, wanted) for wanted in WANTED}
+    def tables(self, *, explain: bool) -> list[Table]:
+        """For people: the settings; the numbers of the first; where the time goes, if that is to be explained."""
+        return [self._settings(), self._numbers(), *([self._seconds()] if explain else [])]
+
+    def _settings(self) -> Table:
+        rows = []
+        for trial in self.trials:
+            needed = [_steps_words(trial, trial.steps_for(error), self.start_s) for error in WANTED]
+            rows.append(
+                [trial.options or "as given", f"{1000 * trial.seconds / trial.steps:.0f}", _bias(trial), *needed]
+            )
+        wanted = [f"steps for {_points(error)}" for error in WANTED]
+        return text_table(
+            ("setting", "step (ms)", "bias (points)", *wanted),
+            [rows],
+            title="Every detection in front to so many percentage points",
+            caption="bias: the largest to the first setting on the same instants, * if it is beyond chance",
+        )
+
+    def _numbers(self) -> Table:
+        first, rows = self.trials[0], []
+        for one in first.numbers:
+            steps = [one.error.steps_for(error) for error in WANTED] if one.quantity.unit == "share" else [None] * 3
+            words = [
+                _steps_words(first, each and rounded_up(max(each, first.least_steps)), self.start_s) for each in steps
+            ]
+            error = error_words(one.error.error_after(first.steps), one.quantity.unit)
+            rows.append([f"{one.region} {one.height}", difference_heading(one.quantity), error, *words])
+        wanted = [f"steps for {_points(error)}" for error in WANTED]
+        return text_table(
+            ("place", "number", f"error after {first.steps:,}", *wanted), [rows], title="Each number, as given"
+        )
+
+    def _seconds(self) -> Table:
+        rows = [
+            [
+                trial.options or "as given",
+                *(f"{1000 * s / trial.steps:.0f}" for s in (trial.seconds - trial.measuring_s, trial.measuring_s)),
+            ]
+            for trial in self.trials
+        ]
+        headings = ("setting", "worlds and rays (ms a step)", "search and sums (ms a step)")
+        return text_table(headings, [rows], title="Where the time goes", caption=f"and {self.start_s:.1f} s once")
+
+    def advice(self, error: float) -> str:
+        """The options of `evaluate` that reach an error."""
+        found = self.recommended(error)
+        if found is None:
+            after = f"{self.trials[0].steps:,} steps"
+            return f"For {_points(error)} of every detection: not reached, or not known from {after}."
+        trial, steps = found
+        options = " ".join([*self.plan.command[1:], *([trial.options] if trial.options else []), f"--steps={steps}"])
+        return f"For {_points(error)} of every detection: {options} ({trial.seconds_for(steps, self.start_s):.0f} s)."
 
     @property
     def record(self) -> dict[str, Any]:
         """All of it: what stands in `summary.json`."""
-        plan = self.plan
+        rig, scenario = map(str, self.plan.named)
+        found = {error: self.recommended(error) for error in WANTED}
         return {
             "torchcover": __version__,
-            "rig": plan.rig,
-            "scenario": plan.scenario,
-            "vehicle": self.vehicle,
-            "seed": plan.settings.seed,
-            "every_s": self.every_s,
-            "cell_m": plan.task.asked.grid.cell,
-            "long_run": {
-                "steps": self.truth.coverage.counts["steps"],
-                "standard_errors": json_record(self.truth.errors),
-            },
+            "rig": rig,
+            "scenario": scenario,
+            "seed": self.plan.settings.seed,
             "start_s": self.start_s,
-            "points": study_records(self.points, self.quantities),
-            "seconds_a_step": list(self.stages),
+            "trials": [_record(trial) for trial in self.trials],
             "recommended": [
-                {"error": wanted, "rays": point and point.rays, "steps": point and point.steps}
-                for wanted, point in self.recommended.items()
+                {"error": error, "options": one and one[0].options, "steps": one and one[1]}
+                for error, one in found.items()
             ],
         }
 
     def draw(self) -> Figure:
-        """The diagram of error against run time."""
-        title = f"{self.plan.rig} on {self.vehicle} in {self.plan.scenario}: a step every {self.every_s:g} s"
-        panels = work_panels(self.points, self.quantities, self.truth.errors)
-        return draw_work_precision(panels, title=title, legend_title="rays a step")
+        """The diagram of error against run time: the largest error of each unit."""
+        panels = []
+        for quantity in list(dict.fromkeys(one.quantity for one in self.trials[0].numbers))[:2]:
+            lines = {}
+            for trial in self.trials:
+                steps = [trial.least_steps << doubling for doubling in range(DOUBLINGS + 1)]
+                factor = shown_unit(quantity.unit).factor
+                errors = [factor * trial.error_after(each, quantity.unit) for each in steps]
+                times = [trial.seconds_for(each, self.start_s) for each in steps]
+                lines[trial.options or "as given"] = list(zip(times, errors, strict=True))
+            panels.append(WorkPanel(f"largest error of the {difference_heading(quantity)}", lines))
+        return draw_work_precision(panels, title=" in ".join(map(str, self.plan.named)), legend_title="setting")
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write `long_run.npz`, `work_precision.png` and `summary.json` into a folder, which is made if need be.
+        """Write `work_precision.png` and `summary.json` into a folder, which is made if need be.
 
         Returns:
             The files.
         """
         figure = self.draw()
         with Publication(Path(folder)) as files:
-            files.add("long_run.npz", self.truth.coverage.save)
             files.add("work_precision.png", figure.savefig)
             files.publish(self.record)
         return files.paths
 
 
+def _points(error: float) -> str:
+    return f"{100 * error:g} percentage point{'s' * (error != 0.01)}"
+
+
+def _steps_words(trial: Trial, steps: int | None, start_s: float) -> str:
+    return "-" if steps is None else f"{steps:,} ({trial.seconds_for(steps, start_s):.0f} s)"
+
+
+def _bias(trial: Trial) -> str:
+    known = [one for one in trial.of("share") if one.difference and not math.isnan(one.difference.value)]
+    if not known:
+        return "-" if trial.options else ""
+    most = max(known, key=lambda one: (one.is_biased, abs(one.difference.value if one.difference else 0.0)))
+    assert most.difference is not None
+    return f"{difference_words(most.difference)}{' *' * most.is_biased}"
+
+
+def _record(trial: Trial) -> dict[str, Any]:
+    numbers = []
+    for one in trial.numbers:
+        difference = one.difference._asdict() if one.difference else {}
+        told = {name: difference.get(name, math.nan) for name in ("value", "error", "p")}
+        own = {"region": one.region, "height": one.height, "quantity": one.quantity.key, "value": one.value}
+        numbers.append(json_record({**own, "a": one.error.a, "bias": one.error.bias, "difference": json_record(told)}))
+    names = ("options", "steps", "least_steps", "seconds", "measuring_s")
+    return {**{name: getattr(trial, name) for name in names}, "numbers": numbers}
+
+
 def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
-    """Measure what each number of rays costs and how far it is off after how many steps.
+    """Measure what each setting costs and how far it is off, all of them on the same instants.
 
     Args:
         plan: What to try.
@@ -229,28 +318,67 @@ def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
         ValueError: A plan that makes no sense.
         FileNotFoundError: An unknown name or file.
     """
-    frames, _ = plan.frames(plan.settings.seed, 1), plan.metric(1)  # which fail at once if anything is wrong
-    truth = long_run(plan, progress=progress)
-    one_step_s = command_s(plan)
-    done = tried(plan, one_step_s, progress=progress)
-    points = [
-        WorkPoint(
-            rays=trial.rays,
-            steps=steps,
-            runs=done.steps // steps,
-            seconds=done.seconds(trial, steps),
-            errors=truth.distances(trial.sums(steps // plan.lengths[0])),
-        )
-        for trial in done.trials
-        for steps in plan.lengths
-    ]
-    stages = [
-        {
-            "rays": trial.rays,
-            "worlds": done.worlds_s / done.steps,
-            "casting": trial.casting.seconds / done.steps,
-            "measuring": trial.measuring.seconds / done.steps,
-        }
-        for trial in done.trials
-    ]
-    return Study(plan, frames.scenario.ego_name, frames.every_s, truth, points, done.start_s, stages)
+    tasks = {options: simulation(settings) for options, settings in plan.each.items()}  # fail before anything runs
+    trials: list[Trial] = []
+    first: Coverage | None = None
+    for (options, task), settings in zip(tasks.items(), plan.each.values(), strict=True):
+        trial, coverage = _tried(options, task, replace(settings, progress=progress), first)
+        trials.append(trial)
+        first = first or coverage
+    return Study(plan, trials, max(0.0, command_s(plan) - trials[0].seconds / trials[0].steps))
+
+
+def _tried(
+    options: str, task: Task[SimulatedFrames], settings: Settings, first: Coverage | None
+) -> tuple[Trial, Coverage]:
+    """Run a setting, and hold it against the first."""
+    result = measured(task, settings)
+    assert result.run is not None  # it was not loaded
+    result.run.raise_failure()
+    coverage, awaited = result.coverage, task.asked.awaited
+    places = [(region, height) for region in result.regions for height in coverage.grid.heights]
+    count, steps, worlds = len(places) * len(coverage.quantities), coverage.counts["steps"], math.inf
+    numbers = []
+    for region, height in places:
+        estimate = coverage.estimate(region, height)
+        differences = _differences(coverage, first, estimate, region, height)
+        if region in awaited and not estimate.value.isnan().all():
+            worlds = min(worlds, float(estimate.effective.min()))
+        each = zip(estimate.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True)
+        for quantity, value, error in each:
+            difference = differences.get(quantity.key)
+            is_biased = difference is not None and difference.p * count < LEVEL
+            bias = abs(difference.value) if difference and (is_biased or math.isnan(difference.value)) else 0.0
+            model = ErrorModel.of(error, steps, bias)
+            place = region.name, height, region in awaited
+            numbers.append(Studied(*place, quantity, value, model, difference, is_biased))
+    least = max(MIN_STEPS, math.ceil(MIN_BLOCKS * steps / worlds) if worlds > 0 else steps)
+    return Trial(options, steps, least, result.run.seconds, result.run.measuring_s, numbers), coverage
+
+
+def _differences(
+    coverage: Coverage, first: Coverage | None, estimate: Estimate, region: Region, height: str
+) -> dict[str, Difference]:
+    """To the first setting; unknown of numbers of another definition, or of other instants."""
+    if first is None:
+        return {}
+    against = first.estimate(region, height)
+    if first.measure == coverage.measure and against.steps.tolist() == estimate.steps.tolist():
+        return estimate.differences(against)
+    return {quantity.key: Difference(quantity, math.nan) for quantity in estimate.quantities}
+
+
+def command_s(plan: StudyPlan) -> float:
+    """How long `torchcover evaluate` takes for one step, from its start to its end.
+
+    Raises:
+        ValueError: It fails.
+    """
+    words = [*plan.command, "--steps=1"]
+    start = time.perf_counter()
+    with TemporaryDirectory() as folder:
+        command = [sys.executable, "-m", "torchcover", *words, f"--out={folder}"]
+        done = subprocess.run(command, check=False, capture_output=True, text=True, preexec_fn=end_with_parent())
+    if done.returncode:
+        raise ValueError(f"torchcover {' '.join(words)} ended with {done.returncode}: {done.stderr.strip()}")
+    return time.perf_counter() - start

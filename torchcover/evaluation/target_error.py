@@ -8,6 +8,7 @@ from itertools import groupby
 from typing import Any
 
 from torchcover.coverage import Coverage, Region
+from torchcover.estimation import ErrorModel
 from torchcover.evaluation.observers import Observer
 from torchcover.report import json_record
 
@@ -117,7 +118,9 @@ class Standing:
         """Steps after which it should be good enough, for errors fall as 1 / sqrt(steps); None if there is no error."""
         if math.isinf(self.excess):
             return None
-        return max(MIN_STEPS, self.steps if self.reached else math.ceil(self.steps * self.excess**2))
+        return max(
+            MIN_STEPS, self.steps if self.reached else ErrorModel.of(self.error, self.steps).steps_for(self.target) or 0
+        )
 
     @property
     def words(self) -> str:
@@ -270,11 +273,17 @@ def _lines(found: Sequence[Standing], steps: int, *, confirmed: bool) -> list[st
         elif worst.reached:
             lines.append(f"{where}: {worst.words}, reached")
         else:
-            needed = f"about {_two_digits(worst.steps_needed):,} different steps are needed"
+            needed = f"about {rounded_up(worst.steps_needed):,} different steps are needed"
             lines.append(f"{where}: {worst.words}, {needed}")
     return lines
 
 
-def _two_digits(steps: int) -> int:
+def rounded_up(steps: int) -> int:
+    """Steps in two digits, never fewer.
+
+    Example:
+        >>> rounded_up(99), rounded_up(1234)
+        (99, 1300)
+    """
     unit: int = 10 ** max(0, len(str(steps)) - 2)
     return -(-steps // unit) * unit

@@ -169,9 +169,8 @@ def _recording(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
     # A name that is in the recording may be a name only; any other has to be that of a rig.
     documents = {name: rig for name, rig in named.items() if is_document(rig) or name not in frames.rigs}
     sensors = {**chosen.sensors, **{name: loaded(rig).sensors for name, rig in documents.items()}}
-    asked = (settings.ask or RegionsOfInterest()).around(
-        frames.ego_outline_m, settings.cell_m, settings.band_frame or "vehicle"
-    )
+    band_frame = settings.band_frame or ("ground" if frames.has_heights() else "vehicle")
+    asked = (settings.ask or RegionsOfInterest()).around(frames.ego_outline_m, settings.cell_m, band_frame)
     return Task(chosen, given, sensors, frames.description, asked, settings.steps)
 
 

@@ -88,7 +88,8 @@ def read_npz(
     except (ValueError, MemoryError):
         raise
     except Exception as error:
-        raise ValueError(f"not a readable .npz archive ({error})") from error
+        # A damaged name may be as long as the rest of the archive.
+        raise ValueError(f"not a readable .npz archive ({str(error)[:100]})") from error
 
 
 def npz_headers(path: Path) -> dict[str, NpyHeader]:

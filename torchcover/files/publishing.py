@@ -87,7 +87,15 @@ def claimed(folder: Path) -> Iterator[None]:
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK, timeout=0, is_singleton=True)  # one for the whole process: it may claim it twice
     try:
-        with lock:
+        with _naming(folder / LOCK), ExitStack() as stack:
+            try:
+                stack.enter_context(lock)
+            except Timeout as error:
+                raise ValueError(
+                    f"{folder}: another run is writing there; wait for its end, or choose another folder"
+                ) from error
+            until_exit = stack.pop_all()
+        with until_exit:
             _claims.append(folder)
             try:
                 if lock.lock_counter == 1:
@@ -97,10 +105,6 @@ def claimed(folder: Path) -> Iterator[None]:
                 _claims.remove(folder)
                 if lock.lock_counter == 1:
                     (folder / LOCK).unlink(missing_ok=True)
-    except Timeout as error:
-        raise ValueError(
-            f"{folder}: another run is writing there; wait for its end, or choose another folder"
-        ) from error
     finally:
         with suppress(OSError):
             for place in made:

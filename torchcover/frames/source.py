@@ -106,6 +106,10 @@ class FrameSource(Protocol):
         """Whether frames have `Frame.boxes`."""
         ...
 
+    def has_heights(self) -> bool:
+        """Whether frames have `Frame.reference_heights_m`: then height bands are over the ground by default."""
+        ...
+
     def ego_mesh(self) -> "Mesh | None":
         """The body of the ego in the vehicle frame; None if unknown."""
         ...
@@ -165,6 +169,10 @@ class FrameDataset(Dataset[Frame]):
         return {}
 
     def has_boxes(self) -> bool:
+        """None of them."""
+        return False
+
+    def has_heights(self) -> bool:
         """None of them."""
         return False
 
@@ -231,6 +239,10 @@ class ChosenRigs(FrameDataset):
         """As there."""
         return self.frames.has_boxes()
 
+    def has_heights(self) -> bool:
+        """As there."""
+        return self.frames.has_heights()
+
     def ego_mesh(self) -> "Mesh | None":
         """As there."""
         return self.frames.ego_mesh()
@@ -267,7 +279,8 @@ class ChosenRigs(FrameDataset):
         boxes = None if frame.boxes is None else replace(frame.boxes, hits=self._chosen(frame.boxes.hits))
         points = None if frame.sensor_points is None else self._chosen(frame.sensor_points)
         clouds = {name: frame.cloud_of(of) for name, of in self.names.items()}
-        return replace(frame, clouds=clouds, boxes=boxes, sensor_points=points)
+        measured = self._chosen(frame.measured)
+        return replace(frame, clouds=clouds, boxes=boxes, sensor_points=points, measured=measured)
 
     def _chosen(self, by_rig: Mapping[str, ValueT]) -> dict[str, ValueT]:
         return {name: by_rig[of] for name, of in self.names.items() if of in by_rig}

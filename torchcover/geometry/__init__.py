@@ -1,6 +1,7 @@
-"""Rigid transforms, boxes, and rays through voxels. Knows no other part of the house."""
+"""Rigid transforms, boxes, height fields, and rays through voxels. Knows no other part of the house."""
 
 from torchcover.geometry.bounding_box import BoundingBox, overlap
+from torchcover.geometry.height_field import HeightField, fitted, spread
 from torchcover.geometry.rigid import (
     check_rigid,
     euler_from_rotation,
@@ -16,16 +17,19 @@ from torchcover.geometry.voxel_walk import VoxelGrid, crossed_voxels
 
 __all__ = [
     "BoundingBox",
+    "HeightField",
     "VoxelGrid",
     "check_rigid",
     "crossed_voxels",
     "euler_from_rotation",
+    "fitted",
     "invert",
     "overlap",
     "quaternion_from_rotation",
     "rigid",
     "rotation_from_euler",
     "rotation_from_quaternion",
+    "spread",
     "transform",
     "transform_tensor",
 ]

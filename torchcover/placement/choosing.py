@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 
 from torchcover import __version__
 from torchcover.coverage import Measure
+from torchcover.coverage.regions import Places
 from torchcover.estimation import Number
 from torchcover.evaluation.settings import FILES
 from torchcover.neighbors import nearest
@@ -256,7 +257,8 @@ def seen_by(rig: Rig, instants: CommonInstants) -> Bytes:
     (threshold,) = instants.questions.thresholds_m
     found = []
     for frame in instants.frames(rig):
-        distance = nearest(frame.reference, frame.sensor, max_distance=instants.questions.max_radius_m).distance
+        points = frame.cloud_of(within_m=threshold)
+        distance = nearest(frame.reference, points, max_distance=instants.questions.max_radius_m).distance
         found.append(np.packbits((distance <= threshold).numpy()))
     return np.concatenate(found)
 
@@ -276,12 +278,17 @@ def worth_of(instants: CommonInstants) -> Worth:
     of_bits = [torch.zeros(-(-len(frame.reference) // 8) * 8, dtype=torch.float64) for frame in frames]
     places = questions.objectives[OBJECTIVE].places
     for region, band in places:
+        where = Places([questions.regions[region]], grid)
         cells = torch.zeros(grid.shape, dtype=torch.bool)
-        cells[list(grid.heights).index(band)] = questions.regions[region].mask(grid)
+        cells[list(grid.heights).index(band)] = where.regions[0].mask(grid)
         of_places, m2, probed = [], torch.zeros(0), torch.zeros(grid.cells, dtype=torch.int64)
         for frame in frames:
             inside, of, cell = grid.bins(frame.reference, frame.heights_in(grid.band_frame))
-            own = cells.view(-1)[cell]
+            if instants.estimate == "area":
+                place, point = where.of_points(frame.reference[inside[of]], cell)
+                own = point[place == where.number_of(where.regions[0], band)]
+            else:
+                own = cells.view(-1)[cell].nonzero().squeeze(1)
             points, cell = inside[of[own]], cell[own]
             assert frame.reference_weights is not None  # square metres
             weight = frame.reference_weights[points].double()

@@ -98,8 +98,9 @@ class Questions(NamedTuple):
 
     @property
     def areas(self) -> Areas:
-        """Rectangles of whole cells around the regions: a cell counts as a whole, so that all of it is to be probed."""
-        return tuple(_whole_cells(self.grid, region.mask(self.grid)) for region in self.regions.values())
+        """Rectangles of whole cells around the regions: over known cells a cell counts as a whole."""
+        each = (_around(self.grid, [region]) for region in self.regions.values())
+        return tuple((own.x, own.y) for own in each)
 
     def reference_sensor(self, rays: int) -> SurfaceReference:
         """One that is aimed at what is asked about."""
@@ -114,14 +115,14 @@ class Questions(NamedTuple):
         """
         if self.metrics:
             return torch.ones(len(points), dtype=torch.bool)
-        cells = torch.zeros(self.grid.shape, dtype=torch.bool)
-        bands = list(self.grid.heights)
-        for objective in self.objectives.values():
-            for region, band in objective.places:
-                cells[bands.index(band)] |= self.regions[region].mask(self.grid)
         inside, of, cell = self.grid.bins(points, height)
         kept = torch.zeros(len(points), dtype=torch.bool)
-        kept[inside[of[cells.view(-1)[cell]]]] = True
+        x, y, bands = *points[inside[of], :2].T, list(self.grid.heights)
+        band, column = cell // (self.grid.cells // len(bands)), cell % (self.grid.cells // len(bands))
+        for place in dict.fromkeys(place for objective in self.objectives.values() for place in objective.places):
+            region = self.regions[place[0]]
+            own = region.contains(x, y) | region.mask(self.grid).view(-1)[column]  # by area, or of a cell of it
+            kept[inside[of[own & (band == bands.index(place[1]))]]] = True
         return kept
 
     def check(self, rig: Rig, ego: Mesh | None = None) -> None:
@@ -311,15 +312,3 @@ def _around(grid: BevGrid, regions: Collection[Region]) -> BevGrid:
 
     x, y = outside(grid.x_edges_m, [one.x for one in regions]), outside(grid.y_edges_m, [one.y for one in regions])
     return BevGrid(x, y, grid.cell, grid.heights, grid.band_frame)
-
-
-def _whole_cells(grid: BevGrid, mask: Tensor) -> tuple[tuple[float, float], tuple[float, float]]:
-    """The rectangle around cells."""
-    (y_low, y_high), (x_low, x_high) = (
-        (float(edges[used.min()]), float(edges[used.max() + 1]))
-        for edges, used in (
-            (grid.y_edges_m, mask.any(dim=1).nonzero()),
-            (grid.x_edges_m, mask.any(dim=0).nonzero()),
-        )
-    )
-    return (x_low, x_high), (y_low, y_high)

@@ -99,7 +99,7 @@ class KCover(WorldRatios):
         weight = weights.to(point.device)[point].double()
         seen = [weight * (sensors >= k) for k in self.at_least]
         values = torch.stack([torch.ones_like(weight), weight, *seen])
-        place, of_place = self.places.of_points(cell)
+        place, of_place = self.places.of_points(frame.reference.to(point.device)[point], cell)
         in_places = values.new_zeros(len(values), self.places.count).index_add_(1, place, values[:, of_place])
         sums = torch.cat([values.sum(dim=1, keepdim=True), in_places], dim=1)
         count, base = (row.repeat(len(seen)) for row in sums[:2])

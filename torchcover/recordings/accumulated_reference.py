@@ -2,43 +2,16 @@
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from torchcover.detection import Boxes, points_in_boxes
-from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_euler, transform
+from torchcover.detection import Boxes
+from torchcover.geometry import BoundingBox, invert, transform
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, within
+from torchcover.recordings.in_vehicle import InVehicle, within
 from torchcover.recordings.recording import Recording
-
-# Voxels are numbered with so many bits an axis: 200 km at 0.1 m.
-VOXEL_BITS = 21
-# Boxes that were drawn by hand leave out mirrors and corners: what is so near to the sides belongs to the object, as in
-# the published scene flow of Argoverse 2 (0.2 m in length and width).
-BESIDE_BOX_M = 0.1
-
-
-@dataclass(frozen=True)
-class Thinned:
-    """A scan, one point a voxel.
-
-    Args:
-        still_m: (N, 3) float64 points that belong to no box, in the world, from the recording's first place.
-        voxel: (N,) int64 number of the voxel of each, ascending.
-        of_box: Name of each object -> (M, 3) float64 points in the frame of its box: x along its heading, its centre in
-            the middle.
-        unnamed: Points in boxes without a name, which cannot be found again.
-        dropped: As `InVehicle.dropped`.
-    """
-
-    still_m: NDArray[np.float64]
-    voxel: NDArray[np.int64]
-    of_box: Mapping[str, NDArray[np.float64]]
-    unnamed: int
-    dropped: Counter[str]
+from torchcover.recordings.sweeps import Sweeps, first_of_each, pose_of
 
 
 class AccumulatedReference:
@@ -70,12 +43,12 @@ class AccumulatedReference:
         self.window_s = window_s
         self.voxel_m = voxel_m
         self.sensors = None if sensors is None else tuple(sensors)
-        # Of the recording and the window that were asked for last: the next window is much alike.
-        self._kept: dict[tuple[str, int], Thinned] = {}
-        self._kept_of: Recording | None = None
+        self._sweeps = Sweeps(window_s, voxel_m)
 
-    def __getstate__(self) -> dict[str, object]:
-        return {**vars(self), "_kept": {}, "_kept_of": None}
+    @property
+    def sweeps(self) -> Sweeps:
+        """What it is made of."""
+        return self._sweeps
 
     def check(self, recording: Recording, judged: Collection[str]) -> None:
         """Whether the recording says when and where its scans were made.
@@ -109,16 +82,12 @@ class AccumulatedReference:
         Raises:
             OSError, ValueError: A scan cannot be read, or no point is left.
         """
-        origin_m, world_T_vehicle = _first_place(recording), _pose(recording, index)
-        vehicle_T_local = invert(world_T_vehicle) @ rigid(np.eye(3), origin_m)
+        sweeps, vehicle_T_local = self._sweeps, invert(self._sweeps.local_T_vehicle(recording, index))
         boxes = _by_name(recording.boxes(index))
         still, voxels, moved, dropped = [], [], [], Counter[str]()
         of_box: dict[str, list[NDArray[np.float64]]] = {}
-        taken = list(self._scans(recording, index, judged))
-        of_recording = self._kept if recording is self._kept_of else {}
-        self._kept_of, self._kept = recording, {key: scan for key, scan in of_recording.items() if key in taken}
-        for sensor, instant in taken:
-            scan = self._thinned(recording, sensor, instant, origin_m)
+        for sensor, instant in self._scans(recording, index, judged):
+            scan = sweeps.thinned(recording, sensor, instant)
             still.append(scan.still_m)
             voxels.append(scan.voxel)
             dropped += scan.dropped
@@ -130,8 +99,8 @@ class AccumulatedReference:
             if name not in boxes:
                 dropped["gone"] += len(points_m)
                 continue
-            moved.append(transform(boxes[name], points_m[_first_of_each(self._voxel(points_m))]))
-        first = np.sort(_first_of_each(np.concatenate([np.empty(0, np.int64), *voxels])))
+            moved.append(transform(boxes[name], points_m[first_of_each(sweeps.voxel(points_m))]))
+        first = np.sort(first_of_each(np.concatenate([np.empty(0, np.int64), *voxels])))
         ends = np.cumsum([0, *map(len, still)])
         kept = np.split(first, np.searchsorted(first, ends[1:-1]))
         placed = [
@@ -179,81 +148,15 @@ class AccumulatedReference:
 
     def _scans(self, recording: Recording, index: int, judged: Collection[str]) -> Iterator[tuple[str, int]]:
         """Sensor and instant of each scan, the nearest in time first."""
-        instants = [index]
-        if self.window_s:
-            assert recording.times_s is not None  # see check
-            apart_s = np.abs(recording.times_s - recording.times_s[index])
-            near = np.flatnonzero(apart_s <= self.window_s / 2 * (1 + 1e-9))
-            instants = near[np.argsort(apart_s[near], kind="stable")].tolist()
-        for instant in instants:
+        for instant in self._sweeps.instants(recording, index):
             for sensor in self._taking_part(recording):
                 if instant != index or sensor not in judged:
                     yield sensor, instant
 
-    def _thinned(self, recording: Recording, sensor: str, index: int, origin_m: NDArray[np.float64]) -> Thinned:
-        key = (sensor, index)
-        if key in self._kept:
-            return self._kept[key]
-        scan = in_vehicle(recording.scan(sensor, index), recording.body)
-        points_m = scan.points_m.astype(np.float64)
-        boxes = recording.boxes(index)
-        in_box = np.zeros(len(points_m), dtype=bool)
-        of_box, unnamed = {}, 0
-        if boxes is not None:
-            inside = points_in_boxes(torch.from_numpy(scan.points_m), _grown(boxes))
-            in_box[inside.point.numpy()] = True
-            for number, name in enumerate(boxes.ids):
-                own_m = points_m[inside.point[inside.box == number].numpy()]
-                if name and len(own_m):
-                    own_m = transform(invert(_pose_of(boxes, number)), own_m)
-                    of_box[name] = own_m[_first_of_each(self._voxel(own_m))]
-                else:
-                    unnamed += len(own_m)
-        local_T_vehicle = rigid(np.eye(3), -origin_m) @ _pose(recording, index)
-        still_m = transform(local_T_vehicle, points_m[~in_box])
-        voxel = self._voxel(still_m)
-        first = _first_of_each(voxel)
-        thinned = Thinned(still_m[first], voxel[first], of_box, unnamed, scan.dropped)
-        self._kept[key] = thinned
-        return thinned
-
-    def _voxel(self, points_m: NDArray[np.float64]) -> NDArray[np.int64]:
-        x, y, z = (np.floor(points_m / self.voxel_m).astype(np.int64) & ((1 << VOXEL_BITS) - 1)).T
-        numbers: NDArray[np.int64] = (x << 2 * VOXEL_BITS) | (y << VOXEL_BITS) | z
-        return numbers
-
-
-def _first_of_each(numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where each number is seen first, by ascending number; fast where ascending runs follow each other."""
-    order = np.argsort(numbers, kind="stable")
-    ordered = numbers[order]
-    first: NDArray[np.int64] = order[np.append(True, ordered[1:] != ordered[:-1])[: len(order)]]
-    return first
-
-
-def _first_place(recording: Recording) -> NDArray[np.float64]:
-    """Where the drive begins: world coordinates may be too large to be counted in voxels."""
-    return _pose(recording, 0)[:3, 3]
-
-
-def _pose(recording: Recording, index: int) -> Matrix:
-    """Where the vehicle was; it has not moved where that is unknown."""
-    pose = recording.world_T_vehicle(index)
-    return np.eye(4) if pose is None else pose
-
-
-def _pose_of(boxes: Boxes, number: int) -> Matrix:
-    yaw_deg = float(np.rad2deg(boxes.yaw_rad[number].item()))
-    return rigid(rotation_from_euler(yaw_deg, 0.0, 0.0), boxes.centre_m[number].double().numpy())
-
-
-def _grown(boxes: Boxes) -> Boxes:
-    return replace(boxes, size_m=boxes.size_m + boxes.size_m.new_tensor([2 * BESIDE_BOX_M, 2 * BESIDE_BOX_M, 0.0]))
-
 
 def _by_name(boxes: Boxes | None) -> dict[str, Matrix]:
     """Name of each object -> vehicle_T_box."""
-    return {} if boxes is None else {name: _pose_of(boxes, number) for number, name in enumerate(boxes.ids)}
+    return {} if boxes is None else {name: pose_of(boxes, number) for number, name in enumerate(boxes.ids)}
 
 
 def _beneath_or_in(points_m: NDArray[np.float64], body: BoundingBox | None) -> NDArray[np.intp]:

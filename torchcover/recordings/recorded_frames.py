@@ -13,10 +13,12 @@ from numpy.typing import NDArray
 from torchcover.detection.inside import with_hits
 from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
+from torchcover.geometry import transform
 from torchcover.recordings.accumulated_reference import AccumulatedReference
 from torchcover.recordings.in_vehicle import InVehicle, in_vehicle, joined
 from torchcover.recordings.recorded_reference import RecordedReference, Reference
 from torchcover.recordings.recording import Recording
+from torchcover.recordings.sweeps import Sweeps
 
 # What a folder of results holds, during the run or after it.
 RESULTS = frozenset({".lock", "summary.json", "checkpoint.npz"})
@@ -34,6 +36,8 @@ class RecordedFrames(FrameDataset):
         rigs: Names of rigs -> names of their sensors; those of the recording if not given.
         reference: Where the reference clouds come from. Not given: the sensors that were recorded for it, or
             else an `AccumulatedReference`.
+        ground: Whether heights above the ground that were not recorded come from a `GroundModel` of all scans within
+            the window of the reference, or 2 s.
 
     Raises:
         FileNotFoundError: There is no such recording, or a part of it is missing.
@@ -56,6 +60,7 @@ class RecordedFrames(FrameDataset):
         *,
         rigs: Mapping[str, Sequence[str]] | None = None,
         reference: Reference | None = None,
+        ground: bool = True,
     ) -> None:
         if isinstance(recording, str | os.PathLike):
             from torchcover.recordings.formats import open_recording  # all formats, for a path only
@@ -68,6 +73,8 @@ class RecordedFrames(FrameDataset):
             reference = RecordedReference() if self.recording.reference_sensors else AccumulatedReference()
         self.reference = reference
         self.reference.check(self.recording, self._judged)
+        self.ground = ground
+        self._sweeps = self.reference.sweeps if isinstance(self.reference, AccumulatedReference) else Sweeps()
 
     @property
     def names(self) -> Sequence[str]:
@@ -100,6 +107,16 @@ class RecordedFrames(FrameDataset):
                 return self.recording.boxes(instant) is not None
             except (OSError, ValueError):
                 continue  # whoever measures it will say so
+        return False
+
+    def has_heights(self) -> bool:
+        """Whether the first frame whose recorded reference can be read has them."""
+        if isinstance(self.reference, RecordedReference):
+            for instant in self.recording.frames:
+                try:
+                    return self.recording.scan(self.recording.reference_sensors[0], instant).heights_m is not None
+                except (OSError, ValueError):
+                    continue
         return False
 
     def doubts(self, steps: int | None) -> Sequence[str]:
@@ -143,6 +160,7 @@ class RecordedFrames(FrameDataset):
             "instants": [list(self.recording.names), list(self.recording.frames)],
             "sensors": self.sensors_of_rigs,
             "reference": [type(self.reference).__name__, reference],
+            "ground": self.ground,
         }
 
     def __len__(self) -> int:
@@ -164,6 +182,7 @@ class RecordedFrames(FrameDataset):
         try:
             scans = {sensor: self._read(sensor, instant) for sensor in self._judged}
             reference = self.reference.cloud(self.recording, instant, self._judged)
+            heights_m = self._heights_m(instant, reference)
             boxes = self.recording.boxes(instant)
         except (OSError, ValueError) as error:
             raise BadFrameError(f"{name} (frame {position}): {error}") from error
@@ -184,7 +203,7 @@ class RecordedFrames(FrameDataset):
             name,
             counts=counts,
             reference_weights=None if reference.weights is None else torch.from_numpy(reference.weights),
-            reference_heights_m=None if reference.heights_m is None else torch.from_numpy(reference.heights_m),
+            reference_heights_m=None if heights_m is None else torch.from_numpy(heights_m),
             boxes=boxes,
             place_in_time=position if self.recording.instants is None else self.recording.instants[instant],
             sensor_points={
@@ -199,6 +218,15 @@ class RecordedFrames(FrameDataset):
 
     def _read(self, sensor: str, instant: int) -> InVehicle:
         return in_vehicle(self.recording.scan(sensor, instant), self.recording.body)
+
+    def _heights_m(self, instant: int, reference: InVehicle) -> NDArray[np.float32] | None:
+        if reference.heights_m is not None or not self.ground:
+            return reference.heights_m
+        ground = self._sweeps.ground(self.recording, instant)
+        if ground is None:
+            return np.full(len(reference.points_m), np.nan, dtype=np.float32)
+        local_T_vehicle = self._sweeps.local_T_vehicle(self.recording, instant)
+        return ground.heights_m(transform(local_T_vehicle, reference.points_m)).astype(np.float32)
 
     def _check_sensors(self) -> None:
         there = (*self.recording.sensors, *self.recording.reference_sensors)

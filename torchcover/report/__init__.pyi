@@ -55,6 +55,7 @@ from .renderers.text_file import text_table as text_table
 from .table import CoverageTable as CoverageTable
 from .table import Row as Row
 from .wording import difference_heading as difference_heading
+from .wording import difference_words as difference_words
 from .wording import error_words as error_words
 from .wording import number_words as number_words
 from .wording import percent as percent

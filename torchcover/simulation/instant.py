@@ -29,11 +29,12 @@ NO_GROUND = LocalGround([], np.zeros(3))
 
 
 class SensorScan(NamedTuple):
-    """What one sensor saw: `points` (N, 3) float32 in the vehicle frame, and how many rays went where.
+    """What one sensor saw: `points` (N, 3) float32 in the vehicle frame, where they are, and how many rays went where.
 
     `ray` (N,) says which ray, counted over the tiles, made each point, and `range_m` (N,) how far it went. `body_casts`
     is the number of pairs of a ray and a moving body at which it was cast: the other pairs could not meet. `struck`
-    finds out what they hit, for who asks; None of what a sensor has measured.
+    finds out what they hit, for who asks; None of what a sensor has measured. `error_m` (N,) is how far off it measured
+    them, along their rays, and `landed` (N, 3) where that is; None if they are exact.
     """
 
     points: Float32
@@ -43,6 +44,8 @@ class SensorScan(NamedTuple):
     self_hits: int
     body_casts: int = 0
     struck: Callable[[], Struck] | None = None
+    error_m: Float32 | None = None
+    landed: Float32 | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -77,7 +77,7 @@ class ScanPattern(Ranging):
         if self.range_at_10_percent_m is None:
             return super().measure(hits, draws)
         returned = draws.chance(hits.ray) < self._return_probability(hits, self.range_at_10_percent_m)
-        return self.erring(hits.ray, np.flatnonzero(returned & (hits.range_m >= self.min_range_m)), draws)
+        return self.erring(hits, np.flatnonzero(returned & (hits.range_m >= self.min_range_m)), draws)
 
     def _return_probability(self, hits: RayHits, range_at_10_percent_m: float) -> NDArray[np.floating]:
         material, weather = hits.struck.material, hits.weather

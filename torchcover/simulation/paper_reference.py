@@ -56,6 +56,7 @@ class PaperReference:
     """
 
     name: ClassVar[str] = "paper"
+    band_frame: ClassVar[BandFrame] = "vehicle"
     square_metres: ClassVar[bool] = False
 
     rows: int = 1024
@@ -86,7 +87,7 @@ class PaperReference:
             areas: Not used.
             rays: About how many rays; 1024 x 1024 if not given.
             bands_m: Not used.
-            band_frame: Not used.
+            band_frame: Not used: its own is "vehicle".
 
         Raises:
             ValueError: Fewer than 1 ray.

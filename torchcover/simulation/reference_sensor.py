@@ -26,7 +26,7 @@ Bands = tuple[tuple[float, float], ...]
 DrawPose = Callable[[BoundingBox, np.random.Generator], NDArray[np.float64]]
 
 # What height bands are over, where nothing else is said.
-DEFAULT_BAND_FRAME: BandFrame = "vehicle"
+DEFAULT_BAND_FRAME: BandFrame = "ground"
 # The paper's heights: ground, and what stands on it.
 PAPER_BANDS_M: Bands = ((-0.5, 0.5), (0.5, 2.0))
 # A place inside a body is drawn again, at most this often.
@@ -112,6 +112,11 @@ class ReferenceSensor(Protocol):
     """What it is registered as, and what `--reference` and `summary.json` call it."""
     square_metres: ClassVar[bool]
     """Whether its points have weights, the square metres that they stand for. The same in every scan."""
+
+    @property
+    def band_frame(self) -> BandFrame:
+        """What its height bands are over: "ground" if all of its scans have heights, "vehicle" if none has."""
+        ...
 
     @classmethod
     def from_rays(

@@ -161,6 +161,11 @@ class Sensor(Protocol):
         """(3, rows, columns) unit directions in the sensor's frame; NaN where there is no ray."""
         ...
 
+    @property
+    def counts_as(self) -> int:
+        """How many points each of its points is counted as on a body: of a camera, pixels of the full image."""
+        ...
+
     def beams(self) -> Numbers | None:
         """(rows, columns) the number of the beam that each ray is part of; None if each is a beam of its own.
 
@@ -197,12 +202,27 @@ class Ranging(Document):
     def _check_ranges(self) -> Self:
         if self.min_range_m >= self.max_range_m:
             raise ValueError(f"min_range_m ({self.min_range_m}) must be below max_range_m ({self.max_range_m})")
+        if self.range_noise_m >= self.max_range_m:
+            raise ValueError(f"range_noise_m ({self.range_noise_m}) must be below max_range_m ({self.max_range_m})")
         return self
+
+    def noise_m(self, range_m: NDArray[np.floating]) -> float | NDArray[np.floating]:
+        """Standard deviation of measured ranges, of each of (N,) or of all; 0 if they are exact."""
+        return self.range_noise_m
 
     @property
     def is_exact(self) -> bool:
         """Whether it has neither noise nor drop-out."""
-        return not (self.range_noise_m or self.dropout)
+        return not self._errs
+
+    @property
+    def _errs(self) -> bool:
+        return bool(self.dropout or np.any(self.noise_m(np.ones(1))))
+
+    @property
+    def counts_as(self) -> int:
+        """1: a point is a measurement."""
+        return 1
 
     def beams(self) -> Numbers | None:
         """None: every ray measures alone."""
@@ -211,22 +231,24 @@ class Ranging(Document):
     def measure(self, hits: RayHits, draws: Draws) -> Returns:
         """A point for each hit that is not too close, with noise along its ray, unless it drops out."""
         if not self.min_range_m:
-            return self.erring(hits.ray, None, draws)
+            return self.erring(hits, None, draws)
         far_enough = hits.range_m >= self.min_range_m
-        return self.erring(hits.ray, None if far_enough.all() else np.flatnonzero(far_enough), draws)
+        return self.erring(hits, None if far_enough.all() else np.flatnonzero(far_enough), draws)
 
-    def erring(self, ray: Numbers, hit: Numbers | None, draws: Draws) -> Returns:
+    def erring(self, hits: RayHits, hit: Numbers | None, draws: Draws) -> Returns:
         """Points at some of N hits, with noise and drop-out.
 
         Args:
-            ray: (N,) the rays.
+            hits: All of them.
             hit: (K,) which hits would give a point; None for all.
             draws: Source of the random numbers.
         """
-        if not (self.range_noise_m or self.dropout):
+        if not self._errs:
             return Returns(hit, None)
-        ray = ray if hit is None else ray[hit]
-        error_m = self.range_noise_m * draws.normal(ray) if self.range_noise_m else None
+        ray, range_m = (hits.ray, hits.range_m) if hit is None else (hits.ray[hit], hits.range_m[hit])
+        noise_m = self.noise_m(range_m)
+        # No range is less than 0.
+        error_m = np.maximum(noise_m * draws.normal(ray), -range_m) if np.any(noise_m) else None
         if self.dropout:
             stays = np.flatnonzero(draws.uniform(ray) >= self.dropout)
             hit, error_m = stays if hit is None else hit[stays], None if error_m is None else error_m[stays]

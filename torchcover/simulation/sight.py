@@ -68,7 +68,8 @@ class MountedSensor:
             return scan
         ways_m = scan.points.astype(np.float64) - self.vehicle_T_sensor[:3, 3]
         along = error_m[:, None] / np.linalg.norm(ways_m, axis=1, keepdims=True)
-        return scan._replace(points=(scan.points + ways_m * along).astype(np.float32))
+        landed = (scan.points + ways_m * along).astype(np.float32)
+        return scan._replace(error_m=error_m.astype(np.float32), landed=landed)
 
     def _cast(self, instant: Instant, threads: int) -> tuple[SensorScan, RayHits]:
         if self._resting is not None:

@@ -223,7 +223,7 @@ def _count_step(
     near = np.zeros((count, there.near[0].shape[1]), dtype=np.uint8)
     for k, (sensor, one, seen) in enumerate(zip(mounted, there.met, step.sensors, strict=True)):
         measured = _measured(sensor, beams[k], one, seen, there.placed, threshold_m)
-        points[k] = np.bincount(one.position[measured], minlength=count)
+        points[k] = sensor.sensor.counts_as * np.bincount(one.position[measured], minlength=count)
         near |= _any_of_each(one.position[measured], there.near[k][measured], count)
     _add(sums, step, points, near, hits)
 

@@ -46,13 +46,12 @@ class BinnedStep(NamedTuple):
 
     Args:
         cell: (N,) int64 cell of each point.
-        values: (1 + T, N) float64 of each point: its `radius`, then 1 for each threshold that it is within, or 0.
+        values: (V, N) float64 of each point: its `radius`, then 1 for each threshold that it is within, or 0; then what
+            there is to say of the sensors, if the metric knows them.
         weight: (N,) weight of each point; None if all weigh the same.
-        means: Over the points of each cell: the radius, then the detection at each threshold.
+        means: Of each value over the points of each cell.
         block: Number of the block that the step belongs to.
         cells: Number of cells of the grid.
-        of_sensors: (S, N) distance to the nearest point of each sensor, infinite beyond `max_radius`; None unless the
-            metric knows the sensors.
     """
 
     cell: Tensor
@@ -61,7 +60,6 @@ class BinnedStep(NamedTuple):
     means: CellMeans
     block: int
     cells: int
-    of_sensors: Tensor | None = None
 
     @property
     def radius(self) -> Tensor:

@@ -45,7 +45,7 @@ class MeanOfMeans(Aggregation):
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the means of a step."""
-        sums["sums"][step.block][:, step.means.cell] += step.means.mean
+        sums["sums"][step.block][:, step.means.cell] += step.means.mean[: len(self.quantities)]
 
     def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
         """The radius, then the detection at each threshold."""
@@ -91,7 +91,7 @@ class VisibleArea(Aggregation):
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the points of a step."""
         sums["m2"][step.block, step.means.cell] += step.means.weight
-        sums["sums"][step.block][:, step.means.cell] += step.means.mean * step.means.weight
+        sums["sums"][step.block][:, step.means.cell] += step.means.mean[: len(self.quantities)] * step.means.weight
 
     def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
         """The radius, then the detection at each threshold; 0 / 0, which is NaN, where nothing was seen."""

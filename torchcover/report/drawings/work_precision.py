@@ -1,6 +1,5 @@
 """Error against run time: which setting is worth its time."""
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -22,15 +21,11 @@ class WorkPanel(NamedTuple):
 
     Args:
         label: What the errors are, with their unit.
-        lines: Name of a line, such as a number of rays -> its points.
-        front: The points that no other beats.
-        floor: Errors below it say nothing; NaN for none.
+        lines: Name of a line, such as a setting -> its points.
     """
 
     label: str
     lines: Mapping[str, Sequence[Point]]
-    front: Sequence[Point]
-    floor: float
 
 
 def draw_work_precision(panels: Iterable[WorkPanel], *, title: str, legend_title: str = "") -> Figure:
@@ -61,9 +56,6 @@ def _draw_panel(axes: Axes, panel: WorkPanel) -> None:
     for at, (name, points) in enumerate(panel.lines.items()):
         colour, marker = colours(MAX_LIGHTNESS * at / max(len(panel.lines) - 1, 1)), MARKERS[at % len(MARKERS)]
         axes.plot(*_xy(points), marker=marker, markersize=5, linewidth=1.2, color=colour, label=name)
-    axes.plot(*_xy(panel.front), color="black", linewidth=4.5, alpha=0.25, zorder=1, label="Pareto front")
-    if math.isfinite(panel.floor):
-        axes.axhline(panel.floor, color="grey", linestyle=":", label="standard error of the long run")
     axes.set(xscale="log", yscale="log", xlabel="run time (s)", ylabel=panel.label)
     for axis in (axes.xaxis, axes.yaxis):
         # Few numbers, written out: powers of ten lie on each other where there is less than a decade.

@@ -6,7 +6,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from torchcover.simulation.height_field import CELL_M, MARGIN_M, Ground, Plain, Slopes, corners_of, middles_m, spread
+from torchcover.geometry import spread
+from torchcover.simulation.height_field import CELL_M, MARGIN_M, Ground, Plain, Slopes, corners_of, middles_m
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.scenery import PAVEMENT_M

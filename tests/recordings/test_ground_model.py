@@ -1,0 +1,157 @@
+"""The ground that sweeps have seen, against closed forms: heights above it, what is no ground, and what is unknown."""
+
+import numpy as np
+import pytest
+
+from torchcover.recordings.ground_model import CELL_M, GroundModel, low_surfaces
+
+NOISE_M = 0.03
+HERE_M = np.zeros(3)
+
+
+def level(x, y):
+    return np.zeros_like(x)
+
+
+def kerbs(x, y):
+    return np.where(np.abs(y) > 5.0, 0.15, 0.0)
+
+
+def ramp(x, y):
+    """15 % up from 10 m to 30 m, level before and behind, as everywhere beside it."""
+    return np.clip(0.15 * (x - 10.0), 0.0, 3.0)
+
+
+def hills(x, y):
+    return 1.5 * np.sin(x / 25.0) + 0.06 * y
+
+
+def seen(heights, count=30_000, within_m=40.0, seed=0, noise_m=NOISE_M):
+    """Points of a surface, as many near the middle as far from it."""
+    generator = np.random.default_rng(seed)
+    x, y = generator.uniform(-within_m, within_m, (2, count))
+    return np.stack([x, y, heights(x, y) + generator.normal(0.0, noise_m, count)], axis=1)
+
+
+def upright(ends, low_m, high_m, count, seed=1):
+    """Points of a wall between two places."""
+    generator = np.random.default_rng(seed)
+    way = generator.uniform(size=(count, 1))
+    across_m = np.array(ends[0]) * (1 - way) + np.array(ends[1]) * way
+    return np.column_stack([across_m, generator.uniform(low_m, high_m, count)])
+
+
+def cut(points_m, *, x=(-np.inf, np.inf), y=(-np.inf, np.inf)):
+    """Those that are not within a rectangle."""
+    inside = (points_m[:, 0] > x[0]) & (points_m[:, 0] < x[1]) & (points_m[:, 1] > y[0]) & (points_m[:, 1] < y[1])
+    return points_m[~inside]
+
+
+def ground_of(*parts, place_m=HERE_M):
+    return GroundModel.below([low_surfaces(part, place_m) for part in parts], place_m)
+
+
+def rms_m(ground, heights, within_m=38.0):
+    """How far from the truth, where a raster of places has heights; and the share that has."""
+    x, y = (axis.ravel() for axis in np.meshgrid(np.arange(-within_m, within_m, 0.7), np.arange(-within_m, within_m)))
+    off_m = ground.heights_m(np.stack([x, y, heights(x, y)], axis=1))
+    return np.sqrt(np.nanmean(off_m**2)), np.isfinite(off_m).mean()
+
+
+@pytest.mark.parametrize(
+    ("heights", "most_m"), [(level, 0.01), (kerbs, 0.03), (ramp, 0.03), (hills, 0.01), (lambda x, y: 0.2 * x, 0.02)]
+)
+def test_heights_are_those_above_what_one_drives_on(heights, most_m):
+    ground = ground_of(seen(heights))
+    error_m, known = rms_m(ground, heights)
+    assert error_m < most_m
+    assert known == 1.0
+
+
+def test_what_stands_and_what_hangs_is_no_ground():
+    cars = []
+    for k, (x, y) in enumerate([(-15, 4), (-8, -4), (7, 4), (14, -4), (14, 4), (22, 4)]):
+        roof = seen(level, 300, 1.0, seed=k, noise_m=0.01) * [2.0, 0.9, 1.0] + [x, y, 1.45]
+        side = upright([(x - 2, y - 0.9), (x + 2, y - 0.9)], 0.25, 1.2, 200, seed=k)
+        cars += [roof, side]
+    crown = seen(level, 500, 4.0, noise_m=0.5) + [0.0, 12.0, 4.0]
+    road = seen(level)
+    for x, y in [(-15, 4), (-8, -4), (7, 4), (14, -4), (14, 4), (22, 4)]:
+        road = cut(road, x=(x - 2, x + 2), y=(y - 0.9, y + 0.9))  # nobody sees the ground below a car
+    wall = upright([(-38.0, 20.0), (38.0, 20.0)], 0.0, 9.0, 6000)
+    ground = ground_of(np.concatenate([cut(road, y=(20.0, np.inf)), *cars, crown, wall]))
+    for what in (*cars, crown, wall):
+        np.testing.assert_allclose(ground.heights_m(what), what[:, 2], atol=0.05)
+
+
+def test_a_few_reflections_below_the_road_do_not_lower_it():
+    below = seen(level, 600, 40.0, seed=5) - [0.0, 0.0, 2.0]
+    below[:300] = below[300:] + [0.05, 0.05, -0.05]  # in pairs
+    ground = ground_of(np.concatenate([seen(level), below]))
+    assert rms_m(ground, level)[0] < 0.01
+    assert (ground.heights_m(below) < -1.5).all()
+
+
+def test_a_lorry_without_a_foot_far_away_is_unknown_and_not_ground():
+    far = upright([(70.0, -1.2), (70.0, 1.2)], 1.0, 3.5, 60)
+    ground = ground_of(np.concatenate([seen(level), far]))
+    assert np.isnan(ground.heights_m(far)).all()
+    near = far - [25.0, 0.0, 0.0]  # 5 m behind what was seen
+    np.testing.assert_allclose(ground_of(np.concatenate([seen(level), near])).heights_m(near), near[:, 2], atol=0.1)
+
+
+def test_of_two_roads_above_each_other_it_is_that_of_the_vehicle():
+    road = seen(level)
+    deck = seen(level, 6000, 40.0, seed=2) * [1.0, 0.12, 1.0] + [0.0, 0.0, 5.5]  # 10 m wide
+    under = ground_of(road, deck, place_m=np.array([0.0, 0.0, 0.0]))
+    np.testing.assert_allclose(under.heights_m(deck), 5.5, atol=0.15)
+    # From above nobody sees what is below the deck, nor next to it behind the parapet.
+    above = ground_of(cut(road, y=(-7.0, 7.0)), deck, place_m=np.array([0.0, 0.0, 5.5]))
+    np.testing.assert_allclose(above.heights_m(deck), 0.0, atol=0.15)
+    off_m = above.heights_m(road)
+    assert np.isnan(off_m[np.abs(road[:, 1]) > 17.0]).all()
+    np.testing.assert_allclose(off_m[np.isfinite(off_m)], -5.5, atol=0.5)
+
+
+def test_beyond_what_was_seen_nothing_is_known():
+    road = seen(level)
+    holed = road[np.hypot(*(road[:, :2] - [5.0, 20.0]).T) > 16.0]
+    ground = ground_of(holed)
+    places_m = np.array([[5.0, 20.0, 1.0], [5.0, 7.0, 1.0], [-30.0, 0.0, 1.0], [70.0, 0.0, 1.0], [0.0, -999.0, 1.0]])
+    found_m = ground.heights_m(places_m)
+    assert np.isnan(found_m).tolist() == [True, False, False, True, True]
+    np.testing.assert_allclose(found_m[1:3], 1.0, atol=0.05)
+
+
+def test_where_there_are_only_walls_there_is_no_ground():
+    walls = [upright([(-40.0, y), (40.0, y)], 0.0, 6.0, 8000) for y in (-4.0, 4.0)]
+    assert ground_of(*walls) is None
+    ceiling = seen(level, 5000) * [1.0, 0.1, 1.0] + [0.0, 0.0, 6.0]
+    assert ground_of(*walls, ceiling) is None
+    assert ground_of(np.empty((0, 3))) is None
+    assert ground_of() is None
+    assert ground_of(seen(level) + [100.0, 0.0, 0.0]) is None  # none of it is near
+
+
+def test_points_without_a_place_say_nothing():
+    road = seen(hills)
+    bad = np.array([[np.nan, 0.0, 0.0], [0.0, 0.0, np.inf], [1.0, 1.0, -np.inf]])
+    places_m = seen(hills, 100, seed=7)
+    expected_m = ground_of(road).heights_m(places_m)
+    np.testing.assert_array_equal(ground_of(np.concatenate([road, bad])).heights_m(places_m), expected_m)
+    assert np.isnan(ground_of(road).heights_m(np.array([[np.nan, 0.0, 0.0], [0.0, 0.0, np.nan]]))).all()
+
+
+def test_neither_the_order_of_points_nor_of_sweeps_matters():
+    one, two, places_m = seen(hills, seed=1), seen(kerbs, 3000, seed=2), seen(hills, 300, seed=3)
+    expected_m = ground_of(one, two).heights_m(places_m)
+    turned = np.random.default_rng(0).permutation(one)
+    np.testing.assert_allclose(ground_of(two, turned).heights_m(places_m), expected_m, atol=2e-6)
+
+
+def test_large_coordinates_change_nothing():
+    road, places_m = seen(hills), seen(hills, 300, seed=3)
+    expected_m = ground_of(road).heights_m(places_m)
+    shift_m = np.array([4096 * CELL_M, -8192 * CELL_M, 512.0])
+    shifted = ground_of(road + shift_m, place_m=shift_m)
+    np.testing.assert_allclose(shifted.heights_m(places_m + shift_m), expected_m, atol=1e-8)

@@ -1,0 +1,206 @@
+"""The ground of a recording: what sweeps have seen of it as a height field, and where nobody knows.
+
+*Low surfaces.* In each upright column, `CELL_M` wide, the lowest point that another confirms within `THICK_M` begins the
+low surface; a lone one counts where there is no other. Its place is the mean of all points within `THICK_M` above that,
+so that noise cancels. Where something goes on above it (`STANDS_M`), it may be the lower end of a thing whose foot
+nobody sees, as of a lorry far away: such a column says nothing about the ground.
+
+*Height field.* In every square of `NODE_M` the column that a fifth lie below stands for all: below roofs, and above a
+few reflections. Through these goes a height field, from coarse to fine (`geometry.fitted`): what lies too high counts a
+ninth of what lies too low, and what lies farther off than 15 % of a scale counts for nothing.
+
+*What is connected.* Before that, and again with those squares alone whose column lies on the field, what counts is
+where one gets to from beside the vehicle: from each square to all others within `REACH`, unless they are higher or lower
+by more than a kerb and a steep slope, or by a metre. A bridge above the own road is higher, a road below the own bridge
+lower. The field is fitted again to what is left, and then, with squares of 1.25 m, to all columns there: kerbs stay.
+
+*What is unknown.* Farther than `REACH` from all such squares there is no height, and no band. Of surfaces above each
+other it is the one that is connected with the vehicle's; stairs lead nowhere.
+
+Others: Patchwork++ (Lee et al., 2022) fits planes to the lowest points of sectors of rings around one scan, and accepts
+them by tilt, height and flatness; its patches know nothing of each other, and it gives no heights in between.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import HeightField, fitted
+
+Bools = NDArray[np.bool_]
+Float64 = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+CELL_M = 0.5
+THICK_M = 0.15
+STANDS_M = (0.3, 1.2)
+NODE_M = 2.0
+FIFTH = 0.2
+COARSE_M, FINE_M = (80.0, 40.0, 20.0, 10.0, 5.0, 2.5), (1.25,)
+BENEATH = 0.1
+# So near to the field lies what is part of it: a kerb beside the road, and what the field smooths.
+ON_FIELD_M = 0.2
+# Squares from the one to the other in any direction, as far as one may look for ground, and know it.
+REACH = 5
+# A kerb, the steepest slope, and the most that the ground rises between two squares.
+KERB_M, STEEPEST, RISE_M = 0.1, 0.25, 1.0
+# The vehicle stands on most of the squares that are hardly farther away than the nearest; no ground is so high above
+# the origin of its frame. Of fewer squares there is no ground.
+START_M, HIGHEST_M, FEWEST = 8.0, 3.0, 25
+# Nothing is asked about what lies farther away, or so much higher or lower.
+AROUND_M = 200.0
+SIDE = int(2 * AROUND_M / NODE_M) + 2 * REACH + 1
+
+
+class GroundModel(NamedTuple):
+    """The ground around a place, made as this module says.
+
+    Args:
+        lower_m: (2,) where it begins, in the frame of the points that it was made of.
+        field: The heights, from there.
+        known: (SIDE^2,) squares, row after row along y, in which there is a height; they begin `REACH` before that.
+
+    Example:
+        >>> x, y = np.meshgrid(np.arange(-20, 20, 0.3), np.arange(-20, 20, 0.3))
+        >>> road_m = np.stack([x.ravel(), y.ravel(), 0.05 * x.ravel() - 1.7], axis=1)
+        >>> ground = GroundModel.below([low_surfaces(road_m, np.zeros(3))], np.zeros(3))
+        >>> ground.heights_m(np.array([[10.0, 0.0, 0.3], [50.0, 0.0, 1.0]])).round(2)
+        array([1.5, nan])
+    """
+
+    lower_m: Float64
+    field: HeightField
+    known: Bools
+
+    @classmethod
+    def below(cls, surfaces: Sequence[Float64], place_m: Float64) -> "GroundModel | None":
+        """The ground that sweeps have seen around a place.
+
+        Args:
+            surfaces: `low_surfaces` of each sweep.
+            place_m: (3,) where the vehicle is.
+
+        Returns:
+            It; None where none of it is near the vehicle.
+        """
+        low, above_m = _columns(np.concatenate([np.empty((0, 4)), *surfaces]), place_m)
+        lower_m, size_m = place_m[:2] - AROUND_M, np.full(2, 2 * AROUND_M)
+        stands = above_m - low[:, 2] < STANDS_M[1]
+        clear = np.flatnonzero(~_beside_what_stands(low, stands, lower_m)[~stands])
+        across_m, heights_m = low[~stands, :2] - lower_m, low[~stands, 2]
+        square = _squares(across_m)
+        chosen = clear[_a_fifth_below(square[clear], heights_m[clear])]
+        for _ in range(2):
+            found = _connected(square[chosen], heights_m[chosen] - place_m[2])
+            chosen = chosen[found[square[chosen]]]
+            if len(chosen) < FEWEST:
+                return None
+            field = fitted(across_m[chosen], heights_m[chosen], size_m, COARSE_M, beneath=BENEATH)
+            off_m = heights_m[chosen] - field.heights_m(across_m[chosen])
+            chosen = chosen[np.abs(off_m) < ON_FIELD_M]
+        own = found[square]
+        field = fitted(across_m[own], heights_m[own], size_m, FINE_M, on=field)
+        known = np.zeros(SIDE**2, dtype=np.bool_)
+        known[square[chosen][:, None] + _around()[0]] = True
+        return cls(lower_m, field, known)
+
+    def heights_m(self, points_m: NDArray[np.floating]) -> Float64:
+        """(N,) how high above the ground (N, 3) points are, below it less than 0; NaN where that is unknown."""
+        across_m = points_m[:, :2] - self.lower_m
+        heights_m = np.full(len(points_m), np.nan)
+        inside = np.flatnonzero(((across_m >= 0) & (across_m < 2 * AROUND_M)).all(axis=1))
+        inside = inside[self.known[_squares(across_m[inside])]]
+        heights_m[inside] = points_m[inside, 2] - self.field.heights_m(across_m[inside])
+        return heights_m
+
+
+def low_surfaces(points_m: Float64, place_m: Float64) -> Float64:
+    """What a sweep says about the ground: much less than all of its points.
+
+    Args:
+        points_m: (N, 3) points that belong to nothing that moves.
+        place_m: (3,) where the vehicle was, in the same frame, whose z points up.
+
+    Returns:
+        (K, 4) places of the low surfaces of columns with the number of their points, and the lowest of what stands or
+        hangs above each, as one point.
+    """
+    low, above_m = _columns(np.column_stack([points_m, np.ones(len(points_m))]), place_m)
+    below = np.isfinite(above_m)
+    above = np.column_stack([low[below, :2], above_m[below], np.ones(np.count_nonzero(below))])
+    return np.concatenate([low, above])
+
+
+def _columns(points: Float64, place_m: Float64) -> tuple[Float64, Float64]:
+    """(K, 4) low surfaces of the columns of (N, 4) places with counts; (K,) what is lowest above each, or infinite."""
+    points = points[(np.abs(points[:, :3] - place_m) < AROUND_M).all(axis=1)]
+    cells = np.floor(points[:, :2] / CELL_M).astype(np.int64) - np.floor((place_m[:2] - AROUND_M) / CELL_M).astype(int)
+    key = (cells[:, 1] << 10) + cells[:, 0]
+    above_um = (1e6 * (points[:, 2] - place_m[2] + AROUND_M)).astype(np.int64)
+    order = np.argsort((key << 29) + above_um, kind="stable")
+    key, points = key[order], points[order]
+    if not len(key):
+        return points, np.empty(0)
+    same = np.diff(key) == 0
+    first = np.append(0, np.flatnonzero(~same) + 1)
+    column = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(key))))
+    z, count = points[:, 2:].T
+    confirmed = count > 1
+    confirmed[:-1] |= same & (np.diff(z) <= THICK_M)
+    bottom = np.minimum.reduceat(np.where(confirmed, np.arange(len(z)), len(z)), first)
+    over_m = z - z[np.where(bottom < len(z), bottom, first)][column]
+    weights = count * ((over_m >= 0) & (over_m <= THICK_M))
+    sums = [np.bincount(column, weights * values) for values in (*points[:, :3].T, 1.0)]
+    low = np.stack([*(total / sums[3] for total in sums[:3]), sums[3]], axis=1)
+    return low, np.minimum.reduceat(np.where(z > low[column, 2] + STANDS_M[0], z, np.inf), first)
+
+
+def _beside_what_stands(low: Float64, stands: Bools, lower_m: Float64) -> Bools:
+    """(K,) whether something stands in a column, or in one beside it that begins no higher: this may be a part of it."""
+    x, y = (np.floor(low[:, :2] / CELL_M) - np.floor(lower_m / CELL_M)).astype(np.int64).T + 1
+    bottom_m = np.full(np.full(2, int(2 * AROUND_M / CELL_M) + 3), np.inf)
+    bottom_m[y[stands], x[stands]] = low[stands, 2]
+    around_m = np.min([bottom_m[y + dy, x + dx] for dy in (-1, 0, 1) for dx in (-1, 0, 1)], axis=0)
+    beside: Bools = low[:, 2] > around_m - THICK_M
+    return beside
+
+
+def _squares(across_m: Float64) -> Numbers:
+    """(N,) numbers of the squares of (N, 2) places from the first corner."""
+    x, y = (across_m / NODE_M).astype(np.int64).T + REACH
+    return y * SIDE + x
+
+
+def _a_fifth_below(square: Numbers, heights_m: Float64) -> Numbers:
+    """(K,) numbers of the places that stand for their squares."""
+    order = np.lexsort((heights_m, square))
+    first = np.flatnonzero(np.diff(square[order], prepend=-1))
+    count = np.diff(np.append(first, len(order)))
+    return order[first + (FIFTH * count).astype(np.int64)]
+
+
+def _around() -> tuple[Numbers, Float64]:
+    """Steps from one square to all that are near, and how far each is."""
+    y, x = np.indices((2 * REACH + 1, 2 * REACH + 1)).reshape(2, -1) - REACH
+    near = np.hypot(x, y) <= REACH
+    return (y * SIDE + x)[near], NODE_M * np.hypot(x, y)[near]
+
+
+def _connected(square: Numbers, heights_m: Float64) -> Bools:
+    """(SIDE^2,) squares that one gets to from the middle, of those with heights above the vehicle's origin."""
+    height_m, found = np.full(SIDE**2, np.nan), np.zeros(SIDE**2, dtype=np.bool_)
+    height_m[square] = heights_m
+    away_m = NODE_M * np.hypot(*(np.array(np.divmod(square, SIDE)) - SIDE // 2))
+    near = (away_m <= away_m.min(initial=2 * START_M) + START_M) & (heights_m < HIGHEST_M)
+    front = square[near][np.abs(heights_m[near] - np.median(heights_m[near])) < RISE_M] if near.any() else square[:0]
+    step, step_m = _around()
+    rise_m = np.minimum(KERB_M + STEEPEST * step_m, RISE_M)
+    while len(front):
+        found[front] = True
+        others = front[:, None] + step
+        # A square without a height is NaN, which is near to nothing.
+        reached = others[(np.abs(height_m[others] - height_m[front, None]) <= rise_m) & ~found[others]]
+        front = np.unique(reached)
+    return found
