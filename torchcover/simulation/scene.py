@@ -231,13 +231,8 @@ class Scene:
         """
         if not self.world.ego.trajectory.moves:
             return ()
-        ego, own_m = self._solids.of(self.world.ego.mesh).caster, []
-        for tile in tiles:
-            directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
-            limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
-            hits = ego.cast(vehicle_T_sensor[:3, 3], directions, limit_m)
-            own_m.append(np.where(hits.body >= 0, hits.range_m, np.float32(np.inf)))
-        return tuple(own_m)
+        ego = self._solids.of(self.world.ego.mesh).caster
+        return tuple(ends_at(ego, vehicle_T_sensor, tile, max_range_m) for tile in tiles)
 
     def encloses(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies inside the ego's body, so that no ray gets out."""
@@ -266,3 +261,11 @@ class Scene:
         # The ego is where it is, to the last bit: what a sensor sees of it is the same at every step.
         vehicle_T_part[[actor is self.world.ego for actor in actors]] = np.eye(4)
         return Moving.placed(solids, vehicle_T_part, self._first_moving + numbers)
+
+
+def ends_at(caster: RayCaster, vehicle_T_sensor: Matrix, tile: Tile, max_range_m: float) -> Float32:
+    """(n,) where bodies in the vehicle frame end the rays of a tile; infinite where they do not."""
+    directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
+    limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
+    hits = caster.cast(vehicle_T_sensor[:3, 3], directions, limit_m)
+    return np.where(hits.body >= 0, hits.range_m, np.float32(np.inf))

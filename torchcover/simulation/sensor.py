@@ -3,7 +3,7 @@
 Another kind is a class with the members of `Sensor` and a line in `kinds.py`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
+from torchcover.simulation.bodies import Body
 from torchcover.simulation.documents import Document, Pose
 from torchcover.simulation.raycaster import Struck
 from torchcover.simulation.weather import CLEAR, Weather
@@ -148,6 +149,11 @@ class Sensor(Protocol):
         ...
 
     @property
+    def housing(self) -> Sequence[Body]:
+        """What it is built into, in its own frame: the other sensors of its rig see that, and it looks out of it."""
+        ...
+
+    @property
     def is_exact(self) -> bool:
         """Whether it measures the same thing alike at any time: its measuring draws no random numbers."""
         ...
@@ -191,12 +197,14 @@ class Ranging(Document):
         max_range_m: Farther hits give no point.
         range_noise_m: Standard deviation of the measured range, along the ray.
         dropout: Probability that a point is missing, from 0 to 1.
+        housing: Bodies that it is built into or stands on, in its own frame, which are in the way of the rig's others.
     """
 
     min_range_m: NonNegativeFloat = 0.0
     max_range_m: PositiveFloat
     range_noise_m: NonNegativeFloat = 0.0
     dropout: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    housing: tuple[Body, ...] = ()
 
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:

@@ -1,5 +1,6 @@
 """What is seen from a place on the ego: by the rays of a sensor, or of given points."""
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -8,8 +9,9 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import rigid
 from torchcover.simulation.instant import Instant, SensorScan
+from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import BLOCK, Tile, into_tiles, pixels_in_tiles
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.scene import Scene, ends_at
 from torchcover.simulation.sensor import Draws, RayHits, Sensor
 from torchcover.simulation.weather import CLEAR, Weather
 
@@ -37,9 +39,12 @@ class MountedSensor:
         scene: Where it is.
         reach_m: How far its rays are cast there; `Scenario.reach_m`.
         weather: What they go through.
+        others: The other sensors of its rig, whose housings may be in the way.
     """
 
-    def __init__(self, sensor: Sensor, scene: Scene, reach_m: float, weather: Weather = CLEAR) -> None:
+    def __init__(
+        self, sensor: Sensor, scene: Scene, reach_m: float, weather: Weather = CLEAR, others: Sequence[Sensor] = ()
+    ) -> None:
         self.sensor = sensor
         self.reach_m = reach_m
         self.weather = weather
@@ -48,6 +53,14 @@ class MountedSensor:
         self.tiles = into_tiles(directions)
         self.pixel_of_ray = pixels_in_tiles(directions)
         self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
+        housings = [
+            mesh.moved(other.mount.matrix()) for other in others for body in other.housing for mesh in body.meshes()
+        ]
+        if housings:
+            caster = RayCaster(housings)
+            ends_m = [ends_at(caster, self.vehicle_T_sensor, tile, reach_m) for tile in self.tiles]
+            ego_m = self._own_m or ends_m
+            self._own_m = tuple(np.minimum(*both) for both in zip(ends_m, ego_m, strict=True))
         self._at_rest = not scene.moves
         self._resting: tuple[SensorScan, RayHits] | None = None
 

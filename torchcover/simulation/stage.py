@@ -179,7 +179,16 @@ class Stages:
         self._check_mounts(scene)
         scenario = self._scenes.scenario
         return {
-            name: [MountedSensor(one, scene, scenario.reach_m(one), scenario.weather) for one in rig.sensors]
+            name: [
+                MountedSensor(
+                    one,
+                    scene,
+                    scenario.reach_m(one),
+                    scenario.weather,
+                    [other for other in rig.sensors if other is not one],
+                )
+                for one in rig.sensors
+            ]
             for name, rig in self._rigs.items()
         }
 
