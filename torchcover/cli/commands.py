@@ -53,7 +53,7 @@ def study(
     print_study(found, files, out, explain=explain)
 
 
-@with_options(of_evaluate("scenario", "seed", "vehicle", "sensor_model", "reference", "rays", "every_s"))
+@with_options(of_evaluate("scenario", "seed", "vehicle", "sensor_model", "weather", "reference", "rays", "every_s"))
 def record(
     rig: options.Rig,
     out: Annotated[
@@ -325,7 +325,7 @@ def list_builtin(
         str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
     ] = None,
 ) -> None:
-    """List the built-in rigs, scenarios, LiDAR models, vehicles and materials."""
+    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials and weather."""
     from torchcover.cli.listing import run
 
     run(word)

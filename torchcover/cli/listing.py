@@ -14,7 +14,7 @@ from torchcover.simulation import builtin_documents
 
 
 def run(word: str | None) -> None:
-    """Print the built-in rigs, scenarios, LiDAR models, vehicles and materials: what each is, and its first sentence.
+    """Print what is built in: what each consists of, and its first sentence.
 
     Args:
         word: Only those with it in a column; their descriptions are then printed whole.
@@ -30,6 +30,7 @@ def run(word: str | None) -> None:
         ("lidars", _rows),
         ("vehicles", None),
         ("materials", _reflectivity),
+        ("weather", None),
     ):
         rows = []
         for name, document in builtin_documents(kind).items():

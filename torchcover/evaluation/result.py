@@ -259,7 +259,7 @@ class Result:
         rays, every_s = record["rays_per_step"], record["every_s"]
         sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
         carried = [f"Vehicle: {self.vehicle}."] if self.vehicle else []
-        carried += sensor_model_words(self.source.get("sensor_model"))
+        carried += sensor_model_words(self.source.get("sensor_model")) + weather_words(self.source.get("weather"))
         return [*on_failure, *carried, sensor, *record["notes"], *self._on_refused, *self._on_repetitions]
 
     @property
@@ -324,3 +324,14 @@ def sensor_model_words(of_rigs: object) -> list[str]:
         (model,) = set(of_rigs.values())
         return [f"Sensor model: {model}, {means[model]}."]
     return [f"Sensor models: {', '.join(f'{rig} {model}' for rig, model in of_rigs.items())}: differences are of both."]
+
+
+def weather_words(of_rigs: object) -> list[str]:
+    """What the rigs were measured in, in words; none where that is clear air or unknown.
+
+    Example:
+        >>> weather_words({"kitti, clear": "clear", "kitti, fog_100m": "fog_100m"}), weather_words({"kitti": "clear"})
+        (['Weather: clear, fog_100m.'], [])
+    """
+    names = dict.fromkeys(of_rigs.values()) if isinstance(of_rigs, Mapping) else {}
+    return [f"Weather: {', '.join(names)}."] if names and list(names) != ["clear"] else []

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torchcover.evaluation.ranks import Ranks
     from torchcover.evaluation.target_error import TargetError
     from torchcover.frames import FrameSource
-    from torchcover.simulation import RegionsOfInterest, Rig, Scenario
+    from torchcover.simulation import RegionsOfInterest, Rig, Scenario, Weather
 
     AnyRig = Rig | str | Path
 
@@ -109,6 +109,15 @@ def _target(given: "TargetError | str | Sequence[str] | None") -> "TargetError |
     return given if isinstance(given, TargetError) else TargetError.parse(given)
 
 
+def _weather(given: "Weather | str | Path | Sequence[Weather | str | Path]") -> "tuple[Weather, ...]":
+    if not given:
+        return ()
+    from torchcover.simulation import Weather
+
+    each = [given] if isinstance(given, (Weather, str, Path)) else given
+    return tuple(one if isinstance(one, Weather) else Weather.load(one) for one in each)
+
+
 def _device(given: "str | torch.device") -> str:
     return str(given)
 
@@ -161,6 +170,14 @@ class Settings:
             in_study=True,
         ),
     ] = None
+    weather: Annotated[
+        Read["Weather | str | Path | Sequence[Weather | str | Path]", "tuple[Weather, ...]"],
+        Option(
+            "Weather in place of the scenario's: a built-in name as fog_100m (see `list`) or a YAML file. In several, "
+            "every rig is measured in each; `compare` of one rig puts it beside `clear`.",
+            list[str],
+        ),
+    ] = Read(_weather, ())
     ask: Annotated[
         Read["RegionsOfInterest | str | Path | None", "RegionsOfInterest | None"],
         Option(
@@ -303,8 +320,8 @@ class Settings:
         Raises:
             ValueError: The vehicle, the sensor model, the reference sensor, its rays or the time between steps was set.
         """
-        if self.sensor_model is not None:
-            raise ValueError("sensor_model: for simulations; a recording has the points that returned")
+        if self.sensor_model is not None or self.weather:
+            raise ValueError("sensor_model and weather are for simulations; a recording has the points that returned")
         if self.vehicle is not None:
             raise ValueError("vehicle: for simulations; a recording has its own")
         if any(setting is not None for setting in (self.reference, self.rays, self.every_s)):

@@ -42,4 +42,5 @@ from .simulator import Observation as Observation
 from .simulator import Simulator as Simulator
 from .surface_reference import SurfaceReference as SurfaceReference
 from .world import Label as Label
+from .weather import Weather as Weather
 from .writing import write_recording as write_recording

@@ -14,6 +14,7 @@ from torchcover.simulation.lidar import Lidar, LidarModel
 from torchcover.simulation.scenario import DEFAULT_EGO, Mover, Scenario
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import MeshFile
+from torchcover.simulation.weather import Weather
 
 
 def read_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whatever stood in the file, or a sensor)
@@ -32,6 +33,7 @@ class Rig(Document):
         description: What it is, and where its numbers come from.
         vehicle: What carries it, a built-in vehicle or the YAML file of one, where neither the user nor the scenario
             decides that.
+        weather: What it is measured in, in place of the scenario's.
         sensors: The sensors, each of a kind in `SENSORS`; their clouds are fused.
 
     Example:
@@ -42,6 +44,7 @@ class Rig(Document):
     name: str
     description: str = ""
     vehicle: NameOrFile | None = None
+    weather: Weather | None = None
     sensors: tuple[Annotated[Sensor, PlainValidator(read_sensor)], ...] = Field(min_length=1)
 
     @model_validator(mode="after")

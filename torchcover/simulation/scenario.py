@@ -146,12 +146,16 @@ class Scenario(Document):
         episode, step = divmod(index, self.steps)
         return (0 if self.repeats else episode), step
 
-    def reach_m(self, sensor: Sensor) -> float:
+    def reach_m(self, sensor: Sensor, weather: Weather | None = None) -> float:
         """How far the rays of a sensor are cast in it: cameras see no farther than people, radars through fog.
 
         What fog leaves of the light of a LiDAR is decided hit by hit, unless every hit returns.
+
+        Args:
+            sensor: The sensor.
+            weather: In place of its own.
         """
-        seen_m = self.weather.visibility_m
+        seen_m = (weather or self.weather).visibility_m
         if seen_m is None or isinstance(sensor, Radar) or (isinstance(sensor, Lidar) and sensor.range_at_10_percent_m):
             return sensor.max_range_m
         return min(sensor.max_range_m, seen_m)

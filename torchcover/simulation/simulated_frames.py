@@ -170,6 +170,7 @@ class SimulatedFrames(FrameDataset):
             "scenario": self.scenario.name,
             "vehicle": self.scenario.ego_name,
             "sensor_model": {name: rig.sensor_model for name, rig in self.rigs.items()},
+            "weather": {name: (rig.weather or self.scenario.weather).name for name, rig in self.rigs.items()},
             "frames": None,
             "seed": self.seed,
         }

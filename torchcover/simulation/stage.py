@@ -183,8 +183,8 @@ class Stages:
                 MountedSensor(
                     one,
                     scene,
-                    scenario.reach_m(one),
-                    scenario.weather,
+                    scenario.reach_m(one, rig.weather),
+                    rig.weather or scenario.weather,
                     [other for other in rig.sensors if other is not one],
                 )
                 for one in rig.sensors
