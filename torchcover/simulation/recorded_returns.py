@@ -32,7 +32,7 @@ CLEAR, ABOUT = 0.97, (0.85, 1.2)
 # A sector in which fewer of the nearest rays return is blocked by the vehicle or by the housing of another sensor.
 OPEN_SHARE = 0.6
 # What is known before anything was seen: the spread of ln range.
-USUAL_SPREAD, SPREAD_IS_SURE_TO = 0.3, 0.5
+USUAL_SPREAD, SPREAD_IS_SURE_TO = 0.3, 0.7
 # Twice the range is refused where ln of the likelihood falls by so much: two standard errors.
 LESS_LIKELY = 2.0
 CURVATURE_OVER = 0.05
