@@ -16,6 +16,7 @@ SCORE_HEADINGS = (
     "| LiDARs | measure | steps | detection (points) | radius (factor) | orderings in rows | all orderings | "
     "Spearman, detection | Spearman, radius |"
 )
+HIGHER_HEADINGS = "| LiDARs | measure | larger at obstacle height | ground within 20 m: grille and roof, 128 rows (m) |"
 MEASURE_WORDS = {"known": "known cells", "area": "by area"}
 
 
@@ -63,7 +64,7 @@ def as_markdown(results):
             f"{each.rows_held} of {each.rows} | {each.pairs_held} of {each.pairs} | "
             f"{each.spearman_detection:.3f} | {each.spearman_radius:.3f} |"
         )
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, "", "### Radii at obstacle height", "", *_higher_up(results, last), ""])
 
 
 def as_records(results):
@@ -96,6 +97,22 @@ def _table(known, area):
             cells += [_words(known[place]), f"{paper[place]:.2f}", _words(ratio), _words(area[place])]
         lines.append(f"| {' | '.join(cells)} |")
     return [*lines, ""]
+
+
+def _higher_up(results, last):
+    """In how many of the rows radii are larger at obstacle height than on the ground, as all of the paper's are."""
+    lines = [HIGHER_HEADINGS, f"|{' --- |' * 2}{' ---: |' * 2}"]
+    for (lidars, measure, steps), run in results.items():
+        if steps == last:
+            radii = {(lidar, region): _radii(run, lidar, region) for lidar, region in product(LIDARS, REGIONS)}
+            larger = sum(obstacle > ground for ground, obstacle in radii.values())
+            near = " and ".join(f"{radii[lidar, REGIONS[0]][0]:.2f}" for lidar in ("grille_128", "roof_128"))
+            lines.append(f"| {lidars} | {MEASURE_WORDS[measure]} | {larger} of {len(radii)} | {near} |")
+    return lines
+
+
+def _radii(run, lidar, region):
+    return [run[Place("radius_m", lidar, region, height)].value for height in HEIGHTS]
 
 
 def _words(number):

@@ -206,7 +206,7 @@ def saved(tmp_path):
     return path
 
 
-NOT_ONE = r"coverage\.npz: (not a coverage file as Coverage\.save writes it \(.+\)|an empty file)"
+NOT_ONE = r"coverage\.npz: (not a coverage file as Coverage\.save writes it \(.+|an empty file)"
 
 
 @pytest.mark.parametrize("content", [b"", b"hello world", b"PK\x03\x04" + bytes(100), pickle.dumps([1, 2, 3])])

@@ -74,7 +74,7 @@ def test_what_stands_and_what_hangs_is_no_ground():
         roof = seen(level, 300, 1.0, seed=k, noise_m=0.01) * [2.0, 0.9, 1.0] + [x, y, 1.45]
         side = upright([(x - 2, y - 0.9), (x + 2, y - 0.9)], 0.25, 1.2, 200, seed=k)
         cars += [roof, side]
-    crown = seen(level, 500, 4.0, noise_m=0.5) + [0.0, 12.0, 4.0]
+    crown = seen(level, 500, 4.0, noise_m=0.5) + np.array([0.0, 12.0, 4.0])
     road = seen(level)
     for x, y in [(-15, 4), (-8, -4), (7, 4), (14, -4), (14, 4), (22, 4)]:
         road = cut(road, x=(x - 2, x + 2), y=(y - 0.9, y + 0.9))  # nobody sees the ground below a car
@@ -86,7 +86,7 @@ def test_what_stands_and_what_hangs_is_no_ground():
 
 def test_a_few_reflections_below_the_road_do_not_lower_it():
     below = seen(level, 600, 40.0, seed=5) - [0.0, 0.0, 2.0]
-    below[:300] = below[300:] + [0.05, 0.05, -0.05]  # in pairs
+    below[:300] = below[300:] + np.array([0.05, 0.05, -0.05])  # in pairs
     ground = ground_of(np.concatenate([seen(level), below]))
     assert rms_m(ground, level)[0] < 0.01
     assert (ground.heights_m(below) < -1.5).all()
@@ -130,7 +130,7 @@ def test_where_there_are_only_walls_there_is_no_ground():
     assert ground_of(*walls, ceiling) is None
     assert ground_of(np.empty((0, 3))) is None
     assert ground_of() is None
-    assert ground_of(seen(level) + [100.0, 0.0, 0.0]) is None  # none of it is near
+    assert ground_of(seen(level) + np.array([100.0, 0.0, 0.0])) is None  # none of it is near
 
 
 def test_points_without_a_place_say_nothing():

@@ -117,7 +117,7 @@ def read_coverage(path: Path) -> CoverageParts:
     except (TooLargeError, MemoryError):
         raise
     except Exception as error:  # damage shows anywhere: in the zip, zlib, NumPy, JSON, or as a missing part
-        reason = " ".join(str(error).split()) or type(error).__name__
+        reason = str(error) or type(error).__name__
         raise ValueError(f"not a coverage file as Coverage.save writes it ({reason})") from error
     if parts is None:
         raise ValueError(f"coverage format {version}; this torchcover reads format {FORMAT_VERSION}")

@@ -294,9 +294,9 @@ class Result:
         if not again:
             return []
         if steps - again == 1:
-            about = ": ± is about the reference sensor's places only" if self._has_errors else ""
+            about = ": intervals are about the reference sensor's places only" if self._has_errors else ""
             return [f"All {steps:,} steps show the same instant{about}."]
-        known = ", which ± knows" if self._has_errors else ""
+        known = ", which intervals know" if self._has_errors else ""
         return [f"{steps - again:,} different instants in {steps:,} steps: the scenario was seen again{known}."]
 
     @property

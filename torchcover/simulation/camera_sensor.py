@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcover.cameras import Camera
 from torchcover.geometry import rigid
 from torchcover.simulation.documents import Document, Pose
-from torchcover.simulation.sensor import Ranging
+from torchcover.simulation.sensor import Ranging, Scan
 
 # The camera frame is x right, y down, z forward; a mount looks along its x, with y left and z up.
 MOUNT_T_CAMERA = rigid(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
@@ -53,6 +53,7 @@ class CameraSensor(Ranging):
             same.
         stereo: Its error in depth as that of a pair of cameras; none if not given.
         range_noise_share: Standard deviation of measured ranges, as a share of the range.
+        scan: When its rows are cast, as by a rolling shutter; all at once if not given.
         min_range_m, max_range_m, range_noise_m, dropout: As in `Ranging`; ranges are along the ray.
 
     Example:
@@ -76,6 +77,7 @@ class CameraSensor(Ranging):
     stride: PositiveInt = 1
     stereo: Stereo | None = None
     range_noise_share: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    scan: Scan | None = None
 
     @model_validator(mode="after")
     def _check_lens(self) -> Self:
@@ -156,6 +158,13 @@ class CameraSensor(Ranging):
         """(3, rows, columns) unit directions in the frame of the mount; NaN where a pixel has no ray."""
         rows, columns = (torch.arange(0, size, self.stride, dtype=torch.float64) for size in (self.height, self.width))
         return self._directions(torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2))
+
+    def times_s(self) -> NDArray[np.float64] | None:
+        """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
+        if self.scan is None:
+            return None
+        of_rows_s = self.scan.times_s(self.height)[:: self.stride]
+        return np.repeat(of_rows_s[:, None], -(-self.width // self.stride), axis=1)
 
     def _directions(self, pixels: Tensor) -> NDArray[np.float64]:
         """(3, rows, columns) of (rows, columns, 2) pixels."""

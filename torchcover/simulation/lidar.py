@@ -11,7 +11,7 @@ from torchcover.simulation.documents import Pose, beside, is_file_name, load_doc
 from torchcover.simulation.material import material_number, materials, tone
 from torchcover.simulation.rays import unit_directions
 from torchcover.simulation.returns import log_excess, return_probability
-from torchcover.simulation.sensor import Draws, Elevation, Ranging, RayHits, Returns
+from torchcover.simulation.sensor import Draws, Elevation, Ranging, RayHits, Returns, Scan
 
 # Two ways to write rows: a sensor that chooses one of them takes nothing of the other from its model.
 SPACED_ROWS = ("channels", "vertical_fov_deg")
@@ -38,6 +38,7 @@ class ScanPattern(Ranging):
             `log_excess`. None: every hit within `max_range_m` returns.
         spread: Standard deviation of ln of that range between one ray and the next.
         range_factors: Of each row, what its range at 10 % is multiplied with; 1 if not given.
+        scan: When its columns are cast; all at once if not given.
         min_range_m, max_range_m, range_noise_m, dropout: As in `Ranging`.
     """
 
@@ -50,6 +51,7 @@ class ScanPattern(Ranging):
     range_at_10_percent_m: PositiveFloat | None = None
     spread: PositiveFloat = 0.3
     range_factors: tuple[PositiveFloat, ...] | None = None
+    scan: Scan | None = None
 
     @model_validator(mode="after")
     def _check_rows(self) -> Self:
@@ -111,6 +113,11 @@ class ScanPattern(Ranging):
         assert self.channels is not None  # checked in _check_rows
         assert self.vertical_fov_deg is not None
         return np.linspace(*self.vertical_fov_deg, self.channels)
+
+    def times_s(self) -> NDArray[np.float64] | None:
+        """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
+        rows = len(self.rows_deg())
+        return None if self.scan is None else np.tile(self.scan.times_s(self.columns), (rows, 1))
 
     def directions(self) -> NDArray[np.float64]:
         """(3, rows, columns) unit directions in the LiDAR's frame."""

@@ -14,10 +14,13 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
+from torchcover.geometry import transform
 from torchcover.simulation.patches import outward_faces
+from torchcover.simulation.rays import rotate
 from torchcover.simulation.shapes import Mesh
 
 Float32 = NDArray[np.float32]
+Matrix = NDArray[np.float64]
 
 # Farther from the origin float32 resolves no better than 64 m, and at 2e18 Embree drops faces without a word.
 MAX_M = 1e9
@@ -143,7 +146,8 @@ class RayCaster:
     @cached_property
     def _normals(self) -> Float32:
         """(3, F) normals of all faces."""
-        return self._faces.normals.astype(np.float32)
+        normals: Float32 = self._faces.normals.astype(np.float32)
+        return normals
 
     @cached_property
     def _materials(self) -> NDArray[np.uint8]:
@@ -291,3 +295,11 @@ class RayCaster:
             of_body = np.flatnonzero(bodies == number)
             bodies[of_body[~self._closed[number][answer["primID"][of_body]]]] = -1
         return bodies
+
+
+def cast_from(
+    caster: RayCaster, part_T_vehicle: Matrix, origin_m: Matrix, directions: Float32, limit_m: Float32
+) -> Hits:
+    """Cast rays of the vehicle frame at a caster in its own frame."""
+    towards = rotate(part_T_vehicle[:3, :3], directions)
+    return caster.cast(transform(part_T_vehicle, origin_m[None])[0], towards, limit_m)

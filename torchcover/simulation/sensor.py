@@ -172,6 +172,10 @@ class Sensor(Protocol):
         """How many points each of its points is counted as on a body: of a camera, pixels of the full image."""
         ...
 
+    def times_s(self) -> Float64 | None:
+        """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
+        ...
+
     def beams(self) -> Numbers | None:
         """(rows, columns) the number of the beam that each ray is part of; None if each is a beam of its own.
 
@@ -187,6 +191,24 @@ class Sensor(Protocol):
             draws: Source of all random numbers.
         """
         ...
+
+
+class Scan(Document):
+    """How long a sensor takes for its rays: a LiDAR for its columns, in their order, a camera for its rows, from above.
+
+    Args:
+        period_s: From the first to the last.
+        start_s: When the first is cast, after the time of the frame; `-period_s` if not given, so that it ends then.
+    """
+
+    period_s: PositiveFloat
+    start_s: float | None = None
+
+    def times_s(self, count: int) -> Float64:
+        """(count,) when each is cast, after the time of the frame."""
+        start_s = -self.period_s if self.start_s is None else self.start_s
+        times_s: Float64 = start_s + self.period_s * (np.arange(count) + 0.5) / count
+        return times_s
 
 
 class Ranging(Document):
@@ -231,6 +253,10 @@ class Ranging(Document):
     def counts_as(self) -> int:
         """1: a point is a measurement."""
         return 1
+
+    def times_s(self) -> Float64 | None:
+        """None: all rays are cast at the time of the frame."""
+        return None
 
     def beams(self) -> Numbers | None:
         """None: every ray measures alone."""

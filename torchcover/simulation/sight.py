@@ -13,6 +13,7 @@ from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import BLOCK, Tile, into_tiles, pixels_in_tiles
 from torchcover.simulation.scene import Scene, ends_at
 from torchcover.simulation.sensor import Draws, RayHits, Sensor
+from torchcover.simulation.sweep import RayTimes
 from torchcover.simulation.weather import CLEAR, Weather
 
 # Rays in a tile: of neighbours all, so that a tile is narrow. A constant, so that nothing depends on threads.
@@ -52,6 +53,13 @@ class MountedSensor:
         directions = sensor.directions()
         self.tiles = into_tiles(directions)
         self.pixel_of_ray = pixels_in_tiles(directions)
+        self._times = ray_times(sensor, self.tiles, self.pixel_of_ray) if scene.moves else None
+        taken_s = max((float(np.ptp(each.at_s)) for each in self._times or () if len(each.at_s)), default=0.0)
+        if taken_s > scene.world.time_step_s:
+            raise ValueError(
+                f"sensor {sensor.name!r}: a scan of {taken_s:g} s is longer than the time step of the scenario, "
+                f"{scene.world.time_step_s:g} s; shorten its period, or make the time steps longer"
+            )
         self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
         housings = [
             mesh.moved(other.mount.matrix()) for other in others for body in other.housing for mesh in body.meshes()
@@ -74,14 +82,14 @@ class MountedSensor:
         """
         scan, hits = self._cast(instant, threads)
         hit, error_m = self.sensor.measure(hits, draws)
-        scan = scan._replace(struck=None)
+        ways = scan.ways() if error_m is not None and scan.ways else None
+        scan = scan._replace(struck=None, ways=None)
         if hit is not None:
-            scan = scan._replace(points=scan.points[hit], ray=scan.ray[hit], range_m=scan.range_m[hit])
-        if error_m is None:
+            scan = scan.some(hit)
+        if error_m is None or ways is None:
             return scan
-        ways_m = scan.points.astype(np.float64) - self.vehicle_T_sensor[:3, 3]
-        along = error_m[:, None] / np.linalg.norm(ways_m, axis=1, keepdims=True)
-        landed = (scan.points + ways_m * along).astype(np.float32)
+        landed, ways = scan.points if scan.landed is None else scan.landed, ways if hit is None else ways[hit]
+        landed = (landed + error_m[:, None] * ways).astype(np.float32)
         return scan._replace(error_m=error_m.astype(np.float32), landed=landed)
 
     def _cast(self, instant: Instant, threads: int) -> tuple[SensorScan, RayHits]:
@@ -92,6 +100,7 @@ class MountedSensor:
             self.tiles,
             max_range_m=self.reach_m,
             own_m=self._own_m,
+            times=self._times,
             threads=threads,
         )
         hits = RayHits(scan.ray, scan.range_m, self.pixel_of_ray, find=scan.struck, weather=self.weather)
@@ -113,6 +122,16 @@ class MountedSensor:
             range_m.append(hits.range_m)
             is_hit.append((hits.body >= 0) & (hits.body != instant.ego))
         return Ends(np.concatenate(range_m), np.concatenate(is_hit))
+
+
+def ray_times(sensor: Sensor, tiles: Sequence[Tile], pixel_of_ray: NDArray[np.int64]) -> list[RayTimes] | None:
+    """When the rays of each tile of a sensor are cast; None if all are at once."""
+    times_s = sensor.times_s()
+    if times_s is None:
+        return None
+    ends = np.cumsum([tile.directions.shape[1] for tile in tiles])
+    of_tiles = np.split(times_s.ravel()[pixel_of_ray], ends[:-1])
+    return [RayTimes(*np.unique(of_tile, return_inverse=True)) for of_tile in of_tiles]
 
 
 class Sight(NamedTuple):

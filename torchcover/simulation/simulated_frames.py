@@ -261,7 +261,7 @@ def of_rigs(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) 
             torch.from_numpy(np.concatenate([_error_m(one) for one in seen])),
         )
         for name, seen in scans.items()
-        if any(one.error_m is not None for one in seen)
+        if any(one.landed is not None for one in seen)
     }
     points = {
         name: {sensor.name: len(one.points) for sensor, one in zip(rigs[name].sensors, seen, strict=True)}
