@@ -108,7 +108,7 @@ def road_profile(points_m: Float64) -> RoadProfile:
     return RoadProfile(coefficients)
 
 
-def ground_rays(sweeps: Sequence[Float64], lidar: Lidar) -> GroundRays:
+def ground_rays(sweeps: Sequence[NDArray[np.floating]], lidar: Lidar) -> GroundRays:
     """The rays of a LiDAR that point at the road, and how many of them returned.
 
     Which rays there were is known from its scan pattern: the row of a return is the nearest one, and each row has
@@ -133,7 +133,7 @@ def _of_sweep(points_m: Float64, lidar: Lidar, number: int) -> GroundRays:
     azimuth_deg = np.rad2deg(np.arctan2(in_sensor_m[:, 1], in_sensor_m[:, 0]))
     sector = np.floor((azimuth_deg + 180.0) / SECTOR_DEG).astype(np.int64) % sectors
     above_m = points_m[:, 2] - road.height_m(points_m)
-    middle_deg = (np.arange(sectors) + 0.5) * SECTOR_DEG - 180.0
+    middle_deg: Float64 = (np.arange(sectors, dtype=np.float64) + 0.5) * SECTOR_DEG - 180.0
     expected_m, place_m = _expected(vehicle_T_sensor, rows_deg, middle_deg, road)
     # What stands in the way: the second nearest of a sector and its neighbours, for one may be rain or dust.
     stands = (above_m > OFF_GROUND_M + OFF_GROUND_SHARE * range_m) & (above_m < OVERHEAD_M) & (range_m > 2.0)
@@ -242,7 +242,9 @@ def fit_returns(rays: GroundRays, road: Material) -> ReturnFit:
     ]
     curvature = np.reshape([(a - b - c + d) for a, b, c, d in around], (2, 2)) / (4 * CURVATURE_OVER**2)
     errors = np.sqrt(np.maximum(np.diag(np.linalg.pinv(curvature, hermitian=True)), 0.0))
-    return ReturnFit(*np.exp(best.x).tolist(), *errors.tolist(), fades=bool(twice.fun - best.fun > LESS_LIKELY))
+    range_m, spread = np.exp(best.x).tolist()
+    range_error, spread_error = errors.tolist()
+    return ReturnFit(range_m, spread, range_error, spread_error, bool(twice.fun - best.fun > LESS_LIKELY))
 
 
 class LidarCalibration(NamedTuple):

@@ -6,7 +6,7 @@ What is enough differs from pulse to pulse: P(return) = p0 Phi(ln q / (2 s)), wh
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 Floats = NDArray[np.floating]
@@ -20,11 +20,11 @@ LEAST_COSINE = 1e-4
 
 
 def log_excess(
-    range_m: ArrayLike,
-    cos_incidence: ArrayLike,
-    reflectivity: ArrayLike,
-    incidence_exponent: ArrayLike,
-    range_at_10_percent_m: ArrayLike,
+    range_m: float | Floats,
+    cos_incidence: float | Floats,
+    reflectivity: float | Floats,
+    incidence_exponent: float | Floats,
+    range_at_10_percent_m: float | Floats,
     extinction_per_m: float = 0.0,
 ) -> Floats:
     """(N,) ln q of N hits, above 0 where what comes back is more than enough.
@@ -45,7 +45,6 @@ def log_excess(
         >>> round(float(np.exp(log_excess(100.0, 0.5, 0.4, 1.0, 100.0))), 12)    # four times as bright, aslant
         2.0
     """
-    range_m = np.asarray(range_m)
     with np.errstate(divide="ignore"):  # of what reflects nothing: minus infinity
         excess: Floats = np.log(np.asarray(reflectivity) / 0.1)
     excess = excess + incidence_exponent * np.log(np.maximum(cos_incidence, LEAST_COSINE))
@@ -53,7 +52,9 @@ def log_excess(
     return excess - 2.0 * extinction_per_m * range_m if extinction_per_m else excess
 
 
-def return_probability(log_excess: ArrayLike, spread: ArrayLike, reflectivity_spread: ArrayLike = 0.0) -> Floats:
+def return_probability(
+    log_excess: float | Floats, spread: float | Floats, reflectivity_spread: float | Floats = 0.0
+) -> Floats:
     """(N,) P(return) of hits with these ln q.
 
     Args:
