@@ -241,13 +241,8 @@ class Scene:
         """
         if not self.world.ego.trajectory.moves:
             return ()
-        ego, own_m = self._solids.of(self.world.ego.mesh).caster, []
-        for tile in tiles:
-            directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
-            limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
-            hits = ego.cast(vehicle_T_sensor[:3, 3], directions, limit_m)
-            own_m.append(np.where(hits.body >= 0, hits.range_m, np.float32(np.inf)))
-        return tuple(own_m)
+        ego = self._solids.of(self.world.ego.mesh).caster
+        return tuple(ends_at(ego, vehicle_T_sensor, tile, max_range_m) for tile in tiles)
 
     def encloses(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies inside the ego's body, so that no ray gets out."""
@@ -299,3 +294,11 @@ class Scene:
             static_T_vehicle = invert(self._world_T_local) @ world_T_vehicle if moves else np.eye(4)
             found.append(Poses(static_T_vehicle, self._parts(numbers, invert(world_T_vehicle), each_s)))
         return samples_s, found
+
+
+def ends_at(caster: RayCaster, vehicle_T_sensor: Matrix, tile: Tile, max_range_m: float) -> Float32:
+    """(n,) where bodies in the vehicle frame end the rays of a tile; infinite where they do not."""
+    directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
+    limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
+    hits = caster.cast(vehicle_T_sensor[:3, 3], directions, limit_m)
+    return np.where(hits.body >= 0, hits.range_m, np.float32(np.inf))

@@ -3,7 +3,7 @@
 Another kind is a class with the members of `Sensor` and a line in `kinds.py`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
+from torchcover.simulation.bodies import Body
 from torchcover.simulation.documents import Document, Pose
 from torchcover.simulation.raycaster import Struck
+from torchcover.simulation.weather import CLEAR, Weather
 
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -31,6 +33,7 @@ class RayHits:
         pixel_of_ray: (rays,) where each ray stands in `Sensor.directions`, row by row.
         place: (N,) in which of several worlds, of which a sensor sees each alone; None if there is one.
         find: Finds out what they ended on.
+        weather: What they went through.
     """
 
     ray: Numbers
@@ -38,6 +41,7 @@ class RayHits:
     pixel_of_ray: Numbers
     place: Numbers | None = None
     find: Callable[[], Struck] | None = None
+    weather: Weather = CLEAR
 
     @property
     def pixel(self) -> Numbers:
@@ -92,21 +96,25 @@ class Draws:
 
     def normal(self, ray: Numbers) -> Float64:
         """(N,) of a normal distribution with standard deviation 1, for hits of these rays."""
-        return np.zeros(len(ray)) if self._generator is None else self._drawn("standard_normal", ray)
+        return np.zeros(len(ray)) if self._generator is None else self._drawn("error", "standard_normal", ray)
 
     def uniform(self, ray: Numbers) -> Float64:
         """(N,) evenly from [0, 1), for hits of these rays; 1 where there is no source."""
-        return np.ones(len(ray)) if self._generator is None else self._drawn("random", ray)
+        return np.ones(len(ray)) if self._generator is None else self._drawn("dropout", "random", ray)
 
-    def _drawn(self, kind: str, ray: Numbers) -> Float64:
+    def chance(self, ray: Numbers) -> Float64:
+        """(N,) evenly from [0, 1), others than `uniform`, for hits of these rays; 1/2 where there is no source."""
+        return np.full(len(ray), 0.5) if self._generator is None else self._drawn("return", "random", ray)
+
+    def _drawn(self, purpose: str, kind: str, ray: Numbers) -> Float64:
         draw = getattr(self._generator, kind)
         if self._rays is None:
             drawn: Float64 = draw(len(ray))
             return drawn
         with self._lock:  # whichever thread asks first draws for all
-            if kind not in self._of_rays:
-                self._of_rays[kind] = draw(self._rays)
-            return self._of_rays[kind][ray]
+            if purpose not in self._of_rays:
+                self._of_rays[purpose] = draw(self._rays)
+            return self._of_rays[purpose][ray]
 
 
 class Sensor(Protocol):
@@ -138,6 +146,11 @@ class Sensor(Protocol):
     @property
     def max_range_m(self) -> float:
         """Farther hits give no point; so far its rays are cast."""
+        ...
+
+    @property
+    def housing(self) -> Sequence[Body]:
+        """What it is built into, in its own frame: the other sensors of its rig see that, and it looks out of it."""
         ...
 
     @property
@@ -206,12 +219,14 @@ class Ranging(Document):
         max_range_m: Farther hits give no point.
         range_noise_m: Standard deviation of the measured range, along the ray.
         dropout: Probability that a point is missing, from 0 to 1.
+        housing: Bodies that it is built into or stands on, in its own frame, which are in the way of the rig's others.
     """
 
     min_range_m: NonNegativeFloat = 0.0
     max_range_m: PositiveFloat
     range_noise_m: NonNegativeFloat = 0.0
     dropout: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    housing: tuple[Body, ...] = ()
 
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:
@@ -228,7 +243,11 @@ class Ranging(Document):
     @property
     def is_exact(self) -> bool:
         """Whether it has neither noise nor drop-out."""
-        return not (self.dropout or np.any(self.noise_m(np.ones(1))))
+        return not self._errs
+
+    @property
+    def _errs(self) -> bool:
+        return bool(self.dropout or np.any(self.noise_m(np.ones(1))))
 
     @property
     def counts_as(self) -> int:
@@ -258,7 +277,7 @@ class Ranging(Document):
             hit: (K,) which hits would give a point; None for all.
             draws: Source of the random numbers.
         """
-        if self.is_exact:
+        if not self._errs:
             return Returns(hit, None)
         ray, range_m = (hits.ray, hits.range_m) if hit is None else (hits.ray[hit], hits.range_m[hit])
         noise_m = self.noise_m(range_m)

@@ -10,6 +10,7 @@ from pydantic import Field, PositiveFloat
 from torchcover.files import check_memory, reads
 from torchcover.geometry import transform
 from torchcover.simulation.documents import Document, PathBeside
+from torchcover.simulation.material import material_number
 
 CYLINDER_SIDES = 24
 MAX_SIDES = 10_000
@@ -24,7 +25,7 @@ Length = PositiveFloat
 class Mesh(NamedTuple):
     """A triangle mesh: `vertices_m` (V, 3) float64 in metres and `faces` (F, 3) int64 indices into them.
 
-    `material` (F,) uint8 is what each face is made of, by its number; None, as 0, where that is not said.
+    `material` (F,) uint8 is what each face is made of, by `material_number`; None, as 0, where that is not said.
     """
 
     vertices_m: NDArray[np.float64]
@@ -38,6 +39,10 @@ class Mesh(NamedTuple):
     def with_faces(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> "Mesh":
         """Some of its faces, of what they were made of."""
         return self._replace(faces=self.faces[which], material=None if self.material is None else self.material[which])
+
+    def made_of(self, material: str) -> "Mesh":
+        """The mesh with all its faces of a built-in material."""
+        return self._replace(material=np.full(len(self.faces), material_number(material), dtype=np.uint8))
 
     @property
     def materials(self) -> NDArray[np.uint8]:

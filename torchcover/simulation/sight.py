@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import rigid
 from torchcover.simulation.instant import Instant, SensorScan
+from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import BLOCK, Tile, into_tiles, pixels_in_tiles
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.scene import Scene, ends_at
 from torchcover.simulation.sensor import Draws, RayHits, Sensor
 from torchcover.simulation.sweep import RayTimes
+from torchcover.simulation.weather import CLEAR, Weather
 
 # Rays in a tile: of neighbours all, so that a tile is narrow. A constant, so that nothing depends on threads.
 TILE_RAYS = 8192
@@ -37,11 +39,16 @@ class MountedSensor:
         sensor: The sensor.
         scene: Where it is.
         reach_m: How far its rays are cast there; `Scenario.reach_m`.
+        weather: What they go through.
+        others: The other sensors of its rig, whose housings may be in the way.
     """
 
-    def __init__(self, sensor: Sensor, scene: Scene, reach_m: float) -> None:
+    def __init__(
+        self, sensor: Sensor, scene: Scene, reach_m: float, weather: Weather = CLEAR, others: Sequence[Sensor] = ()
+    ) -> None:
         self.sensor = sensor
         self.reach_m = reach_m
+        self.weather = weather
         self.vehicle_T_sensor = sensor.mount.matrix()
         directions = sensor.directions()
         self.tiles = into_tiles(directions)
@@ -54,6 +61,14 @@ class MountedSensor:
                 f"{scene.world.time_step_s:g} s; shorten its period, or make the time steps longer"
             )
         self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
+        housings = [
+            mesh.moved(other.mount.matrix()) for other in others for body in other.housing for mesh in body.meshes()
+        ]
+        if housings:
+            caster = RayCaster(housings)
+            ends_m = [ends_at(caster, self.vehicle_T_sensor, tile, reach_m) for tile in self.tiles]
+            ego_m = self._own_m or ends_m
+            self._own_m = tuple(np.minimum(*both) for both in zip(ends_m, ego_m, strict=True))
         self._at_rest = not scene.moves
         self._resting: tuple[SensorScan, RayHits] | None = None
 
@@ -88,7 +103,7 @@ class MountedSensor:
             times=self._times,
             threads=threads,
         )
-        hits = RayHits(scan.ray, scan.range_m, self.pixel_of_ray, find=scan.struck)
+        hits = RayHits(scan.ray, scan.range_m, self.pixel_of_ray, find=scan.struck, weather=self.weather)
         if self._at_rest:
             self._resting = scan, hits
         return scan, hits

@@ -165,10 +165,12 @@ class SimulatedFrames(FrameDataset):
 
     @property
     def description(self) -> Mapping[str, object]:
-        """The names of the scenario and of the vehicle, and the seed."""
+        """The names of the scenario and of the vehicle, what sensors make of their hits, and the seed."""
         return {
             "scenario": self.scenario.name,
             "vehicle": self.scenario.ego_name,
+            "sensor_model": {name: rig.sensor_model for name, rig in self.rigs.items()},
+            "weather": {name: (rig.weather or self.scenario.weather).name for name, rig in self.rigs.items()},
             "frames": None,
             "seed": self.seed,
         }

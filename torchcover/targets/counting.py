@@ -242,6 +242,7 @@ def _measured(
         mounted.pixel_of_ray,
         met.position[arrived],
         lambda: placed.struck(met.position[arrived], met.triangle[arrived], met.direction[arrived].T),
+        mounted.weather,
     )
     of_target = np.arange(len(arrived))
     if beams is not None:

@@ -75,4 +75,4 @@ def read_boxes(path: Path) -> tuple[Actor, ...]:
 
 def box_mesh(size_m: tuple[float, float, float]) -> Mesh:
     """A box of a length, width and height that stands on its origin."""
-    return Box(type="box", size_m=size_m).mesh()
+    return Box(type="box", size_m=size_m).mesh().made_of("car_paint")
