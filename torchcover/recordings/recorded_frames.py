@@ -4,12 +4,14 @@ import operator
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchcover.detection import Boxes
 from torchcover.detection.inside import with_hits
 from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
@@ -37,8 +39,8 @@ class RecordedFrames(FrameDataset):
         rigs: Names of rigs -> names of their sensors; those of the recording if not given.
         reference: Where the reference clouds come from. Not given: the sensors that were recorded for it, or
             else an `AccumulatedReference`.
-        ground: Whether heights above the ground that were not recorded come from a `GroundModel` of what all sensors
-            saw: within the window of the reference if it is accumulated, else at the instant.
+        ground: Whether heights above the ground that were not recorded, also of boxes, come from a `GroundModel` of
+            what all sensors saw: within the window of the reference if it is accumulated, else at the instant.
 
     Raises:
         FileNotFoundError: There is no such recording, or a part of it is missing.
@@ -188,8 +190,7 @@ class RecordedFrames(FrameDataset):
         try:
             scans = {sensor: self._read(sensor, instant) for sensor in self._judged}
             reference = self.reference.cloud(self.recording, instant, self._judged)
-            heights_m = self._heights_m(instant, reference)
-            boxes = self.recording.boxes(instant)
+            heights_m, boxes = self._above_ground(instant, reference, self.recording.boxes(instant))
         except (OSError, ValueError) as error:
             raise BadFrameError(f"{name} (frame {position}): {error}") from error
         dropped = sum((scan.dropped for scan in scans.values()), Counter[str]())
@@ -225,15 +226,23 @@ class RecordedFrames(FrameDataset):
     def _read(self, sensor: str, instant: int) -> InVehicle:
         return in_vehicle(self.recording.scan(sensor, instant), self.recording.body)
 
-    def _heights_m(self, instant: int, reference: InVehicle) -> NDArray[np.float32] | None:
+    def _above_ground(
+        self, instant: int, reference: InVehicle, boxes: Boxes | None
+    ) -> tuple[NDArray[np.float32] | None, Boxes | None]:
+        """The heights of the reference points, and the boxes with those of their bottoms."""
         # Points with square metres, but without heights, were drawn for bands over z.
         if reference.heights_m is not None or reference.weights is not None or not self.ground:
-            return reference.heights_m
+            return reference.heights_m, boxes
         ground = self._sweeps.ground(self.recording, instant)
         if ground is None:
-            return np.full(len(reference.points_m), np.nan, dtype=np.float32)
+            return np.full(len(reference.points_m), np.nan, dtype=np.float32), boxes
         local_T_vehicle = self._sweeps.local_T_vehicle(self.recording, instant)
-        return ground.heights_m(transform(local_T_vehicle, reference.points_m)).astype(np.float32)
+        if boxes is not None:
+            centres_m = transform(local_T_vehicle, boxes.centre_m.double().numpy())
+            bottoms_m = torch.from_numpy(ground.heights_m(centres_m)).to(boxes.size_m) - boxes.size_m[:, 2] / 2
+            known = boxes.bottom_heights_m
+            boxes = replace(boxes, bottom_heights_m=torch.where(known.isnan(), bottoms_m, known))
+        return ground.heights_m(transform(local_T_vehicle, reference.points_m)).astype(np.float32), boxes
 
     def _check_sensors(self) -> None:
         there = (*self.recording.sensors, *self.recording.reference_sensors)
