@@ -32,9 +32,8 @@ def trial(a, seconds=64.0, bias=0.0, options="", least=64):
     """64 steps of one number that is awaited, and of one that is not."""
     error = ErrorModel(a, bias)
     other = Studied("3m", "ground", False, DETECTION, 0.5, ErrorModel(9.0), None, False)
-    return Trial(
-        options, 64, least, seconds, 1.0, [Studied("20m", "ground", True, DETECTION, 0.5, error, None, False), other]
-    )
+    own = Studied("20m", "ground", True, DETECTION, 0.5, error, None, False)
+    return Trial(options, 64, least, seconds, 1.0, seconds, [own, other])
 
 
 @pytest.mark.parametrize("a", [0.01, 0.36, 25.0])
@@ -75,6 +74,7 @@ def test_times_are_those_of_a_whole_command(study):
     assert first.seconds_for(16, study.start_s) - first.seconds_for(8, study.start_s) == pytest.approx(first.seconds)
     assert study.start_s == pytest.approx(100.0 - first.seconds / 8)
     assert 0 < first.measuring_s < first.seconds
+    assert first.processor_s > 0
 
 
 def test_the_worst_awaited_number_decides_and_what_prints_no_error_is_not_recommended():

@@ -1,6 +1,7 @@
 """Error against run time: what settings cost, how far each is off, and the steps that reach a wanted error."""
 
 import math
+import os
 import subprocess
 import sys
 import time
@@ -130,6 +131,7 @@ class Trial:
         least_steps: The fewest that print an error of every number that is awaited.
         seconds: What they took.
         measuring_s: That part of it that went into the search and the sums.
+        processor_s: What it took of all processors, those of workers too.
         numbers: Of all regions and bands.
     """
 
@@ -138,6 +140,7 @@ class Trial:
     least_steps: int
     seconds: float
     measuring_s: float
+    processor_s: float
     numbers: Sequence[Studied]
 
     def of(self, unit: str) -> list[Studied]:
@@ -191,12 +194,11 @@ class Study:
         rows = []
         for trial in self.trials:
             needed = [_steps_words(trial, trial.steps_for(error), self.start_s) for error in WANTED]
-            rows.append(
-                [trial.options or "as given", f"{1000 * trial.seconds / trial.steps:.0f}", _bias(trial), *needed]
-            )
+            times = [f"{1000 * s / trial.steps:.0f}" for s in (trial.seconds, trial.processor_s)]
+            rows.append([trial.options or "as given", *times, _bias(trial), *needed])
         wanted = [f"steps for {_points(error)}" for error in WANTED]
         return text_table(
-            ("setting", "step (ms)", "bias (points)", *wanted),
+            ("setting", "step (ms)", "of processors (ms)", "bias (points)", *wanted),
             [rows],
             title="Every detection in front to so many percentage points",
             caption="bias: the largest to the first setting on the same instants, * if it is beyond chance",
@@ -306,7 +308,7 @@ def _record(trial: Trial) -> dict[str, Any]:
         told = {name: difference.get(name, math.nan) for name in ("value", "error", "p")}
         own = {"region": one.region, "height": one.height, "quantity": one.quantity.key, "value": one.value}
         numbers.append(json_record({**own, "a": one.error.a, "bias": one.error.bias, "difference": json_record(told)}))
-    names = ("options", "steps", "least_steps", "seconds", "measuring_s")
+    names = ("options", "steps", "least_steps", "seconds", "measuring_s", "processor_s")
     return {**{name: getattr(trial, name) for name in names}, "numbers": numbers}
 
 
@@ -341,8 +343,9 @@ def _first_steps(coverage: Coverage) -> int:
 
 def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Trial, Coverage]:
     """Run a setting, and hold it against the first."""
-    task = simulation(settings)
+    task, before_s = simulation(settings), sum(os.times()[:4])
     result = measured(task, settings)
+    processor_s = sum(os.times()[:4]) - before_s
     assert result.run is not None  # it was not loaded
     result.run.raise_failure()
     coverage, awaited = result.coverage, task.asked.awaited
@@ -366,7 +369,8 @@ def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Tr
             place = region.name, height, region in awaited
             numbers.append(Studied(*place, quantity, value, ErrorModel(own, bias), difference, is_biased))
     least = max(MIN_STEPS, math.ceil(MIN_BLOCKS * steps / worlds) if worlds > 0 else steps)
-    return Trial(options, steps, least, result.run.seconds, result.run.measuring_s, numbers), coverage
+    times = result.run.seconds, result.run.measuring_s, processor_s
+    return Trial(options, steps, least, *times, numbers), coverage
 
 
 def _known(errors: Tensor) -> Tensor:

@@ -74,10 +74,11 @@ class AboveGround(NamedTuple):
             others = np.flatnonzero(~is_ground[face])
             wanted = np.full(len(face), self.lowest_m <= OF_GROUND_M[1, 0])
             if len(others):
-                corners_m = _moved_corners(self.squares_T_static, triangles_m.take(others, axis=2))
-                heights_m[:, others] = of_others_m = self.squares.heights_m(corners_m)
+                of_others_m = triangles_m if len(others) == len(face) else triangles_m.take(others, axis=2)
+                corners_m = self.squares_T_static[:3, :3] @ of_others_m + self.squares_T_static[:3, 3:]
+                heights_m[:, others] = others_m = self.squares.heights_m(corners_m)
                 least_m = np.maximum(self.lowest_m, np.where(is_down[face[others]], ON_GROUND_M, 0.0))
-                wanted[others] = (of_others_m[1] > least_m) & (of_others_m[0] <= self.highest_m)
+                wanted[others] = (others_m[1] > least_m) & (others_m[0] <= self.highest_m)
             return heights_m, wanted
 
         return heights
@@ -131,7 +132,8 @@ class SceneSurface:
         self._moving = {body: (objects[number], number) for body, number in moving.items()}
         placed = [objects[number].moved(pose).given_to(number) for number, pose in resting.items()]
         if above is not None:
-            placed = [above.of_objects(patches, np.eye(4), *_box_of(patches)) for patches in placed]
+            count = np.array([len(patches.outward) for patches in placed], dtype=np.int64)
+            placed = [above.of_objects(Patches.joined(placed), np.eye(4), _boxes_around(placed), count)]
         cut = [
             Patches.cut(
                 mesh,
@@ -252,17 +254,11 @@ def _groups(patches: Patches, group: Numbers | NDArray[np.int32]) -> Groups:
     return Groups(np.append(first, len(group)), Bounds(lower_m - SLACK_M, upper_m + SLACK_M))
 
 
-def _box_of(patches: Patches) -> tuple[Float64, Numbers]:
-    """(1, 8, 3) corners of a box around all of some patches, and (1,) how many there are."""
-    sides = np.stack([patches.lower_m.min(axis=1), patches.upper_m.max(axis=1)]).astype(np.float64)
+def _boxes_around(parts: Sequence[Patches]) -> Float64:
+    """(J, 8, 3) corners of J upright boxes, each around all patches of one part."""
+    sides = [[patches.lower_m.min(axis=1), patches.upper_m.max(axis=1)] for patches in parts]
     corner = np.indices((2, 2, 2)).reshape(3, -1).T
-    return sides[corner, np.arange(3)][None], np.array([len(patches.outward)])
-
-
-def _moved_corners(destination_T_source: Float64, corners_m: NDArray[np.floating]) -> Float64:
-    """(3, 3, N) corners, coordinates, triangles in another frame."""
-    moved_m: Float64 = destination_T_source[:3, :3] @ corners_m.astype(np.float64) + destination_T_source[:3, 3:]
-    return moved_m
+    return np.array(sides, dtype=np.float64).reshape(-1, 2, 3)[:, corner, np.arange(3)]
 
 
 def _moved_bounds(destination_T_source: Float64, bounds: Bounds) -> tuple[Float64, Float64]:
