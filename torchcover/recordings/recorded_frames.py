@@ -23,6 +23,7 @@ from torchcover.recordings.recording import Recording
 from torchcover.recordings.sweeps import Sweeps
 
 NO_GROUND = "Ground: none was found near the vehicle, so heights are z of the vehicle frame."
+SEEN_GROUND = "Ground: a height field through what all sensors saw of it; unknown farther than 10 m from that."
 # What a folder of results holds, during the run or after it.
 RESULTS = frozenset({".lock", "summary.json", "checkpoint.npz"})
 
@@ -79,6 +80,7 @@ class RecordedFrames(FrameDataset):
         self.ground = ground
         self._sweeps = self.reference.sweeps if isinstance(self.reference, AccumulatedReference) else Sweeps(0.0)
         self._has_heights: bool | None = None
+        self._modelled = False
 
     @property
     def names(self) -> Sequence[str]:
@@ -149,11 +151,12 @@ class RecordedFrames(FrameDataset):
 
     @property
     def reference_record(self) -> Mapping[str, object]:
-        """Where the reference comes from; that no ground was found, if it was looked for."""
+        """Where the reference comes from, and the ground, if it was looked for to choose what bands are over."""
         record = self.reference.record(self.recording, self._judged)
-        if not self.ground or self._has_heights in (None, True):
+        if self._has_heights is None or not self._modelled:
             return record
-        return {**record, "notes": [*record["notes"], NO_GROUND]}  # type: ignore[misc]  # sentences, as it says
+        words = SEEN_GROUND if self._has_heights else NO_GROUND
+        return {**record, "notes": [*record["notes"], words]}  # type: ignore[misc]  # sentences, as it says
 
     @property
     def content(self) -> Mapping[str, object]:
@@ -234,6 +237,7 @@ class RecordedFrames(FrameDataset):
         if reference.heights_m is not None or reference.weights is not None or not self.ground:
             return reference.heights_m, boxes
         ground = self._sweeps.ground(self.recording, instant)
+        self._modelled = True
         if ground is None:
             return np.full(len(reference.points_m), np.nan, dtype=np.float32), boxes
         local_T_vehicle = self._sweeps.local_T_vehicle(self.recording, instant)
