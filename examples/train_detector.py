@@ -76,7 +76,7 @@ def simulate(steps, seed, reference, name, keep_clouds):
     kept = []
     for index in track(range(steps), description=f"simulating {name}"):
         frame = frames[index]
-        fed = {f"network {rig}": thinned(cloud) for rig, cloud in frame.clouds.items()}
+        fed = {f"network {rig}": thinned(frame.landed(rig)) for rig in frame.clouds}
         clouds = {**frame.clouds, **fed} if keep_clouds else fed
         kept.append(replace(frame, clouds=clouds, boxes=in_region(frame.boxes)))
     return kept

@@ -55,7 +55,7 @@ def study(
     print_study(found, files, out, explain=explain)
 
 
-@with_options(of_evaluate("scenario", "seed", "vehicle", "reference", "rays", "every_s"))
+@with_options(of_evaluate("scenario", "seed", "vehicle", "sensor_model", "weather", "reference", "rays", "every_s"))
 def record(
     rig: options.Rig,
     out: Annotated[
@@ -118,6 +118,26 @@ def rig(
     typer.echo(as_yaml(document), nl=False)
 
 
+def calibrate(
+    recording: Annotated[Path, typer.Argument(help="A drive on a straight road, of any layout in docs/recordings.md.")],
+    rig: Annotated[
+        str,
+        typer.Option(help="Rig that recorded it, whose LiDARs are called as there: a built-in name or a YAML file."),
+    ],
+    recording_format: options.Format = None,
+    out: Annotated[Path, typer.Option("--out", help="YAML file for the rig with what was found.")] = Path("rig.yaml"),
+) -> None:
+    """Fit how far each LiDAR of a rig sees, and its noise, to a recording: from road that did or did not return."""
+    from torchcover.recordings import open_recording
+    from torchcover.simulation import Rig, calibrate
+
+    calibrated, found = calibrate(open_recording(recording, recording_format), Rig.load(rig))
+    calibrated.save(out)
+    for one in found:
+        typer.echo(one.words)
+    typer.echo(f"Wrote {out}; simulate with it: torchcover evaluate {out}")
+
+
 def _pair(text: str) -> tuple[str, str]:
     sensor, equals, model = text.partition("=")
     if not (sensor and equals and model):
@@ -146,7 +166,7 @@ def show(
     run(name, scenario=scenario, rig=rig, step=step, seed=seed, film=film, out=out, **settings)
 
 
-@with_options(of_evaluate("vehicle", "every_s", "seed"))
+@with_options(of_evaluate("vehicle", "sensor_model", "every_s", "seed"))
 def targets(
     rig: options.Rig,
     target: Annotated[
@@ -307,7 +327,7 @@ def list_builtin(
         str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
     ] = None,
 ) -> None:
-    """List the built-in rigs, scenarios, LiDAR models and vehicles."""
+    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials and weather."""
     from torchcover.cli.listing import run
 
     run(word)

@@ -157,12 +157,14 @@ class CoverageMetric(SumsInBlocks):
         weights: Clouds | None = None,
         height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
+        error: SensorClouds | None = None,
     ) -> None:
         """Add one step, or one step for each entry of two lists.
 
         Args:
-            sensor: (N, 3) points of the rig in the vehicle frame in metres, or a list of them. N = 0: a blind step.
-                Of a metric with `sensors`: name of the sensor -> its points, or a list of such dicts.
+            sensor: (N, 3) points of the rig in the vehicle frame in metres, where they truly are if that is known, or a
+                list of them. N = 0: a blind step. Of a metric with `sensors`: name of the sensor -> its points, or a
+                list of such dicts.
             reference: (M, 3) points of the reference sensor in the same frame, or a list of the same length. M = 0:
                 the step says nothing.
             weights: (M,) square metres that each reference point stands for (`frame.reference_weights`), or a list of
@@ -174,14 +176,17 @@ class CoverageMetric(SumsInBlocks):
             place_in_time: Number of the step, 10^15 at most, or a list of them (`frame.place_in_time`); it decides
                 about the block, so that steps of one number, as of an instant that is seen again, share one. Not
                 given: counted on from the steps so far.
+            error: (N,) by how many metres each point of the rig was measured off its place, along its ray, or as
+                `sensor` in a dict or a list. One that is off by more than `within_m` is no point. Not given: none is.
 
         Raises:
             ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates; weights,
-                heights or places in time as `torchcover.coverage.steps.checked_steps` refuses them.
+                heights, places in time or errors as `torchcover.coverage.steps.checked_steps` refuses them.
             TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
         """
+        given = (sensor, reference, weights, height, place_in_time, error)
         how: dict[str, Any] = {"grid": self.grid, "square_metres": self.square_metres, "names": self.sensors}
-        for step in checked_steps(sensor, reference, weights, height, place_in_time, first=int(self.steps), **how):
+        for step in checked_steps(*given, within_m=self.within_m, first=int(self.steps), **how):
             self._add_step(step)
 
     def forward(
@@ -192,12 +197,18 @@ class CoverageMetric(SumsInBlocks):
         weights: Clouds | None = None,
         height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
+        error: SensorClouds | None = None,
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
         if place_in_time is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
             place_in_time = [int(self.steps) + step for step in range(len(as_list(reference, "reference")))]
-        given = {"weights": weights, "height": height, "place_in_time": place_in_time}
+        given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
         return super().forward(sensor, reference, **given)  # type: ignore[no-any-return]
+
+    @property
+    def within_m(self) -> float:
+        """How far off a point may be measured: the largest threshold; any distance if there is none."""
+        return max(self.thresholds, default=math.inf)
 
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
     def _add_step(self, step: CheckedStep) -> None:

@@ -1,7 +1,7 @@
 """A world as geometry that rays can be cast at."""
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import Tile, rotate
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.surface import AboveGround, SceneSurface, bounds_along
+from torchcover.simulation.sweep import SAMPLES, Poses
 from torchcover.simulation.world import Actor, World
 
 Matrix = NDArray[np.float64]
@@ -167,14 +168,16 @@ class Scene:
         distance_m = self._distance_m(step, world_T_vehicle)
         self._check_overlap(time_s, vehicle_T_world, distance_m)
         resting, first = len(self._resting), self._first_moving
-        moving = self._placed(np.flatnonzero(distance_m[resting:] < within_m), vehicle_T_world, time_s)
+        near = np.flatnonzero(distance_m[resting:] < within_m)
+        moving = self._placed(near, vehicle_T_world, time_s)
         # Either list of bodies begins with the ego.
         if self.world.ego.trajectory.moves:
             static_T_vehicle, ego = invert(self._world_T_local) @ world_T_vehicle, first
         else:
             static_T_vehicle, ego = np.eye(4), 0
         out_of_range = len(self._moving) - len(moving)
-        return Instant(self._static, static_T_vehicle, moving, ego, out_of_range, self.ground, world_T_vehicle)
+        motion = partial(self._motion, near, time_s)
+        return Instant(self._static, static_T_vehicle, moving, ego, out_of_range, self.ground, world_T_vehicle, motion)
 
     def check_apart(self, steps: NDArray[np.int64]) -> None:
         """Refuse time steps at which an actor overlaps the ego, as `at` does for one.
@@ -238,13 +241,8 @@ class Scene:
         """
         if not self.world.ego.trajectory.moves:
             return ()
-        ego, own_m = self._solids.of(self.world.ego.mesh).caster, []
-        for tile in tiles:
-            directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
-            limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
-            hits = ego.cast(vehicle_T_sensor[:3, 3], directions, limit_m)
-            own_m.append(np.where(hits.body >= 0, hits.range_m, np.float32(np.inf)))
-        return tuple(own_m)
+        ego = self._solids.of(self.world.ego.mesh).caster
+        return tuple(ends_at(ego, vehicle_T_sensor, tile, max_range_m) for tile in tiles)
 
     def encloses(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies inside the ego's body, so that no ray gets out."""
@@ -267,9 +265,40 @@ class Scene:
 
     def _placed(self, numbers: NDArray[np.intp], vehicle_T_world: Matrix, time_s: float) -> Moving:
         """Some of the bodies that move, at a time."""
+        solids = [self._solids.of(self._moving[k].mesh) for k in numbers.tolist()]
+        return Moving.placed(solids, self._parts(numbers, vehicle_T_world, time_s), self._first_moving + numbers)
+
+    def _parts(self, numbers: NDArray[np.intp], vehicle_T_world: Matrix, time_s: float) -> Matrix:
+        """(P, 4, 4) where some of the bodies that move are at a time."""
         actors = [self._moving[k] for k in numbers.tolist()]
-        solids = [self._solids.of(actor.mesh) for actor in actors]
-        vehicle_T_part = vehicle_T_world @ poses_at([actor.trajectory for actor in actors], time_s)
+        vehicle_T_part: Matrix = vehicle_T_world @ poses_at([actor.trajectory for actor in actors], time_s)
         # The ego is where it is, to the last bit: what a sensor sees of it is the same at every step.
         vehicle_T_part[[actor is self.world.ego for actor in actors]] = np.eye(4)
-        return Moving.placed(solids, vehicle_T_part, self._first_moving + numbers)
+        return vehicle_T_part
+
+    def _motion(
+        self, numbers: NDArray[np.intp], time_s: float, first_s: float, last_s: float
+    ) -> tuple[Matrix, list[Poses]]:
+        """Where the ego and some of the bodies that move are from one time to another, both after `time_s`.
+
+        What was before the world began, or comes after it, is as long within it, and told from that.
+        """
+        world, found = self.world, list[Poses]()
+        end_s = max(world.time_step_s * (world.steps - 1) - time_s, 0.0)
+        begin_s = max(min(first_s, end_s - (last_s - first_s)), -time_s)
+        samples_s = np.linspace(begin_s, min(begin_s + last_s - first_s, end_s), SAMPLES)
+        for each_s in (time_s + samples_s).tolist():
+            world_T_vehicle = world.ego.trajectory.at(each_s)
+            # As in `at`, to the bit.
+            moves = world.ego.trajectory.moves
+            static_T_vehicle = invert(self._world_T_local) @ world_T_vehicle if moves else np.eye(4)
+            found.append(Poses(static_T_vehicle, self._parts(numbers, invert(world_T_vehicle), each_s)))
+        return samples_s, found
+
+
+def ends_at(caster: RayCaster, vehicle_T_sensor: Matrix, tile: Tile, max_range_m: float) -> Float32:
+    """(n,) where bodies in the vehicle frame end the rays of a tile; infinite where they do not."""
+    directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
+    limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
+    hits = caster.cast(vehicle_T_sensor[:3, 3], directions, limit_m)
+    return np.where(hits.body >= 0, hits.range_m, np.float32(np.inf))
