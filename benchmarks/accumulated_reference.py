@@ -2,9 +2,14 @@
 
 A drive is simulated with two LiDARs, 0.1 s apart, with poses and tracked boxes. The forward one is judged; the other
 spins. The truth is the measure by area against the surface reference at the same instants.
+
+With `--ground`, ranges have noise, and the question is how far the heights above the ground that these sweeps have seen
+are from those of the world, and how far that moves the numbers.
 """
 
 import argparse
+from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +28,7 @@ from torchcover.data import (
     reference_called,
 )
 from torchcover.geometry import invert, transform
-from torchcover.simulation import Lidar, PaperReference, Rig
+from torchcover.simulation import Lidar, PaperReference, Rig, Scenario
 
 EVERY_S = 0.1
 # A ray this near to a point that goes on so far, and by a share of the range, has passed through it.
@@ -40,6 +45,9 @@ OTHER = Lidar(
     max_range_m=200.0,
     mount={"x_m": -0.8, "z_m": 1.95},
 )
+# With the ground: noise, how near to it points lie on it, and how far up they are lifted, lest noise takes them below.
+NOISE_M, ON_GROUND_M, LIFT_M = 0.03, 0.1, 0.3
+RANGES_M = (0.0, 40.0, 80.0, 160.0)
 MOUNTS = {"judged": JUDGED.mount.matrix(), "other": OTHER.mount.matrix()}
 
 
@@ -98,18 +106,15 @@ def main():
     parser.add_argument("--scenario", default="urban")
     parser.add_argument("--instants", type=int, default=4, help="each in a city of its own")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--ground", action="store_true")
+    parser.add_argument("--hills-m", type=float, help="of a city")
     parser.add_argument("--windows", type=float, nargs="+", default=[1.0, 5.0])
     options = parser.parse_args([] if __name__ != "__main__" else None)
     torch.set_num_threads(1)
-    sweeps = SimulatedFrames(
-        options.scenario,
-        rigs={sensor.name: Rig(name=sensor.name, sensors=[sensor]) for sensor in (named(JUDGED, "judged"), OTHER)},
-        steps=1_000_000,
-        seed=options.seed,
-        every_s=EVERY_S,
-        reference_sensor=PaperReference(rows=4, columns=4),
-        boxes=True,
-    )
+    sweeps = drive(options)
+    if options.ground:
+        heights(sweeps, options)
+        return
     surface = sweeps.with_reference_sensor(reference_called(asked=RegionsOfInterest().around(band_frame="vehicle")))
     references = {"other, 0 s": AccumulatedReference(0.0, sensors=("other",))}
     for window_s in options.windows:
@@ -127,16 +132,89 @@ def main():
         instant = round((number + 0.5) * run_s / EVERY_S)
         true = surface[instant]
         truth.update(true.clouds["judged"], true.reference, weights=true.reference_weights)
-        drive = SimulatedDrive(sweeps, instant, longest)
+        recording = SimulatedDrive(sweeps, instant, longest)
         for name, reference in references.items():
-            drive.labelled = "labelled" not in name
-            (frame,) = RecordedFrames(drive, reference=reference)
+            recording.labelled = "labelled" not in name
+            (frame,) = RecordedFrames(recording, reference=reference)
             metrics[name].update(frame.sensor, frame.reference)
     report(truth.compute(), {name: each.compute() for name, each in metrics.items()})
 
 
-def named(sensor, name):
-    return sensor.model_copy(update={"name": name})
+def drive(options):
+    """The sweeps of both LiDARs."""
+    scenario, noise_m = Scenario.load(options.scenario), NOISE_M if options.ground else 0.0
+    if options.hills_m is not None:
+        hilly = scenario.traffic.model_copy(update={"hills_m": options.hills_m})
+        scenario = scenario.model_copy(update={"traffic": hilly})
+    lidars = (named(sensor, name, range_noise_m=noise_m) for sensor, name in ((JUDGED, "judged"), (OTHER, "other")))
+    return SimulatedFrames(
+        scenario,
+        rigs={sensor.name: Rig(name=sensor.name, sensors=[sensor]) for sensor in lidars},
+        steps=1_000_000,
+        seed=options.seed,
+        every_s=EVERY_S,
+        reference_sensor=PaperReference(rows=4, columns=4),
+        boxes=True,
+    )
+
+
+def heights(sweeps, options):
+    """Print how far heights are from the truth by range, and numbers with them from those with the true ones."""
+    grid, rows, moves = replace(GRID, band_frame="ground"), [], []
+    references = {"the instant": (0.0, ("other",), True)}
+    for window_s in options.windows:
+        references[f"{window_s:g} s"] = window_s, ("judged", "other"), True
+    references[f"{options.windows[-1]:g} s, nothing labelled"] = options.windows[-1], ("judged", "other"), False
+    instants = [
+        round((number + 0.5) * sweeps.scenario.traffic.duration_s / EVERY_S) for number in range(options.instants)
+    ]
+    for name, (window_s, sensors, labelled) in references.items():
+        found, known = (CoverageMetric(grid, max_radius=grid.diagonal_m) for _ in range(2))
+        seen = []
+        for instant in instants:
+            recording = SimulatedDrive(sweeps, instant, window_s, labelled=labelled)
+            frames = RecordedFrames(recording, reference=AccumulatedReference(window_s, sensors=sensors))
+            (frame,) = frames
+            true_m = true_heights_m(sweeps, instant, frame.reference.numpy().astype(np.float64))
+            for metric_of, heights_m in ((found, frame.reference_heights_m), (known, torch.from_numpy(true_m))):
+                metric_of.update(frame.sensor, frame.reference, height=heights_m)
+            range_m = torch.linalg.vector_norm(frame.reference[:, :2], dim=1).numpy()
+            seen.append(np.stack([range_m, frame.reference_heights_m.numpy(), true_m]))
+        rows += [(name, *row) for row in by_range(*np.concatenate(seen, axis=1), grid)]
+        one, other = (numbers(of.compute(), "known") for of in (found, known))
+        apart = np.stack([100 * (one[:, 1] - other[:, 1]), 100 * (one[:, 0] / other[:, 0] - 1)], axis=1)
+        moves.append((name, *(f"{points:+.2f} / {share:+.1f}" for points, share in apart)))
+    on, above = ("known on the ground (%)", "rms (cm)"), ("known above it (%)", "rms (cm)")
+    table(("reference", "range", *on, *above, "ground in a wrong band (%)", "obstacles in a wrong band (%)"), rows)
+    print()
+    table(("reference", *(f"{region.name} {height}" for region in REGIONS for height in GRID.heights)), moves)
+
+
+def true_heights_m(sweeps, instant, points_m):
+    """(N,) of points in the vehicle frame above the ground of the world."""
+    scene, step = sweeps.simulator.scene_of(instant)
+    placed_m = transform(scene.world.ego.trajectory.at(step * scene.world.time_step_s), points_m)
+    return scene.ground.heights_m(placed_m + np.array([0.0, 0.0, LIFT_M]), np.eye(4)) - np.float32(LIFT_M)
+
+
+def by_range(range_m, found_m, true_m, grid):
+    """Range; of what lies on the ground, and above it, the share with a height and the rms; shares in a wrong band."""
+    edges_m = [-0.5, *(edge for _, edge in grid.heights.values())]
+    band, true_band = (np.digitize(of, edges_m) for of in (found_m, true_m))
+    for near_m, far_m in pairwise(RANGES_M):
+        here = (range_m >= near_m) & (range_m < far_m)
+        row = [f"{near_m:g} to {far_m:g} m"]
+        for of in (here & (np.abs(true_m) < ON_GROUND_M), here & (true_m >= ON_GROUND_M)):
+            rms_m = np.sqrt(np.nanmean((found_m[of] - true_m[of]) ** 2))
+            row += [f"{100 * np.isfinite(found_m[of]).mean():.1f}", f"{100 * rms_m:.1f}"]
+        for number in (1, 2):
+            of = here & np.isfinite(found_m) & (true_band == number)
+            row.append(f"{100 * (band != true_band)[of].mean():.2f}")
+        yield row
+
+
+def named(sensor, name, **more):
+    return sensor.model_copy(update={"name": name, **more})
 
 
 def metric(**options):

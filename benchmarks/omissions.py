@@ -7,7 +7,8 @@ import numpy as np
 from benchmarks.timing import compare, table
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import Draws, PaperReference, Rig, Scenario
-from torchcover.simulation.instant import SensorScan, cast_from
+from torchcover.simulation.instant import SensorScan
+from torchcover.simulation.raycaster import cast_from
 from torchcover.simulation.rays import into_tiles, rotate
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.sight import MountedSensor

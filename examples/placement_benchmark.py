@@ -97,8 +97,8 @@ def simulate(rigs, steps, seed, name):
     kept = []
     for index in track(range(steps), description=f"simulating {name}", console=Console(stderr=True)):
         frame = frames[index]
-        clouds = {rig: thinned(cloud) for rig, cloud in frame.clouds.items()}
-        kept.append(replace(frame, clouds=clouds, boxes=in_region(frame.boxes), sensor_points=None))
+        clouds = {rig: thinned(frame.landed(rig)) for rig in frame.clouds}
+        kept.append(replace(frame, clouds=clouds, measured={}, boxes=in_region(frame.boxes), sensor_points=None))
     return kept
 
 

@@ -53,7 +53,7 @@ def read(frames):
     for frame in track(frames, description="accumulating the reference", total=len(frames)):
         if frame.boxes is None:
             raise SystemExit(f"{frames.recording.path}: no labelled boxes, and recall is about objects")
-        fed, boxes = {f"network {rig}": thinned(frame.cloud_of(rig))}, in_region(frame.boxes, CARS)
+        fed, boxes = {f"network {rig}": thinned(frame.landed(rig))}, in_region(frame.boxes, CARS)
         if len(kept) < trained:
             kept.append(replace(frame, clouds=fed, reference=frame.reference[:0], boxes=boxes))
         else:

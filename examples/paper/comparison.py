@@ -16,6 +16,7 @@ SCORE_HEADINGS = (
     "| LiDARs | measure | steps | detection (points) | radius (factor) | orderings in rows | all orderings | "
     "Spearman, detection | Spearman, radius |"
 )
+HIGHER_HEADINGS = "| LiDARs | measure | larger at obstacle height | ground within 20 m: grille and roof, 128 rows (m) |"
 MEASURE_WORDS = {"known": "known cells", "area": "by area"}
 
 
@@ -31,8 +32,9 @@ def numbers_of(coverages, regions):
         for region in regions:
             for height in coverage.grid.heights:
                 estimate = coverage.estimate(region, height)
-                radius, share = estimate.numbers(intervals=False).values()
-                percent = share._replace(value=100 * share.value, error=100 * share.error)
+                radius, share = estimate.numbers().values()
+                in_percent = {part: 100 * getattr(share, part) for part in ("value", "error", "low", "high")}
+                percent = share._replace(**in_percent)
                 for quantity, number in zip(QUANTITIES, (percent, radius), strict=True):
                     numbers[Place(quantity, lidar, region.name, height)] = number
     return numbers
@@ -63,7 +65,7 @@ def as_markdown(results):
             f"{each.rows_held} of {each.rows} | {each.pairs_held} of {each.pairs} | "
             f"{each.spearman_detection:.3f} | {each.spearman_radius:.3f} |"
         )
-    return "\n".join([*lines, ""])
+    return "\n".join([*lines, "", "### Radii at obstacle height", "", *_higher_up(results, last), ""])
 
 
 def as_records(results):
@@ -92,14 +94,31 @@ def _table(known, area):
         cells = [region, height, lidar]
         for quantity in QUANTITIES:
             place = Place(quantity, lidar, region, height)
-            ratio = known[place]._replace(value=known[place].value / paper[place], error=math.nan)
+            ratio = known[place]._replace(value=known[place].value / paper[place], low=math.nan)
             cells += [_words(known[place]), f"{paper[place]:.2f}", _words(ratio), _words(area[place])]
         lines.append(f"| {' | '.join(cells)} |")
     return [*lines, ""]
 
 
+def _higher_up(results, last):
+    """In how many of the rows radii are larger at obstacle height than on the ground, as all of the paper's are."""
+    lines = [HIGHER_HEADINGS, f"|{' --- |' * 2}{' ---: |' * 2}"]
+    for (lidars, measure, steps), run in results.items():
+        if steps == last:
+            radii = {(lidar, region): _radii(run, lidar, region) for lidar, region in product(LIDARS, REGIONS)}
+            larger = sum(obstacle > ground for ground, obstacle in radii.values())
+            near = " and ".join(f"{radii[lidar, REGIONS[0]][0]:.2f}" for lidar in ("grille_128", "roof_128"))
+            lines.append(f"| {lidars} | {MEASURE_WORDS[measure]} | {larger} of {len(radii)} | {near} |")
+    return lines
+
+
+def _radii(run, lidar, region):
+    return [run[Place("radius_m", lidar, region, height)].value for height in HEIGHTS]
+
+
 def _words(number):
-    """Two decimals, as in the paper."""
+    """Two decimals, as in the paper, and the interval."""
     if math.isnan(number.value):
         return "unknown"
-    return f"{number.value:.2f}" if math.isnan(number.error) else f"{number.value:.2f} ± {number.error:.2f}"
+    ends = "" if math.isnan(number.low) else f" [{number.low:.2f}, {number.high:.2f}]"
+    return f"{number.value:.2f}{ends}"

@@ -35,7 +35,7 @@ def test_evaluate_stops_when_it_is_good_enough(torchcover, long_recording, tmp_p
     assert f"Target error reached after {steps} steps." in printed
     assert (summary["complete"], summary["target_error"]["reached"]) == (True, True)
     assert all(row["radius_m_error"] <= 0.05 for row in summary["rows"] if row["known_cells"])
-    assert re.search(r"0\.\d+ ± 0\.0\d+", printed)
+    assert re.search(r"0\.\d+  \[0\.\d+, 0\.\d+\]", printed)
 
 
 def test_a_target_beyond_the_steps_ends_the_run_as_ever_and_says_what_it_would_take(

@@ -269,6 +269,46 @@ def test_more_sensor_points_never_make_it_worse(seed):
     assert (map_of(before, "radius_maximum_m") >= before.radius - 1e-12)[known].all()
 
 
+def test_points_that_were_measured_farther_off_than_the_largest_threshold_are_none():
+    points, reference = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(2)).unbind()
+    error = torch.linspace(-0.6, 0.6, 40)
+    off, near = torch.full((40,), math.inf), error.abs() <= 0.4
+    for each, kept in ((error, points[near]), ([error], points[near]), (off, NOTHING), (torch.zeros(40), points)):
+        metric, plain = (CoverageMetric(ONE_CELL, (0.1, 0.4), max_radius=9.0) for _ in range(2))
+        many = isinstance(each, list)
+        metric.update([points] if many else points, [reference] if many else reference, error=each)
+        plain.update(kept, reference)
+        assert torch.equal(metric.compute().radius, plain.compute().radius)
+        assert int(metric.empty_sensor_steps) == (len(kept) == 0)
+    by_name = CoverageMetric(ONE_CELL, (0.4,), max_radius=9.0, sensors=("a", "b"))
+    by_name.update({"a": points, "b": points[:5]}, reference, error={"a": error, "b": off[:5]})
+    assert torch.equal(by_name.compute().radius, coverage([(points[near], reference)], max_radius=9.0).radius)
+    everything = CoverageMetric(ONE_CELL, (), max_radius=9.0)
+    everything.update(points, reference, error=1e9 * error)
+    assert torch.equal(everything.compute().radius, coverage([(points, reference)], max_radius=9.0).radius)
+
+
+@pytest.mark.parametrize(
+    ("given", "error", "message"),
+    [
+        (
+            torch.zeros(3),
+            ValueError,
+            r"error\[0\]: metres of each of 2 points of the rig are needed; got \(3,\) with 0 NaN",
+        ),
+        (torch.tensor([0.0, math.nan]), ValueError, r"error\[0\]: .*got \(2,\) with 1 NaN"),
+        ([torch.zeros(2)] * 2, ValueError, r"2 errors for 1 reference clouds; one a step each"),
+        (0.1, TypeError, r"error .*tensor"),
+        ({"a": torch.zeros(2)}, TypeError, r"got clouds by name"),
+    ],
+)
+def test_errors_that_are_none_of_its_points_are_refused(given, error, message):
+    metric = CoverageMetric(ONE_CELL)
+    with pytest.raises(error, match=message):
+        metric.update(torch.zeros(2, 3), torch.zeros(2, 3), error=given)
+    assert int(metric.steps) == 0
+
+
 def test_a_step_split_in_two_is_another_number():
     """The unit is the step: twice half of its points is not the step."""
     whole = coverage([(ORIGIN, points_at(0.125, 0.5, 0.875))])

@@ -154,10 +154,10 @@ def test_what_was_not_reached_is_told_for_each_region_with_the_steps_it_would_ta
     target = TargetError(radius_m=0.005, detection=0.5)
     record, lines = outcome(target, {"a": filled(64, scale=0.01).compute()}, REGIONS, confirmed=False)
     assert re.fullmatch(
-        r"  near all, radius_m of a: ± 0\.03\d m \(target 0\.005 m\), about \d,\d00 different steps are needed",
+        r"  near all, radius_m of a: error 0\.03\d m \(target 0\.005 m\), about \d,\d00 different steps are needed",
         lines[1],
     )
-    assert re.fullmatch(r"  far all, radius_m of a: ± 0\.000\d+ m \(target 0\.005 m\), reached", lines[2])
+    assert re.fullmatch(r"  far all, radius_m of a: error 0\.000\d+ m \(target 0\.005 m\), reached", lines[2])
     assert record["radius_m"] == 0.005
     worst = max(record["numbers"], key=lambda number: number["steps_needed"])
     assert record["steps_needed"] == worst["steps_needed"] == math.ceil(64 * (worst["error"] / 0.005) ** 2)

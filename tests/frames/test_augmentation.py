@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchcover import blind_spot_radius
-from torchcover.data import Augmentation, Frame, flip, rotate, scale
+from torchcover.data import Augmentation, Frame, Measured, flip, rotate, scale
 from torchcover.detection import Boxes, bev_iou, box_visibility, points_in_boxes
 
 
@@ -37,6 +37,22 @@ def test_radii_stay_and_scale_with_a_scaling(move, factor):
         before = blind_spot_radius(frame.reference, frame.clouds[rig])
         after = blind_spot_radius(moved.reference, moved.clouds[rig])
         torch.testing.assert_close(after, factor * before, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("move", "factor"), MOVES.values(), ids=MOVES)
+def test_where_points_landed_moves_with_where_they_are(move, factor):
+    frame = make_frame()
+    error_m = torch.linspace(-1, 1, 500)
+    off = torch.nn.functional.normalize(frame.clouds["b"]) * error_m[:, None]
+    frame = replace(frame, measured={"b": Measured(frame.clouds["b"] + off, error_m)})
+    moved = move(frame)
+    torch.testing.assert_close(moved.measured["b"].error_m, factor * error_m)
+    distance = torch.linalg.vector_norm(moved.landed("b") - moved.clouds["b"], dim=1)
+    torch.testing.assert_close(distance, factor * error_m.abs(), atol=1e-5, rtol=1e-4)
+    assert moved.landed("a") is moved.clouds["a"]
+    assert len(moved.cloud_of("b", within_m=0.5 * factor)) == int((error_m.abs() <= 0.5).sum())
+    with pytest.raises(ValueError, match=r"'b' has 9 points, 500 that were measured and 500 errors; give `clouds` and"):
+        replace(frame, clouds={"b": torch.zeros(9, 3)})
 
 
 @pytest.mark.parametrize(("move", "factor"), MOVES.values(), ids=MOVES)

@@ -61,7 +61,8 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
         assert frame.index == index
         assert list(frame.clouds) == list(source.rigs)
         assert (frame.reference_weights is not None) == source.square_metres
-        assert (frame.reference_heights_m is not None) == source.has_heights()
+        heights_m = frame.reference_heights_m
+        assert (heights_m is not None and bool(heights_m.isfinite().any())) == source.has_heights()
         assert all(cloud.dtype == torch.float32 for cloud in (*frame.clouds.values(), frame.reference))
     assert [frame.index for frame in source] == [frame.index for frame in source] == [0, 1]
     with pytest.raises(IndexError):

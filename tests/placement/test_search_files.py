@@ -116,18 +116,28 @@ DETECTION = detection(0.4)
 
 
 def gain(mean, error, significant, worlds=16, quantity=DETECTION):
-    return FreshGain("near", "area", Difference(quantity, mean, error, 0, 0, significant, 0.1, worlds, 9), 0.04)
+    ends = mean - 2 * error, mean + 2 * error
+    return FreshGain("near", "area", Difference(quantity, mean, error, *ends, significant, 0.1, worlds, 9), 0.04)
 
 
 @pytest.mark.parametrize(
     ("found", "words"),
     [
-        (gain(-0.02, 0.004, True), "lost 2.00 ± 0.40 points on 16 fresh worlds (t -5.0, better in 9)"),
-        (gain(0.03, 0.01, True), "gained 3.00 ± 1.00 points on 16 fresh worlds (t 3.0, better in 9)"),
-        (gain(0.03, 0.01, None, 3), "no gain is shown: +3.00 ± 1.00 points on 3 fresh worlds (t 3.0, better in 9)"),
-        (gain(0.0199, 0.01, False), "no gain is shown: +1.99 ± 1.00 points on 16 fresh worlds (t 2.0, better in 9)"),
-        (gain(0.02, np.nan, None), "no gain is shown: +2.00 ± ? points on 16 fresh worlds (t unknown, better in 9)"),
-        (gain(-0.1, 0.02, True, quantity=RADIUS), "gained 0.100 ± 0.020 m on 16 fresh worlds (t 5.0, better in 9)"),
+        (gain(-0.02, 0.004, True), "lost -2.00  [-2.80, -1.20] points on 16 fresh worlds (t -5.0, better in 9)"),
+        (gain(0.03, 0.01, True), "gained +3.0  [+1.0, +5.0] points on 16 fresh worlds (t 3.0, better in 9)"),
+        (
+            gain(0.03, 0.01, None, 3),
+            "no gain is shown: +3.0  [+1.0, +5.0] points on 3 fresh worlds (t 3.0, better in 9)",
+        ),
+        (
+            gain(0.0202, 0.01, False),
+            "no gain is shown: +2.0  [0.0, +4.0] points on 16 fresh worlds (t 2.0, better in 9)",
+        ),
+        (gain(0.02, np.nan, None), "no gain is shown: +2.0 points on 16 fresh worlds (t unknown, better in 9)"),
+        (
+            gain(-0.1, 0.02, True, quantity=RADIUS),
+            "gained +0.100  [+0.060, +0.140] m on 16 fresh worlds (t 5.0, better in 9)",
+        ),
         (gain(np.nan, np.nan, None), "unknown in the fresh worlds"),
     ],
 )

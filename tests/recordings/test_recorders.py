@@ -52,7 +52,7 @@ def test_a_plain_folder_gives_the_frames_that_were_written(both, tmp_path):
     assert len(again) == 3
     for written, read in zip(both, again, strict=True):
         assert len(read.sensor) == len(written.sensor) > 100
-        torch.testing.assert_close(in_order(read.sensor), in_order(written.sensor), rtol=0, atol=1e-12)
+        torch.testing.assert_close(in_order(read.sensor), in_order(written.landed()), rtol=0, atol=1e-12)
         assert torch.equal(read.reference, written.reference)
         assert torch.equal(read.reference_weights, written.reference_weights)
         assert torch.equal(read.boxes.rows, written.boxes.rows)
@@ -60,14 +60,16 @@ def test_a_plain_folder_gives_the_frames_that_were_written(both, tmp_path):
         assert torch.equal(read.boxes.velocity_mps, written.boxes.velocity_mps)
         assert torch.equal(read.boxes.drawn_points, written.boxes.drawn_points)
         assert (read.boxes.ids, read.boxes.categories) == (written.boxes.ids, written.boxes.categories)
-        assert torch.equal(*(next(iter(frame.boxes.hits.values())) for frame in (read, written)))
+        # Of what was written it is unknown where it truly is: a point may leave a box that it was on.
+        hits = [next(iter(frame.boxes.hits.values())) for frame in (read, written)]
+        assert (hits[0] - hits[1]).abs().max() <= 0.2 * max(hits[1].max(), 5)
         assert read.place_in_time == written.place_in_time
         assert sum(read.counts.values()) == 0  # nothing was lost on the way
 
 
 def test_clouds_are_in_the_frame_of_their_sensor(both, tmp_path):
     write_recording(both, tmp_path)
-    alone = simulated(FRONT, steps=3)[0].sensor.numpy()
+    alone = simulated(FRONT, steps=3)[0].landed().numpy()
     points = np.load(tmp_path / "sensors" / "z front" / "000000.npy")
     assert len(points) == len(alone)
     range_m = np.linalg.norm(points, axis=1)
@@ -106,7 +108,7 @@ def test_kittis_layout_is_read_as_kittis(tmp_path):
     assert (again.rigs, again.names) == (("kitti",), ("000000",))
     written, read = frames[0], again[0]
     # What is drawn in KITTI's own car the reader takes for that car.
-    points = written.sensor.numpy().astype(np.float64)
+    points = written.landed().numpy().astype(np.float64)
     own = ((points > BODY.lower_m) & (points < BODY.upper_m)).all(axis=1)
     assert read.counts["sensor_own_vehicle"] == own.sum()
     np.testing.assert_allclose(read.sensor, points[~own], atol=1e-5)

@@ -76,13 +76,13 @@ def test_records_are_those_of_the_summary(table, surface_pair, regions):
     for record, row in zip(records(table), rows, strict=True):
         for key in KEYS if row.known_cells else ():
             assert tuple(record[f"{key}{end}"] for end in ("", "_error", "_low", "_high")) == row.numbers[key][1:5]
-            assert (record[f"known_{key}"], record[f"known_{key}_error"]) == row.known[key][1:3]
+            assert tuple(record[f"known_{key}{end}"] for end in ("", "_error", "_low", "_high")) == row.known[key][1:5]
             assert record[key] != record[f"known_{key}"]
 
 
 def test_the_surface_adds_the_numbers_over_known_cells_and_no_other_column(table, trio, regions):
     known = CoverageTable.of({name: trio[name] for name in table.rigs}, regions)
-    more = {f"known_{key}{end}" for key in KEYS for end in ("", "_error")}
+    more = {f"known_{key}{end}" for key in KEYS for end in ("", "_error", "_low", "_high")}
     assert [name for name in header(table) if name not in more] == header(known)
     assert set(header(table)) - set(header(known)) == more
 
@@ -91,15 +91,6 @@ def test_known_cells_have_no_square_metres(trio, regions):
     table = CoverageTable.of(trio, regions)
     assert {(row["measure"], row["visible_m2"]) for row in records(table)} == {("known", None)}
     assert all("known cells\n(%)" in part.headings for part in parts_of(table))
-
-
-def test_only_means_over_the_surface_have_intervals(table, trio, regions):
-    def ends(table):
-        return {row[f"{key}{end}"] for row in records(table) for key in KEYS for end in ("_low", "_high")}
-
-    assert ends(CoverageTable.of(trio, regions)) == {None}
-    assert ends(table) - {None}
-    assert any(row["radius_m_error"] for row in records(CoverageTable.of(trio, regions)))
 
 
 @pytest.mark.parametrize("name", ["text", "markdown"])

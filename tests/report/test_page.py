@@ -145,14 +145,15 @@ def seen(named, tmp_path_factory):
 
 
 def numbers(words: str, unit: str) -> list[tuple[float, float]]:
-    """Every number and its error in this unit."""
-    found = re.findall(rf"(−?[\d.]+) ± ([\d.]+) {unit}(?=$|[; ])", words)
-    return [(float(value.replace("−", "-")), float(error)) for value, error in found]
+    """Every number and its interval in this unit."""
+    found = re.findall(rf"(−?[\d.]+) \[(−?[\d.]+), (−?[\d.]+)\] {unit}(?=$|[; ])", words)
+    return [tuple(float(each.replace("−", "-")) for each in one) for one in found]
 
 
 def close(said: tuple[float, float], value: float, error: float) -> bool:
-    """Four digits of the value, two of the error, each of them coded."""
-    return said[0] == pytest.approx(value, rel=6e-4) and said[1] == pytest.approx(error, rel=0.06)
+    """Four digits of the value, two errors to either side, each of them coded; within the range of a length."""
+    ends = max(value - 2 * error, min(value, 0.0)), value + 2 * error
+    return said[0] == pytest.approx(value, rel=6e-4) and said[1:] == pytest.approx(ends, abs=0.06 * 2 * error)
 
 
 def test_a_browser_has_nothing_to_complain_about(seen):
@@ -191,7 +192,7 @@ def test_a_difference_says_what_both_are(seen, named):
     difference, *each = numbers(words, "percentage points") + numbers(words, "%")
     assert difference[0] == pytest.approx(values[1] - values[0], rel=2e-3)
     assert seen[0]["drawn"] == pytest.approx(values[1] - values[0], rel=2e-3)
-    assert difference[1] == pytest.approx(np.hypot(*errors), rel=0.06)
+    assert difference[2] - difference[1] == pytest.approx(4 * np.hypot(*errors), rel=0.06)
     assert close(each[0], values[1], errors[1])
     assert close(each[1], values[0], errors[0])
     assert f"blue: many is better; red: {NASTY} is better" in seen[0]["difference_legend"]

@@ -74,19 +74,23 @@ def test_csv_reads_back_as_json_and_json_as_the_table(table):
         assert (record["rig"], record["region"], record["height"]) == (row.rig, row.region.name, row.summary.height)
         assert (record["known_cells"], record["known_share"]) == (row.summary.known_cells, row.summary.known_share)
         for key, number in row.summary.numbers.items():
-            expected = json_record({"value": number.value, "error": number.error})
-            assert (record[key], record[f"{key}_error"]) == (expected["value"], expected["error"])
+            expected = json_record({part: getattr(number, part) for part in ("value", "error", "low", "high")})
+            assert [record[key], *(record[f"{key}_{part}"] for part in ("error", "low", "high"))] == [
+                *expected.values()
+            ]
         for key, difference in row.differences.items():
             expected = json_record(difference._asdict())
             assert record[f"{key}_difference"] == expected["value"]
-            assert record[f"{key}_difference_error"] == expected["error"]
+            for part in ("error", "low", "high"):
+                assert record[f"{key}_difference_{part}"] == expected[part]
             assert record[f"{key}_difference_significant"] is difference.significant
             assert record[f"{key}_best"] is (key in row.best)
 
 
 def test_text_and_markdown_have_the_same_cells_and_they_are_those_of_the_parts(table):
     parts = [[cell.text for cell in row] for part in parts_of(table) for row in part.rows]
-    assert text_cells(table) == markdown_cells(table) == parts
+    assert text_cells(table) == parts
+    assert markdown_cells(table) == [[cell.replace("  ", " ") for cell in row] for row in parts]
 
 
 def test_what_is_marked_in_text_is_bold_in_markdown(trio, regions):
@@ -107,7 +111,8 @@ def test_the_columns_are_the_same_for_one_rig_and_for_several_which_have_more(tr
     one, three = (list(csv_rows(CoverageTable.of(of, regions))[0]) for of in ({"few": trio["few"]}, trio))
     assert three[: len(one)] == one
     assert one[:5] == ["rig", "region", "height", "radius_m", "radius_m_error"]
-    names = ("best", "difference", "difference_error", "difference_significant")
+    numbers = ("difference", "difference_error", "difference_low", "difference_high")
+    names = ("best", *numbers, "difference_significant")
     assert three[len(one) :] == [f"{key}_{name}" for key in ("radius_m", "detection_0.4m") for name in names]
 
 

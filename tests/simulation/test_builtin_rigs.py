@@ -17,7 +17,7 @@ NUSCENES, KITTI, WAYMO, ARGOVERSE, EDGAR = (1.385, 0.0), (1.337, 0.0), (1.461, 0
 # Rig, sensor, frame, position as published (rear axle; x forward, y left, z up).
 REAR_AXLE = [
     ("nuscenes", "top", NUSCENES, (0.944, 0.0, 1.840)),
-    ("kitti", "velodyne", KITTI, (0.76, 0.0, 1.73)),
+    ("kitti", "velodyne", KITTI, (0.76, 0.0, 1.73 + 0.121)),  # above the origin of its clouds, see the rig
     ("waymo", "top", WAYMO, (1.430, 0.0, 2.184)),
     ("waymo", "front", WAYMO, (4.070, 0.0, 0.689)),
     ("waymo", "side_left", WAYMO, (3.245, 1.025, 0.979)),

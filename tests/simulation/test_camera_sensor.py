@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from tests.simulation.small_worlds import AHEAD, FLOOR, scenario
 from torchcover import Rig
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import CameraSensor, PaperReference, Pose, Scenario
+from torchcover.simulation import CameraSensor, Draws, PaperReference, Pose, RayHits, Scenario, SurfaceReference
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
 
@@ -120,3 +121,49 @@ def test_range_limits():
     scene = Scene(Scenario.load("courtyard").world()).at(0)
     near = scene.scan(camera().mount.matrix(), into_tiles(camera().directions()), max_range_m=8.0).points
     assert np.linalg.norm(near - Pose(x_m=1.0, y_m=0.2, z_m=1.9).matrix()[:3, 3], axis=1).max() <= 8.001
+
+
+def test_depth_errs_as_that_of_a_pair_of_cameras_and_no_range_is_below_zero():
+    pair = {"baseline_m": 0.3, "subpixel_px": 0.25}
+    sensor = camera(stereo=pair, range_noise_share=0.03, range_noise_m=0.04, width=500, fov_deg=90.0)  # f is 250 px
+    range_m = np.array([1.0, 10.0, 59.0])
+    stereo_m = range_m**2 * 0.25 / (250 * 0.3)
+    np.testing.assert_allclose(sensor.noise_m(range_m), np.sqrt(stereo_m**2 + (0.03 * range_m) ** 2 + 0.04**2))
+    ray = np.arange(5000)
+    hits = RayHits(ray, np.full(5000, 50.0), ray)
+    _, error_m = sensor.measure(hits, Draws(np.random.default_rng(0)))
+    assert error_m[error_m > -50].std() == pytest.approx(float(sensor.noise_m(np.array(50.0))), rel=0.05)
+    wild = camera(stereo={**pair, "subpixel_px": 20.0}).measure(hits, Draws(np.random.default_rng(0)))
+    assert wild.error_m.min() == -50.0
+    assert camera(stereo=None).is_exact
+    assert not camera(range_noise_share=0.1).is_exact
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"stereo": {"baseline_m": 0.0, "subpixel_px": 0.2}}, r"stereo\.baseline_m\n.*greater than 0"),
+        ({"stereo": {"baseline_m": 0.3, "subpixel_px": -0.2}}, r"stereo\.subpixel_px\n.*greater than 0"),
+        ({"range_noise_share": 1.0}, r"range_noise_share\n.*less than 1"),
+        ({"range_noise_m": 60.0}, r"range_noise_m \(60\.0\) must be below max_range_m \(60\.0\)"),
+    ],
+)
+def test_an_impossible_error_is_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        camera(**changes)
+
+
+def test_points_on_an_object_are_counted_as_pixels_of_the_full_image():
+    car = {"category": "car", "shape": {"type": "box", "size_m": [4, 2, 1.5]}, "name": "car", "pose": {"x_m": 9.0}}
+    made = scenario(FLOOR, actors=[car])
+    rigs = {
+        str(stride): Rig(
+            name="r", sensors=(camera(stride=stride, mount={"x_m": 2.1, "z_m": 1.7}, width=640, height=480),)
+        )
+        for stride in (1, 2, 5)
+    }
+    few = SurfaceReference((AHEAD,), rays=50)
+    (frame,) = SimulatedFrames(made, rigs=rigs, steps=1, reference_sensor=few, boxes=True)
+    full, *strided = (int(hits) for hits in frame.boxes.hits.values())
+    assert full > 5000
+    assert strided == pytest.approx([full, full], rel=0.05)

@@ -6,7 +6,7 @@ import pytest
 from torchcover.geometry import BoundingBox, rigid, rotation_from_euler
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Draws, Lidar, PaperReference, Pose, Scenario
-from torchcover.simulation.instant import cast_from
+from torchcover.simulation.raycaster import cast_from
 from torchcover.simulation.rays import (
     blocks_towards,
     boxes_in_cone,

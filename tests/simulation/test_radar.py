@@ -24,7 +24,7 @@ def points_of(sensor, *bodies):
     scenario = Scenario.model_validate({"name": "s", "ego": EGO, "bodies": [WALL, *bodies]})
     rig = Rig(name="r", sensors=(sensor,))
     [scan] = Simulator(scenario, {"r": rig}, PaperReference(2, 2)).scans(0)["r"]
-    return scan.points.astype(np.float64) - [2.1, 0.0, 1.0]
+    return (scan.points if scan.landed is None else scan.landed).astype(np.float64) - [2.1, 0.0, 1.0]
 
 
 def cells_of(sensor, points_m):

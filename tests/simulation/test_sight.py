@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from torchcover.geometry import invert
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Draws, Lidar, Pose
-from torchcover.simulation.bodies import in_vehicle_frame
+from torchcover.simulation.bodies import Body, in_vehicle_frame
 from torchcover.simulation.instant import Instant
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
-from torchcover.simulation.shapes import Box, Plane
+from torchcover.simulation.shapes import Box, Cylinder, Plane
 from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.world import Actor, World
 
@@ -110,3 +111,56 @@ def test_the_ego_is_at_its_own_place_to_the_last_bit():
     turned = replace(made, ego=replace(made.ego, trajectory=driving(UTM, (10, 0, 0), yaw_deg=37.3)), actors=())
     for step in (0, 3, 7):
         np.testing.assert_array_equal(Scene(turned).at(step).moving.part_T_vehicle, np.eye(4)[None])
+
+
+@pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), UTM])
+@pytest.mark.parametrize(("ego_moves", "actor_moves"), [(False, False), (False, True), (True, True)])
+def test_a_hit_lies_on_the_face_that_it_says_at_the_angle_that_it_says(ego_moves, actor_moves, origin_m):
+    made = world(ego_moves, actor_moves, origin_m)
+    bar, ground = made.static
+    bar = bar._replace(material=np.arange(len(bar.faces), dtype=np.uint8))
+    car = replace(made.actors[0], mesh=made.actors[0].mesh._replace(material=np.full(12, 77, dtype=np.uint8)))
+    turning = Trajectory.from_arrays([0.0, 10.0], [origin_m, np.add(origin_m, (3, 1, 0))], [[0, 0, 0], [40, 0, 0]])
+    ego = replace(made.ego, trajectory=turning if ego_moves else made.ego.trajectory)
+    scene, time_s = Scene(replace(made, static=(bar, ground), actors=(car,), ego=ego)), 3.0
+    scan = afresh(scene.at(3))
+    struck, origin = scan.struck(), LIDAR.mount.matrix()[:3, 3]
+    vehicle_T_world = invert(ego.trajectory.at(time_s))
+    there = {0: bar.moved(vehicle_T_world), 1: ground.moved(vehicle_T_world)}
+    there[2] = car.mesh.moved(vehicle_T_world @ car.trajectory.at(time_s))
+    # Resting bodies before what never was one, which is before those that move.
+    of_body = {(False, False): [-1, 2, 0, 1], (False, True): [-1, 0, 1, 2], (True, True): [0, 1, -1, 2]}
+    number = np.array(of_body[ego_moves, actor_moves])[struck.body]
+    assert set(number) == {0, 1, 2}
+    for one, mesh in there.items():
+        some = number == one
+        points, triangle = scan.points[some].astype(np.float64), struck.triangle[some]
+        first, second, third = mesh.vertices_m[mesh.faces[triangle]].transpose(1, 0, 2)
+        across = np.cross(second - first, third - first)
+        normals = across / np.linalg.norm(across, axis=1, keepdims=True)
+        assert np.abs(((points - first) * normals).sum(axis=1)).max() < 1e-4
+        for start, end in ((first, second), (second, third), (third, first)):
+            assert (np.cross(end - start, points - start) * normals).sum(axis=1).min() > -1e-3
+        ways = (points - origin) / np.linalg.norm(points - origin, axis=1, keepdims=True)
+        np.testing.assert_allclose(struck.cos_incidence[some], np.abs((ways * normals).sum(axis=1)), atol=1e-5)
+        assert (struck.material[some] == mesh.materials[triangle]).all()
+
+
+@pytest.mark.parametrize("traffic", [False, True], ids=["standing", "driving"])
+def test_the_housing_of_a_sensor_is_in_the_way_of_the_others_alone(traffic):
+    """A mast 0.2 m wide, 1 m before the other, hides 11.5 degrees of it."""
+    mast = Body(name="mast", shape=Cylinder(type="cylinder", radius_m=0.1, height_m=3.0), poses=(Pose(z_m=-1.5),))
+    front = LIDAR.model_copy(update={"name": "front", "mount": Pose(x_m=1.0, z_m=2.5), "housing": (mast,)})
+    level = {"columns": 360, "channels": 4, "vertical_fov_deg": (-20.0, -5.0)}
+    rear = LIDAR.model_copy(update={"mount": Pose(z_m=2.5), **level})
+    there = Trajectory(np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [float(traffic), 0, 0]]), np.zeros((2, 3)))
+    plain = Plane(type="plane", size_m=(200.0, 200.0)).mesh()
+    scene = Scene(World((plain,), Actor("ego", "car", box(0.1, 0.1, 0.1), there), time_step_s=1.0, duration_s=1.0))
+
+    def azimuths_deg(sensor, others=()):
+        points_m = MountedSensor(sensor, scene, 40.0, others=others).scan(scene.at(0), EXACT).points
+        x, y, _ = (points_m - sensor.mount.matrix()[:3, 3]).T
+        return set(np.round(np.rad2deg(np.arctan2(y, x)), 1).tolist())
+
+    assert azimuths_deg(front, (rear,)) == azimuths_deg(front)
+    assert sorted(azimuths_deg(rear) - azimuths_deg(rear, (front,))) == [k + 0.5 for k in range(-6, 6)]

@@ -12,6 +12,7 @@ from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import into_tiles
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Mesh, Plane
+from torchcover.simulation.sweep import parabola_weights
 from torchcover.simulation.world import Actor, World
 
 from .case import Case, most, relative
@@ -225,6 +226,51 @@ def lost_by_cosine():
     return int((cosine <= np.cos(np.arcsin(radius / distance))).sum())
 
 
+def slope_from(offset_m):
+    """A slope of 400 m in general position at UTM-like coordinates, under an ego."""
+    here = np.array([offset_m, -offset_m, 0.0])
+    slope = plane(400.0, 400.0).moved(rigid(rotation_from_euler(37.0, 11.0, -8.0), [*here[:2], -3.0]))
+    return World(static=(slope,), ego=Actor("ego", "car", box(0.1, 0.1, 0.1), Trajectory.resting(here)))
+
+
+def incidence(cosine):
+    """Off the cosine of the incidence of rays that meet the slope."""
+    downwards = directions(5000) * -np.sign(directions(5000)[2])
+    normal = rotation_from_euler(37.0, 11.0, -8.0)[:, 2]
+    expected = np.abs(normal @ downwards.astype(np.float64))
+    return most((cosine(downwards) - expected)[expected > 0.02])
+
+
+def incidence_ours(towards):
+    (tile,) = into_tiles(towards[:, None].astype(np.float64), tile_columns=towards.shape[1])
+    scan = Scene(slope_from(1e6 + 0.3)).at(0).scan(at(0.0, 0.0, 2.0), [tile])
+    cosine = np.full(towards.shape[1], np.nan)
+    cosine[scan.ray] = scan.struck().cos_incidence
+    return np.where(np.isnan(cosine), np.abs(rotation_from_euler(37.0, 11.0, -8.0)[:, 2] @ towards), cosine)
+
+
+def incidence_in_float32(towards):
+    (mesh,) = slope_from(1e6 + 0.3).static
+    a, b, c = mesh.vertices_m.astype(np.float32)[mesh.faces[0]]
+    normal = np.cross(b - a, c - a)
+    return np.abs(normal / np.linalg.norm(normal) @ towards)
+
+
+def turning(samples):
+    """Metres that a corner 100 m from the origin of a frame is off that turns 9 degrees in a sweep of 0.1 s."""
+    turn = Trajectory.from_arrays([0.0, 1.0], [[0.0, 0.0, 0.0], [20.0, 0.0, 0.0]], [[0.0] * 3, [90.0, 0.0, 0.0]])
+    times_s = np.linspace(0.2, 0.3, 101)
+    samples_s = np.linspace(0.2, 0.3, samples)
+    poses = np.stack([turn.at(each) for each in samples_s])
+    if samples == 3:
+        found = np.tensordot(parabola_weights(samples_s, times_s), poses, 1)
+    else:
+        share = ((times_s - 0.2) / 0.1)[:, None, None]
+        found = (1 - share) * poses[0] + share * poses[1]
+    corner = np.array([100.0, 0.0, 0.0, 1.0])
+    return most(np.linalg.norm(np.stack([turn.at(each) for each in times_s]) @ corner - found @ corner, axis=1))
+
+
 def ours(bodies, origin_m, towards):
     return cast(bodies, origin_m, towards).range_m
 
@@ -256,6 +302,10 @@ CASES = [
          "Embree as it comes", partial(along_a_surface, bare_embree)),
     Case("coincident surfaces of two bodies", "closed form", "m", 2e-6, partial(coincident, ours),
          FORMULA, partial(coincident, formula), naive_fails=False),
+    Case("incidence on a slope 1e6 m away", "closed form", "cosine", 3e-7, partial(incidence, incidence_ours),
+         "normals of float32 corners", partial(incidence, incidence_in_float32)),
+    Case("a frame that turns 9 degrees in a sweep, 100 m away", "float64 at each time", "m", 0.01, partial(turning, 3),
+         "straight between two poses", partial(turning, 2)),
     Case("a cone of rays 1e-9 rad wide", "closed form", "relative", 1e-6, partial(narrow, 1e-9),
          "arccos of the dot product", partial(narrow_by_arccos, 1e-9)),
     Case("corners of a moving box of 0.2 m at 250 m", "every ray hits", "of 1,600 missed", 0, lost_at_corners,

@@ -36,6 +36,7 @@ def seen_where(points, *, raster=None, state=None, share=None, hits=5, least=Non
         raster=raster,
         vehicle=CAR,
         vehicle_outline_m=OUTLINE,
+        sensor_model="ideal",
         sensor_names=("a", "b"),
         sensors_m=np.zeros((2, 2)),
         hits=hits,

@@ -17,8 +17,8 @@ from .worlds import EGO, RASTER, WALL, drive, lidar, on_target, rig, world
 FREE, OCCUPIED, OUTSIDE = range(len(STATES))
 REFERENCE = PaperReference(rows=2, columns=2)
 CAMERA = {
-    "type": "camera", "name": "cam", "mount": {"x_m": 2.1, "z_m": 0.8}, "width": 90, "height": 50, "fov_deg": 100,
-    "max_range_m": 3.5, "min_range_m": 1.0,
+    "type": "camera", "name": "cam", "mount": {"x_m": 2.1, "z_m": 0.8}, "width": 180, "height": 100, "fov_deg": 100,
+    "stride": 2, "max_range_m": 3.5, "min_range_m": 1.0,
 }  # fmt: skip
 
 RADAR = {
@@ -47,10 +47,11 @@ def test_points_are_those_of_a_simulation_with_the_target_in_the_world(name, hea
         assert seen.state[row, column] == FREE
         x_m, y_m = seen.x_m[column], seen.y_m[row]
         simulator = Simulator(with_target(scenario, target.name, x_m, y_m, yaw[row, column]), {"r": sensors}, REFERENCE)
-        step = simulator.step(0)
-        ends = np.cumsum(step.sensor_points["r"])
-        clouds = np.split(step.clouds["r"], ends[:-1])
-        counts = [on_target(cloud, target, x_m, y_m, yaw[row, column]) for cloud in clouds]
+        scans = simulator.step(0).scans["r"]
+        counts = [
+            sensor.counts_as * on_target(scan.points, target, x_m, y_m, yaw[row, column])
+            for sensor, scan in zip(sensors.sensors, scans, strict=True)
+        ]
         assert seen.sensor_points[:, row, column].tolist() == counts
         assert seen.sensors[row, column] == sum(count >= 5 for count in counts)
         compared += sum(count > 0 for count in counts)

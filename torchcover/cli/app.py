@@ -38,7 +38,7 @@ def main() -> None:
     """Run the command line; a user's mistake ends in one line on stderr and exit code 2, a warning is one line too."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # where there is no ±, a result with ? is better than none
+            stream.reconfigure(errors="replace")  # where there is no –, a result with ? is better than none
     try:
         with warnings.catch_warnings(), terminable(_on_signals()) as signals:
             warnings.showwarning = _warn
@@ -105,7 +105,7 @@ def version(show: Annotated[bool, typer.Option("--version", help="Print the vers
         raise typer.Exit
 
 
-for command in (evaluate, compare, commands.study, commands.record, commands.rig, commands.show,
+for command in (evaluate, compare, commands.study, commands.record, commands.rig, commands.calibrate, commands.show,
                 commands.targets, commands.search, commands.agree):  # fmt: skip
     app.command()(command)
 app.command("list")(commands.list_builtin)

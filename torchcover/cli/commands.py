@@ -1,7 +1,7 @@
 """What each command is called with; what it does is imported when it runs."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,7 +25,9 @@ TRIED = [name for name, option in OPTIONS.items() if option.in_study == "tried"]
 )
 def study(
     rig: options.Rig,
-    steps: Annotated[int, typer.Option(min=8, help="Steps of every setting, all of them on the same instants.")] = 256,
+    steps: Annotated[
+        int, typer.Option(min=8, help="Steps of the first setting; the others see the first quarter of these instants.")
+    ] = 512,
     explain: Annotated[bool, typer.Option("--explain", help="Say where the seconds go.")] = False,
     out: options.Out = Path("out"),
     **settings: Any,  # noqa: ANN401
@@ -43,17 +45,17 @@ def study(
         raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
     given = {name: settings.pop(name) for name in TRIED if name in settings}
     first = {name: values[0] for name, values in given.items() if values}
-    others = tuple({name: value} for name, values in given.items() for value in values[1:])
+    others: Sequence[Mapping[str, Any]] = [{name: value} for name, values in given.items() for value in values[1:]]
     if not others and "rays" not in first and first.get("reference") != "paper":
         others = StudyPlan.others
-    plan = StudyPlan(Settings(rig, steps=steps, **settings, **first), others)
+    plan = StudyPlan(Settings(rig, steps=steps, **settings, **first), tuple(others))
     with claimed(out):
         found = error_against_time(plan, progress=True)
         files = found.save(out)
     print_study(found, files, out, explain=explain)
 
 
-@with_options(of_evaluate("scenario", "seed", "vehicle", "reference", "rays", "every_s"))
+@with_options(of_evaluate("scenario", "seed", "vehicle", "sensor_model", "weather", "reference", "rays", "every_s"))
 def record(
     rig: options.Rig,
     out: Annotated[
@@ -116,6 +118,26 @@ def rig(
     typer.echo(as_yaml(document), nl=False)
 
 
+def calibrate(
+    recording: Annotated[Path, typer.Argument(help="A drive on a straight road, of any layout in docs/recordings.md.")],
+    rig: Annotated[
+        str,
+        typer.Option(help="Rig that recorded it, whose LiDARs are called as there: a built-in name or a YAML file."),
+    ],
+    recording_format: options.Format = None,
+    out: Annotated[Path, typer.Option("--out", help="YAML file for the rig with what was found.")] = Path("rig.yaml"),
+) -> None:
+    """Fit how far each LiDAR of a rig sees, and its noise, to a recording: from road that did or did not return."""
+    from torchcover.recordings import open_recording
+    from torchcover.simulation import Rig, calibrate
+
+    calibrated, found = calibrate(open_recording(recording, recording_format), Rig.load(rig))
+    calibrated.save(out)
+    for one in found:
+        typer.echo(one.words)
+    typer.echo(f"Wrote {out}; simulate with it: torchcover evaluate {out}")
+
+
 def _pair(text: str) -> tuple[str, str]:
     sensor, equals, model = text.partition("=")
     if not (sensor and equals and model):
@@ -144,7 +166,7 @@ def show(
     run(name, scenario=scenario, rig=rig, step=step, seed=seed, film=film, out=out, **settings)
 
 
-@with_options(of_evaluate("vehicle", "every_s", "seed"))
+@with_options(of_evaluate("vehicle", "sensor_model", "every_s", "seed"))
 def targets(
     rig: options.Rig,
     target: Annotated[
@@ -305,7 +327,7 @@ def list_builtin(
         str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
     ] = None,
 ) -> None:
-    """List the built-in rigs, scenarios, LiDAR models and vehicles."""
+    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials and weather."""
     from torchcover.cli.listing import run
 
     run(word)

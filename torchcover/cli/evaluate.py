@@ -82,7 +82,9 @@ def _measure(
     if recording is not None:
         settings.pop("reference", None)
     named = list(rigs or (() if recording is None else recording.rigs))
-    if 0 < len(named) < at_least:
+    if len(named) == 1 and at_least > 1 and len(settings.get("weather") or ()) == 1:
+        settings["weather"] = ["clear", *settings["weather"]]
+    if 0 < len(named) * max(1, len(settings.get("weather") or ())) < at_least:
         raise ValueError(
             f"compare: at least two rigs are needed; got {named[0]} only (for one: `evaluate`; of a recording, each "
             "--sensors makes a rig)"

@@ -14,7 +14,7 @@ from torchcover.simulation import builtin_documents
 
 
 def run(word: str | None) -> None:
-    """Print the built-in rigs, scenarios, LiDAR models and vehicles: what each consists of, and its first sentence.
+    """Print what is built in: what each consists of, and its first sentence.
 
     Args:
         word: Only those with it in a column; their descriptions are then printed whole.
@@ -24,7 +24,14 @@ def run(word: str | None) -> None:
     """
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
     found = False
-    for kind, what_of in (("rigs", _sensors), ("scenarios", _traffic), ("lidars", _rows), ("vehicles", None)):
+    for kind, what_of in (
+        ("rigs", _sensors),
+        ("scenarios", _traffic),
+        ("lidars", _rows),
+        ("vehicles", None),
+        ("materials", _reflectivity),
+        ("weather", None),
+    ):
         rows = []
         for name, document in builtin_documents(kind).items():
             cells = [name, what_of(document)] if what_of else [name]
@@ -62,6 +69,10 @@ def _traffic(scenario: Mapping[str, Any]) -> str:
 def _rows(lidar: Mapping[str, Any]) -> str:
     rows = lidar["channels"] if "channels" in lidar else len(lidar["elevations_deg"])
     return f"{rows} rows, {lidar['max_range_m']:g} m"
+
+
+def _reflectivity(material: Mapping[str, Any]) -> str:
+    return str(material["reflectivity"])
 
 
 def _first_sentence(text: str) -> str:

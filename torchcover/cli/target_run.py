@@ -96,7 +96,11 @@ def _print(seen: TargetMap, verdicts: Sequence[Verdict], not_checked: Sequence[s
     console = Console()
     length, width, height = seen.target_size_m
     size = f"{length:.2f} x {width:.2f} x {height:.2f} m"
-    console.print(f"{seen.rig} sees {seen.target} ({size}), in {seen.scenario}", markup=False, soft_wrap=True)
+    console.print(
+        f"{seen.rig} sees {seen.target} ({size}), in {seen.scenario}, sensor model {seen.sensor_model}",
+        markup=False,
+        soft_wrap=True,
+    )
     worst = places_table(seen.worst(), "The places with the fewest points, 1 m apart")
     print_whole([in_words(sides_table(seen)), in_words(worst)])
     if unknown := seen.counts["share_unknown"]:

@@ -124,7 +124,8 @@ class CoverageMetric(SumsInBlocks):
         self._failures = SensorFailures(self.sensors, thresholds, square_metres) if sensors else None
         self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *([self._failures] if self._failures else []))
         values = 1 + len(thresholds) + (len(self._failures.quantities) if self._failures else 0)
-        self._in_regions = RegionSums(aggregations, Places(regions, grid), blocks, values if square_metres else 0)
+        by_area = (self.fine_blocks, values) if square_metres else None
+        self._in_regions = RegionSums(aggregations, Places(regions, grid), blocks, by_area)
         self._add_states()
 
     def _add_states(self) -> None:
@@ -142,7 +143,8 @@ class CoverageMetric(SumsInBlocks):
         for name, state in states.items():
             full_name = f"{owner}_{name}"
             self.add_state(full_name, state.initial, dist_reduce_fx=state.reduction, persistent=True)
-            self._in_blocks = (*self._in_blocks, *[full_name] * state.in_blocks)
+            self._in_blocks = (*self._in_blocks, *[full_name] * (state.in_blocks and not state.fine))
+            self._in_fine_blocks = (*self._in_fine_blocks, *[full_name] * state.fine)
 
     def _sums_of(self, owner: str) -> dict[str, Tensor]:
         return {name: getattr(self, f"{owner}_{name}") for name in self._state_names[owner]}
@@ -155,12 +157,14 @@ class CoverageMetric(SumsInBlocks):
         weights: Clouds | None = None,
         height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
+        error: SensorClouds | None = None,
     ) -> None:
         """Add one step, or one step for each entry of two lists.
 
         Args:
-            sensor: (N, 3) points of the rig in the vehicle frame in metres, or a list of them. N = 0: a blind step.
-                Of a metric with `sensors`: name of the sensor -> its points, or a list of such dicts.
+            sensor: (N, 3) points of the rig in the vehicle frame in metres, where they truly are if that is known, or a
+                list of them. N = 0: a blind step. Of a metric with `sensors`: name of the sensor -> its points, or a
+                list of such dicts.
             reference: (M, 3) points of the reference sensor in the same frame, or a list of the same length. M = 0:
                 the step says nothing.
             weights: (M,) square metres that each reference point stands for (`frame.reference_weights`), or a list of
@@ -172,14 +176,17 @@ class CoverageMetric(SumsInBlocks):
             place_in_time: Number of the step, 10^15 at most, or a list of them (`frame.place_in_time`); it decides
                 about the block, so that steps of one number, as of an instant that is seen again, share one. Not
                 given: counted on from the steps so far.
+            error: (N,) by how many metres each point of the rig was measured off its place, along its ray, or as
+                `sensor` in a dict or a list. One that is off by more than `within_m` is no point. Not given: none is.
 
         Raises:
             ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates; weights,
-                heights or places in time as `torchcover.coverage.steps.checked_steps` refuses them.
+                heights, places in time or errors as `torchcover.coverage.steps.checked_steps` refuses them.
             TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
         """
+        given = (sensor, reference, weights, height, place_in_time, error)
         how: dict[str, Any] = {"grid": self.grid, "square_metres": self.square_metres, "names": self.sensors}
-        for step in checked_steps(sensor, reference, weights, height, place_in_time, first=int(self.steps), **how):
+        for step in checked_steps(*given, within_m=self.within_m, first=int(self.steps), **how):
             self._add_step(step)
 
     def forward(
@@ -190,12 +197,18 @@ class CoverageMetric(SumsInBlocks):
         weights: Clouds | None = None,
         height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
+        error: SensorClouds | None = None,
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
         if place_in_time is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
             place_in_time = [int(self.steps) + step for step in range(len(as_list(reference, "reference")))]
-        given = {"weights": weights, "height": height, "place_in_time": place_in_time}
+        given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
         return super().forward(sensor, reference, **given)  # type: ignore[no-any-return]
+
+    @property
+    def within_m(self) -> float:
+        """How far off a point may be measured: the largest threshold; any distance if there is none."""
+        return max(self.thresholds, default=math.inf)
 
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
     def _add_step(self, step: CheckedStep) -> None:
@@ -210,7 +223,8 @@ class CoverageMetric(SumsInBlocks):
         binned = self._binned(place_in_time, cell.to(device), of_sensors[:, of].to(device), weights)
         for aggregation in self.aggregations:
             aggregation.update(self._sums_of(aggregation.name), binned)
-        self._in_regions.update(self._sums_of(IN_REGIONS), binned, reference[inside[of]].to(device))
+        fine = self._fine_block_of(place_in_time)
+        self._in_regions.update(self._sums_of(IN_REGIONS), binned, fine, reference[inside[of]].to(device))
         self.probed_steps[binned.block, binned.means.cell] += 1
         self.points[binned.means.cell] += binned.means.points
         self.steps += 1
@@ -248,7 +262,7 @@ class CoverageMetric(SumsInBlocks):
             area=self._listed(AreaSums, self.area_m2, self.area_sums) if self.square_metres else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
             regions=self.regions,
-            places=self._in_regions.area(self._sums_of(IN_REGIONS), self.block_steps),
+            places=self._in_regions.area(self._sums_of(IN_REGIONS), self.fine_steps),
             aggregated=self._in_regions.numbers(self._sums_of(IN_REGIONS), self.max_radius),
             redundancy=Redundancy(self.sensors, {one.quantity.key: one for one in failures}) if failures else None,
         )
@@ -263,7 +277,7 @@ class CoverageMetric(SumsInBlocks):
         Raises:
             ValueError: As there.
         """
-        sums = self._in_regions.area(self._sums_of(IN_REGIONS), self.block_steps)
+        sums = self._in_regions.area(self._sums_of(IN_REGIONS), self.fine_steps)
         numbers = [self._in_regions.places.number_of(*place) for place in places]
         if measure == "area" and sums and None not in numbers:
             quantities = MeanOfMeans(self.thresholds).quantities

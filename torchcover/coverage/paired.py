@@ -1,5 +1,6 @@
 """Comparisons are paired: rigs at the same instants, measured against the same reference."""
 
+import math
 from collections.abc import Mapping
 
 import torch
@@ -59,4 +60,25 @@ def differences(coverages: Mapping[str, Coverage], region: Region, height: str) 
         expected = part(first, region, height)
         for name, coverage in coverages.items():
             found[name] |= part(coverage, region, height).differences(expected)
+    return found
+
+
+def leaders(coverages: Mapping[str, Coverage], region: Region, height: str) -> dict[str, str]:
+    """Key of a quantity -> the rig that is best in it, where its lead over the next is more than chance.
+
+    Args:
+        coverages: As in `differences`.
+        region: As there.
+        height: As there.
+    """
+    found = {}
+    for part in (Coverage.estimate, Coverage.estimate_aggregated):
+        each = {rig: part(coverage, region, height) for rig, coverage in coverages.items()}
+        for at, quantity in enumerate(next(iter(each.values())).quantities):
+            gains = {rig: quantity.gain(float(estimate.value[at])) for rig, estimate in each.items()}
+            ranked = sorted((rig for rig in gains if not math.isnan(gains[rig])), key=gains.__getitem__)
+            if len(ranked) > 1:
+                best, following = (each[rig][at : at + 1] for rig in (ranked[-1], ranked[-2]))
+                if best.differences(following)[quantity.key].significant:
+                    found[quantity.key] = ranked[-1]
     return found

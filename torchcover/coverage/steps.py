@@ -23,7 +23,7 @@ MAX_NUMBER = 10**15
 
 # One step, or a list with an entry for each.
 Clouds: TypeAlias = Tensor | Sequence[Tensor]
-# Of a rig whose sensors are told apart: by their names.
+# Of a rig whose sensors are told apart: by their names. Of clouds, or of a number for each of their points.
 SensorClouds: TypeAlias = Clouds | Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]]
 
 
@@ -81,7 +81,9 @@ def checked_steps(
     weights: Clouds | None,
     height: Clouds | None,
     place_in_time: int | Sequence[int] | None,
+    error: SensorClouds | None,
     *,
+    within_m: float,
     grid: BevGrid,
     square_metres: bool,
     names: Sequence[str] = (),
@@ -95,6 +97,8 @@ def checked_steps(
         weights: Their weights.
         height: Their heights above the local ground.
         place_in_time: Numbers of the steps in time.
+        error: How far off the points of the rig were measured.
+        within_m: Those that are farther off are left out.
         grid: Which needs heights, or does not.
         square_metres: Whether weights are needed.
         names: Of the sensors, where they are told apart.
@@ -102,8 +106,8 @@ def checked_steps(
 
     Raises:
         ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights that are
-            not positive and finite, heights that are infinite or do not go with the grid, a place in time that is
-            negative or above 10^15.
+            not positive and finite, heights that are infinite or do not go with the grid, errors that are NaN, a place
+            in time that is negative or above 10^15.
         TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
     """
     if square_metres and weights is None:
@@ -120,10 +124,11 @@ def checked_steps(
     numbers = list(range(first, first + count)) if place_in_time is None else _numbers(place_in_time)
     if len(sensors) != count:
         raise ValueError(f"{len(sensors)} sensor clouds for {count} reference clouds; one pair a step")
-    if {len(every_weights), len(every_height), len(numbers)} != {count}:
+    errors = [None] * count if error is None else [error] if isinstance(error, Mapping) else as_list(error, "error")
+    if {len(every_weights), len(every_height), len(numbers), len(errors)} != {count}:
         raise ValueError(
-            f"{len(every_weights)} weights, {len(every_height)} heights and {len(numbers)} places in time for {count} "
-            "reference clouds; one a step each"
+            f"{len(every_weights)} weights, {len(every_height)} heights, {len(numbers)} places in time and "
+            f"{len(errors)} errors for {count} reference clouds; one a step each"
         )
     each = zip(sensors, references, every_weights, every_height, numbers, strict=True)
     steps = [CheckedStep(*parts) for parts in each]
@@ -135,7 +140,28 @@ def checked_steps(
         _check_height(step.height, step.reference, grid, f"height[{at}]")
         if not 0 <= step.number <= MAX_NUMBER:
             raise ValueError(f"place_in_time[{at}]: a number from 0 to {MAX_NUMBER:,} is needed; got {step.number}")
-    return steps
+    if error is None:
+        return steps
+    of_steps = [_by_name(one, names) for one in errors]
+    return [
+        step._replace(sensors=_measured(step.sensors, one, f"error[{at}]", within_m))
+        for at, (step, one) in enumerate(zip(steps, of_steps, strict=True))
+    ]
+
+
+def _measured(
+    clouds: Mapping[str, Tensor], errors: Mapping[str, Tensor], name: str, within_m: float
+) -> Mapping[str, Tensor]:
+    """The points that were not measured farther off."""
+    for sensor, error in errors.items():
+        what, points = name + f"[{sensor!r}]" * bool(sensor), len(clouds[sensor])
+        check_tensor(error, what)
+        if error.shape != (points,) or bool(error.isnan().any()):
+            raise ValueError(
+                f"{what}: metres of each of {points} points of the rig are needed; got {tuple(error.shape)} with "
+                f"{int(error.isnan().sum())} NaN"
+            )
+    return {sensor: cloud[errors[sensor].to(cloud.device).abs() <= within_m] for sensor, cloud in clouds.items()}
 
 
 def as_list(clouds: Any, name: str) -> list[Any]:  # noqa: ANN401

@@ -108,10 +108,8 @@ def summarise(coverage: "Coverage", region: Region, height: str) -> RegionSummar
         cells=cells,
         known_cells=known_cells,
         measure=coverage.measure,
-        # How often other intervals than those by area hold the truth has not been measured.
-        numbers=numbers(coverage.estimate(region, height), intervals=by_area)
-        | numbers(coverage.estimate_aggregated(region, height), intervals=False),
-        known=numbers(coverage.estimate(region, height, "known"), intervals=False),
+        numbers=numbers(coverage.estimate(region, height)) | numbers(coverage.estimate_aggregated(region, height)),
+        known=numbers(coverage.estimate(region, height, "known")),
         visible_m2=float(area_in_blocks(coverage, region, height)[1][:, 0].sum()) / steps
         if by_area and steps
         else math.nan,
@@ -123,7 +121,7 @@ def region_redundancy(redundancy: Redundancy, coverage: "Coverage", region: Regi
     """The numbers of a region without each sensor; as `summarise`."""
     thresholds, estimate = coverage.thresholds, estimate_redundancy(coverage, region, height)
     single, several = MeanOfMeans(thresholds).quantities, redundancy_quantities((), thresholds)
-    numbers, count = estimate.numbers(intervals=False), len(single)
+    numbers, count = estimate.numbers(), len(single)
     each, change = {}, {}
     for at, sensor in enumerate(redundancy.sensors):
         start = count + len(several) + at * count

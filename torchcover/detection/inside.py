@@ -127,13 +127,17 @@ def _numbered(counts: Tensor) -> Tensor:
     return every - (total - counts).repeat_interleave(counts)
 
 
-def with_hits(boxes: Boxes, clouds: Mapping[str, Tensor]) -> Boxes:
+def with_hits(boxes: Boxes, clouds: Mapping[str, Tensor], counts_as: Mapping[str, Tensor] | None = None) -> Boxes:
     """The same boxes with `hits`: how many points of each rig lie in each.
 
     Args:
         boxes: K boxes.
         clouds: Name of each rig -> (N, 3) its points in the vehicle frame.
+        counts_as: Name of a rig -> (N,) how many points each of its points is counted as; one if not given.
     """
-    of_all = _BoxMap(boxes)
-    inside = {rig: of_all.holding(cloud).box for rig, cloud in clouds.items()}
-    return replace(boxes, hits={rig: torch.bincount(box, minlength=len(boxes)) for rig, box in inside.items()})
+    of_all, hits = _BoxMap(boxes), dict[str, Tensor]()
+    for rig, cloud in clouds.items():
+        inside = of_all.holding(cloud)
+        weights = counts_as[rig][inside.point] if counts_as and rig in counts_as else None
+        hits[rig] = torch.bincount(inside.box, weights, minlength=len(boxes)).long()
+    return replace(boxes, hits=hits)

@@ -71,7 +71,7 @@ def compare(results: Result | str | Path | Sequence[Result | str | Path]) -> Res
         regions=next(iter(coverages.values())).regions,
         run=None,
         rigs={name: str(given) for name, given in zip(names, given_as, strict=True)},
-        source={"scenario": None, "vehicle": None, "frames": None, "seed": None},
+        source={"scenario": None, "vehicle": None, "sensor_model": None, "weather": None, "frames": None, "seed": None},
         reference_record=None,
         device=None,
         inputs=[given for given in given_as if isinstance(given, Path)],

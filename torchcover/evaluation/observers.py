@@ -3,8 +3,6 @@
 from collections.abc import Mapping
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
-from torch import Tensor
-
 from torchcover.coverage import Coverage, CoverageMetric
 from torchcover.frames import Frame
 
@@ -87,20 +85,14 @@ class CoverageObserver:
                 square metres or the heights that the metric wants, or it is unknown which points are of which sensor
                 and it wants that.
         """
-        sensor = self._by_sensor(frame) if self.metric.sensors else self._whole(frame)
+        clouds = frame.clouds_by_sensor if self.metric.sensors else frame.cloud_of
         self.metric.update(
-            sensor,
+            clouds(self.rig, within_m=self.metric.within_m),
             frame.reference,
             weights=frame.reference_weights,
             height=frame.heights_in(self.metric.grid.band_frame),
             place_in_time=frame.place_in_time,
         )
-
-    def _whole(self, frame: Frame) -> Tensor:
-        return frame.sensor if self.rig is None else frame.cloud_of(self.rig)
-
-    def _by_sensor(self, frame: Frame) -> dict[str, Tensor]:
-        return frame.clouds_by_sensor(self.rig)
 
     def compute(self) -> Coverage:
         """The coverage so far."""

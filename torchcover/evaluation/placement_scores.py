@@ -137,7 +137,7 @@ def _own(coverages: Sequence[Coverage], region: Region, seed: int) -> Iterator[R
         name, bands = f"detection {THRESHOLD_M:g} m, {{}}, {region.name}, {words}", []
         for band in coverages[0].grid.heights:
             estimates = [coverage.estimate(region, band, measure)[1:] for coverage in coverages]
-            numbers = [list(estimate.numbers(intervals=measure == "area").values()) for estimate in estimates]
+            numbers = [list(estimate.numbers().values()) for estimate in estimates]
             (one,) = rankings(OWN, numbers, estimates, seed)
             bands.append(one._replace(name=name.format(band)))
         yield from bands

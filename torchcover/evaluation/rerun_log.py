@@ -47,12 +47,12 @@ class RerunLog:
         self._stream = opened(self._path, self._unfinished)
 
     def update(self, frame: Frame) -> None:
-        """Write the clouds of a frame, the reference coloured by the radius of each rig, and the boxes."""
+        """Write the clouds of a frame as measured, the reference coloured by the radius of each rig, and the boxes."""
         import rerun as rr
 
         self._stream.set_time("step", sequence=frame.index)
         for rig, cloud in frame.clouds.items():
-            self._stream.log([rig, "points"], rr.Points3D(_few(cloud), colors=[70, 120, 190]))
+            self._stream.log([rig, "points"], rr.Points3D(_few(frame.landed(rig)), colors=[70, 120, 190]))
             radius = blind_spot_radius(frame.reference, cloud, max_radius=FAR_M)
             colours = coloured(_few(radius), ColourScale("radius", "m", "viridis_r", 0.0, FAR_M))
             self._stream.log([rig, "reference by radius"], rr.Points3D(_few(frame.reference), colors=colours))

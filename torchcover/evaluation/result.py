@@ -259,6 +259,7 @@ class Result:
         rays, every_s = record["rays_per_step"], record["every_s"]
         sensor = f"Reference sensor: {record['sensor']}, {rays:,} rays a step; a step every {every_s:g} s."
         carried = [f"Vehicle: {self.vehicle}."] if self.vehicle else []
+        carried += sensor_model_words(self.source.get("sensor_model")) + weather_words(self.source.get("weather"))
         return [*on_failure, *carried, sensor, *record["notes"], *self._on_refused, *self._on_repetitions]
 
     @property
@@ -293,9 +294,9 @@ class Result:
         if not again:
             return []
         if steps - again == 1:
-            about = ": ± is about the reference sensor's places only" if self._has_errors else ""
+            about = ": intervals are about the reference sensor's places only" if self._has_errors else ""
             return [f"All {steps:,} steps show the same instant{about}."]
-        known = ", which ± knows" if self._has_errors else ""
+        known = ", which intervals know" if self._has_errors else ""
         return [f"{steps - again:,} different instants in {steps:,} steps: the scenario was seen again{known}."]
 
     @property
@@ -307,3 +308,30 @@ class Result:
         cut_short = ", cut short" if self.run is not None and not self.run.complete else ""
         about = f"Result of {', '.join(self.coverages)}: {self._first.counts['steps']} steps{cut_short}"
         return f"{about}\n{RENDERERS['text'](self.table)}"
+
+
+def sensor_model_words(of_rigs: object) -> list[str]:
+    """What sensors make of their hits, in words; none where that is unknown.
+
+    Example:
+        >>> sensor_model_words({"kitti": "real"})
+        ['Sensor model: real, what returns too little light is no point.']
+    """
+    if not isinstance(of_rigs, Mapping) or not of_rigs:
+        return []
+    means = {"real": "what returns too little light is no point", "ideal": "every hit is a point"}
+    if len(set(of_rigs.values())) == 1:
+        (model,) = set(of_rigs.values())
+        return [f"Sensor model: {model}, {means[model]}."]
+    return [f"Sensor models: {', '.join(f'{rig} {model}' for rig, model in of_rigs.items())}: differences are of both."]
+
+
+def weather_words(of_rigs: object) -> list[str]:
+    """What the rigs were measured in, in words; none where that is clear air or unknown.
+
+    Example:
+        >>> weather_words({"kitti, clear": "clear", "kitti, fog_100m": "fog_100m"}), weather_words({"kitti": "clear"})
+        (['Weather: clear, fog_100m.'], [])
+    """
+    names = dict.fromkeys(of_rigs.values()) if isinstance(of_rigs, Mapping) else {}
+    return [f"Weather: {', '.join(names)}."] if names and list(names) != ["clear"] else []

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torchcover.evaluation.ranks import Ranks
     from torchcover.evaluation.target_error import TargetError
     from torchcover.frames import FrameSource
-    from torchcover.simulation import RegionsOfInterest, Rig, Scenario
+    from torchcover.simulation import RegionsOfInterest, Rig, Scenario, Weather
 
     AnyRig = Rig | str | Path
 
@@ -109,6 +109,15 @@ def _target(given: "TargetError | str | Sequence[str] | None") -> "TargetError |
     return given if isinstance(given, TargetError) else TargetError.parse(given)
 
 
+def _weather(given: "Weather | str | Path | Sequence[Weather | str | Path]") -> "tuple[Weather, ...]":
+    if not given:
+        return ()
+    from torchcover.simulation import Weather
+
+    each = [given] if isinstance(given, (Weather, str, Path)) else given
+    return tuple(one if isinstance(one, Weather) else Weather.load(one) for one in each)
+
+
 def _device(given: "str | torch.device") -> str:
     return str(given)
 
@@ -153,6 +162,22 @@ class Settings:
             in_study="once",
         ),
     ] = None
+    sensor_model: Annotated[
+        Literal["ideal", "real"] | None,
+        Option(
+            "What sensors make of their hits: `real`, a LiDAR has no point where too little light returns (default "
+            "where its range at 10 % is known), or `ideal`, every hit is a point (default of the `paper` reference).",
+            in_study=True,
+        ),
+    ] = None
+    weather: Annotated[
+        Read["Weather | str | Path | Sequence[Weather | str | Path]", "tuple[Weather, ...]"],
+        Option(
+            "Weather in place of the scenario's: a built-in name as fog_100m (see `list`) or a YAML file. In several, "
+            "every rig is measured in each; `compare` of one rig puts it beside `clear`.",
+            list[str],
+        ),
+    ] = Read(_weather, ())
     ask: Annotated[
         Read["RegionsOfInterest | str | Path | None", "RegionsOfInterest | None"],
         Option(
@@ -268,6 +293,8 @@ class Settings:
             raise ValueError(f"estimate {self.estimate}: `area` or `known` is needed")
         if self.band_frame not in (None, "ground", "vehicle"):
             raise ValueError(f"band_frame {self.band_frame}: `ground` or `vehicle` is needed")
+        if self.sensor_model not in (None, "ideal", "real"):
+            raise ValueError(f"sensor_model {self.sensor_model}: `ideal` or `real` is needed")
         if self.reference == "paper" and self.band_frame == "ground":
             raise ValueError("band_frame ground: the paper's reference has bands over z of the vehicle; leave it out")
 
@@ -291,8 +318,10 @@ class Settings:
         """Find out whether anything was set that a recording decides itself.
 
         Raises:
-            ValueError: The vehicle, the reference sensor, its rays or the time between steps was set.
+            ValueError: The vehicle, the sensor model, the reference sensor, its rays or the time between steps was set.
         """
+        if self.sensor_model is not None or self.weather:
+            raise ValueError("sensor_model and weather are for simulations; a recording has the points that returned")
         if self.vehicle is not None:
             raise ValueError("vehicle: for simulations; a recording has its own")
         if any(setting is not None for setting in (self.reference, self.rays, self.every_s)):

@@ -125,7 +125,7 @@ class Standing:
     @property
     def words(self) -> str:
         """Error and target."""
-        return f"± {_measure(self.error, self.quantity)} (target {_measure(self.target, self.quantity)})"
+        return f"error {_measure(self.error, self.quantity)} (target {_measure(self.target, self.quantity)})"
 
 
 def standings(target: TargetError, coverages: Mapping[str, Coverage], regions: Sequence[Region]) -> list[Standing]:

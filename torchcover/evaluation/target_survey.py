@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -47,6 +47,7 @@ def survey_target(
     scenario: Scenario | str | Path | None = None,
     *,
     vehicle: str | Path | None = None,
+    sensor_model: Literal["ideal", "real"] | None = None,
     raster: Raster | None = None,
     steps: int | None = None,
     every_s: float | None = None,
@@ -62,6 +63,7 @@ def survey_target(
         target: "child", "adult", "dog", "cyclist", "pole", a built-in vehicle, the YAML file of one, or a mesh file.
         scenario: The world: a scenario, a built-in name or a YAML file; flat ground with nothing on it if not given.
         vehicle: What carries the rig, as for `evaluate`, or a mesh file.
+        sensor_model: What sensors make of their hits; as for `evaluate`.
         raster: Where to put it; within 5 m of the vehicle in steps of 0.2 m if not given.
         steps: How many steps are averaged; 1 where all are alike, else 16.
         every_s: Time between two of them; as for `evaluate` if not given.
@@ -82,7 +84,7 @@ def survey_target(
         >>> seen.target, seen.counts["free"]
         ('dog_57cm', 8)
     """
-    rig = as_called(rig)
+    rig = as_called(rig).sensing(sensor_model)
     world = free_space() if scenario is None else scenario
     world = with_ego(world if isinstance(world, Scenario) else Scenario.load(world), {rig.name: rig}, vehicle)
     alike = world.instants == 1 and all(sensor.is_exact for sensor in rig.sensors)
@@ -209,7 +211,7 @@ def target_page(
     tables += [places_table(verdict.worst, f"Not met: {verdict.requirement.words}") for verdict in failed]
     return Page(
         title=f"{seen.rig}: would it see {seen.target}?",
-        lead=f"In {seen.scenario}, measured by torchcover."
+        lead=f"In {seen.scenario}, sensor model {seen.sensor_model}, measured by torchcover."
         + "".join(f" Not checked, as it is not about {seen.target}: {words}." for words in not_checked),
         tables=tables,
         maps=_maps(seen),

@@ -21,6 +21,7 @@ from torchcover.simulation import (
     Scenario,
     Sensor,
     SimulatedFrames,
+    Weather,
     builtin_names,
     reference_called,
     with_ego,
@@ -36,7 +37,7 @@ EVERY_S_IN_TRAFFIC = 10.0
 CALLER = 4
 # Options that frames, what is asked and observers say by what they are, and those that change no result.
 TOLD_OTHERWISE = {"scenario", "seed", "vehicle", "reference", "rays", "every_s", "ask", "cell_m", "band_frame"}
-TOLD_OTHERWISE |= {"metrics", "steps", "device", "workers", "skip_bad_frames"}
+TOLD_OTHERWISE |= {"sensor_model", "weather", "metrics", "steps", "device", "workers", "skip_bad_frames"}
 # Of an identity, what is longer is told by its hash.
 MAX_TOLD = 40
 
@@ -97,7 +98,10 @@ def task_of(settings: Settings) -> Task[FrameSource]:
     if settings.scenario is not None:
         raise ValueError("scenario and frames exclude each other: simulate a scenario or read a recording")
     settings.check_recording()
-    source = RecordedFrames(frames) if isinstance(frames, str | Path) else frames
+    if isinstance(frames, str | Path):
+        source: FrameSource = RecordedFrames(frames, ground=settings.band_frame != "vehicle")
+    else:
+        source = frames
     if missing := [name for name in vars(FrameSource) if not name.startswith("_") and not hasattr(source, name)]:
         raise TypeError(
             f"frames: a recording's path or a torchcover.data.FrameSource is needed; got {type(source).__name__}, "
@@ -123,7 +127,11 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
     if not rigs:
         raise ValueError("which rig? Give a built-in name (see `torchcover list`) or a YAML file, or a recording")
     names = distinct_names(rigs)
-    carried = {name: loaded(rig) for name, rig in zip(names, rigs, strict=True)}
+    sensor_model = settings.sensor_model or ("ideal" if settings.reference == "paper" else None)
+    carried = {name: loaded(rig).sensing(sensor_model) for name, rig in zip(names, rigs, strict=True)}
+    given = {name: given_as(rig) for name, rig in zip(names, rigs, strict=True)}
+    if settings.weather:
+        carried, given = _in_weather(carried, given, settings.weather)
     loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
     world = with_ego(loaded_world, carried, settings.vehicle)
     asked = (settings.ask or RegionsOfInterest()).around(
@@ -139,10 +147,24 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
         boxes=boxes or settings.needs_boxes,
     )
     frames.simulator.check_run(frames.steps)
-    given = {name: given_as(rig) for name, rig in zip(names, rigs, strict=True)}
     # A path says more than the name within the file.
     description = {**frames.description, "scenario": world.name if loaded_world is scenario else str(scenario)}
     return Task(frames, given, frames.sensors, description, asked, _most_steps(frames, settings))
+
+
+def _in_weather(
+    carried: Mapping[str, Rig], given: Mapping[str, str], weather: Sequence[Weather]
+) -> tuple[dict[str, Rig], dict[str, str]]:
+    """Each rig in each weather, which its name tells if there are several; and what the user called them."""
+    if len(weather) == 1:
+        return {name: rig.model_copy(update={"weather": weather[0]}) for name, rig in carried.items()}, dict(given)
+    if len({one.name for one in weather}) < len(weather):
+        raise ValueError(
+            f"weather: two are called alike, {', '.join(one.name for one in weather)}; name each another way"
+        )
+    each = {f"{name}, {one.name}": (name, one) for name in carried for one in weather}
+    in_each = {both: carried[name].model_copy(update={"weather": one}) for both, (name, one) in each.items()}
+    return in_each, {both: given[name] for both, (name, _) in each.items()}
 
 
 def _band_frame(settings: Settings) -> BandFrame:

@@ -4,6 +4,7 @@ from .augmentation import rotate as rotate
 from .augmentation import scale as scale
 from .frame import Frame as Frame
 from .frame import FrameBatch as FrameBatch
+from .frame import Measured as Measured
 from .frame import collate_frames as collate_frames
 from .source import BadFrameError as BadFrameError
 from .source import ChosenRigs as ChosenRigs

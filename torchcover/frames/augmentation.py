@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcover.detection.boxes import Boxes
-from torchcover.frames.frame import Frame
+from torchcover.frames.frame import Frame, Measured
 
 
 def flip(frame: Frame) -> Frame:
@@ -121,6 +121,10 @@ def _moved(frame: Frame, similarity: Tensor) -> Frame:
         reference_weights=weights,
         reference_heights_m=heights_m,
         boxes=None if frame.boxes is None else _moved_boxes(frame.boxes, similarity),
+        measured={
+            name: Measured(_times(similarity, measured.points), measured.error_m * factor)
+            for name, measured in frame.measured.items()
+        },
     )
 
 

@@ -1,7 +1,9 @@
 """One instant: what the rig saw and what was there to be seen."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -9,14 +11,32 @@ from torch import Tensor
 from torchcover.coverage.grid import BandFrame
 from torchcover.detection.boxes import Boxes
 
+# What was measured farther off than this is no point on an object: the threshold of the paper.
+ON_OBJECT_WITHIN_M = 0.4
+
+
+class Measured(NamedTuple):
+    """What sensors that err made of the points of a rig.
+
+    Args:
+        points: (N, 3) float32 where they landed, in the vehicle frame.
+        error_m: (N,) float32 how far off they were measured, along their rays.
+    """
+
+    points: Tensor
+    error_m: Tensor
+
 
 @dataclass(frozen=True)
 class Frame:
     """The clouds of one time step, in the vehicle frame (x forward, y left, z up, metres).
 
+    A point is a place on a surface, measured with an error. What it covers is what was truly hit: a point that lands in
+    a gap fills none.
+
     Args:
-        clouds: Name of each rig -> (N, 3) float32 points of all its sensors; one rig, unless several were simulated
-            side by side.
+        clouds: Name of each rig -> (N, 3) float32 points of all its sensors, where they truly are; one rig, unless
+            several were simulated side by side. Of a recording only `landed` is known, and stands for it.
         reference: (M, 3) float32 points of the reference sensor.
         index: Position in its dataset.
         name: What a user calls it: a file stem, or scenario and step.
@@ -30,6 +50,7 @@ class Frame:
             their order; None if it is unknown which points are whose.
         place_in_time: Number of what it shows, for standard errors: frames that share it, as of an instant that is
             seen again or of one city, do not count as independent. Not given: `index`, every frame is its own.
+        measured: Name of a rig -> what its sensors made of its points, if they err; the others land where they are.
     """
 
     clouds: Mapping[str, Tensor]
@@ -42,49 +63,94 @@ class Frame:
     place_in_time: int = None  # type: ignore[assignment]  # filled in at once
     sensor_points: Mapping[str, Mapping[str, int]] | None = None
     reference_heights_m: Tensor | None = None
+    measured: Mapping[str, Measured] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.place_in_time is None:
             object.__setattr__(self, "place_in_time", self.index)
+        for rig in self.measured.keys() & self.clouds.keys():
+            sizes = [len(self.clouds[rig]), *map(len, self.measured[rig])]
+            if len(set(sizes)) > 1:
+                raise ValueError(
+                    f"frame {self.name!r}: {rig!r} has {sizes[0]} points, {sizes[1]} that were measured and {sizes[2]} "
+                    "errors; give `clouds` and `measured` together"
+                )
 
     @property
     def sensor(self) -> Tensor:
-        """(N, 3) points of the only rig.
+        """(N, 3) points of the only rig, where they truly are.
 
         Raises:
-            ValueError: There are several rigs: say which, `frame.clouds[name]`.
+            ValueError: There are several rigs: say which, `frame.cloud_of(name)`.
         """
-        if len(self.clouds) != 1:
-            raise ValueError(f"the frame has clouds of {len(self.clouds)} rigs ({', '.join(self.clouds)}): say which")
-        return next(iter(self.clouds.values()))
+        return self.cloud_of()
 
-    def cloud_of(self, rig: str) -> Tensor:
-        """(N, 3) points of one rig.
+    def cloud_of(self, rig: str | None = None, *, within_m: float = math.inf) -> Tensor:
+        """(N, 3) points of one rig, where they truly are.
+
+        Args:
+            rig: Which of several rigs; the only one if not given.
+            within_m: Only those that were measured with no larger error.
 
         Raises:
-            ValueError: The frame has no such rig.
+            ValueError: The frame has no such rig, or several, and none was named.
         """
-        if rig not in self.clouds:
-            raise ValueError(f"frame {self.name!r} has no rig {rig!r}; it has {', '.join(self.clouds)}")
-        return self.clouds[rig]
+        rig = self._named(rig)
+        cloud = self.clouds[rig]
+        return cloud[self._is_within(rig, within_m)] if rig in self.measured and within_m < math.inf else cloud
 
-    def clouds_by_sensor(self, rig: str | None = None) -> dict[str, Tensor]:
-        """(N, 3) points of each sensor of a rig.
+    def landed(self, rig: str | None = None) -> Tensor:
+        """(N, 3) points of one rig as they were measured: what a network is fed with, or a file holds.
 
         Args:
             rig: Which of several rigs; the only one if not given.
 
         Raises:
+            ValueError: As `cloud_of`.
+
+        Example:
+            >>> true, off = torch.tensor([[5.0, 0.0, 0.0]]), torch.tensor([[5.1, 0.0, 0.0]])
+            >>> measured = {"rig": Measured(off, torch.tensor([0.1]))}
+            >>> frame = Frame({"rig": true}, torch.zeros(1, 3), index=0, name="a", measured=measured)
+            >>> frame.landed() is off, frame.cloud_of(within_m=0.4), len(frame.cloud_of(within_m=0.05))
+            (True, tensor([[5., 0., 0.]]), 0)
+        """
+        rig = self._named(rig)
+        return self.measured[rig].points if rig in self.measured else self.clouds[rig]
+
+    def _named(self, rig: str | None) -> str:
+        if rig is None and len(self.clouds) != 1:
+            raise ValueError(f"the frame has clouds of {len(self.clouds)} rigs ({', '.join(self.clouds)}): say which")
+        if rig is not None and rig not in self.clouds:
+            raise ValueError(f"frame {self.name!r} has no rig {rig!r}; it has {', '.join(self.clouds)}")
+        return next(iter(self.clouds)) if rig is None else rig
+
+    def _is_within(self, rig: str, within_m: float) -> Tensor:
+        return self.measured[rig].error_m.abs() <= within_m
+
+    def clouds_by_sensor(self, rig: str | None = None, *, within_m: float = math.inf) -> dict[str, Tensor]:
+        """(N, 3) points of each sensor of a rig, where they truly are.
+
+        Args:
+            rig: Which of several rigs; the only one if not given.
+            within_m: As in `cloud_of`.
+
+        Raises:
             ValueError: No such rig, or it is unknown which points are whose.
         """
-        cloud, name = self.sensor if rig is None else self.cloud_of(rig), rig or next(iter(self.clouds))
+        name = self._named(rig)
         if self.sensor_points is None or name not in self.sensor_points:
             raise ValueError(
                 f"frame {self.name!r}: it is unknown which points of {name!r} are of which sensor (sensor_points), as "
                 "redundancy needs"
             )
         points = self.sensor_points[name]
-        return dict(zip(points, torch.split(cloud, list(points.values())), strict=True))
+        sizes = list(points.values())
+        clouds = dict(zip(points, torch.split(self.clouds[name], sizes), strict=True))
+        if name not in self.measured or within_m == math.inf:
+            return clouds
+        within = torch.split(self._is_within(name, within_m), sizes)
+        return {sensor: cloud[kept] for (sensor, cloud), kept in zip(clouds.items(), within, strict=True)}
 
     def pin_memory(self) -> "Frame":
         """A copy in page-locked memory; DataLoader calls it when `pin_memory=True`."""
@@ -128,6 +194,7 @@ class Frame:
             reference_weights=None if weights is None else change(weights),
             reference_heights_m=None if heights_m is None else change(heights_m),
             boxes=boxes,
+            measured={name: Measured(*map(change, measured)) for name, measured in self.measured.items()},
         )
 
 
@@ -146,16 +213,24 @@ class FrameBatch:
 
     @property
     def sensor(self) -> list[Tensor]:
-        """One (N, 3) cloud a frame, of the only rig; N differs."""
+        """One (N, 3) cloud a frame, of the only rig, where its points truly are; N differs."""
         return [frame.sensor for frame in self.frames]
 
-    def clouds_of(self, rig: str) -> list[Tensor]:
-        """One (N, 3) cloud a frame, of one of several rigs.
+    def clouds_of(self, rig: str | None = None, *, within_m: float = math.inf) -> list[Tensor]:
+        """One (N, 3) cloud a frame, as `Frame.cloud_of`.
 
         Raises:
             ValueError: A frame has no such rig.
         """
-        return [frame.cloud_of(rig) for frame in self.frames]
+        return [frame.cloud_of(rig, within_m=within_m) for frame in self.frames]
+
+    def landed(self, rig: str | None = None) -> list[Tensor]:
+        """One (N, 3) cloud a frame, as `Frame.landed`.
+
+        Raises:
+            ValueError: A frame has no such rig.
+        """
+        return [frame.landed(rig) for frame in self.frames]
 
     @property
     def reference(self) -> list[Tensor]:
@@ -226,7 +301,7 @@ class FrameBatch:
         return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
 
     def stacked_points(self, rig: str | None = None) -> Tensor:
-        """The clouds of one rig as one tensor, as voxel and pillar encoders take them.
+        """The clouds of one rig as they landed in one tensor, as voxel and pillar encoders take them.
 
         Args:
             rig: Which of several rigs; the only one if not given.
@@ -234,8 +309,8 @@ class FrameBatch:
         Returns:
             (points of all frames, 4): number of the frame in the batch, x, y, z.
         """
-        clouds = self.sensor if rig is None else self.clouds_of(rig)
-        numbered = [torch.nn.functional.pad(cloud, (1, 0), value=number) for number, cloud in enumerate(clouds)]
+        landed = enumerate(self.landed(rig))
+        numbered = [torch.nn.functional.pad(cloud, (1, 0), value=number) for number, cloud in landed]
         return torch.cat(numbered)
 
     def __len__(self) -> int:

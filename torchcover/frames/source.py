@@ -279,7 +279,8 @@ class ChosenRigs(FrameDataset):
         boxes = None if frame.boxes is None else replace(frame.boxes, hits=self._chosen(frame.boxes.hits))
         points = None if frame.sensor_points is None else self._chosen(frame.sensor_points)
         clouds = {name: frame.cloud_of(of) for name, of in self.names.items()}
-        return replace(frame, clouds=clouds, boxes=boxes, sensor_points=points)
+        measured = self._chosen(frame.measured)
+        return replace(frame, clouds=clouds, boxes=boxes, sensor_points=points, measured=measured)
 
     def _chosen(self, by_rig: Mapping[str, ValueT]) -> dict[str, ValueT]:
         return {name: by_rig[of] for name, of in self.names.items() if of in by_rig}

@@ -257,7 +257,8 @@ def seen_by(rig: Rig, instants: CommonInstants) -> Bytes:
     (threshold,) = instants.questions.thresholds_m
     found = []
     for frame in instants.frames(rig):
-        distance = nearest(frame.reference, frame.sensor, max_distance=instants.questions.max_radius_m).distance
+        points = frame.cloud_of(within_m=threshold)
+        distance = nearest(frame.reference, points, max_distance=instants.questions.max_radius_m).distance
         found.append(np.packbits((distance <= threshold).numpy()))
     return np.concatenate(found)
 

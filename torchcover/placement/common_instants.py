@@ -5,12 +5,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
-import numpy as np
-import torch
 from torch.utils.data import DataLoader, Dataset
 
 from torchcover.coverage import Measure
-from torchcover.detection.inside import with_hits
 from torchcover.estimation import Estimate
 from torchcover.evaluation.pipeline import FramesOrErrors, killed_worker
 from torchcover.frames import Frame
@@ -19,6 +16,7 @@ from torchcover.placement.objective import Objective
 from torchcover.placement.questions import Questions, RigNumbers
 from torchcover.placement.racing import TOGETHER, Prefix, racing_order
 from torchcover.simulation import Rig, Scenario, SimulatedFrames, Simulator, with_ego
+from torchcover.simulation.simulated_frames import of_rigs, with_boxes
 
 WORLDS = 6
 PER_WORLD = 3
@@ -67,15 +65,9 @@ class HeldWorlds(Dataset[Frame]):
         if rig is None:
             return held
         scans = self._with(rig, instant.scenario).scans(instant.step)[rig.name]
-        clouds = {rig.name: torch.from_numpy(np.concatenate([scan.points for scan in scans]))}
-        names = [sensor.name for sensor in rig.sensors]
-        return replace(
-            held,
-            clouds=clouds,
-            sensor_points={rig.name: dict(zip(names, (len(scan.points) for scan in scans), strict=True))},
-            counts={"rays": sum(scan.rays for scan in scans), "self_hits": sum(scan.self_hits for scan in scans)},
-            boxes=None if held.boxes is None else with_hits(held.boxes, clouds),
-        )
+        counts = {"rays": sum(scan.rays for scan in scans), "self_hits": sum(scan.self_hits for scan in scans)}
+        frame = replace(held, **of_rigs({rig.name: rig}, {rig.name: scans}), counts=counts)
+        return frame if held.boxes is None else with_boxes(frame, held.boxes, {rig.name: rig})
 
     def _built(self, instant: HeldInstant, number: int) -> Frame:
         frames = self._simulations[instant.scenario]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from torchcover.estimation import Difference
 from torchcover.placement.common_instants import CommonInstants
-from torchcover.report.wording import shown_unit
+from torchcover.report.wording import difference_words, shown_unit
 from torchcover.simulation import Rig
 
 
@@ -27,6 +27,14 @@ class FreshGain(NamedTuple):
     search_gain: float
 
     @property
+    def words(self) -> str:
+        """The gain on fresh worlds with its interval, without its unit: shares in percentage points."""
+        test = self.test
+        if test.quantity.lower_is_better:
+            test = test._replace(value=-test.value, low=-test.high, high=-test.low)
+        return difference_words(test)
+
+    @property
     def optimism(self) -> float:
         """How much more the search had promised."""
         return self.search_gain - self.test.gain
@@ -44,6 +52,7 @@ class FreshGain(NamedTuple):
             "unit": test.quantity.unit,
             "gain": test.gain,
             "error": test.error,
+            "interval": sorted([test.quantity.gain(test.low), test.quantity.gain(test.high)]),
             "t": self.t,
             "p": test.p,
             "worlds": test.blocks,
@@ -91,14 +100,14 @@ def fresh_test(
     return tests
 
 
-def amount(value: float, unit: str, sign: str = "") -> str:
+def amount(value: float, unit: str) -> str:
     """A gain without its unit: shares in percentage points.
 
     Example:
-        >>> amount(0.01234, "share", "+"), amount(0.01234, "m")
-        ('+1.23', '0.012')
+        >>> amount(0.01234, "share"), amount(0.01234, "m")
+        ('+1.23', '+0.012')
     """
-    return f"{shown_unit(unit).factor * value:{sign}.{2 if unit == 'share' else 3}f}"
+    return f"{shown_unit(unit).factor * value:+.{2 if unit == 'share' else 3}f}"
 
 
 def unit_words(unit: str) -> str:
@@ -115,24 +124,23 @@ def told(gain: FreshGain, *, optimism: bool = False) -> str:
 
     Example:
         >>> from torchcover.coverage.quantity import detection
-        >>> test = Difference(detection(0.4), 0.0132, 0.0024, significant=True, blocks=16, better=16)
+        >>> test = Difference(detection(0.4), 0.0132, 0.0024, 0.0081, 0.0183, significant=True, blocks=16, better=16)
         >>> told(FreshGain("near", "area", test, 0.0148), optimism=True)
-        'gained 1.32 ± 0.24 points on 16 fresh worlds (t 5.5, better in 16), optimism +0.16'
-        >>> told(FreshGain("near", "area", test._replace(value=0.002, significant=False), 0.0148))
-        'no gain is shown: +0.20 ± 0.24 points on 16 fresh worlds (t 0.8, better in 16)'
+        'gained +1.32  [+0.81, +1.83] points on 16 fresh worlds (t 5.5, better in 16), optimism +0.16'
+        >>> small = test._replace(value=0.002, low=-0.0031, high=0.0071, significant=False)
+        >>> told(FreshGain("near", "area", small, 0.0148))
+        'no gain is shown: +0.20  [-0.31, +0.71] points on 16 fresh worlds (t 0.8, better in 16)'
     """
     test, unit = gain.test, gain.test.quantity.unit
     if math.isnan(test.value):
         return "unknown in the fresh worlds"
-    error = "± ?" if math.isnan(test.error) else f"± {amount(test.error, unit)}"
     t = "t unknown" if math.isnan(gain.t) else f"t {gain.t:.1f}"
-    rest = f"{error} {unit_words(unit)} on {test.blocks} fresh worlds ({t}, better in {test.better})"
+    rest = f"{gain.words} {unit_words(unit)} on {test.blocks} fresh worlds ({t}, better in {test.better})"
     if optimism and not math.isnan(gain.optimism):
-        rest += f", optimism {amount(gain.optimism, unit, '+')}"
+        rest += f", optimism {amount(gain.optimism, unit)}"
     if test.significant:
-        verb = "gained" if test.gain > 0 else "lost"
-        return f"{verb} {amount(abs(test.gain), unit)} {rest}"
-    return f"no gain is shown: {amount(test.gain, unit, '+')} {rest}"
+        return f"{'gained' if test.gain > 0 else 'lost'} {rest}"
+    return f"no gain is shown: {rest}"
 
 
 def finite(value: Any) -> Any:  # noqa: ANN401  (whatever a record holds)

@@ -17,6 +17,7 @@ from torchcover.placement.report_files import OF_THE_RUN, PlacementReport
 from torchcover.placement.result_pictures import search_pictures
 from torchcover.placement.search import PlacementSearch
 from torchcover.report import PageTable, Words, file_stems
+from torchcover.report.wording import UNKNOWN
 from torchcover.simulation import Rig
 
 HEADINGS = ("found by", "objective", "estimate", "gain in\nthe search", "gain on\nfresh worlds", "t",
@@ -201,13 +202,13 @@ class SearchResult:
                     pick.name,
                     f"{gain.objective} ({unit_words(unit)})",
                     gain.estimate,
-                    amount(gain.search_gain, unit, "+"),
-                    f"{amount(test.gain, unit, '+')} ± {amount(test.error, unit)}",
+                    amount(gain.search_gain, unit),
+                    gain.words,
                     f"{gain.t:.1f}",
                     f"{test.better} of {test.blocks}",
-                    amount(gain.optimism, unit, "+"),
+                    amount(gain.optimism, unit),
                 )
-                known = ["-" if word in ("nan", "+nan") else word.replace("nan", "?") for word in words]
+                known = ["-" if word in ("nan", "+nan", UNKNOWN) else word.replace("nan", "?") for word in words]
                 marked = ["significant" if at == 4 and test.significant else "" for at in range(len(words))]
                 rows.append(tuple(map(Words, known, marked)))
             if not pick.gains:
@@ -216,7 +217,7 @@ class SearchResult:
                 name = pick.name + " (the start)" * pick.is_start
                 for (objective, asked), unit, each in zip(objectives.items(), self.units, gained, strict=True):
                     estimate = asked.own_estimate or self.search.plan.estimate
-                    cells = (name, f"{objective} ({unit_words(unit)})", estimate, amount(each, unit, "+"), *"----")
+                    cells = (name, f"{objective} ({unit_words(unit)})", estimate, amount(each, unit), *"----")
                     rows.append(tuple(map(Words, cells)))
         return rows
 

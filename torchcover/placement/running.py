@@ -182,7 +182,7 @@ def _standing(search: PlacementSearch) -> str:
         return "nothing that can be yet"
     quantities = search.evaluations[0].prefixes[-1].estimate.quantities
     gains = zip(quantities, arm.gains[arm.best].tolist(), strict=True)
-    return "  ".join(f"{quantity.key} {amount(gain, quantity.unit, '+')}" for quantity, gain in gains)
+    return "  ".join(f"{quantity.key} {amount(gain, quantity.unit)}" for quantity, gain in gains)
 
 
 def _picks(search: PlacementSearch) -> list[Pick]:

@@ -69,9 +69,10 @@ class FrameMetric(MergeableMetric):
         """What the frames so far say."""
         estimate, about = self._found()
         # How often an interval around such a number holds the truth has not been measured.
-        numbers = estimate.numbers(intervals=False).values()
+        numbers = estimate.numbers().values()
         return tuple(
-            one._replace(value=number.value, error=number.error) for one, number in zip(about, numbers, strict=True)
+            one._replace(value=number.value, error=number.error, low=number.low, high=number.high)
+            for one, number in zip(about, numbers, strict=True)
         )
 
     def plot(self, val: Sequence[Number] | None = None, ax: "Axes | None" = None) -> "tuple[Figure, Axes]":

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.frames import Frame
+from torchcover.frames.frame import ON_OBJECT_WITHIN_M
 from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
 from torchcover.published.sights import Sights, count_in_boxes, rig_of
@@ -94,7 +95,7 @@ class PerceptionEntropy(WorldRatios):
         sights: Sights | None = None,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
-        cameras = frozenset(sensor.name for sensor in sensors if isinstance(sensor, CameraSensor))
+        cameras = {sensor.name: sensor.counts_as for sensor in sensors if isinstance(sensor, CameraSensor)}
         strata = ObjectStrata(categories, range_borders_m)
         given = {"range_m": strata.range_borders_m[-1], "constants": dict(CONSTANTS), "cameras": sorted(cameras)}
         ratios = [
@@ -102,7 +103,7 @@ class PerceptionEntropy(WorldRatios):
             for form in ("perception_entropy", "perception_entropy_bounded")
             for name in strata.names
         ]
-        super().__init__(ratios, {**strata.meaning, "cameras": tuple(sorted(cameras))}, rig, **kwargs)
+        super().__init__(ratios, {**strata.meaning, "cameras": tuple(sorted(cameras.items()))}, rig, **kwargs)
         self.strata = strata
         self.cameras = cameras
         self.sights = Sights() if sights is None else sights
@@ -115,12 +116,11 @@ class PerceptionEntropy(WorldRatios):
         return count, (values @ members.T).flatten(), count.long()
 
     def _sigma(self, frame: Frame, rig: str) -> Tensor:
-        hits = self.sights.hits(frame, rig)
         if not self.cameras:
-            return standard_deviation(hits, "lidar")
-        of_cameras = [cloud for name, cloud in frame.clouds_by_sensor(rig).items() if name in self.cameras]
-        pixels = count_in_boxes(torch.cat(of_cameras), self.sights.boxes(frame)).to(hits)
-        kinds = [standard_deviation(pixels, "camera")]
-        if len(of_cameras) < len(frame.clouds_by_sensor(rig)):
-            kinds.append(standard_deviation(hits - pixels, "lidar"))
-        return late_fusion(kinds)
+            return standard_deviation(self.sights.hits(frame, rig), "lidar")
+        boxes, measurements = self.sights.boxes(frame), dict[str, Tensor]()
+        for name, cloud in frame.clouds_by_sensor(rig, within_m=ON_OBJECT_WITHIN_M).items():
+            kind = "camera" if name in self.cameras else "lidar"
+            of_sensor = self.cameras.get(name, 1) * count_in_boxes(cloud, boxes)
+            measurements[kind] = measurements.get(kind, torch.zeros_like(of_sensor)) + of_sensor
+        return late_fusion([standard_deviation(count, kind) for kind, count in measurements.items()])

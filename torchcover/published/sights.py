@@ -11,6 +11,7 @@ from torchcover.coverage.grid import Bins
 from torchcover.detection import Boxes, points_in_boxes
 from torchcover.detection.inside import Inside
 from torchcover.frames import Frame
+from torchcover.frames.frame import ON_OBJECT_WITHIN_M
 from torchcover.neighbors import check_cloud, nearest
 from torchcover.neighbors.choice import backend_of_several
 from torchcover.published.object_strata import ObjectStrata
@@ -45,6 +46,8 @@ class Sights:
     def distance(self, frame: Frame, rig: str, within_m: float) -> Tensor:
         """(M,) metres from each reference point to the nearest point of the rig; infinite where none is within reach.
 
+        Points that were measured farther off than that are none.
+
         Args:
             frame: The frame.
             rig: Name of the rig.
@@ -52,7 +55,9 @@ class Sights:
         """
         if self.by_sensor:
             return self.of_sensors(frame, rig, within_m).amin(dim=0)
-        return self.once(frame, ("rig", rig, within_m), lambda: _search(frame, frame.cloud_of(rig), within_m))
+        return self.once(
+            frame, ("rig", rig, within_m), lambda: _search(frame, frame.cloud_of(rig, within_m=within_m), within_m)
+        )
 
     def of_sensors(self, frame: Frame, rig: str, within_m: float) -> Tensor:
         """(S, M) the same for each sensor of the rig.
@@ -62,7 +67,7 @@ class Sights:
         """
 
         def search() -> Tensor:
-            clouds = list(frame.clouds_by_sensor(rig).values())
+            clouds = list(frame.clouds_by_sensor(rig, within_m=within_m).values())
             backend = backend_of_several(frame.reference, clouds)
             return torch.stack([_search(frame, cloud, within_m, backend) for cloud in clouds])
 
@@ -92,7 +97,8 @@ class Sights:
         boxes = self.boxes(frame)
         if rig in boxes.hits:
             return boxes.hits[rig]
-        return self.once(frame, ("hits", rig), lambda: count_in_boxes(frame.cloud_of(rig), boxes))
+        points = frame.cloud_of(rig, within_m=ON_OBJECT_WITHIN_M)
+        return self.once(frame, ("hits", rig), lambda: count_in_boxes(points, boxes))
 
     def bins(self, frame: Frame, grid: BevGrid) -> Bins:
         """In which cells of a grid the reference points are."""
@@ -121,11 +127,8 @@ def rig_of(frame: Frame, rig: str | None) -> str:
     Raises:
         ValueError: There is no such rig, or there are several.
     """
-    if rig is None:
-        _ = frame.sensor  # the only one
-        return next(iter(frame.clouds))
     frame.cloud_of(rig)
-    return rig
+    return next(iter(frame.clouds)) if rig is None else rig
 
 
 def count_in_boxes(cloud: Tensor, boxes: Boxes) -> Tensor:

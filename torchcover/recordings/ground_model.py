@@ -1,18 +1,18 @@
 """The ground of a recording: what sweeps have seen of it as a height field, and where nobody knows.
 
-*Low surfaces.* In each upright column, `CELL_M` wide, the lowest point that another confirms within `THICK_M` begins the
-low surface; a lone one counts where there is no other. Its place is the mean of all points within `THICK_M` above that,
-so that noise cancels. Where something goes on above it (`STANDS_M`), it may be the lower end of a thing whose foot
-nobody sees, as of a lorry far away: such a column says nothing about the ground.
+*Low surfaces.* In each upright column, `CELL_M` wide, the lowest point that another confirms within `THICK_M` begins
+the low surface; a lone one counts where there is no other. Its place is the mean of all points within `THICK_M` above
+that, so that noise cancels. Where something goes on above it (`STANDS_M`), it may be the lower end of a thing whose
+foot nobody sees, as of a lorry far away: such a column says nothing about the ground, nor does at first one beside it.
 
 *Height field.* In every square of `NODE_M` the column that a fifth lie below stands for all: below roofs, and above a
 few reflections. Through these goes a height field, from coarse to fine (`geometry.fitted`): what lies too high counts a
 ninth of what lies too low, and what lies farther off than 15 % of a scale counts for nothing.
 
-*What is connected.* Before that, and again with those squares alone whose column lies on the field, what counts is
-where one gets to from beside the vehicle: from each square to all others within `REACH`, unless they are higher or lower
-by more than a kerb and a steep slope, or by a metre. A bridge above the own road is higher, a road below the own bridge
-lower. The field is fitted again to what is left, and then, with squares of 1.25 m, to all columns there: kerbs stay.
+*What is connected.* Only such squares count as one gets to from beside the vehicle: from each to all others within
+`REACH`, unless they are higher or lower by more than a kerb and a steep slope, or by a metre. A bridge above the own
+road is higher, a road below the own bridge lower. Those whose column lies on the field are connected and fitted once
+more; then, with squares of 1.25 m, all columns there: kerbs stay.
 
 *What is unknown.* Farther than `REACH` from all such squares there is no height, and no band. Of surfaces above each
 other it is the one that is connected with the vehicle's; stairs lead nowhere.
@@ -40,8 +40,9 @@ NODE_M = 2.0
 FIFTH = 0.2
 COARSE_M, FINE_M = (80.0, 40.0, 20.0, 10.0, 5.0, 2.5), (1.25,)
 BENEATH = 0.1
-# So near to the field lies what is part of it: a kerb beside the road, and what the field smooths.
-ON_FIELD_M = 0.2
+# So near to the field lies what is part of it: a kerb beside the road, and what the field smooths. Where less than this
+# share of what is connected lies on it, as in the crowns of trees, it is no ground.
+ON_FIELD_M, SMOOTH = 0.2, 0.4
 # Squares from the one to the other in any direction, as far as one may look for ground, and know it.
 REACH = 5
 # A kerb, the steepest slope, and the most that the ground rises between two squares.
@@ -58,7 +59,7 @@ class GroundModel(NamedTuple):
     """The ground around a place, made as this module says.
 
     Args:
-        lower_m: (2,) where it begins, in the frame of the points that it was made of.
+        lower_m: (2,) where it may begin, in the frame of the points that it was made of.
         field: The heights, from there.
         known: (SIDE^2,) squares, row after row along y, in which there is a height; they begin `REACH` before that.
 
@@ -86,11 +87,17 @@ class GroundModel(NamedTuple):
             It; None where none of it is near the vehicle.
         """
         low, above_m = _columns(np.concatenate([np.empty((0, 4)), *surfaces]), place_m)
-        lower_m, size_m = place_m[:2] - AROUND_M, np.full(2, 2 * AROUND_M)
+        if not len(low):
+            return None
+        lower_m = place_m[:2] - AROUND_M
         stands = above_m - low[:, 2] < STANDS_M[1]
         clear = np.flatnonzero(~_beside_what_stands(low, stands, lower_m)[~stands])
         across_m, heights_m = low[~stands, :2] - lower_m, low[~stands, 2]
         square = _squares(across_m)
+        # The rasters begin where others do, and reach no farther than points.
+        first_m = COARSE_M[0] * np.floor((low[:, :2].min(axis=0) - lower_m) / COARSE_M[0])
+        across_m -= first_m
+        size_m = low[:, :2].max(axis=0) - lower_m - first_m
         chosen = clear[_a_fifth_below(square[clear], heights_m[clear])]
         for _ in range(2):
             found = _connected(square[chosen], heights_m[chosen] - place_m[2])
@@ -98,13 +105,15 @@ class GroundModel(NamedTuple):
             if len(chosen) < FEWEST:
                 return None
             field = fitted(across_m[chosen], heights_m[chosen], size_m, COARSE_M, beneath=BENEATH)
-            off_m = heights_m[chosen] - field.heights_m(across_m[chosen])
-            chosen = chosen[np.abs(off_m) < ON_FIELD_M]
+            on_field = np.abs(heights_m[chosen] - field.heights_m(across_m[chosen])) < ON_FIELD_M
+            if on_field.mean() < SMOOTH:
+                return None
+            chosen = chosen[on_field]
         own = found[square]
         field = fitted(across_m[own], heights_m[own], size_m, FINE_M, on=field)
         known = np.zeros(SIDE**2, dtype=np.bool_)
         known[square[chosen][:, None] + _around()[0]] = True
-        return cls(lower_m, field, known)
+        return cls(lower_m, field._replace(lower_m=field.lower_m + first_m), known)
 
     def heights_m(self, points_m: NDArray[np.floating]) -> Float64:
         """(N,) how high above the ground (N, 3) points are, below it less than 0; NaN where that is unknown."""
@@ -158,7 +167,7 @@ def _columns(points: Float64, place_m: Float64) -> tuple[Float64, Float64]:
 
 
 def _beside_what_stands(low: Float64, stands: Bools, lower_m: Float64) -> Bools:
-    """(K,) whether something stands in a column, or in one beside it that begins no higher: this may be a part of it."""
+    """(K,) whether something stands in a column, or in one beside it that begins no higher."""
     x, y = (np.floor(low[:, :2] / CELL_M) - np.floor(lower_m / CELL_M)).astype(np.int64).T + 1
     bottom_m = np.full(np.full(2, int(2 * AROUND_M / CELL_M) + 3), np.inf)
     bottom_m[y[stands], x[stands]] = low[stands, 2]
@@ -170,7 +179,8 @@ def _beside_what_stands(low: Float64, stands: Bools, lower_m: Float64) -> Bools:
 def _squares(across_m: Float64) -> Numbers:
     """(N,) numbers of the squares of (N, 2) places from the first corner."""
     x, y = (across_m / NODE_M).astype(np.int64).T + REACH
-    return y * SIDE + x
+    numbers: Numbers = y * SIDE + x
+    return numbers
 
 
 def _a_fifth_below(square: Numbers, heights_m: Float64) -> Numbers:
@@ -178,7 +188,8 @@ def _a_fifth_below(square: Numbers, heights_m: Float64) -> Numbers:
     order = np.lexsort((heights_m, square))
     first = np.flatnonzero(np.diff(square[order], prepend=-1))
     count = np.diff(np.append(first, len(order)))
-    return order[first + (FIFTH * count).astype(np.int64)]
+    chosen: Numbers = order[first + (FIFTH * count).astype(np.int64)]
+    return chosen
 
 
 def _around() -> tuple[Numbers, Float64]:

@@ -20,6 +20,7 @@ from torchcover.recordings.recorded_reference import RecordedReference, Referenc
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.sweeps import Sweeps
 
+NO_GROUND = "Ground: none was found near the vehicle, so heights are z of the vehicle frame."
 # What a folder of results holds, during the run or after it.
 RESULTS = frozenset({".lock", "summary.json", "checkpoint.npz"})
 
@@ -36,8 +37,8 @@ class RecordedFrames(FrameDataset):
         rigs: Names of rigs -> names of their sensors; those of the recording if not given.
         reference: Where the reference clouds come from. Not given: the sensors that were recorded for it, or
             else an `AccumulatedReference`.
-        ground: Whether heights above the ground that were not recorded come from a `GroundModel` of all scans within
-            the window of the reference, or 2 s.
+        ground: Whether heights above the ground that were not recorded come from a `GroundModel` of what all sensors
+            saw: within the window of the reference if it is accumulated, else at the instant.
 
     Raises:
         FileNotFoundError: There is no such recording, or a part of it is missing.
@@ -74,7 +75,8 @@ class RecordedFrames(FrameDataset):
         self.reference = reference
         self.reference.check(self.recording, self._judged)
         self.ground = ground
-        self._sweeps = self.reference.sweeps if isinstance(self.reference, AccumulatedReference) else Sweeps()
+        self._sweeps = self.reference.sweeps if isinstance(self.reference, AccumulatedReference) else Sweeps(0.0)
+        self._has_heights: bool | None = None
 
     @property
     def names(self) -> Sequence[str]:
@@ -110,14 +112,15 @@ class RecordedFrames(FrameDataset):
         return False
 
     def has_heights(self) -> bool:
-        """Whether the first frame whose recorded reference can be read has them."""
-        if isinstance(self.reference, RecordedReference):
-            for instant in self.recording.frames:
-                try:
-                    return self.recording.scan(self.recording.reference_sensors[0], instant).heights_m is not None
-                except (OSError, ValueError):
-                    continue
-        return False
+        """Whether the first frame that can be read has any, recorded or above ground that was found."""
+        for position in range(len(self) if self._has_heights is None else 0):
+            try:
+                heights_m = self[position].reference_heights_m
+            except BadFrameError:
+                continue  # whoever measures it will say so
+            self._has_heights = heights_m is not None and bool(heights_m.isfinite().any())
+            break
+        return bool(self._has_heights)
 
     def doubts(self, steps: int | None) -> Sequence[str]:
         """As `torchcover.recordings.suspicion` says."""
@@ -144,8 +147,11 @@ class RecordedFrames(FrameDataset):
 
     @property
     def reference_record(self) -> Mapping[str, object]:
-        """Where the reference comes from."""
-        return self.reference.record(self.recording, self._judged)
+        """Where the reference comes from; that no ground was found, if it was looked for."""
+        record = self.reference.record(self.recording, self._judged)
+        if not self.ground or self._has_heights in (None, True):
+            return record
+        return {**record, "notes": [*record["notes"], NO_GROUND]}  # type: ignore[misc]  # sentences, as it says
 
     @property
     def content(self) -> Mapping[str, object]:
@@ -220,7 +226,8 @@ class RecordedFrames(FrameDataset):
         return in_vehicle(self.recording.scan(sensor, instant), self.recording.body)
 
     def _heights_m(self, instant: int, reference: InVehicle) -> NDArray[np.float32] | None:
-        if reference.heights_m is not None or not self.ground:
+        # Points with square metres, but without heights, were drawn for bands over z.
+        if reference.heights_m is not None or reference.weights is not None or not self.ground:
             return reference.heights_m
         ground = self._sweeps.ground(self.recording, instant)
         if ground is None:

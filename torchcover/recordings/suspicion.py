@@ -11,16 +11,15 @@ from torchcover.detection import Boxes, points_in_boxes
 from torchcover.geometry import invert
 from torchcover.neighbors import nearest
 from torchcover.recordings.accumulated_reference import AccumulatedReference
+from torchcover.recordings.ground_model import GroundModel, low_surfaces
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.recordings.recorded_reference import RecordedReference, Reference
 from torchcover.recordings.recording import Recording
 
 # What is looked at, evenly spread over what will be measured.
 FRAMES, POSES = 5, 64
-# The ground is the plane that leaves a quarter of the lowest points of these squares around the vehicle beneath it, for
-# what stands on it is above. Where it does not hold a share of them, it is no ground.
-GROUND_WITHIN_M, SQUARE_M, GROUND_SQUARES = 20.0, 1.0, 100
-BENEATH, ON_PLANE_M, ON_PLANE = 0.25, 0.2, 0.3
+# As far around the vehicle as the ground beneath it is looked for.
+GROUND_WITHIN_M = 30.0
 # Half of the lowest band: beyond, the ground is in another one, or in none.
 GROUND_OFF_M = 0.5
 # Clouds of fewer points may be alike; so near, a point is the other one.
@@ -92,7 +91,7 @@ def ground_is_elsewhere(clouds: Mapping[str, Sequence[NDArray[np.float32]]]) -> 
 
 
 def ground_height_m(points_m: NDArray[np.floating]) -> float | None:
-    """The height of the ground beneath the vehicle: 0 where slopes leave that open, None where no ground is seen.
+    """The height of the ground beneath the vehicle; None where none is seen near it.
 
     Example:
         >>> x, y = np.meshgrid(np.arange(-20, 20, 0.5), np.arange(-20, 20, 0.5))
@@ -100,24 +99,10 @@ def ground_height_m(points_m: NDArray[np.floating]) -> float | None:
         -1.7
     """
     near_m = points_m[(np.abs(points_m) < GROUND_WITHIN_M).all(axis=1)].astype(np.float64)
-    numbers = np.floor(near_m[:, :2] / SQUARE_M).astype(np.int64) + round(GROUND_WITHIN_M / SQUARE_M)
-    order = np.lexsort((near_m[:, 2], numbers[:, 0], numbers[:, 1]))
-    new = (np.diff(numbers[order], axis=0, prepend=-1) != 0).any(axis=1)
-    lowest_m = near_m[order[new]]
-    if len(lowest_m) < GROUND_SQUARES:
-        return None
-    sides = np.column_stack([lowest_m[:, :2], np.ones(len(lowest_m))])
-    around_m = float(np.quantile(lowest_m[:, 2], BENEATH))
-    off_m = lowest_m[:, 2] - around_m
-    for _ in range(20):  # a quantile by weighted squares: how far off walls and holes are does not matter
-        weights = np.sqrt(np.where(off_m > 0, BENEATH, 1 - BENEATH) / np.maximum(np.abs(off_m), ON_PLANE_M / 4))
-        plane = np.linalg.lstsq(sides * weights[:, None], lowest_m[:, 2] * weights, rcond=None)[0]
-        off_m = lowest_m[:, 2] - sides @ plane
-    if (np.abs(off_m) < ON_PLANE_M).mean() < ON_PLANE:
-        return None
-    beneath_m = float(plane[2])
-    # Far ahead a hill may begin; only where the lowest points are as low (or as high), so is the ground.
-    return beneath_m if 0.0 < beneath_m / 2 < around_m or 0.0 > beneath_m / 2 > around_m else 0.0
+    origin_m = np.zeros((1, 3))
+    ground = GroundModel.below([low_surfaces(near_m, origin_m[0])], origin_m[0])
+    above_m = np.nan if ground is None else float(ground.heights_m(origin_m)[0])
+    return None if np.isnan(above_m) else -above_m
 
 
 def same_clouds(rig: str, pairs: Sequence[tuple[NDArray[np.float32], NDArray[np.float32]]]) -> str | None:

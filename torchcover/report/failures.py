@@ -8,7 +8,7 @@ from torchcover.coverage import RegionRedundancy
 from torchcover.coverage.quantity import RADIUS, seen_by_two, sensors_seeing
 from torchcover.estimation import Quantity
 from torchcover.report.table import CoverageTable, Row
-from torchcover.report.wording import UNKNOWN, difference_heading, difference_words, number_words, percent, value_words
+from torchcover.report.wording import UNKNOWN, difference_heading, difference_words, number_words, value_words
 
 MAX_HEADING_CHARS = 16
 NONE = "none"
@@ -46,7 +46,7 @@ def failure_words(table: CoverageTable, row: Row) -> list[tuple[str, bool]]:
     words = []
     for threshold in table.thresholds[:1]:
         words.append((number_words(redundancy.seen_by[sensors_seeing(threshold).key]), False))
-        words.append((percent(redundancy.seen_by[seen_by_two(threshold).key].value), False))
+        words.append((number_words(redundancy.seen_by[seen_by_two(threshold).key]), False))
     for sensor in sensors:
         change = redundancy.change[sensor][key]
         words.append((difference_words(change), bool(change.significant)))
@@ -69,7 +69,7 @@ def single_point_of_failure(table: CoverageTable, rig: str) -> str:
         return "No single point of failure: whichever sensor fails, nothing that is known changes."
     sensor = redundancy.indispensable
     before, after = worst.summary.numbers[quantity.key].value, redundancy.without[sensor][quantity.key].value
-    whole, rest = (value_words(value, math.nan, quantity.unit) for value in (before, after))
+    whole, rest = (value_words(value, quantity.unit) for value in (before, after))
     unit = "m" if quantity.unit == "m" else "%"
     where = f"{worst.summary.region} {worst.summary.height}"
     change = f"{quantity.title} is {rest} {unit} in {where}, not {whole} {unit}"

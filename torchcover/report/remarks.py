@@ -16,8 +16,8 @@ RemarkName = Literal[
     "visible_surface",
     "unknown_cells",
     "too_few_blocks",
-    "standard_errors",
-    "one_block_regions",
+    "intervals",
+    "no_intervals",
     "empty_sensor_steps",
     "empty_reference_steps",
     "saturated_points",
@@ -77,8 +77,8 @@ def _on_errors(table: CoverageTable, rig: str) -> list[Remark]:
         return [Remark("too_few_blocks", blocks, MIN_BLOCKS)]
     means = [quantity.key for quantity in table.means]  # of a largest radius no error is ever known
     numbers = [[row.summary.numbers[key] for key in means] for row in table.rows[rig]]
-    without = sum(any(math.isfinite(number.value) and math.isnan(number.error) for number in row) for row in numbers)
-    return [Remark("standard_errors", blocks, blocks), Remark("one_block_regions", without, len(numbers))]
+    without = sum(any(math.isfinite(number.value) and math.isnan(number.low) for number in row) for row in numbers)
+    return [Remark("intervals", blocks, blocks), Remark("no_intervals", without, len(numbers))]
 
 
 def notes_on(table: CoverageTable) -> list[str]:
@@ -94,13 +94,11 @@ def notes_on(table: CoverageTable) -> list[str]:
 def marks_on(table: CoverageTable) -> dict[str, str]:
     """What the marks of differences mean, by their names; empty where there are none."""
     several, by_sensor = len(table.rigs) > 1, any(sensors_of(rows) for rows in table.rows.values())
-    marks = {"best": "the best of its row; equal numbers are all marked, unknown ones never."} if several else {}
-    if not (several or by_sensor):
+    if not (several or by_sensor) or (table.first.blocks or 0) < MIN_BLOCKS:
         return {}
-    if (table.conditions[table.rigs[0]].blocks or 0) >= MIN_BLOCKS:
-        chance = "more than chance, by Student's t at 95 %: of 20 rows without a difference, one is marked."
-        marks["significant"] = chance
-    return marks
+    best = {"best": "the best of its row, where its lead over the next is more than chance."} if several else {}
+    chance = "more than chance, by Student's t at 95 %: of 20 rows without a difference, one is marked."
+    return {**best, "significant": chance}
 
 
 def _of_rig(table: CoverageTable, rig: str) -> list[str]:
@@ -116,9 +114,9 @@ def _too_few_blocks(remark: Remark, _: CoverageTable, __: str) -> str:
     return f"Not enough steps for errors: {blocks}, {remark.of} are needed."
 
 
-def _standard_errors(remark: Remark, table: CoverageTable, rig: str) -> str:
+def _intervals(remark: Remark, table: CoverageTable, rig: str) -> str:
     steps = table.conditions[rig].steps_per_block
-    return f"± is one standard error, from {remark.count} blocks of up to {steps:,} steps in a row."
+    return f"In brackets: 95 % intervals, from {remark.count} blocks of up to {steps:,} steps in a row."
 
 
 def _saturated(remark: Remark, table: CoverageTable, _: str) -> str:
@@ -144,8 +142,8 @@ SENTENCES: Mapping[RemarkName, Callable[[Remark, CoverageTable, str], str]] = Ma
             "Means over the known cells only; the fewer are known, the more the numbers may flatter the rig."
         ),
         "too_few_blocks": _too_few_blocks,
-        "standard_errors": _standard_errors,
-        "one_block_regions": lambda *_: "No ± where one block alone has probed the region, or all say the same.",
+        "intervals": _intervals,
+        "no_intervals": lambda *_: "No interval where too few blocks have probed the region, or all say the same.",
         "empty_sensor_steps": lambda remark, *_: (
             f"{_some(remark)} steps had no sensor point: they count as blind, not as missing."
         ),

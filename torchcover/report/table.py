@@ -1,14 +1,13 @@
 """The table: regions, bands, quantities and rigs as data. How it is written down is the business of the renderers."""
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 from torchcover.coverage import BevGrid, Coverage, Region, RegionSummary, check_paired, differences
 from torchcover.coverage.measures import Measure
-from torchcover.estimation import Difference, Number, Quantity
-from torchcover.report.wording import rounded
+from torchcover.coverage.paired import leaders
+from torchcover.estimation import Difference, Quantity
 
 
 @dataclass(frozen=True)
@@ -19,8 +18,7 @@ class Row:
         rig: Name of the rig.
         region: The region.
         summary: Its numbers by the key of their quantity, and how many of its cells are known.
-        best: Keys of the quantities in which no other rig is better here, to the digits that are shown; none if there
-            is no other rig.
+        best: Keys of the quantities in which it leads here, and its lead over the next rig is more than chance.
         differences: Key of the quantity -> difference to the first rig; empty if there is no other rig.
     """
 
@@ -134,41 +132,18 @@ def _rows(
     several = len(coverages) > 1
     rows = []
     for (region, height), of_rigs in zip(places, zip(*summaries.values(), strict=True), strict=True):
-        best = _best(of_rigs) if several else [frozenset[str]()]
         compared = differences(coverages, region, height) if several else {}
-        each = zip(coverages, of_rigs, best, strict=True)
-        rows.append({rig: Row(rig, region, summary, own, compared.get(rig, {})) for rig, summary, own in each})
+        best = leaders(coverages, region, height)
+        row = {}
+        for rig, summary in zip(coverages, of_rigs, strict=True):
+            marked = frozenset(key for key, leader in best.items() if leader == rig)
+            row[rig] = Row(rig, region, summary, marked, compared.get(rig, {}))
+        rows.append(row)
     return rows
 
 
-def _best(rigs: Sequence[RegionSummary]) -> list[frozenset[str]]:
-    """For each rig, the quantities in which it is best."""
-    marks = {key: best_of([summary.numbers[key] for summary in rigs]) for key in rigs[0].numbers}
-    return [frozenset(key for key, marked in marks.items() if marked[at]) for at in range(len(rigs))]
-
-
-def best_of(numbers: Sequence[Number]) -> list[bool]:
-    """Which numbers are the best of their row.
-
-    Returns:
-        True for the best and for all that look the same as they are shown; never for an unknown one.
-
-    Example:
-        >>> from torchcover.coverage.quantity import RADIUS
-        >>> best_of([Number(RADIUS, radius_m) for radius_m in (0.121, 0.123, 0.13, float("nan"))])
-        [True, True, False, False]
-    """
-    known = [number for number in numbers if not math.isnan(number.value)]
-    if not known:
-        return [False] * len(numbers)
-    unit = numbers[0].quantity.unit
-    best = max(known, key=lambda number: number.quantity.gain(number.value))
-    looks = rounded(best.value, best.error, unit)
-    return [number in known and rounded(number.value, number.error, unit) == looks for number in numbers]
-
-
 def _conditions(coverage: Coverage) -> Conditions:
-    blocks = coverage.blocks
+    blocks = coverage.blocks and (coverage.places or coverage.blocks)  # by area they are the fine ones
     used = None if blocks is None else int((blocks.steps > 0).sum())
     longest = None if blocks is None else int(blocks.steps.max())
     return Conditions(dict(coverage.counts), used, longest, coverage.counts["inside_points"])

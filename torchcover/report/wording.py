@@ -1,7 +1,7 @@
 """Numbers in plain words: how they are rounded, and what tables and maps say in the same way."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
@@ -49,7 +49,7 @@ def shown_unit(unit: Unit) -> ShownUnit:
 
 
 class Rounded(NamedTuple):
-    """A number as a reader sees it; two of them are equal if they look the same.
+    """A number as a reader sees it.
 
     Args:
         value: In the unit that is shown: metres or percent.
@@ -144,43 +144,53 @@ def _round(value: float, decimals: int) -> Rounded:
 
 
 UNKNOWN = "unknown"
+# An end of an interval beyond is no number for anybody.
+ENDLESS = 1e9
 
 
 def number_words(number: Number) -> str:
-    """A number and its standard error, without the unit; see `value_words`."""
-    return value_words(number.value, number.error, number.quantity.unit)
+    """A number and its 95 % interval, without the unit.
+
+    Returns:
+        As `value_words` has it; with an error in as many decimals as its two digits need, of lengths and shares at most
+        four and three, and with the interval behind it if there is one.
+
+    Example:
+        >>> radius = Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True)
+        >>> number_words(Number(radius, 0.34127, 0.0123, 0.31812, 0.36992)), number_words(Number(radius, 0.34127))
+        ('0.341  [0.318, 0.370]', '0.34')
+        >>> number_words(Number(radius._replace(unit="share"), 0.869, 0.0121, 0.8412, 0.8899))
+        '86.9  [84.1, 89.0]'
+    """
+    unit = number.quantity.unit
+    if not math.isfinite(number.value):
+        return value_words(number.value, unit)
+    found = rounded(number.value, number.error, unit)
+    return _words(found) + _interval_words(number, found.decimals)
 
 
-def value_words(number: float, error: float, unit: Unit) -> str:
-    """A number and its standard error, without the unit.
+def value_words(value: float, unit: Unit) -> str:
+    """A number alone, without the unit.
 
     Args:
-        number: In its unit.
-        error: Its standard error; NaN for none.
+        value: In its unit.
         unit: Its unit.
 
     Returns:
-        A length with two decimals, a share in percent with one, what has another unit with four digits; with an error
-        as many as its two digits need, of lengths and shares at most four and three. A share is never rounded to 0 or
-        100. "unknown" for NaN, "infinite" for infinity.
+        A length with two decimals, a share in percent with one, what has another unit with four digits. A share is
+        never rounded to 0 or 100. "unknown" for NaN, "infinite" for infinity.
 
     Example:
-        >>> none = float("nan")
-        >>> [value_words(length, none, "m") for length in (0.126, 12.0, float("inf"), none)]
+        >>> [value_words(length, "m") for length in (0.126, 12.0, float("inf"), float("nan"))]
         ['0.13', '12.00', 'infinite', 'unknown']
-        >>> [value_words(0.34127, error, "m") for error in (0.0123, 0.00123, 1e-7, 0.0)]
-        ['0.341 ± 0.012', '0.3413 ± 0.0012', '0.3413 ± <0.0001', '0.34 ± 0']
-        >>> value_words(0.49812, 0.00123, "share"), value_words(1.0, 0.0, "share")
-        ('49.81 ± 0.12', '100 ± 0')
-        >>> value_words(-0.0123456, none, "nats"), value_words(12345.6, none, "points")
+        >>> value_words(0.49812, "share"), value_words(1.0, "share")
+        ('49.8', '100')
+        >>> value_words(-0.0123456, "nats"), value_words(12345.6, "points")
         ('-0.01235', '12346')
     """
-    if math.isnan(number):
+    if math.isnan(value):
         return UNKNOWN
-    if math.isinf(number):
-        return "infinite"
-    words = _words(rounded(number, error, unit))
-    return words if math.isnan(error) else f"{words} ± {_error_words(error, unit, ROUND_OFF)}"
+    return "infinite" if math.isinf(value) else _words(rounded(value, math.nan, unit))
 
 
 def percent(share: float) -> str:
@@ -190,7 +200,7 @@ def percent(share: float) -> str:
         >>> [percent(share) for share in (0.0, 0.0001, 0.123, 0.9999, 1.0, float("nan"))]
         ['0', '<0.1', '12.3', '>99.9', '100', 'unknown']
     """
-    return value_words(share, math.nan, "share")
+    return value_words(share, "share")
 
 
 def square_metres(m2: float) -> str:
@@ -214,18 +224,21 @@ def error_words(error: float, unit: Unit) -> str:
         >>> error_words(0.0123, "m"), error_words(0.0123, "share"), error_words(0.0, "m")
         ('0.012', '1.2', '0')
     """
-    return UNKNOWN if math.isnan(error) else _error_words(error, unit, ROUND_OFF)
+    if math.isnan(error):
+        return UNKNOWN
+    shown = shown_unit(unit)
+    return _words(rounded_error(shown.factor * error, shown.max_decimals)) if error > ROUND_OFF else "0"
 
 
 def difference_words(difference: Difference) -> str:
-    """A difference and its standard error, with its sign: lengths in metres, shares in percentage points.
+    """A difference and its 95 % interval, with signs: lengths in metres, shares in percentage points.
 
     Example:
         >>> radius = Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True)
-        >>> difference_words(Difference(radius, 0.0213, 0.0041)), difference_words(Difference(radius, -0.5, 0.0))
-        ('+0.0213 ± 0.0041', '-0.50 ± 0')
-        >>> difference_words(Difference(radius._replace(unit="share"), -0.0213, 0.0041))
-        '-2.13 ± 0.41'
+        >>> difference_words(Difference(radius, 0.0213, 0.0041, 0.0126, 0.0301))
+        '+0.0213  [+0.0126, +0.0301]'
+        >>> difference_words(Difference(radius._replace(unit="share"), -0.0213, 0.0041, -0.0301, -0.0126))
+        '-2.13  [-3.01, -1.26]'
     """
     if math.isnan(difference.value):
         return UNKNOWN
@@ -236,12 +249,8 @@ def difference_words(difference: Difference) -> str:
     value, error = shown.factor * difference.value, shown.factor * difference.error
     inexact = error > 100 * ROUND_OFF
     decimals = decimals_of(error, shown.max_decimals) if inexact else _decimals(value, shown)
-    # What rounds to nothing has no sign: a loss too small to be shown is no gain. Adding 0 turns -0.0 into 0.0.
-    shown_value = round(value, decimals) + 0.0
-    words = f"{shown_value:{'+' if shown_value else ''}.{decimals}f}" if inexact or value else "0"
-    if math.isnan(error):
-        return words
-    return f"{words} ± {_error_words(difference.error, unit, 100 * ROUND_OFF / shown.factor)}"
+    words = _signed(value, decimals) if inexact or value else "0"
+    return words + (_interval_words(difference, decimals, _signed) if inexact else "")
 
 
 def heading(quantity: Quantity) -> str:
@@ -280,8 +289,20 @@ def _words(number: Rounded) -> str:
     return f"{number.relation}{number.value:.{number.decimals}f}"
 
 
-def _error_words(error: float, unit: Unit, negligible: float) -> str:
-    if error <= negligible:
-        return "0"
-    shown = shown_unit(unit)
-    return _words(rounded_error(shown.factor * error, shown.max_decimals))
+def _plain(value: float, decimals: int) -> str:
+    return f"{value:.{decimals}f}"
+
+
+def _signed(value: float, decimals: int) -> str:
+    # What rounds to nothing has no sign: a loss too small to be shown is no gain. Adding 0 turns -0.0 into 0.0.
+    shown = round(value, decimals) + 0.0
+    return f"{shown:{'+' if shown else ''}.{decimals}f}"
+
+
+def _interval_words(number: Number | Difference, decimals: int, words: Callable[[float, int], str] = _plain) -> str:
+    """Behind a number, as `  [84.1, 89.0]`; nothing if it has no interval."""
+    if math.isnan(number.low) or math.isnan(number.high):
+        return ""
+    factor = shown_unit(number.quantity.unit).factor
+    low, high = (words(factor * end, decimals) if abs(end) < ENDLESS else "inf" for end in (number.low, number.high))
+    return f"  [{low}, {high}]"

@@ -8,10 +8,13 @@ from .kinds import REFERENCE_SENSORS as REFERENCE_SENSORS
 from .kinds import SENSORS as SENSORS
 from .lidar import Lidar as Lidar
 from .lidar import LidarModel as LidarModel
+from .material import Material as Material
 from .paper_reference import PaperReference as PaperReference
 from .radar import Radar as Radar
 from .rays import Tile as Tile
 from .rays import into_tiles as into_tiles
+from .recorded_returns import LidarCalibration as LidarCalibration
+from .recorded_returns import calibrate as calibrate
 from .recorded_rig import rig_document as rig_document
 from .reference_sensor import Areas as Areas
 from .reference_sensor import ReferenceScan as ReferenceScan
@@ -38,5 +41,6 @@ from .simulated_frames import reference_of_objects as reference_of_objects
 from .simulator import Observation as Observation
 from .simulator import Simulator as Simulator
 from .surface_reference import SurfaceReference as SurfaceReference
+from .weather import Weather as Weather
 from .world import Label as Label
 from .writing import write_recording as write_recording

@@ -11,6 +11,7 @@ from pydantic import Field, model_validator
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import shapes
 from torchcover.simulation.documents import Document, NameOrFile, Pose, is_file_name, load_document
+from torchcover.simulation.material import material_number
 from torchcover.simulation.mount_regions import MountRegion
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sound import told
@@ -27,6 +28,7 @@ SHORTEST_M = 0.2
 # Words of a category that stand for what is longer than wide and high, and no longer than lorries. Of the others,
 # people are wider than long, and trams longer.
 ROAD_VEHICLES = {"ego", "car", "truck", "lorry", "bus", "van", "suv", "vehicle", "trailer", "taxi", "pickup"}
+ON_FOOT = {"pedestrian", "person", "adult", "child"}
 RAIL_VEHICLES = {"tram", "train", "rail", "railed"}
 
 TURN = (
@@ -113,6 +115,8 @@ class Body(Document):
         name: What messages call it.
         shape: Its form, in its own frame.
         poses: Where its frame lies in that of the document; one copy for each.
+        material: What it is made of, a built-in material. Not given: ground is `road`, other scenery `brick`, and what
+            moves or is a vehicle `car_paint`, or `clothing` if it walks.
         ground: In a scenario: whether one drives or walks on it, so that heights are measured from its level faces. If
             no body of a scenario is, the ground is what is level under the ego and connected with that by steps of at
             most 0.3 m.
@@ -121,11 +125,23 @@ class Body(Document):
     name: str
     shape: Shape
     poses: tuple[Pose, ...] = Field(default=(Pose(),), min_length=1)
+    material: str | None = None
     ground: bool = False
+
+    @model_validator(mode="after")
+    def _check_material(self) -> Self:
+        if self.material is not None:
+            try:
+                material_number(self.material)
+            except FileNotFoundError as error:
+                raise ValueError(f"material: {error}") from error
+        return self
 
     def meshes(self) -> list[Mesh]:
         """One mesh for each pose."""
         mesh = sound_mesh(self.shape, f"body {self.name!r}")
+        if self.material is not None or self.ground:
+            mesh = mesh.made_of(self.material or "road")
         warn_of_scenery(f"body {self.name!r}", mesh)
         return [mesh.moved(pose.matrix()) for pose in self.poses]
 
@@ -161,8 +177,10 @@ class Vehicle(Document):
         return self
 
     def mesh(self) -> Mesh:
-        """All parts in one mesh, in the vehicle frame."""
-        return in_vehicle_frame(merge([mesh for part in self.parts for mesh in part.meshes()]))
+        """All parts in one mesh, in the vehicle frame; painted, where they do not say their material."""
+        meshes = [mesh for part in self.parts for mesh in part.meshes()]
+        painted = [mesh.made_of("car_paint") if mesh.material is None else mesh for mesh in meshes]
+        return in_vehicle_frame(merge(painted))
 
     def content(self) -> dict[str, Any]:
         """Its body; where sensors may be mounted on it means nothing to those that are."""
@@ -197,6 +215,8 @@ def mover_mesh(name: str, shape: Shape, category: str = "ego") -> Mesh:
         category: What it is: "ego", or that of an actor.
     """
     mesh = in_vehicle_frame(sound_mesh(shape, name))
+    if mesh.material is None:
+        mesh = mesh.made_of("clothing" if category in ON_FOOT else "car_paint")
     warn_of_mover(name, mesh, category)
     return mesh
 
@@ -232,4 +252,5 @@ def merge(meshes: list[Mesh]) -> Mesh:
     return Mesh(
         np.concatenate([mesh.vertices_m for mesh in meshes]),
         np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]),
+        np.concatenate([mesh.materials for mesh in meshes]),
     )

@@ -16,7 +16,7 @@ def builtin_documents(kind: str) -> dict[str, dict[str, Any]]:
     """The built-in documents of a kind as they are written, by name.
 
     Args:
-        kind: "rigs", "scenarios", "vehicles" or "lidars".
+        kind: "rigs", "scenarios", "vehicles", "lidars", "materials" or "weather".
 
     Example:
         >>> builtin_documents("scenarios")["courtyard"]["description"].split(",")[0]
@@ -30,7 +30,7 @@ def builtin_folder(kind: str) -> Path:
     """Where the built-in documents of a kind lie.
 
     Args:
-        kind: "rigs", "scenarios", "vehicles", "lidars", or "published", which has tables.
+        kind: As above, or "published", which has tables.
     """
     package = Path(str(files("torchcover")))
     # In a wheel the folder lies inside the package; in a checkout beside it.

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from torchcover.cameras import Camera
 from torchcover.geometry import rigid
-from torchcover.simulation.documents import Pose
-from torchcover.simulation.sensor import Ranging
+from torchcover.simulation.documents import Document, Pose
+from torchcover.simulation.sensor import Ranging, Scan
 
 # The camera frame is x right, y down, z forward; a mount looks along its x, with y left and z up.
 MOUNT_T_CAMERA = rigid(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
@@ -22,8 +22,23 @@ MAX_PIXELS = 200_000
 Side = Annotated[int, Field(gt=0, le=MAX_PIXELS)]
 
 
+class Stereo(Document):
+    """How a pair of cameras errs in depth: by R^2 / (f B) for each pixel of disparity, f their focal length in pixels.
+
+    Args:
+        baseline_m: B, the distance between the two.
+        subpixel_px: Standard deviation of the disparity.
+    """
+
+    baseline_m: PositiveFloat
+    subpixel_px: PositiveFloat
+
+
 class CameraSensor(Ranging):
     """A camera as a depth sensor: every pixel that has a ray gives the point that it sees.
+
+    What it takes for the range has a standard deviation of `range_noise_m`, `range_noise_share` of the range, and that
+    of `stereo`, together: beyond the range at which that is as large as the threshold, its points stop counting.
 
     Args:
         name: What maps and messages call it.
@@ -34,7 +49,11 @@ class CameraSensor(Ranging):
         fx, fy, cx, cy: Intrinsics in pixels instead; pixel centres lie at integers.
         lens: Lens model, with the intrinsics; see `torchcover.Camera`.
         coefficients: Of the lens.
-        stride: Use every stride-th row and column.
+        stride: Use every stride-th row and column. Points on a body are counted as pixels of the full image all the
+            same.
+        stereo: Its error in depth as that of a pair of cameras; none if not given.
+        range_noise_share: Standard deviation of measured ranges, as a share of the range.
+        scan: When its rows are cast, as by a rolling shutter; all at once if not given.
         min_range_m, max_range_m, range_noise_m, dropout: As in `Ranging`; ranges are along the ray.
 
     Example:
@@ -56,6 +75,9 @@ class CameraSensor(Ranging):
     lens: str = "pinhole"
     coefficients: tuple[float, ...] = ()
     stride: PositiveInt = 1
+    stereo: Stereo | None = None
+    range_noise_share: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
+    scan: Scan | None = None
 
     @model_validator(mode="after")
     def _check_lens(self) -> Self:
@@ -66,6 +88,23 @@ class CameraSensor(Ranging):
             raise ValueError("fov_deg is for a pinhole without fx, fy, cx, cy; give one or the other")
         self.camera()
         return self
+
+    def noise_m(self, range_m: NDArray[np.floating]) -> float | NDArray[np.floating]:
+        """Standard deviation of measured ranges, of each of (N,) or of all; 0 if they are exact."""
+        if self.stereo is None and not self.range_noise_share:
+            return self.range_noise_m
+        squared = self.range_noise_m**2 + (self.range_noise_share * range_m) ** 2
+        if self.stereo is not None:
+            focal_px = float(self.camera().intrinsics[0])
+            per_m2 = self.stereo.subpixel_px / (focal_px * self.stereo.baseline_m)
+            squared = squared + (per_m2 * range_m**2) ** 2
+        noise_m: NDArray[np.floating] = np.sqrt(squared)
+        return noise_m
+
+    @property
+    def counts_as(self) -> int:
+        """The pixels of the full image that each one in use stands for."""
+        return self.stride**2
 
     @property
     def rays(self) -> int:
@@ -119,6 +158,13 @@ class CameraSensor(Ranging):
         """(3, rows, columns) unit directions in the frame of the mount; NaN where a pixel has no ray."""
         rows, columns = (torch.arange(0, size, self.stride, dtype=torch.float64) for size in (self.height, self.width))
         return self._directions(torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2))
+
+    def times_s(self) -> NDArray[np.float64] | None:
+        """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
+        if self.scan is None:
+            return None
+        of_rows_s = self.scan.times_s(self.height)[:: self.stride]
+        return np.repeat(of_rows_s[:, None], -(-self.width // self.stride), axis=1)
 
     def _directions(self, pixels: Tensor) -> NDArray[np.float64]:
         """(3, rows, columns) of (rows, columns, 2) pixels."""

@@ -111,7 +111,7 @@ def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -
 
     Args:
         model: What it must hold.
-        kind: Folder of the built-in ones: "rigs", "scenarios", "vehicles" or "lidars".
+        kind: Folder of the built-in ones, as "rigs".
         path_or_name: A path that ends in .yaml or .yml, or the name of a built-in document.
 
     Returns:

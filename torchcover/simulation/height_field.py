@@ -41,7 +41,7 @@ class Plain(NamedTuple):
     def mesh(self) -> Mesh:
         """Two triangles."""
         sheet = ground(self.lower_m, self.upper_m)
-        return Mesh(sheet.vertices_m + np.array([0.0, 0.0, self.height_m]), sheet.faces)
+        return sheet._replace(vertices_m=sheet.vertices_m + np.array([0.0, 0.0, self.height_m]))
 
 
 class Slopes(NamedTuple):
@@ -70,7 +70,7 @@ class Slopes(NamedTuple):
         faces = np.concatenate([np.stack([here, right, across], axis=1), np.stack([here, across, above], axis=1)])
         used, faces = np.unique(faces, return_inverse=True)
         places_m = self.lower_m + CELL_M * np.stack([used % columns, used // columns], axis=1)
-        return Mesh(np.column_stack([places_m, self.corners_m.reshape(-1)[used]]), faces.reshape(-1, 3))
+        return Mesh(np.column_stack([places_m, self.corners_m.reshape(-1)[used]]), faces.reshape(-1, 3)).made_of("road")
 
 
 def corners_of(lower_m: Numbers, upper_m: Numbers) -> tuple[int, int]:

@@ -1,6 +1,7 @@
 """A scene at one time, which sensors scan."""
 
-from collections.abc import Sequence
+import operator
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -11,8 +12,9 @@ from numpy.typing import NDArray
 from torchcover.geometry import transform
 from torchcover.simulation.local_ground import LocalGround
 from torchcover.simulation.moving import Moving
-from torchcover.simulation.raycaster import Hits, RayCaster
+from torchcover.simulation.raycaster import Hits, RayCaster, Struck, cast_from
 from torchcover.simulation.rays import TILE_ROWS, Outlines, Tile, into_tiles, outlines, rotate, unit_directions
+from torchcover.simulation.sweep import Motion, Poses, RayTimes, Sweep, no_motion
 
 # Directions all around, to find out whether a place lies inside a body.
 ALL_AROUND = unit_directions(np.linspace(-85.0, 85.0, 12)[:, None], np.arange(0.0, 360.0, 30.0)[None])
@@ -29,10 +31,13 @@ NO_GROUND = LocalGround([], np.zeros(3))
 
 
 class SensorScan(NamedTuple):
-    """What one sensor saw: `points` (N, 3) float32 in the vehicle frame, and how many rays went where.
+    """What one sensor saw: `points` (N, 3) float32 in the vehicle frame, where they are, and how many rays went where.
 
     `ray` (N,) says which ray, counted over the tiles, made each point, and `range_m` (N,) how far it went. `body_casts`
-    is the number of pairs of a ray and a moving body at which it was cast: the other pairs could not meet.
+    is the number of pairs of a ray and a moving body at which it was cast: the other pairs could not meet. `struck`
+    finds out what they hit, for who asks, and `ways` the (N, 3) directions of their rays in the vehicle frame; both are
+    None of what a sensor has measured. `error_m` (N,) is how far off it measured them, along their rays, None if they
+    are exact, and `landed` (N, 3) where that is, None if where they are.
     """
 
     points: Float32
@@ -41,6 +46,16 @@ class SensorScan(NamedTuple):
     rays: int
     self_hits: int
     body_casts: int = 0
+    struck: Callable[[], Struck] | None = None
+    error_m: Float32 | None = None
+    landed: Float32 | None = None
+    ways: Callable[[], Float32] | None = None
+
+    def some(self, which: NDArray[np.int64]) -> "SensorScan":
+        """Some of its points."""
+        names = ("points", "ray", "range_m", "landed")
+        given = {name: value[which] for name in names if (value := getattr(self, name)) is not None}
+        return self._replace(**given)
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +70,7 @@ class Instant:
         out_of_range: How many bodies that move are not near, or not there.
         ground: What one drives or walks on; none if not given.
         world_T_vehicle: (4, 4) where the vehicle is in the frame that the ground is given in.
+        motion: Where everything is from a time before this one to another.
     """
 
     static: RayCaster
@@ -64,6 +80,7 @@ class Instant:
     out_of_range: int = 0
     ground: LocalGround = NO_GROUND
     world_T_vehicle: Matrix = field(default_factory=lambda: np.eye(4))
+    motion: Motion = no_motion
 
     def heights_m(self, points_m: NDArray[np.floating]) -> Float32:
         """(N,) heights above the local ground of (N, 3) points of the vehicle frame; see `LocalGround.heights_m`."""
@@ -92,6 +109,7 @@ class Instant:
         max_range_m: float = np.inf,
         own_m: Sequence[Float32] = (),
         ego_points: bool = False,
+        times: Sequence[RayTimes] | None = None,
         threads: int = 1,
     ) -> SensorScan:
         """Cast the rays of one sensor. The ego occludes, but its own points are left out unless they are wanted.
@@ -103,35 +121,90 @@ class Instant:
             own_m: Of a sensor that is fixed to the ego: where the ego's body ends the rays of each tile, from
                 `Scene.own_m`. They are not cast at it again. The result is the same.
             ego_points: Whether hits on the ego give points too.
+            times: When the rays of each tile are cast; all at once if not given.
             threads: Number of threads; the result does not depend on it.
 
         Returns:
             A `SensorScan`, the points in the order of the tiles.
         """
-        bodies = self.outlines(vehicle_T_sensor[:3, 3])
+        origin_m = vehicle_T_sensor[:3, 3]
+        sweep = self._sweep(times) if times else None
+        bodies = self.outlines(origin_m) if sweep is None else sweep.outlines(origin_m)
 
-        def scan_tile(tile: Tile, own_m: Float32 | None) -> tuple[Float32, NDArray[np.bool_], Float32, int, int]:
-            directions, hits, casts = self.cast(vehicle_T_sensor, tile, _limit(tile, max_range_m), bodies, own_m)
-            seen = (hits.body >= 0) & (ego_points | (hits.body != self.ego))
-            points = _points(vehicle_T_sensor[:3, 3], directions, hits.range_m, seen)
-            return points, seen, hits.range_m[seen], int(np.count_nonzero(hits.body == self.ego)), casts
+        def scan_tile(tile: Tile, own_m: Float32 | None, when: RayTimes | None) -> _TileScan:
+            limit_m = _limit(tile, max_range_m)
+            if sweep is None or when is None:
+                directions, hits, casts = self.cast(vehicle_T_sensor, tile, limit_m, bodies, own_m)
+                seen = self._seen(hits, ego_points)
+                points = _points(origin_m.astype(np.float32), directions, hits.range_m, seen)
+                return _TileScan(points, points, seen, hits.range_m[seen], directions, hits, casts)
+            swept = sweep.cast(vehicle_T_sensor, tile, when, limit_m, bodies, self.ego, own_m)
+            hits, seen = swept.hits, self._seen(swept.hits, ego_points)
+            starts_m = swept.starts_m.take(when.of_ray, axis=0)
+            points = landed = _points(starts_m, swept.directions, hits.range_m, seen)
+            if len(swept.on_body):
+                points = landed.copy()
+                points[np.cumsum(seen)[swept.on_body] - 1] = swept.points
+            return _TileScan(points, landed, seen, hits.range_m[seen], swept.directions, hits, swept.casts)
 
         own: Sequence[Float32 | None] = own_m or [None] * len(tiles)
+        whens: Sequence[RayTimes | None] = times or [None] * len(tiles)
         if threads <= 1 or len(tiles) <= 1:
-            scans = list(map(scan_tile, tiles, own))
+            scans = list(map(scan_tile, tiles, own, whens))
         else:
             # A pool for each scan: threads do not survive the fork that makes a DataLoader worker.
             with ThreadPoolExecutor(threads) as pool:
-                scans = list(pool.map(scan_tile, tiles, own))
-        points, seen, range_m, self_hits, casts = zip(*scans, strict=True)
+                scans = list(pool.map(scan_tile, tiles, own, whens))
+        points, landed, seen, range_m, directions, hits, casts = zip(*scans, strict=True)
+
+        def towards(tile: int) -> Float32:
+            return directions[tile].take(np.flatnonzero(seen[tile]), axis=1)  # type: ignore[no-any-return]
+
+        def struck() -> Struck:
+            parts = [
+                self.struck(of.body[there], of.triangle[there], towards(tile))
+                for tile, (of, there) in enumerate(zip(hits, seen, strict=True))
+            ]
+            return Struck._make(np.concatenate(column) for column in zip(*parts, strict=True))
+
         return SensorScan(
             points=np.concatenate(points),
             ray=np.flatnonzero(np.concatenate(seen)),
             range_m=np.concatenate(range_m),
             rays=sum(tile.directions.shape[1] for tile in tiles),
-            self_hits=sum(self_hits),
+            self_hits=sum(int(np.count_nonzero(of.body == self.ego)) for of in hits),
             body_casts=sum(casts),
+            struck=struck,
+            ways=lambda: np.concatenate([towards(tile) for tile in range(len(tiles))], axis=1).T,
+            landed=np.concatenate(landed) if any(map(operator.is_not, landed, points)) else None,
         )
+
+    def _seen(self, hits: Hits, ego_points: bool) -> NDArray[np.bool_]:
+        seen: NDArray[np.bool_] = (hits.body >= 0) & (ego_points | (hits.body != self.ego))
+        return seen
+
+    def _sweep(self, times: Sequence[RayTimes]) -> Sweep | None:
+        now = Poses(self.static_T_vehicle, self.moving.vehicle_T_part)
+        return Sweep.of(self.static, now, self.moving, self.motion, times)
+
+    def struck(self, body: NDArray[np.int32], triangle: NDArray[np.int32], directions: Float32) -> Struck:
+        """What the rays hit that ended on some faces.
+
+        Args:
+            body: (N,) numbers of the bodies, as `cast` gives them, none of them -1.
+            triangle: (N,) likewise.
+            directions: (3, N) unit directions of these rays in the vehicle frame.
+        """
+        moved = np.flatnonzero(body >= self.static.bodies)
+        # What moves is looked up as any face of what does not, and then put right.
+        rests = np.where(body < self.static.bodies, triangle, 0) if len(moved) else triangle
+        towards = rotate(self.static_T_vehicle[:3, :3], directions)
+        found = self.static.struck(np.minimum(body, self.static.bodies - 1), rests, towards)
+        if len(moved):
+            part = np.searchsorted(self.moving.body, body[moved])
+            others = self.moving.struck(part, triangle[moved], directions[:, moved])
+            found.cos_incidence[moved], found.material[moved] = others.cos_incidence, others.material
+        return found._replace(body=body, triangle=triangle)
 
     def range_image(
         self, vehicle_T_sensor: Matrix, directions: NDArray[np.float64], *, max_range_m: float = np.inf
@@ -228,37 +301,34 @@ class Instant:
         The hits are brought up to date.
         """
         leaving_out = self.ego if ego_is_known else None
-        (part, ray, range_m), casts = self.moving.meetings(
+        met, casts = self.moving.meetings(
             origin_m, vehicle_R_sensor, tile, directions, hits.range_m, bodies, leaving_out=leaving_out
         )
-        if casts == 0:
-            return 0
-        # The nearest counts; of two that coincide, the last in the order of the bodies.
-        nearest_m = np.full(len(hits.range_m), np.inf, dtype=np.float32)
-        np.minimum.at(nearest_m, ray, range_m)
-        first = range_m == nearest_m[ray]
-        hits.range_m[ray[first]] = range_m[first]
-        hits.body[ray[first]] = self.moving.body[part[first]]
+        self.moving.nearer(hits, met)
         return casts
+
+
+class _TileScan(NamedTuple):
+    """What n rays of a tile saw: `points` and `landed` (K, 3) and `range_m` (K,) of those that did."""
+
+    points: Float32
+    landed: Float32
+    seen: NDArray[np.bool_]
+    range_m: Float32
+    directions: Float32
+    hits: Hits
+    casts: int
 
 
 def _limit(tile: Tile, max_range_m: float) -> Float32:
     return np.full(tile.directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
 
 
-def _points(origin_m: Matrix, directions: Float32, range_m: Float32, seen: NDArray[np.bool_]) -> Float32:
-    """(K, 3) where the rays that saw something ended."""
+def _points(origin_m: Float32, directions: Float32, range_m: Float32, seen: NDArray[np.bool_]) -> Float32:
+    """(K, 3) where the rays that saw something ended, which start at (3,) one place or (n, 3) one each."""
     points = np.empty((np.count_nonzero(seen), 3), dtype=np.float32)
     for axis in range(3):
         coordinate = directions[axis] * range_m
-        coordinate += np.float32(origin_m[axis])
+        coordinate += origin_m[..., axis]
         points[:, axis] = coordinate[seen]
     return points
-
-
-def cast_from(
-    caster: RayCaster, part_T_vehicle: Matrix, origin_m: Matrix, directions: Float32, limit_m: Float32
-) -> Hits:
-    """Cast rays of the vehicle frame at a caster in its own frame."""
-    towards = rotate(part_T_vehicle[:3, :3], directions)
-    return caster.cast(transform(part_T_vehicle, origin_m[None])[0], towards, limit_m)

@@ -5,15 +5,17 @@ from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, ValidationInfo, model_validator
+from pydantic import Field, PositiveFloat, ValidationInfo, model_validator
 
 from torchcover.simulation.documents import Pose, beside, is_file_name, load_document
+from torchcover.simulation.material import material_number, materials, tone
 from torchcover.simulation.rays import unit_directions
-from torchcover.simulation.sensor import Elevation, Ranging
+from torchcover.simulation.returns import log_excess, return_probability
+from torchcover.simulation.sensor import Draws, Elevation, Ranging, RayHits, Returns, Scan
 
 # Two ways to write rows: a sensor that chooses one of them takes nothing of the other from its model.
 SPACED_ROWS = ("channels", "vertical_fov_deg")
-ROW_TABLE = ("elevations_deg", "azimuth_offsets_deg")
+ROW_TABLE = ("elevations_deg", "azimuth_offsets_deg", "range_factors")
 # A hundred times what there is on the market.
 MAX_ROWS, MAX_COLUMNS = 100_000, 1_000_000
 
@@ -32,6 +34,11 @@ class ScanPattern(Ranging):
         azimuth_offsets_deg: Offset of each row; positive is left. None if not given.
         horizontal_fov_deg: Field of view about the x axis, 360 for a full turn.
         columns: Number of columns.
+        range_at_10_percent_m: Range at which a surface of reflectivity 10 %, met head-on, returns every other ray; see
+            `log_excess`. None: every hit within `max_range_m` returns.
+        spread: Standard deviation of ln of that range between one ray and the next.
+        range_factors: Of each row, what its range at 10 % is multiplied with; 1 if not given.
+        scan: When its columns are cast; all at once if not given.
         min_range_m, max_range_m, range_noise_m, dropout: As in `Ranging`.
     """
 
@@ -41,6 +48,10 @@ class ScanPattern(Ranging):
     azimuth_offsets_deg: tuple[float, ...] | None = None
     horizontal_fov_deg: Annotated[float, Field(gt=0.0, le=360.0)]
     columns: Annotated[int, Field(gt=0, le=MAX_COLUMNS)]
+    range_at_10_percent_m: PositiveFloat | None = None
+    spread: PositiveFloat = 0.3
+    range_factors: tuple[PositiveFloat, ...] | None = None
+    scan: Scan | None = None
 
     @model_validator(mode="after")
     def _check_rows(self) -> Self:
@@ -51,10 +62,44 @@ class ScanPattern(Ranging):
             raise ValueError("the rows are missing: give channels and vertical_fov_deg, or elevations_deg")
         if self.vertical_fov_deg is not None and self.vertical_fov_deg[0] > self.vertical_fov_deg[1]:
             raise ValueError(f"vertical_fov_deg: the lower elevation comes first; got {self.vertical_fov_deg}")
-        rows, offsets = len(self.rows_deg()), self.azimuth_offsets_deg
-        if offsets is not None and len(offsets) != rows:
-            raise ValueError(f"azimuth_offsets_deg: one for each of the {rows} rows is needed; got {len(offsets)}")
+        rows = len(self.rows_deg())
+        for key in ("azimuth_offsets_deg", "range_factors"):
+            given = getattr(self, key)
+            if given is not None and len(given) != rows:
+                raise ValueError(f"{key}: one for each of the {rows} rows is needed; got {len(given)}")
         return self
+
+    @property
+    def is_exact(self) -> bool:
+        """Whether it has neither noise nor drop-out, and every hit returns."""
+        return self.range_at_10_percent_m is None and super().is_exact
+
+    def measure(self, hits: RayHits, draws: Draws) -> Returns:
+        """A point for each hit that returns enough light and is not too close; see `Ranging.measure`."""
+        if self.range_at_10_percent_m is None:
+            return super().measure(hits, draws)
+        returned = draws.chance(hits.ray) < self._return_probability(hits, self.range_at_10_percent_m)
+        return self.erring(hits, np.flatnonzero(returned & (hits.range_m >= self.min_range_m)), draws)
+
+    def _return_probability(self, hits: RayHits, range_at_10_percent_m: float) -> NDArray[np.floating]:
+        material, weather = hits.struck.material, hits.weather
+        if weather.road == "wet":
+            material = np.where(material == material_number("road"), material_number("wet_road"), material)
+        known = materials()
+        reach_m: float | NDArray[np.float32] = range_at_10_percent_m
+        if self.range_factors is not None:
+            of_rows_m = range_at_10_percent_m * np.array(self.range_factors, dtype=np.float32)
+            reach_m = of_rows_m[hits.pixel // self.columns]
+        excess = log_excess(
+            hits.range_m,
+            hits.struck.cos_incidence,
+            known.reflectivity[material],
+            known.exponent[material],
+            reach_m,
+            weather.extinction_per_m,
+        )
+        excess += known.spread_of_bodies[material] * tone(hits.struck.body)
+        return return_probability(excess, self.spread, known.spread_of_places[material])
 
     @property
     def rays(self) -> int:
@@ -68,6 +113,11 @@ class ScanPattern(Ranging):
         assert self.channels is not None  # checked in _check_rows
         assert self.vertical_fov_deg is not None
         return np.linspace(*self.vertical_fov_deg, self.channels)
+
+    def times_s(self) -> NDArray[np.float64] | None:
+        """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
+        rows = len(self.rows_deg())
+        return None if self.scan is None else np.tile(self.scan.times_s(self.columns), (rows, 1))
 
     def directions(self) -> NDArray[np.float64]:
         """(3, rows, columns) unit directions in the LiDAR's frame."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, invert
 from torchcover.simulation.patches import Patches
-from torchcover.simulation.raycaster import RayCaster
+from torchcover.simulation.raycaster import Hits, RayCaster, Struck
 from torchcover.simulation.rays import (
     SLACK_M,
     SLACK_SHARE,
@@ -75,11 +75,15 @@ class Solids:
 
 
 class Meetings(NamedTuple):
-    """L times that a ray meets a body: (L,) number of the body in `Moving`, of the ray in its tile, and where."""
+    """L times that a ray meets a body: (L,) number of the body in `Moving`, of the ray in its tile, and where.
+
+    `triangle` (L,) says on which face of the body.
+    """
 
     part: Numbers
     ray: Numbers
     range_m: Float32
+    triangle: NDArray[np.int32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +149,34 @@ class Moving:
         place: Float64 = ((place_m + (back @ translation)[..., 0])[:, None] @ back)[:, 0]
         return place
 
+    def pairs(
+        self,
+        vehicle_R_sensor: Float64,
+        tile: Tile,
+        directions: Float32,
+        limit_m: Float32,
+        bodies: Outlines,
+        *,
+        leaving_out: int | None = None,
+    ) -> tuple[Numbers, Numbers]:
+        """Which rays of one tile may meet which body before they end: (K,) bodies and (K,) rays.
+
+        Args:
+            vehicle_R_sensor: (3, 3) rotation of the sensor.
+            tile: n of its rays.
+            directions: (3, n) the same in the vehicle frame.
+            limit_m: (n,) where they end.
+            bodies: These bodies as they look from there, from `outlines`.
+            leaving_out: Number of a body that they are not cast at.
+        """
+        near = boxes_in_cone(bodies, vehicle_R_sensor @ tile.axis, tile.half_angle, float(limit_m.max(initial=0.0)))
+        if leaving_out is not None:
+            near = near[self.body[near] != leaving_out]
+        if len(near) == 0:
+            return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
+        of_near, block = np.nonzero(blocks_towards(bodies.kept(near), tile, vehicle_R_sensor, limit_m))
+        return rays_towards(bodies, near[of_near], tile.blocks[block], directions, limit_m)
+
     def meetings(
         self,
         origin_m: Float64,
@@ -156,54 +188,86 @@ class Moving:
         *,
         leaving_out: int | None = None,
     ) -> tuple[Meetings, int]:
-        """Where the rays of one tile meet each body, as if it were alone.
+        """Where the rays of one tile meet each body, as if it were alone; and at how many pairs of both it was cast.
 
         Args:
             origin_m: (3,) where they start.
-            vehicle_R_sensor: (3, 3) rotation of the sensor.
-            tile: n of its rays.
-            directions: (3, n) the same in the vehicle frame.
-            limit_m: (n,) where they end.
-            bodies: These bodies as they look from there, from `outlines`.
-            leaving_out: Number of a body that they are not cast at.
-
-        Returns:
-            The meetings, and at how many pairs of a ray and a body it was cast.
+            vehicle_R_sensor: As in `pairs`, and so are the others.
+            tile: Rays of the sensor.
+            directions: The same in the vehicle frame.
+            limit_m: Where they end.
+            bodies: How the bodies look.
+            leaving_out: Number of a body.
         """
-        near = boxes_in_cone(bodies, vehicle_R_sensor @ tile.axis, tile.half_angle, float(limit_m.max(initial=0.0)))
-        if leaving_out is not None:
-            near = near[self.body[near] != leaving_out]
-        part, ray = np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-        if len(near):
-            of_near, block = np.nonzero(blocks_towards(bodies.kept(near), tile, vehicle_R_sensor, limit_m))
-            part, ray = rays_towards(bodies, near[of_near], tile.blocks[block], directions, limit_m)
+        part, ray = self.pairs(vehicle_R_sensor, tile, directions, limit_m, bodies, leaving_out=leaving_out)
         if len(ray) == 0:
-            return Meetings(part, ray, np.empty(0, dtype=np.float32)), 0
-        range_m, met = self._cast_pairs(origin_m, directions, part, ray, limit_m)
-        return Meetings(part[met], ray[met], range_m[met]), len(met)
-
-    def _cast_pairs(
-        self, origin_m: Float64, directions: Float32, part: Numbers, ray: Numbers, limit_m: Float32
-    ) -> tuple[Float32, NDArray[np.bool_]]:
-        """Cast K pairs of a ray and a body: (K,) where the ray ends, and whether it met the body."""
+            return Meetings(part, ray, np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int32)), 0
         places_m = self.from_there_m(origin_m)
+        towards = rotate_each(self.part_T_vehicle[:, :3, :3].astype(np.float32)[part], directions.take(ray, axis=1))
+        hits = self.cast_pairs(part, places_m.astype(np.float32)[part], towards, limit_m[ray], (origin_m, places_m))
+        met = hits.body >= 0
+        return Meetings(part[met], ray[met], hits.range_m[met], hits.triangle[met]), len(met)
+
+    def struck(self, part: Numbers, triangle: NDArray[np.int32], directions: Float32) -> Struck:
+        """What the rays hit that met some of the bodies.
+
+        Args:
+            part: (N,) of `Meetings`.
+            triangle: (N,) likewise.
+            directions: (3, N) unit directions of these rays in the vehicle frame.
+        """
+        towards = rotate_each(self.part_T_vehicle[:, :3, :3].astype(np.float32)[part], directions)
         casters, kind = self.kinds
-        touched = self.touched_by(origin_m, places_m)
+        cosine, material = np.empty(len(part), dtype=np.float32), np.empty(len(part), dtype=np.uint8)
+        for number in np.unique(kind[part]).tolist():
+            some = np.flatnonzero(kind[part] == number)
+            alone = casters[number].struck(np.zeros(len(some), dtype=np.int32), triangle[some], towards[:, some])
+            cosine[some], material[some] = alone.cos_incidence, alone.material
+        return Struck(self.body[part].astype(np.int32), triangle, cosine, material)
+
+    def cast_pairs(
+        self,
+        part: Numbers,
+        starts_m: Float32,
+        towards: Float32,
+        limit_m: Float32,
+        common: tuple[Float64, Float64] | None = None,
+    ) -> Hits:
+        """Cast K pairs of a ray and a body, each as if it were alone.
+
+        Args:
+            part: (K,) the bodies.
+            starts_m: (K, 3) where the rays start, each in the frame of its body.
+            towards: (3, K) their directions, likewise.
+            limit_m: (K,) where they end.
+            common: If they start at one place: (3,) that, and (P, 3) the same in the frame of each body. It may lie on
+                a face.
+        """
+        casters, kind = self.kinds
+        touched = np.zeros(len(self), dtype=bool) if common is None else self.touched_by(*common)
         # Bodies of one kind are cast at together. A ray that starts on a face is cast as one that leaves it.
         group = np.where(touched, len(casters) + np.arange(len(self)), kind)[part]
         order = np.argsort(group, kind="stable")
-        part, ray, group = part[order], ray[order], group[order]
-        towards = rotate_each(self.part_T_vehicle[:, :3, :3].astype(np.float32)[part], directions.take(ray, axis=1))
-        starts_m, limit_m = places_m.astype(np.float32)[part], limit_m[ray]
+        part, group = part[order], group[order]
+        starts_m, towards, limit_m = starts_m[order], towards[:, order], limit_m[order]
         first, answers = np.flatnonzero(np.diff(group, prepend=-1)).tolist(), []
         for start, end in pairwise([*first, len(group)]):
             some, body = slice(start, end), part[start]
-            if touched[body]:
-                answers.append(self.casters[body].cast(places_m[body], towards[:, some], limit_m[some]))
+            if common is not None and touched[body]:
+                answers.append(self.casters[body].cast(common[1][body], towards[:, some], limit_m[some]))
             else:
                 caster = casters[group[start]]
                 answers.append(caster.cast_from_each(starts_m[some], towards[:, some], limit_m[some]))
-        range_m, met = np.empty_like(limit_m), np.empty(len(order), dtype=bool)
-        range_m[order] = np.concatenate([answer.range_m for answer in answers])
-        met[order] = np.concatenate([answer.body for answer in answers]) >= 0
-        return range_m, met
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        return Hits._make(np.concatenate(column)[back] for column in zip(*answers, strict=True))
+
+    def nearer(self, hits: Hits, met: Meetings) -> None:
+        """Bring the hits of all rays of a tile up to date with what they meet of the bodies."""
+        # The nearest counts; of two that coincide, the last in the order of the bodies.
+        part, ray, range_m, triangle = met
+        nearest_m = np.full(len(hits.range_m), np.inf, dtype=np.float32)
+        np.minimum.at(nearest_m, ray, range_m)
+        first = range_m == nearest_m[ray]
+        hits.range_m[ray[first]] = range_m[first]
+        hits.body[ray[first]], hits.triangle[ray[first]] = self.body[part[first]], triangle[first]

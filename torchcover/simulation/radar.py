@@ -118,4 +118,4 @@ class Radar(Ranging):
         first = np.flatnonzero((np.diff(cell, prepend=-1) != 0) | (np.diff(beam[seen], prepend=-1) != 0))
         last = np.append(first[1:], len(seen)) - 1
         middle = seen[(first + last) // 2]
-        return self.erring(hits.ray, np.sort(middle), draws)
+        return self.erring(hits, np.sort(middle), draws)

@@ -14,10 +14,13 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
+from torchcover.geometry import transform
 from torchcover.simulation.patches import outward_faces
+from torchcover.simulation.rays import rotate
 from torchcover.simulation.shapes import Mesh
 
 Float32 = NDArray[np.float32]
+Matrix = NDArray[np.float64]
 
 # Farther from the origin float32 resolves no better than 64 m, and at 2e18 Embree drops faces without a word.
 MAX_M = 1e9
@@ -33,7 +36,7 @@ class Faces:
     """The faces of all bodies, one after the other, and how far from each a place counts as on it.
 
     `contact_m` (F,) bounds the distance from its plane at which float32 may find a place that lies on it, unless it is
-    a sliver.
+    a sliver; `normals` (3, F) are of length one, or 0 where a face has no area.
     """
 
     def __init__(self, bodies: Sequence[Mesh], reach_m: float) -> None:
@@ -49,7 +52,7 @@ class Faces:
         # The plane of a sliver is anybody's guess, but the sliver is not far from where it is.
         rounding_m = np.minimum(rounding_m, largest.max(axis=0)) * np.finfo(np.float32).eps
         self.contact_m = np.maximum(CONTACT_ROUNDINGS * rounding_m, MIN_CONTACT * reach_m)
-        self._normals = across / length
+        self.normals = across / length
         self._corner_m = first
         self._lower_m = np.min([first, second, third], axis=0) - 2 * self.contact_m
         self._upper_m = np.max([first, second, third], axis=0) + 2 * self.contact_m
@@ -72,16 +75,36 @@ class Faces:
 
     def from_plane_m(self, place_m: NDArray[np.floating], faces: NDArray[np.int64]) -> NDArray[np.float64]:
         """Distance of a (3,) place from the planes of some of them."""
-        along_normal = (place_m[:, None] - self._corner_m[:, faces]) * self._normals[:, faces]
+        along_normal = (place_m[:, None] - self._corner_m[:, faces]) * self.normals[:, faces]
         distance_m: NDArray[np.float64] = np.abs(along_normal.sum(axis=0))
         return distance_m
 
 
 class Hits(NamedTuple):
-    """For each of N rays: `range_m` (N,) float32 where it ended, and `body` (N,) int32, -1 if at its limit."""
+    """For each of N rays: `range_m` (N,) float32 where it ended, and `body` (N,) int32, -1 if at its limit.
+
+    `triangle` (N,) int32 is the number of the face among those of its body.
+    """
 
     range_m: Float32
     body: NDArray[np.int32]
+    triangle: NDArray[np.int32]
+
+
+class Struck(NamedTuple):
+    """What N rays hit.
+
+    Args:
+        body: (N,) its number, see `Instant`; -1 for what is no body of a scene.
+        triangle: (N,) which face of its mesh.
+        cos_incidence: (N,) float32 cosine of the angle between the ray and the normal of the face, on either side.
+        material: (N,) uint8 what the face is made of, as `Mesh.material` has it.
+    """
+
+    body: NDArray[np.int32]
+    triangle: NDArray[np.int32]
+    cos_incidence: Float32
+    material: NDArray[np.uint8]
 
 
 class RayCaster:
@@ -120,6 +143,22 @@ class RayCaster:
         """Asked where rays have a common origin, which may lie on a face."""
         return Faces(self._bodies, self._reach_m)
 
+    @cached_property
+    def _normals(self) -> Float32:
+        """(3, F) normals of all faces."""
+        normals: Float32 = self._faces.normals.astype(np.float32)
+        return normals
+
+    @cached_property
+    def _materials(self) -> NDArray[np.uint8]:
+        """(F,) what each of all faces is made of."""
+        return np.concatenate([body.materials for body in self._bodies])
+
+    @property
+    def bodies(self) -> int:
+        """How many there are; their numbers begin with 0."""
+        return len(self._bodies)
+
     def cast(self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32) -> Hits:
         """Cast rays from one origin. A ray that starts on a face does not hit that face.
 
@@ -136,7 +175,7 @@ class RayCaster:
             (directions.shape[1], 3), np.float32, origin_m.astype(np.float32).tobytes(), strides=(0, 4)
         )
         answer = self._scene.run(origins, directions.T, dists=limit_m.copy(), output=True)
-        hits = Hits(answer["tfar"], answer["geomID"])
+        hits = Hits(answer["tfar"], answer["geomID"], answer["primID"])
         if len(self.touched(origin_m)):
             self._leave_faces(origin_m, directions, limit_m, hits, self._numbers(answer))
         return hits
@@ -153,7 +192,20 @@ class RayCaster:
             As `cast`.
         """
         answer = self._scene.run(origins_m, directions.T, dists=limit_m.copy(), output=True)
-        return Hits(answer["tfar"], answer["geomID"])
+        return Hits(answer["tfar"], answer["geomID"], answer["primID"])
+
+    def struck(self, body: NDArray[np.int32], triangle: NDArray[np.int32], directions: Float32) -> Struck:
+        """What the rays hit that ended on some faces.
+
+        Args:
+            body: (N,) of `Hits`, none of them -1.
+            triangle: (N,) likewise.
+            directions: (3, N) unit directions of these rays.
+        """
+        face = self._first_face.take(body) + triangle
+        (nx, ny, nz), (x, y, z) = self._normals.take(face, axis=1), directions
+        cosine = np.abs(nx * x + ny * y + nz * z)
+        return Struck(body, triangle, np.minimum(cosine, 1.0, out=cosine), self._materials.take(face))
 
     def faces_met(
         self, origins_m: NDArray[np.floating], directions: NDArray[np.floating], limit_m: float
@@ -217,7 +269,7 @@ class RayCaster:
             answer = self._scene.run(starts_m.astype(np.float32), towards, dists=left_m.astype(np.float32), output=True)
             hit, range_m, faces = answer["geomID"] >= 0, answer["tfar"], self._numbers(answer)
             hits.range_m[rays] = np.where(hit, travelled_m + range_m, limit_m[rays])
-            hits.body[rays] = answer["geomID"]
+            hits.body[rays], hits.triangle[rays] = answer["geomID"], answer["primID"]
             again = hit & starts_on_plane(faces)
             rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
 
@@ -243,3 +295,11 @@ class RayCaster:
             of_body = np.flatnonzero(bodies == number)
             bodies[of_body[~self._closed[number][answer["primID"][of_body]]]] = -1
         return bodies
+
+
+def cast_from(
+    caster: RayCaster, part_T_vehicle: Matrix, origin_m: Matrix, directions: Float32, limit_m: Float32
+) -> Hits:
+    """Cast rays of the vehicle frame at a caster in its own frame."""
+    towards = rotate(part_T_vehicle[:3, :3], directions)
+    return caster.cast(transform(part_T_vehicle, origin_m[None])[0], towards, limit_m)

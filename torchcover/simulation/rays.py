@@ -21,6 +21,8 @@ BLOCK = 8
 ROUNDING = 1e-5
 # A box whose corners are not all this far in front of the sensor has no pyramid, in metres.
 CLOSEST_M = 0.05
+# Of a box.
+CORNERS = 8
 # By how much boxes are grown for their bodies' float32 coordinates: in metres, and as a share of their coordinates.
 SLACK_M = 1e-3
 SLACK_SHARE = 1e-6
@@ -167,7 +169,7 @@ def outlines(corners_m: Float64, origin_m: Float64) -> Outlines:
     """How boxes look from a place.
 
     Args:
-        corners_m: (P, 8, 3) their corners.
+        corners_m: (P, 8, 3) their corners; or (P, C, 3), those at several times one after the other.
         origin_m: (3,) the place, in the same frame.
     """
     ways_m = corners_m - origin_m
@@ -188,7 +190,7 @@ def outlines(corners_m: Float64, origin_m: Float64) -> Outlines:
         normals += [side - slope.max(axis=1, keepdims=True) * forward]
         normals += [slope.min(axis=1, keepdims=True) * forward - side]
     planes = _unit(np.stack(normals, axis=1))
-    planes[too_close] = _faces_towards(ways_m[too_close])
+    planes[too_close] = _faces_towards(ways_m[too_close]) if corners_m.shape[1] == CORNERS else 0.0
     return Outlines(planes, np.where(too_close, 0.0, nearest_m) - RANGE_SLACK_M)
 
 

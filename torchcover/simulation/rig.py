@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationInfo, model_validator
 
@@ -14,6 +14,7 @@ from torchcover.simulation.lidar import Lidar, LidarModel
 from torchcover.simulation.scenario import DEFAULT_EGO, Mover, Scenario
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import MeshFile
+from torchcover.simulation.weather import Weather
 
 
 def read_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whatever stood in the file, or a sensor)
@@ -32,6 +33,7 @@ class Rig(Document):
         description: What it is, and where its numbers come from.
         vehicle: What carries it, a built-in vehicle or the YAML file of one, where neither the user nor the scenario
             decides that.
+        weather: What it is measured in, in place of the scenario's.
         sensors: The sensors, each of a kind in `SENSORS`; their clouds are fused.
 
     Example:
@@ -42,6 +44,7 @@ class Rig(Document):
     name: str
     description: str = ""
     vehicle: NameOrFile | None = None
+    weather: Weather | None = None
     sensors: tuple[Annotated[Sensor, PlainValidator(read_sensor)], ...] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -81,6 +84,37 @@ class Rig(Document):
             keys["vehicle"] = str(Path(self.vehicle).resolve())
         keys["sensors"] = [_written(sensor) for sensor in self.sensors]
         write_durably(Path(path), lambda aside: aside.write_text(as_yaml(keys), encoding="utf-8"))
+
+    @property
+    def sensor_model(self) -> Literal["ideal", "real"]:
+        """`real` if what returns too little light to one of its LiDARs is no point; else every hit is one."""
+        return "real" if any(isinstance(one, Lidar) and one.range_at_10_percent_m for one in self.sensors) else "ideal"
+
+    def sensing(self, sensor_model: Literal["ideal", "real"] | None) -> Self:
+        """The rig with ideal sensors, or as it is.
+
+        Args:
+            sensor_model: `ideal` takes the range at 10 % from every LiDAR.
+
+        Raises:
+            ValueError: `real` of a rig of which no range at 10 % is known.
+
+        Example:
+            >>> Rig.load("kitti").sensor_model, Rig.load("kitti").sensing("ideal").sensor_model
+            ('real', 'ideal')
+        """
+        if sensor_model == "real" and self.sensor_model == "ideal":
+            raise ValueError(
+                f"sensor_model real: no LiDAR of the rig {self.name!r} has a range_at_10_percent_m; take it from a "
+                "data sheet, or fit it to a recording by `torchcover calibrate`"
+            )
+        if sensor_model != "ideal":
+            return self
+        sensors = [
+            one.model_copy(update={"range_at_10_percent_m": None}) if isinstance(one, Lidar) else one
+            for one in self.sensors
+        ]
+        return self.model_copy(update={"sensors": tuple(sensors)})
 
     def content(self) -> dict[str, Any]:
         """Its sensors; the vehicle is in the scenario that it is simulated in, if it is the one."""

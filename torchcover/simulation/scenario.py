@@ -13,12 +13,15 @@ from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, called, mover_mesh
 from torchcover.simulation.documents import Document, PathBeside, Pose, load_document
 from torchcover.simulation.kinds import TRAFFIC
+from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.local_ground import STEEPEST_DEG, level_faces
+from torchcover.simulation.radar import Radar
 from torchcover.simulation.recorded.bodies import read_boxes
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh, MeshFile
 from torchcover.simulation.sound import coincident_faces, warn_of_coincidence
 from torchcover.simulation.traffic.kind import Traffic
+from torchcover.simulation.weather import CLEAR, Weather
 from torchcover.simulation.world import Actor, World, steps_of
 
 # What carries a rig that names no vehicle, unless the document says otherwise.
@@ -94,6 +97,7 @@ class Scenario(Document):
         boxes: File of recorded boxes that are actors too; relative to the document.
         time_step_s: Time between two frames.
         duration_s: Time of the last frame; frames beyond it start again at 0.
+        weather: Clear and dry if not given.
         traffic: Of a kind in `TRAFFIC`, drawn or recorded: it makes bodies, actors, the ego's drive, and the times.
 
     Example:
@@ -109,6 +113,7 @@ class Scenario(Document):
     boxes: PathBeside | None = None
     time_step_s: PositiveFloat = 0.1
     duration_s: NonNegativeFloat = 0.0
+    weather: Weather = CLEAR
     traffic: Annotated[Traffic | None, PlainValidator(_traffic)] = None
 
     @model_validator(mode="after")
@@ -141,9 +146,19 @@ class Scenario(Document):
         episode, step = divmod(index, self.steps)
         return (0 if self.repeats else episode), step
 
-    def reach_m(self, sensor: Sensor) -> float:
-        """How far the rays of a sensor are cast in it: whatever limits sight is decided here."""
-        return sensor.max_range_m
+    def reach_m(self, sensor: Sensor, weather: Weather | None = None) -> float:
+        """How far the rays of a sensor are cast in it: cameras see no farther than people, radars through fog.
+
+        What fog leaves of the light of a LiDAR is decided hit by hit, unless every hit returns.
+
+        Args:
+            sensor: The sensor.
+            weather: In place of its own.
+        """
+        seen_m = (weather or self.weather).visibility_m
+        if seen_m is None or isinstance(sensor, Radar) or (isinstance(sensor, Lidar) and sensor.range_at_10_percent_m):
+            return sensor.max_range_m
+        return min(sensor.max_range_m, seen_m)
 
     @property
     def repeats(self) -> bool:

@@ -1,7 +1,7 @@
 """A world as geometry that rays can be cast at."""
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,14 +9,15 @@ from numpy.typing import NDArray
 from torchcover.geometry import BoundingBox, invert, overlap
 from torchcover.geometry.trajectory import poses_at
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
-from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces
+from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces, looks_down
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.moving import Moving, Solids
-from torchcover.simulation.patches import Bounds
+from torchcover.simulation.patches import Bounds, outward_faces
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import Tile, rotate
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.surface import AboveGround, SceneSurface, bounds_along
+from torchcover.simulation.sweep import SAMPLES, Poses
 from torchcover.simulation.world import Actor, World
 
 Matrix = NDArray[np.float64]
@@ -90,9 +91,14 @@ class Scene:
             times_s = self.world.time_step_s * looks.astype(np.float64)
             return ground_under(static, self.world.ego.trajectory.positions_at(times_s))
         return [
-            level_faces(mesh) if number in known else np.zeros(len(mesh.faces), dtype=bool)
-            for number, mesh in enumerate(static)
+            level_faces(mesh, outward) if number in known else np.zeros(len(mesh.faces), dtype=bool)
+            for number, (mesh, outward) in enumerate(zip(static, self._outward, strict=True))
         ]
+
+    @cached_property
+    def _outward(self) -> Sequence[NDArray[np.bool_]]:
+        """For each static mesh what `outward_faces` says of it."""
+        return [outward_faces(mesh) for mesh in self.world.static]
 
     def surface(self, lower_m: Matrix, upper_m: Matrix, heights_m: tuple[float, float] | None = None) -> SceneSurface:
         """The surface of everything but the ego, for questions about a box that the vehicle carries along.
@@ -121,6 +127,7 @@ class Scene:
                 },
                 {self._first_moving + k: number[id(actor)] for k, actor in enumerate(self._moving) if actor is not ego},
                 bounds,
+                self._outward,
                 None if heights_m is None else self._above_ground(*heights_m),
                 self.coincident,
             )
@@ -139,7 +146,8 @@ class Scene:
     def _above_ground(self, lowest_m: float, highest_m: float) -> AboveGround:
         squares_T_static = self._world_T_local.copy()
         squares_T_static[:3, 3] -= self.ground.origin_m
-        return AboveGround(self.ground.squares, squares_T_static, self.is_ground, lowest_m, highest_m)
+        down = [outward & looks_down(mesh) for mesh, outward in zip(self.world.static, self._outward, strict=True)]
+        return AboveGround(self.ground.squares, squares_T_static, self.is_ground, down, lowest_m, highest_m)
 
     def at(self, step: int, within_m: float = np.inf) -> "Instant":
         """Place everything for one step.
@@ -160,14 +168,16 @@ class Scene:
         distance_m = self._distance_m(step, world_T_vehicle)
         self._check_overlap(time_s, vehicle_T_world, distance_m)
         resting, first = len(self._resting), self._first_moving
-        moving = self._placed(np.flatnonzero(distance_m[resting:] < within_m), vehicle_T_world, time_s)
+        near = np.flatnonzero(distance_m[resting:] < within_m)
+        moving = self._placed(near, vehicle_T_world, time_s)
         # Either list of bodies begins with the ego.
         if self.world.ego.trajectory.moves:
             static_T_vehicle, ego = invert(self._world_T_local) @ world_T_vehicle, first
         else:
             static_T_vehicle, ego = np.eye(4), 0
         out_of_range = len(self._moving) - len(moving)
-        return Instant(self._static, static_T_vehicle, moving, ego, out_of_range, self.ground, world_T_vehicle)
+        motion = partial(self._motion, near, time_s)
+        return Instant(self._static, static_T_vehicle, moving, ego, out_of_range, self.ground, world_T_vehicle, motion)
 
     def check_apart(self, steps: NDArray[np.int64]) -> None:
         """Refuse time steps at which an actor overlaps the ego, as `at` does for one.
@@ -231,13 +241,8 @@ class Scene:
         """
         if not self.world.ego.trajectory.moves:
             return ()
-        ego, own_m = self._solids.of(self.world.ego.mesh).caster, []
-        for tile in tiles:
-            directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
-            limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
-            hits = ego.cast(vehicle_T_sensor[:3, 3], directions, limit_m)
-            own_m.append(np.where(hits.body >= 0, hits.range_m, np.float32(np.inf)))
-        return tuple(own_m)
+        ego = self._solids.of(self.world.ego.mesh).caster
+        return tuple(ends_at(ego, vehicle_T_sensor, tile, max_range_m) for tile in tiles)
 
     def encloses(self, position_m: Matrix) -> bool:
         """Whether a place in the vehicle frame lies inside the ego's body, so that no ray gets out."""
@@ -260,9 +265,40 @@ class Scene:
 
     def _placed(self, numbers: NDArray[np.intp], vehicle_T_world: Matrix, time_s: float) -> Moving:
         """Some of the bodies that move, at a time."""
+        solids = [self._solids.of(self._moving[k].mesh) for k in numbers.tolist()]
+        return Moving.placed(solids, self._parts(numbers, vehicle_T_world, time_s), self._first_moving + numbers)
+
+    def _parts(self, numbers: NDArray[np.intp], vehicle_T_world: Matrix, time_s: float) -> Matrix:
+        """(P, 4, 4) where some of the bodies that move are at a time."""
         actors = [self._moving[k] for k in numbers.tolist()]
-        solids = [self._solids.of(actor.mesh) for actor in actors]
-        vehicle_T_part = vehicle_T_world @ poses_at([actor.trajectory for actor in actors], time_s)
+        vehicle_T_part: Matrix = vehicle_T_world @ poses_at([actor.trajectory for actor in actors], time_s)
         # The ego is where it is, to the last bit: what a sensor sees of it is the same at every step.
         vehicle_T_part[[actor is self.world.ego for actor in actors]] = np.eye(4)
-        return Moving.placed(solids, vehicle_T_part, self._first_moving + numbers)
+        return vehicle_T_part
+
+    def _motion(
+        self, numbers: NDArray[np.intp], time_s: float, first_s: float, last_s: float
+    ) -> tuple[Matrix, list[Poses]]:
+        """Where the ego and some of the bodies that move are from one time to another, both after `time_s`.
+
+        What was before the world began, or comes after it, is as long within it, and told from that.
+        """
+        world, found = self.world, list[Poses]()
+        end_s = max(world.time_step_s * (world.steps - 1) - time_s, 0.0)
+        begin_s = max(min(first_s, end_s - (last_s - first_s)), -time_s)
+        samples_s = np.linspace(begin_s, min(begin_s + last_s - first_s, end_s), SAMPLES)
+        for each_s in (time_s + samples_s).tolist():
+            world_T_vehicle = world.ego.trajectory.at(each_s)
+            # As in `at`, to the bit.
+            moves = world.ego.trajectory.moves
+            static_T_vehicle = invert(self._world_T_local) @ world_T_vehicle if moves else np.eye(4)
+            found.append(Poses(static_T_vehicle, self._parts(numbers, invert(world_T_vehicle), each_s)))
+        return samples_s, found
+
+
+def ends_at(caster: RayCaster, vehicle_T_sensor: Matrix, tile: Tile, max_range_m: float) -> Float32:
+    """(n,) where bodies in the vehicle frame end the rays of a tile; infinite where they do not."""
+    directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
+    limit_m = np.full(directions.shape[1], min(max_range_m, np.finfo(np.float32).max), dtype=np.float32)
+    hits = caster.cast(vehicle_T_sensor[:3, 3], directions, limit_m)
+    return np.where(hits.body >= 0, hits.range_m, np.float32(np.inf))

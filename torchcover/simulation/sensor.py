@@ -3,7 +3,9 @@
 Another kind is a class with the members of `Sensor` and a line in `kinds.py`.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from threading import Lock
 from typing import Annotated, NamedTuple, Protocol, Self
 
@@ -11,7 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
+from torchcover.simulation.bodies import Body
 from torchcover.simulation.documents import Document, Pose
+from torchcover.simulation.raycaster import Struck
+from torchcover.simulation.weather import CLEAR, Weather
 
 Float64 = NDArray[np.float64]
 Numbers = NDArray[np.int64]
@@ -27,18 +32,33 @@ class RayHits:
         range_m: (N,) how far it went, up to the sensor's range.
         pixel_of_ray: (rays,) where each ray stands in `Sensor.directions`, row by row.
         place: (N,) in which of several worlds, of which a sensor sees each alone; None if there is one.
+        find: Finds out what they ended on.
+        weather: What they went through.
     """
 
     ray: Numbers
     range_m: NDArray[np.floating]
     pixel_of_ray: Numbers
     place: Numbers | None = None
+    find: Callable[[], Struck] | None = None
+    weather: Weather = CLEAR
 
     @property
     def pixel(self) -> Numbers:
         """(N,) row * columns + column of each ray in `Sensor.directions`."""
         pixels: Numbers = self.pixel_of_ray[self.ray]
         return pixels
+
+    @cached_property
+    def struck(self) -> Struck:
+        """What they ended on: bodies, faces, angles of incidence, materials. A sensor that does not ask does not pay.
+
+        Raises:
+            ValueError: Hits of which that is unknown.
+        """
+        if self.find is None:
+            raise ValueError("the hits know where they are, and not on what; give RayHits its `find`")
+        return self.find()
 
 
 class Returns(NamedTuple):
@@ -76,21 +96,25 @@ class Draws:
 
     def normal(self, ray: Numbers) -> Float64:
         """(N,) of a normal distribution with standard deviation 1, for hits of these rays."""
-        return np.zeros(len(ray)) if self._generator is None else self._drawn("standard_normal", ray)
+        return np.zeros(len(ray)) if self._generator is None else self._drawn("error", "standard_normal", ray)
 
     def uniform(self, ray: Numbers) -> Float64:
         """(N,) evenly from [0, 1), for hits of these rays; 1 where there is no source."""
-        return np.ones(len(ray)) if self._generator is None else self._drawn("random", ray)
+        return np.ones(len(ray)) if self._generator is None else self._drawn("dropout", "random", ray)
 
-    def _drawn(self, kind: str, ray: Numbers) -> Float64:
+    def chance(self, ray: Numbers) -> Float64:
+        """(N,) evenly from [0, 1), others than `uniform`, for hits of these rays; 1/2 where there is no source."""
+        return np.full(len(ray), 0.5) if self._generator is None else self._drawn("return", "random", ray)
+
+    def _drawn(self, purpose: str, kind: str, ray: Numbers) -> Float64:
         draw = getattr(self._generator, kind)
         if self._rays is None:
             drawn: Float64 = draw(len(ray))
             return drawn
         with self._lock:  # whichever thread asks first draws for all
-            if kind not in self._of_rays:
-                self._of_rays[kind] = draw(self._rays)
-            return self._of_rays[kind][ray]
+            if purpose not in self._of_rays:
+                self._of_rays[purpose] = draw(self._rays)
+            return self._of_rays[purpose][ray]
 
 
 class Sensor(Protocol):
@@ -125,6 +149,11 @@ class Sensor(Protocol):
         ...
 
     @property
+    def housing(self) -> Sequence[Body]:
+        """What it is built into, in its own frame: the other sensors of its rig see that, and it looks out of it."""
+        ...
+
+    @property
     def is_exact(self) -> bool:
         """Whether it measures the same thing alike at any time: its measuring draws no random numbers."""
         ...
@@ -136,6 +165,15 @@ class Sensor(Protocol):
 
     def directions(self) -> Float64:
         """(3, rows, columns) unit directions in the sensor's frame; NaN where there is no ray."""
+        ...
+
+    @property
+    def counts_as(self) -> int:
+        """How many points each of its points is counted as on a body: of a camera, pixels of the full image."""
+        ...
+
+    def times_s(self) -> Float64 | None:
+        """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
         ...
 
     def beams(self) -> Numbers | None:
@@ -155,6 +193,24 @@ class Sensor(Protocol):
         ...
 
 
+class Scan(Document):
+    """How long a sensor takes for its rays: a LiDAR for its columns, in their order, a camera for its rows, from above.
+
+    Args:
+        period_s: From the first to the last.
+        start_s: When the first is cast, after the time of the frame; `-period_s` if not given, so that it ends then.
+    """
+
+    period_s: PositiveFloat
+    start_s: float | None = None
+
+    def times_s(self, count: int) -> Float64:
+        """(count,) when each is cast, after the time of the frame."""
+        start_s = -self.period_s if self.start_s is None else self.start_s
+        times_s: Float64 = start_s + self.period_s * (np.arange(count) + 0.5) / count
+        return times_s
+
+
 class Ranging(Document):
     """A sensor within whose ranges every hit gives a point, with noise and drop-out: the keys that such kinds share.
 
@@ -163,23 +219,44 @@ class Ranging(Document):
         max_range_m: Farther hits give no point.
         range_noise_m: Standard deviation of the measured range, along the ray.
         dropout: Probability that a point is missing, from 0 to 1.
+        housing: Bodies that it is built into or stands on, in its own frame, which are in the way of the rig's others.
     """
 
     min_range_m: NonNegativeFloat = 0.0
     max_range_m: PositiveFloat
     range_noise_m: NonNegativeFloat = 0.0
     dropout: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    housing: tuple[Body, ...] = ()
 
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:
         if self.min_range_m >= self.max_range_m:
             raise ValueError(f"min_range_m ({self.min_range_m}) must be below max_range_m ({self.max_range_m})")
+        if self.range_noise_m >= self.max_range_m:
+            raise ValueError(f"range_noise_m ({self.range_noise_m}) must be below max_range_m ({self.max_range_m})")
         return self
+
+    def noise_m(self, range_m: NDArray[np.floating]) -> float | NDArray[np.floating]:
+        """Standard deviation of measured ranges, of each of (N,) or of all; 0 if they are exact."""
+        return self.range_noise_m
 
     @property
     def is_exact(self) -> bool:
         """Whether it has neither noise nor drop-out."""
-        return not (self.range_noise_m or self.dropout)
+        return not self._errs
+
+    @property
+    def _errs(self) -> bool:
+        return bool(self.dropout or np.any(self.noise_m(np.ones(1))))
+
+    @property
+    def counts_as(self) -> int:
+        """1: a point is a measurement."""
+        return 1
+
+    def times_s(self) -> Float64 | None:
+        """None: all rays are cast at the time of the frame."""
+        return None
 
     def beams(self) -> Numbers | None:
         """None: every ray measures alone."""
@@ -188,22 +265,24 @@ class Ranging(Document):
     def measure(self, hits: RayHits, draws: Draws) -> Returns:
         """A point for each hit that is not too close, with noise along its ray, unless it drops out."""
         if not self.min_range_m:
-            return self.erring(hits.ray, None, draws)
+            return self.erring(hits, None, draws)
         far_enough = hits.range_m >= self.min_range_m
-        return self.erring(hits.ray, None if far_enough.all() else np.flatnonzero(far_enough), draws)
+        return self.erring(hits, None if far_enough.all() else np.flatnonzero(far_enough), draws)
 
-    def erring(self, ray: Numbers, hit: Numbers | None, draws: Draws) -> Returns:
+    def erring(self, hits: RayHits, hit: Numbers | None, draws: Draws) -> Returns:
         """Points at some of N hits, with noise and drop-out.
 
         Args:
-            ray: (N,) the rays.
+            hits: All of them.
             hit: (K,) which hits would give a point; None for all.
             draws: Source of the random numbers.
         """
-        if self.is_exact:
+        if not self._errs:
             return Returns(hit, None)
-        ray = ray if hit is None else ray[hit]
-        error_m = self.range_noise_m * draws.normal(ray) if self.range_noise_m else None
+        ray, range_m = (hits.ray, hits.range_m) if hit is None else (hits.ray[hit], hits.range_m[hit])
+        noise_m = self.noise_m(range_m)
+        # No range is less than 0.
+        error_m = np.maximum(noise_m * draws.normal(ray), -range_m) if np.any(noise_m) else None
         if self.dropout:
             stays = np.flatnonzero(draws.uniform(ray) >= self.dropout)
             hit, error_m = stays if hit is None else hit[stays], None if error_m is None else error_m[stays]

@@ -10,6 +10,7 @@ from pydantic import Field, PositiveFloat
 from torchcover.files import check_memory, reads
 from torchcover.geometry import transform
 from torchcover.simulation.documents import Document, PathBeside
+from torchcover.simulation.material import material_number
 
 CYLINDER_SIDES = 24
 MAX_SIDES = 10_000
@@ -22,14 +23,31 @@ Length = PositiveFloat
 
 
 class Mesh(NamedTuple):
-    """A triangle mesh: `vertices_m` (V, 3) float64 in metres and `faces` (F, 3) int64 indices into them."""
+    """A triangle mesh: `vertices_m` (V, 3) float64 in metres and `faces` (F, 3) int64 indices into them.
+
+    `material` (F,) uint8 is what each face is made of, by `material_number`; None, as 0, where that is not said.
+    """
 
     vertices_m: NDArray[np.float64]
     faces: NDArray[np.int64]
+    material: NDArray[np.uint8] | None = None
 
     def moved(self, destination_T_source: NDArray[np.float64]) -> "Mesh":
         """The mesh in another frame."""
-        return Mesh(transform(destination_T_source, self.vertices_m), self.faces)
+        return self._replace(vertices_m=transform(destination_T_source, self.vertices_m))
+
+    def with_faces(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> "Mesh":
+        """Some of its faces, of what they were made of."""
+        return self._replace(faces=self.faces[which], material=None if self.material is None else self.material[which])
+
+    def made_of(self, material: str) -> "Mesh":
+        """The mesh with all its faces of a built-in material."""
+        return self._replace(material=np.full(len(self.faces), material_number(material), dtype=np.uint8))
+
+    @property
+    def materials(self) -> NDArray[np.uint8]:
+        """(F,) the number of what each face is made of."""
+        return np.zeros(len(self.faces), dtype=np.uint8) if self.material is None else self.material
 
 
 class Plane(Document):
@@ -148,8 +166,8 @@ class MeshFile(Document):
             IsADirectoryError: A folder.
             BadFileError: trimesh cannot read it, it has no faces, a vertex is NaN or infinite, or it is too large.
         """
-        vertices, faces = _read_mesh(self.path)
-        return Mesh(vertices * self.metres_per_unit, faces)
+        mesh = _read_mesh(self.path)
+        return mesh._replace(vertices_m=mesh.vertices_m * self.metres_per_unit)
 
 
 @reads("a mesh")

@@ -1,5 +1,6 @@
 """What is seen from a place on the ego: by the rays of a sensor, or of given points."""
 
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
@@ -8,9 +9,12 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import rigid
 from torchcover.simulation.instant import Instant, SensorScan
+from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import BLOCK, Tile, into_tiles, pixels_in_tiles
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.scene import Scene, ends_at
 from torchcover.simulation.sensor import Draws, RayHits, Sensor
+from torchcover.simulation.sweep import RayTimes
+from torchcover.simulation.weather import CLEAR, Weather
 
 # Rays in a tile: of neighbours all, so that a tile is narrow. A constant, so that nothing depends on threads.
 TILE_RAYS = 8192
@@ -35,18 +39,38 @@ class MountedSensor:
         sensor: The sensor.
         scene: Where it is.
         reach_m: How far its rays are cast there; `Scenario.reach_m`.
+        weather: What they go through.
+        others: The other sensors of its rig, whose housings may be in the way.
     """
 
-    def __init__(self, sensor: Sensor, scene: Scene, reach_m: float) -> None:
+    def __init__(
+        self, sensor: Sensor, scene: Scene, reach_m: float, weather: Weather = CLEAR, others: Sequence[Sensor] = ()
+    ) -> None:
         self.sensor = sensor
         self.reach_m = reach_m
+        self.weather = weather
         self.vehicle_T_sensor = sensor.mount.matrix()
         directions = sensor.directions()
         self.tiles = into_tiles(directions)
         self.pixel_of_ray = pixels_in_tiles(directions)
+        self._times = ray_times(sensor, self.tiles, self.pixel_of_ray) if scene.moves else None
+        taken_s = max((float(np.ptp(each.at_s)) for each in self._times or () if len(each.at_s)), default=0.0)
+        if taken_s > scene.world.time_step_s:
+            raise ValueError(
+                f"sensor {sensor.name!r}: a scan of {taken_s:g} s is longer than the time step of the scenario, "
+                f"{scene.world.time_step_s:g} s; shorten its period, or make the time steps longer"
+            )
         self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
+        housings = [
+            mesh.moved(other.mount.matrix()) for other in others for body in other.housing for mesh in body.meshes()
+        ]
+        if housings:
+            caster = RayCaster(housings)
+            ends_m = [ends_at(caster, self.vehicle_T_sensor, tile, reach_m) for tile in self.tiles]
+            ego_m = self._own_m or ends_m
+            self._own_m = tuple(np.minimum(*both) for both in zip(ends_m, ego_m, strict=True))
         self._at_rest = not scene.moves
-        self._hits: SensorScan | None = None
+        self._resting: tuple[SensorScan, RayHits] | None = None
 
     def scan(self, instant: Instant, draws: Draws, *, threads: int = 1) -> SensorScan:
         """What it makes of what its rays hit at one time of the scene.
@@ -56,29 +80,33 @@ class MountedSensor:
             draws: The random numbers of its measuring.
             threads: Number of threads; the result does not depend on it.
         """
-        hits = self._cast(instant, threads)
-        hit, error_m = self.sensor.measure(RayHits(hits.ray, hits.range_m, self.pixel_of_ray), draws)
+        scan, hits = self._cast(instant, threads)
+        hit, error_m = self.sensor.measure(hits, draws)
+        ways = scan.ways() if error_m is not None and scan.ways else None
+        scan = scan._replace(struck=None, ways=None)
         if hit is not None:
-            hits = hits._replace(points=hits.points[hit], ray=hits.ray[hit], range_m=hits.range_m[hit])
-        if error_m is None:
-            return hits
-        ways_m = hits.points.astype(np.float64) - self.vehicle_T_sensor[:3, 3]
-        along = error_m[:, None] / np.linalg.norm(ways_m, axis=1, keepdims=True)
-        return hits._replace(points=(hits.points + ways_m * along).astype(np.float32))
+            scan = scan.some(hit)
+        if error_m is None or ways is None:
+            return scan
+        landed, ways = scan.points if scan.landed is None else scan.landed, ways if hit is None else ways[hit]
+        landed = (landed + error_m[:, None] * ways).astype(np.float32)
+        return scan._replace(error_m=error_m.astype(np.float32), landed=landed)
 
-    def _cast(self, instant: Instant, threads: int) -> SensorScan:
-        if self._hits is not None:
-            return self._hits
-        hits = instant.scan(
+    def _cast(self, instant: Instant, threads: int) -> tuple[SensorScan, RayHits]:
+        if self._resting is not None:
+            return self._resting
+        scan = instant.scan(
             self.vehicle_T_sensor,
             self.tiles,
             max_range_m=self.reach_m,
             own_m=self._own_m,
+            times=self._times,
             threads=threads,
         )
+        hits = RayHits(scan.ray, scan.range_m, self.pixel_of_ray, find=scan.struck, weather=self.weather)
         if self._at_rest:
-            self._hits = hits
-        return hits
+            self._resting = scan, hits
+        return scan, hits
 
     def ends(self, instant: Instant) -> Ends:
         """Where each of its rays ends: at what it hits first, the ego's body included, or at its reach.
@@ -94,6 +122,16 @@ class MountedSensor:
             range_m.append(hits.range_m)
             is_hit.append((hits.body >= 0) & (hits.body != instant.ego))
         return Ends(np.concatenate(range_m), np.concatenate(is_hit))
+
+
+def ray_times(sensor: Sensor, tiles: Sequence[Tile], pixel_of_ray: NDArray[np.int64]) -> list[RayTimes] | None:
+    """When the rays of each tile of a sensor are cast; None if all are at once."""
+    times_s = sensor.times_s()
+    if times_s is None:
+        return None
+    ends = np.cumsum([tile.directions.shape[1] for tile in tiles])
+    of_tiles = np.split(times_s.ravel()[pixel_of_ray], ends[:-1])
+    return [RayTimes(*np.unique(of_tile, return_inverse=True)) for of_tile in of_tiles]
 
 
 class Sight(NamedTuple):

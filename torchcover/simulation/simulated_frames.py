@@ -4,9 +4,9 @@ import copy
 import hashlib
 import pickle
 from collections.abc import Mapping, Sequence
-from dataclasses import is_dataclass
+from dataclasses import is_dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import numpy as np
 import torch
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import with_hits
-from torchcover.frames.frame import Frame
+from torchcover.frames.frame import ON_OBJECT_WITHIN_M, Frame, Measured
 from torchcover.frames.source import FrameDataset
+from torchcover.simulation.instant import SensorScan
 from torchcover.simulation.kinds import REFERENCE_SENSORS
 from torchcover.simulation.reference_sensor import ReferenceSensor
 from torchcover.simulation.regions_of_interest import Asked, RegionsOfInterest
@@ -164,10 +165,12 @@ class SimulatedFrames(FrameDataset):
 
     @property
     def description(self) -> Mapping[str, object]:
-        """The names of the scenario and of the vehicle, and the seed."""
+        """The names of the scenario and of the vehicle, what sensors make of their hits, and the seed."""
         return {
             "scenario": self.scenario.name,
             "vehicle": self.scenario.ego_name,
+            "sensor_model": {name: rig.sensor_model for name, rig in self.rigs.items()},
+            "weather": {name: (rig.weather or self.scenario.weather).name for name, rig in self.rigs.items()},
             "frames": None,
             "seed": self.seed,
         }
@@ -217,29 +220,24 @@ class SimulatedFrames(FrameDataset):
 
     def frame_of(self, seen: Observation, index: int) -> Frame:
         """The frame of what the simulator saw at a step."""
-        clouds = {name: torch.from_numpy(points) for name, points in seen.clouds.items()}
         weights, heights_m = seen.reference_weights, seen.reference_heights_m
-        return Frame(
-            clouds=clouds,
+        frame = Frame(
+            **of_rigs(self.rigs, seen.scans),
             reference=torch.from_numpy(seen.reference),
             reference_weights=None if weights is None else torch.from_numpy(weights),
             reference_heights_m=None if heights_m is None else torch.from_numpy(heights_m),
             index=index,
             name=f"{self.scenario.name} step {index}",
             counts=seen.counts,
-            boxes=self._boxes(index, clouds, seen.drawn) if self.boxes else None,
             place_in_time=self.simulator.place_in_time(index),
-            sensor_points={
-                name: dict(zip((sensor.name for sensor in self.rigs[name].sensors), points, strict=True))
-                for name, points in seen.sensor_points.items()
-            },
         )
+        return with_boxes(frame, self._boxes(index, seen.drawn), self.rigs) if self.boxes else frame
 
-    def _boxes(self, index: int, clouds: Mapping[str, torch.Tensor], drawn: NDArray[np.int64] | None) -> Boxes:
+    def _boxes(self, index: int, drawn: NDArray[np.int64] | None) -> Boxes:
         found = self.simulator.labels(index)
         rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
         velocities = np.array([label.velocity_mps for label in found])
-        boxes = Boxes.from_rows(
+        return Boxes.from_rows(
             torch.tensor(rows, dtype=torch.float32).view(-1, 7),
             velocity_mps=torch.tensor(velocities, dtype=torch.float32).view(-1, 2),
             ids=tuple(label.name for label in found),
@@ -247,7 +245,45 @@ class SimulatedFrames(FrameDataset):
             drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
             bottom_heights_m=torch.from_numpy(self.simulator.bottom_heights_m(index, found)),
         )
-        return with_hits(boxes, clouds)
+
+
+def of_rigs(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) -> dict[str, Any]:
+    """What a `Frame` says of its rigs: clouds, what was measured of them, and which points are of which sensor.
+
+    Args:
+        rigs: By their names.
+        scans: What each of their sensors saw.
+    """
+    clouds = {name: torch.from_numpy(np.concatenate([one.points for one in seen])) for name, seen in scans.items()}
+    measured = {
+        name: Measured(
+            torch.from_numpy(np.concatenate([one.points if one.landed is None else one.landed for one in seen])),
+            torch.from_numpy(np.concatenate([_error_m(one) for one in seen])),
+        )
+        for name, seen in scans.items()
+        if any(one.landed is not None for one in seen)
+    }
+    points = {
+        name: {sensor.name: len(one.points) for sensor, one in zip(rigs[name].sensors, seen, strict=True)}
+        for name, seen in scans.items()
+    }
+    return {"clouds": clouds, "measured": measured, "sensor_points": points}
+
+
+def with_boxes(frame: Frame, boxes: Boxes, rigs: Mapping[str, Rig]) -> Frame:
+    """The frame with its objects, and how many points each of its rigs has on them."""
+    clouds = {name: frame.cloud_of(name, within_m=ON_OBJECT_WITHIN_M) for name in frame.clouds}
+    counts_as = {}
+    for name, rig in rigs.items():
+        if any(sensor.counts_as > 1 for sensor in rig.sensors):
+            of_sensors = frame.clouds_by_sensor(name, within_m=ON_OBJECT_WITHIN_M).values()
+            each = torch.tensor([sensor.counts_as for sensor in rig.sensors])
+            counts_as[name] = each.repeat_interleave(torch.tensor([len(cloud) for cloud in of_sensors]))
+    return replace(frame, boxes=with_hits(boxes, clouds, counts_as))
+
+
+def _error_m(scan: SensorScan) -> NDArray[np.float32]:
+    return np.zeros(len(scan.points), dtype=np.float32) if scan.error_m is None else scan.error_m
 
 
 def reference_called(name: str | None = None, rays: int | None = None, asked: Asked | None = None) -> ReferenceSensor:

@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Self
 
 import numpy as np
@@ -34,8 +35,7 @@ class Observation:
     """The clouds of one step in the vehicle frame (x forward, y left, z up, metres), without points of the ego itself.
 
     Args:
-        clouds: Name of each rig -> (N, 3) float32 points of all its sensors, in their order.
-        sensor_points: Name of each rig -> how many of its points are of each of its sensors.
+        scans: Name of each rig -> what each of its sensors saw.
         reference: (M, 3) float32 points of the reference sensor.
         reference_weights: (M,) float32 square metres that each of them stands for; None if they count the same.
         reference_heights_m: (M,) float32 heights of the reference points above the local ground, from `ReferenceScan`.
@@ -43,13 +43,17 @@ class Observation:
         counts: How many rays there were, how many of them the ego took, and what was left out, by name.
     """
 
-    clouds: Mapping[str, Float32]
-    sensor_points: Mapping[str, Sequence[int]]
+    scans: Mapping[str, Sequence[SensorScan]]
     reference: Float32
     reference_weights: Float32 | None
     reference_heights_m: Float32 | None
     drawn: NDArray[np.int64] | None
     counts: Mapping[str, int]
+
+    @cached_property
+    def clouds(self) -> Mapping[str, Float32]:
+        """Name of each rig -> (N, 3) float32 points of all its sensors, in their order, where they truly are."""
+        return {name: np.concatenate([scan.points for scan in scans]) for name, scans in self.scans.items()}
 
 
 class Simulator:
@@ -183,8 +187,7 @@ class Simulator:
         reference = self.reference_sensor.scan(self._surroundings(stage.scene, instant, index))
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
         return Observation(
-            clouds={name: np.concatenate([scan.points for scan in of_rig]) for name, of_rig in scans.items()},
-            sensor_points={name: [len(scan.points) for scan in of_rig] for name, of_rig in scans.items()},
+            scans=scans,
             reference=reference.points,
             reference_weights=reference.weights,
             reference_heights_m=reference.heights_m,

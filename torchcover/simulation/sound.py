@@ -39,7 +39,7 @@ def told(owner: str, mesh: Mesh) -> Mesh:
     if len(once) < len(mesh.faces):
         doubled = len(mesh.faces) - len(once)
         _warn(owner, f"{_share(doubled, len(mesh.faces))} of its faces are there more than once, and count once")
-        mesh = Mesh(mesh.vertices_m, mesh.faces[once])
+        mesh = mesh.with_faces(once)
         edge, way = edges_of(mesh)
     faces = np.bincount(edge, weights=way != 0)
     turns = np.bincount(edge, weights=way)

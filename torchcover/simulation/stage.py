@@ -177,9 +177,18 @@ class Stages:
     def _on(self, scene: Scene) -> Mapping[str, Sequence[MountedSensor]]:
         """The rigs' sensors on the ego of a scene."""
         self._check_mounts(scene)
-        reach_m = self._scenes.scenario.reach_m
+        scenario = self._scenes.scenario
         return {
-            name: [MountedSensor(sensor, scene, reach_m(sensor)) for sensor in rig.sensors]
+            name: [
+                MountedSensor(
+                    one,
+                    scene,
+                    scenario.reach_m(one, rig.weather),
+                    rig.weather or scenario.weather,
+                    [other for other in rig.sensors if other is not one],
+                )
+                for one in rig.sensors
+            ]
             for name, rig in self._rigs.items()
         }
 

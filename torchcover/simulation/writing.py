@@ -6,9 +6,6 @@ import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from torchcover.files import RECORDING, Publication, noted
 from torchcover.recordings.recorders import RECORDERS
 from torchcover.recordings.recorders.recorder import RecordedStep, RecordingSetup
@@ -120,8 +117,7 @@ def _step(frames: SimulatedFrames, index: int) -> RecordedStep:
     """Simulate a step of the only rig."""
     ((name, rig),) = frames.rigs.items()
     seen = frames.simulator.step(index)
-    ends = np.cumsum(seen.sensor_points[name])
-    clouds: list[NDArray[np.float32]] = np.split(seen.clouds[name], ends[:-1])
+    landed = [scan.points if scan.landed is None else scan.landed for scan in seen.scans[name]]
     scene, step = frames.simulator.scene_of(index)
     world = scene.world
     played = round(index * frames.every_s / world.time_step_s) // world.steps if world.steps > 1 else 0
@@ -129,7 +125,7 @@ def _step(frames: SimulatedFrames, index: int) -> RecordedStep:
         _name(index),
         index * frames.every_s + played * APART_S,
         world.ego.trajectory.at(step * world.time_step_s),
-        {sensor.name: cloud for sensor, cloud in zip(rig.sensors, clouds, strict=True)},
+        {sensor.name: cloud for sensor, cloud in zip(rig.sensors, landed, strict=True)},
         frames.frame_of(seen, index),
     )
 

@@ -56,12 +56,13 @@ class Sums(NamedTuple):
 class _Met(NamedTuple):
     """Where the rays of one sensor meet the target, were it alone, in the order of positions and rays.
 
-    `position`, `ray` and `range_m` (N,), `direction` (N, 3).
+    `position`, `ray`, `range_m` and `triangle` (N,), `direction` (N, 3).
     """
 
     position: Numbers
     ray: Numbers
     range_m: Float32
+    triangle: NDArray[np.int32]
     direction: Float32
 
 
@@ -146,12 +147,14 @@ def count(
         on_ground: _OnGround | None = None
         for step in steps:
             z_m = step.ground_z_m[some]
-            if on_ground is None or not np.array_equal(on_ground.vehicle_T_target[:, 2, 3], z_m):
+            if on_ground is None or not np.array_equal(on_ground.placed.vehicle_T_part[:, 2, 3], z_m):
                 standing_there = standing(poses, z_m)
-                met = [_meetings(target, standing_there, *sensor) for sensor in zip(mounted, farthest_m, strict=True)]
-                on_ground = _OnGround.of(surface, standing_there, mounted, met, threshold_m)
+                # No bodies of the scene: their numbers say so.
+                placed = Moving.placed([target.solid] * len(poses), standing_there, np.full(len(poses), -1))
+                met = [_meetings(placed, *sensor) for sensor in zip(mounted, farthest_m, strict=True)]
+                on_ground = _OnGround.of(surface, placed, mounted, met, threshold_m)
             cut = Step(step.sensors, z_m, step.free[some], step.visible[:, some])
-            _count_step(sums, surface, on_ground, mounted, beams, cut, hits, threshold_m)
+            _count_step(sums, on_ground, mounted, beams, cut, hits, threshold_m)
         return sums
 
     firsts, threads = range(0, max(len(vehicle_T_target), 1), CHUNK), torch.get_num_threads()
@@ -163,9 +166,7 @@ def count(
     return Sums._make(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
 
 
-def _meetings(target: Target, vehicle_T_target: Float64, mounted: MountedSensor, farthest_m: Float32) -> _Met:
-    solids, body = [target.solid] * len(vehicle_T_target), np.arange(len(vehicle_T_target))
-    placed = Moving.placed(solids, vehicle_T_target, body)
+def _meetings(placed: Moving, mounted: MountedSensor, farthest_m: Float32) -> _Met:
     origin_m, vehicle_R_sensor = mounted.vehicle_T_sensor[:3, 3], mounted.vehicle_T_sensor[:3, :3]
     bodies, first, parts = outlines(placed.corners_m, origin_m), 0, []
     for tile in mounted.tiles:
@@ -173,7 +174,8 @@ def _meetings(target: Target, vehicle_T_target: Float64, mounted: MountedSensor,
         directions = rotate(vehicle_R_sensor, tile.directions)
         limit_m = farthest_m[first : first + rays]
         met, _ = placed.meetings(origin_m, vehicle_R_sensor, tile, directions, limit_m, bodies)
-        parts.append(_Met(met.part, first + met.ray, met.range_m, directions.take(met.ray, axis=1).T))
+        towards = directions.take(met.ray, axis=1).T
+        parts.append(_Met(met.part, first + met.ray, met.range_m, met.triangle, towards))
         first += rays
     together = _Met._make(np.concatenate(column) for column in zip(*parts, strict=True))
     # A ray that fills up the block of a tile is cast more than once.
@@ -184,33 +186,31 @@ def _meetings(target: Target, vehicle_T_target: Float64, mounted: MountedSensor,
 class _OnGround(NamedTuple):
     """What the rays meet of the target at some positions, where the ground is as it is: the same for many steps.
 
-    `vehicle_T_target` (P, 4, 4); `met` by each sensor, and of that the points of the surface that are near, without
-    errors of the range: `exact`.
+    `placed` has P bodies; `met` is by each sensor, and of that the points of the surface that are near: `near`.
     """
 
-    vehicle_T_target: Float64
+    placed: Moving
     met: Sequence[_Met]
-    exact: Sequence[NDArray[np.uint8]]
+    near: Sequence[NDArray[np.uint8]]
 
     @classmethod
     def of(
         cls,
         surface: Surface,
-        vehicle_T_target: Float64,
+        placed: Moving,
         mounted: Sequence[MountedSensor],
         met: Sequence[_Met],
         threshold_m: float,
     ) -> Self:
-        exact = [
-            surface.near(_in_target(sensor, one, vehicle_T_target, None), threshold_m)
+        near = [
+            surface.near(_in_target(sensor, one, placed.vehicle_T_part), threshold_m)
             for sensor, one in zip(mounted, met, strict=True)
         ]
-        return cls(vehicle_T_target, met, exact)
+        return cls(placed, met, near)
 
 
 def _count_step(
     sums: Sums,
-    surface: Surface,
     there: _OnGround,
     mounted: Sequence[MountedSensor],
     beams: Sequence[_Beams | None],
@@ -218,43 +218,44 @@ def _count_step(
     hits: int,
     threshold_m: float,
 ) -> None:
-    count = len(there.vehicle_T_target)
+    count = len(there.placed)
     points = np.zeros_like(sums.points)
-    near = np.zeros((count, there.exact[0].shape[1]), dtype=np.uint8)
+    near = np.zeros((count, there.near[0].shape[1]), dtype=np.uint8)
     for k, (sensor, one, seen) in enumerate(zip(mounted, there.met, step.sensors, strict=True)):
-        measured, error_m = _measured(sensor, beams[k], one, seen)
-        points[k] = np.bincount(one.position[measured], minlength=count)
-        if error_m is None:
-            bits = there.exact[k][measured]
-        else:
-            erring = _Met._make(column[measured] for column in one)
-            bits = surface.near(_in_target(sensor, erring, there.vehicle_T_target, error_m), threshold_m)
-        near |= _any_of_each(one.position[measured], bits, count)
+        measured = _measured(sensor, beams[k], one, seen, there.placed, threshold_m)
+        points[k] = sensor.sensor.counts_as * np.bincount(one.position[measured], minlength=count)
+        near |= _any_of_each(one.position[measured], there.near[k][measured], count)
     _add(sums, step, points, near, hits)
 
 
 def _measured(
-    mounted: MountedSensor, beams: _Beams | None, met: _Met, seen: SensorStep
-) -> tuple[Numbers, Float64 | None]:
-    """Which of N meetings give a point, by position, and the errors of these: of rays with nothing else in the way.
+    mounted: MountedSensor, beams: _Beams | None, met: _Met, seen: SensorStep, placed: Moving, within_m: float
+) -> Numbers:
+    """Which of N meetings give a point that is no farther off along its ray, by position: nothing else is in the way.
 
     Where the rays of a beam are measured together, the point may be one of what stands next to the target.
     """
     arrived = np.flatnonzero(met.range_m <= seen.ends.range_m[met.ray])
-    hits = RayHits(met.ray[arrived], met.range_m[arrived], mounted.pixel_of_ray, met.position[arrived])
-    if beams is None:
-        hit, error_m = mounted.sensor.measure(hits, seen.draws)
-        return (arrived if hit is None else arrived[hit]), error_m
-    hits, of_target = beams.filled(hits, seen.ends)
+    hits = RayHits(
+        met.ray[arrived],
+        met.range_m[arrived],
+        mounted.pixel_of_ray,
+        met.position[arrived],
+        lambda: placed.struck(met.position[arrived], met.triangle[arrived], met.direction[arrived].T),
+        mounted.weather,
+    )
+    of_target = np.arange(len(arrived))
+    if beams is not None:
+        hits, of_target = beams.filled(hits, seen.ends)
     hit, error_m = mounted.sensor.measure(hits, seen.draws)
     of_target = of_target if hit is None else of_target[hit]
-    on_target = of_target >= 0
-    return arrived[of_target[on_target]], None if error_m is None else error_m[on_target]
+    counts = of_target >= 0 if error_m is None else (of_target >= 0) & (np.abs(error_m) <= within_m)
+    return arrived[of_target[counts]]
 
 
-def _in_target(mounted: MountedSensor, met: _Met, vehicle_T_target: Float64, error_m: Float64 | None) -> Float64:
-    """(N, 3) the measured points in the frame of the target."""
-    range_m = met.range_m.astype(np.float64) + (0.0 if error_m is None else error_m)
+def _in_target(mounted: MountedSensor, met: _Met, vehicle_T_target: Float64) -> Float64:
+    """(N, 3) the points in the frame of the target."""
+    range_m = met.range_m.astype(np.float64)
     from_origin_m = mounted.vehicle_T_sensor[:3, 3] + met.direction * range_m[:, None]
     from_origin_m -= vehicle_T_target[met.position, :3, 3]
     hits_m: Float64 = np.einsum("nji,nj->ni", vehicle_T_target[met.position, :3, :3], from_origin_m)

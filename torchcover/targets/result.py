@@ -56,6 +56,7 @@ class TargetMap:
         raster: The cells.
         vehicle: Box of the vehicle.
         vehicle_outline_m: (K, 2) what is drawn of it.
+        sensor_model: What its sensors make of their hits, `ideal` or `real`.
         sensor_names: Of the rig.
         sensors_m: (S, 2) where they are, seen from above.
         hits: How many points are enough.
@@ -81,6 +82,7 @@ class TargetMap:
     raster: Raster
     vehicle: BoundingBox
     vehicle_outline_m: Float64
+    sensor_model: str
     sensor_names: tuple[str, ...]
     sensors_m: Float64
     hits: int
@@ -222,6 +224,7 @@ class TargetMap:
             "target_size_m": list(self.target_size_m),
             "heading": self.heading,
             "raster": {"x": list(self.raster.x), "y": list(self.raster.y), "step_m": self.raster.step_m},
+            "sensor_model": self.sensor_model,
             "sensors": list(self.sensor_names),
             "hits": self.hits,
             "threshold_m": self.threshold_m,

@@ -96,6 +96,7 @@ def survey(
         raster=raster,
         vehicle=vehicle,
         vehicle_outline_m=_outline_m(scenario),
+        sensor_model=rig.sensor_model,
         sensor_names=tuple(sensor.name for sensor in rig.sensors),
         sensors_m=np.array([sensor.mount.matrix()[:2, 3] for sensor in rig.sensors]),
         hits=hits,

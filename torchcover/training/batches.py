@@ -29,15 +29,6 @@ def frames_in(batch: object) -> tuple[Frame, ...]:
     )
 
 
-def sensor_of(frame: Frame, rig: str | None = None) -> Tensor:
-    """(N, 3) points of a rig, or of the only one.
-
-    Raises:
-        ValueError: The frame has no such rig, or several and none is named.
-    """
-    return frame.sensor if rig is None else frame.cloud_of(rig)
-
-
 def frame_of(sensor: Tensor, reference: Tensor, name: object, vehicle_T_lidar: Tensor | None) -> Frame:
     """A frame out of the points of another framework.
 

@@ -13,7 +13,7 @@ from lightning.pytorch.utilities import CombinedLoader, rank_zero_warn
 
 from torchcover.coverage import Coverage, CoverageMetric, Region
 from torchcover.frames import FrameBatch
-from torchcover.training.batches import UNKNOWN_INDEX, frames_in, sensor_of
+from torchcover.training.batches import UNKNOWN_INDEX, frames_in
 from torchcover.training.counting import CountOnce, Shard, is_distributed, shard_of
 
 # Names of the stages in tags, as Lightning users write them.
@@ -133,7 +133,7 @@ class CoverageCallback(Callback):
         self._added = True
         indices = [frame.index for frame in new.frames]
         self.metric.update(
-            [sensor_of(frame, self.rig) for frame in new.frames],
+            new.clouds_of(self.rig, within_m=self.metric.within_m),
             new.reference,
             weights=new.weights,
             height=new.heights_in(self.metric.grid.band_frame),

@@ -15,7 +15,7 @@ from mmengine.dist import get_comm_device, get_dist_info
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.frames import Frame
-from torchcover.training.batches import UNKNOWN_INDEX, frames_in, sensor_of
+from torchcover.training.batches import UNKNOWN_INDEX, frames_in
 from torchcover.training.counting import CountOnce, Shard
 from torchcover.training.mmdetection3d import frames_of_data_batch
 
@@ -78,7 +78,7 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         for frame in self._once.new(frames, Shard(rank, processes, size)):
             index = None if frame.index == UNKNOWN_INDEX else frame.place_in_time
             self.metric.update(
-                sensor_of(frame),
+                frame.cloud_of(within_m=self.metric.within_m),
                 frame.reference,
                 weights=frame.reference_weights,
                 height=frame.heights_in(self.metric.grid.band_frame),

@@ -37,7 +37,7 @@ class RecordedStep(NamedTuple):
         name: What its files are called.
         time_s: When it was.
         world_T_vehicle: (4, 4) where the vehicle was.
-        clouds: Name of each sensor -> (N, 3) float32 points in the vehicle frame.
+        clouds: Name of each sensor -> (N, 3) float32 points in the vehicle frame, as they landed.
         frame: Everything together.
     """
 

@@ -155,7 +155,7 @@ class MapPage {
       const value = this.numbers(map.values, raster)[cell], expected = this.numbers(against.values, raster)[cell];
       const error = Math.hypot(this.error(map, raster, cell), this.error(against, raster, cell));
       const difference = value === expected ? 0 : value - expected;
-      parts[0] = `${where}: difference ${said(difference, error, map.difference.unit, map.unknown)} (errors as if independent)`;
+      parts[0] = `${where}: difference ${said(difference, error, map.difference.unit, map.unknown, -Infinity)} (as if independent)`;
       parts.push(`${map.rig} ${one(map)}`, `${against.rig} ${one(against)}`);
     }
     const weights = this.numbers(map.weights, raster);
@@ -177,9 +177,11 @@ class MapPage {
 const figures = (value) => (value === Infinity ? "infinite" : tidy(+value.toPrecision(4)));
 const tidy = (value) => String(+value.toFixed(6)).replace("-", "−");
 
-function said(value, error, unit, unknown) {
+// A number, and two standard errors to either side within its range.
+function said(value, error, unit, unknown, least = 0, most = unit === "%" ? 100 : Infinity) {
   if (Number.isNaN(value)) return `unknown, ${unknown}`;
-  return `${figures(value)}${Number.isNaN(error) ? "" : ` ± ${+error.toPrecision(2)}`} ${unit}`;
+  const end = (times) => figures(Math.min(Math.max(value + times * error, least), most));
+  return `${figures(value)}${Number.isNaN(error) ? "" : ` [${end(-2)}, ${end(2)}]`} ${unit}`;
 }
 
 function barOf(scale, luts) {

@@ -85,7 +85,7 @@ def columns_of(table: CoverageTable) -> Columns:
         "height": lambda row: row.summary.height,
     }
     for key in keys:
-        columns |= _numbers(key)
+        columns |= _of_summary(key)
     for key in means if table.measure == "area" else ():
         columns |= _known(key)
     columns |= {column.key: partial(column.of, table) for column in COLUMNS}
@@ -102,23 +102,18 @@ def columns_of(table: CoverageTable) -> Columns:
     return columns
 
 
-def _numbers(key: str) -> Columns:
-    return {
-        **_with_error(key, lambda row: row.summary.numbers[key]),
-        f"{key}_low": lambda row: row.summary.numbers[key].low,
-        f"{key}_high": lambda row: row.summary.numbers[key].high,
-    }
+def _of_summary(key: str) -> Columns:
+    return _number(key, lambda row: row.summary.numbers[key])
 
 
 def _known(key: str) -> Columns:
-    return _with_error(f"known_{key}", lambda row: row.summary.known[key])
+    return _number(f"known_{key}", lambda row: row.summary.known[key])
 
 
 def _compared(key: str) -> Columns:
     return {
         f"{key}_best": lambda row: key in row.best,
-        f"{key}_difference": lambda row: row.differences[key].value,
-        f"{key}_difference_error": lambda row: row.differences[key].error,
+        **_number(f"{key}_difference", lambda row: row.differences[key]),
         f"{key}_difference_significant": lambda row: row.differences[key].significant,
     }
 
@@ -131,7 +126,7 @@ def _seen_by(key: str) -> Columns:
     def number(row: Row) -> Number | None:
         return row.summary.redundancy.seen_by[key] if row.summary.redundancy else None
 
-    return _with_error(key, number)
+    return _number(key, number)
 
 
 def _without(sensor: str, key: str) -> Columns:
@@ -145,12 +140,15 @@ def _without(sensor: str, key: str) -> Columns:
 
     without = f"{key}_without_{sensor}"
     significant = f"{without}_change_significant"
-    columns = _with_error(without, number) | _with_error(f"{without}_change", change)
+    columns = _number(without, number) | _number(f"{without}_change", change)
     return {**columns, significant: lambda row: getattr(change(row), "significant", None)}
 
 
-def _with_error(key: str, number: Callable[[Row], Number | Difference | None]) -> Columns:
-    return {
-        key: lambda row: getattr(number(row), "value", math.nan),
-        f"{key}_error": lambda row: getattr(number(row), "error", math.nan),
-    }
+def _number(key: str, number: Callable[[Row], Number | Difference | None]) -> Columns:
+    """A number, its standard error and the ends of its interval."""
+    parts = {"value": key, "error": f"{key}_error", "low": f"{key}_low", "high": f"{key}_high"}
+    return {name: partial(_part, number, part) for part, name in parts.items()}
+
+
+def _part(number: Callable[[Row], Number | Difference | None], part: str, row: Row) -> object:
+    return getattr(number(row), part, math.nan)

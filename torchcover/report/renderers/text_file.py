@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 from rich.cells import cell_len
@@ -28,7 +29,7 @@ def render(table: CoverageTable) -> str:
 
 
 def print_table(table: CoverageTable, console: Console | None = None) -> None:
-    """Print a table, as wide as its numbers need; on a terminal that is narrower, names are folded.
+    """Print a table, as wide as its numbers need; on a terminal that is narrower, names and intervals are folded.
 
     Args:
         table: The table.
@@ -36,6 +37,8 @@ def print_table(table: CoverageTable, console: Console | None = None) -> None:
     """
     console = console or Console()
     tables = rich_tables(table)
+    if console.is_terminal and narrowest_width(tables) > console.width:
+        tables = rich_tables(table, two_lines=True)
     folded = table.rigs if console.is_terminal and len(table.rigs) > 1 else ()
     # Rather lines that are too long than numbers that are cut off; in a file the names are whole too.
     console.width = max(console.width, narrowest_width(tables, folded))
@@ -43,16 +46,25 @@ def print_table(table: CoverageTable, console: Console | None = None) -> None:
         console.print(part)
 
 
-def rich_tables(table: CoverageTable) -> list[Table]:
+def rich_tables(table: CoverageTable, *, two_lines: bool = False) -> list[Table]:
     """The parts of a table for `rich.console.Console.print`.
 
     The best number of each row is bold and marked `*`; a difference that is more than chance is bold and marked `!`.
+
+    Args:
+        table: The table.
+        two_lines: Whether intervals stand below their numbers.
 
     Returns:
         A table for each part; what they hold under, and what went wrong, is the caption of the last.
     """
     parts = parts_of(table)
-    widest = max((cell_len(_text(cell).plain) for part in parts for row in part.rows for cell in row[2:-1]), default=0)
+    if two_lines:
+        parts = [replace(part, rows=tuple(tuple(map(_below, row)) for row in part.rows)) for part in parts]
+    lines = [
+        line for part in parts for row in part.rows for cell in row[2:-1] for line in _text(cell).plain.split("\n")
+    ]
+    widest = max(map(cell_len, lines), default=0)
     tables = [_rich_table(part, widest) for part in parts]
     marks = [f"{SIGNS[mark]} {meaning}" for mark, meaning in marks_on(table).items()]
     tables[-1].caption = Text("\n".join([*marks, *notes_on(table)]))
@@ -105,6 +117,10 @@ def _rich_table(part: Part, widest: int) -> Table:
     for at, row in enumerate(part.rows, 1):
         table.add_row(*map(_text, row), end_section=at % part.bands == 0)
     return table
+
+
+def _below(cell: Words) -> Words:
+    return cell._replace(text=cell.text.replace("  [", "\n["))
 
 
 def _text(cell: Words) -> Text:

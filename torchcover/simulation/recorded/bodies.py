@@ -54,7 +54,7 @@ class Bodies:
         if kind is None:
             return box_mesh(size_m)
         mesh = self._meshes[kind]
-        return Mesh(mesh.vertices_m * (np.array(size_m) / self._sizes_m[kind]), mesh.faces)
+        return mesh._replace(vertices_m=mesh.vertices_m * (np.array(size_m) / self._sizes_m[kind]))
 
 
 @reads("a file of boxes")
@@ -75,4 +75,4 @@ def read_boxes(path: Path) -> tuple[Actor, ...]:
 
 def box_mesh(size_m: tuple[float, float, float]) -> Mesh:
     """A box of a length, width and height that stands on its origin."""
-    return Box(type="box", size_m=size_m).mesh()
+    return Box(type="box", size_m=size_m).mesh().made_of("car_paint")

@@ -138,7 +138,7 @@ def _slab(piece: shapely.Geometry, ground: Ground) -> Mesh:
             np.column_stack([places_m, heights_m + PAVEMENT_M]), np.column_stack([places_m, heights_m - SUNK_M])
         ]),
         np.concatenate([faces, faces[:, ::-1] + count, *(side.T for side in sides)]),
-    )  # fmt: skip
+    ).made_of("pavement")  # fmt: skip
 
 
 def _strip(line_m: Numbers, width_m: float) -> Mesh:
@@ -157,4 +157,4 @@ def _strip(line_m: Numbers, width_m: float) -> Mesh:
             faces += [[here + a, there + a, there + b], [here + a, there + b, here + b]]
     last = len(vertices_m) - 4
     faces += [[0, 1, 2], [0, 2, 3], [last + 2, last + 1, last], [last + 3, last + 2, last]]
-    return Mesh(vertices_m, np.array(faces))
+    return Mesh(vertices_m, np.array(faces)).made_of("road")

@@ -85,4 +85,4 @@ class Hills:
         wanted[faces] = True
         used, number = np.flatnonzero(wanted), np.cumsum(wanted) - 1
         places_m = SQUARE_M * (lower + np.stack([used % (columns + 1), used // (columns + 1)], axis=1))
-        return Mesh(np.column_stack([places_m, self.heights_m(places_m)]), number[faces])
+        return Mesh(np.column_stack([places_m, self.heights_m(places_m)]), number[faces]).made_of("road")

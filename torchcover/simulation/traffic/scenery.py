@@ -30,7 +30,7 @@ def ground(lower_m: ArrayLike, upper_m: ArrayLike) -> Mesh:
     """The one plane at z = 0 under everything: two triangles, so there is no seam for a ray to slip through."""
     (x0, y0), (x1, y1) = np.asarray(lower_m, dtype=np.float64), np.asarray(upper_m, dtype=np.float64)
     corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
-    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]])).made_of("road")
 
 
 def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
@@ -113,7 +113,7 @@ def box(centre_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: 
 def post(centre_m: ArrayLike, radius_m: float, bottom_m: float, height_m: float) -> Mesh:
     """An upright post."""
     outline = np.asarray(centre_m) + radius_m * _circle(POST_SIDES)
-    return prism([outline, outline], [bottom_m, bottom_m + height_m])
+    return prism([outline, outline], [bottom_m, bottom_m + height_m]).made_of("metal")
 
 
 def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, crown_radius_m: float) -> list[Mesh]:
@@ -129,7 +129,8 @@ def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, 
     shape, centre = _circle(CROWN_SIDES), np.asarray(centre_m)
     outlines = [centre + share * crown_radius_m * shape for share in (0.45, 1.0, 0.9, 0.3)]
     levels = bottom_m + clear_m + np.array([0.0, 0.3, 0.65, 1.0]) * (height_m - clear_m)
-    return [post(centre, 0.15, bottom_m, clear_m), prism(outlines, levels.tolist())]
+    crown = prism(outlines, levels.tolist()).made_of("vegetation")
+    return [post(centre, 0.15, bottom_m, clear_m).made_of("wood"), crown]
 
 
 def rail(line: Polyline, places_m: Numbers, left_m: float, width_m: float, z_m: tuple[float, float]) -> list[Mesh]:
@@ -146,7 +147,7 @@ def rail(line: Polyline, places_m: Numbers, left_m: float, width_m: float, z_m: 
     pieces = []
     for piece in range(len(places_m) - 1):
         outline = np.stack([sides[0][piece], sides[0][piece + 1], sides[1][piece + 1], sides[1][piece]])
-        pieces.append(prism([outline, outline], z_m))
+        pieces.append(prism([outline, outline], z_m).made_of("metal"))
     return pieces
 
 

@@ -81,13 +81,13 @@ class BuildingSite:
         """Pavement from a kerb on, on the left (1) or the right (-1), as far as the site goes there."""
         if self.is_plain:
             near, far = sorted((side * kerb_m, side * (kerb_m + depth_m)))
-            return block(x_m, (near, far), (0.0, PAVEMENT_M))
+            return block(x_m, (near, far), (0.0, PAVEMENT_M)).made_of("pavement")
         x = np.linspace(*x_m, int(np.ceil((x_m[1] - x_m[0]) / PIECE_M)) + 1)
         wide_m = np.minimum(self._reach_m(x, side, kerb_m) - kerb_m - BETWEEN_BLOCKS_M, depth_m)
         rows = 2 if self._hills.are_flat else int(np.ceil(depth_m / ACROSS_M)) + 1
         y = kerb_m + np.linspace(0.0, 1.0, rows) * np.maximum(wide_m, NARROWEST_M)[:, None]
         net = np.stack(np.broadcast_arrays(x[:, None], side * y), axis=-1)
-        return slab(net if side == 1 else net[:, ::-1], (0.0, PAVEMENT_M))
+        return slab(net if side == 1 else net[:, ::-1], (0.0, PAVEMENT_M)).made_of("pavement")
 
     def bent(self, pieces: Sequence[Mesh], bottom_m: float) -> list[Mesh]:
         """The bodies in the world, as one mesh.
@@ -103,7 +103,7 @@ class BuildingSite:
         places_m = self.street.poses(x_m, y_m)[:, :2]
         if not self._hills.are_flat:
             height_m = height_m + self._hills.heights_m(places_m) - np.where(height_m <= bottom_m, FOOT_M, 0.0)
-        return [Mesh(np.column_stack([places_m, height_m]), merged.faces)]
+        return [merged._replace(vertices_m=np.column_stack([places_m, height_m]))]
 
     def _reach_m(self, x_m: Numbers, side: int, kerb_m: float) -> Numbers:
         """(N,) how far from the middle it goes there."""

@@ -1,0 +1,99 @@
+"""What sensors make of their hits, and the weather: named in every result, and never to the good of a rig."""
+
+import pytest
+
+from torchcover.evaluation import evaluate
+from torchcover.simulation import Lidar, Rig, Weather
+
+RIG = Rig.model_validate(
+    {
+        "name": "roof",
+        "sensors": [
+            {
+                "name": "roof",
+                "mount": {"z_m": 1.9},
+                "channels": 32,
+                "vertical_fov_deg": [-25.0, 5.0],
+                "columns": 360,
+                "horizontal_fov_deg": 360.0,
+                "max_range_m": 150.0,
+                "range_at_10_percent_m": 40.0,
+            }
+        ],
+    }
+)
+SETTINGS = {"steps": 2, "rays": 1024}
+
+
+def numbers(result, name):
+    """Radius and detection by region and band, where known."""
+    rows = [row for row in result.summary if row["rig"] == name]
+    return {(row["region"], row["height"]): row for row in rows if row["radius_m"] is not None}
+
+
+def columns(row):
+    detection = next(value for key, value in row.items() if key.startswith("detection"))
+    return row["radius_m"], detection
+
+
+@pytest.fixture(scope="module")
+def worse():
+    """Ideal sensors, and what gets worse and worse."""
+    weather = ("clear", "fog_200m", "fog_50m", "rain_50mm_h")
+    ideal = evaluate(RIG, "courtyard", sensor_model="ideal", **SETTINGS)
+    return ideal, evaluate(RIG, "courtyard", weather=weather, **SETTINGS)
+
+
+@pytest.mark.parametrize(
+    ("better", "worse_one"),
+    [
+        ("roof", "roof, clear"),
+        ("roof, clear", "roof, fog_200m"),
+        ("roof, fog_200m", "roof, fog_50m"),
+        ("roof, clear", "roof, rain_50mm_h"),
+    ],
+)
+def test_nothing_bad_makes_a_rig_better(worse, better, worse_one):
+    ideal, real = worse
+    before = numbers(ideal if better == "roof" else real, better)
+    after = numbers(real, worse_one)
+    assert before.keys() == after.keys()
+    falls = 0
+    for place in before:
+        (radius_m, detection), (worse_radius_m, worse_detection) = columns(before[place]), columns(after[place])
+        assert worse_radius_m >= radius_m - 1e-9
+        assert worse_detection <= detection + 1e-9
+        falls += worse_detection < detection
+    assert falls
+
+
+def test_every_result_names_its_sensor_model_and_the_weather(worse):
+    ideal, real = worse
+    assert ideal.record["sensor_model"] == {"roof": "ideal"}
+    assert "Sensor model: ideal" in str(ideal)
+    assert set(real.record["sensor_model"].values()) == {"real"}
+    assert real.record["weather"]["roof, fog_50m"] == "fog_50m"
+    assert "Weather: clear, fog_200m, fog_50m, rain_50mm_h." in str(real)
+
+
+def test_the_paper_measures_with_ideal_sensors():
+    result = evaluate(RIG, reference="paper", rays=256, steps=1)
+    assert result.record["sensor_model"] == {"roof": "ideal"}
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"sensor_model": "perfect"}, "`ideal` or `real` is needed"),
+        ({"sensor_model": "real", "rigs": "front_roof_32"}, "no LiDAR of the rig 'front_roof_32'"),
+        ({"weather": "fog_10m"}, "is 'fog_100m' meant"),
+        ({"weather": [Weather(), Weather(visibility_m=9.0)]}, "two are called alike, weather, weather"),
+    ],
+)
+def test_what_cannot_be_is_told(given, told):
+    with pytest.raises((ValueError, FileNotFoundError), match=told):
+        evaluate(**({"rigs": RIG, "steps": 1} | given))
+
+
+def test_a_model_says_as_much_of_its_lidars_as_a_rig():
+    assert Lidar.model_validate({"name": "a", "model": "velodyne_vlp32c"}).range_at_10_percent_m == 115.0

@@ -1,0 +1,126 @@
+"""A LiDAR is calibrated by which of its rays returned from a road."""
+
+import numpy as np
+import pytest
+
+from torchcover.recordings import open_recording
+from torchcover.simulation import Rig, calibrate
+from torchcover.simulation.material import Material
+from torchcover.simulation.recorded_returns import fit_returns, ground_rays, road_profile
+from torchcover.simulation.returns import log_excess, return_probability
+
+RANGE_M, SPREAD, NOISE_M, HEIGHT_M = 60.0, 0.25, 0.02, 1.9
+RIG = Rig.model_validate(
+    {
+        "name": "truth",
+        "sensors": [
+            {
+                "name": "roof",
+                "mount": {"z_m": HEIGHT_M},
+                "elevations_deg": np.round(-np.rad2deg(np.arctan(HEIGHT_M / np.geomspace(4, 90, 40))), 6).tolist(),
+                "horizontal_fov_deg": 360,
+                "columns": 1440,
+                "max_range_m": 200,
+            }
+        ],
+    }
+)
+ROAD = Material.load("road")
+
+
+def sweep(generator, wall_m=np.inf):
+    """What returns from a plain, with a wall across the road ahead."""
+    directions = RIG.sensors[0].directions().reshape(3, -1)
+    range_m = HEIGHT_M / -directions[2]
+    cosine, on_wall = -directions[2], directions[0] * range_m > wall_m
+    range_m = np.where(on_wall, wall_m / directions[0], range_m)
+    excess = log_excess(range_m, cosine, ROAD.share, ROAD.incidence_exponent, RANGE_M)
+    returned = on_wall | (generator.random(len(range_m)) < return_probability(excess, SPREAD, ROAD.spread))
+    measured_m = range_m + NOISE_M * generator.standard_normal(len(range_m))
+    return (directions * measured_m).T[returned] + [0.0, 0.0, HEIGHT_M]
+
+
+def written(folder, sweeps, poses=True):
+    (folder / "sensor").mkdir()
+    for number, points_m in enumerate(sweeps):
+        np.save(folder / "sensor" / f"{number}.npy", points_m)
+    if poses:
+        step_m = poses if isinstance(poses, float) else 5.0
+        rows = [f"{number},{number},{step_m * number},0,0,1,0,0,0" for number in range(len(sweeps))]
+        (folder / "poses.csv").write_text("\n".join(["frame,time_s,x_m,y_m,z_m,qw,qx,qy,qz", *rows]))
+    return open_recording(folder)
+
+
+@pytest.fixture(scope="module")
+def sweeps():
+    generator = np.random.default_rng(5)
+    return [sweep(generator) for _ in range(3)]
+
+
+def test_a_plain_gives_back_what_it_was_made_with(sweeps, tmp_path):
+    rig, [found] = calibrate(written(tmp_path, sweeps), RIG)
+    assert abs(np.log(found.fit.range_at_10_percent_m / RANGE_M)) < 3 * found.fit.range_error < 0.15
+    assert abs(np.log(found.fit.spread / SPREAD)) < 3 * found.fit.spread_error < 0.6
+    assert found.noise_m == pytest.approx(NOISE_M, rel=0.1)
+    assert rig.sensors[0].range_at_10_percent_m == round(found.fit.range_at_10_percent_m, 1)
+
+
+def test_half_of_the_turn_predicts_the_other_half(sweeps):
+    rays = ground_rays(sweeps, RIG.sensors[0])
+    ahead = np.abs(rays.azimuth_deg) < 90
+    fit, judged = fit_returns(rays.some(ahead), ROAD), rays.some(~ahead)
+    excess = log_excess(
+        judged.range_m, judged.cos_incidence, ROAD.share, ROAD.incidence_exponent, fit.range_at_10_percent_m
+    )
+    probability = return_probability(excess, fit.spread, ROAD.spread)
+    for low_m in range(10, 90, 10):
+        there = (judged.range_m >= low_m) & (judged.range_m < low_m + 10)
+        rays_there = judged.rays[there].sum()
+        if rays_there >= 200:
+            real = judged.returned[there].sum() / rays_there
+            assert real == pytest.approx((probability * judged.rays)[there].sum() / rays_there, abs=0.06)
+
+
+def test_rays_behind_a_wall_are_in_nobodys_count():
+    """Else what the wall hides would be road that did not return."""
+    rays = ground_rays([sweep(np.random.default_rng(1), wall_m=30.0)], RIG.sensors[0])
+    ahead = np.abs(rays.azimuth_deg) < 10
+    assert rays.range_m[ahead].max() < 31 < 60 < rays.range_m[~ahead].max()
+
+
+def test_the_road_is_found_where_it_tilts_and_bends():
+    x, y = np.meshgrid(np.linspace(-60, 60, 121), np.linspace(-6, 6, 25))
+    height_m = 0.02 * x - 0.01 * y + 0.2 * (x / 40) ** 2 * (x > 0)
+    profile = road_profile(np.stack([x, y, height_m], axis=-1).reshape(-1, 3))
+    assert (
+        np.abs(profile.height_m(np.stack([x, y, height_m], axis=-1).reshape(-1, 3)) - height_m.reshape(-1)).max() < 0.02
+    )
+
+
+def test_near_road_cannot_tell_how_far_a_lidar_sees(sweeps, tmp_path):
+    """All of it returns: any range that is long enough explains that."""
+    _, [found] = calibrate(written(tmp_path, sweeps), RIG)
+    rays = ground_rays(sweeps, RIG.sensors[0])
+    fit = fit_returns(rays.some(rays.range_m < 16), ROAD)
+    assert found.fit.fades
+    assert not fit.fades
+    assert "m at 10 %" in found.words
+    assert "cannot tell" in found._replace(fit=fit).words
+
+
+@pytest.mark.parametrize(
+    ("sweeps_made", "poses", "told"),
+    [
+        (lambda made: [points_m[:0] for points_m in made], 5.0, "0 rays to an open road"),
+        (lambda made: made, 0.1, "the vehicle stands, 3 sweeps within 0.20 m"),
+    ],
+    ids=["empty", "standing"],
+)
+def test_recordings_that_say_nothing_are_refused(sweeps, tmp_path, sweeps_made, poses, told):
+    with pytest.raises(ValueError, match=told):
+        calibrate(written(tmp_path, sweeps_made(sweeps), poses), RIG)
+
+
+def test_a_rig_of_other_sensors_is_refused(sweeps, tmp_path):
+    with pytest.raises(ValueError, match="no LiDAR of the rig 'argoverse2' is in it"):
+        calibrate(written(tmp_path, sweeps[:1]), Rig.load("argoverse2"))

@@ -1,0 +1,236 @@
+"""The law of returns: what it says where that is known, and that nothing bad makes more of them."""
+
+import numpy as np
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator, builtin_names
+from torchcover.simulation.returns import SURE, extinction_per_m, log_excess, return_probability
+
+KEYS = {
+    "name": "a",
+    "channels": 2,
+    "vertical_fov_deg": [-9, 0],
+    "columns": 4,
+    "horizontal_fov_deg": 360,
+    "max_range_m": 9,
+}
+
+
+@pytest.mark.parametrize("range_at_10_percent_m", [40.0, 200.0])
+@pytest.mark.parametrize("reflectivity", [0.1, 0.4])
+def test_every_other_ray_returns_from_where_the_data_sheet_says(range_at_10_percent_m, reflectivity):
+    """Four times as bright is twice as far."""
+    range_m = range_at_10_percent_m * np.sqrt(reflectivity / 0.1)
+    excess = log_excess(range_m, 1.0, reflectivity, 1.0, range_at_10_percent_m)
+    assert return_probability(excess, 0.3) == pytest.approx(SURE / 2, abs=1e-15)
+    one_spread_nearer = log_excess(range_m * np.exp(-0.3), 1.0, reflectivity, 1.0, range_at_10_percent_m)
+    assert return_probability(one_spread_nearer, 0.3) / SURE == pytest.approx(0.8413447460685429)
+
+
+def test_lambert_on_a_road_falls_with_the_cube_of_the_range():
+    """cos = h / R: where half the rays return is at (R10^2 h)^(1/3)."""
+    range_m = (60.0**2 * 1.9) ** (1 / 3)
+    assert log_excess(range_m, 1.9 / range_m, 0.1, 1.0, 60.0) == pytest.approx(0.0, abs=1e-14)
+
+
+@pytest.mark.parametrize(
+    "worse",
+    [
+        {"range_m": 60.0},
+        {"cos_incidence": 0.3},
+        {"reflectivity": 0.1},
+        {"incidence_exponent": 1.5},
+        {"range_at_10_percent_m": 50.0},
+        {"extinction_per_m": 0.001},
+    ],
+)
+def test_whatever_is_worse_returns_less(worse):
+    hit = {
+        "range_m": 50.0,
+        "cos_incidence": 0.5,
+        "reflectivity": 0.2,
+        "incidence_exponent": 1.0,
+        "range_at_10_percent_m": 70.0,
+    }
+    assert log_excess(**(hit | worse)) < log_excess(**hit)
+
+
+def test_what_reflects_nothing_never_returns_and_a_retroreflector_always_does():
+    excess = log_excess(50.0, 0.1, np.array([0.0, np.inf]), 1.0, 1.0)
+    assert return_probability(excess, 0.3).tolist() == [0.0, SURE]
+
+
+def test_a_contrast_of_five_percent_is_left_at_the_visibility():
+    assert np.exp(-extinction_per_m(80.0) * 80.0) == pytest.approx(0.05)
+    assert extinction_per_m(None) == 0.0
+
+
+def test_each_builtin_material_is_called_as_its_file():
+    assert [Material.load(name).name for name in builtin_names("materials")] == builtin_names("materials")
+
+
+def test_bad_materials_are_told():
+    with pytest.raises(ValidationError, match="less than or equal to 1"):
+        Material(name="snow", reflectivity=1.2)
+    with pytest.raises(ValidationError, match="greater than or equal to 0"):
+        Material(name="hole", reflectivity=-0.1)
+    with pytest.raises(FileNotFoundError, match="is 'brick' meant"):
+        Material.load("bricks")
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"range_at_10_percent_m": 0.0}, "greater than 0"),
+        ({"range_at_10_percent_m": 50.0, "spread": 0.0}, "greater than 0"),
+        ({"range_factors": [1.0]}, "one for each of the 2 rows is needed; got 1"),
+    ],
+)
+def test_bad_keys_of_a_lidar_are_told(given, told):
+    with pytest.raises(ValidationError, match=told):
+        Lidar.model_validate(KEYS | given)
+
+
+PLAIN = {
+    "name": "plain",
+    "ego": {"pose": {}, "shape": {"type": "box", "size_m": [0.5, 0.5, 0.5]}},
+    "bodies": [
+        {"name": "plain", "ground": True, "shape": {"type": "plane", "size_m": [400.0, 400.0]}},
+        {"name": "wall", "shape": {"type": "box", "size_m": [1.0, 30.0, 8.0]}, "poses": [{"x_m": 60.0}]},
+    ],
+}
+ROOF = {
+    "name": "roof",
+    "mount": {"z_m": 2.0},
+    "channels": 40,
+    "vertical_fov_deg": [-8.0, -1.5],
+    "columns": 720,
+    "horizontal_fov_deg": 360.0,
+    "max_range_m": 150.0,
+    "range_at_10_percent_m": 60.0,
+    "spread": 0.25,
+}
+
+
+def seen(weather=None, index=0, bodies=None, **keys):
+    """Which rays of a LiDAR on a plain return at a step."""
+    scenario = Scenario.model_validate(PLAIN | {"weather": weather or {}} | ({"bodies": bodies} if bodies else {}))
+    rig = Rig.model_validate({"name": "rig", "sensors": [ROOF | keys]})
+    return Simulator(scenario, {"rig": rig}, PaperReference(rows=2, columns=2)).scans(index)["rig"][0]
+
+
+def test_as_many_return_from_a_plain_as_the_law_says():
+    every, returned = seen(range_at_10_percent_m=None), seen()
+    road = Material.load("road")
+    is_road = every.points[:, 2] < 1e-3
+    excess = log_excess(
+        every.range_m.astype(float),
+        2.0 / every.range_m,
+        road.share,
+        road.incidence_exponent,
+        ROOF["range_at_10_percent_m"],
+    )
+    expected = return_probability(excess, ROOF["spread"], road.spread)
+    there = np.isin(every.ray, returned.ray)
+    for low_m in range(15, 75, 15):
+        some = is_road & (every.range_m > low_m) & (every.range_m < low_m + 15)
+        error = np.sqrt((expected * (1 - expected))[some].sum()) / some.sum()
+        assert there[some].mean() == pytest.approx(expected[some].mean(), abs=4 * error + 1e-9)
+
+
+@pytest.mark.parametrize(
+    ("worse", "keys"),
+    [
+        ({"visibility_m": 100.0}, {}),
+        ({"rain_mm_h": 50.0}, {}),
+        ({"road": "wet"}, {}),
+        (None, {"range_at_10_percent_m": 40.0}),
+        (None, {"range_factors": [0.5] * 40}),
+        (None, {"dropout": 0.3}),
+    ],
+    ids=["fog", "rain", "wet", "short", "factors", "dropout"],
+)
+def test_no_ray_returns_because_something_is_worse(worse, keys):
+    """The same random numbers: not one return more, and fewer in all."""
+    clear, bad = seen(), seen(worse, **keys)
+    assert set(bad.ray.tolist()) < set(clear.ray.tolist())
+
+
+def test_rows_have_their_own_factors():
+    """The lower half of them hardly sees anything."""
+    factors = np.where(np.arange(40) < 20, 1e-3, 1.0).tolist()
+    lower, every = seen(range_factors=factors).points, seen().points
+    assert len(lower) < 0.6 * len(every)
+    assert np.hypot(*lower[:, :2].T).min() > 20 > np.hypot(*every[:, :2].T).min()
+
+
+def test_what_reflects_returns_from_farther():
+    """Paint, a sign and nothing at all in place of the road."""
+
+    def of(material):
+        ground = {"name": "plain", "shape": {"type": "plane", "size_m": [400.0, 400.0]}, "material": material}
+        return len(seen(bodies=[ground]).ray)
+
+    assert of("glass") < of("tyre") < of("road") < of("lane_paint") < of("sign")
+    assert of("sign") == pytest.approx(
+        SURE * len(seen(range_at_10_percent_m=None, bodies=PLAIN["bodies"][:1]).ray), rel=0.01
+    )
+
+
+def test_a_body_is_as_dark_all_over_and_always():
+    """Of black cars, hardly one ray returns; and a step later it is the same cars."""
+    bodies = [
+        PLAIN["bodies"][0],
+        *(
+            {
+                "name": f"car {number}",
+                "material": "car_paint",
+                "shape": {"type": "box", "size_m": [4.0, 1.8, 1.5]},
+                "poses": [{"x_m": 40.0 * np.cos(number / 4), "y_m": 40.0 * np.sin(number / 4)}],
+            }
+            for number in range(24)
+        ),
+    ]
+    every, shares = seen(range_at_10_percent_m=None, bodies=bodies), []
+    on_car = every.points[:, 2] > 0.01
+    car = np.round(np.arctan2(every.points[:, 1], every.points[:, 0]) * 4).astype(int)
+    for index in (0, 1):
+        there = np.isin(every.ray, seen(index=index, bodies=bodies).ray)
+        shares.append(np.array([there[on_car & (car == number)].mean() for number in np.unique(car[on_car])]))
+    assert np.ptp(shares[0]) > 0.9
+    assert np.abs(shares[0] - shares[1]).max() < 0.25
+
+
+def test_an_ideal_rig_is_the_one_without_a_range_at_10_percent():
+    rig = Rig.model_validate({"name": "rig", "sensors": [ROOF]})
+    ideal = rig.sensing("ideal")
+    assert (rig.sensor_model, ideal.sensor_model, ideal.sensing(None).sensor_model) == ("real", "ideal", "ideal")
+    assert not rig.sensors[0].is_exact
+    assert ideal.sensors[0].is_exact
+    with pytest.raises(ValueError, match="no LiDAR of the rig 'rig' has a range_at_10_percent_m"):
+        ideal.sensing("real")
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"weather": {"visibility_m": 0.0}}, "visibility_m: Input should be greater than 0"),
+        ({"weather": {"rain_mm_h": -1.0}}, "greater than or equal to 0"),
+        ({"bodies": [PLAIN["bodies"][0] | {"material": "raod"}]}, "is 'road' meant"),
+    ],
+)
+def test_bad_weather_and_materials_of_a_scenario_are_told(given, told, tmp_path):
+    path = tmp_path / "world.yaml"
+    path.write_text(yaml.safe_dump(PLAIN | given))
+    with pytest.raises(ValueError, match=told):
+        Scenario.load(path)
+
+
+def test_cameras_see_as_far_as_people_and_radars_through_fog():
+    foggy = Scenario.model_validate(PLAIN | {"weather": {"visibility_m": 50.0}})
+    camera, radar = Rig.load("three_cameras").sensors[0], Rig.load("nuscenes_radars").sensors[0]
+    assert foggy.reach_m(camera) == 50.0
+    assert foggy.reach_m(radar) == radar.max_range_m
+    assert foggy.reach_m(Rig.load("kitti").sensors[0]) == Rig.load("kitti").sensors[0].max_range_m

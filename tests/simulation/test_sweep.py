@@ -1,0 +1,127 @@
+"""Rays that are cast one after the other hit what they would have hit, each at its own time."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from torchcover.geometry import invert, transform
+from torchcover.geometry.trajectory import Trajectory
+from torchcover.simulation import Draws, Lidar, Pose
+from torchcover.simulation.bodies import in_vehicle_frame
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.shapes import Box, Plane
+from torchcover.simulation.sight import MountedSensor
+from torchcover.simulation.world import Actor, World
+
+PERIOD_S, COLUMNS = 0.1, 40
+LIDAR = Lidar(
+    name="roof", mount=Pose(x_m=-0.3, z_m=1.5, yaw_deg=10), channels=16, vertical_fov_deg=(-40, 6),
+    horizontal_fov_deg=360, columns=COLUMNS, max_range_m=60, scan={"period_s": PERIOD_S},
+)  # fmt: skip
+EXACT = Draws(None)
+STEP_S = PERIOD_S / COLUMNS / 2
+
+
+def box(*size_m):
+    return in_vehicle_frame(Box(type="box", size_m=size_m).mesh())
+
+
+def driving(start, way, turn_deg=0.0):
+    """Ten seconds, from before the world begins."""
+    return Trajectory.from_arrays(
+        [-5.0, 5.0], [np.subtract(start, way), np.add(start, way)], [[-turn_deg, 0, 0], [turn_deg, 0, 0]]
+    )
+
+
+def world(ego_mps=0.0, cars_mps=0.0, turn_deg=0.0, step_s=PERIOD_S):
+    """An ego between two walls, with a car that comes closer beside it and one that crosses far ahead."""
+    ground, wall = Plane(type="plane", size_m=(400, 400)).mesh(), box(60, 0.5, 4)
+    walls = [wall.moved(Pose(y_m=y_m).matrix()) for y_m in (-9.0, 12.0)]
+    ego = Actor("ego", "ego", box(4, 2, 1), driving((0, 0, 0), (5 * ego_mps, 0, 0), turn_deg))
+    beside = Actor("beside", "car", box(4, 2, 1.5), driving((6, 5, 0), (-5 * cars_mps, 0, 0)))
+    ahead = Actor("ahead", "car", box(4, 2, 1.5), driving((15, -2, 0), (0, 5 * cars_mps, 0), 2 * turn_deg))
+    return World((ground, *walls), ego, (beside, ahead), time_step_s=step_s, duration_s=1.0)
+
+
+def swept(made, time_s=0.5, lidar=LIDAR):
+    scene = Scene(made)
+    mounted = MountedSensor(lidar, scene, lidar.max_range_m)
+    return mounted, mounted.scan(scene.at(round(time_s / made.time_step_s)), EXACT)
+
+
+@pytest.mark.parametrize(
+    ("ego_mps", "cars_mps", "turn_deg"), [(20.0, 0.0, 0.0), (0.0, 15.0, 0.0), (20.0, 15.0, 0.0), (20.0, 15.0, 150.0)]
+)
+def test_each_column_is_that_of_a_scan_at_its_own_time(ego_mps, cars_mps, turn_deg):
+    """The slow twin: the whole scene is placed anew for each column."""
+    made = world(ego_mps, cars_mps, turn_deg)
+    mounted, seen = swept(made)
+    fine = Scene(world(ego_mps, cars_mps, turn_deg, step_s=STEP_S))
+    now, at_once = round(0.5 / STEP_S), LIDAR.model_copy(update={"scan": None})
+    world_T_now = made.ego.trajectory.at(0.5)
+    compared = moved = 0
+    for column in range(COLUMNS):
+        step = now - 2 * (COLUMNS - column) + 1
+        then, time_s = fine.at(step), step * STEP_S
+        there = MountedSensor(at_once, fine, LIDAR.max_range_m).scan(then, EXACT)
+        own, mine = (mounted.pixel_of_ray[scan.ray] % COLUMNS == column for scan in (there, seen))
+        np.testing.assert_array_equal(there.ray[own], seen.ray[mine])
+        np.testing.assert_allclose(seen.range_m[mine], there.range_m[own], rtol=1e-4, atol=2e-3)
+        struck = then.scan(at_once.mount.matrix(), mounted.tiles, max_range_m=60).struck()
+        now_T_then = invert(world_T_now) @ made.ego.trajectory.at(time_s)
+        true = transform(now_T_then, there.points[own])
+        np.testing.assert_allclose((seen.points if seen.landed is None else seen.landed)[mine], true, atol=5e-3)
+        others = [actor for actor in made.actors if actor.trajectory.moves]
+        for actor, number in zip(others, [body for body in then.moving.body if body != then.ego], strict=True):
+            on_body, trajectory = struck.body[own] == number, actor.trajectory
+            travelled = invert(world_T_now) @ trajectory.at(0.5) @ invert(trajectory.at(time_s)) @ world_T_now
+            true[on_body] = transform(travelled, true[on_body])
+            moved += int(on_body.sum())
+        np.testing.assert_allclose(seen.points[mine], true, atol=5e-3)
+        compared += len(true)
+    assert compared > 200
+    assert (moved > 15) == (cars_mps > 0)
+
+
+def test_where_nothing_moves_it_is_the_same_to_the_bit():
+    _, still = swept(world())
+    _, at_once = swept(world(), lidar=LIDAR.model_copy(update={"scan": None}))
+    np.testing.assert_array_equal(still.points.view(np.int32), at_once.points.view(np.int32))
+    assert still.landed is None
+    # An ego that stands, in a world in which others drive: what rests is the same, and its landed points are true.
+    moving = world(cars_mps=15.0)
+    _, seen = swept(moving)
+    _, at_once = swept(moving, lidar=LIDAR.model_copy(update={"scan": None}))
+    both = np.intersect1d(seen.ray, at_once.ray)
+    same = (seen.points[np.isin(seen.ray, both)] == at_once.points[np.isin(at_once.ray, both)]).all(axis=1)
+    assert same.mean() > 0.85
+
+
+def test_a_car_that_drives_beside_the_ego_is_where_it_is():
+    """Both at one speed: the points of the car are those of a scan at once."""
+    made = world(ego_mps=20.0, cars_mps=-20.0)
+    made = replace(made, actors=made.actors[:1])
+    seen, at_once = swept(made)[1], swept(made, lidar=LIDAR.model_copy(update={"scan": None}))[1]
+    on_car = [(np.abs(scan.points - [6, 5, 0.75]) < [2.01, 1.01, 0.76]).all(axis=1) for scan in (seen, at_once)]
+    assert on_car[0].sum() == on_car[1].sum() > 3
+    np.testing.assert_allclose(seen.points[on_car[0]], at_once.points[on_car[1]], atol=1e-3)
+
+
+def test_the_first_frame_of_a_world_is_as_its_second():
+    """Before a world begins it is told from how it goes on."""
+    made = world(ego_mps=20.0)
+    made = replace(made, static=made.static[:1], actors=())
+    (_, first), (_, later), (_, at_once) = (
+        swept(made, time_s, lidar)
+        for time_s, lidar in ((0.0, LIDAR), (0.5, LIDAR), (0.0, LIDAR.model_copy(update={"scan": None})))
+    )
+    np.testing.assert_allclose(first.points, later.points, atol=2e-3)
+    assert np.abs(first.points - at_once.points).max() > 1.0
+
+
+def test_a_scan_that_is_longer_than_a_time_step_is_refused():
+    with pytest.raises(ValueError, match=r"'roof': a scan of 0\.0975 s is longer than the time step .* 0\.05 s"):
+        swept(world(ego_mps=1.0, step_s=0.05))
+    with pytest.raises(ValueError, match=r"scan\.period_s\n.*greater than 0"):
+        Lidar.model_validate({**LIDAR.model_dump(), "scan": {"period_s": 0.0}})

@@ -1,0 +1,96 @@
+"""What surfaces are made of, as far as a LiDAR can tell."""
+
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Literal, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeFloat
+
+from torchcover.simulation.builtin import builtin_names
+from torchcover.simulation.documents import Document, load_document
+
+# What nobody said the material of is scenery: walls for the most part.
+UNSAID = "brick"
+# A body has its own tone, the same at every time and for every rig: that of its number among so many.
+TONES = np.append(np.random.default_rng(905).standard_normal(4095), 0.0).astype(np.float32)
+
+
+class Material(Document):
+    """A surface, as light of 905 nm meets it.
+
+    Args:
+        name: What a body's `material` calls it.
+        description: What it is, and where its numbers come from.
+        reflectivity: Share of light that a white, rough surface would return, 0 to 1: the median. `retroreflective`:
+            it sends light back to where it came from, and always returns.
+        incidence_exponent: k; what returns falls as the cosine of the incidence to the power of k. 1 is Lambert's law.
+        spread: Standard deviation of ln reflectivity.
+        varies_by: Whether that is between places, drawn for each ray, or between bodies, so that a dark one is dark all
+            over.
+
+    Example:
+        >>> Material.load("road").incidence_exponent
+        0.2
+    """
+
+    name: str
+    description: str = ""
+    reflectivity: Annotated[float, Field(ge=0.0, le=1.0)] | Literal["retroreflective"]
+    incidence_exponent: NonNegativeFloat = 1.0
+    spread: NonNegativeFloat = 0.0
+    varies_by: Literal["place", "body"] = "place"
+
+    @classmethod
+    def load(cls, path_or_name: str | Path) -> Self:
+        """Read a material from a YAML file, or a built-in one by its name.
+
+        Raises:
+            FileNotFoundError: No such file or name; the message has the nearest name.
+            ValueError: The file is not a material.
+        """
+        return load_document(cls, "materials", path_or_name)
+
+    @property
+    def share(self) -> float:
+        """The reflectivity as a number: infinite for a retroreflector."""
+        return np.inf if self.reflectivity == "retroreflective" else float(self.reflectivity)
+
+
+class Materials(NamedTuple):
+    """What all materials are, by number: `reflectivity`, `exponent`, and `spread` of ln reflectivity by what varies."""
+
+    reflectivity: NDArray[np.float32]
+    exponent: NDArray[np.float32]
+    spread_of_places: NDArray[np.float32]
+    spread_of_bodies: NDArray[np.float32]
+
+
+@cache
+def material_number(name: str) -> int:
+    """The number of a built-in material, which meshes have; 0 is where none was said.
+
+    Raises:
+        FileNotFoundError: No such material; the message has the nearest name.
+    """
+    known = builtin_names("materials")
+    if name not in known:
+        Material.load(name)
+    return 1 + known.index(name)
+
+
+@cache
+def materials() -> Materials:
+    """All built-in materials, that for number 0 ahead."""
+    each = [Material.load(name) for name in (UNSAID, *builtin_names("materials"))]
+    of_body = [one.spread if one.varies_by == "body" else 0.0 for one in each]
+    of_place = [one.spread - spread for one, spread in zip(each, of_body, strict=True)]
+    columns = ([one.share for one in each], [one.incidence_exponent for one in each], of_place, of_body)
+    return Materials._make(np.array(column, dtype=np.float32) for column in columns)
+
+
+def tone(body: NDArray[np.integer]) -> NDArray[np.float32]:
+    """(N,) by how many spreads each body is brighter than its material, by its number; 0 for what is no body, -1."""
+    tones: NDArray[np.float32] = TONES[body % len(TONES)]
+    return tones

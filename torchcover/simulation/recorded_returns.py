@@ -1,0 +1,382 @@
+"""Which rays of a real LiDAR returned from the road, and which should have: how a rig is calibrated by a recording."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize, minimize_scalar
+from scipy.special import log_ndtr
+
+from torchcover.geometry import invert, transform
+from torchcover.recordings.in_vehicle import in_vehicle
+from torchcover.recordings.recording import Recording
+from torchcover.simulation.lidar import Lidar
+from torchcover.simulation.material import Material
+from torchcover.simulation.returns import SURE, log_excess
+from torchcover.simulation.rig import Rig
+
+Float64 = NDArray[np.float64]
+
+# Of a road that is straight ahead; beside it there are kerbs and grass.
+HALF_ROAD_M = 7.0
+# Rays to nearer ground always return, or the vehicle hides them.
+NEAREST_M, FARTHEST_M = 10.0, 125.0
+SECTOR_DEG = 1.0
+# Higher than this above the road, or lower than what no road hides, is in nobody's way.
+OVERHEAD_M = 2.5
+# How far a return from the ground may lie off it, and how much of that is an error of the ground.
+OFF_GROUND_M, OFF_GROUND_SHARE = 0.12, 0.005
+# Shares of the range to the ground: a ray is free that meets nothing before it, and returned if it ended about there.
+CLEAR, ABOUT = 0.97, (0.85, 1.2)
+# A sector in which fewer of the nearest rays return is blocked by the vehicle or by the housing of another sensor.
+OPEN_SHARE = 0.6
+# What is known before anything was seen: the spread of ln range.
+USUAL_SPREAD, SPREAD_IS_SURE_TO = 0.3, 0.7
+# Twice the range is refused where ln of the likelihood falls by so much: two standard errors.
+LESS_LIKELY = 2.0
+CURVATURE_OVER = 0.05
+FEWEST_RAYS = 200
+# A drive of less sees one road.
+LEAST_WAY_M = 2.0
+NOISE_WITHIN_M = 12.0
+
+
+class GroundRays(NamedTuple):
+    """Rays that point at the road, nothing being in their way, by (C,) cells: one row in one sector of one sweep.
+
+    Args:
+        range_m: (C,) how far the ground is there.
+        cos_incidence: (C,) of the rays on it.
+        rays: (C,) how many rays there are.
+        returned: (C,) how many of them returned from there; too many where a row is taken for its neighbour.
+        azimuth_deg: (C,) middle of the sector, in the sensor's frame.
+        sweep: (C,) number of the sweep.
+    """
+
+    range_m: Float64
+    cos_incidence: Float64
+    rays: Float64
+    returned: Float64
+    azimuth_deg: Float64
+    sweep: NDArray[np.int64]
+
+    def some(self, which: NDArray[np.bool_]) -> "GroundRays":
+        """Those of some cells."""
+        return GroundRays._make(column[which] for column in self)
+
+
+class RoadProfile(NamedTuple):
+    """The road as z of the vehicle frame: `level_m` + two slopes, and a curvature ahead and one behind."""
+
+    coefficients: Float64
+
+    def height_m(self, points_m: Float64) -> Float64:
+        """(N,) z of the road below N points."""
+        height_m: Float64 = _terms(points_m) @ self.coefficients
+        return height_m
+
+
+def _terms(points_m: Float64) -> Float64:
+    x, y = points_m[:, 0], points_m[:, 1]
+    squared = (x / 40.0) ** 2
+    return np.column_stack([np.ones(len(x)), x, y, squared * (x > 0), squared * (x < 0)])
+
+
+def road_profile(points_m: Float64) -> RoadProfile:
+    """Fit the road under a sweep, from near to far.
+
+    Args:
+        points_m: (N, 3) in the vehicle frame.
+    """
+    range_m = np.hypot(points_m[:, 0], points_m[:, 1])
+    chosen = (np.abs(points_m[:, 1]) < HALF_ROAD_M) & (range_m < 90.0) & (range_m > 3.5)
+    points_m, range_m = points_m[chosen], range_m[chosen]
+    low = (range_m < 15.0) & (np.abs(points_m[:, 2]) < 0.6)
+    terms, coefficients = _terms(points_m), np.zeros(5)
+    if low.any():
+        coefficients[0] = np.median(points_m[low, 2])
+    # A curvature has to be shown: without far points it is none.
+    shrink = np.diag([0.0, 0.0, 0.0, 2000.0, 2000.0])
+    for farthest_m in (10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 80):
+        off_m = np.abs(points_m[:, 2] - terms @ coefficients)
+        near = (off_m < OFF_GROUND_M + 0.004 * range_m) & (range_m < farthest_m)
+        if np.count_nonzero(near) < 50:
+            continue
+        weighted = terms[near].T * range_m[near] ** 2  # a square metre counts alike, wherever it is
+        coefficients = np.linalg.solve(weighted @ terms[near] + shrink, weighted @ points_m[near, 2])
+    return RoadProfile(coefficients)
+
+
+def ground_rays(sweeps: Sequence[NDArray[np.floating]], lidar: Lidar) -> GroundRays:
+    """The rays of a LiDAR that point at the road, and how many of them returned.
+
+    Which rays there were is known from its scan pattern: the row of a return is the nearest one, and each row has
+    `columns` rays to a turn.
+
+    Args:
+        sweeps: (N, 3) points of each sweep, in the vehicle frame.
+        lidar: The sensor, where it is mounted.
+    """
+    found = [_of_sweep(np.asarray(points_m, dtype=np.float64), lidar, number) for number, points_m in enumerate(sweeps)]
+    return GroundRays._make(np.concatenate(columns) for columns in zip(*found, strict=True))
+
+
+def _of_sweep(points_m: Float64, lidar: Lidar, number: int) -> GroundRays:
+    vehicle_T_sensor, rows_deg = lidar.mount.matrix(), np.sort(lidar.rows_deg())
+    road = road_profile(points_m)
+    in_sensor_m = transform(invert(vehicle_T_sensor), points_m)
+    range_m = np.linalg.norm(in_sensor_m, axis=1)
+    elevation_deg = np.rad2deg(np.arctan2(in_sensor_m[:, 2], np.hypot(in_sensor_m[:, 0], in_sensor_m[:, 1])))
+    row = np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, elevation_deg)
+    sectors = round(360.0 / SECTOR_DEG)
+    azimuth_deg = np.rad2deg(np.arctan2(in_sensor_m[:, 1], in_sensor_m[:, 0]))
+    sector = np.floor((azimuth_deg + 180.0) / SECTOR_DEG).astype(np.int64) % sectors
+    above_m = points_m[:, 2] - road.height_m(points_m)
+    middle_deg: Float64 = (np.arange(sectors, dtype=np.float64) + 0.5) * SECTOR_DEG - 180.0
+    expected_m, place_m = _expected(vehicle_T_sensor, rows_deg, middle_deg, road)
+    # What stands in the way: the second nearest of a sector and its neighbours, for one may be rain or dust.
+    stands = (above_m > OFF_GROUND_M + OFF_GROUND_SHARE * range_m) & (above_m < OVERHEAD_M) & (range_m > 2.0)
+    blocked_m = np.array([_second(range_m[stands & (sector == k)]) for k in range(sectors)])
+    blocked_m = np.minimum(blocked_m, np.minimum(np.roll(blocked_m, 1), np.roll(blocked_m, -1)))
+    cell = row * sectors + sector
+    share = range_m / expected_m.reshape(-1)[cell]
+
+    def counted(which: NDArray[np.bool_]) -> Float64:
+        return np.bincount(cell[which], minlength=expected_m.size).reshape(expected_m.shape).astype(np.float64)
+
+    returned, beyond = counted((share > ABOUT[0]) & (share < ABOUT[1])), counted(share >= ABOUT[1])
+    rays = np.maximum(lidar.columns * SECTOR_DEG / lidar.horizontal_fov_deg - beyond, 0.0)
+    free = (expected_m < CLEAR * blocked_m) & (np.abs(place_m[..., 1]) < HALF_ROAD_M) & (rays > 0)
+    free &= (expected_m > NEAREST_M) & (expected_m < FARTHEST_M)
+    near = free & (expected_m < 2 * NEAREST_M)
+    opened = (returned * near).sum(axis=0) >= OPEN_SHARE * (rays * near).sum(axis=0)
+    free &= opened & near.any(axis=0)
+    height_m = vehicle_T_sensor[2, 3] - road.height_m(vehicle_T_sensor[None, :3, 3])[0]
+    azimuths_deg = np.broadcast_to(middle_deg, expected_m.shape)
+    return GroundRays(
+        expected_m[free],
+        height_m / expected_m[free],
+        rays[free],
+        returned[free],
+        azimuths_deg[free],
+        np.full(np.count_nonzero(free), number, dtype=np.int64),
+    )
+
+
+def _second(range_m: Float64) -> float:
+    return float(np.partition(range_m, 1)[1]) if len(range_m) > 1 else np.inf
+
+
+def _expected(
+    vehicle_T_sensor: Float64, rows_deg: Float64, azimuths_deg: Float64, road: RoadProfile
+) -> tuple[Float64, Float64]:
+    """(rows, sectors) range to the road along each ray, infinite where it meets none, and (rows, sectors, 3) where."""
+    elevation, azimuth = np.deg2rad(rows_deg)[:, None], np.deg2rad(azimuths_deg)[None]
+    flat = np.cos(elevation)
+    towards = np.stack(np.broadcast_arrays(flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)), axis=-1)
+    shape, towards = towards.shape, towards.reshape(-1, 3) @ vehicle_T_sensor[:3, :3].T
+    origin_m = vehicle_T_sensor[:3, 3]
+
+    def above_m(range_m: Float64) -> Float64:
+        points_m = origin_m + towards * range_m[:, None]
+        return np.asarray(points_m[:, 2] - road.height_m(points_m))
+
+    # The road bends little: the first crossing is looked for in steps, then halved down to a millimetre.
+    near_m, far_m = np.full(len(towards), 1.0), np.full(len(towards), np.inf)
+    for range_m in np.geomspace(2.0, 2 * FARTHEST_M, 60):
+        below = np.isinf(far_m) & (above_m(np.full(len(towards), range_m)) <= 0)
+        far_m[below] = range_m
+        near_m[np.isinf(far_m)] = range_m
+    met = np.isfinite(far_m)
+    for _ in range(20):
+        middle_m = np.where(met, (near_m + np.where(met, far_m, 0.0)) / 2, 1.0)
+        is_below = above_m(middle_m) <= 0
+        far_m = np.where(met & is_below, middle_m, far_m)
+        near_m = np.where(met & ~is_below, middle_m, near_m)
+    places_m = origin_m + towards * np.where(met, far_m, 0.0)[:, None]
+    return far_m.reshape(shape[:2]), places_m.reshape(*shape[:2], 3)
+
+
+class ReturnFit(NamedTuple):
+    """Range at 10 % and spread of a LiDAR, from rays to a road.
+
+    Args:
+        range_at_10_percent_m: The likeliest.
+        spread: The likeliest, of ln range.
+        range_error: Standard error of ln of the range.
+        spread_error: Of ln of the spread.
+        fades: Whether the recording tells: twice the range would have left other returns.
+    """
+
+    range_at_10_percent_m: float
+    spread: float
+    range_error: float
+    spread_error: float
+    fades: bool
+
+
+def fit_returns(rays: GroundRays, road: Material) -> ReturnFit:
+    """The likeliest range at 10 % and spread. The rays of a cell meet one spot, and count as one.
+
+    Args:
+        rays: Rays to the road; at least one.
+        road: What the road is made of.
+    """
+    at_one_metre = log_excess(rays.range_m, rays.cos_incidence, road.share, road.incidence_exponent, 1.0)
+    returned = rays.returned / rays.rays
+
+    def surprise(logs: Float64) -> float:
+        """Of logarithms of both."""
+        excess = (at_one_metre + 2 * logs[0]) / np.hypot(2 * np.exp(logs[1]), road.spread)
+        log_seen = np.log(SURE) + log_ndtr(excess)
+        prior = ((logs[1] - np.log(USUAL_SPREAD)) / SPREAD_IS_SURE_TO) ** 2 / 2
+        return float(prior - (returned * log_seen + (1 - returned) * np.log1p(-np.exp(log_seen))).sum())
+
+    # Of rays that all return, any long enough range is as likely: the search begins at a short one.
+    best = minimize(surprise, np.log([rays.range_m.max(), USUAL_SPREAD]), method="Nelder-Mead")
+    twice = minimize_scalar(lambda log_spread: surprise(np.array([best.x[0] + np.log(2.0), log_spread])), (-3.0, -1.0))
+    width = np.eye(2) * CURVATURE_OVER
+    around = [
+        [surprise(best.x + i * one + j * two) for i in (-1, 1) for j in (-1, 1)] for one in width for two in width
+    ]
+    curvature = np.reshape([(a - b - c + d) for a, b, c, d in around], (2, 2)) / (4 * CURVATURE_OVER**2)
+    errors = np.sqrt(np.maximum(np.diag(np.linalg.pinv(curvature, hermitian=True)), 0.0))
+    range_m, spread = np.exp(best.x).tolist()
+    range_error, spread_error = errors.tolist()
+    return ReturnFit(range_m, spread, range_error, spread_error, bool(twice.fun - best.fun > LESS_LIKELY))
+
+
+class LidarCalibration(NamedTuple):
+    """What a recording says of one LiDAR.
+
+    Args:
+        name: Its name in the rig.
+        rays: How many rays pointed at the road.
+        farthest_m: So far away it was seen, at most.
+        fit: What fits best.
+        noise_m: Standard deviation of ranges about the road; NaN where none was seen closely.
+    """
+
+    name: str
+    rays: float
+    farthest_m: float
+    fit: ReturnFit
+    noise_m: float
+
+    @property
+    def words(self) -> str:
+        """It in a line."""
+        fit, seen = self.fit, f"{self.rays:,.0f} rays to a road up to {self.farthest_m:.0f} m away"
+        noise = f"; noise {1e3 * self.noise_m:.1f} mm" if np.isfinite(self.noise_m) else ""
+        if not fit.fades:
+            return (
+                f"{self.name}: {seen} cannot tell how far it sees, for the road hardly fades in them; it takes far "
+                f"road in the open{noise}"
+            )
+        low_m, high_m = fit.range_at_10_percent_m * np.exp([-fit.range_error, fit.range_error])
+        return (
+            f"{self.name}: {fit.range_at_10_percent_m:.0f} m at 10 % ({low_m:.0f} to {high_m:.0f}), spread "
+            f"{fit.spread:.2f} (within a factor of {np.exp(fit.spread_error):.1f}), from {seen}{noise}"
+        )
+
+
+def calibrate(recording: Recording, rig: Rig) -> tuple[Rig, list[LidarCalibration]]:
+    """Fit the LiDARs of a rig to a recording: the range at 10 % and the spread to how the road fades, and the noise.
+
+    The road is taken for dry asphalt, `datasets/materials/road.yaml`.
+
+    Args:
+        recording: What they recorded, on a straight road as far as can be.
+        rig: Where they are mounted and how they scan; sensors of a recording with one LiDAR may be called otherwise.
+
+    Returns:
+        The rig with what was found, and what that is for each LiDAR; where the road never fades, its keys stay.
+
+    Raises:
+        ValueError: No LiDAR of the rig is in the recording, no ray points at a road, or the recording stands still.
+        OSError: A file is missing.
+    """
+    names = _paired(recording, rig)
+    _check_drive(recording)
+    road, found, sensors = Material.load("road"), [], []
+    for sensor in rig.sensors:
+        if not isinstance(sensor, Lidar) or sensor.name not in names:
+            sensors.append(sensor)
+            continue
+        sweeps = [
+            in_vehicle(recording.scan(names[sensor.name], index), recording.body).points_m for index in recording.frames
+        ]
+        told = _calibration(sensor, sweeps, road, str(recording.path))
+        keys = sensor.model_dump(exclude_unset=True)
+        if told.fit.fades:
+            keys |= {
+                "range_at_10_percent_m": round(told.fit.range_at_10_percent_m, 1),
+                "spread": round(told.fit.spread, 3),
+            }
+        if np.isfinite(told.noise_m):
+            keys["range_noise_m"] = round(told.noise_m, 4)
+        sensors.append(Lidar.model_validate(keys))
+        found.append(told)
+    return rig.model_copy(update={"sensors": tuple(sensors)}), found
+
+
+def _paired(recording: Recording, rig: Rig) -> dict[str, str]:
+    """Name of a LiDAR of the rig -> what the recording calls it."""
+    lidars = [sensor.name for sensor in rig.sensors if isinstance(sensor, Lidar)]
+    same = {name: name for name in lidars if name in recording.sensors}
+    if not same and len(lidars) == len(recording.sensors) == 1:
+        return {lidars[0]: recording.sensors[0]}
+    if not same:
+        raise ValueError(
+            f"{recording.path}: no LiDAR of the rig {rig.name!r} is in it; the rig has {', '.join(lidars) or 'none'}, "
+            f"the recording {', '.join(recording.sensors)}"
+        )
+    return same
+
+
+def _check_drive(recording: Recording) -> None:
+    """Refuse several sweeps from one place: they see the same road, and would seem to know more than one does."""
+    frames = list(recording.frames)
+    if not frames:
+        raise ValueError(f"{recording.path}: no sweep in it")
+    poses = [pose for index in frames if (pose := recording.world_T_vehicle(index)) is not None]
+    if len(poses) > 1:
+        way_m = float(np.ptp([pose[:3, 3] for pose in poses], axis=0).max())
+        if way_m < LEAST_WAY_M:
+            raise ValueError(
+                f"{recording.path}: the vehicle stands, {len(poses)} sweeps within {way_m:.2f} m, which see the same "
+                f"road: give one sweep, or a drive of {LEAST_WAY_M:g} m at least"
+            )
+
+
+def _calibration(lidar: Lidar, sweeps: Sequence[NDArray[np.float32]], road: Material, source: str) -> LidarCalibration:
+    rays = ground_rays(sweeps, lidar)
+    if rays.rays.sum() < FEWEST_RAYS:
+        raise ValueError(
+            f"{source}: {lidar.name} has {rays.rays.sum():.0f} rays to an open road {NEAREST_M:g} to {FARTHEST_M:g} m "
+            f"away; {FEWEST_RAYS} are needed: a drive on a straight, level road, and a rig whose mounts are right"
+        )
+    fit = fit_returns(rays, road)
+    noise_m = _noise_m(sweeps, lidar)
+    return LidarCalibration(lidar.name, float(rays.rays.sum()), float(rays.range_m.max()), fit, noise_m)
+
+
+def _noise_m(sweeps: Sequence[NDArray[np.float32]], lidar: Lidar) -> float:
+    """Noise of ranges to near road: second differences of three neighbours in a row are sqrt(6) of it."""
+    off_m, sensor_T_vehicle, rows_deg = [np.empty(0)], invert(lidar.mount.matrix()), np.sort(lidar.rows_deg())
+    step_deg = lidar.horizontal_fov_deg / lidar.columns
+    for sweep in sweeps:
+        points_m = sweep.astype(np.float64)
+        on_road = np.abs(points_m[:, 2] - road_profile(points_m).height_m(points_m)) < OFF_GROUND_M
+        in_sensor_m = transform(sensor_T_vehicle, points_m[on_road & (np.abs(points_m[:, 1]) < HALF_ROAD_M)])
+        range_m, flat_m = np.linalg.norm(in_sensor_m, axis=1), np.hypot(in_sensor_m[:, 0], in_sensor_m[:, 1])
+        row = np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, np.rad2deg(np.arctan2(in_sensor_m[:, 2], flat_m)))
+        azimuth_deg = np.rad2deg(np.arctan2(in_sensor_m[:, 1], in_sensor_m[:, 0]))
+        order = np.lexsort((azimuth_deg, row))
+        row, azimuth_deg, range_m = row[order], azimuth_deg[order], range_m[order]
+        together = (row[2:] == row[:-2]) & (azimuth_deg[2:] - azimuth_deg[:-2] < 2.5 * step_deg)
+        together &= range_m[1:-1] < NOISE_WITHIN_M
+        off_m.append((range_m[:-2] - 2 * range_m[1:-1] + range_m[2:])[together])
+    off = np.concatenate(off_m)
+    return float(np.median(np.abs(off)) / 0.6745 / np.sqrt(6.0)) if len(off) >= FEWEST_RAYS else float("nan")

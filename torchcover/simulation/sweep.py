@@ -1,0 +1,232 @@
+"""What a sensor hits that takes time for its rays, while the vehicle and the bodies around it move.
+
+In the vehicle's own frame the rays stay what they are, and all else moves: what rests by the vehicle's motion undone,
+each body by its own pose as the vehicle sees it. Poses are looked up at three times and interpolated for each ray: that
+costs hardly more than to cast all rays at once.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from torchcover.geometry import invert
+from torchcover.simulation.moving import Meetings, Moving
+from torchcover.simulation.raycaster import Hits, RayCaster, cast_from
+from torchcover.simulation.rays import SLACK_M, Outlines, Tile, outlines, rotate, rotate_each
+
+Float32 = NDArray[np.float32]
+Float64 = NDArray[np.float64]
+Numbers = NDArray[np.int64]
+
+# Poses at the begin, in the middle and at the end: parabolas, off by the cube of what a body turns in the meantime.
+SAMPLES = 3
+
+
+class RayTimes(NamedTuple):
+    """When the rays of a tile are cast, after the frame's time: `at_s` (g,) ascending, `of_ray` (n,) which of these."""
+
+    at_s: Float64
+    of_ray: Numbers
+
+
+class Poses(NamedTuple):
+    """Where everything is: `static_T_vehicle` (4, 4), and `vehicle_T_part` (P, 4, 4) of the bodies that move."""
+
+    static_T_vehicle: Float64
+    vehicle_T_part: Float64
+
+
+# From a time before or after an instant to another, in seconds -> (3,) such times about there, and what is where then.
+Motion = Callable[[float, float], tuple[Float64, Sequence[Poses]]]
+
+
+def no_motion(*_: float) -> tuple[Float64, Sequence[Poses]]:
+    """That of an instant of which no other is known."""
+    return np.zeros(SAMPLES), ()
+
+
+class SweptHits(NamedTuple):
+    """What n rays of a tile hit.
+
+    Args:
+        hits: Of each.
+        directions: (3, n) in the vehicle frame at the frame's time.
+        starts_m: (g, 3) where they start at each of the tile's times, likewise.
+        on_body: (K,) the rays that hit a body that moves, and is not the ego.
+        points: (K, 3) where these points are at the frame's time: they have travelled with their body.
+        casts: How many rays were cast at bodies that move.
+    """
+
+    hits: Hits
+    directions: Float32
+    starts_m: Float32
+    on_body: Numbers
+    points: Float32
+    casts: int
+
+
+@dataclass(frozen=True, eq=False)
+class Sweep:
+    """How everything moves while rays are cast one after the other.
+
+    Args:
+        static: What never moves.
+        now: Where everything is at the frame's time.
+        moving: The bodies that move, as they are then.
+        samples_s: (3,) times after that.
+        static_T_vehicle: (3, 4, 4) at these times.
+        part_T_vehicle: (3, P, 4, 4) likewise.
+        corners_m: (P, 24, 3) of boxes around the bodies at these times, as the vehicle sees them.
+    """
+
+    static: RayCaster
+    now: Poses
+    moving: Moving
+    samples_s: Float64
+    static_T_vehicle: Float64
+    part_T_vehicle: Float64
+    corners_m: Float64
+
+    @classmethod
+    def of(
+        cls,
+        static: RayCaster,
+        now: Poses,
+        moving: Moving,
+        motion: Motion,
+        times: Sequence[RayTimes],
+    ) -> Self | None:
+        """That of a scene from the first ray to the last; None if nothing moves meanwhile.
+
+        Args:
+            static: What never moves.
+            now: Where everything is at the frame's time.
+            moving: The bodies that move, as they are then.
+            motion: Where everything is meanwhile.
+            times: When rays are cast.
+        """
+        ends_s = np.array([edge for each in times if len(each.at_s) for edge in (each.at_s[0], each.at_s[-1])])
+        if len(ends_s) == 0:
+            return None
+        samples_s, poses = motion(float(ends_s.min()), float(ends_s.max()))
+        if all(np.array_equal(one, other) for each in poses for one, other in zip(each, now, strict=True)):
+            return None
+        # Where the boxes are in the vehicle's frame of each time; those of now, moved.
+        part_T_vehicle = np.stack([invert(each.vehicle_T_part) for each in poses])
+        moved = [each.vehicle_T_part @ moving.part_T_vehicle for each in poses]
+        corners_m = np.stack([moving.corners_m @ one[:, :3, :3].swapaxes(1, 2) + one[:, None, :3, 3] for one in moved])
+        bulge_m = SLACK_M + np.abs(np.diff(corners_m, n=2, axis=0)).max(axis=(0, 2, 3), initial=0.0) / 4
+        outwards = np.sign(moving.corners_m - moving.centre_m[:, None]) * bulge_m[:, None, None]
+        static_T_vehicle = np.stack([each.static_T_vehicle for each in poses])
+        return cls(
+            static,
+            now,
+            moving,
+            samples_s,
+            static_T_vehicle,
+            part_T_vehicle,
+            np.concatenate(list(corners_m + outwards), axis=1),
+        )
+
+    def outlines(self, origin_m: Float64) -> Outlines:
+        """The bodies that move, as they look from a place on the vehicle at any of the times."""
+        return outlines(self.corners_m, origin_m)
+
+    def cast(
+        self,
+        vehicle_T_sensor: Float64,
+        tile: Tile,
+        times: RayTimes,
+        limit_m: Float32,
+        bodies: Outlines,
+        ego: int,
+        own_m: Float32 | None,
+    ) -> SweptHits:
+        """Cast the rays of one tile, each at its time.
+
+        Args:
+            vehicle_T_sensor: (4, 4) pose of the sensor.
+            tile: n of its rays.
+            times: When each of them is cast.
+            limit_m: (n,) distance at which each of them ends; finite.
+            bodies: From `outlines`.
+            ego: Number of the ego.
+            own_m: (n,) where the ego's body ends them, if that is known.
+        """
+        origin_m, vehicle_R_sensor, of_ray = vehicle_T_sensor[:3, 3], vehicle_T_sensor[:3, :3], times.of_ray
+        directions = rotate(vehicle_R_sensor, tile.directions)
+        if own_m is not None:
+            limit_m = np.minimum(limit_m, own_m)
+        weights = parabola_weights(self.samples_s, times.at_s)
+        static_T_vehicle = np.tensordot(weights, self.static_T_vehicle, 1)
+        hits = self._cast_at_static(static_T_vehicle, of_ray, origin_m, directions, limit_m)
+        if own_m is not None:
+            hits.body[(hits.body < 0) & (own_m <= limit_m)] = ego
+        leaving_out = ego if own_m is not None else None
+        limits_m = hits.range_m
+        part, ray = self.moving.pairs(vehicle_R_sensor, tile, directions, limits_m, bodies, leaving_out=leaving_out)
+        if len(ray):
+            pair_T_vehicle = self._parts(weights[of_ray[ray]], part)
+            starts_m = (pair_T_vehicle[:, :3, :3] @ origin_m + pair_T_vehicle[:, :3, 3]).astype(np.float32)
+            towards = rotate_each(pair_T_vehicle[:, :3, :3].astype(np.float32), directions.take(ray, axis=1))
+            met = self.moving.cast_pairs(part, starts_m, towards, limits_m[ray])
+            there = met.body >= 0
+            self.moving.nearer(hits, Meetings(part[there], ray[there], met.range_m[there], met.triangle[there]))
+        now_T_vehicle = invert(self.now.static_T_vehicle) @ static_T_vehicle
+        turned = _turned(now_T_vehicle, of_ray, directions)
+        starts_m = (now_T_vehicle[:, :3, :3] @ origin_m + now_T_vehicle[:, :3, 3]).astype(np.float32)
+        on_body = np.flatnonzero((hits.body >= self.static.bodies) & (hits.body != ego))
+        part = np.searchsorted(self.moving.body, hits.body[on_body])
+        there_m = origin_m + (directions[:, on_body] * hits.range_m[on_body]).T
+        on_part_m = _moved(self._parts(weights[of_ray[on_body]], part), there_m)
+        points = _moved(self.now.vehicle_T_part[part], on_part_m).astype(np.float32)
+        return SweptHits(hits, turned, starts_m, on_body, points, len(ray))
+
+    def _cast_at_static(
+        self, static_T_vehicle: Float64, of_ray: Numbers, origin_m: Float64, directions: Float32, limit_m: Float32
+    ) -> Hits:
+        if (self.static_T_vehicle == self.now.static_T_vehicle).all():
+            return cast_from(self.static, self.now.static_T_vehicle, origin_m, directions, limit_m)
+        starts_m = (static_T_vehicle[:, :3, :3] @ origin_m + static_T_vehicle[:, :3, 3]).astype(np.float32)
+        towards = _turned(static_T_vehicle, of_ray, directions)
+        return self.static.cast_from_each(starts_m.take(of_ray, axis=0), towards, limit_m)
+
+    def _parts(self, weights: Float64, part: Numbers) -> Float64:
+        """(K, 4, 4) `part_T_vehicle` of some bodies at times with these weights, (K, 3)."""
+        poses: Float64 = np.einsum("ks,skij->kij", weights, self.part_T_vehicle[:, part])
+        return poses
+
+
+def parabola_weights(samples_s: Float64, times_s: Float64) -> Float64:
+    """(T, 3) how much poses at three times weigh at (T,) others near them: Lagrange's parabola through them.
+
+    Example:
+        >>> parabola_weights(np.array([0.0, 1.0, 2.0]), np.array([0.5])).tolist()
+        [[0.375, 0.75, -0.125]]
+    """
+    a, b, c = samples_s
+    if a == c:
+        return np.tile([1.0, 0.0, 0.0], (len(times_s), 1))
+    from_a, from_b, from_c = times_s - a, times_s - b, times_s - c
+    weights = (
+        from_b * from_c / ((a - b) * (a - c)),
+        from_a * from_c / ((b - a) * (b - c)),
+        from_a * from_b / ((c - a) * (c - b)),
+    )
+    return np.stack(weights, axis=1)
+
+
+def _moved(poses: Float64, places_m: Float64) -> Float64:
+    """(K, 3) places, each moved by its own of (K, 4, 4) poses."""
+    moved: Float64 = (poses[:, :3, :3] @ places_m[:, :, None])[:, :, 0] + poses[:, :3, 3]
+    return moved
+
+
+def _turned(poses: Float64, of_ray: Numbers, directions: Float32) -> Float32:
+    """(3, n) directions, each turned by the pose of its time."""
+    rotations, (x, y, z) = poses[:, :3, :3].astype(np.float32), directions
+    rows = rotations.transpose(1, 2, 0)
+    return np.stack([a.take(of_ray) * x + b.take(of_ray) * y + c.take(of_ray) * z for a, b, c in rows])
