@@ -80,7 +80,7 @@ CASES = (
     Case(
         "P(return) of the same",
         "60 digits (mpmath)",
-        "of P",
+        "absolute",
         1e-13,
         probability_error,
         "a logistic function of the same slope",
