@@ -17,6 +17,7 @@ BENCHMARKS = (
     "urban_throughput",
     "heights",
     "settings",
+    "imperfections",
     "five_rigs",
     "omissions",
     "metric_omissions",

@@ -1,11 +1,14 @@
 """How far from the truth are numbers against a reference that was accumulated from the recording itself?
 
-A drive is simulated with two LiDARs, 0.1 s apart, with 3 cm of noise, poses and tracked boxes. The forward one is
-judged; the other spins. The truth is the measure by area against the surface reference at the same instants. Height
-bands of the recording are over the ground that its sweeps have seen; another table says how far that is from the truth.
+A drive is simulated with two LiDARs, 0.1 s apart, with poses and tracked boxes. The forward one is judged; the other
+spins. The truth is the measure by area against the surface reference at the same instants.
+
+With `--ground`, ranges have noise, and the question is how far the heights above the ground that these sweeps have seen
+are from those of the world, and how far that moves the numbers.
 """
 
 import argparse
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -19,6 +22,7 @@ from torchcover import BevGrid, CoverageMetric, forward_regions
 from torchcover.data import (
     AccumulatedReference,
     RecordedFrames,
+    RegionsOfInterest,
     Scan,
     SimulatedFrames,
     reference_called,
@@ -29,10 +33,9 @@ from torchcover.simulation import Lidar, PaperReference, Rig, Scenario
 EVERY_S = 0.1
 # A ray this near to a point that goes on so far, and by a share of the range, has passed through it.
 BESIDE_M, BEYOND_M, BEYOND = 0.1, 0.5, 0.15
-GRID = BevGrid(x=(0.0, 160.0), y=(-40.0, 40.0), cell=0.25, band_frame="ground")
+GRID = BevGrid(x=(0.0, 160.0), y=(-40.0, 40.0), cell=0.25)
 REGIONS = forward_regions()
-NOISE_M = 0.03
-JUDGED = Rig.load("front_roof_128").sensors[0].model_copy(update={"columns": 900, "range_noise_m": NOISE_M})
+JUDGED = Rig.load("front_roof_128").sensors[0].model_copy(update={"columns": 900})
 OTHER = Lidar(
     name="other",
     channels=64,
@@ -40,11 +43,10 @@ OTHER = Lidar(
     horizontal_fov_deg=360.0,
     columns=1200,
     max_range_m=200.0,
-    range_noise_m=NOISE_M,
     mount={"x_m": -0.8, "z_m": 1.95},
 )
-# What lies so near to the ground is of it; noise takes points below it, where no true height would be known.
-OF_GROUND_M, LIFT_M = 0.1, 0.3
+# With the ground: noise, how near to it points lie on it, and how far up they are lifted, lest noise takes them below.
+NOISE_M, ON_GROUND_M, LIFT_M = 0.03, 0.1, 0.3
 RANGES_M = (0.0, 40.0, 80.0, 160.0)
 MOUNTS = {"judged": JUDGED.mount.matrix(), "other": OTHER.mount.matrix()}
 
@@ -104,24 +106,16 @@ def main():
     parser.add_argument("--scenario", default="urban")
     parser.add_argument("--instants", type=int, default=4, help="each in a city of its own")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--ground", action="store_true")
     parser.add_argument("--hills-m", type=float, help="of a city")
     parser.add_argument("--windows", type=float, nargs="+", default=[1.0, 5.0])
     options = parser.parse_args([] if __name__ != "__main__" else None)
     torch.set_num_threads(1)
-    scenario = Scenario.load(options.scenario)
-    if options.hills_m is not None:
-        hilly = scenario.traffic.model_copy(update={"hills_m": options.hills_m})
-        scenario = scenario.model_copy(update={"traffic": hilly})
-    sweeps = SimulatedFrames(
-        scenario,
-        rigs={sensor.name: Rig(name=sensor.name, sensors=[sensor]) for sensor in (named(JUDGED, "judged"), OTHER)},
-        steps=1_000_000,
-        seed=options.seed,
-        every_s=EVERY_S,
-        reference_sensor=PaperReference(rows=4, columns=4),
-        boxes=True,
-    )
-    surface = sweeps.with_reference_sensor(reference_called())
+    sweeps = drive(options)
+    if options.ground:
+        heights(sweeps, options)
+        return
+    surface = sweeps.with_reference_sensor(reference_called(asked=RegionsOfInterest().around(band_frame="vehicle")))
     references = {"other, 0 s": AccumulatedReference(0.0, sensors=("other",))}
     for window_s in options.windows:
         for sensors in (("other",), ("judged", "other"), ("judged",)):
@@ -132,80 +126,95 @@ def main():
             references[f"judged, other, {longest:g} s{label}"] = AccumulatedReference(longest)
         references[f"judged, other, {longest:g} s{label}, free space"] = FreeSpace(longest, sensors=("judged", "other"))
     truth = metric(square_metres=True)
-    metrics, knowing = ({name: metric() for name in references} for _ in range(2))
-    grounds = {name: Ground() for name in references}
+    metrics = {name: metric() for name in references}
     run_s = sweeps.scenario.traffic.duration_s
     for number in range(options.instants):
         instant = round((number + 0.5) * run_s / EVERY_S)
         true = surface[instant]
-        truth.update(
-            true.clouds["judged"],
-            true.reference,
-            weights=true.reference_weights,
-            height=true.reference_heights_m,
-        )
-        drive = SimulatedDrive(sweeps, instant, longest)
+        truth.update(true.clouds["judged"], true.reference, weights=true.reference_weights)
+        recording = SimulatedDrive(sweeps, instant, longest)
         for name, reference in references.items():
-            drive.labelled = "labelled" not in name
-            (frame,) = RecordedFrames(drive, reference=reference)
-            metrics[name].update(frame.sensor, frame.reference, height=frame.reference_heights_m)
-            true_m = true_heights_m(sweeps, instant, frame.reference.numpy())
-            knowing[name].update(frame.sensor, frame.reference, height=torch.from_numpy(true_m))
-            grounds[name].add(frame.reference.numpy(), frame.reference_heights_m.numpy(), true_m)
-    found, known = ({name: each.compute() for name, each in of.items()} for of in (metrics, knowing))
-    report(truth.compute(), found)
+            recording.labelled = "labelled" not in name
+            (frame,) = RecordedFrames(recording, reference=reference)
+            metrics[name].update(frame.sensor, frame.reference)
+    report(truth.compute(), {name: each.compute() for name, each in metrics.items()})
+
+
+def drive(options):
+    """The sweeps of both LiDARs."""
+    scenario, noise_m = Scenario.load(options.scenario), NOISE_M if options.ground else 0.0
+    if options.hills_m is not None:
+        hilly = scenario.traffic.model_copy(update={"hills_m": options.hills_m})
+        scenario = scenario.model_copy(update={"traffic": hilly})
+    lidars = (named(sensor, name, range_noise_m=noise_m) for sensor, name in ((JUDGED, "judged"), (OTHER, "other")))
+    return SimulatedFrames(
+        scenario,
+        rigs={sensor.name: Rig(name=sensor.name, sensors=[sensor]) for sensor in lidars},
+        steps=1_000_000,
+        seed=options.seed,
+        every_s=EVERY_S,
+        reference_sensor=PaperReference(rows=4, columns=4),
+        boxes=True,
+    )
+
+
+def heights(sweeps, options):
+    """Print how far heights are from the truth by range, and numbers with them from those with the true ones."""
+    grid, rows, moves = replace(GRID, band_frame="ground"), [], []
+    references = {"the instant": (0.0, ("other",), True)}
+    for window_s in options.windows:
+        references[f"{window_s:g} s"] = window_s, ("judged", "other"), True
+    references[f"{options.windows[-1]:g} s, nothing labelled"] = options.windows[-1], ("judged", "other"), False
+    instants = [
+        round((number + 0.5) * sweeps.scenario.traffic.duration_s / EVERY_S) for number in range(options.instants)
+    ]
+    for name, (window_s, sensors, labelled) in references.items():
+        found, known = (CoverageMetric(grid, max_radius=grid.diagonal_m) for _ in range(2))
+        seen = []
+        for instant in instants:
+            recording = SimulatedDrive(sweeps, instant, window_s, labelled=labelled)
+            frames = RecordedFrames(recording, reference=AccumulatedReference(window_s, sensors=sensors))
+            (frame,) = frames
+            true_m = true_heights_m(sweeps, instant, frame.reference.numpy().astype(np.float64))
+            for metric_of, heights_m in ((found, frame.reference_heights_m), (known, torch.from_numpy(true_m))):
+                metric_of.update(frame.sensor, frame.reference, height=heights_m)
+            range_m = torch.linalg.vector_norm(frame.reference[:, :2], dim=1).numpy()
+            seen.append(np.stack([range_m, frame.reference_heights_m.numpy(), true_m]))
+        rows += [(name, *row) for row in by_range(*np.concatenate(seen, axis=1), grid)]
+        one, other = (numbers(of.compute(), "known") for of in (found, known))
+        apart = np.stack([100 * (one[:, 1] - other[:, 1]), 100 * (one[:, 0] / other[:, 0] - 1)], axis=1)
+        moves.append((name, *(f"{points:+.2f} / {share:+.1f}" for points, share in apart)))
+    on, above = ("known on the ground (%)", "rms (cm)"), ("known above it (%)", "rms (cm)")
+    table(("reference", "range", *on, *above, "ground in a wrong band (%)", "obstacles in a wrong band (%)"), rows)
     print()
-    report_ground(grounds, found, known)
+    table(("reference", *(f"{region.name} {height}" for region in REGIONS for height in GRID.heights)), moves)
 
 
 def true_heights_m(sweeps, instant, points_m):
-    """(N,) above the ground of the world."""
+    """(N,) of points in the vehicle frame above the ground of the world."""
     scene, step = sweeps.simulator.scene_of(instant)
-    placed_m = transform(scene.world.ego.trajectory.at(step * scene.world.time_step_s), points_m.astype(np.float64))
+    placed_m = transform(scene.world.ego.trajectory.at(step * scene.world.time_step_s), points_m)
     return scene.ground.heights_m(placed_m + np.array([0.0, 0.0, LIFT_M]), np.eye(4)) - np.float32(LIFT_M)
 
 
-class Ground:
-    """How far modelled heights are from the truth, by range."""
-
-    def __init__(self):
-        self.seen = []
-
-    def add(self, points_m, found_m, true_m):
-        self.seen.append(np.stack([np.hypot(*points_m[:, :2].T), found_m, true_m]))
-
-    def rows(self):
-        """Range, and of what lies on the ground the share with a height and the rms; shares in a wrong band."""
-        range_m, found_m, true_m = np.concatenate(self.seen, axis=1)
-        edges_m = [edge for _, edge in GRID.heights.values()]
-        band, true_band = (np.digitize(of, [-0.5, *edges_m]) for of in (found_m, true_m))
-        for near_m, far_m in pairwise(RANGES_M):
-            here = (range_m >= near_m) & (range_m < far_m)
-            known, ground = here & np.isfinite(found_m), here & (np.abs(true_m) < OF_GROUND_M)
-            off_m, above = (found_m - true_m), here & (true_m >= OF_GROUND_M)
-            shares = [f"{100 * np.isfinite(found_m[of]).mean():.1f}" for of in (ground, above)]
-            rms = [f"{100 * np.sqrt((off_m[known & of] ** 2).mean()):.1f}" for of in (ground, above)]
-            wrong = [f"{100 * (band != true_band)[known & (true_band == number)].mean():.2f}" for number in (1, 2)]
-            yield f"{near_m:g} to {far_m:g} m", shares[0], rms[0], shares[1], rms[1], *wrong
+def by_range(range_m, found_m, true_m, grid):
+    """Range; of what lies on the ground, and above it, the share with a height and the rms; shares in a wrong band."""
+    edges_m = [-0.5, *(edge for _, edge in grid.heights.values())]
+    band, true_band = (np.digitize(of, edges_m) for of in (found_m, true_m))
+    for near_m, far_m in pairwise(RANGES_M):
+        here = (range_m >= near_m) & (range_m < far_m)
+        row = [f"{near_m:g} to {far_m:g} m"]
+        for of in (here & (np.abs(true_m) < ON_GROUND_M), here & (true_m >= ON_GROUND_M)):
+            rms_m = np.sqrt(np.nanmean((found_m[of] - true_m[of]) ** 2))
+            row += [f"{100 * np.isfinite(found_m[of]).mean():.1f}", f"{100 * rms_m:.1f}"]
+        for number in (1, 2):
+            of = here & np.isfinite(found_m) & (true_band == number)
+            row.append(f"{100 * (band != true_band)[of].mean():.2f}")
+        yield row
 
 
-def report_ground(grounds, found, known):
-    heading = ("on the ground: known (%)", "rms (cm)", "above it: known (%)", "rms (cm)")
-    own = {name: ground for name, ground in grounds.items() if "free space" not in name}
-    rows = [(name, *row) for name, ground in own.items() for row in ground.rows()]
-    table(("reference", "range", *heading, "ground in a wrong band (%)", "obstacles in a wrong band (%)"), rows)
-    print()
-    rows = []
-    for name in own:
-        one, other = numbers(found[name], "known"), numbers(known[name], "known")
-        moves = np.stack([100 * (one[:, 1] - other[:, 1]), 100 * (one[:, 0] / other[:, 0] - 1)], axis=1)
-        rows.append((name, *(f"{points:+.2f} / {share:+.1f}" for points, share in moves)))
-    strata = (f"{region.name} {height}" for region in REGIONS for height in GRID.heights)
-    table(("reference, modelled less true heights", *strata), rows)
-
-
-def named(sensor, name):
-    return sensor.model_copy(update={"name": name})
+def named(sensor, name, **more):
+    return sensor.model_copy(update={"name": name, **more})
 
 
 def metric(**options):

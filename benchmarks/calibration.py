@@ -1,210 +1,296 @@
-"""Do 95 % intervals cover? Runs are put together from simulated cities, again and again, and asked for the mean of all.
+"""Do 95 % intervals cover, and are they no wider than needed? Runs are put together from simulated cities.
 
 Each run draws cities at random, with replacement, and goes through the six steps of each, 10 s apart, as an evaluation
-does. The truth is the number over all the cities; what is counted is how often the interval of a run holds it:
-of the twelve numbers of the regions at several lengths, of cells, and of runs that a target error has ended.
+does. The truth is the number over all the cities; what is counted is how often the interval of a run holds it, and how
+wide it is next to the range that holds the numbers of 95 % of the runs. Then how near to the steps that are needed runs
+with a target error end, and studies say that they would.
 """
 
 import argparse
-import math
-from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import torch
 
 from benchmarks.timing import table
 from torchcover import forward_regions, nearest
-from torchcover.coverage import BevGrid, MeanOfMeans
-from torchcover.coverage.binning import mean_per_cell
-from torchcover.data import SimulatedFrames
-from torchcover.estimation import Estimate, ratio_errors, student
-from torchcover.evaluation.measuring import BLOCKS
-from torchcover.evaluation.target_error import LOOKS_IN_A_ROW, MAX_GROWTH, MIN_GROWTH, MIN_STEPS
-from torchcover.simulation.regions_of_interest import GRID_X_M, GRID_Y_M
+from torchcover.coverage.quantity import RADIUS, detection, seen_by_two, sensors_seeing
+from torchcover.estimation import ErrorModel, Estimate
+from torchcover.evaluation import Settings, TargetError, TargetWatch
+from torchcover.evaluation.task import simulation
 
-RIG, EVERY_S = "front_roof_128", 10.0
-GRID = BevGrid(x=GRID_X_M, y=GRID_Y_M, cell=0.25, band_frame="ground")
-REGIONS = forward_regions()
-PLACES = [(region, height) for region in REGIONS for height in GRID.heights]
-ALL = range(len(PLACES))
-QUANTITIES = MeanOfMeans((0.4,)).quantities
-NAMES = [f"{region.name} {height} {what}" for region, height in PLACES for what in ("radius", "detection")]
-# A cell has a truth if so many cities have probed it.
-CITIES_OF_A_CELL = 20
+SCENARIOS = {"urban": 110, "highway": 70, "sumo_random": 66, "parking": 70}
+RIGS = ("front_roof_128", "front_grille_128")
+THRESHOLD_M, STEPS_OF_A_CITY, LENGTHS = 0.4, 6, (64, 256)
+# What is summed up of each point, each as one rig has it, or both as one.
+VALUES = [*((rig, what) for rig in ("roof", "grille", "both") for what in (RADIUS, detection(THRESHOLD_M))),
+          ("both", sensors_seeing(THRESHOLD_M)), ("both", seen_by_two(THRESHOLD_M))]  # fmt: skip
+# A rig against another: roof and grille as a comparison has them, each against both as a sensor that fails.
+DIFFERENCES = {"difference": [("grille", "roof")], "loss": [("roof", "both"), ("grille", "both")]}
+# Where one city has more than this of the variance, it alone decides about the truth.
+ONE_CITY = 1 / 3
+TARGET = 0.01
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenario", default="urban")
-    parser.add_argument("--seed", type=int, default=77)
-    parser.add_argument("--steps", type=int, default=720, help="steps to simulate, six a city")
+    parser.add_argument("--seed", type=int, default=77, help="of the cities")
+    parser.add_argument("--draw", type=int, default=5, help="seed of the runs")
     parser.add_argument("--runs", type=int, default=1000)
-    parser.add_argument("--sums", type=Path, help="simulated if missing (out/calibration_SCENARIO_SEED_STEPS.npz)")
-    parser.add_argument("--blind-side", type=float, default=student.BLIND_SIDE, help="to try another factor")
     options = parser.parse_args([] if __name__ != "__main__" else None)
-    student.BLIND_SIDE = options.blind_side
-    name = f"calibration_{options.scenario}_{options.seed}_{options.steps}.npz"
-    path = options.sums or Path("out") / name
-    if not path.is_file():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        halves = [range(options.steps // 2), range(options.steps // 2, options.steps)]
-        with ProcessPoolExecutor(2) as pool:
-            parts = list(pool.map(simulated, halves, [options.scenario] * 2, [options.seed] * 2))
-        np.savez(path, **{name: np.concatenate([part[name] for part in parts]) for name in parts[0]})
-    with np.load(path) as sums:
-        cities = Cities(**sums)
-    random = np.random.default_rng(0)
-    print(
-        f"{len(cities.steps)} cities of {options.scenario}, {RIG}; of {options.runs} runs, how many intervals cover\n"
+    pools = {name: Cities.of(name, cities, options.seed) for name, cities in SCENARIOS.items()}
+    apart = []
+    for steps in LENGTHS:
+        found = [
+            (name, *row)
+            for name, pool in pools.items()
+            for row in pool.judged(np.random.default_rng(options.draw), steps, options.runs)
+        ]
+        apart += [(steps, *row) for row in found if row[3] > ONE_CITY]
+        judged = [row for row in found if row[3] <= ONE_CITY]
+        print(f"\nRuns of {steps} steps:\n")
+        table(
+            ("scenario", "what", "rows", "with intervals", "covered, mean", "worst", "which", "width, mean", "widest"),
+            [
+                _summary(name, kind, judged)
+                for name in (*pools, "all")
+                for kind in dict.fromkeys(row[1] for row in judged)
+            ],
+        )
+    print("\nRows of which one city has more than a third of the variance:\n")
+    table(
+        ("steps", "scenario", "row", "its share", "covered", "width"),
+        [(steps, name, what, round(top, 2), *_told(rest)) for steps, name, _, what, top, *rest in apart if rest[0]],
     )
-    lengths = {f"{steps} steps": cities.covered(random, steps, options.runs) for steps in (64, 256, 1024)}
-    stopped = {
-        f"stopped, target as at {steps}": cities.stopped(random, steps, options.runs // 4) for steps in (96, 192)
-    }
-    columns = lengths | stopped
-    rows = [(name, *(f"{share[at]:.3f}" for share in columns.values())) for at, name in enumerate(NAMES)]
-    rows += [(f"**{f.__name__}**", *(f"{f(share):.3f}" for share in columns.values())) for f in (np.mean, np.min)]
-    table(("number", *columns), rows)
-    print("\nCells of 0.25 m, number +- two errors:\n")
-    kinds = [(measure, steps) for measure in ("area", "known") for steps in (64, 256)]
-    rows = [(*kind, *cities.covered_cells(random, *kind, runs=10)) for kind in kinds]
-    table(("measure", "steps", "cells with an error", "radius", "detection", "errors of 0"), rows)
+    print(f"\nEvery detection in front to {100 * TARGET:g} point:\n")
+    table(
+        ("scenario", "steps needed", "by", "stopped at, 5 / 50 / 95 %", "within 0.8 to 1.3", "studied, 5 / 50 / 95 %",
+         "within 1.3 of their median"),
+        [(name, *pool.stopped(np.random.default_rng(options.draw))) for name, pool in pools.items()],
+    )  # fmt: skip
 
 
-def simulated(steps, scenario, seed):
-    """The sums of some steps: over each region and band, and the means of each cell."""
+def _summary(name, kind, judged):
+    rows = [row for row in judged if name in ("all", row[0]) and row[1] == kind]
+    known = [row for row in rows if row[4]]
+    covered, widths = np.array([row[4:6] for row in known]).T
+    worst = known[int(covered.argmin())]
+    where = worst[2] if name != "all" else f"{worst[0]}: {worst[2]}"
+    each = (f"{number:.3f}" for number in (covered.mean(), covered.min()))
+    return name, kind, len(rows), len(known), *each, where, f"{widths.mean():.2f}", f"{widths.max():.2f}"
+
+
+def _told(rest):
+    return f"{rest[0]:.3f}", f"{rest[1]:.2f}"
+
+
+def simulated(scenario, cities, seed):
+    """(n,) city and (n, P, 1 + V) square metres of each place, and those times each value, of each step."""
     torch.set_num_threads(1)
-    frames = SimulatedFrames(scenario, RIG, steps=steps.stop, seed=seed, every_s=EVERY_S)
-    city, over_regions, cells = [], [], []
-    for index in steps:
-        frame = frames[index]
-        height, m2 = frame.reference_heights_m, frame.reference_weights.double()
-        points = torch.cat([frame.reference[:, :2], height[:, None]], dim=1).double()
-        radius = nearest(frame.reference, frame.sensor, max_distance=GRID.diagonal_m).distance.double()
-        each = torch.stack([radius.clamp(max=GRID.diagonal_m), (radius <= 0.4).double()])
+    steps = STEPS_OF_A_CITY * cities + 1
+    task = simulation(Settings(RIGS, scenario, steps=steps, seed=seed, band_frame="ground"))
+    places = [(region, band) for region in task.asked.regions for band in task.asked.grid.heights.values()]
+    city, sums = [], []
+    for index in range(steps):
+        frame = task.frames[index]
+        points, m2, height = frame.reference.double(), frame.reference_weights.double(), frame.reference_heights_m
+        clouds, most = (frame.clouds[rig] for rig in RIGS), task.asked.grid.diagonal_m
+        radii = torch.stack([nearest(frame.reference, cloud, max_distance=most).distance for cloud in clouds])
+        radii = radii.double().clamp(max=most)
+        seen = radii <= THRESHOLD_M
+        both = radii.amin(dim=0)
+        rows = [torch.ones_like(m2), radii[0], seen[0], radii[1], seen[1], both, both <= THRESHOLD_M]
+        values = m2 * torch.stack([row.double() for row in (*rows, seen.sum(dim=0), seen.sum(dim=0) >= 2)])
         city.append(frame.place_in_time)
-        over_regions.append([_sums(points, m2, each, *place) for place in PLACES])
-        cell = GRID.cell_of(frame.reference, height)
-        inside = cell >= 0
-        means = mean_per_cell(cell[inside], each[:, inside], GRID.cells, m2[inside])
-        seen_m2 = torch.bincount(cell[inside], m2[inside], minlength=GRID.cells)[means.cell]
-        cells.append(np.column_stack([np.full(len(means.cell), index), means.cell, seen_m2, *means.mean]))
-    return {"city": np.array(city), "over_regions": np.array(over_regions), "cells": np.concatenate(cells)}
+        sums.append([_within(points, height, values, *place) for place in places])
+    names = [f"{region.name} {height}" for region in task.asked.regions for height in task.asked.grid.heights]
+    return {"city": np.array(city), "S": np.array(sums), "places": np.array(names)}
 
 
-def _sums(points, m2, each, region, height):
-    """Square metres, and the sums of radius and detection over them."""
-    x, y, z = points.T
-    inside = torch.ones_like(x, dtype=torch.bool)
-    for along, (low, high) in ((x, region.x), (y, region.y), (z, GRID.heights[height])):
+def _within(points, height, values, region, band):
+    inside = torch.ones(len(points), dtype=torch.bool)
+    for along, (low, high) in ((points[:, 0], region.x), (points[:, 1], region.y), (height, band)):
         inside &= (along >= low) & (along < high)
-    return [float(m2[inside].sum()), *(each[:, inside] * m2[inside]).sum(dim=1).tolist()]
+    return values[:, inside].sum(dim=1).tolist()
 
 
 class Cities:
-    """The sums of simulated steps, city by city.
+    """The sums of simulated steps, city by city, (C, 6, P, 1 + V)."""
 
-    Args:
-        city: (n,) city of each step.
-        over_regions: (n, 6, 3) square metres, and the sums of radius and detection.
-        cells: (k, 5) step, cell, square metres, mean radius and mean detection of what was probed.
-    """
+    def __init__(self, sums, places):
+        self.sums, self.places = torch.from_numpy(sums), places
+        self.names = [f"{place} {rig} {what.key}" for rig, what in VALUES for place in places]
+        self.whole = self.over_all()
 
-    def __init__(self, city, over_regions, cells):
-        self.over_regions = torch.from_numpy(over_regions)
-        steps = [np.flatnonzero(city == one) for one in np.unique(city)]
-        self.steps = [one for one in steps if len(one) >= 6]
-        all_of_them = self.over_regions[np.concatenate(self.steps)].sum(dim=0)
-        self.truth = (all_of_them[:, 1:] / all_of_them[:, :1]).flatten().tolist()
-        self._index_cells(city, cells)
+    @classmethod
+    def of(cls, scenario, cities, seed):
+        """Those of a file in `out/`, which is simulated if missing."""
+        path = Path("out") / f"calibration_{scenario}_{seed}_{cities}.npz"
+        if not path.is_file():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.savez(path, **simulated(scenario, cities, seed))
+        with np.load(path) as file:
+            steps = [np.flatnonzero(file["city"] == one)[:STEPS_OF_A_CITY] for one in np.unique(file["city"])]
+            whole = np.array([one for one in steps if len(one) == STEPS_OF_A_CITY])
+            return cls(file["S"][whole], [str(name) for name in file["places"]])
 
-    def _index_cells(self, city, cells):
-        """Keep the cells that enough cities have probed, and number them."""
-        pairs = np.unique(np.column_stack([city[cells[:, 0].astype(int)], cells[:, 1]]), axis=0)
-        known, probed_by = np.unique(pairs[:, 1], return_counts=True)
-        known = known[probed_by >= CITIES_OF_A_CELL]
-        cells = cells[np.isin(cells[:, 1], known) & np.isin(cells[:, 0], np.concatenate(self.steps))]
-        at = cells[:, 0].astype(int), slice(None), np.searchsorted(known, cells[:, 1])
-        # By measure: what the ratio is over, radius and detection.
-        self.cell_sums = {name: np.zeros((len(city), 3, len(known)), dtype=np.float32) for name in ("area", "known")}
-        self.cell_sums["area"][at] = cells[:, 2:3] * np.column_stack([np.ones(len(cells)), cells[:, 3:]])
-        self.cell_sums["known"][at] = np.column_stack([np.ones(len(cells)), cells[:, 3:]])
+    def over_all(self, every=1):
+        """What all cities say, by so many of their steps."""
+        of_city = self.sums[:, ::every]
+        return self.estimate(of_city.sum(dim=1)[None], torch.full((len(of_city),), of_city.shape[1]))
 
-    def drawn(self, random, steps):
-        """The blocks of a run: steps of whole cities, as a metric with 16 blocks has them."""
-        cities = [self.steps[one] for one in random.integers(len(self.steps), size=steps // 6 + 1)]
-        cities = np.split(np.concatenate(cities)[:steps], np.cumsum([len(city) for city in cities])[:-1])
-        cities = [city for city in cities if len(city)]
-        length = 2 ** max(0, math.ceil(math.log2(len(cities) / BLOCKS)))
-        return [np.concatenate(cities[at : at + length]) for at in range(0, len(cities), length)]
+    def drawn(self, random, steps, runs=1, every=1):
+        """What runs say, as one estimate: whole cities, the last one as far as the steps go."""
+        of_city = self.sums[:, ::every]
+        cities, rest = divmod(steps, of_city.shape[1])
+        chosen = random.integers(len(of_city), size=(runs, cities + (rest > 0)))
+        sums, lengths = of_city.sum(dim=1)[chosen], torch.full((chosen.shape[1],), of_city.shape[1])
+        if rest:
+            sums[:, -1], lengths[-1] = of_city[:, :rest].sum(dim=1)[chosen[:, -1]], rest
+        return self.estimate(sums, lengths)
 
-    def numbers(self, blocks, places=ALL):
-        """Value, error and degrees of freedom of the radius and detection of each place."""
-        sums = torch.stack([self.over_regions[block].sum(dim=0) for block in blocks])
-        lengths = torch.tensor([len(block) for block in blocks])
-        found = []
-        for at in places:
-            estimate = Estimate.of_ratios(QUANTITIES, sums[:, at, 0], sums[:, at, 1:], lengths)
-            found += zip(estimate.value.tolist(), estimate.error.tolist(), strict=True)
-        return [(value, error, len(blocks) - 1) for value, error in found]
+    def estimate(self, sums, lengths):
+        """Of (R, g, P, 1 + V) sums all R runs, V values and P places, in this order."""
+        each = sums[..., 1:].movedim(-1, 2).movedim(1, 0)
+        base = sums[..., 0].movedim(1, 0)[:, :, None].expand_as(each)
+        quantities = [
+            what._replace(key=f"{run} {rig} {place} {what.key}")
+            for run in range(len(sums))
+            for rig, what in VALUES
+            for place in self.places
+        ]
+        return Estimate.of_ratios(quantities, base.flatten(1), each.flatten(1), lengths)
 
-    def covers(self, number, at):
-        """Whether the interval around a number holds the truth."""
-        low, high = student.interval95(*number, QUANTITIES[at % 2])
-        return low <= self.truth[at] <= high
+    def judged(self, random, steps, runs):
+        """Kind, name, share of one city, share of intervals that cover (0: most runs have none), relative width."""
+        # As a search tests its winner: in 16 fresh worlds, three instants in each.
+        for gain, many, every in (("", steps, 1), ("gain", 48, 2))[: 1 + (steps == LENGTHS[0])]:
+            whole, found = self.over_all(every), self._rows(self.drawn(random, many, runs, every))
+            truths = self._rows(whole)
+            tops = self._rows(replace(whole, left_out=whole.left_out - whole.value), _share_of_one_city)
+            for (kind, name), each in found.items():
+                if not gain or kind == "difference":
+                    yield gain or kind, name, float(tops[kind, name][0]), *_covered(each, truths[kind, name][0, 0])
 
-    def covered(self, random, steps, runs):
-        """(12,) shares of the intervals that cover."""
-        found = [self.numbers(self.drawn(random, steps)) for _ in range(runs)]
-        return np.mean([[self.covers(number, at) for at, number in enumerate(run)] for run in found], axis=0)
+    def _rows(self, estimate, told=None):
+        """(Kind, name) -> (R, 3) value, low, high; or what is told of an estimate, (R,)."""
+        told = told or _ends_of
+        found = {}
+        each = told(estimate, None)
+        each = each.reshape(-1, len(self.names), *each.shape[1:])
+        found |= {("number", name): each[:, at] for at, name in enumerate(self.names)}
+        for kind, pairs in DIFFERENCES.items():
+            for first, second in pairs:
+                for what in (0, 1):
+                    one, other = (self.part(estimate, rig, what) for rig in (first, second))
+                    each = told(one, other)
+                    each = each.reshape(-1, len(self.places), *each.shape[1:])
+                    names = (f"{place} {first} {VALUES[what][1].key}, less {second}" for place in self.places)
+                    found |= {(kind, name): each[:, at] for at, name in enumerate(names)}
+        return found
 
-    def stopped(self, random, steps, runs):
-        """(12,) as `covered`, of runs that ended when this number alone had the error of so many steps."""
-        errors = [[error for _, error, _ in self.numbers(self.drawn(random, steps))] for _ in range(runs)]
-        targets = np.sqrt(np.square(errors).mean(axis=0))
-        return np.array([np.mean([self._stops(random, *one) for _ in range(runs)]) for one in enumerate(targets)])
+    def part(self, estimate, rig, what):
+        """The radius (0) or the detection (1) of a rig, of all runs and places."""
+        places = len(self.places)
+        start = (2 * ("roof", "grille", "both").index(rig) + what) * places
+        runs = np.arange(len(estimate.value) // len(self.names)) * len(self.names)
+        at = (runs[:, None] + start + np.arange(places)).ravel()
+        quantities = [estimate.quantities[one]._replace(key=str(one - start)) for one in at]
+        return Estimate(
+            tuple(quantities),
+            estimate.value[at],
+            estimate.left_out[:, at],
+            estimate.steps,
+            None,
+            estimate.effective[at],
+        )
 
-    def _stops(self, random, at, target, most=1536):
-        """Whether the interval of a number covers when its error has made the run end, as `TargetWatch` does."""
-        order = random.integers(len(self.steps), size=most // 6)
-        steps, good = MIN_STEPS, 0
-        while True:
-            number = self.numbers(self.drawn(_Replay(order), steps), [at // 2])[at % 2]
-            error = number[1]
-            good = good + 1 if error <= target else 0
-            if good == LOOKS_IN_A_ROW or steps == most:
-                return self.covers(number, at)
-            needed = steps * max(1.0, error / target) ** 2
-            steps = min(most, math.ceil(min(max(needed, MIN_GROWTH * steps), MAX_GROWTH * steps)))
-
-    def covered_cells(self, random, measure, steps, runs):
-        """How many cells had an error, and how many of their radii and detections two errors cover; errors of 0."""
-        cells, covered, zero = 0, np.zeros(2), 0
-        of_steps = self.cell_sums[measure]
-        total = torch.from_numpy(of_steps.sum(axis=0, dtype=np.float64))
-        for _ in range(runs):
-            drawn = self.drawn(random, steps)
-            sums = torch.from_numpy(np.stack([of_steps[block].sum(axis=0, dtype=np.float64) for block in drawn]))
-            for at, quantity in enumerate(QUANTITIES, 1):
-                error = ratio_errors(sums[:, 0], sums[:, at], quantity.unit)
-                ratio = sums[:, at].sum(dim=0) / sums[:, 0].sum(dim=0)
-                known = error.isfinite()
-                holds = (ratio - total[at] / total[0]).abs()[known] <= 2 * error[known]
-                covered[at - 1] += int(holds.sum())
-                zero += int((error == 0).sum())
-            cells += int(known.sum())
-        return cells, *(f"{share:.3f}" for share in covered / cells), zero
+    def stopped(self, random, runs=100, studies=50, studied=512):
+        """Steps that the target needs, by which number; where runs stopped, and what studies named."""
+        six = range(2 * len(forward_regions()))
+        whole = self.part(self.whole, "roof", 1)
+        models = [ErrorModel.of(float(whole.error[at]), STEPS_OF_A_CITY * len(self.sums)) for at in six]
+        needed = [model.steps_for(TARGET) for model in models]
+        most = max(needed)
+        ends = np.array([Replay(self, random, 4 * most).stops() for _ in range(runs)])
+        named = []
+        for _ in range(studies):
+            run = self.part(self.drawn(random, studied), "roof", 1)
+            named.append(max(ErrorModel.of(float(run.error[at]), studied).steps_for(TARGET) for at in six))
+        ratio = np.array(named) / np.median(named)
+        near = np.mean((ratio < 1.3) & (ratio > 1 / 1.3))
+        good = np.mean((ends >= 0.8 * most) & (ends <= 1.3 * most))
+        return most, self.places[int(np.argmax(needed))], _ends(ends), f"{good:.2f}", _ends(named), f"{near:.2f}"
 
 
-class _Replay:
-    """Draws what was drawn before, for a run that grows."""
+class Replay:
+    """A run that grows, as `TargetWatch` looks at it: its coverage of the regions in front."""
 
-    def __init__(self, order):
-        self.order = order
+    def __init__(self, pool, random, most):
+        self.pool, self.grid = pool, SimpleNamespace(heights=("ground", "obstacle"))
+        self.order = random.integers(len(pool.sums), size=-(-most // STEPS_OF_A_CITY))
+        self.most, self.counts, self.quantities = most, {"steps": 0}, (RADIUS, detection(THRESHOLD_M))
 
-    def integers(self, _, size):
-        return self.order[:size]
+    def stops(self):
+        """After how many steps."""
+        watch = TargetWatch(TargetError(detection=TARGET), {"roof": self}, forward_regions())
+        while self.counts["steps"] < self.most:
+            self.counts["steps"] = watch.next_look
+            if watch.is_reached(watch.next_look):
+                break
+        return self.counts["steps"]
+
+    def compute(self):
+        """Itself, with what the steps so far say."""
+        cities, rest = divmod(min(self.counts["steps"], self.most), STEPS_OF_A_CITY)
+        parts = self.pool.sums[self.order[: cities + (rest > 0)]].clone()
+        lengths = torch.full((len(parts),), STEPS_OF_A_CITY)
+        if rest:
+            parts[-1, rest:] = 0.0
+            lengths[-1] = rest
+        blocks, block = parts.sum(dim=1), torch.arange(len(parts)) // (1 + len(parts) // 256)
+        whole = blocks.new_zeros((int(block[-1]) + 1, *blocks.shape[1:])).index_add_(0, block, blocks)
+        steps = lengths.new_zeros(len(whole)).index_add_(0, block, lengths)
+        self.found = self.pool.estimate(whole[None], steps)
+        return self
+
+    def estimate(self, region, height):
+        """As `Coverage.estimate`."""
+        at = self.pool.places.index(f"{region.name} {height}")
+        return Estimate(
+            self.quantities,
+            *(one[..., [at, len(self.pool.places) + at]] for one in (self.found.value, self.found.left_out)),
+            self.found.steps,
+        )
+
+
+def _ends_of(estimate, other):
+    """(N, 3) values and ends of numbers, or of differences to others."""
+    found = estimate.numbers() if other is None else estimate.differences(other)
+    return np.array([(one.value, one.low, one.high) for one in found.values()])
+
+
+def _share_of_one_city(estimate, other):
+    """(N,) the largest share that a city has of the variance."""
+    parts = (estimate.left_out - (0.0 if other is None else other.left_out)).numpy()
+    squares = np.square(parts - parts.mean(axis=0))
+    return squares.max(axis=0) / squares.sum(axis=0)
+
+
+def _covered(each, truth):
+    """Of (R, 3) values and ends: how many intervals hold the truth, and their mean width by what is needed."""
+    known = np.isfinite(each[:, 1])
+    if known.mean() < 0.5:
+        return 0.0, 0.0
+    low, high = each[known, 1], each[known, 2]
+    needed = np.subtract(*np.quantile(each[:, 0], (0.975, 0.025)))
+    return float(np.mean((low <= truth) & (truth <= high))), float(np.mean(high - low) / needed)
+
+
+def _ends(numbers):
+    return " / ".join(f"{number:.0f}" for number in np.quantile(numbers, (0.05, 0.5, 0.95)))
 
 
 if __name__ == "__main__":

@@ -29,9 +29,8 @@ def gains(result):
         for gain in pick.gains:
             places = ", ".join(f"{value:.2f}" for value in pick.evaluation.values.values())
             test = gain.test
-            fresh = f"{100 * test.gain:+.2f} ± {100 * test.error:.2f}"
-            better = f"{test.better} of {test.blocks}"
-            yield pick.arm, gain.estimate, places, f"{100 * gain.search_gain:+.2f}", fresh, f"{gain.t:.1f}", better
+            searched, better = f"{100 * gain.search_gain:+.2f}", f"{test.better} of {test.blocks}"
+            yield pick.arm, gain.estimate, places, searched, gain.words, f"{gain.t:.1f}", better
 
 
 def emulator(search):

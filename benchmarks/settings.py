@@ -7,21 +7,22 @@ from benchmarks.timing import table
 
 SCENARIO = "urban"
 PLACES = [(region.name, height) for region in REGIONS for height in HEIGHTS]
-USUAL, CROPPED, OTHER_EGO = "usual", "rig's points cropped to the region", "`sedan`, not `suv`"
+USUAL, CROPPED, OTHER_EGO = "usual", "rig's points cropped to the region", "`sedan` (`suv`)"
 # What is set -> what differs from the usual way.
 OTHERS = {
-    "reference to 120 m, not 250 m": {"max_range_m": 120.0},
-    "shell of 0.25 m, not 0.5 m": {"shell_m": 0.25},
+    "reference to 120 m (250 m)": {"max_range_m": 120.0},
+    "shell of 0.25 m (0.5 m)": {"shell_m": 0.25},
     "shell of 1 m": {"shell_m": 1.0},
     "bands over z of the vehicle": {"band_frame": "vehicle"},
-    "`max_radius` 5 m, not the diagonal": {"max_radius": 5.0},
-    "cells of 0.32 m, not 1 m": {"cell_m": 0.32},
-    "1 place a step, not 4": {"places": 1},
+    "`max_radius` 5 m (diagonal)": {"max_radius": 5.0},
+    "cells of 0.32 m (1 m)": {"cell_m": 0.32},
+    "1 place (4)": {"places": 1},
     "16 places": {"places": 16},
-    "4,096 rays, not 16,384": {"rays": 4096},
+    "4,096 rays (16,384)": {"rays": 4096},
     "65,536 rays": {"rays": 65_536},
 }
 DETECTION, RADIUS = 1, 0
+NONE = "none"
 
 
 def main():
@@ -35,8 +36,10 @@ def main():
         found |= part
     found[CROPPED] = {place: found[place[0]][place] for place in PLACES}
     usual, names = found.pop(USUAL), (*OTHERS, CROPPED, OTHER_EGO)
-    rows = [(name, *(largest(found[name], usual, at) for at in (DETECTION, RADIUS))) for name in names]
-    table(("setting", "detection (points)", "radius (%)"), rows)
+    most = {name: tuple(largest(found[name], usual, at) for at in (DETECTION, RADIUS)) for name in names}
+    still = [name for name in names if most[name] == (NONE, NONE)]
+    rows = [(name, *most[name]) for name in names if name not in still]
+    table(("setting", "detection (points)", "radius (%)"), [*rows, ("; ".join(still), NONE, NONE)])
     for at, heading in ((DETECTION, "detection (points)"), (RADIUS, "radius (%)")):
         rows = [(USUAL, *(whole(usual[place], at) for place in PLACES))]
         rows += [(name, *(words(*moved(found[name][place], usual[place], at)) for place in PLACES)) for name in names]
@@ -79,7 +82,7 @@ def largest(of_places, usual, at):
     moves = {place: moved(of_places[place], usual[place], at) for place in PLACES}
     beyond = {place: value for place, (value, *_, p) in moves.items() if p < 0.05 / len(PLACES) and abs(value) >= 0.05}
     if not beyond:
-        return "none"
+        return NONE
     place = max(beyond, key=lambda one: abs(beyond[one]))
     return f"{beyond[place]:+.1f}, {' '.join(place)}"
 

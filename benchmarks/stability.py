@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 from benchmarks.timing import table
-from tests.stability import faces, lenses, metric, poses, rays, returns, search
+from tests.stability import faces, ground, lenses, metric, poses, rays, returns, search
 from tests.stability.case import CPU_SEARCHES
 
 ROOMS = {
@@ -12,6 +12,7 @@ ROOMS = {
     "Bins and sums": metric,
     "Ray casting": rays,
     "Faces": faces,
+    "Ground of recordings": ground,
     "Lenses": lenses,
     "Poses": poses,
     "Returns": returns,

@@ -30,6 +30,7 @@ from torch.utils.data import DataLoader
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.data import Augmentation, SimulatedFrames, collate_frames
 from torchcover.detection import RecallByVisibility, box_visibility, match
+from torchcover.report import number_words
 from torchcover.simulation import PaperReference, SurfaceReference
 from torchcover.training import CoverageCallback
 
@@ -334,12 +335,12 @@ def cell_agreement(objects, side_m=6.4, least=5):
 
 def report(results, console):
     """Print the table of both rigs, and how strongly visibility and recall agree."""
-    table = Table("rig", "AP", *(f"seen within 0.4 m, {region.name}" for region in REGIONS), "recall", "precision")
+    table = Table("rig", "AP", *(f"seen within 0.4 m, {region.name} (%)" for region in REGIONS), "recall", "precision")
     row = SCORES.index(OPERATING_SCORE)
     for rig, (module, coverage) in results.items():
         curve = module.counts.overall()
         numbers = [line.numbers["detection_0.4m"] for line in coverage.summary(REGIONS)]
-        seen = [f"{number.value:.3f} ± {number.error:.3f}" for number in numbers]
+        seen = map(number_words, numbers)
         shares = [f"{ratio.value[row, 0]:.3f}" for ratio in (curve.recall, curve.precision)]
         table.add_row(rig, f"{average_precision(module.counts):.3f}", *seen, *shares)
     console.print(table)

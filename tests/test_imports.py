@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import indent
 
 import pytest
 
@@ -12,12 +13,52 @@ ROOT = Path(__file__).parents[1]
 HEAVY = {"torch", "torchmetrics", "numpy", "matplotlib", "kornia", "embreex", "trimesh", "pykdtree", "pydantic"}
 
 
-def python(code):
+CORE = ["geometry", "files", "neighbors", "metrics", "coverage", "detection", "frames"]
+SIMULATING = {"torchcover.simulation", "embreex", "trimesh", "shapely", "pydantic", "numba", "matplotlib"}
+# In one interpreter (the run in a fork), one after the other: what a later one may not load, no earlier one may either.
+STAGES = {
+    "torchcover": "import torchcover",
+    "search": "import torch; torchcover.nearest(*torch.zeros(2, 1, 3), backend='cdist')",
+    "Frame": "from torchcover.data import Frame",
+    "Scan": "from torchcover.data import Scan",
+    # torchmetrics imports matplotlib for itself, and is what shall not hide it here.
+    "torchmetrics": "import torchmetrics; [modules.pop(name) for name in [*modules] if 'matplotlib' in name]",
+    "core": "\n".join(f"from torchcover.{room} import *" for room in CORE),
+    "data": "from torchcover.data import RecordedFrames; from torchcover import Camera",
+    "run": "from torchcover.evaluation import evaluate",
+    "callback": "from torchcover.training import CoverageCallback",
+}
+COMMANDS = ["--help", "list", "evaluate --help", "show --help"]
+ASKED = """
+import sys
+from torchcover.cli.app import main
+for command in sys.argv[1:]:
+    sys.argv = ["torchcover", *command.split()]
+    try:
+        main()
+    except SystemExit as end:
+        assert not end.code
+print(*sys.modules)
+"""
+
+
+def python(code, *arguments):
     """Standard output of a fresh interpreter at the root of the repository."""
-    command = [sys.executable, "-c", code]
+    command = [sys.executable, "-c", code, *arguments]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
+
+
+@pytest.fixture(scope="module")
+def loaded():
+    """By stage, the modules that are loaded after it."""
+    lines = ["import os, sys; modules = sys.modules"]
+    for stage, code in STAGES.items():
+        told = f"{code}\nprint(*modules, flush=True)"
+        forked = f"if not os.fork():\n{indent(told, ' ')}\n os._exit(0)\nos.wait()"
+        lines.append(forked if stage == "run" else told)
+    return dict(zip(STAGES, (set(line.split()) for line in python("\n".join(lines)).splitlines()), strict=True))
 
 
 def test_arrows_in_the_house_go_one_way():
@@ -26,68 +67,46 @@ def test_arrows_in_the_house_go_one_way():
     assert "3 kept, 0 broken" in report
 
 
-def test_importing_torchcover_imports_nothing_heavy():
-    loaded = set(python("import sys, torchcover; print(*sys.modules)").split())
-    assert "torchcover" in loaded
-    assert not loaded & HEAVY
+def test_importing_torchcover_imports_nothing_heavy(loaded):
+    assert "torchcover" in loaded["torchcover"]
+    assert not loaded["torchcover"] & HEAVY
 
 
-CORE = ["geometry", "files", "neighbors", "metrics", "coverage", "detection", "frames"]
-SIMULATING = {"torchcover.simulation", "embreex", "trimesh", "shapely", "pydantic", "numba", "matplotlib"}
+@pytest.mark.parametrize("stage", ["core", "data", "callback"])
+def test_what_measures_needs_nothing_that_simulates_or_draws(loaded, stage):
+    assert not loaded[stage] & SIMULATING
 
 
-@pytest.mark.parametrize(
-    "imports",
-    [
-        "\n".join(f"from torchcover.{room} import *" for room in CORE),
-        "from torchcover.training import CoverageCallback",
-        "from torchcover.data import RecordedFrames; from torchcover import Camera",
-    ],
-)
-def test_what_measures_needs_nothing_that_simulates_or_draws(imports):
-    # torchmetrics imports matplotlib for itself, and is what shall not hide it here.
-    code = "import sys, torchmetrics\nfor name in [*sys.modules]:\n    if 'matplotlib' in name: del sys.modules[name]\n"
-    assert not set(python(f"{code}{imports}\nprint(*sys.modules)").split()) & SIMULATING
-
-
-def test_a_name_of_the_door_to_the_data_loads_its_own_room():
+def test_a_name_of_the_door_to_the_data_loads_its_own_room(loaded):
     rooms = {f"torchcover.{room}" for room in ("frames", "recordings", "simulation")}
     for name, needed in (("Frame", 1), ("Scan", 2)):
-        loaded = set(python(f"import sys; from torchcover.data import {name}; print(*sys.modules)").split())
-        assert len(loaded & rooms) <= needed, name
+        assert len(loaded[name] & rooms) <= needed, name
     with pytest.raises(AttributeError, match="no attribute 'frame'"):
         _ = torchcover.data.frame
     assert {name for name in torchcover.data.__all__ if getattr(torchcover.data, name) is None} == set()
 
 
-def test_searching_imports_neither_the_metric_nor_the_tree_before_they_are_needed():
-    search = "torchcover.nearest(*torch.zeros(2, 1, 3), backend='cdist')"
-    code = f"import sys, torch, torchcover; {search}; print(*sys.modules)"
-    assert not set(python(code).split()) & {"torchmetrics", "pykdtree", "matplotlib", "embreex", "trimesh"}
+def test_searching_imports_neither_the_metric_nor_the_tree_before_they_are_needed(loaded):
+    assert not loaded["search"] & {"torchmetrics", "pykdtree", "matplotlib", "embreex", "trimesh"}
 
 
-@pytest.mark.parametrize("command", ["--help", "list", "evaluate --help", "show --help"])
-def test_what_only_tells_imports_nothing_heavy(command):
+def test_what_only_tells_imports_nothing_heavy():
     """Seconds, for an answer that needs none of it."""
-    code = f"import sys; sys.argv = 'torchcover {command}'.split()\nfrom torchcover.cli.app import main\n"
-    code += "try: main()\nexcept SystemExit as end: print(*sys.modules, 'code', end.code)"
-    *loaded, _, status = python(code).splitlines()[-1].split()
-    assert status == "0"
+    loaded = set(python(ASKED, *COMMANDS).splitlines()[-1].split())
     assert "typer" in loaded
-    assert not set(loaded) & (HEAVY - {"numpy", "pydantic"})  # typer imports pydantic where there is one
+    assert not loaded & (HEAVY - {"numpy", "pydantic"})  # typer imports pydantic where there is one
 
 
-def test_a_run_imports_what_it_needs_only():
+def test_a_run_imports_what_it_needs_only(loaded):
     """Of distorted lenses, meshes from files, frameworks and their loggers it may need nothing."""
-    loaded = set(python("import sys; from torchcover.evaluation import evaluate; print(*sys.modules)").split())
-    assert "torchmetrics" in loaded
-    assert not loaded & {"kornia", "trimesh", "networkx", "lightning", "tensorboard", "mmengine", "pandas", "OpenEXR"}
+    assert "torchmetrics" in loaded["run"]
+    optional = {"kornia", "trimesh", "networkx", "lightning", "tensorboard", "mmengine", "pandas", "OpenEXR"}
+    assert not loaded["run"] & optional
 
 
-@pytest.mark.parametrize("name", torchcover.__all__)
-def test_every_public_name_is_there(name):
-    assert getattr(torchcover, name) is not None
-    assert name in dir(torchcover)
+def test_every_public_name_is_there():
+    assert {name for name in torchcover.__all__ if getattr(torchcover, name) is None} == set()
+    assert set(torchcover.__all__) <= set(dir(torchcover))
 
 
 def test_the_public_names_are_those_of_the_contract():

@@ -32,8 +32,9 @@ def numbers_of(coverages, regions):
         for region in regions:
             for height in coverage.grid.heights:
                 estimate = coverage.estimate(region, height)
-                radius, share = estimate.numbers(intervals=False).values()
-                percent = share._replace(value=100 * share.value, error=100 * share.error)
+                radius, share = estimate.numbers().values()
+                in_percent = {part: 100 * getattr(share, part) for part in ("value", "error", "low", "high")}
+                percent = share._replace(**in_percent)
                 for quantity, number in zip(QUANTITIES, (percent, radius), strict=True):
                     numbers[Place(quantity, lidar, region.name, height)] = number
     return numbers
@@ -93,7 +94,7 @@ def _table(known, area):
         cells = [region, height, lidar]
         for quantity in QUANTITIES:
             place = Place(quantity, lidar, region, height)
-            ratio = known[place]._replace(value=known[place].value / paper[place], error=math.nan)
+            ratio = known[place]._replace(value=known[place].value / paper[place], low=math.nan)
             cells += [_words(known[place]), f"{paper[place]:.2f}", _words(ratio), _words(area[place])]
         lines.append(f"| {' | '.join(cells)} |")
     return [*lines, ""]
@@ -116,7 +117,8 @@ def _radii(run, lidar, region):
 
 
 def _words(number):
-    """Two decimals, as in the paper."""
+    """Two decimals, as in the paper, and the interval."""
     if math.isnan(number.value):
         return "unknown"
-    return f"{number.value:.2f}" if math.isnan(number.error) else f"{number.value:.2f} ± {number.error:.2f}"
+    ends = "" if math.isnan(number.low) else f" [{number.low:.2f}, {number.high:.2f}]"
+    return f"{number.value:.2f}{ends}"

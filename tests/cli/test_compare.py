@@ -60,8 +60,6 @@ def test_one_more_sensor_never_makes_it_worse(torchcover, worlds):
     assert known
     for row in known:
         assert row["radius_m_difference"] <= 0 <= row["detection_2m_difference"]
-        assert row["radius_m_best"]
-        assert row["detection_2m_best"]
     low, both = (Coverage.load(out / "coverage" / f"{name}.npz") for name in ("low", "both"))
     assert (both.radius < low.radius - 1.0).any()
 

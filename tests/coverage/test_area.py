@@ -136,7 +136,7 @@ def test_a_point_belongs_to_a_region_by_its_own_place_whatever_the_cells():
         for height, band in HEIGHTS.items():
             found = coverage.estimate(region, height)
             np.testing.assert_allclose(found.value, twin(steps, region, *band), rtol=1e-6)
-            np.testing.assert_allclose(found.left_out[0], twin(steps[4:], region, *band), rtol=1e-6)
+            np.testing.assert_allclose(found.left_out[0], twin(steps[1:], region, *band), rtol=1e-6)
             (row,) = (row for row in coverage.summary([region]) if row.height == height)
             assert row.visible_m2 > 0
     # By the centres of cells it is another number.
@@ -169,7 +169,7 @@ def test_a_region_that_was_not_asked_for_is_made_from_whole_cells_or_refused(tmp
     there = of_odd(steps_of(20), regions=[asked]).compute()
     one, two = (each.estimate(asked, "low") for each in (there, loaded))
     torch.testing.assert_close(one.value, two.value, rtol=1e-12, atol=0)
-    torch.testing.assert_close(one.left_out, two.left_out, rtol=1e-12, atol=0)
+    assert (len(one.steps), len(two.steps)) == (20, 5)  # sums over cells are in fewer blocks
     assert str(loaded.summary(ODD)) == str(of_odd(steps_of(20)).compute().summary(ODD))
     for other in (Region("later", x=(0.3, 3.2), y=(0.64, 1.6)), Region.polygon("later", [(0, 0), (3.2, 0), (0, 3.2)])):
         with pytest.raises(ValueError, match=r"'later': no points were summed up over it, and cells of 0\.32 m"):

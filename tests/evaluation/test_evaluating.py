@@ -14,7 +14,7 @@ import torch
 from matplotlib.figure import Figure
 
 import torchcover
-from torchcover import Coverage, Rig, Scenario
+from torchcover import Coverage, RegionsOfInterest, Rig, Scenario
 from torchcover.coverage import Maximum, Quantiles
 from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame, FrameDataset
 from torchcover.evaluation import Settings, TargetError
@@ -370,15 +370,44 @@ def test_a_source_that_lacks_something_is_told_what():
         torchcover.evaluate(frames=Unfinished(), cell_m=8.0)
 
 
-def test_bands_over_the_ground_see_far_obstacles_where_bands_over_z_see_the_road():
-    """On hills the vehicle pitches, and most of what is 0.5 m above its z = 0 far ahead is the road itself."""
-    far = {}
-    for band_frame in ("vehicle", "ground"):
-        result = torchcover.evaluate("front_roof_32", "urban", steps=4, cell_m=2.0, rays=1024, band_frame=band_frame)
-        assert (result.record["band_frame"], result.coverage.band_frame) == (band_frame, band_frame)
-        obstacles = {row["region"]: row for row in result.summary if row["height"] == "obstacle"}
-        far[band_frame] = obstacles["160m"]["detection_0.4m"]
-    assert far["ground"] > far["vehicle"] + 0.1
+def test_hills_do_not_change_what_is_seen_of_far_obstacles():
+    """The same cities with and without hills; by z of a vehicle that pitches the road is an obstacle there."""
+    urban = Scenario.load("urban")
+    flat = urban.model_copy(update={"traffic": urban.traffic.model_copy(update={"hills_m": 0.0})})
+    settings = {"steps": 8, "cell_m": 1.0, "rays": 2048, "seed": 1}
+    hilly, level = (torchcover.evaluate("front_roof_128", each, **settings) for each in (urban, flat))
+    assert (hilly.record["band_frame"], hilly.coverage.band_frame) == ("ground", "ground")
+    far = [
+        {row["region"]: row["detection_0.4m"] for row in result.summary if row["height"] == "obstacle"}
+        for result in (hilly, level)
+    ]
+    for region in ("80m", "160m"):
+        assert abs(far[0][region] - far[1][region]) < 0.02
+
+
+def test_an_ego_that_leans_finds_the_same_numbers():
+    """Walls up to 70 m away, level ground; by z of the vehicle half of what is called an obstacle is the ground."""
+    places = [{"x_m": x, "y_m": y, "z_m": -1.0} for x, y in ((12, 3), (30, -6), (50, 9), (70, -12))]
+    bodies = [
+        {"name": "floor", "ground": True, "shape": {"type": "plane", "size_m": [400, 400]}},
+        {"name": "wall", "shape": {"type": "box", "size_m": [0.4, 4, 3]}, "poses": places},
+    ]
+    turning = {"channels": 128, "vertical_fov_deg": [-30, 10], "horizontal_fov_deg": 360, "columns": 720}
+    lidar = {"name": "top", "type": "lidar", "mount": {"z_m": 2.0}, "max_range_m": 150, **turning}
+    rig = Rig.model_validate({"name": "rig", "sensors": [lidar]})
+    ask = RegionsOfInterest(regions={"80m": {"x_m": (0, 80), "y_m": (-20, 20)}})
+
+    def obstacle(band_frame=None, **pose):
+        ego = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}, "pose": pose}
+        scenario = Scenario.model_validate({"name": "walls", "ego": ego, "bodies": bodies})
+        result = torchcover.evaluate(rig, scenario, steps=4, cell_m=4, rays=1024, ask=ask, band_frame=band_frame)
+        (row,) = (row for row in result.summary if row["height"] == "obstacle")
+        return np.array([row["detection_0.4m"], row["visible_m2"] / 10])
+
+    level = obstacle()
+    for pose in ({"pitch_deg": 2.0}, {"pitch_deg": -2.0}, {"roll_deg": 2.0}, {"roll_deg": -2.0}):
+        np.testing.assert_allclose(obstacle(**pose), level, atol=0.06)
+    assert obstacle("vehicle", pitch_deg=2.0)[0] < level[0] - 0.4
 
 
 def test_a_band_frame_that_frames_do_not_have_is_refused():

@@ -32,9 +32,8 @@ def trial(a, seconds=64.0, bias=0.0, options="", least=64):
     """64 steps of one number that is awaited, and of one that is not."""
     error = ErrorModel(a, bias)
     other = Studied("3m", "ground", False, DETECTION, 0.5, ErrorModel(9.0), None, False)
-    return Trial(
-        options, 64, least, seconds, 1.0, [Studied("20m", "ground", True, DETECTION, 0.5, error, None, False), other]
-    )
+    own = Studied("20m", "ground", True, DETECTION, 0.5, error, None, False)
+    return Trial(options, 64, least, seconds, 1.0, seconds, [own, other])
 
 
 @pytest.mark.parametrize("a", [0.01, 0.36, 25.0])
@@ -51,6 +50,7 @@ def test_the_model_falls_to_the_bias_and_says_which_steps_reach_an_error(a):
 
 def test_a_study_says_of_the_same_steps_what_an_evaluation_says(study):
     first, fewer, _ = study.trials
+    # Of 8 blocks at least: here the others see all of them.
     for each, rays in ((first, 256), (fewer, 64)):
         coverage = evaluate(*SMALL.rigs, "courtyard", steps=8, cell_m=4.0, rays=rays).coverage
         rows = {(row.region, row.height): row.numbers for row in coverage.summary()}
@@ -74,6 +74,7 @@ def test_times_are_those_of_a_whole_command(study):
     assert first.seconds_for(16, study.start_s) - first.seconds_for(8, study.start_s) == pytest.approx(first.seconds)
     assert study.start_s == pytest.approx(100.0 - first.seconds / 8)
     assert 0 < first.measuring_s < first.seconds
+    assert first.processor_s > 0
 
 
 def test_the_worst_awaited_number_decides_and_what_prints_no_error_is_not_recommended():
@@ -120,7 +121,7 @@ def test_the_command_that_is_timed_has_every_option_that_is_not_as_usual():
         "evaluate", "rig", "--scenario=urban", "--cell-m=0.5", "--thresholds-m=0.2", "--thresholds-m=1.0",
         "--every-s=5.0", "--workers=2",
     ]  # fmt: skip
-    assert StudyPlan(replace(settings, steps=None)).each[""].steps == 256
+    assert StudyPlan(replace(settings, steps=None)).each[""].steps == 512
 
 
 @pytest.mark.parametrize("settings", [Settings(), Settings(Rig.load("front_roof_32"))])

@@ -1,8 +1,14 @@
 """The ground that sweeps have seen, against closed forms: heights above it, what is no ground, and what is unknown."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+import torchcover
+from tests.recordings.drives import CAR_SIZE_M, Drive
+from torchcover.data import AccumulatedReference, RecordedFrames
+from torchcover.geometry import invert, rigid, rotation_from_euler, transform
 from torchcover.recordings.ground_model import CELL_M, GroundModel, low_surfaces
 
 NOISE_M = 0.03
@@ -85,8 +91,8 @@ def test_what_stands_and_what_hangs_is_no_ground():
 
 
 def test_a_few_reflections_below_the_road_do_not_lower_it():
-    below = seen(level, 600, 40.0, seed=5) - [0.0, 0.0, 2.0]
-    below[:300] = below[300:] + np.array([0.05, 0.05, -0.05])  # in pairs
+    below = seen(level, 1600, 40.0, seed=5) - [0.0, 0.0, 2.0]
+    below[:800] = below[800:] + np.array([0.05, 0.05, -0.05])  # in pairs
     ground = ground_of(np.concatenate([seen(level), below]))
     assert rms_m(ground, level)[0] < 0.01
     assert (ground.heights_m(below) < -1.5).all()
@@ -155,3 +161,80 @@ def test_large_coordinates_change_nothing():
     shift_m = np.array([4096 * CELL_M, -8192 * CELL_M, 512.0])
     shifted = ground_of(road + shift_m, place_m=shift_m)
     np.testing.assert_allclose(shifted.heights_m(places_m + shift_m), expected_m, atol=1e-8)
+
+
+class Road(Drive):
+    """The drive past the wall on a road that rises by 3 %, in a vehicle that pitches and rolls."""
+
+    tilt_deg = (0.0, 0.0)
+
+    def world_T_vehicle(self, index):
+        return super().world_T_vehicle(index) @ rigid(rotation_from_euler(0.0, *self.tilt_deg), np.zeros(3))
+
+    def scan(self, sensor, index):
+        scan = super().scan(sensor, index)
+        road_m = seen(rises, 12_000, 30.0, seed=index) + self.origin_m
+        road_m = transform(invert(self.world_T_vehicle(index) @ scan.vehicle_T_sensor), road_m)
+        return replace(scan, points_m=np.concatenate([scan.points_m, road_m]))
+
+
+def rises(x, y):
+    return 0.03 * x
+
+
+@pytest.mark.parametrize("tilt_deg", [(0.0, 0.0), (2.0, -2.0)])
+@pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), (513_248.0, 5_403_655.0, 260.0)])
+def test_heights_of_a_drive_are_those_of_its_world_however_the_vehicle_leans(tilt_deg, origin_m):
+    road = Road(steps=3, labelled=False, origin_m=origin_m)
+    road.tilt_deg = tilt_deg
+    frames = RecordedFrames(road, reference=AccumulatedReference(10.0))
+    assert frames.has_heights()
+    frame = frames[1]
+    placed_m = transform(road.world_T_vehicle(1), frame.reference.numpy().astype(np.float64)) - origin_m
+    expected_m = placed_m[:, 2] - rises(placed_m[:, 0], placed_m[:, 1])
+    found_m = frame.reference_heights_m.numpy()
+    assert found_m.dtype == np.float32
+    known = np.isfinite(found_m)
+    assert known.mean() > 0.95
+    assert np.sqrt(((found_m - expected_m)[known] ** 2).mean()) < 0.02
+    assert (placed_m[~known, 0] > 35.0).all()  # the wall goes on where the road was not seen
+
+
+def test_the_bottom_of_a_box_has_a_height():
+    road = Road(steps=2)
+    boxes = RecordedFrames(road)[1].boxes
+    place_m = road.world_T_car(1)[:3, 3]
+    expected_m = place_m[2] - CAR_SIZE_M[2] / 2 - rises(*place_m[:2])
+    np.testing.assert_allclose(boxes.bottom_heights_m, [expected_m], atol=0.02)
+
+
+def test_heights_do_not_depend_on_the_frames_read_before():
+    forward, backward = (RecordedFrames(Road(steps=4), reference=AccumulatedReference(0.2)) for _ in range(2))
+    one = [forward[index].reference_heights_m for index in range(4)]
+    other = [backward[index].reference_heights_m for index in reversed(range(4))][::-1]
+    for first, second in zip(one, other, strict=True):
+        np.testing.assert_array_equal(first, second)
+
+
+def test_without_times_the_ground_is_that_of_the_instant():
+    road = Road(steps=2, labelled=False)
+    road.times_s = None
+    frames = RecordedFrames(road, rigs={"left": ("left",)}, reference=AccumulatedReference(0.0))
+    frame = frames[1]
+    placed_m = transform(road.world_T_vehicle(1), frame.reference.numpy().astype(np.float64))
+    off_m = frame.reference_heights_m.numpy() - (placed_m[:, 2] - rises(placed_m[:, 0], placed_m[:, 1]))
+    assert np.sqrt(np.nanmean(off_m**2)) < 0.03
+
+
+def test_without_ground_bands_are_over_the_vehicle_and_the_result_says_so():
+    result = torchcover.evaluate(frames=RecordedFrames(Drive()), cell_m=8.0)
+    assert result.coverage.band_frame == "vehicle"
+    assert "Ground: none was found near the vehicle" in " ".join(result.table.notes)
+    assert RecordedFrames(Drive())[0].reference_heights_m.isnan().all()
+    assert RecordedFrames(Road(steps=2), ground=False)[0].reference_heights_m is None
+
+
+def test_with_ground_bands_are_over_it():
+    result = torchcover.evaluate(frames=RecordedFrames(Road(steps=2)), cell_m=8.0)
+    assert result.coverage.band_frame == "ground"
+    assert "Ground: a height field through what all sensors saw of it" in " ".join(result.table.notes)

@@ -201,6 +201,20 @@ def test_on_level_ground_both_frames_are_one(at):
         agrees(sums(made, sensor), 15.0)
 
 
+def test_what_is_sunk_into_the_ground_counts_from_there_on(at):
+    """A ledge of 4 x 4 m, which is ground: the upper 5 cm of its front lie on its top, as kerbs do."""
+    at([2.6, 0.0, 2.0])
+    ledge = {"name": "ledge", "ground": True, "shape": {"type": "box", "size_m": [4, 4, 2]}, "poses": [{"x_m": 12}]}
+    for sunk_m in (0.0, 1.0, 1.6):
+        made = scenario({**FLOOR, "ground": True}, {**ledge, "poses": [{"x_m": 12, "z_m": -sunk_m}]})
+        high_m = 2.0 - sunk_m
+        front = SurfaceReference((((9.5, 14.5), (-2.5, 2.5)),), 300, 1, ((0.5, 2.0),))
+        agrees(sums(made, front, steps=20), 4 * max(high_m - 0.05 - 0.5, 0))
+        if high_m < 2:  # from where the top is seen
+            area = SurfaceReference((((10.0, 14.0), (-2.0, 2.0)),), 300, 1, ((-0.5, 0.5),))
+            agrees(sums(made, area, steps=20), 16 + 4 * min(high_m, 0.5 + 0.05))
+
+
 def test_bodies_that_move_are_cut_at_heights_above_the_ground_below_them(at):
     at([2.6, 0.0, 1.0])
     hill = sheet(lambda x, y: 0.08 * x)
@@ -345,6 +359,9 @@ def test_what_cannot_be_ground_is_refused():
         scenario(FLOOR, upright).world()
     with pytest.raises(ValueError, match="band_frame: ground or vehicle is needed; got 'world'"):
         SurfaceReference(AREA, band_frame="world")
+    with pytest.raises(ValueError, match=r"bands_m: nothing is seen below the ground, and \(-3.0, -1.0\) m lies there"):
+        SurfaceReference(AREA, bands_m=((0.5, 2.0), (-3.0, -1.0)))
+    SurfaceReference(AREA, bands_m=((-3.0, -1.0),), band_frame="vehicle")
 
 
 def test_the_courtyard_says_what_would_have_been_found():

@@ -7,9 +7,10 @@ import pytest
 
 from torchcover.geometry import invert, transform
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.simulation import Draws, Lidar, Pose
+from torchcover.simulation import CameraSensor, Draws, Lidar, Pose
 from torchcover.simulation.bodies import in_vehicle_frame
 from torchcover.simulation.scene import Scene
+from torchcover.simulation.sensor import Scan
 from torchcover.simulation.shapes import Box, Plane
 from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.world import Actor, World
@@ -44,10 +45,10 @@ def world(ego_mps=0.0, cars_mps=0.0, turn_deg=0.0, step_s=PERIOD_S):
     return World((ground, *walls), ego, (beside, ahead), time_step_s=step_s, duration_s=1.0)
 
 
-def swept(made, time_s=0.5, lidar=LIDAR):
+def swept(made, time_s=0.5, lidar=LIDAR, draws=EXACT):
     scene = Scene(made)
     mounted = MountedSensor(lidar, scene, lidar.max_range_m)
-    return mounted, mounted.scan(scene.at(round(time_s / made.time_step_s)), EXACT)
+    return mounted, mounted.scan(scene.at(round(time_s / made.time_step_s)), draws)
 
 
 @pytest.mark.parametrize(
@@ -118,6 +119,39 @@ def test_the_first_frame_of_a_world_is_as_its_second():
     )
     np.testing.assert_allclose(first.points, later.points, atol=2e-3)
     assert np.abs(first.points - at_once.points).max() > 1.0
+
+
+@pytest.mark.parametrize(
+    ("sensor", "axis"),
+    [
+        (LIDAR, 1),
+        (CameraSensor(name="c", width=50, height=30, fov_deg=90, stride=4, max_range_m=9, scan={"period_s": 0.1}), 0),
+    ],
+)
+def test_columns_of_a_lidar_and_rows_of_a_camera_follow_each_other(sensor, axis):
+    times_s = sensor.times_s()
+    assert times_s.shape == sensor.directions().shape[1:]
+    assert (np.diff(times_s, axis=axis) > 0).all()
+    assert (np.diff(times_s, axis=1 - axis) == 0).all()
+    assert -0.1 < times_s.min() < times_s.max() < 0.0
+    assert sensor.model_copy(update={"scan": None}).times_s() is None
+    later = sensor.model_copy(update={"scan": Scan(period_s=0.1, start_s=0.02)}).times_s()
+    np.testing.assert_allclose(later, times_s + 0.12)
+
+
+def test_where_points_of_a_sensor_that_errs_land():
+    """Along the ray as it was cast, from where the sensor was then."""
+    made = world(ego_mps=20.0)
+    exact, erring = (
+        swept(made, lidar=LIDAR.model_copy(update={"range_noise_m": sigma_m}), draws=draws)[1]
+        for sigma_m, draws in ((0.0, EXACT), (0.5, Draws(np.random.default_rng(1))))
+    )
+    np.testing.assert_array_equal(erring.points, exact.points)
+    way = (erring.landed - exact.points).astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(way, axis=1), np.abs(erring.error_m), atol=1e-4)
+    origins = (exact.points - way / erring.error_m[:, None] * exact.range_m[:, None])[np.abs(erring.error_m) > 0.1]
+    assert np.abs(origins[:, 1:] - LIDAR.mount.matrix()[1:3, 3]).max() < 0.05
+    assert 1.8 < np.ptp(origins[:, 0]) < 2.1
 
 
 def test_a_scan_that_is_longer_than_a_time_step_is_refused():

@@ -9,6 +9,8 @@ import numpy as np
 import torch
 
 from torchcover import BevGrid, Region
+from torchcover.coverage.quantity import RADIUS
+from torchcover.estimation import Estimate
 
 from .case import Case, most, relative
 
@@ -261,6 +263,32 @@ def crowded(count, **options):
                 "float32 running sum", partial(one_crowded_cell_in_float32, count), **options)  # fmt: skip
 
 
+# Numbers without a block
+
+
+def lopsided_blocks():
+    """Square metres, and radii times them, of 256 blocks; one has seen 1e12 times what the others have."""
+    m2 = np.random.default_rng(1).uniform(1.0, 2.0, 256)
+    m2[100] *= 1e12
+    return m2, m2 * np.random.default_rng(2).uniform(0.1, 0.2, 256)
+
+
+def without_the_largest():
+    m2, sums = (np.delete(each, 100) for each in lopsided_blocks())
+    return fsum(sums) / fsum(m2)
+
+
+def left_out(_):
+    m2, sums = map(torch.from_numpy, lopsided_blocks())
+    estimate = Estimate.of_ratios((RADIUS,), m2, sums[:, None], torch.ones(256, dtype=torch.int64))
+    return relative(estimate.left_out[100].item(), without_the_largest())
+
+
+def left_out_by_differences():
+    m2, sums = lopsided_blocks()
+    return relative((sums.sum() - sums[100]) / (m2.sum() - m2[100]), without_the_largest())
+
+
 CASES = [
     Case("100,000 steps (1,000, merged 100 times)", "math.fsum", "relative", 1e-12, many_steps,
          "float32 running sum", many_steps_in_float32),
@@ -290,4 +318,6 @@ CASES = [
          "float32 coordinates", partial(far_grid_in_float32, 1e7)),
     Case("thresholds equal to a distance, and just below", "by hand", "of 40 wrong", 0, detections,
          "float64 distances", detections_in_float64),
+    Case("without one of 256 blocks, which has 1e12 times the others", "math.fsum", "relative", 1e-14, left_out,
+         "all less the block, float64", left_out_by_differences),
 ]  # fmt: skip

@@ -7,7 +7,7 @@ import torch
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
 
-from . import faces, lenses, metric, poses, rays, returns, search
+from . import faces, ground, lenses, metric, poses, rays, returns, search
 from .case import CPU_SEARCHES, CUDA_SEARCHES
 
 
@@ -39,12 +39,12 @@ def test_on_cuda(case, backend):
     assert case.ours(backend) <= case.bound
 
 
-@each(cases_of(rays, faces, lenses, poses, returns))
+@each(cases_of(rays, faces, ground, lenses, poses, returns))
 def test_without_a_search(case):
     assert case.ours() <= case.bound
 
 
-@each([case for case in cases_of(search, metric, rays, faces, lenses, poses, returns) if case.naive_fails])
+@each([case for case in cases_of(search, metric, rays, faces, ground, lenses, poses, returns) if case.naive_fails])
 def test_the_naive_way_is_found_out(case):
     """So that a case whose bound is too wide, or that measures nothing, is noticed."""
     assert case.naive() > case.bound

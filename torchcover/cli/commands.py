@@ -1,7 +1,7 @@
 """What each command is called with; what it does is imported when it runs."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -25,7 +25,9 @@ TRIED = [name for name, option in OPTIONS.items() if option.in_study == "tried"]
 )
 def study(
     rig: options.Rig,
-    steps: Annotated[int, typer.Option(min=8, help="Steps of every setting, all of them on the same instants.")] = 256,
+    steps: Annotated[
+        int, typer.Option(min=8, help="Steps of the first setting; the others see the first quarter of these instants.")
+    ] = 512,
     explain: Annotated[bool, typer.Option("--explain", help="Say where the seconds go.")] = False,
     out: options.Out = Path("out"),
     **settings: Any,  # noqa: ANN401
@@ -43,10 +45,10 @@ def study(
         raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
     given = {name: settings.pop(name) for name in TRIED if name in settings}
     first = {name: values[0] for name, values in given.items() if values}
-    others = tuple({name: value} for name, values in given.items() for value in values[1:])
+    others: Sequence[Mapping[str, Any]] = [{name: value} for name, values in given.items() for value in values[1:]]
     if not others and "rays" not in first and first.get("reference") != "paper":
         others = StudyPlan.others
-    plan = StudyPlan(Settings(rig, steps=steps, **settings, **first), others)
+    plan = StudyPlan(Settings(rig, steps=steps, **settings, **first), tuple(others))
     with claimed(out):
         found = error_against_time(plan, progress=True)
         files = found.save(out)

@@ -24,8 +24,9 @@ from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
 from torchcover.coverage.regions import Region
 from torchcover.estimation import Quantity
 from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
+from torchcover.metrics.blocks import FINER
 
-FORMAT_VERSION = 7
+FORMAT_VERSION = 8
 Arrays = dict[str, NDArray[Any]]
 # Steps, cells, what is divided by, sums.
 IN_BLOCKS = ("block_steps", "block_cell", "block_probed_steps", "block_sums")
@@ -120,7 +121,9 @@ def read_coverage(path: Path) -> CoverageParts:
         reason = str(error) or type(error).__name__
         raise ValueError(f"not a coverage file as Coverage.save writes it ({reason})") from error
     if parts is None:
-        raise ValueError(f"coverage format {version}; this torchcover reads format {FORMAT_VERSION}")
+        older = version in range(FORMAT_VERSION)
+        bands = "; height bands of older ones were over z of the vehicle: measure again" if older else ""
+        raise ValueError(f"coverage format {version}; this torchcover reads format {FORMAT_VERSION}{bands}")
     return parts
 
 
@@ -183,6 +186,7 @@ def _redundancy(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> Redund
 def _places(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> PlaceSums:
     places = PlaceSums(*(torch.from_numpy(arrays[name]) for name in OVER_PLACES))
     blocks, count = header["blocks"], len(header["regions"]) * len(grid.heights)
+    blocks *= FINER if blocks > 1 else 1
     values = 1 + len(header["thresholds"]) + len(header["redundancy"])
     if [tuple(one.shape) for one in places] != [(blocks,), (blocks, count), (blocks, values, count)]:
         raise ValueError(f"sums over {count} regions and bands of shape {tuple(places.sums.shape)}")

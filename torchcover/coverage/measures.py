@@ -72,17 +72,17 @@ def area_in_blocks(coverage: "Coverage", region: Region, height: str) -> tuple[T
             "no estimate by area: the reference points had no square metres; take them from a SurfaceReference and "
             "give the metric square_metres=True"
         )
-    place, places, steps = coverage.place_of(region, height), coverage.places, coverage.area.steps
+    place, places = coverage.place_of(region, height), coverage.places
     if places is not None and place is not None:
         own = places.sums[:, : len(coverage.quantities), place]
-        return steps, torch.cat([places.m2[:, place, None], own], dim=1)
+        return places.steps, torch.cat([places.m2[:, place, None], own], dim=1)
     if not region.has_whole_cells(coverage.grid):
         raise ValueError(
             f"region {region.name!r}: no points were summed up over it, and cells of {coverage.grid.cell:g} m cannot "
             "tell, for its edges are not theirs; ask for it when measuring, or move its edges"
         )
     cells = region.mask(coverage.grid).to(coverage.area.at.device)
-    return steps, coverage.area.over(_in_band(coverage.area, coverage.band_of(height), cells))
+    return coverage.area.steps, coverage.area.over(_in_band(coverage.area, coverage.band_of(height), cells))
 
 
 def estimate_redundancy(coverage: "Coverage", region: Region, height: str) -> Estimate:

@@ -124,7 +124,8 @@ class CoverageMetric(SumsInBlocks):
         self._failures = SensorFailures(self.sensors, thresholds, square_metres) if sensors else None
         self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *([self._failures] if self._failures else []))
         values = 1 + len(thresholds) + (len(self._failures.quantities) if self._failures else 0)
-        self._in_regions = RegionSums(aggregations, Places(regions, grid), blocks, values if square_metres else 0)
+        by_area = (self.fine_blocks, values) if square_metres else None
+        self._in_regions = RegionSums(aggregations, Places(regions, grid), blocks, by_area)
         self._add_states()
 
     def _add_states(self) -> None:
@@ -142,7 +143,8 @@ class CoverageMetric(SumsInBlocks):
         for name, state in states.items():
             full_name = f"{owner}_{name}"
             self.add_state(full_name, state.initial, dist_reduce_fx=state.reduction, persistent=True)
-            self._in_blocks = (*self._in_blocks, *[full_name] * state.in_blocks)
+            self._in_blocks = (*self._in_blocks, *[full_name] * (state.in_blocks and not state.fine))
+            self._in_fine_blocks = (*self._in_fine_blocks, *[full_name] * state.fine)
 
     def _sums_of(self, owner: str) -> dict[str, Tensor]:
         return {name: getattr(self, f"{owner}_{name}") for name in self._state_names[owner]}
@@ -221,7 +223,8 @@ class CoverageMetric(SumsInBlocks):
         binned = self._binned(place_in_time, cell.to(device), of_sensors[:, of].to(device), weights)
         for aggregation in self.aggregations:
             aggregation.update(self._sums_of(aggregation.name), binned)
-        self._in_regions.update(self._sums_of(IN_REGIONS), binned, reference[inside[of]].to(device))
+        fine = self._fine_block_of(place_in_time)
+        self._in_regions.update(self._sums_of(IN_REGIONS), binned, fine, reference[inside[of]].to(device))
         self.probed_steps[binned.block, binned.means.cell] += 1
         self.points[binned.means.cell] += binned.means.points
         self.steps += 1
@@ -259,7 +262,7 @@ class CoverageMetric(SumsInBlocks):
             area=self._listed(AreaSums, self.area_m2, self.area_sums) if self.square_metres else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
             regions=self.regions,
-            places=self._in_regions.area(self._sums_of(IN_REGIONS), self.block_steps),
+            places=self._in_regions.area(self._sums_of(IN_REGIONS), self.fine_steps),
             aggregated=self._in_regions.numbers(self._sums_of(IN_REGIONS), self.max_radius),
             redundancy=Redundancy(self.sensors, {one.quantity.key: one for one in failures}) if failures else None,
         )
@@ -274,7 +277,7 @@ class CoverageMetric(SumsInBlocks):
         Raises:
             ValueError: As there.
         """
-        sums = self._in_regions.area(self._sums_of(IN_REGIONS), self.block_steps)
+        sums = self._in_regions.area(self._sums_of(IN_REGIONS), self.fine_steps)
         numbers = [self._in_regions.places.number_of(*place) for place in places]
         if measure == "area" and sums and None not in numbers:
             quantities = MeanOfMeans(self.thresholds).quantities

@@ -29,7 +29,7 @@ class PlaceNumbers(NamedTuple):
 
 
 class PlaceSums(NamedTuple):
-    """Sums over the visible surface of P regions and bands, region by region, in B blocks of steps.
+    """Sums over the visible surface of P regions and bands, region by region, in B fine blocks of steps.
 
     `steps` (B,) int64 steps in each block; `m2` (B, P) float64 square metres; `sums` (B, V, P) those times the radius
     and the detections, then, of a metric that knows the sensors, times each of `redundancy_quantities`.
@@ -55,14 +55,17 @@ class RegionSums:
         aggregations: Whose numbers.
         places: Regions and bands.
         blocks: Blocks of contiguous steps.
-        by_area: How many values of each point are summed up with its square metres; none without these.
+        by_area: In how many fine blocks how many values of each point are summed up with its square metres; None
+            without these.
     """
 
-    def __init__(self, aggregations: Sequence[Aggregation], places: Places, blocks: int, by_area: int) -> None:
+    def __init__(
+        self, aggregations: Sequence[Aggregation], places: Places, blocks: int, by_area: tuple[int, int] | None
+    ) -> None:
         self.aggregations = tuple(aggregations) if places.count else ()
         self.places = places
         self.blocks = blocks
-        self.by_area = by_area if places.count else 0
+        self.by_area = by_area if places.count else None
 
     def states(self) -> dict[str, State]:
         """The empty sums, by name.
@@ -72,8 +75,9 @@ class RegionSums:
         """
         zero, states = torch.zeros((), dtype=torch.float64), dict[str, State]()
         if self.by_area:
-            states["m2"] = self._in_blocks(State(zero.expand(self.places.count)))
-            states["sums"] = self._in_blocks(State(zero.expand(self.by_area, self.places.count)))
+            blocks, values = self.by_area
+            states["m2"] = State(zero.expand(blocks, self.places.count), in_blocks=True, fine=True)
+            states["sums"] = State(zero.expand(blocks, values, self.places.count), in_blocks=True, fine=True)
         if self.aggregations:
             states["probed"] = self._in_blocks(State(zero.long().expand(self.places.count)))
         for aggregation in self.aggregations:
@@ -86,8 +90,8 @@ class RegionSums:
         shape = (self.blocks if added else 1, *state.initial.shape)
         return State(state.initial.expand(shape), state.reduction, in_blocks=added)
 
-    def update(self, sums: Mapping[str, Tensor], step: BinnedStep, points: Tensor) -> None:
-        """Add the points of a step, (N, 3) in metres, to all regions that they lie in."""
+    def update(self, sums: Mapping[str, Tensor], step: BinnedStep, fine: int, points: Tensor) -> None:
+        """Add the points of a step of a fine block, (N, 3) in metres, to all regions that they lie in."""
         if not sums:
             return
         place, point = self.places.of_points(points, step.cell)
@@ -95,8 +99,8 @@ class RegionSums:
         weight = None if step.weight is None else step.weight[point]
         means = mean_per_cell(place, values, self.places.count, weight)
         if self.by_area:
-            sums["m2"][step.block, means.cell] += means.weight
-            sums["sums"][step.block][:, means.cell] += means.mean * means.weight
+            sums["m2"][fine, means.cell] += means.weight
+            sums["sums"][fine][:, means.cell] += means.mean * means.weight
         if not self.aggregations:
             return
         sums["probed"][step.block, means.cell] += 1

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchcover.estimation.jackknife import MIN_BLOCKS, ROUND_OFF, jackknife_error, pseudo_values
 from torchcover.estimation.quantity import Quantity
@@ -163,6 +164,13 @@ class Estimate:
         some = self.value[which], self.left_out[:, which], self.steps, again, self.effective[which]
         return Estimate(self.quantities[which], *some)
 
+    def after(self, blocks: int) -> "Estimate":
+        """What it was after the first blocks alone."""
+        again = self.again
+        assert again is not None  # known of all that is a ratio of sums
+        rest = len(self.steps) - blocks
+        return Estimate.of_blocks(self.quantities, lambda some: again(pad(some, (0, rest))), self.steps[:blocks])
+
     def resampled(self, weights: Tensor) -> Tensor | None:
         """What the numbers were if other worlds had come, for intervals of what is made from numbers of several rigs.
 
@@ -194,12 +202,10 @@ class Estimate:
         enough: list[bool] = (self.effective > MIN_BLOCKS - ROUND_OFF).tolist()
         return enough
 
-    def numbers(self, *, intervals: bool = True, count: int = 0, count_of: str = "") -> dict[str, Number]:
-        """The numbers by the keys of their quantities.
+    def numbers(self, *, count: int = 0, count_of: str = "") -> dict[str, Number]:
+        """The numbers by the keys of their quantities; of fewer than 8 blocks in effect without intervals.
 
         Args:
-            intervals: Whether they have intervals: not where how often such an interval holds the truth has
-                not been measured, nor where fewer than 8 blocks are in effect.
             count: How many they are over.
             count_of: What these are.
         """
@@ -207,7 +213,7 @@ class Estimate:
         each = zip(self.quantities, self.value.tolist(), self.error.tolist(), self.has_intervals, strict=True)
         for quantity, value, error, has_interval in each:
             known = error if error > ROUND_OFF else math.nan  # blocks that all say the same prove nothing
-            ends = interval95(value, known if intervals and has_interval else math.nan, freedom, quantity)
+            ends = interval95(value, known if has_interval else math.nan, freedom, quantity)
             found[quantity.key] = Number(quantity, value, known, *ends, count, count_of)
         return found
 
@@ -251,8 +257,8 @@ class Estimate:
 def _without_each(sums: Tensor) -> Tensor:
     """(g, ...) what all blocks but each add up to; not by a difference, which infinite radii would not survive."""
     none = sums.new_zeros((1, *sums.shape[1:]))
-    before = torch.cat([none, sums[:-1]]).cumsum(dim=0)
-    after = torch.cat([sums[1:], none]).flip(0).cumsum(dim=0).flip(0)
+    before = torch.cat([none, sums])[:-1].cumsum(dim=0)
+    after = torch.cat([sums, none])[1:].flip(0).cumsum(dim=0).flip(0)
     return before + after
 
 

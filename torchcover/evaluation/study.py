@@ -1,6 +1,7 @@
 """Error against run time: what settings cost, how far each is off, and the steps that reach a wanted error."""
 
 import math
+import os
 import subprocess
 import sys
 import time
@@ -10,16 +11,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
+import torch
 from matplotlib.figure import Figure
 from rich.table import Table
+from torch import Tensor
 
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
-from torchcover.estimation import MIN_BLOCKS, Difference, ErrorModel, Estimate, Quantity
+from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, ErrorModel, Estimate, Quantity
 from torchcover.evaluation.measuring import measured
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, OPTIONS, Settings
 from torchcover.evaluation.target_error import MIN_STEPS, rounded_up
-from torchcover.evaluation.task import Task, simulation
+from torchcover.evaluation.task import simulation
 from torchcover.files import Publication, end_with_parent
 from torchcover.report import (
     WorkPanel,
@@ -31,9 +34,10 @@ from torchcover.report import (
     shown_unit,
     text_table,
 )
-from torchcover.simulation import SimulatedFrames
 
-DEFAULT_STEPS = 256
+DEFAULT_STEPS = 512
+# Of the blocks of the first setting, which alone says how errors fall, the others see so many.
+SHARE_OF_OTHERS = 4
 FEWER_RAYS: tuple[Mapping[str, Any], ...] = ({"rays": 4096}, {"rays": 1024})
 # Errors of the detection that settings are recommended for.
 WANTED = (0.02, 0.01, 0.005)
@@ -49,8 +53,8 @@ class StudyPlan:
     """What is tried, on the same instants.
 
     Args:
-        settings: Of `evaluate`: one rig and a scenario, by names or paths; 256 steps if not given. The others are held
-            against it.
+        settings: Of `evaluate`: one rig and a scenario, by names or paths; 512 steps if not given. The others are held
+            against it on the first quarter of them.
         others: What each other setting has different, by the name of the argument of `evaluate`.
 
     Raises:
@@ -127,6 +131,7 @@ class Trial:
         least_steps: The fewest that print an error of every number that is awaited.
         seconds: What they took.
         measuring_s: That part of it that went into the search and the sums.
+        processor_s: What it took of all processors, those of workers too.
         numbers: Of all regions and bands.
     """
 
@@ -135,6 +140,7 @@ class Trial:
     least_steps: int
     seconds: float
     measuring_s: float
+    processor_s: float
     numbers: Sequence[Studied]
 
     def of(self, unit: str) -> list[Studied]:
@@ -188,12 +194,11 @@ class Study:
         rows = []
         for trial in self.trials:
             needed = [_steps_words(trial, trial.steps_for(error), self.start_s) for error in WANTED]
-            rows.append(
-                [trial.options or "as given", f"{1000 * trial.seconds / trial.steps:.0f}", _bias(trial), *needed]
-            )
+            times = [f"{1000 * s / trial.steps:.0f}" for s in (trial.seconds, trial.processor_s)]
+            rows.append([trial.options or "as given", *times, _bias(trial), *needed])
         wanted = [f"steps for {_points(error)}" for error in WANTED]
         return text_table(
-            ("setting", "step (ms)", "bias (points)", *wanted),
+            ("setting", "step (ms)", "of processors (ms)", "bias (points)", *wanted),
             [rows],
             title="Every detection in front to so many percentage points",
             caption="bias: the largest to the first setting on the same instants, * if it is beyond chance",
@@ -303,7 +308,7 @@ def _record(trial: Trial) -> dict[str, Any]:
         told = {name: difference.get(name, math.nan) for name in ("value", "error", "p")}
         own = {"region": one.region, "height": one.height, "quantity": one.quantity.key, "value": one.value}
         numbers.append(json_record({**own, "a": one.error.a, "bias": one.error.bias, "difference": json_record(told)}))
-    names = ("options", "steps", "least_steps", "seconds", "measuring_s")
+    names = ("options", "steps", "least_steps", "seconds", "measuring_s", "processor_s")
     return {**{name: getattr(trial, name) for name in names}, "numbers": numbers}
 
 
@@ -318,21 +323,29 @@ def error_against_time(plan: StudyPlan, *, progress: bool = False) -> Study:
         ValueError: A plan that makes no sense.
         FileNotFoundError: An unknown name or file.
     """
-    tasks = {options: simulation(settings) for options, settings in plan.each.items()}  # fail before anything runs
+    for settings in plan.each.values():
+        simulation(settings)  # fails before anything runs
     trials: list[Trial] = []
     first: Coverage | None = None
-    for (options, task), settings in zip(tasks.items(), plan.each.values(), strict=True):
-        trial, coverage = _tried(options, task, replace(settings, progress=progress), first)
+    for options, settings in plan.each.items():
+        steps = settings.steps if first is None else _first_steps(first)
+        trial, coverage = _tried(options, replace(settings, steps=steps, progress=progress), first)
         trials.append(trial)
         first = first or coverage
     return Study(plan, trials, max(0.0, command_s(plan) - trials[0].seconds / trials[0].steps))
 
 
-def _tried(
-    options: str, task: Task[SimulatedFrames], settings: Settings, first: Coverage | None
-) -> tuple[Trial, Coverage]:
+def _first_steps(coverage: Coverage) -> int:
+    """Steps of the first quarter of its blocks, and of 8 at least."""
+    blocks = coverage.estimate(coverage.regions[0], next(iter(coverage.grid.heights))).steps
+    return int(blocks[: max(MIN_BLOCKS, len(blocks) // SHARE_OF_OTHERS)].sum())
+
+
+def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Trial, Coverage]:
     """Run a setting, and hold it against the first."""
+    task, before_s = simulation(settings), sum(os.times()[:4])
     result = measured(task, settings)
+    processor_s = sum(os.times()[:4]) - before_s
     assert result.run is not None  # it was not loaded
     result.run.raise_failure()
     coverage, awaited = result.coverage, task.asked.awaited
@@ -341,31 +354,37 @@ def _tried(
     numbers = []
     for region, height in places:
         estimate = coverage.estimate(region, height)
-        differences = _differences(coverage, first, estimate, region, height)
+        against = None if first is None else _paired(first, coverage, region, height)
+        differences = estimate.differences(against) if against else {}
         if region in awaited and not estimate.value.isnan().all():
             worlds = min(worlds, float(estimate.effective.min()))
-        each = zip(estimate.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True)
-        for quantity, value, error in each:
-            difference = differences.get(quantity.key)
+        a = _known(estimate.error).square() * steps
+        if against and first:  # who has more steps knows it better; on the same instants the ratio is known well
+            more = _known(first.estimate(region, height).error).square() * first.counts["steps"]
+            a = torch.where(more.isnan(), a, more * (estimate.error / _known(against.error)).square())
+        for quantity, value, own in zip(estimate.quantities, estimate.value.tolist(), a.tolist(), strict=True):
+            difference = None if first is None else differences.get(quantity.key, Difference(quantity, math.nan))
             is_biased = difference is not None and difference.p * count < LEVEL
             bias = abs(difference.value) if difference and (is_biased or math.isnan(difference.value)) else 0.0
-            model = ErrorModel.of(error, steps, bias)
             place = region.name, height, region in awaited
-            numbers.append(Studied(*place, quantity, value, model, difference, is_biased))
+            numbers.append(Studied(*place, quantity, value, ErrorModel(own, bias), difference, is_biased))
     least = max(MIN_STEPS, math.ceil(MIN_BLOCKS * steps / worlds) if worlds > 0 else steps)
-    return Trial(options, steps, least, result.run.seconds, result.run.measuring_s, numbers), coverage
+    times = result.run.seconds, result.run.measuring_s, processor_s
+    return Trial(options, steps, least, *times, numbers), coverage
 
 
-def _differences(
-    coverage: Coverage, first: Coverage | None, estimate: Estimate, region: Region, height: str
-) -> dict[str, Difference]:
-    """To the first setting; unknown of numbers of another definition, or of other instants."""
-    if first is None:
-        return {}
-    against = first.estimate(region, height)
-    if first.measure == coverage.measure and against.steps.tolist() == estimate.steps.tolist():
-        return estimate.differences(against)
-    return {quantity.key: Difference(quantity, math.nan) for quantity in estimate.quantities}
+def _known(errors: Tensor) -> Tensor:
+    """Errors, NaN where all blocks say the same: that proves nothing."""
+    return errors.where(errors > ROUND_OFF, math.nan)
+
+
+def _paired(first: Coverage, coverage: Coverage, region: Region, height: str) -> Estimate | None:
+    """The first setting over the instants of another; None of numbers of another definition, or of other instants."""
+    own, against = (each.estimate(region, height) for each in (coverage, first))
+    if first.measure != coverage.measure or len(own.steps) > len(against.steps):
+        return None
+    against = against.after(len(own.steps))
+    return against if against.steps.tolist() == own.steps.tolist() else None
 
 
 def command_s(plan: StudyPlan) -> float:

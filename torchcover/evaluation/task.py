@@ -98,8 +98,10 @@ def task_of(settings: Settings) -> Task[FrameSource]:
     if settings.scenario is not None:
         raise ValueError("scenario and frames exclude each other: simulate a scenario or read a recording")
     settings.check_recording()
-    is_path = isinstance(frames, str | Path)
-    source = RecordedFrames(frames, ground=settings.band_frame != "vehicle") if is_path else frames
+    if isinstance(frames, str | Path):
+        source: FrameSource = RecordedFrames(frames, ground=settings.band_frame != "vehicle")
+    else:
+        source = frames
     if missing := [name for name in vars(FrameSource) if not name.startswith("_") and not hasattr(source, name)]:
         raise TypeError(
             f"frames: a recording's path or a torchcover.data.FrameSource is needed; got {type(source).__name__}, "

@@ -202,8 +202,8 @@ class Frame:
 class FrameBatch:
     """Frames side by side, as `CoverageMetric.update` takes them.
 
-    `metric.update(batch.sensor, batch.reference, weights=batch.weights, height=batch.heights_in(grid.band_frame),
-    place_in_time=batch.place_in_time)`.
+    `metric.update(batch.clouds_of(within_m=metric.within_m), batch.reference, weights=batch.weights,
+    height=batch.heights_in(grid.band_frame), place_in_time=batch.place_in_time)`.
 
     Args:
         frames: The frames in order.

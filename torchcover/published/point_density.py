@@ -1,7 +1,7 @@
 """How many points a rig has, how dense they are, and how evenly they lie."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid, Region, check_regions
 from torchcover.frames import Frame
-from torchcover.neighbors import check_cloud
+from torchcover.neighbors import check_cloud, nearest
 from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.sights import rig_of
 
@@ -22,8 +22,8 @@ class PointDensity(WorldRatios):
     et al. (2023) look at; their own formula of uniformity could not be read.
 
     Args:
-        grid: Where points count: its extent, its height bands, over z of the vehicle whatever its band frame is, and
-            the cells of the uniformity.
+        grid: Where points count: its extent, its height bands, and the cells of the uniformity. The ground below a
+            point is that below the reference point which, seen from above, is next to it.
         regions: Those that have numbers of their own.
         rig: Whose clouds; those of the only rig if not given.
         kwargs: For `torchmetrics.Metric`.
@@ -54,17 +54,16 @@ class PointDensity(WorldRatios):
             *(said(f"point_density{name}", "points/m2", "frames") for name in names),
             *(said(f"point_uniformity_{grid.cell:g}m{name}", "share", "frames") for name in names),
         ]
-        super().__init__(
-            ratios, {"grid": replace(grid, band_frame="vehicle"), "regions": tuple(regions)}, rig, **kwargs
-        )
-        self.grid = replace(grid, band_frame="vehicle")
+        super().__init__(ratios, {"grid": grid, "regions": tuple(regions)}, rig, **kwargs)
+        self.grid = grid
         everywhere = torch.ones(grid.shape[1:], dtype=torch.bool)
         self._members = torch.stack([everywhere, *(region.mask(grid) for region in regions)]).flatten(1).double()
 
     def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         cloud = frame.cloud_of(rig_of(frame, self.rig))
         check_cloud(cloud, "sensor")
-        each = self.grid.points_by_column(cloud).flatten().cpu()
+        height = None if self.grid.band_frame == "vehicle" else _heights_m(cloud, frame)
+        each = self.grid.points_by_column(cloud, height).flatten().cpu()
         cells = self._members.sum(dim=1)
         points, squares = (self._members @ torch.stack([each, each.square()], dim=1)).T
         somewhere = (points > 0).double()
@@ -73,3 +72,13 @@ class PointDensity(WorldRatios):
         base = torch.cat([one, cells * self.grid.cell**2, somewhere])
         counts = torch.cat([one, torch.ones_like(cells), somewhere]).long()
         return base, torch.cat([all_points, points, uniformity]), counts
+
+
+def _heights_m(cloud: Tensor, frame: Frame) -> Tensor:
+    """(N,) how high points lie above the ground, NaN where it is unknown everywhere."""
+    heights_m = frame.heights_in("ground")
+    assert heights_m is not None  # those over z alone are
+    known = heights_m.isfinite()
+    ground_m = torch.cat([(frame.reference[:, 2] - heights_m)[known], heights_m.new_tensor([math.nan])])
+    from_above = cloud.new_tensor([1.0, 1.0, 0.0])
+    return cloud[:, 2] - ground_m[nearest(cloud * from_above, frame.reference[known] * from_above).index]

@@ -179,7 +179,8 @@ def _beside_what_stands(low: Float64, stands: Bools, lower_m: Float64) -> Bools:
 def _squares(across_m: Float64) -> Numbers:
     """(N,) numbers of the squares of (N, 2) places from the first corner."""
     x, y = (across_m / NODE_M).astype(np.int64).T + REACH
-    return y * SIDE + x
+    numbers: Numbers = y * SIDE + x
+    return numbers
 
 
 def _a_fifth_below(square: Numbers, heights_m: Float64) -> Numbers:
@@ -187,7 +188,8 @@ def _a_fifth_below(square: Numbers, heights_m: Float64) -> Numbers:
     order = np.lexsort((heights_m, square))
     first = np.flatnonzero(np.diff(square[order], prepend=-1))
     count = np.diff(np.append(first, len(order)))
-    return order[first + (FIFTH * count).astype(np.int64)]
+    chosen: Numbers = order[first + (FIFTH * count).astype(np.int64)]
+    return chosen
 
 
 def _around() -> tuple[Numbers, Float64]:

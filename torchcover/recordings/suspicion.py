@@ -18,6 +18,8 @@ from torchcover.recordings.recording import Recording
 
 # What is looked at, evenly spread over what will be measured.
 FRAMES, POSES = 5, 64
+# As far around the vehicle as the ground beneath it is looked for.
+GROUND_WITHIN_M = 30.0
 # Half of the lowest band: beyond, the ground is in another one, or in none.
 GROUND_OFF_M = 0.5
 # Clouds of fewer points may be alike; so near, a point is the other one.
@@ -96,8 +98,9 @@ def ground_height_m(points_m: NDArray[np.floating]) -> float | None:
         >>> round(ground_height_m(np.stack([x.ravel(), y.ravel(), 0.05 * x.ravel() - 1.7], axis=1)), 1)
         -1.7
     """
+    near_m = points_m[(np.abs(points_m) < GROUND_WITHIN_M).all(axis=1)].astype(np.float64)
     origin_m = np.zeros((1, 3))
-    ground = GroundModel.below([low_surfaces(points_m.astype(np.float64), origin_m[0])], origin_m[0])
+    ground = GroundModel.below([low_surfaces(near_m, origin_m[0])], origin_m[0])
     above_m = np.nan if ground is None else float(ground.heights_m(origin_m)[0])
     return None if np.isnan(above_m) else -above_m
 

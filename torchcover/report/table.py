@@ -143,7 +143,7 @@ def _rows(
 
 
 def _conditions(coverage: Coverage) -> Conditions:
-    blocks = coverage.blocks
+    blocks = coverage.blocks and (coverage.places or coverage.blocks)  # by area they are the fine ones
     used = None if blocks is None else int((blocks.steps > 0).sum())
     longest = None if blocks is None else int(blocks.steps.max())
     return Conditions(dict(coverage.counts), used, longest, coverage.counts["inside_points"])

@@ -33,11 +33,14 @@ PROBES = np.array([0.1, 0.5, 0.9])
 NEAR_M = 1.0
 # Ground that is nowhere higher or lower than that is looked at as a whole, and not square by square.
 LEVEL_M = 0.3
-# Side of the smallest squares in which the height of the ground is known roughly, of how many at most.
-SQUARE_M = 8.0
+# Side of the smallest squares in which the height of the ground is known roughly, of how many at most. Those that the
+# ground of own cities is made of lie like them: at multiples of 10 m.
+SQUARE_M = 10.0
 MOST_SQUARES = 65_536
 # Points are rounded to float32, and so are their heights: so little above or below the ground they lie on it.
 ROUNDING_M = 5e-4
+# What reaches so little into a square, as a share of it, is next to it.
+ROUNDING = 1e-6
 # Bounds of heights are so much wider.
 SLACK_M = 1e-3
 
@@ -56,14 +59,23 @@ def level_faces(mesh: Mesh, outward: Bools | None = None) -> Bools:
         >>> level_faces(Plane(type="plane", size_m=(1, 1)).mesh()).tolist()
         [True, True]
     """
+    level, down = _looks(mesh, 1.0), looks_down(mesh)
+    if down.any():
+        level |= down & ~(outward_faces(mesh) if outward is None else outward)
+    return level
+
+
+def looks_down(mesh: Mesh) -> Bools:
+    """(F,) whether the normal of each face points downwards, and the face is not too steep to stand on."""
+    return _looks(mesh, -1.0)
+
+
+def _looks(mesh: Mesh, way: float) -> Bools:
     first, second, third = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
     normals = np.cross(second - first, third - first)
     least = np.cos(np.deg2rad(STEEPEST_DEG)) * np.linalg.norm(normals, axis=1)
-    level: Bools = (normals[:, 2] >= least) & (least > 0)
-    downwards = normals[:, 2] <= -least
-    if (downwards & (least > 0)).any():
-        level |= downwards & (least > 0) & ~(outward_faces(mesh) if outward is None else outward)
-    return level
+    looks: Bools = (way * normals[:, 2] >= least) & (least > 0)
+    return looks
 
 
 def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
@@ -79,7 +91,8 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
     Returns:
         One (F,) mask for each mesh.
     """
-    level = [level_faces(mesh) for mesh in meshes]
+    outward = [outward_faces(mesh) for mesh in meshes]
+    level = [level_faces(mesh, known) for mesh, known in zip(meshes, outward, strict=True)]
     if not any(mask.any() for mask in level):
         return level
     corners_m = np.concatenate([mesh.vertices_m[mesh.faces[mask]] for mesh, mask in zip(meshes, level, strict=True)])
@@ -92,8 +105,8 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
     one, other = surface[face[border]].repeat(len(PROBES)), _met(caster, _probes_m(corners_m, border), STEP_M)
     joined = np.stack([one, other])[:, other >= 0]
     root = connected(np.tile(np.arange(joined.shape[1]), 2), joined.ravel(), surface.max() + 1)
-    outward = np.concatenate([outward_faces(mesh)[mask] for mesh, mask in zip(meshes, level, strict=True)])
-    is_sheet = np.bincount(surface, weights=outward) == 0
+    of_level = np.concatenate([known[mask] for known, mask in zip(outward, level, strict=True)])
+    is_sheet = np.bincount(surface, weights=of_level) == 0
     is_ground = np.isin(root, root[_stood_on(caster, places_m, is_sheet)])[surface]
     ends = np.cumsum([np.count_nonzero(mask) for mask in level])[:-1]
     for mask, found in zip(level, np.split(is_ground, ends), strict=True):
@@ -212,7 +225,7 @@ class LocalGround:
     @cached_property
     def squares(self) -> "GroundSquares":
         """Between which heights it lies, roughly, in its own frame: that of the world less the origin."""
-        return GroundSquares.of(self._meshes)
+        return GroundSquares.of(self._meshes, self.origin_m)
 
 
 class GroundSquares(NamedTuple):
@@ -227,10 +240,16 @@ class GroundSquares(NamedTuple):
     levels: Sequence[Float32]
 
     @classmethod
-    def of(cls, meshes: Sequence[Mesh]) -> "GroundSquares":
-        """Those of triangles, of whose bounding boxes all squares are taken, lest one be overlooked."""
+    def of(cls, meshes: Sequence[Mesh], origin_m: Float64) -> "GroundSquares":
+        """Those of triangles, of whose bounding boxes all squares are taken, lest one be overlooked.
+
+        Args:
+            meshes: The triangles, near zero.
+            origin_m: (3,) what was subtracted of their world coordinates.
+        """
         parts = [mesh.vertices_m[mesh.faces] for mesh in meshes]
-        corners_m = np.concatenate([np.empty((0, 3, 3)), *parts]).transpose(1, 2, 0)
+        # NumPy is quick along the last axis.
+        corners_m = np.ascontiguousarray(np.concatenate([np.empty((0, 3, 3)), *parts]).transpose(1, 2, 0))
         if corners_m.shape[2] == 0:
             return cls(np.zeros(2), math.inf, [np.array([[[np.inf]], [[-np.inf]]], dtype=np.float32)])
         lower_m, upper_m = corners_m.min(axis=0), corners_m.max(axis=0)
@@ -238,10 +257,12 @@ class GroundSquares(NamedTuple):
         if highest_m - lowest_m <= LEVEL_M:
             everywhere = np.array([lowest_m - SLACK_M, highest_m + SLACK_M], dtype=np.float32)
             return cls(np.zeros(2), math.inf, [everywhere.reshape(2, 1, 1)])
-        first_m, size_m = lower_m[:2].min(axis=1), np.ptp(np.hstack([lower_m[:2], upper_m[:2]]), axis=1)
+        size_m = np.ptp(np.hstack([lower_m[:2], upper_m[:2]]), axis=1)
         square_m = max(SQUARE_M, float(np.sqrt(size_m.prod() / MOST_SQUARES)), float(size_m.max()) / MOST_SQUARES)
-        from_square = ((lower_m[:2] - first_m[:, None]) / square_m).astype(np.int64)
-        to_square = ((upper_m[:2] - first_m[:, None]) / square_m).astype(np.int64)
+        first_m = np.floor((lower_m[:2].min(axis=1) + origin_m[:2]) / square_m) * square_m - origin_m[:2]
+        from_square = np.floor((lower_m[:2] - first_m[:, None]) / square_m + ROUNDING).astype(np.int64)
+        to_square = np.ceil((upper_m[:2] - first_m[:, None]) / square_m - ROUNDING).astype(np.int64) - 1
+        to_square = np.maximum(to_square, from_square)
         columns, rows = (to_square.max(axis=1) + 1).tolist()
         lowest, highest = np.full(columns * rows, np.inf), np.full(columns * rows, -np.inf)
         slopes, at_zero_m = _planes(corners_m - np.append(first_m, 0.0)[None, :, None])

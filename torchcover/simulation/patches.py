@@ -144,6 +144,7 @@ class Patches(NamedTuple):
         bounds: Bounds | None = None,
         heights: Callable[[Float64, Int64], tuple[Float32, Bools]] | None = None,
         coincident: Int32 | None = None,
+        outward: Bools | None = None,
     ) -> Self:
         """Cut a mesh, or what is wanted of it.
 
@@ -153,6 +154,7 @@ class Patches(NamedTuple):
             heights: Of (3, 3, N) corners, coordinates, triangles and (N,) the faces that they are parts of: their
                 `heights_m`, and (N,) whether any of that is wanted.
             coincident: (F,) what patches of each face have as `face`, if any coincides.
+            outward: (F,) what `outward_faces` says of it, if that is known.
         """
         extent_m = 0.0 if bounds is not None else float(np.ptp(mesh.vertices_m, axis=0).max())
         corners_m = np.ascontiguousarray(mesh.vertices_m[mesh.faces].transpose(1, 2, 0))
@@ -160,9 +162,9 @@ class Patches(NamedTuple):
         (corner, second, third), face, heights_m = _cut(corners_m, bounds, longest_m, heights)
         first_m, second_m = (second - corner).astype(np.float32), (third - corner).astype(np.float32)
         nobodys = np.full(len(face), -1, dtype=np.int32)
-        outward = outward_faces(mesh)[face]
         of_face = np.empty((0, len(face)), dtype=np.int32) if coincident is None else coincident[None, face]
-        return cls(corner.astype(np.float32), first_m, second_m, outward, nobodys, heights_m, of_face)
+        is_outward = (outward_faces(mesh) if outward is None else outward)[face]
+        return cls(corner.astype(np.float32), first_m, second_m, is_outward, nobodys, heights_m, of_face)
 
     @classmethod
     def joined(cls, parts: "list[Patches]") -> Self:
@@ -237,7 +239,9 @@ def _cut(
             kept &= bounds.meet(triangles.min(axis=0).T, triangles.max(axis=0).T)
         heights_m = np.empty((0, len(face)), dtype=np.float32)
         if heights is not None:
-            triangles, face, area_m2 = triangles[..., kept], face[kept], area_m2[kept]
+            if not kept.all():
+                some = np.flatnonzero(kept)
+                triangles, face, area_m2 = triangles.take(some, axis=2), face[some], area_m2[some]
             heights_m, kept = heights(triangles, face)
         edges_m = np.linalg.norm(triangles[[1, 2, 0]] - triangles, axis=1)
         small = edges_m.max(axis=0) <= longest_m

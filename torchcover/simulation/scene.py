@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from torchcover.geometry import BoundingBox, invert, overlap
 from torchcover.geometry.trajectory import poses_at
 from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
-from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces
+from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces, looks_down
 from torchcover.simulation.memory import check_fits
 from torchcover.simulation.moving import Moving, Solids
-from torchcover.simulation.patches import Bounds
+from torchcover.simulation.patches import Bounds, outward_faces
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import Tile, rotate
 from torchcover.simulation.shapes import Mesh
@@ -91,9 +91,14 @@ class Scene:
             times_s = self.world.time_step_s * looks.astype(np.float64)
             return ground_under(static, self.world.ego.trajectory.positions_at(times_s))
         return [
-            level_faces(mesh) if number in known else np.zeros(len(mesh.faces), dtype=bool)
-            for number, mesh in enumerate(static)
+            level_faces(mesh, outward) if number in known else np.zeros(len(mesh.faces), dtype=bool)
+            for number, (mesh, outward) in enumerate(zip(static, self._outward, strict=True))
         ]
+
+    @cached_property
+    def _outward(self) -> Sequence[NDArray[np.bool_]]:
+        """For each static mesh what `outward_faces` says of it."""
+        return [outward_faces(mesh) for mesh in self.world.static]
 
     def surface(self, lower_m: Matrix, upper_m: Matrix, heights_m: tuple[float, float] | None = None) -> SceneSurface:
         """The surface of everything but the ego, for questions about a box that the vehicle carries along.
@@ -122,6 +127,7 @@ class Scene:
                 },
                 {self._first_moving + k: number[id(actor)] for k, actor in enumerate(self._moving) if actor is not ego},
                 bounds,
+                self._outward,
                 None if heights_m is None else self._above_ground(*heights_m),
                 self.coincident,
             )
@@ -140,7 +146,8 @@ class Scene:
     def _above_ground(self, lowest_m: float, highest_m: float) -> AboveGround:
         squares_T_static = self._world_T_local.copy()
         squares_T_static[:3, 3] -= self.ground.origin_m
-        return AboveGround(self.ground.squares, squares_T_static, self.is_ground, lowest_m, highest_m)
+        down = [outward & looks_down(mesh) for mesh, outward in zip(self.world.static, self._outward, strict=True)]
+        return AboveGround(self.ground.squares, squares_T_static, self.is_ground, down, lowest_m, highest_m)
 
     def at(self, step: int, within_m: float = np.inf) -> "Instant":
         """Place everything for one step.

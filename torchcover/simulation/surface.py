@@ -21,6 +21,8 @@ Numbers = NDArray[np.int64]
 
 # Between which heights above the ground the ground itself lies.
 OF_GROUND_M = np.array([[-TOLERANCE_M - HEIGHT_SLACK_M], [HEIGHT_SLACK_M]], dtype=np.float32)
+# What is nowhere higher above it, by bounds that are wider than it is, lies on it.
+ON_GROUND_M = 3 * HEIGHT_SLACK_M
 # Side of the squares of the ground by which patches are looked up.
 CELL_M = 16  # a power of two
 # A drive is followed by boxes around stretches of it of this length.
@@ -47,28 +49,36 @@ class Groups(NamedTuple):
 class AboveGround(NamedTuple):
     """What is asked about the surface by height above the local ground.
 
-    `squares` of the ground; `squares_T_static` (4, 4) from the frame of what never moves to theirs; `ground` for each
-    mesh that never moves (F,) which of its faces are ground; `lowest_m` and `highest_m` of all heights that are wanted.
+    `squares` of the ground; `squares_T_static` (4, 4) from the frame of what never moves to theirs; for each mesh that
+    never moves (F,) which of its faces are `ground`, and which look `down` and are seen from below only; `lowest_m` and
+    `highest_m` of all heights that are wanted.
     """
 
     squares: GroundSquares
     squares_T_static: Float64
     ground: Sequence[Bools]
+    down: Sequence[Bools]
     lowest_m: float
     highest_m: float
 
     def of_scenery(self, number: int) -> Callable[[Float64, Numbers], tuple[Float32, Bools]]:
         """From triangles of a mesh that never moves and their faces to (2, N) heights, and (N,) whether any is wanted.
 
-        That of the ground itself is none, but for other ground a few centimetres above it.
+        That of the ground itself is none, but for other ground a few centimetres above it. What lies below the ground
+        is hidden by it, and so is what lies on it and looks down.
         """
+        is_ground, is_down = self.ground[number], self.down[number]
 
         def heights(triangles_m: Float64, face: Numbers) -> tuple[Float32, Bools]:
             heights_m = OF_GROUND_M.repeat(len(face), axis=1)
-            others = np.flatnonzero(~self.ground[number][face])
-            corners_m = _moved_corners(self.squares_T_static, triangles_m.take(others, axis=2))
-            heights_m[:, others] = self.squares.heights_m(corners_m)
-            wanted: Bools = (heights_m[1] >= self.lowest_m) & (heights_m[0] <= self.highest_m)
+            others = np.flatnonzero(~is_ground[face])
+            wanted = np.full(len(face), self.lowest_m <= OF_GROUND_M[1, 0])
+            if len(others):
+                of_others_m = triangles_m if len(others) == len(face) else triangles_m.take(others, axis=2)
+                corners_m = self.squares_T_static[:3, :3] @ of_others_m + self.squares_T_static[:3, 3:]
+                heights_m[:, others] = others_m = self.squares.heights_m(corners_m)
+                least_m = np.maximum(self.lowest_m, np.where(is_down[face[others]], ON_GROUND_M, 0.0))
+                wanted[others] = (others_m[1] > least_m) & (others_m[0] <= self.highest_m)
             return heights_m, wanted
 
         return heights
@@ -101,6 +111,7 @@ class SceneSurface:
         resting: By number, `static_T_object` of those that never move.
         moving: Of the others the number of the object, by that of the body in an instant.
         bounds: Boxes in the frame of what never moves, outside of which no scenery is ever asked for.
+        outward: For each mesh of the scenery (F,) what `outward_faces` says of it.
         above: What is asked by height above the local ground; None if nothing is.
         coincident: For each mesh that never moves (F,) numbers of its faces that coincide with others, -1 for the rest;
             empty if none does.
@@ -113,6 +124,7 @@ class SceneSurface:
         resting: Mapping[int, Float64],
         moving: Mapping[int, int],
         bounds: Bounds,
+        outward: Sequence[Bools],
         above: AboveGround | None = None,
         coincident: Sequence[NDArray[np.int32]] = (),
     ) -> None:
@@ -120,9 +132,16 @@ class SceneSurface:
         self._moving = {body: (objects[number], number) for body, number in moving.items()}
         placed = [objects[number].moved(pose).given_to(number) for number, pose in resting.items()]
         if above is not None:
-            placed = [above.of_objects(patches, np.eye(4), *_box_of(patches)) for patches in placed]
+            count = np.array([len(patches.outward) for patches in placed], dtype=np.int64)
+            placed = [above.of_objects(Patches.joined(placed), np.eye(4), _boxes_around(placed), count)]
         cut = [
-            Patches.cut(mesh, bounds, above and above.of_scenery(number), coincident[number] if coincident else None)
+            Patches.cut(
+                mesh,
+                bounds,
+                above and above.of_scenery(number),
+                coincident[number] if coincident else None,
+                outward[number],
+            )
             for number, mesh in enumerate(scenery)
         ]
         patches = Patches.joined(cut + placed)
@@ -235,17 +254,11 @@ def _groups(patches: Patches, group: Numbers | NDArray[np.int32]) -> Groups:
     return Groups(np.append(first, len(group)), Bounds(lower_m - SLACK_M, upper_m + SLACK_M))
 
 
-def _box_of(patches: Patches) -> tuple[Float64, Numbers]:
-    """(1, 8, 3) corners of a box around all of some patches, and (1,) how many there are."""
-    sides = np.stack([patches.lower_m.min(axis=1), patches.upper_m.max(axis=1)]).astype(np.float64)
+def _boxes_around(parts: Sequence[Patches]) -> Float64:
+    """(J, 8, 3) corners of J upright boxes, each around all patches of one part."""
+    sides = [[patches.lower_m.min(axis=1), patches.upper_m.max(axis=1)] for patches in parts]
     corner = np.indices((2, 2, 2)).reshape(3, -1).T
-    return sides[corner, np.arange(3)][None], np.array([len(patches.outward)])
-
-
-def _moved_corners(destination_T_source: Float64, corners_m: NDArray[np.floating]) -> Float64:
-    """(3, 3, N) corners, coordinates, triangles in another frame."""
-    moved_m: Float64 = destination_T_source[:3, :3] @ corners_m.astype(np.float64) + destination_T_source[:3, 3:]
-    return moved_m
+    return np.array(sides, dtype=np.float64).reshape(-1, 2, 3)[:, corner, np.arange(3)]
 
 
 def _moved_bounds(destination_T_source: Float64, bounds: Bounds) -> tuple[Float64, Float64]:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from torchcover.coverage.grid import BandFrame
 from torchcover.geometry import BoundingBox, rigid
+from torchcover.simulation.local_ground import TOLERANCE_M
 from torchcover.simulation.patches import Bounds
 from torchcover.simulation.reference_sensor import (
     DEFAULT_BAND_FRAME,
@@ -64,8 +65,8 @@ class SurfaceReference:
             `rays`.
 
     Raises:
-        ValueError: No area or no band, one with inverted or infinite bounds, no ray, no place, a shell or a range that
-            is not positive, fewer than no points on objects.
+        ValueError: No area or no band, one with inverted or infinite bounds or below the ground, no ray, no place, a
+            shell or a range that is not positive, fewer than no points on objects.
 
     Example:
         >>> from torchcover.simulation import Scenario, Simulator
@@ -99,6 +100,9 @@ class SurfaceReference:
             raise ValueError(f"object_points: a number >= 0 is needed; got {self.object_points}")
         if self.band_frame not in get_args(BandFrame):
             raise ValueError(f"band_frame: ground or vehicle is needed; got {self.band_frame!r}")
+        below = [band for band in self.bands_m if self.band_frame == "ground" and band[1] <= -TOLERANCE_M]
+        if below:
+            raise ValueError(f"bands_m: nothing is seen below the ground, and {below[0]} m lies there; use others")
         check_reach(self.shell_m, self.max_range_m)
 
     @classmethod

@@ -34,11 +34,13 @@ class State(NamedTuple):
         initial: What it is before the first step; float64 or int64. One number that is expanded takes no memory.
         reduction: How two of them become one: added up, or the larger of each entry.
         in_blocks: Whether its first dimension is the blocks of contiguous steps.
+        fine: Whether these are the fine ones.
     """
 
     initial: Tensor
     reduction: Literal["sum", "max"] = "sum"
     in_blocks: bool = False
+    fine: bool = False
 
 
 class BinnedStep(NamedTuple):

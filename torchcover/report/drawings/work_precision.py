@@ -1,5 +1,6 @@
 """Error against run time: which setting is worth its time."""
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
@@ -56,7 +57,10 @@ def _draw_panel(axes: Axes, panel: WorkPanel) -> None:
     for at, (name, points) in enumerate(panel.lines.items()):
         colour, marker = colours(MAX_LIGHTNESS * at / max(len(panel.lines) - 1, 1)), MARKERS[at % len(MARKERS)]
         axes.plot(*_xy(points), marker=marker, markersize=5, linewidth=1.2, color=colour, label=name)
-    axes.set(xscale="log", yscale="log", xlabel="run time (s)", ylabel=panel.label)
+    axes.set(xlabel="run time (s)", ylabel=panel.label)
+    if not any(math.isfinite(error) for points in panel.lines.values() for _, error in points):
+        return  # what is unknown has no logarithm
+    axes.set(xscale="log", yscale="log")
     for axis in (axes.xaxis, axes.yaxis):
         # Few numbers, written out: powers of ten lie on each other where there is less than a decade.
         axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
