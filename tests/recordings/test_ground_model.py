@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import torchcover
-from tests.recordings.drives import Drive
+from tests.recordings.drives import CAR_SIZE_M, Drive
 from torchcover.data import AccumulatedReference, RecordedFrames
 from torchcover.geometry import invert, rigid, rotation_from_euler, transform
 from torchcover.recordings.ground_model import CELL_M, GroundModel, low_surfaces
@@ -200,6 +200,14 @@ def test_heights_of_a_drive_are_those_of_its_world_however_the_vehicle_leans(til
     assert (placed_m[~known, 0] > 35.0).all()  # the wall goes on where the road was not seen
 
 
+def test_the_bottom_of_a_box_has_a_height():
+    road = Road(steps=2)
+    boxes = RecordedFrames(road)[1].boxes
+    place_m = road.world_T_car(1)[:3, 3]
+    expected_m = place_m[2] - CAR_SIZE_M[2] / 2 - rises(*place_m[:2])
+    np.testing.assert_allclose(boxes.bottom_heights_m, [expected_m], atol=0.02)
+
+
 def test_heights_do_not_depend_on_the_frames_read_before():
     forward, backward = (RecordedFrames(Road(steps=4), reference=AccumulatedReference(0.2)) for _ in range(2))
     one = [forward[index].reference_heights_m for index in range(4)]
@@ -229,4 +237,4 @@ def test_without_ground_bands_are_over_the_vehicle_and_the_result_says_so():
 def test_with_ground_bands_are_over_it():
     result = torchcover.evaluate(frames=RecordedFrames(Road(steps=2)), cell_m=8.0)
     assert result.coverage.band_frame == "ground"
-    assert "Ground:" not in " ".join(result.table.notes)
+    assert "Ground: a height field through what all sensors saw of it" in " ".join(result.table.notes)

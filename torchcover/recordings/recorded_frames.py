@@ -4,12 +4,14 @@ import operator
 import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchcover.detection import Boxes
 from torchcover.detection.inside import with_hits
 from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
@@ -21,6 +23,7 @@ from torchcover.recordings.recording import Recording
 from torchcover.recordings.sweeps import Sweeps
 
 NO_GROUND = "Ground: none was found near the vehicle, so heights are z of the vehicle frame."
+SEEN_GROUND = "Ground: a height field through what all sensors saw of it; unknown farther than 10 m from that."
 # What a folder of results holds, during the run or after it.
 RESULTS = frozenset({".lock", "summary.json", "checkpoint.npz"})
 
@@ -37,8 +40,8 @@ class RecordedFrames(FrameDataset):
         rigs: Names of rigs -> names of their sensors; those of the recording if not given.
         reference: Where the reference clouds come from. Not given: the sensors that were recorded for it, or
             else an `AccumulatedReference`.
-        ground: Whether heights above the ground that were not recorded come from a `GroundModel` of what all sensors
-            saw: within the window of the reference if it is accumulated, else at the instant.
+        ground: Whether heights above the ground that were not recorded, also of boxes, come from a `GroundModel` of
+            what all sensors saw: within the window of the reference if it is accumulated, else at the instant.
 
     Raises:
         FileNotFoundError: There is no such recording, or a part of it is missing.
@@ -77,6 +80,7 @@ class RecordedFrames(FrameDataset):
         self.ground = ground
         self._sweeps = self.reference.sweeps if isinstance(self.reference, AccumulatedReference) else Sweeps(0.0)
         self._has_heights: bool | None = None
+        self._modelled = False
 
     @property
     def names(self) -> Sequence[str]:
@@ -147,11 +151,12 @@ class RecordedFrames(FrameDataset):
 
     @property
     def reference_record(self) -> Mapping[str, object]:
-        """Where the reference comes from; that no ground was found, if it was looked for."""
+        """Where the reference comes from, and the ground, if it was looked for to choose what bands are over."""
         record = self.reference.record(self.recording, self._judged)
-        if not self.ground or self._has_heights in (None, True):
+        if self._has_heights is None or not self._modelled:
             return record
-        return {**record, "notes": [*record["notes"], NO_GROUND]}  # type: ignore[misc]  # sentences, as it says
+        words = SEEN_GROUND if self._has_heights else NO_GROUND
+        return {**record, "notes": [*record["notes"], words]}  # type: ignore[misc]  # sentences, as it says
 
     @property
     def content(self) -> Mapping[str, object]:
@@ -188,8 +193,7 @@ class RecordedFrames(FrameDataset):
         try:
             scans = {sensor: self._read(sensor, instant) for sensor in self._judged}
             reference = self.reference.cloud(self.recording, instant, self._judged)
-            heights_m = self._heights_m(instant, reference)
-            boxes = self.recording.boxes(instant)
+            heights_m, boxes = self._above_ground(instant, reference, self.recording.boxes(instant))
         except (OSError, ValueError) as error:
             raise BadFrameError(f"{name} (frame {position}): {error}") from error
         dropped = sum((scan.dropped for scan in scans.values()), Counter[str]())
@@ -225,15 +229,24 @@ class RecordedFrames(FrameDataset):
     def _read(self, sensor: str, instant: int) -> InVehicle:
         return in_vehicle(self.recording.scan(sensor, instant), self.recording.body)
 
-    def _heights_m(self, instant: int, reference: InVehicle) -> NDArray[np.float32] | None:
+    def _above_ground(
+        self, instant: int, reference: InVehicle, boxes: Boxes | None
+    ) -> tuple[NDArray[np.float32] | None, Boxes | None]:
+        """The heights of the reference points, and the boxes with those of their bottoms."""
         # Points with square metres, but without heights, were drawn for bands over z.
         if reference.heights_m is not None or reference.weights is not None or not self.ground:
-            return reference.heights_m
+            return reference.heights_m, boxes
         ground = self._sweeps.ground(self.recording, instant)
+        self._modelled = True
         if ground is None:
-            return np.full(len(reference.points_m), np.nan, dtype=np.float32)
+            return np.full(len(reference.points_m), np.nan, dtype=np.float32), boxes
         local_T_vehicle = self._sweeps.local_T_vehicle(self.recording, instant)
-        return ground.heights_m(transform(local_T_vehicle, reference.points_m)).astype(np.float32)
+        if boxes is not None:
+            centres_m = transform(local_T_vehicle, boxes.centre_m.double().numpy())
+            bottoms_m = torch.from_numpy(ground.heights_m(centres_m)).to(boxes.size_m) - boxes.size_m[:, 2] / 2
+            known = boxes.bottom_heights_m
+            boxes = replace(boxes, bottom_heights_m=torch.where(known.isnan(), bottoms_m, known))
+        return ground.heights_m(transform(local_T_vehicle, reference.points_m)).astype(np.float32), boxes
 
     def _check_sensors(self) -> None:
         there = (*self.recording.sensors, *self.recording.reference_sensors)
