@@ -44,12 +44,7 @@ class Scan:
 
 
 def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArray[np.float64]:
-    """Return the times of instants, if they can be those.
-
-    Args:
-        times_s: (F,) in seconds.
-        count: How many instants there are.
-        source: Where they were read from, for messages.
+    """Return the times of instants in seconds, if they can be those.
 
     Raises:
         ValueError: Another number of them, or two that do not follow each other.

@@ -42,13 +42,7 @@ UNITS = (
 
 
 def warn_of_mover(owner: str, mesh: Mesh, category: str) -> None:
-    """Warn if the ego or an actor is as large, as small or as wide as none is.
-
-    Args:
-        owner: What the warning calls it.
-        mesh: Its form, x forward and z up.
-        category: What it is: "ego", or that of an actor.
-    """
+    """Warn if the ego or an actor is as large, as small or as wide as none is."""
     words = set(re.split(r"[^a-z]+", category.lower()))
     on_roads = bool(words & ROAD_VEHICLES) and not words & RAIL_VEHICLES
     x, y, z = np.ptp(mesh.vertices_m, axis=0).tolist()
@@ -62,12 +56,7 @@ def warn_of_mover(owner: str, mesh: Mesh, category: str) -> None:
 
 
 def warn_of_scenery(owner: str, mesh: Mesh) -> None:
-    """Warn if what never moves, which may be a whole city, is larger than any in all three extents.
-
-    Args:
-        owner: What the warning calls it.
-        mesh: Its form.
-    """
+    """Warn if what never moves, which may be a whole city, is larger than any in all three extents."""
     x, y, z = np.ptp(mesh.vertices_m, axis=0).tolist()
     if min(x, y, z) > TALLEST_SCENERY_M:
         _warn(owner, (x, y, z), f"far too large; {UNITS}")
@@ -207,13 +196,7 @@ def in_vehicle_frame(mesh: Mesh) -> Mesh:
 
 
 def mover_mesh(name: str, shape: Shape, category: str = "ego") -> Mesh:
-    """The body of the ego or of an actor in its vehicle frame; a warning if it is too large, too small or turned.
-
-    Args:
-        name: What the warning calls it.
-        shape: Its form, in its own frame.
-        category: What it is: "ego", or that of an actor.
-    """
+    """The body of the ego or of an actor in its vehicle frame; a warning if it is too large, too small or turned."""
     mesh = in_vehicle_frame(sound_mesh(shape, name))
     if mesh.material is None:
         mesh = mesh.made_of("clothing" if category in ON_FOOT else "car_paint")

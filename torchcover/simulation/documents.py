@@ -114,9 +114,6 @@ def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -
         kind: Folder of the built-in ones, as "rigs".
         path_or_name: A path that ends in .yaml or .yml, or the name of a built-in document.
 
-    Returns:
-        The validated document.
-
     Raises:
         FileNotFoundError: No such file, or no built-in document of this name; the message lists the names.
         BadFileError: Not YAML, or a key is unknown, missing, doubled or has a wrong value; the message names the file
@@ -126,12 +123,7 @@ def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -
 
 
 def read_document(model: type[DocumentT], path: Path) -> DocumentT:
-    """Read a YAML file into a model of which none is built in.
-
-    Raises:
-        FileNotFoundError: No such file.
-        BadFileError: As for `load_document`.
-    """
+    """Read a YAML file into a model of which none is built in."""
     content = read_mapping(path)
     try:
         return model.model_validate(content, context={"folder": path.parent})
@@ -141,13 +133,7 @@ def read_document(model: type[DocumentT], path: Path) -> DocumentT:
 
 @reads("a YAML document")
 def read_mapping(path: Path) -> dict[str, Any]:
-    """The keys of a YAML file and what they hold.
-
-    Raises:
-        FileNotFoundError: No such file.
-        IsADirectoryError: A folder.
-        BadFileError: Not YAML, or no mapping.
-    """
+    """The keys of a YAML file and what they hold."""
     content = parse_yaml(read_short_text(path))
     if not isinstance(content, dict):
         raise ValueError(f"a YAML mapping of keys is needed; got {type(content).__name__}")

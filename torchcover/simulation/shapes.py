@@ -159,13 +159,7 @@ class MeshFile(Document):
     metres_per_unit: PositiveFloat = 1.0
 
     def mesh(self) -> Mesh:
-        """All geometry of the file in one mesh.
-
-        Raises:
-            FileNotFoundError: No such file.
-            IsADirectoryError: A folder.
-            BadFileError: trimesh cannot read it, it has no faces, a vertex is NaN or infinite, or it is too large.
-        """
+        """All geometry of the file in one mesh."""
         mesh = _read_mesh(self.path)
         return mesh._replace(vertices_m=mesh.vertices_m * self.metres_per_unit)
 

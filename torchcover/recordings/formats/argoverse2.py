@@ -62,9 +62,6 @@ class Argoverse2:
 
     The clouds are in the frame of the ego and corrected for its motion within a turn. Needs `torchcover[av2]`.
 
-    Args:
-        path: The log.
-
     Raises:
         FileNotFoundError: No sweeps, or no poses.
         ValueError: A table with other columns, a sweep without a pose within 10 ms.
@@ -119,12 +116,7 @@ class Argoverse2:
         return self._tracks.at(float(self._times_ns[index] - self._times_ns[0]) * 1e-9, vehicle_T_ego)
 
     def calibrations(self) -> SensorCalibrations:
-        """The mounts of both LiDARs, and the cameras with the distortion of their lenses.
-
-        Raises:
-            FileNotFoundError: The log has no `calibration/`.
-            ValueError: Other tables, or no such LiDAR in them.
-        """
+        """The mounts of both LiDARs, and the cameras with the distortion of their lenses."""
         folder = self.path / "calibration"
         poses = read_feather(folder / "egovehicle_SE3_sensor.feather", ("sensor_name", *POSE))
         lenses = read_feather(folder / "intrinsics.feather", ("sensor_name", *_LENS))

@@ -54,9 +54,6 @@ class Carla:
     frames as make a turn of all LiDARs. It bears name, time and pose of the last; the parts before are moved by the
     poses of the vehicle, without whatever else moved meanwhile. Frames at the end that make no turn are left out.
 
-    Args:
-        path: The folder.
-
     Raises:
         FileNotFoundError: No `sensors.json`, or no clouds of a LiDAR in it.
         ValueError: Not such a list, no LiDAR or depth camera in it, places with other frames, too few for a turn, or a
@@ -133,11 +130,7 @@ class Carla:
         return self._pose(self._lasts[index])
 
     def boxes(self, index: int) -> Boxes | None:
-        """The objects of a frame; None without the folder.
-
-        Raises:
-            ValueError: A file that is not what it is meant to be.
-        """
+        """The objects of a frame; None without the folder."""
         pose = self.world_T_vehicle(index)
         if pose is None or not self._labelled:
             return None

@@ -46,9 +46,6 @@ class FolderRecording:
             lower_m: [-2.4, -0.9, 0.05]
             upper_m: [2.4, 0.9, 1.6]
 
-    Args:
-        path: The folder.
-
     Raises:
         FileNotFoundError: The folder, or clouds of a sensor in it, are missing.
         ValueError: No frames, a file that is no cloud, two files of one name, names in one place only, two of
@@ -115,12 +112,7 @@ class FolderRecording:
         return None if self._poses is None else self._poses[index]
 
     def boxes(self, index: int) -> Boxes | None:
-        """The objects of a frame; None without the folder.
-
-        Raises:
-            FileNotFoundError: This frame has none, while the folder is there.
-            ValueError: A file that is not what it is meant to be.
-        """
+        """The objects of a frame; None without the folder."""
         return read_boxes(self.path / BOXES / f"{self.names[index]}.csv") if self._labelled else None
 
     def _table(self, folder: Path, *, timed: bool) -> PoseTable | None:

@@ -31,10 +31,6 @@ class KittiObject:
 
     Args:
         path: `training`, `testing`, or the folder that holds `training`.
-
-    Raises:
-        FileNotFoundError: No `velodyne`.
-        ValueError: No frames in it, or a reference with other frames.
     """
 
     layout: ClassVar[str] = "velodyne/FRAME.bin, calib/FRAME.txt, label_2/FRAME.txt"
@@ -72,12 +68,7 @@ class KittiObject:
         """Unknown."""
 
     def calibrations(self) -> SensorCalibrations:
-        """The rectified cameras of the first frame; the layout has the sizes of their images only where there are some.
-
-        Raises:
-            FileNotFoundError: It has no calibration.
-            ValueError: It is not what it is meant to be.
-        """
+        """The rectified cameras of the first frame; their sizes are known only where there are images."""
         name = self.names[0]
         calibration = self.path / "calib" / f"{name}.txt"
         images = [path for number in range(4) if (path := self.path / f"image_{number}" / f"{name}.png").exists()]
@@ -91,12 +82,7 @@ class KittiObject:
         return SensorCalibrations(source, {"velodyne": vehicle_T_velodyne}, tuple(cameras))
 
     def boxes(self, index: int) -> Boxes | None:
-        """The labels, if there are any files of them.
-
-        Raises:
-            FileNotFoundError: This frame has none, while others have.
-            ValueError: A file that is not what it is meant to be.
-        """
+        """The labels, if there are any files of them."""
         if not (self.path / "label_2").is_dir():
             return None
         name = f"{self.names[index]}.txt"

@@ -32,9 +32,6 @@ class KittiRaw:
 
     Boxes are those of `tracklet_labels.xml`, if it is there.
 
-    Args:
-        path: The folder of the drive.
-
     Raises:
         FileNotFoundError: A part is missing.
         ValueError: No frames, another number of times than of scans, times out of order, a bad calibration.
@@ -74,21 +71,11 @@ class KittiRaw:
         return Scan(read_cloud(path), vehicle_T_velodyne, str(path))
 
     def world_T_vehicle(self, index: int) -> Matrix:
-        """Where the vehicle was, by the GPS and IMU.
-
-        Raises:
-            FileNotFoundError: There is no record of that instant.
-            ValueError: It is not what it is meant to be.
-        """
+        """Where the vehicle was, by the GPS and IMU."""
         return world_T_imu(self._oxts(index), self._latitude_deg) @ self._imu_T_vehicle
 
     def calibrations(self) -> SensorCalibrations:
-        """The rectified cameras of the day, where its `calib_cam_to_cam.txt` is there.
-
-        Raises:
-            FileNotFoundError: `calib_velo_to_cam.txt` is missing beside it.
-            ValueError: They are not what they are meant to be.
-        """
+        """The rectified cameras of the day, where its `calib_cam_to_cam.txt` is there."""
         day = self.path.parent
         cameras = day / "calib_cam_to_cam.txt"
         mounts = {"velodyne": vehicle_T_velodyne}
@@ -125,13 +112,6 @@ def read_tracklets(path: Path, vehicle_T_velodyne: Matrix) -> dict[int, Boxes]:
 
     The origin of a tracklet is the middle of the bottom of its box, in the frame of the LiDAR. Its name is its number
     in the file.
-
-    Args:
-        path: The file.
-        vehicle_T_velodyne: (4, 4) where the LiDAR is; its z axis is upright.
-
-    Raises:
-        BadFileError: Not such a file, or numbers that are no boxes.
     """
     root = parse_xml(path)
     frames: dict[int, list[tuple[list[float], str, str]]] = {}

@@ -94,11 +94,7 @@ class Ros2:
         return range(len(self.names))
 
     def scan(self, sensor: str, index: int) -> Scan:
-        """Read a cloud; where the vehicle's poses are known, it is moved to the instant.
-
-        Raises:
-            BadFileError: It is damaged, there is none near the instant, or no pose near a point's time.
-        """
+        """Read a cloud; where the vehicle's poses are known, it is moved to the instant."""
         cloud, stamp_ns = self._cloud(sensor, index)
         source, mount = f"{self.path}: {sensor} at {self._logged_ns[sensor][index]}", self._mounts[sensor]
         if self._poses is None:
@@ -118,11 +114,7 @@ class Ros2:
         return Scan(points_m, mount, source)
 
     def world_T_vehicle(self, index: int) -> Matrix | None:
-        """Where the vehicle was at the stamp of the instant; None in a bag without poses.
-
-        Raises:
-            BadFileError: The messages are damaged, or there is no pose near that time.
-        """
+        """Where the vehicle was at the stamp of the instant; None in a bag without poses."""
         return None if self._poses is None else self._world_T_vehicle(self._poses, index)
 
     def calibrations(self) -> SensorCalibrations:

@@ -25,11 +25,7 @@ PLACES_ALIKE_M = 1e-6
 
 
 def ground_of(vicinity: Vicinity) -> Plain | Slopes:
-    """The ground around the ego's way: plain if all lanes are of one height, else through all that are no bridges.
-
-    Raises:
-        ValueError: The way is so long that the ground would have more than four million corners.
-    """
+    """The ground around the ego's way: plain if all lanes are of one height, else through all that are no bridges."""
     lower_m, upper_m = vicinity.lower_m - MARGIN_M, vicinity.upper_m + MARGIN_M
     places_m = vicinity.samples_m[~vicinity.on_deck]
     if np.ptp(vicinity.samples_m[:, 2]) == 0.0:
@@ -76,12 +72,7 @@ def tilts_deg(ground: Ground, places_m: Numbers, yaw_deg: Numbers, size_m: tuple
 
 
 class Pavement:
-    """All sidewalks and medians, in plan: where neither vehicles nor crossings are.
-
-    Args:
-        vicinity: What is near.
-        ground: What they lie on.
-    """
+    """All sidewalks and medians, in plan: where neither vehicles nor crossings are."""
 
     def __init__(self, vicinity: Vicinity, ground: Ground) -> None:
         self._ground = ground

@@ -47,11 +47,6 @@ def load_bodies() -> Mapping[str, Mesh]:
 class Fleet:
     """The bodies of a world, and the drivers drawn for them.
 
-    Args:
-        bodies: A mesh for each kind in `CATEGORIES`.
-        ego: Body of the ego; the SUV if not given.
-        generator: Draws kinds, drivers and gaps.
-
     Raises:
         ValueError: A kind has no body.
     """

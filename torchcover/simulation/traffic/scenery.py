@@ -117,15 +117,7 @@ def post(centre_m: ArrayLike, radius_m: float, bottom_m: float, height_m: float)
 
 
 def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, crown_radius_m: float) -> list[Mesh]:
-    """A trunk, and on it a crown as wide as given.
-
-    Args:
-        centre_m: (2,) position.
-        bottom_m: Height of the soil.
-        clear_m: Height of the crown's lower end above the soil.
-        height_m: Height of the whole tree.
-        crown_radius_m: Largest radius of the crown.
-    """
+    """A trunk, and on it a crown as wide as given."""
     shape, centre = _circle(CROWN_SIDES), np.asarray(centre_m)
     outlines = [centre + share * crown_radius_m * shape for share in (0.45, 1.0, 0.9, 0.3)]
     levels = bottom_m + clear_m + np.array([0.0, 0.3, 0.65, 1.0]) * (height_m - clear_m)
@@ -134,15 +126,7 @@ def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, 
 
 
 def rail(line: Polyline, places_m: Numbers, left_m: float, width_m: float, z_m: tuple[float, float]) -> list[Mesh]:
-    """A rail or wall along a line: one straight piece between each two places.
-
-    Args:
-        line: What it follows.
-        places_m: (K,) ascending places on the line.
-        left_m: How far its middle lies to the left of the line.
-        width_m: Its thickness.
-        z_m: Its lower and upper edge.
-    """
+    """A rail or wall along a line: one straight piece between each two of (K,) ascending places."""
     sides = [beside(line, places_m, left_m + shift)[:, :2] for shift in (-width_m / 2, width_m / 2)]
     pieces = []
     for piece in range(len(places_m) - 1):
