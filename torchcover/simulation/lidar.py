@@ -11,7 +11,7 @@ from torchcover.simulation.documents import Pose, beside, is_file_name, load_doc
 from torchcover.simulation.material import material_number, materials, tone
 from torchcover.simulation.rays import unit_directions
 from torchcover.simulation.returns import log_excess, return_probability
-from torchcover.simulation.sensor import Draws, Elevation, Ranging, RayHits, Returns, Scan
+from torchcover.simulation.sensor import Draws, Elevation, Ranging, RayHits, Returns, ScanTimes
 
 # Two ways to write rows: a sensor that chooses one of them takes nothing of the other from its model.
 SPACED_ROWS = ("channels", "vertical_fov_deg")
@@ -51,7 +51,7 @@ class ScanPattern(Ranging):
     range_at_10_percent_m: PositiveFloat | None = None
     spread: PositiveFloat = 0.3
     range_factors: tuple[PositiveFloat, ...] | None = None
-    scan: Scan | None = None
+    scan: ScanTimes | None = None
 
     @model_validator(mode="after")
     def _check_rows(self) -> Self:
