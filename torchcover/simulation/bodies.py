@@ -3,14 +3,14 @@
 import re
 import warnings
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import shapes
-from torchcover.simulation.documents import Document, NameOrFile, Pose, is_file_name, load_document
+from torchcover.simulation.documents import BuiltIn, Document, NameOrFile, Pose, is_file_name
 from torchcover.simulation.material import material_number
 from torchcover.simulation.mount_regions import MountRegion
 from torchcover.simulation.shapes import Mesh
@@ -79,11 +79,11 @@ class VehicleShape(Document):
 
     def mesh(self) -> Mesh:
         """All parts in one mesh, in the vehicle frame."""
-        return load_document(Vehicle, "vehicles", self.vehicle).mesh()
+        return Vehicle.load(self.vehicle).mesh()
 
     def content(self) -> dict[str, Any]:
         """Its parts, wherever they stand."""
-        return load_document(Vehicle, "vehicles", self.vehicle).content()
+        return Vehicle.load(self.vehicle).content()
 
 
 Shape = Annotated[
@@ -138,7 +138,7 @@ class Body(Document):
 RegionName = Annotated[str, Field(min_length=1)]
 
 
-class Vehicle(Document):
+class Vehicle(BuiltIn):
     """The body of a vehicle, put together from parts.
 
     Args:
@@ -147,6 +147,8 @@ class Vehicle(Document):
         parts: Its parts, in one frame with x forward and z up.
         mount_regions: By name, patches of its skin that sensors can be mounted on, in the vehicle frame.
     """
+
+    folder: ClassVar[str] = "vehicles"
 
     name: str
     description: str = ""
@@ -185,7 +187,7 @@ def mount_regions_of(shape: Shape | None) -> dict[str, MountRegion]:
     """
     if not isinstance(shape, VehicleShape):
         return {}
-    return load_document(Vehicle, "vehicles", shape.vehicle).mount_regions
+    return Vehicle.load(shape.vehicle).mount_regions
 
 
 def in_vehicle_frame(mesh: Mesh) -> Mesh:
