@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import spread
 from torchcover.simulation.height_field import CELL_M, MARGIN_M, Ground, Plain, Slopes, corners_of, middles_m
-from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.shapes import Mesh, band
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.scenery import PAVEMENT_M
 
@@ -123,12 +123,11 @@ def _slab(piece: shapely.Geometry, ground: Ground) -> Mesh:
     # Around the outline an edge has a triangle on one side only.
     key, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
     here, following = edges[~np.isin(key, back)].T
-    sides = [np.stack([here + count, following + count, following]), np.stack([here + count, following, here])]
     return Mesh(
         np.concatenate([
             np.column_stack([places_m, heights_m + PAVEMENT_M]), np.column_stack([places_m, heights_m - SUNK_M])
         ]),
-        np.concatenate([faces, faces[:, ::-1] + count, *(side.T for side in sides)]),
+        np.concatenate([faces, faces[:, ::-1] + count, band(here + count, following + count, -count)]),
     ).made_of("pavement")  # fmt: skip
 
 
