@@ -136,6 +136,20 @@ class Recording(Protocol):
         ...
 
 
+class Layout:
+    """What most layouts have in common: every instant is looked at, and no reference was recorded."""
+
+    names: Sequence[str]
+    reference_sensors: Sequence[str] = ()
+    square_metres = False
+    instants: Sequence[int] | None = None
+
+    @property
+    def frames(self) -> range:
+        """All instants."""
+        return range(len(self.names))
+
+
 class SensorCalibrations(NamedTuple):
     """Mounts of LiDARs, and cameras.
 

@@ -60,11 +60,7 @@ class Materials(NamedTuple):
 
 @cache
 def material_number(name: str) -> int:
-    """The number of a built-in material, which meshes have; 0 is where none was said.
-
-    Raises:
-        FileNotFoundError: No such material; the message has the nearest name.
-    """
+    """The number of a built-in material, which meshes have; 0 is where none was said."""
     known = builtin_names("materials")
     if name not in known:
         Material.load(name)

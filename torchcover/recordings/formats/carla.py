@@ -26,7 +26,7 @@ from torchcover.recordings.formats.carla_files import (
     right_handed,
 )
 from torchcover.recordings.formats.file_names import check_frames, check_same_names, frame_files
-from torchcover.recordings.recording import Scan, check_times
+from torchcover.recordings.recording import Layout, Scan, check_times
 
 SENSORS_FILES = ("sensors.json", "sensors.yaml")
 VEHICLE_FILE, POSES_FILE, BOXES = "vehicle.json", "poses.csv", "boxes"
@@ -36,7 +36,7 @@ OF_A_FILE = 0.02
 SECTOR_DEG = 60.0
 
 
-class Carla:
+class Carla(Layout):
     """A folder with `sensors.json` and `ID/FRAME.ply` (or `.npy`; `.png` of a depth camera) of each sensor in it.
 
     All of it is in CARLA's left-handed axes. `sensors.json` (or `.yaml`) is the list that an agent of CARLA's
@@ -64,8 +64,6 @@ class Carla:
     """
 
     layout: ClassVar[str] = "sensors.json, ID/FRAME.ply of each LiDAR and ID/FRAME.png of each depth camera in it"
-    square_metres = False
-    instants = None
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -102,11 +100,6 @@ class Carla:
         self.names = tuple(self._ticks[last] for last in self._lasts)
         if self.times_s is not None:
             self.times_s = self.times_s[self._lasts.start :: turn]
-
-    @property
-    def frames(self) -> range:
-        """All of them."""
-        return range(len(self.names))
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

@@ -10,7 +10,7 @@ from torchcover.recordings.clouds.readers import read_cloud, read_heights, read_
 from torchcover.recordings.formats.file_names import check_same_names, frame_files, natural
 from torchcover.recordings.formats.folder_settings import FolderSettings, PlaceSettings, read_folder_settings
 from torchcover.recordings.formats.folder_tables import PoseTable, read_boxes
-from torchcover.recordings.recording import Scan, check_times
+from torchcover.recordings.recording import Layout, Scan, check_times
 
 SETTINGS_FILE = "frames.yaml"
 POSES_FILE = "poses.csv"
@@ -19,7 +19,7 @@ REFERENCE, BOXES = "reference", "boxes"
 ONLY_RIG = "recording"
 
 
-class FolderRecording:
+class FolderRecording(Layout):
     """A folder with `sensor/FRAME.*`, in natural order (frame2 before frame10), and whatever else is known.
 
     Several sensors of one rig have `sensors/NAME/FRAME.*` each, several rigs `rigs/NAME/FRAME.*`. Any format of
@@ -80,11 +80,6 @@ class FolderRecording:
         self.times_s = None if times_s is None else check_times(times_s, len(self.names), str(self.path / POSES_FILE))
         self._moving = {place: self._table(self.path / place, timed=False) for place in files}
         self._check(self._settings)
-
-    @property
-    def frames(self) -> range:
-        """All of them."""
-        return range(len(self.names))
 
     @classmethod
     def recognises(cls, path: Path) -> bool:

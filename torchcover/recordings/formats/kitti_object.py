@@ -20,10 +20,10 @@ from torchcover.recordings.formats.kitti_files import (
     transform_of,
     vehicle_T_velodyne,
 )
-from torchcover.recordings.recording import Scan, SensorCalibrations
+from torchcover.recordings.recording import Layout, Scan, SensorCalibrations
 
 
-class KittiObject:
+class KittiObject(Layout):
     """A folder with `velodyne/FRAME.bin`, `calib/FRAME.txt`, and `label_2/FRAME.txt` where there are labels.
 
     The data set has no reference, and neighbours in the list are not neighbours in time: a reference has to be in a
@@ -36,8 +36,6 @@ class KittiObject:
     layout: ClassVar[str] = "velodyne/FRAME.bin, calib/FRAME.txt, label_2/FRAME.txt"
     sensors = ("velodyne",)
     times_s = None
-    square_metres = False
-    instants = None
     body = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -53,11 +51,6 @@ class KittiObject:
     def recognises(cls, path: Path) -> bool:
         """Whether it has clouds and calibrations."""
         return all((_split(path) / place).is_dir() for place in ("velodyne", "calib"))
-
-    @property
-    def frames(self) -> range:
-        """All of them."""
-        return range(len(self.names))
 
     def scan(self, sensor: str, index: int) -> Scan:
         """Read a cloud."""

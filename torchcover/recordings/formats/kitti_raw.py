@@ -24,10 +24,10 @@ from torchcover.recordings.formats.kitti_files import (
     vehicle_T_velodyne,
     world_T_imu,
 )
-from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
+from torchcover.recordings.recording import Layout, Scan, SensorCalibrations, check_times
 
 
-class KittiRaw:
+class KittiRaw(Layout):
     """A folder `DATE/DATE_drive_NUMBER_sync` with `velodyne_points` and `oxts`; calibrations are in `DATE`.
 
     Boxes are those of `tracklet_labels.xml`, if it is there.
@@ -39,9 +39,6 @@ class KittiRaw:
 
     layout: ClassVar[str] = "DATE/DRIVE/velodyne_points/data/FRAME.bin, oxts/data/FRAME.txt"
     sensors = ("velodyne",)
-    reference_sensors = ()
-    square_metres = False
-    instants = None
     body = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -59,11 +56,6 @@ class KittiRaw:
     def recognises(cls, path: Path) -> bool:
         """Whether it has scans and records of the GPS and IMU."""
         return all((path / place).is_dir() for place in ("velodyne_points", "oxts"))
-
-    @property
-    def frames(self) -> range:
-        """All of them."""
-        return range(len(self.names))
 
     def scan(self, sensor: str, index: int) -> Scan:
         """Read a cloud, which the development kit has corrected for the motion within a turn."""

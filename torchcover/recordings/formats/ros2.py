@@ -16,7 +16,7 @@ from torchcover.recordings.formats.bag import METADATA, SUFFIXES, Bag
 from torchcover.recordings.formats.frame_tree import FrameTree, frame_name
 from torchcover.recordings.formats.point_cloud2 import CloudMessage, cloud_of
 from torchcover.recordings.formats.ros_poses import TF, WINDOW_NS, VehiclePoses, vehicle_poses
-from torchcover.recordings.recording import NO_RETURN_M, Scan, SensorCalibrations, check_times
+from torchcover.recordings.recording import NO_RETURN_M, Layout, Scan, SensorCalibrations, check_times
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 VEHICLE_FRAMES = ("base_link", "base_footprint")
@@ -28,7 +28,7 @@ FARTHEST_SCAN = 0.75
 TICK_S = 1e-5
 
 
-class Ros2:
+class Ros2(Layout):
     """A bag: a folder with `metadata.yaml` and `.db3` or `.mcap` files, or one such file. Needs `torchcover[ros]`.
 
     The sensors are the topics of `PointCloud2`, named without the first slash, whose frame static transforms link to
@@ -52,9 +52,6 @@ class Ros2:
     """
 
     layout: ClassVar[str] = "metadata.yaml and *.db3 or *.mcap, or such a file, with topics of PointCloud2"
-    reference_sensors = ()
-    square_metres = False
-    instants = None
     body = None
 
     def __init__(self, path: str | os.PathLike[str], vehicle_frame: str | None = None) -> None:
@@ -87,11 +84,6 @@ class Ros2:
         if path.is_dir():
             return (path / METADATA).exists() and any(any(path.glob(f"*{suffix}*")) for suffix in SUFFIXES.values())
         return path.suffix in SUFFIXES.values()
-
-    @property
-    def frames(self) -> range:
-        """All instants."""
-        return range(len(self.names))
 
     def scan(self, sensor: str, index: int) -> Scan:
         """Read a cloud; where the vehicle's poses are known, it is moved to the instant."""
