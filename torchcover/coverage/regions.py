@@ -169,12 +169,7 @@ class Region:
 
 
 class Places:
-    """The P places of a grid that numbers are given for: each region in each band, region by region.
-
-    Args:
-        regions: Regions within the grid.
-        grid: Cells and height bands.
-    """
+    """The P places of a grid that numbers are given for: each region in each band, region by region."""
 
     def __init__(self, regions: Sequence[Region], grid: BevGrid) -> None:
         self.regions = tuple(regions)

@@ -198,13 +198,7 @@ class Instant:
         return self._sweeps[ends_s]
 
     def struck(self, body: NDArray[np.int32], triangle: NDArray[np.int32], directions: Float32) -> Struck:
-        """What the rays hit that ended on some faces.
-
-        Args:
-            body: (N,) numbers of the bodies, as `cast` gives them, none of them -1.
-            triangle: (N,) likewise.
-            directions: (3, N) unit directions of these rays in the vehicle frame.
-        """
+        """What the rays hit that ended on some faces, as `RayCaster.struck`; directions in the vehicle frame."""
         moved = np.flatnonzero(body >= self.static.bodies)
         # What moves is looked up as any face of what does not, and then put right.
         rests = np.where(body < self.static.bodies, triangle, 0) if len(moved) else triangle

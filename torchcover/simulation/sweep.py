@@ -99,15 +99,7 @@ class Sweep:
         samples_s: Float64,
         poses: Sequence[Poses],
     ) -> Self | None:
-        """That of a scene; None if nothing moves meanwhile.
-
-        Args:
-            static: What never moves.
-            now: Where everything is at the frame's time.
-            moving: The bodies that move, as they are then.
-            samples_s: (3,) times about there, in seconds.
-            poses: Where everything is then.
-        """
+        """That of a scene; None if nothing moves meanwhile."""
         if all(np.array_equal(one, other) for each in poses for one, other in zip(each, now, strict=True)):
             return None
         # Where the boxes are in the vehicle's frame of each time; those of now, moved.
@@ -141,17 +133,7 @@ class Sweep:
         ego: int,
         own_m: Float32 | None,
     ) -> SweptHits:
-        """Cast the rays of one tile, each at its time.
-
-        Args:
-            vehicle_T_sensor: (4, 4) pose of the sensor.
-            tile: n of its rays.
-            times: When each of them is cast.
-            limit_m: (n,) distance at which each of them ends; finite.
-            bodies: From `outlines`.
-            ego: Number of the ego.
-            own_m: (n,) where the ego's body ends them, if that is known.
-        """
+        """Cast the rays of one tile, each at its time, as `Instant.cast` does."""
         origin_m, vehicle_R_sensor, of_ray = vehicle_T_sensor[:3, 3], vehicle_T_sensor[:3, :3], times.of_ray
         directions = rotate(vehicle_R_sensor, tile.directions)
         if own_m is not None:
