@@ -93,7 +93,9 @@ def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
     biased = Study(plan, [trial(0.04), trial(0.04, 1.0, bias=0.02, options="--rays=64")], 1.0)
     assert biased.recommended(0.01)[0].options == ""
     assert Study(plan, [trial(math.nan)], 1.0).recommended(0.01) is None
-    assert "not reached, or not known" in Study(plan, [trial(math.nan)], 1.0).advice(0.01)
+    assert Study(plan, [trial(math.nan)], 1.0).advice(0.01) == (
+        "For 1 percentage point of every detection: not known, for 64 steps say no error of 20m ground."
+    )
     assert Study(plan, [trial(0.04)], 1.0).advice(0.01) == (
         "For 1 percentage point of every detection: front_roof_32 --scenario=courtyard --cell-m=4.0 --rays=256 "
         "--steps=400 (401 s)."

@@ -233,8 +233,10 @@ class Study:
         """The options of `evaluate` that reach an error."""
         found = self.recommended(error)
         if found is None:
-            after = f"{self.trials[0].steps:,} steps"
-            return f"For {_points(error)} of every detection: not reached, or not known from {after}."
+            first = self.trials[0]
+            unknown = [f"{one.region} {one.height}" for one in first.of("share") if math.isnan(one.error.a)]
+            why = f"not known, for {first.steps:,} steps say no error of {', '.join(unknown) or 'any'}"
+            return f"For {_points(error)} of every detection: {why}."
         trial, steps = found
         options = " ".join([*self.plan.command[1:], *([trial.options] if trial.options else []), f"--steps={steps}"])
         return f"For {_points(error)} of every detection: {options} ({trial.seconds_for(steps, self.start_s):.0f} s)."
