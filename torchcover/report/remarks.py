@@ -153,7 +153,7 @@ SENTENCES: Mapping[RemarkName, Callable[[Remark, CoverageTable, str], str]] = Ma
         "saturated_points": _saturated,
         "outside_points": _outside,
         "no_ground_points": lambda remark, *_: (
-            f"{_some(remark)} reference points have no ground at or below them: in no band."
+            f"{_some(remark)} reference points have no known ground at or below them: in no band."
         ),
     }
 )
