@@ -25,7 +25,6 @@ from torchcover.placement import ChoiceSpace, SearchSpace
 from torchcover.recordings.formats.folder_settings import read_folder_settings
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.documents import load_document
 from torchcover.targets import Requirements
 
 ROOT = Path(__file__).parent.parent
@@ -147,7 +146,7 @@ def test_a_command_can_be_given(words):
 READERS = (
     Rig.load,
     Scenario.load,
-    partial(load_document, Vehicle, "vehicles"),
+    Vehicle.load,
     RegionsOfInterest.load,
     Requirements.load,
     SearchSpace.load,

@@ -76,7 +76,7 @@ def test_points_without_ground_are_in_no_band_and_counted():
         ),
         (GROUND, HEIGHT[:3], r"height\[0\]: shape \(80,\), one for each point, is needed; got \(3,\)"),
         (GROUND, HEIGHT / 0, r"height\[0\]: metres are needed, NaN where there is no ground; got infinite ones"),
-        (GROUND, [HEIGHT, HEIGHT], "1 weights, 2 heights and 1 places in time for 1 reference clouds"),
+        (GROUND, [HEIGHT, HEIGHT], "1 weights, 2 heights, 1 places in time and 1 errors for 1 reference clouds"),
     ],
 )
 def test_heights_that_do_not_go_with_the_grid_are_refused(grid, height, message):

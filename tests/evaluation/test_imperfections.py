@@ -29,10 +29,18 @@ RIG = {
 CHAINS = {
     "range noise": [{"range_noise_m": sigma} for sigma in (0.0, 0.03, 0.2, 0.5, 3.0)],
     "drop-out": [{"dropout": share} for share in (0.0, 0.2, 0.7, 1.0)],
+    "missing returns": [{}, *({"range_at_10_percent_m": range_m} for range_m in (200.0, 30.0, 8.0))],
     "share of the range": [{"range_noise_share": share} for share in (0.0, 0.002, 0.02, 0.1)],
     "stereo": [{}, *({"stereo": {"baseline_m": b_m, "subpixel_px": 0.3}} for b_m in (0.5, 0.1, 0.03))],
     "both": [{}, {"range_noise_m": 0.3, "dropout": 0.3}, {"range_noise_m": 1.0, "dropout": 0.5}],
 }
+ONLY = {"share of the range": "camera", "stereo": "camera", "missing returns": "lidar"}
+WEATHERS = [
+    {},
+    {"visibility_m": 200.0},
+    {"visibility_m": 60.0},
+    {"visibility_m": 60.0, "rain_mm_h": 30.0, "road": "wet"},
+]
 # Those that more is better of, or less. How evenly points lie is no virtue; false_visible is a share of what is
 # invisible, which grows; s_mig_occluded is best without a ray, as its page says; the others read no points of a rig.
 PUBLISHED_WITH_LAW = ("object_coverage", "perception_entropy", "k_cover", "point_density")
@@ -45,10 +53,10 @@ def rig(kind, name, **changes):
     return Rig.model_validate({"name": name, "sensors": others})
 
 
-def numbers_of(rigs, steps=1):
+def numbers_of(rigs, steps=1, world=WORLD):
     """Name of each rig -> all its numbers."""
     reference = SurfaceReference(((AREA.x, AREA.y),), rays=1000, bands_m=((-0.5, 2.0),), object_points=32)
-    frames = SimulatedFrames(WORLD, rigs=rigs, steps=steps, reference_sensor=reference, boxes=True)
+    frames = SimulatedFrames(world, rigs=rigs, steps=steps, reference_sensor=reference, boxes=True)
     observers = {}
     for name, one in rigs.items():
         sensors = [sensor.name for sensor in one.sensors]
@@ -73,16 +81,8 @@ def numbers_of(rigs, steps=1):
     return found
 
 
-OF_CAMERAS = {"share of the range", "stereo"}
-
-
-@pytest.mark.parametrize(
-    ("kind", "chain"),
-    [(kind, chain) for kind in RIG for chain in CHAINS if kind == "camera" or chain not in OF_CAMERAS],
-)
-def test_no_imperfection_makes_a_rig_better(kind, chain):
-    rigs = {str(at): rig(kind, str(at), **keys) for at, keys in enumerate(CHAINS[chain])}
-    found = list(numbers_of(rigs).values())
+def never_better(found):
+    """Of the numbers of rigs or worlds, each worse than the one before."""
     for better, worse in pairwise(found):
         for key, number in better.items():
             if str(key).startswith(NO_VIRTUE) or number.value != number.value:
@@ -91,6 +91,21 @@ def test_no_imperfection_makes_a_rig_better(kind, chain):
             assert not gain > 1e-9, (key, number.value, worse[key].value)
     first, *_, last = (one["20m", "ground", "detection_0.4m"].value for one in found)
     assert first > last + 0.05
+
+
+@pytest.mark.parametrize(
+    ("kind", "chain"),
+    [(kind, chain) for kind in RIG for chain in CHAINS if ONLY.get(chain, kind) == kind],
+)
+def test_no_imperfection_makes_a_rig_better(kind, chain):
+    rigs = {str(at): rig(kind, str(at), **keys) for at, keys in enumerate(CHAINS[chain])}
+    never_better(list(numbers_of(rigs).values()))
+
+
+def test_no_weather_makes_a_rig_better():
+    sensor, keys = rig("lidar", "r", range_at_10_percent_m=40.0), WORLD.model_dump(exclude_unset=True)
+    worlds = [type(WORLD).model_validate({**keys, "weather": weather}) for weather in WEATHERS]
+    never_better([numbers_of({"r": sensor}, world=world)["r"] for world in worlds])
 
 
 @pytest.mark.parametrize("kind", RIG)

@@ -54,7 +54,7 @@ def answers_of(rank, folder):
         # One rank has seen nothing, not even an empty list.
         answer["alone"] = flat(case.over(case.steps[:5] if rank == 0 else []).compute())
         answer["complaints"] = {
-            change: complaint_about(case.over(case.steps[:2], **(changes if rank else {})))
+            change: complaint_about(case.over(case.steps[:1], **(changes if rank else {})))
             for change, changes in case.changes.items()
         }
     dist.destroy_process_group()

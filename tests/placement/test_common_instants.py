@@ -84,7 +84,12 @@ def test_numbers_are_those_of_evaluate_on_the_same_instants_to_the_last_bit():
 def test_every_prefix_is_the_coverage_of_its_instants(instants):
     questions = instants.questions
     metric = CoverageMetric(
-        questions.grid, questions.thresholds_m, max_radius=90.0, blocks=16, regions=(), square_metres=True
+        questions.grid,
+        questions.thresholds_m,
+        max_radius=90.0,
+        blocks=16,
+        regions=questions.regions.values(),
+        square_metres=True,
     )
     frames = instants.frames(TWO, instants.order.tolist())
     for prefix in instants.prefixes(TWO):

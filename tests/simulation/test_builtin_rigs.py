@@ -7,7 +7,6 @@ from torchcover import Rig
 from torchcover.geometry import transform
 from torchcover.simulation import builtin_names
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.documents import load_document
 
 RIGS = builtin_names("rigs")
 
@@ -118,7 +117,7 @@ def test_no_sensor_lies_inside_its_vehicle_or_below_the_ground(name):
     # A camera is smaller than a LiDAR, and may sit right on the body.
     room_m = np.array([0.03 if sensor.type == "lidar" else 0.0 for sensor in sensors])
     assert (positions[:, 2] > 0.3).all()
-    for part in load_document(Vehicle, "vehicles", rig.vehicle or "suv").parts:
+    for part in Vehicle.load(rig.vehicle or "suv").parts:
         for mesh in part.meshes():
             # Parts are convex: a point inside lies behind every face.
             a, b, c = (mesh.vertices_m[mesh.faces[:, corner]] for corner in range(3))

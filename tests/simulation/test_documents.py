@@ -1,7 +1,5 @@
 """YAML documents: what is wrong is said in one line that names the file and the key."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 
@@ -10,7 +8,6 @@ from torchcover.cameras.calibration import read_opencv, read_ros
 from torchcover.recordings.formats.folder_settings import read_folder_settings
 from torchcover.simulation import Lidar, LidarModel, Pose, builtin_names
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.documents import load_document
 
 RIG = """
 name: r
@@ -55,7 +52,7 @@ def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
     names = builtin_names(kind)
     assert names
     for name in names:
-        document = load_document(model, kind, name)
+        document = model.load(name)
         assert document.name == name
         assert document.description
 
@@ -108,7 +105,7 @@ def test_a_wrong_rig_names_file_and_key(tmp_path, old, new, message):
 DOUBLED = {
     "rig": (Rig.load, RIG + "sensors: []\n", "sensors"),
     "scenario": (Scenario.load, SCENARIO + "bodies: []\n", "bodies"),
-    "vehicle": (partial(load_document, Vehicle, "vehicles"), "name: v\nparts: []\nparts: []\n", "parts"),
+    "vehicle": (Vehicle.load, "name: v\nparts: []\nparts: []\n", "parts"),
     "lidar": (LidarModel.load, "name: l\ncolumns: 5\ncolumns: 6\n", "columns"),
     "ros": (read_ros, "width: 5\nwidth: 6\n", "width"),
     "opencv": (read_opencv, "%YAML:1.0\n---\nimage_width: 5\nimage_width: 6\n", "image_width"),
@@ -150,7 +147,7 @@ def test_a_vehicle_that_names_itself_is_refused(tmp_path):
     path = tmp_path / "v.yaml"
     path.write_text(f"name: v\nparts: [{{name: p, shape: {{type: vehicle, vehicle: {path}}}}}]\n")
     with pytest.raises(ValueError, match=r"v\.yaml: part 'p' is the vehicle '.*v\.yaml'; a vehicle is put"):
-        load_document(Vehicle, "vehicles", path)
+        Vehicle.load(path)
 
 
 def test_sensors_need_different_names(tmp_path):

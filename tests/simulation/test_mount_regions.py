@@ -9,7 +9,6 @@ import trimesh
 
 from torchcover.simulation import builtin_names
 from torchcover.simulation.bodies import Vehicle, VehicleShape, mount_regions_of
-from torchcover.simulation.documents import load_document
 from torchcover.simulation.mount_regions import SEEN_FROM, MountRegion, Skin
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Box, Mesh
@@ -23,7 +22,7 @@ BOX = Skin(Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh())
 @cache
 def loaded(name):
     """A vehicle and its skin."""
-    vehicle = load_document(Vehicle, "vehicles", name)
+    vehicle = Vehicle.load(name)
     return vehicle, Skin(vehicle.mesh())
 
 
@@ -94,7 +93,7 @@ def test_people_animals_bikes_and_poles_have_none(name):
 
 
 def test_regions_are_nothing_to_a_simulation():
-    suv = load_document(Vehicle, "vehicles", "suv")
+    suv = Vehicle.load("suv")
     assert suv.content() == suv.model_copy(update={"mount_regions": {}}).content()
 
 

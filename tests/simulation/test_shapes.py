@@ -5,7 +5,7 @@ import pytest
 
 from torchcover.simulation import builtin_names
 from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, in_vehicle_frame
-from torchcover.simulation.documents import Pose, load_document
+from torchcover.simulation.documents import Pose
 from torchcover.simulation.scenario import Mover
 from torchcover.simulation.shapes import Box, Cylinder, Ellipsoid, Frustum, MeshFile, Plane
 
@@ -131,7 +131,7 @@ def test_a_vehicle_frame_lies_on_the_ground_under_the_centre():
 def test_the_built_in_vehicle_has_the_size_of_the_papers_ego_and_closed_parts():
     mesh = VehicleShape(type="vehicle", vehicle="suv").mesh()
     np.testing.assert_allclose(np.ptp(mesh.vertices_m, axis=0), [4.90, 1.94, 1.63], atol=1e-9)
-    for part in load_document(Vehicle, "vehicles", "suv").parts:
+    for part in Vehicle.load("suv").parts:
         for copy in part.meshes():
             assert signed_volume(copy) > 0
             assert edge_counts(copy)[2]

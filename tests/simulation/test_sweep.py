@@ -10,7 +10,7 @@ from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import CameraSensor, Draws, Lidar, Pose
 from torchcover.simulation.bodies import in_vehicle_frame
 from torchcover.simulation.scene import Scene
-from torchcover.simulation.sensor import Scan
+from torchcover.simulation.sensor import ScanTimes
 from torchcover.simulation.shapes import Box, Plane
 from torchcover.simulation.sight import MountedSensor
 from torchcover.simulation.world import Actor, World
@@ -135,7 +135,7 @@ def test_columns_of_a_lidar_and_rows_of_a_camera_follow_each_other(sensor, axis)
     assert (np.diff(times_s, axis=1 - axis) == 0).all()
     assert -0.1 < times_s.min() < times_s.max() < 0.0
     assert sensor.model_copy(update={"scan": None}).times_s() is None
-    later = sensor.model_copy(update={"scan": Scan(period_s=0.1, start_s=0.02)}).times_s()
+    later = sensor.model_copy(update={"scan": ScanTimes(period_s=0.1, start_s=0.02)}).times_s()
     np.testing.assert_allclose(later, times_s + 0.12)
 
 

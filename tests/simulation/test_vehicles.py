@@ -6,7 +6,6 @@ import trimesh
 
 from torchcover.simulation import builtin_names
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.documents import load_document
 
 SIZES_M = {
     "adult": (0.305, 0.52, 1.75),
@@ -41,7 +40,7 @@ WITH_WHEELS = tuple(sorted(set(SIZES_M) - {"adult", "child", "child_110cm", "dog
 
 
 def load(name):
-    return load_document(Vehicle, "vehicles", name)
+    return Vehicle.load(name)
 
 
 def height_at(mesh, x_m, y_m):

@@ -15,7 +15,7 @@ FOG_PER_M, SPREAD = 0.06, 0.2
 @lru_cache
 def extremes():
     """(N,) ranges, cosines, reflectivities, exponents: each with each."""
-    columns = np.meshgrid([1e-3, 1.0, 80.0, 1e4], [1.0, 0.02, 1e-4], [1e-9, 0.1, 1.0], [0.0, 0.2, 30.0])
+    columns = np.meshgrid([1e-3, 1.0, 20.0, 30.0, 80.0, 1e4], [1.0, 0.02, 1e-4], [1e-9, 0.1, 1.0], [0.0, 0.2, 30.0])
     return tuple(column.reshape(-1) for column in columns)
 
 
@@ -80,7 +80,7 @@ CASES = (
     Case(
         "P(return) of the same",
         "60 digits (mpmath)",
-        "of P",
+        "absolute",
         1e-13,
         probability_error,
         "a logistic function of the same slope",

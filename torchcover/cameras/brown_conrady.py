@@ -113,12 +113,7 @@ class BrownConrady:
 
 @dataclass(frozen=True)
 class SensorTilt:
-    """The projective map of a sensor turned by tau_x about x, then tau_y about y, from kornia's `tilt_projection`.
-
-    Args:
-        tau_x: Angle in radians.
-        tau_y: Angle in radians.
-    """
+    """The projective map of a sensor turned by tau_x about x, then tau_y about y, from kornia's `tilt_projection`."""
 
     tau_x: Scalar
     tau_y: Scalar

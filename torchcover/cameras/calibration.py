@@ -46,11 +46,7 @@ class Calibration:
 
 
 def split_matrix(matrix: ArrayLike, name: str) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy of a 3x3 camera matrix, once it is known to be nothing else.
-
-    Raises:
-        ValueError: Another shape, a skew, or a last row that is not 0 0 1.
-    """
+    """fx, fy, cx, cy of a 3x3 camera matrix, once it is known to be nothing else."""
     K = np.asarray(matrix, dtype=np.float64)
     if K.shape != (3, 3):
         raise ValueError(f"{name}: a camera matrix has shape (3, 3); got {K.shape}")
@@ -139,9 +135,6 @@ def read_opencv(
         size: (width, height); None takes image_width and image_height from the file.
         model: None is Brown-Conrady, or Kannala-Brandt where the file says `fisheye_model: 1`.
 
-    Returns:
-        The calibration.
-
     Raises:
         FileNotFoundError: There is no such file.
         BadFileError: An entry is missing, and the message lists those that the file has; or makes no camera.
@@ -170,9 +163,6 @@ def read_kitti(
         height: Rows of the images.
         vehicle_T_lidar: Where the lidar sits, through which the camera is placed; None is the identity, so that the
             lidar frame takes the place of the vehicle frame.
-
-    Returns:
-        The calibration.
 
     Raises:
         FileNotFoundError: There is no such file.

@@ -54,11 +54,7 @@ def _stretched(a: Array, b: Array, gain: Array, slope: Array) -> Linear:
 
 @dataclass(frozen=True)
 class KannalaBrandt:
-    """t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8): OpenCV's fisheye, Kalibr's equidistant.
-
-    Args:
-        coefficients: k1 k2 k3 k4.
-    """
+    """t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8): OpenCV's fisheye, Kalibr's equidistant."""
 
     coefficients: Sequence[Scalar]
     symmetric: bool = True
@@ -92,11 +88,7 @@ class KannalaBrandt:
 
 @dataclass(frozen=True)
 class ThetaPolynomial:
-    """k1 t + k2 t^2 + k3 t^3 + k4 t^4: WoodScape's surround-view fisheyes (there in pixels, with fx = fy = 1).
-
-    Args:
-        coefficients: k1 k2 k3 k4.
-    """
+    """k1 t + k2 t^2 + k3 t^3 + k4 t^4: WoodScape's surround-view fisheyes (there in pixels, with fx = fy = 1)."""
 
     coefficients: Sequence[Scalar]
     symmetric: bool = True

@@ -61,12 +61,7 @@ _RANGES = {
 
 
 def check_model(model: str, coefficients: Sequence[float]) -> None:
-    """Raise unless the model exists and takes these coefficients.
-
-    Raises:
-        ValueError: The model is unknown, the number of coefficients is not one of its own, or a value is not finite
-            or outside the model's range.
-    """
+    """Raise unless the model exists and takes these coefficients."""
     if model not in COEFFICIENTS:
         raise ValueError(f"camera model {model!r} is unknown; allowed: {', '.join(COEFFICIENTS)}")
     counts, order = COEFFICIENTS[model]
@@ -85,32 +80,15 @@ def check_model(model: str, coefficients: Sequence[float]) -> None:
 
 
 def build_lens(model: str, coefficients: Sequence[Scalar], *, trainable: bool) -> Lens:
-    """The lens of a model.
+    """The lens of a model that `check_model` has passed, without a distortion that does nothing.
 
-    Args:
-        model: A name that `check_model` has passed.
-        coefficients: As it has passed them.
-        trainable: Whether gradients are wanted: then a distortion is kept while its coefficients are zero, where the
-            map is the identity but its derivatives by the coefficients are not zero.
-
-    Returns:
-        The lens, without a distortion where that does nothing.
+    A `trainable` one stays while its coefficients are zero, where its derivatives by them are not.
     """
     return _BUILD[model](coefficients, trainable)
 
 
 def check_image(name: str, width: int, height: int, intrinsics: Tensor) -> None:
-    """Refuse an image or intrinsics that no camera has.
-
-    Args:
-        name: What messages call the camera.
-        width: Columns.
-        height: Rows.
-        intrinsics: (4,) fx, fy, cx, cy in pixels.
-
-    Raises:
-        ValueError: A size or focal length that is not positive, or a number that is not finite.
-    """
+    """Refuse an image or intrinsics that no camera has."""
     for side, size in (("width", width), ("height", height)):
         if isinstance(size, bool) or not isinstance(size, int) or size <= 0:
             raise ValueError(f"{name}: {side} must be a positive integer; got {size!r}")

@@ -15,13 +15,7 @@ from torchcover.cameras.valid_region import HORIZON, ValidRegion, find_region
 
 
 class Optics:
-    """A lens with its intrinsics.
-
-    Args:
-        intrinsics: (4,) float64 fx, fy, cx, cy.
-        model: Name of a model.
-        coefficients: (n,) float64, checked.
-    """
+    """A lens with its intrinsics, (4,) float64 fx, fy, cx, cy."""
 
     def __init__(self, intrinsics: Tensor, model: str, coefficients: Tensor) -> None:
         trainable = coefficients.requires_grad

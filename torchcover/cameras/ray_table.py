@@ -15,13 +15,7 @@ _STATUS_NAMES = {"pixels_valid": ANSWERED, "pixels_outside": OUTSIDE, "pixels_un
 
 
 class RayTable:
-    """For each pixel the point at depth 1, and whether there is one.
-
-    Args:
-        optics: The lens.
-        width: Columns of the image.
-        height: Rows of the image.
-    """
+    """For each pixel the point at depth 1, and whether there is one."""
 
     def __init__(self, optics: Optics, width: int, height: int) -> None:
         self._optics = optics

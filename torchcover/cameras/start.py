@@ -33,16 +33,7 @@ class StartTable:
 
 
 def make_start_table(distortion: Distortion, limit: float, farthest: float) -> StartTable:
-    """Tabulate the inverse of the radial part up to its own fold, or as far as the pixels go.
-
-    Args:
-        distortion: With coefficients that are floats.
-        limit: Radius at which the chart ends, or infinity.
-        farthest: Largest distorted radius that will be asked for.
-
-    Returns:
-        The table.
-    """
+    """Tabulate the inverse of the radial part up to its own fold, or as far as the pixels go."""
     fold = _radial_fold(distortion, limit)
     top = _radius_for(distortion, farthest) if np.isinf(fold) else fold
     even = np.linspace(0.0, 1.0, _ENTRIES)
@@ -77,15 +68,6 @@ def nearest_seeds(distortion: Distortion, region: ValidRegion, u: Array, v: Arra
 
     Strong tangential terms bend the region so far from round that Newton's method, coming from the radial part's
     answer, can end in a bay of its edge.
-
-    Args:
-        distortion: With coefficients that are floats.
-        region: Its valid region.
-        u: (N,) images.
-        v: (N,) likewise.
-
-    Returns:
-        `a`, `b` (N,) points of the region.
     """
     azimuth = np.linspace(-np.pi, np.pi, 96, endpoint=False)
     cosine, sine = np.cos(azimuth)[:, None], np.sin(azimuth)[:, None]

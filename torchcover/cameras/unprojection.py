@@ -29,12 +29,7 @@ class Selection(NamedTuple):
 def check_depth(
     depth: Tensor, kind: str, stride: int, valid: Tensor | None, size: tuple[int, int], name: str
 ) -> Tensor:
-    """The depth in float32 or float64, once all arguments of `Camera.unproject` are known to fit.
-
-    Raises:
-        TypeError: Integer depth or a mask that is not boolean.
-        ValueError: Another size, kind or stride than allowed.
-    """
+    """The depth in float32 or float64, once all arguments of `Camera.unproject` are known to fit."""
     if not depth.is_floating_point():
         raise TypeError(
             f"{name}: depth is {depth.dtype}, whose unit is unknown; scale it to metres: depth * 0.001 for mm"

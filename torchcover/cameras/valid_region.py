@@ -71,15 +71,7 @@ class ValidRegion:
 
 
 def find_region(distortion: Distortion, limit: float) -> ValidRegion:
-    """Find the valid region.
-
-    Args:
-        distortion: With coefficients that are floats.
-        limit: Radius at which the chart ends, or infinity.
-
-    Returns:
-        The region.
-    """
+    """Find the valid region."""
     limit = min(limit, HORIZON)
     count = 1 if distortion.symmetric else _DIRECTIONS + 1
     azimuth = np.linspace(-np.pi, np.pi, count)

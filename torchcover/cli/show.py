@@ -16,7 +16,7 @@ from torchcover.files import BadFileError, write_durably
 from torchcover.report import check_film, write_film
 from torchcover.simulation import Scenario, builtin_names
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.documents import load_document, read_mapping
+from torchcover.simulation.documents import read_mapping
 
 DEFAULT_RIG = "front_roof_128"
 # Kinds of documents, and the key that only such a one has.
@@ -49,7 +49,7 @@ def run(
         given = {"--scenario": scenario, "--rig": rig, "--vehicle": vehicle, "--step": step, "--seed": seed}
         _refuse("rigs and scenarios", given, f"{name!r} is a vehicle")
         _refuse("a scenario", {"--film": film}, f"{name!r} is a vehicle")
-        body = load_document(Vehicle, "vehicles", name)
+        body = Vehicle.load(name)
         _say(console, body.description)
         _write(console, out / Path(name).stem, [("", vehicle_picture(body))])
         return

@@ -38,9 +38,6 @@ def mean_per_cell(cell: Tensor, values: Tensor, cells: int, weights: Tensor | No
         cells: Number of cells of the grid.
         weights: (N,) positive weight of each point; all the same if not given.
 
-    Returns:
-        `CellMeans(cell, points, weight, mean)` over the cells with at least one point.
-
     Example:
         >>> means = mean_per_cell(torch.tensor([4, 4, 7]), torch.tensor([[1.0, 3.0, 5.0]]), cells=9)
         >>> means.cell, means.points, means.mean

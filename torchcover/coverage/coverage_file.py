@@ -55,13 +55,7 @@ class CoverageParts(TypedDict):
 
 
 def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Path) -> None:
-    """Write a coverage to one compressed file.
-
-    Args:
-        parts: All that is read again.
-        errors: Maps of standard errors by the key of their quantity, for NumPy users.
-        path: The file.
-    """
+    """Write a coverage to one compressed file, with maps of standard errors by key, for NumPy users."""
     grid, blocks, area, redundancy = parts["grid"], parts["blocks"], parts["area"], parts["redundancy"]
     places, aggregated = parts["places"], parts["aggregated"]
     header = {
@@ -102,14 +96,7 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
 
 @reads("a saved coverage")
 def read_coverage(path: Path) -> CoverageParts:
-    """Read what `write_coverage` wrote.
-
-    Raises:
-        FileNotFoundError: No such file.
-        IsADirectoryError: A folder.
-        BadFileError: Not a coverage file, a damaged one, one of another version, or one that takes more memory than
-            `TORCHCOVER_MAX_FILE_GB` allows.
-    """
+    """Read what `write_coverage` wrote."""
     try:
         arrays = read_npz(path, _check_kind)
         header: dict[str, Any] = json.loads(str(arrays.pop("header")))

@@ -22,11 +22,6 @@ Measure = Literal["area", "known"]
 def estimate_known(coverage: "Coverage", region: Region, height: str) -> Estimate:
     """The unweighted means over the known cells of a region, and what they become without each block.
 
-    Args:
-        coverage: Whose numbers: the mean radius, then the detection at each threshold.
-        region: A region within the grid.
-        height: Name of the band.
-
     Returns:
         NaN where no cell is known.
     """

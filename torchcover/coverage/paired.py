@@ -64,13 +64,7 @@ def differences(coverages: Mapping[str, Coverage], region: Region, height: str) 
 
 
 def leaders(coverages: Mapping[str, Coverage], region: Region, height: str) -> dict[str, str]:
-    """Key of a quantity -> the rig that is best in it, where its lead over the next is more than chance.
-
-    Args:
-        coverages: As in `differences`.
-        region: As there.
-        height: As there.
-    """
+    """Key of a quantity -> the rig that is best in it, where its lead over the next is more than chance."""
     found = {}
     for part in (Coverage.estimate, Coverage.estimate_aggregated):
         each = {rig: part(coverage, region, height) for rig, coverage in coverages.items()}

@@ -25,10 +25,6 @@ def draw_coverage(coverage: object, ax: "Axes", layer: str | None, height: str |
         layer: A key of `Coverage.layers`; the detection at the first threshold if not given, or the radius if there is
             none: by area where the points have square metres.
         height: Name of the band; the first if not given.
-
-    Raises:
-        TypeError: No `Coverage`.
-        ValueError: No such layer or band.
     """
     if not isinstance(coverage, Coverage):
         raise TypeError(f"val: one Coverage, as compute() returns it, is needed; got {type(coverage).__name__}")

@@ -46,11 +46,6 @@ class SensorFailures(Aggregation):
 
     The radius of a rig is the smallest of those of its sensors, so that the radius without a sensor is the smallest of
     the others', and no search is made for it.
-
-    Args:
-        sensors: Names of the sensors.
-        thresholds: Detection thresholds in metres.
-        square_metres: Whether weights are square metres.
     """
 
     name: ClassVar[str] = "redundancy"

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -111,14 +110,20 @@ class Region:
         if not self.corners_m:
             return within
         x, y = (each.expand(within.shape)[within] for each in (x, y))
-        inside = torch.zeros_like(x, dtype=torch.bool)
-        for edge in pairwise((*self.corners_m, self.corners_m[0])):
-            # From below in either direction, so that two regions round alike.
-            (x_low, y_low), (x_high, y_high) = sorted(edge, key=lambda corner: corner[1])
-            beside = ((y >= y_low) & (y < y_high)).nonzero().squeeze(1)
-            if len(beside):
-                share = (y[beside] - y_low) / (y_high - y_low)
-                inside[beside] ^= x[beside] < x_low + share * (x_high - x_low)
+        corners = torch.tensor(self.corners_m, dtype=torch.float64, device=x.device)
+        following = corners.roll(-1, 0)
+        # From below in either direction, so that two regions round alike.
+        upwards = (corners[:, 1] <= following[:, 1])[:, None]
+        low, high = torch.where(upwards, corners, following), torch.where(upwards, following, corners)
+        # In order of y, the places beside an edge are a range.
+        ordered, order = y.sort()
+        first, past = (torch.searchsorted(ordered, end[:, 1].contiguous()) for end in (low, high))
+        edge = torch.repeat_interleave(past - first)
+        before = (past - first).cumsum(0) - past
+        place = order[torch.arange(len(edge), device=x.device) - before[edge]]
+        low, along = low[edge], (high - low)[edge]
+        share = (y[place] - low[:, 1]) / along[:, 1]
+        inside = torch.bincount(place[x[place] < low[:, 0] + share * along[:, 0]], minlength=len(x)) % 2 == 1
         return within.masked_scatter(within, inside)
 
     def fits(self, grid: BevGrid) -> bool:
@@ -164,12 +169,7 @@ class Region:
 
 
 class Places:
-    """The P places of a grid that numbers are given for: each region in each band, region by region.
-
-    Args:
-        regions: Regions within the grid.
-        grid: Cells and height bands.
-    """
+    """The P places of a grid that numbers are given for: each region in each band, region by region."""
 
     def __init__(self, regions: Sequence[Region], grid: BevGrid) -> None:
         self.regions = tuple(regions)

@@ -41,13 +41,7 @@ class CheckedStep(NamedTuple):
 
 
 def check_parameters(thresholds: Sequence[float], max_radius: float, aggregations: Sequence[Aggregation]) -> None:
-    """Refuse parameters of a metric that make no sense.
-
-    Raises:
-        ValueError: A threshold that is negative, NaN, infinite, over `max_radius`, or given twice; a `max_radius` that
-            is not positive; two aggregations of one kind, or one that is built in.
-        TypeError: What is no sequence of numbers, or of aggregations.
-    """
+    """Refuse parameters of a metric that make no sense."""
     if not isinstance(thresholds, Sequence) or not all(isinstance(threshold, Real) for threshold in thresholds):
         raise TypeError(f"thresholds: a sequence of metres, as in (0.4,), is needed; got {thresholds!r}")
     # Within an infinite distance lies whatever a blind rig has not seen.
@@ -89,20 +83,7 @@ def checked_steps(
     names: Sequence[str] = (),
     first: int,
 ) -> list[CheckedStep]:
-    """The steps of an update, in order.
-
-    Args:
-        sensor: As in `CoverageMetric.update`, and so are the others.
-        reference: Reference points.
-        weights: Their weights.
-        height: Their heights above the local ground.
-        place_in_time: Numbers of the steps in time.
-        error: How far off the points of the rig were measured.
-        within_m: Those that are farther off are left out.
-        grid: Which needs heights, or does not.
-        square_metres: Whether weights are needed.
-        names: Of the sensors, where they are told apart.
-        first: Number of the first step if `place_in_time` is not given.
+    """The steps of an update, in order; the arguments are those of `CoverageMetric` and its `update`.
 
     Raises:
         ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, weights that are
@@ -165,15 +146,7 @@ def _measured(
 
 
 def as_list(clouds: Any, name: str) -> list[Any]:  # noqa: ANN401
-    """A list with an entry for each step.
-
-    Args:
-        clouds: One tensor, or several.
-        name: What messages call them.
-
-    Raises:
-        TypeError: Neither a tensor nor a sequence.
-    """
+    """A list with an entry for each step."""
     if isinstance(clouds, Tensor):
         return [clouds]
     if not isinstance(clouds, Sequence):

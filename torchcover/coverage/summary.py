@@ -84,16 +84,7 @@ class RegionSummary:
 
 
 def summarise(coverage: "Coverage", region: Region, height: str) -> RegionSummary:
-    """The numbers of one region in one band.
-
-    Args:
-        coverage: Whose numbers.
-        region: A region within the grid.
-        height: Name of the band.
-
-    Raises:
-        ValueError: As `Coverage.estimate`.
-    """
+    """The numbers of one region in one band."""
     cells, known_cells = (
         int(each.sum()) for each in (region.mask(coverage.grid), coverage.known_cells(region, height))
     )

@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -224,17 +225,10 @@ class Boxes:
         """
         which = which.to(self.yaw_rad.device)
         numbers = (which.nonzero().squeeze(1) if which.dtype == torch.bool else which).tolist()
-        return replace(
-            self,
-            centre_m=self.centre_m[which],
-            size_m=self.size_m[which],
-            yaw_rad=self.yaw_rad[which],
-            velocity_mps=self.velocity_mps[which],
+        return self._each(
+            lambda tensor: tensor[which],
             ids=tuple(self.ids[number] for number in numbers),
             categories=tuple(self.categories[number] for number in numbers),
-            hits={rig: count[which] for rig, count in self.hits.items()},
-            drawn_points=self.drawn_points[which],
-            bottom_heights_m=self.bottom_heights_m[which],
         )
 
     def of_category(self, *categories: str) -> "Boxes":
@@ -243,23 +237,17 @@ class Boxes:
 
     def pin_memory(self) -> "Boxes":
         """A copy in page-locked memory."""
-        return self._moved(Tensor.pin_memory)
+        return self._each(Tensor.pin_memory)
 
     def to(self, device: torch.device | str) -> "Boxes":
         """A copy on another device."""
-        return self._moved(lambda tensor: tensor.to(device))
+        return self._each(lambda tensor: tensor.to(device))
 
-    def _moved(self, move: Callable[[Tensor], Tensor]) -> "Boxes":
-        return replace(
-            self,
-            centre_m=move(self.centre_m),
-            size_m=move(self.size_m),
-            yaw_rad=move(self.yaw_rad),
-            velocity_mps=move(self.velocity_mps),
-            hits={rig: move(count) for rig, count in self.hits.items()},
-            drawn_points=move(self.drawn_points),
-            bottom_heights_m=move(self.bottom_heights_m),
-        )
+    def _each(self, change: Callable[[Tensor], Tensor], **names: tuple[str, ...]) -> "Boxes":
+        """With all tensors changed, and other names where their number changes."""
+        tensors = ("centre_m", "size_m", "yaw_rad", "velocity_mps", "drawn_points", "bottom_heights_m")
+        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in tensors}
+        return replace(self, **changed, hits={rig: change(count) for rig, count in self.hits.items()}, **names)
 
 
 def check_boxes(boxes: object) -> None:

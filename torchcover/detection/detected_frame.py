@@ -11,19 +11,7 @@ from torchcover.neighbors import check_tensor
 
 
 class DetectedFrame:
-    """The objects and the detections of one frame in float64 on the CPU, checked.
-
-    Args:
-        detections: (N, 7) or wider.
-        boxes: K objects.
-        visibility: Of the objects.
-        scores: (N,) scores.
-        detection_visibility: Of the detections' own boxes.
-
-    Raises:
-        ValueError: See `RecallByVisibility.update`.
-        TypeError: See there.
-    """
+    """The objects and the detections of one frame in float64 on the CPU, checked."""
 
     def __init__(
         self,

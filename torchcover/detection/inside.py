@@ -53,12 +53,7 @@ def points_in_boxes(points: Tensor, boxes: Boxes, *, skin_m: float = SKIN_M) -> 
 
 
 class _BoxMap:
-    """The boxes as seen from above: which of them reach into which cell.
-
-    Args:
-        boxes: K boxes.
-        skin_m: How much thicker they are.
-    """
+    """The boxes as seen from above: which of them reach into which cell."""
 
     def __init__(self, boxes: Boxes, skin_m: float = SKIN_M) -> None:
         self._skin_m = skin_m

@@ -105,10 +105,6 @@ class DetectionCounts:
         found, objects, true_detections, detections = (count.sum(dim=other) for count in counts)
         return Curve(bins, Ratio.of(found, objects), Ratio.of(true_detections, detections))
 
-    def by_both(self) -> Ratio:
-        """(S, V, D) recall over visibility and distance together: at equal distance, what does visibility do?"""
-        return Ratio.of(self.found, self.objects)
-
     def overall(self) -> Curve:
         """(S, 1) recall and precision of everything."""
         counts = (self.found, self.objects, self.true_detections, self.detections)

@@ -65,8 +65,7 @@ def ratio_errors(base: Tensor, sums: Tensor, unit: Unit) -> Tensor:
 
     A few blocks that all say the same do not prove that others would. Therefore two more are imagined, each with as
     much of A as the others have on average: in one the rig sees all of the cell, in the other next to nothing of it,
-    as Agresti & Coull (1998, The American Statistician 52, 119-126) add successes and failures. No error is 0; how
-    often the ratio plus and minus two errors covers the truth is in docs/measured/error_bars.md.
+    as Agresti & Coull (1998, The American Statistician 52, 119-126) add successes and failures. No error is 0.
 
     Args:
         base: (B, ...) the a_j: steps that probed the cell in each block, or square metres that were seen in it.

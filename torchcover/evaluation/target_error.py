@@ -16,9 +16,9 @@ from torchcover.report import json_record
 # for the looks at which it happens to be too small are those that would end the run.
 MIN_STEPS = 64
 LOOKS_IN_A_ROW = 2
-# Errors are looked at when they should have become small enough, but after 10 to 50 % more steps: some 20 times in
-# 4096 steps.
-MIN_GROWTH, MAX_GROWTH = 1.1, 1.5
+# Errors are looked at when they should have become small enough, but after 4 to 50 % more steps: a run is as much too
+# long as two looks are apart.
+MIN_GROWTH, MAX_GROWTH = 1.04, 1.5
 
 
 @dataclass(frozen=True)

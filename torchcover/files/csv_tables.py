@@ -15,12 +15,7 @@ BYTES_PER_BYTE = 20
 
 
 class CsvTable(NamedTuple):
-    """Columns of a table.
-
-    Args:
-        numbers: Name -> (N,) float64, finite.
-        words: Name -> N of them.
-    """
+    """Columns of a table by name: `numbers` (N,) float64, finite, and `words`, N of them each."""
 
     numbers: dict[str, NDArray[np.float64]]
     words: dict[str, list[str]]

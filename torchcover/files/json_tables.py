@@ -24,11 +24,7 @@ class JsonTable(NamedTuple):
     by_token: dict[str, dict[str, Any]]
 
     def row(self, token: str) -> dict[str, Any]:
-        """The row of a token.
-
-        Raises:
-            ValueError: It leads nowhere.
-        """
+        """The row of a token."""
         if token not in self.by_token:
             raise ValueError(f"{self.path}: no row has the token {str(token)[:40]!r}, which another table names")
         return self.by_token[token]

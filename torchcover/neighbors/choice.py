@@ -37,15 +37,7 @@ log = logging.getLogger("torchcover")
 
 
 def choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
-    """The search of a backend.
-
-    Args:
-        query: (N, 3) coordinates.
-        points: (M, 3) coordinates of the same type and device.
-        backend: A name in `BACKENDS`, or "auto".
-
-    Returns:
-        A function of query, points, largest distance and memory in megabytes.
+    """The search of a backend: a name in `BACKENDS`, or "auto".
 
     Raises:
         ValueError: An unknown backend, or one for other devices than that of the clouds.
@@ -74,15 +66,7 @@ def choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
 
 
 def backend_of_several(query: Tensor, clouds: Sequence[Tensor]) -> str:
-    """The backend for the same queries in several clouds, one after the other: what pays for all of them together.
-
-    Args:
-        query: (N, 3) coordinates.
-        clouds: (M, 3) coordinates each, of the same type and device.
-
-    Returns:
-        What `nearest` takes as `backend`.
-    """
+    """The backend for the same queries in several clouds, one after the other: what pays for all together."""
     together = len(query) * len(clouds) + sum(map(len, clouds))
     return "packets" if query.device.type == "cpu" and _packets_pay(query, together) else "auto"
 

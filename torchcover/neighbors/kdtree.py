@@ -16,17 +16,7 @@ LEAF = 64
 
 
 def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float) -> Tensor:
-    """Index of a nearest point for each query.
-
-    Args:
-        query: (N, 3) finite float32 or float64 coordinates on the CPU.
-        points: (M, 3) finite coordinates, M > 0, of the same type.
-        max_distance: Queries without a point in reach return -1, or any index.
-        memory_mb: Not used: the tree takes about as much memory as the points.
-
-    Returns:
-        (N,) int64 indices into `points`, or -1.
-    """
+    """As `cdist.search`, on the CPU; -1 for queries without a point in reach. It takes as much memory as the points."""
     bound = None if math.isinf(max_distance) else max_distance
     coordinates, number = _distinct(np.ascontiguousarray(points.numpy()))
     _, index = KDTree(coordinates, leafsize=LEAF).query(np.ascontiguousarray(query.numpy()), distance_upper_bound=bound)

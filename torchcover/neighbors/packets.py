@@ -37,17 +37,7 @@ CROWD = 1024
 
 
 def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float) -> Tensor:
-    """Index of a nearest point for each query; of those at the same distance in float32, the smallest.
-
-    Args:
-        query: (N, 3) finite coordinates on the CPU. What is not float32 is left to the KD-tree.
-        points: (M, 3) finite coordinates, M > 0, of the same type.
-        max_distance: Queries without a point in reach return -1, or any index.
-        memory_mb: Not used: the sorted clouds take about three times as much memory as the clouds.
-
-    Returns:
-        (N,) int64 indices into `points`, or -1.
-    """
+    """As `cdist.search`, on the CPU; -1 for queries without a point in reach. Types wider than float32: the KD-tree."""
     if query.dtype != torch.float32 or max(len(query), len(points)) > INDEX_MASK:
         return kdtree.search(query, points, max_distance, memory_mb)
     queries, tree_points = (np.require(cloud.numpy(), requirements=["C", "A"]) for cloud in (query, points))

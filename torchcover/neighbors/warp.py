@@ -37,17 +37,7 @@ SCALARS = {torch.float32: wp.float32, torch.float64: wp.float64}
 
 
 def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float) -> Tensor:
-    """Index of a nearest point for each query; of those at the same distance in their type, the smallest.
-
-    Args:
-        query: (N, 3) finite float32 or float64 coordinates on a CPU or a CUDA device.
-        points: (M, 3) finite coordinates, M > 0, of the same type and device.
-        max_distance: Queries without a point in reach return -1, or any index.
-        memory_mb: Not used: the sorted clouds and the boxes take a few times as much memory as the clouds.
-
-    Returns:
-        (N,) int64 indices into `points`, or -1.
-    """
+    """As `cdist.search`, on a CPU or a CUDA device; -1 for queries without a point in reach."""
     scalar = SCALARS[query.dtype]
     bound = max_distance**2 if max_distance < torch.finfo(query.dtype).max ** 0.5 else torch.inf
     tree = box_tree(points)

@@ -130,22 +130,14 @@ def track_of(seen: Sequence[Seen], vehicle_class: str | None, world_T_source: Ma
 
 
 def checked_size(name: str, size_m: Matrix) -> tuple[float, ...]:
-    """A size that a body can have, as far as it was recorded.
-
-    Raises:
-        ValueError: It is not; the message names the id.
-    """
+    """A size that a body can have, as far as it was recorded."""
     if not (np.isfinite(size_m).all() and (size_m > 0).all()):
         raise ValueError(f"id {name}: a box needs a positive length, width and height; got {size_m.tolist()}")
     return tuple(size_m.tolist())
 
 
 def moving(name: str, times_s: Matrix, places_m: Matrix, angles_deg: Matrix) -> Trajectory:
-    """A trajectory that is there within its times.
-
-    Raises:
-        ValueError: As `Trajectory`; the message names the id.
-    """
+    """A trajectory that is there within its times."""
     try:
         return Trajectory(times_s, places_m, angles_deg, transient=True)
     except ValueError as error:
@@ -153,11 +145,7 @@ def moving(name: str, times_s: Matrix, places_m: Matrix, angles_deg: Matrix) -> 
 
 
 def objects_of(recording: Recording) -> RecordedObjects:
-    """The labelled objects of a recording, and the drive of its vehicle, in the world of its poses.
-
-    Raises:
-        BadFileError: It has no times, no poses or no boxes, an object of it has no id, or no trajectory.
-    """
+    """The labelled objects of a recording, and the drive of its vehicle, in the world of its poses."""
     with naming(recording.path, "objects of a recording"):
         poses = [recording.world_T_vehicle(index) for index in range(len(recording.names))]
         world_T_vehicle = np.stack([pose for pose in poses if pose is not None] or [np.eye(4)])

@@ -44,12 +44,7 @@ class Scan:
 
 
 def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArray[np.float64]:
-    """Return the times of instants, if they can be those.
-
-    Args:
-        times_s: (F,) in seconds.
-        count: How many instants there are.
-        source: Where they were read from, for messages.
+    """Return the times of instants in seconds, if they can be those.
 
     Raises:
         ValueError: Another number of them, or two that do not follow each other.
@@ -139,6 +134,20 @@ class Recording(Protocol):
     def boxes(self, index: int, /) -> Boxes | None:
         """The labelled objects of an instant in the vehicle frame; None where it is not labelled."""
         ...
+
+
+class Layout:
+    """What most layouts have in common: every instant is looked at, and no reference was recorded."""
+
+    names: Sequence[str]
+    reference_sensors: Sequence[str] = ()
+    square_metres = False
+    instants: Sequence[int] | None = None
+
+    @property
+    def frames(self) -> range:
+        """All instants."""
+        return range(len(self.names))
 
 
 class SensorCalibrations(NamedTuple):

@@ -83,11 +83,7 @@ class Sweeps:
         return rigid(np.eye(3), -_pose(recording, 0)[:3, 3]) @ _pose(recording, index)
 
     def ground(self, recording: Recording, index: int) -> GroundModel | None:
-        """What all sensors have seen of the ground within the window; None where there is none near the vehicle.
-
-        Raises:
-            OSError, ValueError: A scan cannot be read.
-        """
+        """What all sensors have seen of the ground within the window; None where there is none near the vehicle."""
         sensors = (*recording.sensors, *recording.reference_sensors)
         scans = [
             self.thinned(recording, sensor, instant)
@@ -97,11 +93,7 @@ class Sweeps:
         return GroundModel.below([scan.low_surfaces for scan in scans], self.local_T_vehicle(recording, index)[:3, 3])
 
     def thinned(self, recording: Recording, sensor: str, index: int) -> Thinned:
-        """A scan of the window.
-
-        Raises:
-            OSError, ValueError: It cannot be read.
-        """
+        """A scan of the window."""
         key = (sensor, index)
         if key in self._kept:
             return self._kept[key]

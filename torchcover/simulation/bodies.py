@@ -3,14 +3,14 @@
 import re
 import warnings
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import Field, model_validator
 
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import shapes
-from torchcover.simulation.documents import Document, NameOrFile, Pose, is_file_name, load_document
+from torchcover.simulation.documents import BuiltIn, Document, NameOrFile, Pose, is_file_name
 from torchcover.simulation.material import material_number
 from torchcover.simulation.mount_regions import MountRegion
 from torchcover.simulation.shapes import Mesh
@@ -42,13 +42,7 @@ UNITS = (
 
 
 def warn_of_mover(owner: str, mesh: Mesh, category: str) -> None:
-    """Warn if the ego or an actor is as large, as small or as wide as none is.
-
-    Args:
-        owner: What the warning calls it.
-        mesh: Its form, x forward and z up.
-        category: What it is: "ego", or that of an actor.
-    """
+    """Warn if the ego or an actor is as large, as small or as wide as none is."""
     words = set(re.split(r"[^a-z]+", category.lower()))
     on_roads = bool(words & ROAD_VEHICLES) and not words & RAIL_VEHICLES
     x, y, z = np.ptp(mesh.vertices_m, axis=0).tolist()
@@ -62,12 +56,7 @@ def warn_of_mover(owner: str, mesh: Mesh, category: str) -> None:
 
 
 def warn_of_scenery(owner: str, mesh: Mesh) -> None:
-    """Warn if what never moves, which may be a whole city, is larger than any in all three extents.
-
-    Args:
-        owner: What the warning calls it.
-        mesh: Its form.
-    """
+    """Warn if what never moves, which may be a whole city, is larger than any in all three extents."""
     x, y, z = np.ptp(mesh.vertices_m, axis=0).tolist()
     if min(x, y, z) > TALLEST_SCENERY_M:
         _warn(owner, (x, y, z), f"far too large; {UNITS}")
@@ -90,11 +79,11 @@ class VehicleShape(Document):
 
     def mesh(self) -> Mesh:
         """All parts in one mesh, in the vehicle frame."""
-        return load_document(Vehicle, "vehicles", self.vehicle).mesh()
+        return Vehicle.load(self.vehicle).mesh()
 
     def content(self) -> dict[str, Any]:
         """Its parts, wherever they stand."""
-        return load_document(Vehicle, "vehicles", self.vehicle).content()
+        return Vehicle.load(self.vehicle).content()
 
 
 Shape = Annotated[
@@ -149,7 +138,7 @@ class Body(Document):
 RegionName = Annotated[str, Field(min_length=1)]
 
 
-class Vehicle(Document):
+class Vehicle(BuiltIn):
     """The body of a vehicle, put together from parts.
 
     Args:
@@ -158,6 +147,8 @@ class Vehicle(Document):
         parts: Its parts, in one frame with x forward and z up.
         mount_regions: By name, patches of its skin that sensors can be mounted on, in the vehicle frame.
     """
+
+    folder: ClassVar[str] = "vehicles"
 
     name: str
     description: str = ""
@@ -196,7 +187,7 @@ def mount_regions_of(shape: Shape | None) -> dict[str, MountRegion]:
     """
     if not isinstance(shape, VehicleShape):
         return {}
-    return load_document(Vehicle, "vehicles", shape.vehicle).mount_regions
+    return Vehicle.load(shape.vehicle).mount_regions
 
 
 def in_vehicle_frame(mesh: Mesh) -> Mesh:
@@ -207,13 +198,7 @@ def in_vehicle_frame(mesh: Mesh) -> Mesh:
 
 
 def mover_mesh(name: str, shape: Shape, category: str = "ego") -> Mesh:
-    """The body of the ego or of an actor in its vehicle frame; a warning if it is too large, too small or turned.
-
-    Args:
-        name: What the warning calls it.
-        shape: Its form, in its own frame.
-        category: What it is: "ego", or that of an actor.
-    """
+    """The body of the ego or of an actor in its vehicle frame; a warning if it is too large, too small or turned."""
     mesh = in_vehicle_frame(sound_mesh(shape, name))
     if mesh.material is None:
         mesh = mesh.made_of("clothing" if category in ON_FOOT else "car_paint")

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchcover.cameras import Camera
 from torchcover.geometry import rigid
 from torchcover.simulation.documents import Document, Pose
-from torchcover.simulation.sensor import Ranging, Scan
+from torchcover.simulation.sensor import Ranging, ScanTimes
 
 # The camera frame is x right, y down, z forward; a mount looks along its x, with y left and z up.
 MOUNT_T_CAMERA = rigid(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
@@ -77,7 +77,7 @@ class CameraSensor(Ranging):
     stride: PositiveInt = 1
     stereo: Stereo | None = None
     range_noise_share: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.0
-    scan: Scan | None = None
+    scan: ScanTimes | None = None
 
     @model_validator(mode="after")
     def _check_lens(self) -> Self:

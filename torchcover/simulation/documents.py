@@ -6,7 +6,7 @@ from difflib import get_close_matches
 from itertools import islice
 from pathlib import Path
 from reprlib import Repr
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,32 +106,8 @@ class Pose(Document):
 DocumentT = TypeVar("DocumentT", bound=Document)
 
 
-def load_document(model: type[DocumentT], kind: str, path_or_name: str | Path) -> DocumentT:
-    """Read a YAML file into a model.
-
-    Args:
-        model: What it must hold.
-        kind: Folder of the built-in ones, as "rigs".
-        path_or_name: A path that ends in .yaml or .yml, or the name of a built-in document.
-
-    Returns:
-        The validated document.
-
-    Raises:
-        FileNotFoundError: No such file, or no built-in document of this name; the message lists the names.
-        BadFileError: Not YAML, or a key is unknown, missing, doubled or has a wrong value; the message names the file
-            and the key.
-    """
-    return read_document(model, _find(kind, path_or_name))
-
-
 def read_document(model: type[DocumentT], path: Path) -> DocumentT:
-    """Read a YAML file into a model of which none is built in.
-
-    Raises:
-        FileNotFoundError: No such file.
-        BadFileError: As for `load_document`.
-    """
+    """Read a YAML file into a model of which none is built in."""
     content = read_mapping(path)
     try:
         return model.model_validate(content, context={"folder": path.parent})
@@ -139,15 +115,29 @@ def read_document(model: type[DocumentT], path: Path) -> DocumentT:
         raise BadFileError(f"{path}: {explain(error)}") from error
 
 
+class BuiltIn(Document):
+    """A document that has a name if it comes with torchcover, in a folder of its kind."""
+
+    folder: ClassVar[str]
+
+    @classmethod
+    def load(cls, path_or_name: str | Path) -> Self:
+        """Read one from a YAML file, or a built-in one by its name (`torchcover list`).
+
+        Args:
+            path_or_name: A path that ends in .yaml or .yml, or the name of a built-in one.
+
+        Raises:
+            FileNotFoundError: No such file, or no built-in one of this name; the message lists the names.
+            BadFileError: Not YAML, or a key is unknown, missing, doubled or has a wrong value; the message names the
+                file and the key.
+        """
+        return read_document(cls, _find(cls.folder, path_or_name))
+
+
 @reads("a YAML document")
 def read_mapping(path: Path) -> dict[str, Any]:
-    """The keys of a YAML file and what they hold.
-
-    Raises:
-        FileNotFoundError: No such file.
-        IsADirectoryError: A folder.
-        BadFileError: Not YAML, or no mapping.
-    """
+    """The keys of a YAML file and what they hold."""
     content = parse_yaml(read_short_text(path))
     if not isinstance(content, dict):
         raise ValueError(f"a YAML mapping of keys is needed; got {type(content).__name__}")

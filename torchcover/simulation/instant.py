@@ -1,5 +1,6 @@
 """A scene at one time, which sensors scan."""
 
+import math
 import operator
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -26,6 +27,9 @@ CLEAR_RADII = 2.0
 
 Matrix = NDArray[np.float64]
 Float32 = NDArray[np.float32]
+
+# Sweeps begin and end at whole ones of these.
+WHOLE_S = 0.005
 
 NO_GROUND = LocalGround([], np.zeros(3))
 
@@ -81,6 +85,7 @@ class Instant:
     ground: LocalGround = NO_GROUND
     world_T_vehicle: Matrix = field(default_factory=lambda: np.eye(4))
     motion: Motion = no_motion
+    _sweeps: dict[tuple[float, float], Sweep | None] = field(default_factory=dict)
 
     def heights_m(self, points_m: NDArray[np.floating]) -> Float32:
         """(N,) heights above the local ground of (N, 3) points of the vehicle frame; see `LocalGround.heights_m`."""
@@ -140,8 +145,7 @@ class Instant:
                 return _TileScan(points, points, seen, hits.range_m[seen], directions, hits, casts)
             swept = sweep.cast(vehicle_T_sensor, tile, when, limit_m, bodies, self.ego, own_m)
             hits, seen = swept.hits, self._seen(swept.hits, ego_points)
-            starts_m = swept.starts_m.take(when.of_ray, axis=0)
-            points = landed = _points(starts_m, swept.directions, hits.range_m, seen)
+            points = landed = _points(swept.starts_m, swept.directions, hits.range_m, seen)
             if len(swept.on_body):
                 points = landed.copy()
                 points[np.cumsum(seen)[swept.on_body] - 1] = swept.points
@@ -184,17 +188,17 @@ class Instant:
         return seen
 
     def _sweep(self, times: Sequence[RayTimes]) -> Sweep | None:
-        now = Poses(self.static_T_vehicle, self.moving.vehicle_T_part)
-        return Sweep.of(self.static, now, self.moving, self.motion, times)
+        """How everything moves meanwhile; for sensors that take as long it is the same."""
+        edges_s = [edge for each in times if len(each.at_s) for edge in (each.at_s[0], each.at_s[-1])]
+        begin, end = min(edges_s, default=0.0) / WHOLE_S, max(edges_s, default=0.0) / WHOLE_S
+        ends_s = WHOLE_S * math.floor(begin), WHOLE_S * math.ceil(end)
+        if ends_s not in self._sweeps:
+            now = Poses(self.static_T_vehicle, self.moving.vehicle_T_part)
+            self._sweeps[ends_s] = Sweep.of(self.static, now, self.moving, *self.motion(*ends_s))
+        return self._sweeps[ends_s]
 
     def struck(self, body: NDArray[np.int32], triangle: NDArray[np.int32], directions: Float32) -> Struck:
-        """What the rays hit that ended on some faces.
-
-        Args:
-            body: (N,) numbers of the bodies, as `cast` gives them, none of them -1.
-            triangle: (N,) likewise.
-            directions: (3, N) unit directions of these rays in the vehicle frame.
-        """
+        """What the rays hit that ended on some faces, as `RayCaster.struck`; directions in the vehicle frame."""
         moved = np.flatnonzero(body >= self.static.bodies)
         # What moves is looked up as any face of what does not, and then put right.
         rests = np.where(body < self.static.bodies, triangle, 0) if len(moved) else triangle
@@ -325,10 +329,10 @@ def _limit(tile: Tile, max_range_m: float) -> Float32:
 
 
 def _points(origin_m: Float32, directions: Float32, range_m: Float32, seen: NDArray[np.bool_]) -> Float32:
-    """(K, 3) where the rays that saw something ended, which start at (3,) one place or (n, 3) one each."""
+    """(K, 3) where the rays that saw something ended, which start at a (3,) place or at (3, n) of their own."""
     points = np.empty((np.count_nonzero(seen), 3), dtype=np.float32)
     for axis in range(3):
         coordinate = directions[axis] * range_m
-        coordinate += origin_m[..., axis]
+        coordinate += origin_m[axis]
         points[:, axis] = coordinate[seen]
     return points

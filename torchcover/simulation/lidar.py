@@ -1,17 +1,17 @@
 """LiDAR: a table of rows, turned through its columns, and the models on the market that it may start from."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, ValidationInfo, model_validator
 
-from torchcover.simulation.documents import Pose, beside, is_file_name, load_document
+from torchcover.simulation.documents import BuiltIn, Pose, beside, is_file_name
 from torchcover.simulation.material import material_number, materials, tone
 from torchcover.simulation.rays import unit_directions
 from torchcover.simulation.returns import log_excess, return_probability
-from torchcover.simulation.sensor import Draws, Elevation, Ranging, RayHits, Returns, Scan
+from torchcover.simulation.sensor import Draws, Elevation, Ranging, RayHits, Returns, ScanTimes
 
 # Two ways to write rows: a sensor that chooses one of them takes nothing of the other from its model.
 SPACED_ROWS = ("channels", "vertical_fov_deg")
@@ -51,7 +51,7 @@ class ScanPattern(Ranging):
     range_at_10_percent_m: PositiveFloat | None = None
     spread: PositiveFloat = 0.3
     range_factors: tuple[PositiveFloat, ...] | None = None
-    scan: Scan | None = None
+    scan: ScanTimes | None = None
 
     @model_validator(mode="after")
     def _check_rows(self) -> Self:
@@ -127,30 +127,22 @@ class ScanPattern(Ranging):
         return unit_directions(self.rows_deg()[:, None], azimuths_deg)
 
 
-class LidarModel(ScanPattern):
+class LidarModel(ScanPattern, BuiltIn):
     """What is known of a LiDAR on the market: the scan pattern that a sensor starts from.
 
     Args:
         name: What a sensor's `model` calls it.
         description: What it is, and where its numbers come from.
+
+    Example:
+        >>> len(LidarModel.load("velodyne_vlp16").rows_deg())
+        16
     """
+
+    folder: ClassVar[str] = "lidars"
 
     name: str
     description: str = ""
-
-    @classmethod
-    def load(cls, path_or_name: str | Path) -> Self:
-        """Read a model from a YAML file, or a built-in one by its name.
-
-        Raises:
-            FileNotFoundError: No such file or name; the message lists the names.
-            ValueError: The file is not a model; the message names the file and the key.
-
-        Example:
-            >>> len(LidarModel.load("velodyne_vlp16").rows_deg())
-            16
-        """
-        return load_document(cls, "lidars", path_or_name)
 
     def completing(self, given: dict[str, Any]) -> dict[str, Any]:
         """The keys of a sensor, and those of the model that it does not give.

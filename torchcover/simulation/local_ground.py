@@ -48,10 +48,6 @@ SLACK_M = 1e-3
 def level_faces(mesh: Mesh, outward: Bools | None = None) -> Bools:
     """(F,) whether one could stand on each face: it is not too steep, and of a closed body it is an upper side.
 
-    Args:
-        mesh: Vertices and faces, z up.
-        outward: (F,) what `outward_faces` says of it, if that is known.
-
     Example:
         >>> from torchcover.simulation.shapes import Box, Plane
         >>> int(level_faces(Box(type="box", size_m=(1, 1, 1)).mesh()).sum())
@@ -83,10 +79,6 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
 
     Two level surfaces are connected that share an edge, or of which one goes on where the other ends, at most 0.3 m
     higher or lower. If no place has any within a metre, a level face below counts, however far; else a sheet above.
-
-    Args:
-        meshes: What never moves.
-        places_m: (N, 3) where somebody stands on the ground, in the same frame.
 
     Returns:
         One (F,) mask for each mesh.
@@ -241,12 +233,7 @@ class GroundSquares(NamedTuple):
 
     @classmethod
     def of(cls, meshes: Sequence[Mesh], origin_m: Float64) -> "GroundSquares":
-        """Those of triangles, of whose bounding boxes all squares are taken, lest one be overlooked.
-
-        Args:
-            meshes: The triangles, near zero.
-            origin_m: (3,) what was subtracted of their world coordinates.
-        """
+        """Those of triangles, of whose bounding boxes all squares are taken, lest one be overlooked."""
         parts = [mesh.vertices_m[mesh.faces] for mesh in meshes]
         # NumPy is quick along the last axis.
         corners_m = np.ascontiguousarray(np.concatenate([np.empty((0, 3, 3)), *parts]).transpose(1, 2, 0))
@@ -281,11 +268,7 @@ class GroundSquares(NamedTuple):
         return cls(first_m, square_m, levels)
 
     def between_m(self, lower_m: NDArray[np.floating], upper_m: NDArray[np.floating]) -> tuple[Float32, Float32]:
-        """The lowest and the highest ground anywhere in upright rectangles.
-
-        Args:
-            lower_m: (2, N) x and y.
-            upper_m: (2, N).
+        """The lowest and the highest ground anywhere in N upright rectangles between (2, N) corners.
 
         Returns:
             (N,) and (N,); infinite and minus infinite where there is none.

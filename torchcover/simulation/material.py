@@ -1,15 +1,14 @@
 """What surfaces are made of, as far as a LiDAR can tell."""
 
 from functools import cache
-from pathlib import Path
-from typing import Annotated, Literal, NamedTuple, Self
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat
 
 from torchcover.simulation.builtin import builtin_names
-from torchcover.simulation.documents import Document, load_document
+from torchcover.simulation.documents import BuiltIn
 
 # What nobody said the material of is scenery: walls for the most part.
 UNSAID = "brick"
@@ -17,7 +16,7 @@ UNSAID = "brick"
 TONES = np.append(np.random.default_rng(905).standard_normal(4095), 0.0).astype(np.float32)
 
 
-class Material(Document):
+class Material(BuiltIn):
     """A surface, as light of 905 nm meets it.
 
     Args:
@@ -35,22 +34,14 @@ class Material(Document):
         0.2
     """
 
+    folder: ClassVar[str] = "materials"
+
     name: str
     description: str = ""
     reflectivity: Annotated[float, Field(ge=0.0, le=1.0)] | Literal["retroreflective"]
     incidence_exponent: NonNegativeFloat = 1.0
     spread: NonNegativeFloat = 0.0
     varies_by: Literal["place", "body"] = "place"
-
-    @classmethod
-    def load(cls, path_or_name: str | Path) -> Self:
-        """Read a material from a YAML file, or a built-in one by its name.
-
-        Raises:
-            FileNotFoundError: No such file or name; the message has the nearest name.
-            ValueError: The file is not a material.
-        """
-        return load_document(cls, "materials", path_or_name)
 
     @property
     def share(self) -> float:
@@ -69,11 +60,7 @@ class Materials(NamedTuple):
 
 @cache
 def material_number(name: str) -> int:
-    """The number of a built-in material, which meshes have; 0 is where none was said.
-
-    Raises:
-        FileNotFoundError: No such material; the message has the nearest name.
-    """
+    """The number of a built-in material, which meshes have; 0 is where none was said."""
     known = builtin_names("materials")
     if name not in known:
         Material.load(name)

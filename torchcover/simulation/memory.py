@@ -29,14 +29,6 @@ def machine_bytes() -> float:
 def check_fits(what: str, needed_bytes: float, advice: str) -> None:
     """Refuse what this machine has no memory for, before any of it is reserved.
 
-    Args:
-        what: What needs it, and how many there are: "1,000,000 rays".
-        needed_bytes: About how much.
-        advice: What to do.
-
-    Raises:
-        ValueError: It is more than the machine has; the message has both sizes.
-
     Example:
         >>> check_fits("1,000 rays", 1e6, "take fewer")
         >>> check_fits("a million million rays", 1e14, "take fewer")  # doctest: +ELLIPSIS

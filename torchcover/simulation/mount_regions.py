@@ -38,11 +38,7 @@ class SkinPoint(NamedTuple):
 
 
 class Skin:
-    """The outside of a body: where straight lines from outside first meet it.
-
-    Args:
-        mesh: The body.
-    """
+    """The outside of a body: where straight lines from outside first meet it."""
 
     def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh

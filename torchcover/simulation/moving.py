@@ -188,17 +188,7 @@ class Moving:
         *,
         leaving_out: int | None = None,
     ) -> tuple[Meetings, int]:
-        """Where the rays of one tile meet each body, as if it were alone; and at how many pairs of both it was cast.
-
-        Args:
-            origin_m: (3,) where they start.
-            vehicle_R_sensor: As in `pairs`, and so are the others.
-            tile: Rays of the sensor.
-            directions: The same in the vehicle frame.
-            limit_m: Where they end.
-            bodies: How the bodies look.
-            leaving_out: Number of a body.
-        """
+        """Where the rays of one tile meet each body, as if it were alone, and of how many pairs; as `pairs`."""
         part, ray = self.pairs(vehicle_R_sensor, tile, directions, limit_m, bodies, leaving_out=leaving_out)
         if len(ray) == 0:
             return Meetings(part, ray, np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int32)), 0
@@ -209,13 +199,7 @@ class Moving:
         return Meetings(part[met], ray[met], hits.range_m[met], hits.triangle[met]), len(met)
 
     def struck(self, part: Numbers, triangle: NDArray[np.int32], directions: Float32) -> Struck:
-        """What the rays hit that met some of the bodies.
-
-        Args:
-            part: (N,) of `Meetings`.
-            triangle: (N,) likewise.
-            directions: (3, N) unit directions of these rays in the vehicle frame.
-        """
+        """What the rays hit that met some of the bodies, as `RayCaster.struck`."""
         towards = rotate_each(self.part_T_vehicle[:, :3, :3].astype(np.float32)[part], directions)
         casters, kind = self.kinds
         cosine, material = np.empty(len(part), dtype=np.float32), np.empty(len(part), dtype=np.uint8)

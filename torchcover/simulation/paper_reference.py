@@ -81,17 +81,7 @@ class PaperReference:
         bands_m: Bands = PAPER_BANDS_M,
         band_frame: BandFrame = DEFAULT_BAND_FRAME,
     ) -> Self:
-        """The paper's, or a smaller or larger square of rows and columns; it looks everywhere, whatever is asked about.
-
-        Args:
-            areas: Not used.
-            rays: About how many rays; 1024 x 1024 if not given.
-            bands_m: Not used.
-            band_frame: Not used: its own is "vehicle".
-
-        Raises:
-            ValueError: Fewer than 1 ray.
-        """
+        """The paper's 1024 x 1024 rays, or a square of about as many; it looks everywhere, whatever is asked about."""
         if rays is None:
             return cls()
         if rays < 1:

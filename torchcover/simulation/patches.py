@@ -28,17 +28,11 @@ VOLUME_ROUNDING = 1e-9
 
 
 def outward_faces(mesh: Mesh) -> NDArray[np.bool_]:
-    """Whether each face belongs to a closed surface that is turned outwards: its back is then never seen from outside.
+    """(F,) whether each face belongs to a closed surface that is turned outwards: nobody outside sees its back.
 
     Faces that share an edge belong to one surface. It is closed if every edge is run through as often one way as the
     other, and turned outwards if it encloses a volume that is not negative. A face of any other surface, such as a
     plane, an open mesh, or a ball that is turned inside out, may be seen from both sides.
-
-    Args:
-        mesh: Vertices and faces; vertices at the same place are one.
-
-    Returns:
-        (F,) bool.
 
     Example:
         >>> from torchcover.simulation.shapes import Box, Plane

@@ -187,9 +187,6 @@ class RayCaster:
             origins_m: (N, 3) where they start.
             directions: (3, N) unit directions.
             limit_m: (N,) distance at which each ray ends; may be infinite.
-
-        Returns:
-            As `cast`.
         """
         answer = self._scene.run(origins_m, directions.T, dists=limit_m.copy(), output=True)
         return Hits(answer["tfar"], answer["geomID"], answer["primID"])

@@ -84,11 +84,7 @@ def _terms(points_m: Float64) -> Float64:
 
 
 def road_profile(points_m: Float64) -> RoadProfile:
-    """Fit the road under a sweep, from near to far.
-
-    Args:
-        points_m: (N, 3) in the vehicle frame.
-    """
+    """Fit the road under a sweep, (N, 3) points in the vehicle frame, from near to far."""
     range_m = np.hypot(points_m[:, 0], points_m[:, 1])
     chosen = (np.abs(points_m[:, 1]) < HALF_ROAD_M) & (range_m < 90.0) & (range_m > 3.5)
     points_m, range_m = points_m[chosen], range_m[chosen]
@@ -113,10 +109,6 @@ def ground_rays(sweeps: Sequence[NDArray[np.floating]], lidar: Lidar) -> GroundR
 
     Which rays there were is known from its scan pattern: the row of a return is the nearest one, and each row has
     `columns` rays to a turn.
-
-    Args:
-        sweeps: (N, 3) points of each sweep, in the vehicle frame.
-        lidar: The sensor, where it is mounted.
     """
     found = [_of_sweep(np.asarray(points_m, dtype=np.float64), lidar, number) for number, points_m in enumerate(sweeps)]
     return GroundRays._make(np.concatenate(columns) for columns in zip(*found, strict=True))
@@ -217,12 +209,7 @@ class ReturnFit(NamedTuple):
 
 
 def fit_returns(rays: GroundRays, road: Material) -> ReturnFit:
-    """The likeliest range at 10 % and spread. The rays of a cell meet one spot, and count as one.
-
-    Args:
-        rays: Rays to the road; at least one.
-        road: What the road is made of.
-    """
+    """The likeliest range at 10 % and spread. The rays of a cell meet one spot, and count as one."""
     at_one_metre = log_excess(rays.range_m, rays.cos_incidence, road.share, road.incidence_exponent, 1.0)
     returned = rays.returned / rays.rays
 

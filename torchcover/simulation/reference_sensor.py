@@ -170,11 +170,7 @@ class ReferenceSensor(Protocol):
 
 
 def check_areas(areas: Areas) -> None:
-    """Refuse areas that ask nothing.
-
-    Raises:
-        ValueError: No area, or one with inverted or infinite bounds.
-    """
+    """Refuse areas that ask nothing."""
     if not areas:
         raise ValueError("areas: at least one rectangle ((x_low, x_high), (y_low, y_high)) is needed")
     for area in areas:
@@ -183,11 +179,7 @@ def check_areas(areas: Areas) -> None:
 
 
 def check_reach(shell_m: float, max_range_m: float) -> None:
-    """Refuse a shell or a range that is not positive.
-
-    Raises:
-        ValueError: As said.
-    """
+    """Refuse a shell or a range that is not positive."""
     if not shell_m > 0:
         raise ValueError(f"shell_m: a positive thickness in metres is needed; got {shell_m}")
     if not max_range_m > 0:

@@ -2,13 +2,13 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import Field, PlainValidator, TypeAdapter, ValidationInfo, model_validator
 
 from torchcover.files import as_yaml, write_durably
 from torchcover.simulation.bodies import Shape, VehicleShape, body_called
-from torchcover.simulation.documents import Document, NameOrFile, is_file_name, load_document
+from torchcover.simulation.documents import BuiltIn, Document, NameOrFile, is_file_name
 from torchcover.simulation.kinds import SENSORS
 from torchcover.simulation.lidar import Lidar, LidarModel
 from torchcover.simulation.scenario import DEFAULT_EGO, Mover, Scenario
@@ -25,7 +25,7 @@ def read_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  
     return TypeAdapter(SENSORS[kind]).validate_python(content, context=info.context)
 
 
-class Rig(Document):
+class Rig(BuiltIn):
     """The sensors of a vehicle.
 
     Args:
@@ -41,6 +41,8 @@ class Rig(Document):
         ['roof']
     """
 
+    folder: ClassVar[str] = "rigs"
+
     name: str
     description: str = ""
     vehicle: NameOrFile | None = None
@@ -53,16 +55,6 @@ class Rig(Document):
         if len(set(names)) != len(names):
             raise ValueError(f"sensors need different names; got {', '.join(names)}")
         return self
-
-    @classmethod
-    def load(cls, path_or_name: str | Path) -> Self:
-        """Read a rig from a YAML file, or a built-in one by its name (`torchcover list`).
-
-        Raises:
-            FileNotFoundError: No such file or name.
-            ValueError: The file is not a rig; the message names the file and the key.
-        """
-        return load_document(cls, "rigs", path_or_name)
 
     def save(self, path: str | Path) -> None:
         """Write it to a YAML file from which `load` makes the same rig, wherever that is put.

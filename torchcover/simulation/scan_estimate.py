@@ -78,11 +78,7 @@ def estimate_scan(scans: Sequence[NDArray[np.float64]]) -> ScanEstimate | None:
 
 
 def rows_of(elevation_deg: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    """(R,) the elevations that points gather at, ascending, to a bin; None if that depends on how closely one looks.
-
-    Args:
-        elevation_deg: (N,) of the points.
-    """
+    """(R,) the elevations that points gather at, ascending, to a bin; None if that depends on how closely one looks."""
     lowest = float(elevation_deg.min()) - 4 * COARSEST_DEG
     number = ((elevation_deg - lowest) / BIN_DEG).astype(np.int64)
     size = int(number.max() + 4 * COARSEST_DEG / BIN_DEG)

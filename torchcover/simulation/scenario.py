@@ -1,8 +1,7 @@
 """A scenario: the world around the ego, what moves in it, and the ego's own body."""
 
 import math
-from pathlib import Path
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, ClassVar, Self
 
 import numpy as np
 from pydantic import NonNegativeFloat, PlainValidator, PositiveFloat, TypeAdapter, ValidationInfo, model_validator
@@ -11,7 +10,7 @@ from torchcover.geometry import BoundingBox, rigid
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, called, mover_mesh
-from torchcover.simulation.documents import Document, PathBeside, Pose, load_document
+from torchcover.simulation.documents import BuiltIn, Document, PathBeside, Pose
 from torchcover.simulation.kinds import TRAFFIC
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.local_ground import STEEPEST_DEG, level_faces
@@ -84,7 +83,7 @@ class NamedMover(Mover):
     shape: Shape
 
 
-class Scenario(Document):
+class Scenario(BuiltIn):
     """A world with an ego in it: given body by body, or made of traffic.
 
     Args:
@@ -104,6 +103,8 @@ class Scenario(Document):
         >>> Scenario.load("courtyard").ego.pose.x_m
         0.0
     """
+
+    folder: ClassVar[str] = "scenarios"
 
     name: str
     description: str = ""
@@ -130,16 +131,6 @@ class Scenario(Document):
         if self.ego is not None and (self.ego.pose is not None or self.ego.trajectory is not None):
             raise ValueError("ego: traffic drives it; give its shape only")
         return self
-
-    @classmethod
-    def load(cls, path_or_name: str | Path) -> Self:
-        """Read a scenario from a YAML file, or a built-in one by its name (`torchcover list`).
-
-        Raises:
-            FileNotFoundError: No such file or name.
-            ValueError: The file is not a scenario; the message names the file and the key.
-        """
-        return load_document(cls, "scenarios", path_or_name)
 
     def locate(self, index: int) -> tuple[int, int]:
         """Which run through the scenario a frame belongs to, and its time step in it; see `repeats`."""

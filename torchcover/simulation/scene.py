@@ -156,9 +156,6 @@ class Scene:
             step: Number of time steps since the start of the world.
             within_m: Moving bodies whose origin is farther from the vehicle than this and their size are left out.
 
-        Returns:
-            The `Instant`, which sensors can scan.
-
         Raises:
             ValueError: The bounding box of an actor overlaps that of the ego.
         """
@@ -180,11 +177,7 @@ class Scene:
         return Instant(self._static, static_T_vehicle, moving, ego, out_of_range, self.ground, world_T_vehicle, motion)
 
     def check_apart(self, steps: NDArray[np.int64]) -> None:
-        """Refuse time steps at which an actor overlaps the ego, as `at` does for one.
-
-        Raises:
-            ValueError: As said; the message names the actor and the first such time.
-        """
+        """Refuse time steps at which an actor overlaps the ego, as `at` does for one."""
         ego = self.world.ego
         bodies = self._resting + self._moving
         ego_m = self._positions_m[:, [body is ego for body in bodies]]

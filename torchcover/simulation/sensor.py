@@ -193,7 +193,7 @@ class Sensor(Protocol):
         ...
 
 
-class Scan(Document):
+class ScanTimes(Document):
     """How long a sensor takes for its rays: a LiDAR for its columns, in their order, a camera for its rows, from above.
 
     Args:

@@ -1,5 +1,6 @@
 """Shapes: primitives, and meshes from files."""
 
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
 
@@ -119,7 +120,7 @@ class Cylinder(Document):
 
     def mesh(self) -> Mesh:
         """A closed prism."""
-        bottom = np.insert(_circle(self.sides) * self.radius_m, 2, 0.0, axis=1)
+        bottom = np.insert(circle(self.sides) * self.radius_m, 2, 0.0, axis=1)
         return _prism(bottom, bottom + np.array([0.0, 0.0, self.height_m]))
 
 
@@ -138,7 +139,7 @@ class Ellipsoid(Document):
         bands = ELLIPSOID_SIDES // 2
         elevation = np.pi * np.arange(1, bands) / bands - np.pi / 2
         # The unit sphere: axes are bands, sides, coordinates.
-        across = np.cos(elevation)[:, None, None] * _circle(ELLIPSOID_SIDES)
+        across = np.cos(elevation)[:, None, None] * circle(ELLIPSOID_SIDES)
         upwards = np.broadcast_to(np.sin(elevation)[:, None, None], (*across.shape[:2], 1))
         rings = np.concatenate([across, upwards], axis=2).reshape(-1, 3)
         sphere = np.concatenate([[[0.0, 0.0, -1.0]], rings, [[0.0, 0.0, 1.0]]])
@@ -159,13 +160,7 @@ class MeshFile(Document):
     metres_per_unit: PositiveFloat = 1.0
 
     def mesh(self) -> Mesh:
-        """All geometry of the file in one mesh.
-
-        Raises:
-            FileNotFoundError: No such file.
-            IsADirectoryError: A folder.
-            BadFileError: trimesh cannot read it, it has no faces, a vertex is NaN or infinite, or it is too large.
-        """
+        """All geometry of the file in one mesh."""
         mesh = _read_mesh(self.path)
         return mesh._replace(vertices_m=mesh.vertices_m * self.metres_per_unit)
 
@@ -197,7 +192,8 @@ def _rectangle(size_m: tuple[float, float], z_m: float) -> NDArray[np.float64]:
     return np.array([[-x, -y, z_m], [x, -y, z_m], [x, y, z_m], [-x, y, z_m]])
 
 
-def _circle(corners: int) -> NDArray[np.float64]:
+@cache
+def circle(corners: int) -> NDArray[np.float64]:
     """(corners, 2) points of the unit circle, counter-clockwise from (1, 0)."""
     angle = 2 * np.pi * np.arange(corners) / corners
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -211,11 +207,11 @@ def _ball_faces(rings: int, corners: int) -> NDArray[np.int64]:
     top = (rings - 1) * corners + 1
     faces = [np.stack([lower, following + 1, here + 1], axis=1), np.stack([upper, here + top, following + top], axis=1)]
     for first in range(1, top, corners):
-        faces.append(_band(here + first, following + first, corners))
+        faces.append(band(here + first, following + first, corners))
     return np.concatenate(faces)
 
 
-def _band(here: NDArray[np.int64], following: NDArray[np.int64], upwards: int) -> NDArray[np.int64]:
+def band(here: NDArray[np.int64], following: NDArray[np.int64], upwards: int) -> NDArray[np.int64]:
     """Two triangles for each side between a ring and the one above it, whose indices are larger by `upwards`."""
     return np.concatenate(
         [
@@ -227,9 +223,16 @@ def _band(here: NDArray[np.int64], following: NDArray[np.int64], upwards: int) -
 
 def _prism(bottom: NDArray[np.float64], top: NDArray[np.float64]) -> Mesh:
     """Close the space between two convex polygons with K corners each, given counter-clockwise from above."""
-    corners = len(bottom)
+    return Mesh(np.concatenate([bottom, top]), prism_faces(2, len(bottom)))
+
+
+@cache
+def prism_faces(levels: int, corners: int) -> NDArray[np.int64]:
+    """Sides, bottom and top of a prism through so many outlines, which share them: nobody may write into them."""
     here = np.arange(corners)
-    following = (here + 1) % corners
-    sides = _band(here, following, corners)
-    fan = np.stack([np.zeros(corners - 2, dtype=int), here[1:-1], here[2:]], axis=1)
-    return Mesh(np.concatenate([bottom, top]), np.concatenate([sides, fan[:, ::-1], fan + corners]))
+    side = band(here, (here + 1) % corners, corners)
+    fan = np.stack([np.zeros(corners - 2, dtype=np.int64), here[1:-1], here[2:]], axis=1)
+    sides = [side + level * corners for level in range(levels - 1)]
+    faces = np.concatenate([*sides, fan[:, ::-1], fan + (levels - 1) * corners])
+    faces.flags.writeable = False
+    return faces

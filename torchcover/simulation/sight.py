@@ -73,13 +73,7 @@ class MountedSensor:
         self._resting: tuple[SensorScan, RayHits] | None = None
 
     def scan(self, instant: Instant, draws: Draws, *, threads: int = 1) -> SensorScan:
-        """What it makes of what its rays hit at one time of the scene.
-
-        Args:
-            instant: From `Scene.at`.
-            draws: The random numbers of its measuring.
-            threads: Number of threads; the result does not depend on it.
-        """
+        """What it makes of what its rays hit at one time of the scene."""
         scan, hits = self._cast(instant, threads)
         hit, error_m = self.sensor.measure(hits, draws)
         ways = scan.ways() if error_m is not None and scan.ways else None
@@ -109,11 +103,7 @@ class MountedSensor:
         return scan, hits
 
     def ends(self, instant: Instant) -> Ends:
-        """Where each of its rays ends: at what it hits first, the ego's body included, or at its reach.
-
-        Args:
-            instant: From `Scene.at`.
-        """
+        """Where each of its rays ends: at what it hits first, the ego's body included, or at its reach."""
         bodies, own = instant.outlines(self.vehicle_T_sensor[:3, 3]), self._own_m or [None] * len(self.tiles)
         range_m, is_hit = [], []
         for tile, own_m in zip(self.tiles, own, strict=True):

@@ -248,12 +248,7 @@ class SimulatedFrames(FrameDataset):
 
 
 def of_rigs(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) -> dict[str, Any]:
-    """What a `Frame` says of its rigs: clouds, what was measured of them, and which points are of which sensor.
-
-    Args:
-        rigs: By their names.
-        scans: What each of their sensors saw.
-    """
+    """What a `Frame` says of its rigs: clouds, what was measured of them, and which points are of which sensor."""
     clouds = {name: torch.from_numpy(np.concatenate([one.points for one in seen])) for name, seen in scans.items()}
     measured = {
         name: Measured(

@@ -27,10 +27,6 @@ BODY_SHARE = 0.5
 def told(owner: str, mesh: Mesh) -> Mesh:
     """A mesh with each face once, and warnings of what else is wrong with it.
 
-    Args:
-        owner: What the warnings call it.
-        mesh: Vertices and faces.
-
     Warns:
         UserWarning: Faces that are there twice, neighbours whose normals disagree, or a body that is not closed.
     """
@@ -109,12 +105,7 @@ def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Boo
 
 
 def warn_of_coincidence(names: Sequence[str], coincident: Sequence[Bools]) -> None:
-    """Warn of bodies whose surfaces coincide with others.
-
-    Args:
-        names: Of the bodies, one for each mesh.
-        coincident: From `coincident_faces`.
-    """
+    """Warn of bodies whose surfaces coincide with others."""
     shares = {
         name: f"{name!r} ({_share(int(mask.sum()), len(mask))} of the faces)"
         for name, mask in zip(names, coincident, strict=True)

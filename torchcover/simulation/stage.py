@@ -49,11 +49,7 @@ class Stage:
         return self.mounts.sensors
 
     def check_mounts(self, instant: Instant) -> None:
-        """Refuse a sensor that is where none can be; where nothing moves, the first answer holds.
-
-        Raises:
-            ValueError: It lies below the ground or inside a body.
-        """
+        """Refuse a sensor that is where none can be; where nothing moves, the first answer holds."""
         if self.mounts.free_for_good:
             return
         for rig, sensors in self.mounted.items():
@@ -99,12 +95,7 @@ class Scenes:
         self._ego: Mesh | None = None
 
     def of_run(self, run: int) -> Scene:
-        """That of one run; see `Scenario.locate`.
-
-        Raises:
-            FileNotFoundError: A mesh, vehicle or trajectory file is missing.
-            ValueError: A mesh or a trajectory cannot be used.
-        """
+        """That of one run; see `Scenario.locate`."""
         if run in self._kept:
             scene = self._kept.pop(run)
         else:
@@ -130,14 +121,7 @@ class Scenes:
 
 
 class Stages:
-    """The stages of a scenario's runs: rigs in its scenes. In traffic the sensors on the ego are the same in all.
-
-    Args:
-        scenario: What plays.
-        rigs: Whose sensors are mounted.
-        seed: Seed of procedural traffic.
-        kept_bytes: As in `Scenes`.
-    """
+    """The stages of a scenario's runs: rigs in its scenes. In traffic the sensors on the ego are the same in all."""
 
     def __init__(self, scenario: Scenario, rigs: Mapping[str, Rig], seed: int, kept_bytes: float | None = None) -> None:
         self._put(Scenes(scenario, seed, kept_bytes), rigs)
@@ -156,12 +140,7 @@ class Stages:
         return other
 
     def of_run(self, run: int) -> Stage:
-        """The stage of one run; see `Scenario.locate`.
-
-        Raises:
-            FileNotFoundError: A mesh, vehicle or trajectory file is missing.
-            ValueError: A mesh or a trajectory cannot be used, or a sensor is mounted inside the ego's body.
-        """
+        """The stage of one run; see `Scenario.locate`."""
         scene = self._scenes.of_run(run)
         if scene not in self._mounts:
             self._mounts[scene] = Mounts(self._sensors(scene))

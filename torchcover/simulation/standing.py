@@ -20,13 +20,7 @@ LIFT_M = 1e-3
 
 
 def warn_of_floating(name: str, scene: Scene, steps: NDArray[np.int64]) -> None:
-    """Warn if the ego, or more than half of the others that move, have no ground near the bottoms of their bodies.
-
-    Args:
-        name: What the warning calls the scenario.
-        scene: It as geometry.
-        steps: (T,) time steps, of which a few are looked at.
-    """
+    """Warn if the ego, or more than half of the others that move, have no ground near the bottoms of their bodies."""
     found = np.concatenate([_grounded(scene, step) for step in steps[:: -(-len(steps) // LOOKS)].tolist()])
     of_ego, of_others = found[found[:, 0] > 0, 1], found[found[:, 0] == 0, 1]
     for who, grounded, share in (("the ego", of_ego, 0.0), ("others that move", of_others, 0.5)):

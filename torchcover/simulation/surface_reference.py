@@ -113,17 +113,7 @@ class SurfaceReference:
         bands_m: Bands = PAPER_BANDS_M,
         band_frame: BandFrame = DEFAULT_BAND_FRAME,
     ) -> Self:
-        """One that asks about some areas.
-
-        Args:
-            areas: As above.
-            rays: About how many rays; 16,384 if not given.
-            bands_m: As above.
-            band_frame: As above.
-
-        Raises:
-            ValueError: As for the class.
-        """
+        """One that asks about some areas, with 16,384 rays if it is not told how many."""
         return cls(areas, DEFAULT_RAYS if rays is None else rays, bands_m=bands_m, band_frame=band_frame)
 
     def scan(self, surroundings: Surroundings) -> ReferenceScan:

@@ -12,7 +12,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.geometry import invert
+from torchcover.geometry import invert, transform
 from torchcover.simulation.moving import Meetings, Moving
 from torchcover.simulation.raycaster import Hits, RayCaster, cast_from
 from torchcover.simulation.rays import SLACK_M, Outlines, Tile, outlines, rotate, rotate_each
@@ -54,7 +54,7 @@ class SweptHits(NamedTuple):
     Args:
         hits: Of each.
         directions: (3, n) in the vehicle frame at the frame's time.
-        starts_m: (g, 3) where they start at each of the tile's times, likewise.
+        starts_m: (3, n) where they start, likewise, or (3, 1) if all start there.
         on_body: (K,) the rays that hit a body that moves, and is not the ego.
         points: (K, 3) where these points are at the frame's time: they have travelled with their body.
         casts: How many rays were cast at bodies that move.
@@ -96,29 +96,17 @@ class Sweep:
         static: RayCaster,
         now: Poses,
         moving: Moving,
-        motion: Motion,
-        times: Sequence[RayTimes],
+        samples_s: Float64,
+        poses: Sequence[Poses],
     ) -> Self | None:
-        """That of a scene from the first ray to the last; None if nothing moves meanwhile.
-
-        Args:
-            static: What never moves.
-            now: Where everything is at the frame's time.
-            moving: The bodies that move, as they are then.
-            motion: Where everything is meanwhile.
-            times: When rays are cast.
-        """
-        ends_s = np.array([edge for each in times if len(each.at_s) for edge in (each.at_s[0], each.at_s[-1])])
-        if len(ends_s) == 0:
-            return None
-        samples_s, poses = motion(float(ends_s.min()), float(ends_s.max()))
+        """That of a scene; None if nothing moves meanwhile."""
         if all(np.array_equal(one, other) for each in poses for one, other in zip(each, now, strict=True)):
             return None
         # Where the boxes are in the vehicle's frame of each time; those of now, moved.
         part_T_vehicle = np.stack([invert(each.vehicle_T_part) for each in poses])
         moved = [each.vehicle_T_part @ moving.part_T_vehicle for each in poses]
         corners_m = np.stack([moving.corners_m @ one[:, :3, :3].swapaxes(1, 2) + one[:, None, :3, 3] for one in moved])
-        bulge_m = SLACK_M + np.abs(np.diff(corners_m, n=2, axis=0)).max(axis=(0, 2, 3), initial=0.0) / 4
+        bulge_m = SLACK_M + np.abs(np.diff(corners_m, n=2, axis=0)).max(axis=(0, 2, 3), initial=0.0) / 2
         outwards = np.sign(moving.corners_m - moving.centre_m[:, None]) * bulge_m[:, None, None]
         static_T_vehicle = np.stack([each.static_T_vehicle for each in poses])
         return cls(
@@ -145,24 +133,13 @@ class Sweep:
         ego: int,
         own_m: Float32 | None,
     ) -> SweptHits:
-        """Cast the rays of one tile, each at its time.
-
-        Args:
-            vehicle_T_sensor: (4, 4) pose of the sensor.
-            tile: n of its rays.
-            times: When each of them is cast.
-            limit_m: (n,) distance at which each of them ends; finite.
-            bodies: From `outlines`.
-            ego: Number of the ego.
-            own_m: (n,) where the ego's body ends them, if that is known.
-        """
+        """Cast the rays of one tile, each at its time, as `Instant.cast` does."""
         origin_m, vehicle_R_sensor, of_ray = vehicle_T_sensor[:3, 3], vehicle_T_sensor[:3, :3], times.of_ray
         directions = rotate(vehicle_R_sensor, tile.directions)
         if own_m is not None:
             limit_m = np.minimum(limit_m, own_m)
         weights = parabola_weights(self.samples_s, times.at_s)
-        static_T_vehicle = np.tensordot(weights, self.static_T_vehicle, 1)
-        hits = self._cast_at_static(static_T_vehicle, of_ray, origin_m, directions, limit_m)
+        hits, turned, from_m = self._cast_at_static(weights, of_ray, origin_m, directions, limit_m)
         if own_m is not None:
             hits.body[(hits.body < 0) & (own_m <= limit_m)] = ego
         leaving_out = ego if own_m is not None else None
@@ -175,24 +152,27 @@ class Sweep:
             met = self.moving.cast_pairs(part, starts_m, towards, limits_m[ray])
             there = met.body >= 0
             self.moving.nearer(hits, Meetings(part[there], ray[there], met.range_m[there], met.triangle[there]))
-        now_T_vehicle = invert(self.now.static_T_vehicle) @ static_T_vehicle
-        turned = _turned(now_T_vehicle, of_ray, directions)
-        starts_m = (now_T_vehicle[:, :3, :3] @ origin_m + now_T_vehicle[:, :3, 3]).astype(np.float32)
         on_body = np.flatnonzero((hits.body >= self.static.bodies) & (hits.body != ego))
         part = np.searchsorted(self.moving.body, hits.body[on_body])
         there_m = origin_m + (directions[:, on_body] * hits.range_m[on_body]).T
         on_part_m = _moved(self._parts(weights[of_ray[on_body]], part), there_m)
         points = _moved(self.now.vehicle_T_part[part], on_part_m).astype(np.float32)
-        return SweptHits(hits, turned, starts_m, on_body, points, len(ray))
+        return SweptHits(hits, turned, from_m, on_body, points, len(ray))
 
     def _cast_at_static(
-        self, static_T_vehicle: Float64, of_ray: Numbers, origin_m: Float64, directions: Float32, limit_m: Float32
-    ) -> Hits:
+        self, weights: Float64, of_ray: Numbers, origin_m: Float64, directions: Float32, limit_m: Float32
+    ) -> tuple[Hits, Float32, Float32]:
+        """What n rays hit of what never moves; their (3, n) directions and starts in the vehicle frame of now."""
+        now_T_static = invert(self.now.static_T_vehicle)
         if (self.static_T_vehicle == self.now.static_T_vehicle).all():
-            return cast_from(self.static, self.now.static_T_vehicle, origin_m, directions, limit_m)
-        starts_m = (static_T_vehicle[:, :3, :3] @ origin_m + static_T_vehicle[:, :3, 3]).astype(np.float32)
+            hits = cast_from(self.static, self.now.static_T_vehicle, origin_m, directions, limit_m)
+            return hits, directions, origin_m.astype(np.float32)[:, None]
+        static_T_vehicle = np.tensordot(weights, self.static_T_vehicle, 1)
+        starts_m = static_T_vehicle[:, :3, :3] @ origin_m + static_T_vehicle[:, :3, 3]
         towards = _turned(static_T_vehicle, of_ray, directions)
-        return self.static.cast_from_each(starts_m.take(of_ray, axis=0), towards, limit_m)
+        hits = self.static.cast_from_each(starts_m.astype(np.float32).take(of_ray, axis=0), towards, limit_m)
+        starts_m = transform(now_T_static, starts_m).T
+        return hits, rotate(now_T_static[:3, :3], towards), starts_m.astype(np.float32).take(of_ray, axis=1)
 
     def _parts(self, weights: Float64, part: Numbers) -> Float64:
         """(K, 4, 4) `part_T_vehicle` of some bodies at times with these weights, (K, 3)."""

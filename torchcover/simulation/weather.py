@@ -1,15 +1,14 @@
 """The weather of a scenario: what it takes from the light on its way, and from the road."""
 
-from pathlib import Path
-from typing import Literal, Self
+from typing import ClassVar, Literal
 
 from pydantic import NonNegativeFloat, PositiveFloat
 
-from torchcover.simulation.documents import Document, load_document
+from torchcover.simulation.documents import BuiltIn
 from torchcover.simulation.returns import extinction_per_m
 
 
-class Weather(Document):
+class Weather(BuiltIn):
     """What the air and the road are like.
 
     Args:
@@ -24,21 +23,13 @@ class Weather(Document):
         True
     """
 
+    folder: ClassVar[str] = "weather"
+
     name: str = "weather"
     description: str = ""
     visibility_m: PositiveFloat | None = None
     rain_mm_h: NonNegativeFloat = 0.0
     road: Literal["dry", "wet"] = "dry"
-
-    @classmethod
-    def load(cls, path_or_name: str | Path) -> Self:
-        """Read a weather from a YAML file, or a built-in one by its name.
-
-        Raises:
-            FileNotFoundError: No such file or name.
-            ValueError: The file is not a weather.
-        """
-        return load_document(cls, "weather", path_or_name)
 
     @property
     def extinction_per_m(self) -> float:

@@ -72,11 +72,7 @@ class World:
 
 
 def steps_of(duration_s: float, time_step_s: float) -> int:
-    """Number of instants from 0 to a duration, both included.
-
-    Raises:
-        ValueError: More than a million.
-    """
+    """Number of instants from 0 to a duration, both included."""
     steps = duration_s / time_step_s
     if not steps < MAX_STEPS:
         raise ValueError(

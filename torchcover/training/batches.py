@@ -10,14 +10,7 @@ UNKNOWN_INDEX = -1
 
 
 def frames_in(batch: object) -> tuple[Frame, ...]:
-    """The frames of a batch that holds frames.
-
-    Args:
-        batch: A `FrameBatch` or another object with `frames`, a sequence of `Frame`, or one `Frame`.
-
-    Raises:
-        TypeError: Anything else.
-    """
+    """The frames of a `FrameBatch` or another object with `frames`, of a sequence of `Frame`, or one `Frame`."""
     frames = getattr(batch, "frames", batch)
     if isinstance(frames, Frame):
         return (frames,)
@@ -37,9 +30,6 @@ def frame_of(sensor: Tensor, reference: Tensor, name: object, vehicle_T_lidar: T
         reference: (M, 3 + ...) points of the reference sensor.
         name: What the framework calls the sample; its index too if that is a number. None: neither is known.
         vehicle_T_lidar: (4, 4) pose of the points' frame; None if they are in the vehicle frame already.
-
-    Raises:
-        ValueError: Points or a pose of another shape.
     """
     name = "" if name is None else str(name)
     return Frame(

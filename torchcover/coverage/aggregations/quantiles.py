@@ -66,11 +66,7 @@ def histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float
 
 
 def check_levels(levels: Sequence[float]) -> tuple[float, ...]:
-    """The levels of quantiles as plain floats.
-
-    Raises:
-        ValueError: None, one given twice, or one outside [0, 1].
-    """
+    """The levels of quantiles as plain floats."""
     checked = tuple(float(level) for level in levels)
     distinct = {f"{level:g}" for level in checked}  # as the keys of their layers tell them apart
     if not checked or len(distinct) != len(checked) or not all(0 <= level <= 1 for level in checked):
@@ -80,14 +76,7 @@ def check_levels(levels: Sequence[float]) -> tuple[float, ...]:
 
 @dataclass(frozen=True)
 class AtLevels(Aggregation):
-    """Quantiles at some levels, from a `histogram` (bins, C).
-
-    Args:
-        levels: Which, in [0, 1].
-
-    Raises:
-        ValueError: No level, or one outside [0, 1].
-    """
+    """Quantiles at some levels, from a `histogram` (bins, C)."""
 
     example: ClassVar[str] = "0.5,0.9"
     # Of the keys and titles: what stands before a level, and behind it.

@@ -39,14 +39,7 @@ SUFFIXES = {4: ".bin (x y z intensity)", 5: ".pcd.bin (x y z intensity ring)"}
 
 
 def check_records(data: bytes, columns: int) -> NDArray[np.float32]:
-    """Rows of little-endian float32, x y z first, if the bytes may be such.
-
-    Args:
-        data: The file.
-        columns: 4 or 5.
-
-    Returns:
-        (N, columns), a view.
+    """(N, columns) little-endian float32, x y z first, if the bytes may be such.
 
     Raises:
         ValueError: Bytes are left over, or the numbers are no coordinates; with the likelier format, if there is one.
@@ -76,11 +69,7 @@ def check_records(data: bytes, columns: int) -> NDArray[np.float32]:
 
 
 def check_rest(rest: bytes) -> None:
-    """Refuse bytes behind the points that no header speaks of; zeros and line ends are padding.
-
-    Raises:
-        ValueError: There are others.
-    """
+    """Refuse bytes behind the points that no header speaks of; zeros and line ends are padding."""
     if rest.strip(b"\0\r\n"):
         raise ValueError(f"{len(rest)} bytes follow the points that the header claims, and they are not all zero")
 

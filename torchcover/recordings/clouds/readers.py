@@ -104,10 +104,6 @@ def read_cloud(path: Path) -> Points:
 def read_heights(path: Path, count: int) -> NDArray[np.float32] | None:
     """Read how high above the local ground the points of a cloud are: the array `heights_m` of a `.npz`.
 
-    Args:
-        path: The file of the cloud.
-        count: How many points it has.
-
     Returns:
         (N,) metres, NaN where there is no ground at or below; None if the file does not say.
 
@@ -120,9 +116,6 @@ def read_heights(path: Path, count: int) -> NDArray[np.float32] | None:
 @reads("a point cloud with weights")
 def read_weighted_cloud(path: Path) -> tuple[Points, NDArray[np.float64]]:
     """Read a cloud and what each of its points counts for: the arrays `points` and `weights` of a `.npz`.
-
-    Args:
-        path: The file.
 
     Returns:
         (N, 3) points as `read_cloud` gives them, and (N,) float64 weights.

@@ -72,11 +72,7 @@ def parse_rows(
 
 
 def read_lines(data: bytes) -> Iterator[str]:
-    """Lines of UTF-8, with or without a byte order mark; blank ones are left out.
-
-    Raises:
-        ValueError: Not UTF-8, or more lines than there is room for.
-    """
+    """Lines of UTF-8, with or without a byte order mark; blank ones are left out."""
     check_memory(2 * len(data) + ROW_BYTES * max(data.count(b"\n"), data.count(b"\r")))
     return _lines(data)
 

@@ -100,12 +100,7 @@ def _checked(recording: Recording, names: set[str] | None) -> Recording:
 
 
 class ObjectFormat(NamedTuple):
-    """A format whose objects over time can be read without any scan.
-
-    Args:
-        recognises: Whether what is at a path that exists is meant to be of it.
-        read: From the path to the objects.
-    """
+    """A format whose objects over time can be read without any scan."""
 
     recognises: Callable[[Path], bool]
     read: Callable[[Path], RecordedObjects]

@@ -16,7 +16,7 @@ from torchcover.geometry import BoundingBox, invert, rigid, rotation_from_quater
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects, track_of
-from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
+from torchcover.recordings.recording import Layout, Scan, SensorCalibrations, check_times
 from torchcover.recordings.seen import Seen, SeenObjects, by_name
 
 # The ego frame lies in the rear axle, 0.30 m above the ground; the centre of a Ford Fusion is 1.339 m before it, as in
@@ -57,13 +57,10 @@ EGO_CATEGORY = "ego_vehicle"
 MAX_ANNOTATION_GAP_S = 0.1
 
 
-class Argoverse2:
+class Argoverse2(Layout):
     """A folder with `sensors/lidar/TIME.feather`, `city_SE3_egovehicle.feather` and `annotations.feather`.
 
     The clouds are in the frame of the ego and corrected for its motion within a turn. Needs `torchcover[av2]`.
-
-    Args:
-        path: The log.
 
     Raises:
         FileNotFoundError: No sweeps, or no poses.
@@ -73,9 +70,6 @@ class Argoverse2:
 
     layout: ClassVar[str] = "sensors/lidar/TIME.feather, city_SE3_egovehicle.feather"
     sensors = tuple(LASERS)
-    reference_sensors = ()
-    square_metres = False
-    instants = None
     body = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -93,11 +87,6 @@ class Argoverse2:
     def recognises(cls, path: Path) -> bool:
         """Whether it has sweeps and poses."""
         return path.joinpath(*SWEEPS).is_dir() and (path / POSES).exists()
-
-    @property
-    def frames(self) -> range:
-        """All sweeps."""
-        return range(len(self.names))
 
     def scan(self, sensor: str, index: int) -> Scan:
         """The points of one LiDAR in a sweep."""
@@ -119,12 +108,7 @@ class Argoverse2:
         return self._tracks.at(float(self._times_ns[index] - self._times_ns[0]) * 1e-9, vehicle_T_ego)
 
     def calibrations(self) -> SensorCalibrations:
-        """The mounts of both LiDARs, and the cameras with the distortion of their lenses.
-
-        Raises:
-            FileNotFoundError: The log has no `calibration/`.
-            ValueError: Other tables, or no such LiDAR in them.
-        """
+        """The mounts of both LiDARs, and the cameras with the distortion of their lenses."""
         folder = self.path / "calibration"
         poses = read_feather(folder / "egovehicle_SE3_sensor.feather", ("sensor_name", *POSE))
         lenses = read_feather(folder / "intrinsics.feather", ("sensor_name", *_LENS))

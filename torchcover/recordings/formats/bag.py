@@ -26,9 +26,6 @@ class Bag:
     Opening reads the index only. Messages are read as what the standard definitions say of their types; those that are
     in the bag, of which code would be made, are left aside.
 
-    Args:
-        path: The folder, or the file.
-
     Raises:
         FileNotFoundError: A file is missing.
         BadFileError: What is no bag, or a part of one; files that are compressed as a whole or have no index.
@@ -59,22 +56,14 @@ class Bag:
         return sorted(topic for topic, kind in self.types.items() if kind in types and len(self.times_ns(topic)))
 
     def messages(self, topic: str, start_ns: int | None = None, stop_ns: int | None = None) -> list[Any]:
-        """The messages of a topic that were recorded from a time on, until before another.
-
-        Raises:
-            BadFileError: They are damaged.
-        """
+        """The messages of a topic that were recorded from a time on, until before another."""
         with naming(self.path, f"a ROS 2 bag, in {topic}"), np.errstate(all="ignore"):
             reader, types = self._reader()
             own = [one for one in reader.connections if one.topic == topic]
             return [types.deserialize_cdr(raw, one.msgtype) for one, _, raw in reader.messages(own, start_ns, stop_ns)]
 
     def message(self, topic: str, time_ns: int) -> Any:  # noqa: ANN401  (of a type that rosbags has made)
-        """The message of a topic that was recorded at a time.
-
-        Raises:
-            BadFileError: It is damaged, or not there.
-        """
+        """The message of a topic that was recorded at a time."""
         found = self.messages(topic, time_ns, time_ns + 1)
         if not found:
             with naming(self.path, "a ROS 2 bag"):
@@ -98,11 +87,7 @@ class Bag:
 
 @reads("a ROS 2 bag")
 def check_suffix(path: Path) -> None:
-    """Whether a file is called as bags are.
-
-    Raises:
-        BadFileError: It is not.
-    """
+    """Whether a file is called as bags are."""
     if path.suffix not in SUFFIXES.values():
         raise ValueError(f"a folder with {METADATA}, or a file of {' or '.join(SUFFIXES.values())} is needed")
 

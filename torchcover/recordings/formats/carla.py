@@ -26,7 +26,7 @@ from torchcover.recordings.formats.carla_files import (
     right_handed,
 )
 from torchcover.recordings.formats.file_names import check_frames, check_same_names, frame_files
-from torchcover.recordings.recording import Scan, check_times
+from torchcover.recordings.recording import Layout, Scan, check_times
 
 SENSORS_FILES = ("sensors.json", "sensors.yaml")
 VEHICLE_FILE, POSES_FILE, BOXES = "vehicle.json", "poses.csv", "boxes"
@@ -36,7 +36,7 @@ OF_A_FILE = 0.02
 SECTOR_DEG = 60.0
 
 
-class Carla:
+class Carla(Layout):
     """A folder with `sensors.json` and `ID/FRAME.ply` (or `.npy`; `.png` of a depth camera) of each sensor in it.
 
     All of it is in CARLA's left-handed axes. `sensors.json` (or `.yaml`) is the list that an agent of CARLA's
@@ -54,9 +54,6 @@ class Carla:
     frames as make a turn of all LiDARs. It bears name, time and pose of the last; the parts before are moved by the
     poses of the vehicle, without whatever else moved meanwhile. Frames at the end that make no turn are left out.
 
-    Args:
-        path: The folder.
-
     Raises:
         FileNotFoundError: No `sensors.json`, or no clouds of a LiDAR in it.
         ValueError: Not such a list, no LiDAR or depth camera in it, places with other frames, too few for a turn, or a
@@ -67,8 +64,6 @@ class Carla:
     """
 
     layout: ClassVar[str] = "sensors.json, ID/FRAME.ply of each LiDAR and ID/FRAME.png of each depth camera in it"
-    square_metres = False
-    instants = None
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
@@ -106,11 +101,6 @@ class Carla:
         if self.times_s is not None:
             self.times_s = self.times_s[self._lasts.start :: turn]
 
-    @property
-    def frames(self) -> range:
-        """All of them."""
-        return range(len(self.names))
-
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether there is a list of sensors."""
@@ -133,11 +123,7 @@ class Carla:
         return self._pose(self._lasts[index])
 
     def boxes(self, index: int) -> Boxes | None:
-        """The objects of a frame; None without the folder.
-
-        Raises:
-            ValueError: A file that is not what it is meant to be.
-        """
+        """The objects of a frame; None without the folder."""
         pose = self.world_T_vehicle(index)
         if pose is None or not self._labelled:
             return None

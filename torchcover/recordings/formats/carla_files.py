@@ -97,11 +97,7 @@ class CarlaVehicle(BaseModel):
 
 @reads("a list of CARLA's sensors")
 def read_carla_sensors(path: Path) -> list[CarlaSensor]:
-    """Read the LiDARs and depth cameras of a list of sensors; JSON is YAML, too.
-
-    Raises:
-        BadFileError: Not such a list, none of them in it, or two of one name; the message names the field.
-    """
+    """Read the LiDARs and depth cameras of a list of sensors; JSON is YAML, too."""
     try:
         listed = TypeAdapter(list[CarlaSensor]).validate_python(parse_yaml(read_short_text(path)))
     except ValidationError as error:
@@ -118,11 +114,7 @@ def read_carla_sensors(path: Path) -> list[CarlaSensor]:
 
 @reads("the bounding box of a vehicle of CARLA")
 def read_carla_vehicle(path: Path) -> CarlaVehicle:
-    """Read `{"location": {"x": ..., "y": ..., "z": ...}, "extent": {...}}`.
-
-    Raises:
-        BadFileError: Not such a file, or a box without a size.
-    """
+    """Read `{"location": {"x": ..., "y": ..., "z": ...}, "extent": {...}}`."""
     try:
         vehicle = CarlaVehicle.model_validate(parse_yaml(read_short_text(path)))
     except ValidationError as error:
@@ -138,10 +130,6 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
         path: A table with the columns `id, category, x, y, z, roll, pitch, yaw, extent_x, extent_y, extent_z`: the
             centre and half the size of each bounding box in the world; `velocity_x, velocity_y` may be there too.
         vehicle_T_world: (4, 4) the inverse of the vehicle's pose.
-
-    Raises:
-        FileNotFoundError: No such file.
-        BadFileError: Not such a table; what `Boxes` refuses.
     """
     table = read_csv(path, (*POSE, *EXTENT), ("id", "category"), VELOCITY)
     numbers, count = table.numbers, len(table.words["id"])

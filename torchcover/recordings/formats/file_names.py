@@ -49,11 +49,7 @@ def frame_files(
 
 
 def check_same_names(folder: Path, files: Mapping[str, Mapping[str, object]]) -> None:
-    """Whether all places have the same frames.
-
-    Raises:
-        ValueError: No frames at all, or some that are not everywhere.
-    """
+    """Whether all places have the same frames."""
     places = " and ".join(f"{place}/" for place in files)
     anywhere = set[str]().union(*files.values())
     if not anywhere:
@@ -68,11 +64,7 @@ def check_same_names(folder: Path, files: Mapping[str, Mapping[str, object]]) ->
 
 
 def check_frames(frames: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Which row of a table belongs to each frame.
-
-    Raises:
-        ValueError: A frame that is missing, doubled or unknown.
-    """
+    """Which row of a table belongs to each frame."""
     there, wanted = set(frames), set(names)
     doubled = [frame for frame, count in Counter(frames).items() if count > 1]
     missing, unknown = [name for name in names if name not in there], sorted(there - wanted)

@@ -10,7 +10,7 @@ from torchcover.recordings.clouds.readers import read_cloud, read_heights, read_
 from torchcover.recordings.formats.file_names import check_same_names, frame_files, natural
 from torchcover.recordings.formats.folder_settings import FolderSettings, PlaceSettings, read_folder_settings
 from torchcover.recordings.formats.folder_tables import PoseTable, read_boxes
-from torchcover.recordings.recording import Scan, check_times
+from torchcover.recordings.recording import Layout, Scan, check_times
 
 SETTINGS_FILE = "frames.yaml"
 POSES_FILE = "poses.csv"
@@ -19,7 +19,7 @@ REFERENCE, BOXES = "reference", "boxes"
 ONLY_RIG = "recording"
 
 
-class FolderRecording:
+class FolderRecording(Layout):
     """A folder with `sensor/FRAME.*`, in natural order (frame2 before frame10), and whatever else is known.
 
     Several sensors of one rig have `sensors/NAME/FRAME.*` each, several rigs `rigs/NAME/FRAME.*`. Any format of
@@ -45,9 +45,6 @@ class FolderRecording:
           vehicle:                     # what lies in it is the vehicle itself
             lower_m: [-2.4, -0.9, 0.05]
             upper_m: [2.4, 0.9, 1.6]
-
-    Args:
-        path: The folder.
 
     Raises:
         FileNotFoundError: The folder, or clouds of a sensor in it, are missing.
@@ -84,11 +81,6 @@ class FolderRecording:
         self._moving = {place: self._table(self.path / place, timed=False) for place in files}
         self._check(self._settings)
 
-    @property
-    def frames(self) -> range:
-        """All of them."""
-        return range(len(self.names))
-
     @classmethod
     def recognises(cls, path: Path) -> bool:
         """Whether it is a folder with clouds of a sensor, of sensors, of rigs or of a reference in it."""
@@ -115,12 +107,7 @@ class FolderRecording:
         return None if self._poses is None else self._poses[index]
 
     def boxes(self, index: int) -> Boxes | None:
-        """The objects of a frame; None without the folder.
-
-        Raises:
-            FileNotFoundError: This frame has none, while the folder is there.
-            ValueError: A file that is not what it is meant to be.
-        """
+        """The objects of a frame; None without the folder."""
         return read_boxes(self.path / BOXES / f"{self.names[index]}.csv") if self._labelled else None
 
     def _table(self, folder: Path, *, timed: bool) -> PoseTable | None:

@@ -46,13 +46,7 @@ class _Settings(_Strict):
 
 
 class PlaceSettings(NamedTuple):
-    """How the clouds of a place are to be read.
-
-    Args:
-        vehicle_T_sensor: (4, 4) where the sensor is; None: not said.
-        flip_y: Whether the clouds have left-handed axes, y to the right.
-        min_range_m: What is nearer to the sensor is no return.
-    """
+    """How the clouds of a place are to be read."""
 
     vehicle_T_sensor: Matrix | None = None
     flip_y: bool = False
@@ -74,14 +68,7 @@ class FolderSettings(NamedTuple):
 
 
 def read_folder_settings(path: Path) -> FolderSettings:
-    """Read the settings of a plain folder.
-
-    Args:
-        path: The YAML file, which may be missing.
-
-    Raises:
-        BadFileError: Not such a file, or not a rigid transform; the message names file and field.
-    """
+    """Read the settings of a plain folder."""
     return _read(path) if path.exists() else FolderSettings({})
 
 

@@ -30,10 +30,6 @@ class PoseTable:
             (`Frame.place_in_time`).
         names: The frames, in order.
         timed: Whether there are times.
-
-    Raises:
-        FileNotFoundError: No such file.
-        BadFileError: Not such a table; frames that are missing, doubled or unknown; a quaternion whose norm is not 1.
     """
 
     def __init__(self, path: Path, names: Sequence[str], *, timed: bool) -> None:
@@ -69,10 +65,6 @@ def read_boxes(path: Path) -> Boxes:
         path: A table with the columns `x_m, y_m, z_m, length_m, width_m, height_m, yaw_rad, id, category`: the centre,
             half-way up, in the vehicle frame; `id` and `category` may be empty. `vx_mps, vy_mps` may be there too, the
             velocity over ground along the vehicle's x and y, and `drawn_points` and `bottom_height_m`, see `Boxes`.
-
-    Raises:
-        FileNotFoundError: No such file.
-        BadFileError: Not such a table, or a name that is there twice; what `Boxes` refuses.
     """
     table = read_csv(path, BOX, NAMES, (*VELOCITY, DRAWN, BOTTOM))
     numbers, ids = table.numbers, table.words["id"]

@@ -14,9 +14,6 @@ class FrameTree:
 
     Args:
         transforms: Messages `geometry_msgs/msg/TransformStamped`; of two for the same frame the later counts.
-
-    Raises:
-        ValueError: A transform that is none, or frames in a loop.
     """
 
     def __init__(self, transforms: Iterable[Any]) -> None:
@@ -61,11 +58,7 @@ def frame_name(stored: str) -> str:
 
 
 def pose_of(place: Any, rotation: Any, name: str) -> Matrix:  # noqa: ANN401  (of types that rosbags has made)
-    """(4, 4) of a place (or translation) and a quaternion.
-
-    Raises:
-        ValueError: Not finite, or a quaternion of norm 0.
-    """
+    """(4, 4) of a place (or translation) and a quaternion."""
     place_m = np.array([place.x, place.y, place.z], dtype=np.float64)
     if not np.isfinite(place_m).all():
         raise ValueError(f"{name}: three finite coordinates are needed; got {place_m.tolist()}")

@@ -29,14 +29,7 @@ BODY = BoundingBox((-2.387, -0.91, 0.05), (2.387, 0.91, 1.93))
 
 @reads("a KITTI calibration")
 def read_calibration(path: Path) -> dict[str, NDArray[np.float64]]:
-    """Read `KEY: numbers` lines; a line of other things than numbers, such as `calib_time`, is left out.
-
-    Args:
-        path: `calib/000007.txt`, `calib_velo_to_cam.txt`, ...
-
-    Raises:
-        BadFileError: A key that is there twice, or no line with numbers.
-    """
+    """Read `KEY: numbers` lines; a line of other things than numbers, such as `calib_time`, is left out."""
     found: dict[str, NDArray[np.float64]] = {}
     for number, line in enumerate(read_short_text(path).splitlines(), start=1):
         key, colon, rest = line.partition(":")
@@ -57,11 +50,7 @@ def read_calibration(path: Path) -> dict[str, NDArray[np.float64]]:
 
 
 def transform_of(calibration: dict[str, NDArray[np.float64]], key: str, path: Path) -> Matrix:
-    """(4, 4) the rigid transform of twelve (or nine) numbers under a key.
-
-    Raises:
-        ValueError: There is none, or it is not rigid.
-    """
+    """(4, 4) the rigid transform of twelve (or nine) numbers under a key."""
     numbers = calibration.get(key)
     if numbers is None or numbers.size not in (9, 12):
         arrived = "none" if numbers is None else f"{numbers.size} numbers"
@@ -72,12 +61,7 @@ def transform_of(calibration: dict[str, NDArray[np.float64]], key: str, path: Pa
 
 
 def read_rigid(path: Path) -> Matrix:
-    """(4, 4) the transform of a file with `R` and `T`, such as `calib_velo_to_cam.txt`.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is not what it is meant to be.
-    """
+    """(4, 4) the transform of a file with `R` and `T`, such as `calib_velo_to_cam.txt`."""
     numbers = read_calibration(path)
     translation_m = numbers.get("T", np.empty(0))
     if translation_m.size != 3:
@@ -86,16 +70,7 @@ def read_rigid(path: Path) -> Matrix:
 
 
 def read_rectified(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, ...]:
-    """The cameras of `calib_cam_to_cam.txt`: pinholes, for their images are rectified.
-
-    Args:
-        path: The file, with `P_rect_00`, `S_rect_00` and so on.
-        vehicle_T_camera0: Where the first camera is, before it is rectified.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: It is not what it is meant to be.
-    """
+    """The cameras of `calib_cam_to_cam.txt`: pinholes, for their images are rectified."""
     numbers = read_calibration(path)
     vehicle_T_rectified = vehicle_T_camera0 @ invert(transform_of(numbers, "R_rect_00", path))
     found = []
@@ -118,11 +93,7 @@ def read_rectified(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, 
 
 @reads("a PNG image")
 def png_size(path: Path) -> tuple[int, int]:
-    """Width and height of an image; its pixels are not read.
-
-    Raises:
-        BadFileError: It is none.
-    """
+    """Width and height of an image; its pixels are not read."""
     with path.open("rb") as file:
         head = file.read(24)
     if len(head) < 24 or head[:8] != b"\x89PNG\r\n\x1a\n":
@@ -132,11 +103,7 @@ def png_size(path: Path) -> tuple[int, int]:
 
 @reads("KITTI labels")
 def read_labels(path: Path) -> list[tuple[str, NDArray[np.float64]]]:
-    """Read the objects of a `label_2` file: category and 14 numbers, without what is marked `DontCare`.
-
-    Raises:
-        BadFileError: A line with another number of columns than 15, or 16 with a score.
-    """
+    """Read the objects of a `label_2` file: category and 14 numbers, without what is marked `DontCare`."""
     found = []
     for number, line in enumerate(read_short_text(path).splitlines(), start=1):
         words = line.split()
@@ -151,11 +118,7 @@ def read_labels(path: Path) -> list[tuple[str, NDArray[np.float64]]]:
 
 @reads("a record of the GPS and IMU")
 def read_oxts(path: Path) -> NDArray[np.float64]:
-    """Read latitude, longitude, altitude, roll, pitch and yaw (degrees, metres, radians) of one instant.
-
-    Raises:
-        BadFileError: Another number of columns, or no place on earth.
-    """
+    """Read latitude, longitude, altitude, roll, pitch and yaw (degrees, metres, radians) of one instant."""
     numbers = np.array([float(word) for word in read_short_text(path).split()])
     if len(numbers) != OXTS_COLUMNS:
         raise ValueError(f"{OXTS_COLUMNS} numbers are needed; got {len(numbers)}")
@@ -185,11 +148,7 @@ def world_T_imu(oxts: NDArray[np.float64], latitude_deg: float) -> Matrix:
 
 @reads("time stamps")
 def read_timestamps(path: Path) -> NDArray[np.float64]:
-    """Read lines such as `2011-09-26 13:02:25.964389445`: seconds since the first.
-
-    Raises:
-        BadFileError: A line that is no time.
-    """
+    """Read lines such as `2011-09-26 13:02:25.964389445`: seconds since the first."""
     check_memory(BYTES_PER_BYTE * path.stat().st_size)
     lines = decode(path.read_bytes()).split("\n")
     try:

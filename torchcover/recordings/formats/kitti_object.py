@@ -20,10 +20,10 @@ from torchcover.recordings.formats.kitti_files import (
     transform_of,
     vehicle_T_velodyne,
 )
-from torchcover.recordings.recording import Scan, SensorCalibrations
+from torchcover.recordings.recording import Layout, Scan, SensorCalibrations
 
 
-class KittiObject:
+class KittiObject(Layout):
     """A folder with `velodyne/FRAME.bin`, `calib/FRAME.txt`, and `label_2/FRAME.txt` where there are labels.
 
     The data set has no reference, and neighbours in the list are not neighbours in time: a reference has to be in a
@@ -31,17 +31,11 @@ class KittiObject:
 
     Args:
         path: `training`, `testing`, or the folder that holds `training`.
-
-    Raises:
-        FileNotFoundError: No `velodyne`.
-        ValueError: No frames in it, or a reference with other frames.
     """
 
     layout: ClassVar[str] = "velodyne/FRAME.bin, calib/FRAME.txt, label_2/FRAME.txt"
     sensors = ("velodyne",)
     times_s = None
-    square_metres = False
-    instants = None
     body = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -58,11 +52,6 @@ class KittiObject:
         """Whether it has clouds and calibrations."""
         return all((_split(path) / place).is_dir() for place in ("velodyne", "calib"))
 
-    @property
-    def frames(self) -> range:
-        """All of them."""
-        return range(len(self.names))
-
     def scan(self, sensor: str, index: int) -> Scan:
         """Read a cloud."""
         path = (self._references if sensor == "reference" else self._clouds)[self.names[index]]
@@ -72,12 +61,7 @@ class KittiObject:
         """Unknown."""
 
     def calibrations(self) -> SensorCalibrations:
-        """The rectified cameras of the first frame; the layout has the sizes of their images only where there are some.
-
-        Raises:
-            FileNotFoundError: It has no calibration.
-            ValueError: It is not what it is meant to be.
-        """
+        """The rectified cameras of the first frame; their sizes are known only where there are images."""
         name = self.names[0]
         calibration = self.path / "calib" / f"{name}.txt"
         images = [path for number in range(4) if (path := self.path / f"image_{number}" / f"{name}.png").exists()]
@@ -91,12 +75,7 @@ class KittiObject:
         return SensorCalibrations(source, {"velodyne": vehicle_T_velodyne}, tuple(cameras))
 
     def boxes(self, index: int) -> Boxes | None:
-        """The labels, if there are any files of them.
-
-        Raises:
-            FileNotFoundError: This frame has none, while others have.
-            ValueError: A file that is not what it is meant to be.
-        """
+        """The labels, if there are any files of them."""
         if not (self.path / "label_2").is_dir():
             return None
         name = f"{self.names[index]}.txt"

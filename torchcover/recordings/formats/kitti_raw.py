@@ -24,16 +24,13 @@ from torchcover.recordings.formats.kitti_files import (
     vehicle_T_velodyne,
     world_T_imu,
 )
-from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
+from torchcover.recordings.recording import Layout, Scan, SensorCalibrations, check_times
 
 
-class KittiRaw:
+class KittiRaw(Layout):
     """A folder `DATE/DATE_drive_NUMBER_sync` with `velodyne_points` and `oxts`; calibrations are in `DATE`.
 
     Boxes are those of `tracklet_labels.xml`, if it is there.
-
-    Args:
-        path: The folder of the drive.
 
     Raises:
         FileNotFoundError: A part is missing.
@@ -42,9 +39,6 @@ class KittiRaw:
 
     layout: ClassVar[str] = "DATE/DRIVE/velodyne_points/data/FRAME.bin, oxts/data/FRAME.txt"
     sensors = ("velodyne",)
-    reference_sensors = ()
-    square_metres = False
-    instants = None
     body = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -63,32 +57,17 @@ class KittiRaw:
         """Whether it has scans and records of the GPS and IMU."""
         return all((path / place).is_dir() for place in ("velodyne_points", "oxts"))
 
-    @property
-    def frames(self) -> range:
-        """All of them."""
-        return range(len(self.names))
-
     def scan(self, sensor: str, index: int) -> Scan:
         """Read a cloud, which the development kit has corrected for the motion within a turn."""
         path = self._clouds[self.names[index]]
         return Scan(read_cloud(path), vehicle_T_velodyne, str(path))
 
     def world_T_vehicle(self, index: int) -> Matrix:
-        """Where the vehicle was, by the GPS and IMU.
-
-        Raises:
-            FileNotFoundError: There is no record of that instant.
-            ValueError: It is not what it is meant to be.
-        """
+        """Where the vehicle was, by the GPS and IMU."""
         return world_T_imu(self._oxts(index), self._latitude_deg) @ self._imu_T_vehicle
 
     def calibrations(self) -> SensorCalibrations:
-        """The rectified cameras of the day, where its `calib_cam_to_cam.txt` is there.
-
-        Raises:
-            FileNotFoundError: `calib_velo_to_cam.txt` is missing beside it.
-            ValueError: They are not what they are meant to be.
-        """
+        """The rectified cameras of the day, where its `calib_cam_to_cam.txt` is there."""
         day = self.path.parent
         cameras = day / "calib_cam_to_cam.txt"
         mounts = {"velodyne": vehicle_T_velodyne}
@@ -125,13 +104,6 @@ def read_tracklets(path: Path, vehicle_T_velodyne: Matrix) -> dict[int, Boxes]:
 
     The origin of a tracklet is the middle of the bottom of its box, in the frame of the LiDAR. Its name is its number
     in the file.
-
-    Args:
-        path: The file.
-        vehicle_T_velodyne: (4, 4) where the LiDAR is; its z axis is upright.
-
-    Raises:
-        BadFileError: Not such a file, or numbers that are no boxes.
     """
     root = parse_xml(path)
     frames: dict[int, list[tuple[list[float], str, str]]] = {}

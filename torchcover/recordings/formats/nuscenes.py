@@ -93,12 +93,7 @@ class NuScenes:
         return self._tracks.at(float(self.times_s[index]), invert(self.world_T_vehicle(index)))
 
     def calibrations(self) -> SensorCalibrations:
-        """The LiDAR's mount, and the cameras of its first key frame.
-
-        Raises:
-            FileNotFoundError: A table is missing.
-            ValueError: A table that is none.
-        """
+        """The LiDAR's mount, and the cameras of its first key frame."""
         with naming(self._tables, "tables of nuScenes"):
             first = self._sample_tokens[self.frames[0]]
             rows = [
@@ -196,12 +191,7 @@ def read_objects(path: Path, scene: str | None = None) -> RecordedObjects:
 
 
 def _seen(tables: Path, times_s: Mapping[str, float]) -> list[Seen]:
-    """The annotations of samples.
-
-    Args:
-        tables: Their folder.
-        times_s: Token of each sample -> its time.
-    """
+    """The annotations of samples."""
     categories, instances = read_json_table(tables / "category.json"), read_json_table(tables / "instance.json")
     seen = []
     for row in read_json_table(tables / "sample_annotation.json").rows:
@@ -215,11 +205,7 @@ def _seen(tables: Path, times_s: Mapping[str, float]) -> list[Seen]:
 
 
 def _scene(samples: list[dict[str, Any]], path: Path, scene: str | None) -> str:
-    """The token of the scene that is meant.
-
-    Raises:
-        ValueError: There is none of this name, or none is named of several.
-    """
+    """The token of the scene that is meant."""
     tokens = dict.fromkeys(str(row["scene_token"]) for row in samples)
     rows = read_json_table(path).rows if path.exists() else []
     names = {row["name"]: row["token"] for row in rows if row["token"] in tokens}
@@ -237,11 +223,7 @@ def _class(category: str) -> str | None:
 
 
 def pose_of(row: dict[str, Any]) -> Matrix:
-    """(4, 4) the pose of a row with `rotation` (w, x, y, z) and `translation`.
-
-    Raises:
-        ValueError: Not seven finite numbers.
-    """
+    """(4, 4) the pose of a row with `rotation` (w, x, y, z) and `translation`."""
     matrix = rigid(rotation_from_quaternion(row["rotation"]), row["translation"])
     if not np.isfinite(matrix).all():
         raise ValueError(f"translation: three finite numbers are needed; got {row['translation']}")
@@ -249,11 +231,7 @@ def pose_of(row: dict[str, Any]) -> Matrix:
 
 
 def _check_poses(rotations: NDArray[np.float64], places_m: NDArray[np.float64]) -> None:
-    """Whether (F, 4) quaternions and (F, 3) places are those of poses.
-
-    Raises:
-        ValueError: Not so many numbers, or not finite ones, or a quaternion of norm 0.
-    """
+    """Whether (F, 4) quaternions and (F, 3) places are those of poses."""
     if rotations.shape[1:] != (4,) or places_m.shape[1:] != (3,):
         raise ValueError("every pose needs a rotation of 4 numbers and a translation of 3")
     if not (np.isfinite(rotations).all() and np.isfinite(places_m).all()):
@@ -284,9 +262,6 @@ def _tables_with(table: str, path: Path) -> list[Path]:
 
 def check_beneath(folder: Path, name: str) -> str:
     """Return a path that a table names, if it is one within a folder.
-
-    Raises:
-        ValueError: It leads out of it.
 
     Example:
         >>> check_beneath(Path("drive"), "samples/a.bin")

@@ -32,11 +32,7 @@ class CloudMessage(NamedTuple):
 
 
 def cloud_of(message: Any) -> CloudMessage:  # noqa: ANN401  (of a type that rosbags has made)
-    """Read the fields x, y, z, and the time of each point if there is one.
-
-    Raises:
-        ValueError: Sizes that do not fit, no such fields, times that cannot be.
-    """
+    """Read the fields x, y, z, and the time of each point if there is one."""
     fields = {field.name: field for field in message.fields}
     times = next((fields[name] for name in TIME_FIELDS if name in fields), None)
     wanted = [fields[axis] for axis in "xyz" if axis in fields]

@@ -16,7 +16,7 @@ from torchcover.recordings.formats.bag import METADATA, SUFFIXES, Bag
 from torchcover.recordings.formats.frame_tree import FrameTree, frame_name
 from torchcover.recordings.formats.point_cloud2 import CloudMessage, cloud_of
 from torchcover.recordings.formats.ros_poses import TF, WINDOW_NS, VehiclePoses, vehicle_poses
-from torchcover.recordings.recording import NO_RETURN_M, Scan, SensorCalibrations, check_times
+from torchcover.recordings.recording import NO_RETURN_M, Layout, Scan, SensorCalibrations, check_times
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 VEHICLE_FRAMES = ("base_link", "base_footprint")
@@ -28,7 +28,7 @@ FARTHEST_SCAN = 0.75
 TICK_S = 1e-5
 
 
-class Ros2:
+class Ros2(Layout):
     """A bag: a folder with `metadata.yaml` and `.db3` or `.mcap` files, or one such file. Needs `torchcover[ros]`.
 
     The sensors are the topics of `PointCloud2`, named without the first slash, whose frame static transforms link to
@@ -52,9 +52,6 @@ class Ros2:
     """
 
     layout: ClassVar[str] = "metadata.yaml and *.db3 or *.mcap, or such a file, with topics of PointCloud2"
-    reference_sensors = ()
-    square_metres = False
-    instants = None
     body = None
 
     def __init__(self, path: str | os.PathLike[str], vehicle_frame: str | None = None) -> None:
@@ -88,17 +85,8 @@ class Ros2:
             return (path / METADATA).exists() and any(any(path.glob(f"*{suffix}*")) for suffix in SUFFIXES.values())
         return path.suffix in SUFFIXES.values()
 
-    @property
-    def frames(self) -> range:
-        """All instants."""
-        return range(len(self.names))
-
     def scan(self, sensor: str, index: int) -> Scan:
-        """Read a cloud; where the vehicle's poses are known, it is moved to the instant.
-
-        Raises:
-            BadFileError: It is damaged, there is none near the instant, or no pose near a point's time.
-        """
+        """Read a cloud; where the vehicle's poses are known, it is moved to the instant."""
         cloud, stamp_ns = self._cloud(sensor, index)
         source, mount = f"{self.path}: {sensor} at {self._logged_ns[sensor][index]}", self._mounts[sensor]
         if self._poses is None:
@@ -118,11 +106,7 @@ class Ros2:
         return Scan(points_m, mount, source)
 
     def world_T_vehicle(self, index: int) -> Matrix | None:
-        """Where the vehicle was at the stamp of the instant; None in a bag without poses.
-
-        Raises:
-            BadFileError: The messages are damaged, or there is no pose near that time.
-        """
+        """Where the vehicle was at the stamp of the instant; None in a bag without poses."""
         return None if self._poses is None else self._world_T_vehicle(self._poses, index)
 
     def calibrations(self) -> SensorCalibrations:

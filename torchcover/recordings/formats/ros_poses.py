@@ -37,11 +37,7 @@ class PoseSeries(NamedTuple):
     wxyz: Matrix
 
     def at(self, times_ns: NDArray[np.int64], name: str) -> Matrix:
-        """(N, 4, 4) at other times: places evenly, rotations the shorter way at an even rate (slerp).
-
-        Raises:
-            ValueError: A time that is too far from any.
-        """
+        """(N, 4, 4) at other times: places evenly, rotations the shorter way at an even rate (slerp)."""
         if len(self.times_ns) < 2:
             raise ValueError(f"{name}: poses on both sides of the time {int(times_ns[0])} ns are needed; got fewer")
         after = np.searchsorted(self.times_ns, times_ns).clip(1, len(self.times_ns) - 1)
@@ -95,9 +91,6 @@ class VehiclePoses:
         Args:
             times_ns: (N,) when.
             logged_ns: About when such messages were recorded.
-
-        Raises:
-            BadFileError: No poses near these times, or such that are none.
         """
         with naming(self._bag.path, "a ROS 2 bag"):
             series = self._around(logged_ns)
@@ -122,11 +115,7 @@ class VehiclePoses:
 
 
 def series_of(messages: Sequence[Any], kind: str, name: str) -> dict[str, PoseSeries]:
-    """Name of each frame -> its poses; those of `Odometry` and `PoseStamped` are called after their type.
-
-    Raises:
-        ValueError: A pose that is none.
-    """
+    """Name of each frame -> its poses; those of `Odometry` and `PoseStamped` are called after their type."""
     found: dict[str, dict[int, Matrix]] = {}
     for message in messages:
         if kind == TF:
@@ -141,11 +130,7 @@ def series_of(messages: Sequence[Any], kind: str, name: str) -> dict[str, PoseSe
 
 
 def vehicle_poses(bag: Bag, tree: FrameTree, vehicle_frame: str) -> list[VehiclePoses]:
-    """What says where the vehicle was, the best first: odometry, then a tree of frames, then poses.
-
-    Raises:
-        ValueError: Odometry of a frame that is not mounted on the vehicle, frames in a loop, poses that are none.
-    """
+    """What says where the vehicle was, the best first: odometry, then a tree of frames, then poses."""
     found, lost = [], []
     for topic in sorted(bag.topics(ODOMETRY), key=lambda topic: -len(bag.times_ns(topic))):
         child = frame_name(bag.message(topic, int(bag.times_ns(topic)[0])).child_frame_id) or vehicle_frame

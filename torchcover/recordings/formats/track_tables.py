@@ -25,9 +25,6 @@ def read_trajectory(path: Path) -> Trajectory:
         path: `.csv` with the columns t, x, y, z, roll, pitch, yaw (seconds, metres, degrees); or `.npz` with `times_s`
             (K,) and `world_T_body` (K, 4, 4).
 
-    Returns:
-        The trajectory in the world frame.
-
     Raises:
         FileNotFoundError: No such file.
         IsADirectoryError: A folder.
@@ -49,9 +46,6 @@ def read_box_tracks(path: Path) -> tuple[Track, ...]:
     Args:
         path: `.csv` with the columns t, id, category, x, y, z, length, width, height, yaw (seconds, metres, degrees; x,
             y, z of the centre of the bottom).
-
-    Returns:
-        In the order of their first appearance; there may be gaps.
 
     Raises:
         FileNotFoundError: No such file.
@@ -109,11 +103,7 @@ def _read_npz(path: Path) -> Trajectory:
 
 
 def check_gaps(times_s: NDArray[np.float64]) -> None:
-    """Refuse times of which some seem to be missing.
-
-    Raises:
-        ValueError: A step that is many times longer than the usual one.
-    """
+    """Refuse times of which some seem to be missing."""
     steps = np.diff(times_s)
     if len(steps) and steps.max() > MAX_STEP * np.median(steps):
         at = int(steps.argmax())

@@ -24,10 +24,6 @@ class FolderRecorder:
 
     Clouds are float64, so that moved back into the vehicle frame they are the same.
 
-    Args:
-        add: Writes a file.
-        setup: What is to be written.
-
     Raises:
         ValueError: A sensor whose name is none of a folder.
     """

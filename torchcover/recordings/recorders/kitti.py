@@ -26,10 +26,6 @@ class KittiRecorder:
     The layout has no mount: the frame of its clouds is that of KITTI's LiDAR, 1.73 m above the ground and 0.58 m behind
     the vehicle's middle, wherever the rig has its own. Clouds are float32, intensities 0.
 
-    Args:
-        add: Writes a file.
-        setup: What is to be written.
-
     Raises:
         ValueError: Another rig than of one LiDAR.
     """

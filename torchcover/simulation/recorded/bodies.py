@@ -23,11 +23,7 @@ USUAL_HEIGHT_M = 1.5
 
 
 class Bodies:
-    """The built-in bodies, scaled to recorded boxes; those of one size share one mesh.
-
-    Args:
-        meshes: A mesh for each kind of body (`fleet.CATEGORIES`).
-    """
+    """The built-in bodies, scaled to recorded boxes; those of one size share one mesh."""
 
     def __init__(self, meshes: Mapping[str, Mesh]) -> None:
         self._meshes = meshes
@@ -59,11 +55,7 @@ class Bodies:
 
 @reads("a file of boxes")
 def read_boxes(path: Path) -> tuple[Actor, ...]:
-    """Read recorded boxes as actors that are boxes; see `read_box_tracks`.
-
-    Raises:
-        BadFileError: As there, or a gap in time.
-    """
+    """Read recorded boxes as actors that are boxes; see `read_box_tracks`."""
     tracks = read_box_tracks(path)
     for track in tracks:
         try:

@@ -25,9 +25,6 @@ def ground_below(places_m: Numbers, ego_m: Numbers) -> Plain | Slopes:
     Args:
         places_m: (N, 3) on which others stood; some may be wrong.
         ego_m: (T, 3) on which the ego stood: these are believed.
-
-    Raises:
-        ValueError: The way is so long that the ground would have more than four million corners.
     """
     margin_m = HORIZON_M + MARGIN_M
     lower_m, upper_m = ego_m[:, :2].min(axis=0) - margin_m, ego_m[:, :2].max(axis=0) + margin_m

@@ -22,13 +22,7 @@ TOLD = 8
 
 
 class Cast(NamedTuple):
-    """Who is who.
-
-    Args:
-        name: Of the ego.
-        drive: Of the vehicle frame, as it was recorded.
-        others: Everybody else; the recording's own ego, too, if it is not the one.
-    """
+    """Who is who."""
 
     name: str
     drive: Trajectory
@@ -58,9 +52,6 @@ def cast_of(recording: RecordedObjects, ego_id: str | None, ego_T_vehicle: Matri
         recording: Who there is.
         ego_id: The id of a track, or of one of its own egos; the first of these if None.
         ego_T_vehicle: The vehicle frame in that of the poses of its own ego, if not as published.
-
-    Raises:
-        ValueError: No such id, or none of its own; a frame for a track.
     """
     egos = {ego.name: ego for ego in recording.egos}
     if ego_id is None and not egos:
@@ -88,9 +79,6 @@ def excerpt_of(cast: Cast, begin_s: float, duration_s: float | None, max_gap_s: 
         begin_s: After the first such time.
         duration_s: To the last such time if None.
         max_gap_s: See `pieces`.
-
-    Raises:
-        ValueError: There are no such times, or the ego has a gap or jumps in between.
     """
     drive_s = cast.drive.times_s
     stands = len(drive_s) == 1

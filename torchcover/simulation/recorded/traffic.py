@@ -83,17 +83,8 @@ class RecordedTraffic(Traffic):
     def world(self, seed: int, ego: Mesh | None = None) -> World:
         """Build the world: nothing in it is drawn.
 
-        Args:
-            seed: Not used.
-            ego: Body of the ego, in the vehicle frame; the built-in SUV if not given.
-
         Returns:
             The world, in the frame of the recording. Who is where the ego is at an instant is left out, with a warning.
-
-        Raises:
-            FileNotFoundError: A file is missing.
-            ValueError: A file that cannot be used, an id that is absent, times at which the ego is not there.
-            ImportError: A package is missing that the files need.
         """
         run, bodies = self._run, load_bodies()
         drive = self._shown(run.drive)

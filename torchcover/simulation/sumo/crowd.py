@@ -54,12 +54,7 @@ def type_of(name: str, on_foot: bool, known: Mapping[str, VehicleType]) -> Vehic
 
 @reads("routes of SUMO")
 def read_types(path: Path) -> dict[str, VehicleType]:
-    """The types that a file of routes declares.
-
-    Raises:
-        FileNotFoundError: No such file.
-        BadFileError: Not XML, entities, or a length that is no positive number.
-    """
+    """The types that a file of routes declares."""
     found: dict[str, VehicleType] = {}
 
     def start(name: str, names_and_values: list[str]) -> None:

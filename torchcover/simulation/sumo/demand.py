@@ -43,14 +43,6 @@ def write_routes(
 ) -> None:
     """Write vehicles and people, all of whom set off at 0.
 
-    Args:
-        path: The file to write.
-        network: Where they go.
-        streets: How many they are.
-        sizes_m: Length and width of each kind of body, and of the ego.
-        duration_s: How long they are on their way at least.
-        generator: Draws their kinds, places and ways.
-
     Raises:
         ValueError: No street that cars may use leads anywhere, or there would be more than 20,000.
     """

@@ -167,12 +167,7 @@ def record(pieces: Iterable[bytes], window: TimeWindow) -> Recorded:
 
 @reads("floating car data of SUMO")
 def read_floating(path: Path, window: TimeWindow) -> Recorded:
-    """Read it from a file; see `record`.
-
-    Raises:
-        FileNotFoundError: No such file.
-        BadFileError: As `record`.
-    """
+    """Read it from a file; see `record`."""
     with path.open("rb") as file:
         recorded = record(iter(lambda: file.read(PIECE_BYTES), b""), window)
     if not np.isfinite(recorded.last_s):

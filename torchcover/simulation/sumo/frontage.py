@@ -29,14 +29,7 @@ SUNK_M = 1.0
 
 
 class StreetScenery:
-    """Draws what stands along the streets.
-
-    Args:
-        vicinity: The streets.
-        ground: What it stands on.
-        built_share: Share of the frontage that has houses; 0 is open country.
-        generator: Draws everything.
-    """
+    """Draws what stands along the streets."""
 
     def __init__(self, vicinity: Vicinity, ground: Ground, built_share: float, generator: np.random.Generator) -> None:
         self._vicinity = vicinity

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import spread
 from torchcover.simulation.height_field import CELL_M, MARGIN_M, Ground, Plain, Slopes, corners_of, middles_m
-from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.shapes import Mesh, band
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.scenery import PAVEMENT_M
 
@@ -25,11 +25,7 @@ PLACES_ALIKE_M = 1e-6
 
 
 def ground_of(vicinity: Vicinity) -> Plain | Slopes:
-    """The ground around the ego's way: plain if all lanes are of one height, else through all that are no bridges.
-
-    Raises:
-        ValueError: The way is so long that the ground would have more than four million corners.
-    """
+    """The ground around the ego's way: plain if all lanes are of one height, else through all that are no bridges."""
     lower_m, upper_m = vicinity.lower_m - MARGIN_M, vicinity.upper_m + MARGIN_M
     places_m = vicinity.samples_m[~vicinity.on_deck]
     if np.ptp(vicinity.samples_m[:, 2]) == 0.0:
@@ -76,12 +72,7 @@ def tilts_deg(ground: Ground, places_m: Numbers, yaw_deg: Numbers, size_m: tuple
 
 
 class Pavement:
-    """All sidewalks and medians, in plan: where neither vehicles nor crossings are.
-
-    Args:
-        vicinity: What is near.
-        ground: What they lie on.
-    """
+    """All sidewalks and medians, in plan: where neither vehicles nor crossings are."""
 
     def __init__(self, vicinity: Vicinity, ground: Ground) -> None:
         self._ground = ground
@@ -132,12 +123,11 @@ def _slab(piece: shapely.Geometry, ground: Ground) -> Mesh:
     # Around the outline an edge has a triangle on one side only.
     key, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
     here, following = edges[~np.isin(key, back)].T
-    sides = [np.stack([here + count, following + count, following]), np.stack([here + count, following, here])]
     return Mesh(
         np.concatenate([
             np.column_stack([places_m, heights_m + PAVEMENT_M]), np.column_stack([places_m, heights_m - SUNK_M])
         ]),
-        np.concatenate([faces, faces[:, ::-1] + count, *(side.T for side in sides)]),
+        np.concatenate([faces, faces[:, ::-1] + count, band(here + count, following + count, -count)]),
     ).made_of("pavement")  # fmt: skip
 
 

@@ -78,12 +78,7 @@ class Network(NamedTuple):
 
 
 def read_network(path: Path) -> Network:
-    """Read a `.net.xml` file; the one that was read last is kept.
-
-    Raises:
-        FileNotFoundError: No such file.
-        BadFileError: Not a network of SUMO, or a lane that has no width or place.
-    """
+    """Read a `.net.xml` file; the one that was read last is kept."""
     status = path.stat() if path.exists() else None
     return _read_again(path, status and (status.st_size, status.st_mtime_ns))
 

@@ -27,13 +27,7 @@ STEP_S = 0.4
 
 
 class Placing:
-    """Puts bodies onto the ground, the pavement, or the deck of a bridge.
-
-    Args:
-        ground: The ground.
-        pavement: Sidewalks, on which people are.
-        origin_m: (2,) what is subtracted of all places.
-    """
+    """Puts bodies onto the ground, the pavement, or the deck of a bridge; `origin_m` is subtracted of all places."""
 
     def __init__(self, ground: Ground, pavement: Pavement, origin_m: Numbers) -> None:
         self._ground = ground
@@ -94,15 +88,7 @@ def _smooth(heights_m: Numbers, times_s: Numbers) -> Numbers:
 
 
 def park(vicinity: Vicinity, ground: Ground, fleet: Fleet, share: float, generator: np.random.Generator) -> None:
-    """Put cars into the bays of the streets that are near.
-
-    Args:
-        vicinity: The streets.
-        ground: What the cars stand on.
-        fleet: Their bodies; it notes them down.
-        share: How much of the bays' room is taken.
-        generator: Draws kinds and places.
-    """
+    """Put cars into the bays of the streets that are near."""
     poses: dict[str, list[np.ndarray]] = {kind: [] for kind in PARKED}
     for lane in vicinity.lanes:
         if lane.use != "bay":

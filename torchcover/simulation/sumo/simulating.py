@@ -38,12 +38,7 @@ def run(program: str, *options: str | Path) -> None:
 
 
 def output_of(program: str, *options: str | Path) -> Iterator[bytes]:
-    """What a program writes to its standard output, piece by piece; whoever stops asking ends the program.
-
-    Raises:
-        ImportError: SUMO is not installed.
-        ValueError: It fails; with its own message.
-    """
+    """What a program writes to its standard output, piece by piece; whoever stops asking ends the program."""
     home = _home()
     command = [str(home / "bin" / program), *ALWAYS, *map(str, options)]
     with TemporaryFile() as said:
@@ -107,10 +102,6 @@ def simulate(
         seed: Of the simulation.
         around: Only those near to this vehicle are told of.
         drawn: Whether the traffic was drawn: then nobody is taken out of a jam, and ways may end anywhere.
-
-    Raises:
-        ImportError: SUMO is not installed.
-        ValueError: It fails; with its own message.
     """
     options = ["--time-to-teleport", "-1", "--ignore-route-errors"] if drawn else []
     if around is not None:
@@ -126,13 +117,7 @@ def simulate(
 
 @reads("an OpenDRIVE road")
 def from_opendrive(path: Path, folder: Path) -> Path:
-    """Let SUMO turn an OpenDRIVE file into a network in a folder.
-
-    Raises:
-        FileNotFoundError: No such file.
-        BadFileError: Entities, or what SUMO's netconvert refuses, with its own message.
-        ImportError: SUMO is not installed.
-    """
+    """Let SUMO turn an OpenDRIVE file into a network in a folder."""
     root = parse_xml(path)
     if root.tag != "OpenDRIVE":
         raise ValueError(f"an OpenDRIVE file begins with <OpenDRIVE>; got <{root.tag}>")

@@ -57,11 +57,7 @@ class DrawnStreets(Document):
     people_per_km: MostPeople = 12.0
 
     def build(self, folder: Path, generator: np.random.Generator) -> Path:
-        """Draw a network, and write it into a folder.
-
-        Raises:
-            ImportError: SUMO is not installed.
-        """
+        """Draw a network, and write it into a folder."""
         plan = self.network or str(generator.choice(["rand", "grid", "spider"]))
         prefix = folder / "plan"
         seed = str(generator.integers(1 << 31))

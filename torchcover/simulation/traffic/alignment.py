@@ -213,10 +213,6 @@ class Territory:
     """The places that are nearest to the stretch of the street that they were measured from.
 
     No two stretches share any of it: what is built within cannot lie on another street, nor on what belongs to it.
-
-    Args:
-        street: The street.
-        span_m: First and last station that matter.
     """
 
     def __init__(self, street: Alignment, span_m: tuple[float, float]) -> None:

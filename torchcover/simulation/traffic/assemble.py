@@ -41,13 +41,7 @@ class Paths(NamedTuple):
 
 
 def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> Paths:
-    """Follow the lanes, on the ground.
-
-    Args:
-        lanes: The lanes.
-        agents: Who follows them.
-        place_m: (T, N) where they are on them.
-    """
+    """Follow the lanes, on the ground, to (T, N) places on them."""
     positions_m, yaw_deg = np.zeros((*place_m.shape, 3)), np.empty(place_m.shape)
     lane_of = np.array([agent.lane for agent in agents])
     for lane in np.unique(lane_of):
@@ -58,13 +52,7 @@ def paths(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> P
 
 
 def come_near(lanes: Sequence[Lane], agents: Sequence[Agent], place_m: Numbers) -> NDArray[np.int64]:
-    """Numbers of those who may come near the first one, who is among them; they are looked at now and then only.
-
-    Args:
-        lanes: The lanes.
-        agents: Who follows them.
-        place_m: (T, N) where they are on them.
-    """
+    """Numbers of those who may come near the first one, who is among them; they are looked at now and then only."""
     looks = np.unique(np.append(np.arange(0, len(place_m), LOOKS_EVERY), len(place_m) - 1))
     seen_m = place_m[looks]
     positions_m = paths(lanes, agents, seen_m).positions_m

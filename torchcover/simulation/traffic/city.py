@@ -54,18 +54,7 @@ class Pieces(NamedTuple):
 
 
 class City:
-    """Builds the part of a city that the ego gets to see, and parks cars in it.
-
-    Args:
-        streets: The plan.
-        territory: Of the main street.
-        hills: What it stands on.
-        fleet: The bodies of parked cars.
-        parked_share: Share of the parking bays that are taken.
-        built_share: Share of the blocks' sides that have houses.
-        generator: Draws everything.
-        shapes: Draws which blocks have houses.
-    """
+    """Builds the part of a city that the ego gets to see, and parks cars in it."""
 
     def __init__(
         self,
@@ -89,11 +78,7 @@ class City:
         self._shapes = shapes
 
     def static(self, seen_m: Bounds) -> Scenery:
-        """The ground, the blocks, buildings and furniture; cars are parked among them.
-
-        Args:
-            seen_m: First and last station of the main street that matter.
-        """
+        """The ground, the blocks, buildings and furniture; cars are parked among them."""
         site = BuildingSite(
             self._streets.main, self._territory, self._hills, self._streets.kerb_m + BLOCK_DEPTH_M + 10.0
         )

@@ -9,7 +9,6 @@ import numpy as np
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.documents import load_document
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.flow import Agent, Lane
 from torchcover.simulation.traffic.idm import Driver
@@ -41,16 +40,11 @@ CYCLING = Driver(
 @cache
 def load_bodies() -> Mapping[str, Mesh]:
     """The built-in bodies, by kind."""
-    return {kind: load_document(Vehicle, "vehicles", kind).mesh() for kind in CATEGORIES}
+    return {kind: Vehicle.load(kind).mesh() for kind in CATEGORIES}
 
 
 class Fleet:
     """The bodies of a world, and the drivers drawn for them.
-
-    Args:
-        bodies: A mesh for each kind in `CATEGORIES`.
-        ego: Body of the ego; the SUV if not given.
-        generator: Draws kinds, drivers and gaps.
 
     Raises:
         ValueError: A kind has no body.

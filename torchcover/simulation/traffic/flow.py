@@ -112,12 +112,7 @@ class Simulation:
         self._look()
 
     def run(self, times_s: Numbers, warm_up_s: float = 0.0) -> Flow:
-        """Simulate, first the warm-up before the first time, and keep the state at each time.
-
-        Args:
-            times_s: (T,) evenly spaced times.
-            warm_up_s: How long before the first time the simulation begins.
-        """
+        """Simulate, first the warm-up before the first time, and keep the state at each time."""
         place_m, speed_mps = np.empty((2, len(times_s), len(self.place_m)))
         occupied = np.empty((len(times_s), len(self._signals.offset_s), 2), dtype=bool)
         drives = [(float(times_s[0]) - warm_up_s, warm_up_s)]
@@ -232,11 +227,7 @@ class _Limits:
 
 
 def check_crowd(agents: float, steps: int) -> None:
-    """Refuse more agents than a simulation has memory for, before any of them is made.
-
-    Raises:
-        ValueError: There is not so much memory.
-    """
+    """Refuse more agents than a simulation has memory for, before any of them is made."""
     check_fits(
         f"traffic of about {agents:,.0f} for {steps:,} time steps",
         BYTES_PER_STATE * agents * steps,

@@ -17,12 +17,7 @@ SQUARE_M = 10.0
 
 
 class Hills:
-    """A few long waves; a plain if they have no height.
-
-    Args:
-        height_m: Standard deviation of the heights.
-        generator: Draws the waves.
-    """
+    """A few long waves with heights of a standard deviation; a plain if that is 0."""
 
     def __init__(self, height_m: float, generator: np.random.Generator) -> None:
         towards, phase = generator.uniform(0.0, 2 * np.pi, (2, WAVES))

@@ -35,14 +35,7 @@ TROLLEY_SHARE = 0.3
 
 
 class Lot:
-    """Draws a parking lot about the origin, with its aisles along x.
-
-    Args:
-        fleet: The bodies of parked cars.
-        parked_share: Share of the stalls that are taken.
-        crossings: Pairs of facing stalls at each aisle that stay empty because people cross there.
-        generator: Draws everything.
-    """
+    """Draws a parking lot about the origin, with its aisles along x."""
 
     def __init__(self, fleet: Fleet, parked_share: float, crossings: int, generator: np.random.Generator) -> None:
         self._fleet = fleet

@@ -45,9 +45,6 @@ class Procedural(Traffic):
         Returns:
             The world: the ground is z = 0, nobody ever overlaps anybody, and the ego is followed closely enough for
             sensors of up to 250 m range.
-
-        Raises:
-            ValueError: A kind has no body.
         """
         generator = np.random.default_rng(seed)
         fleet = Fleet(load_bodies() if bodies is None else bodies, ego, generator)

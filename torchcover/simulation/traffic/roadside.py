@@ -31,14 +31,7 @@ NO_TREES_NEAR_BRIDGE_M = 25.0
 def roadside(
     middle: Polyline, span_m: tuple[float, float], everybody_m: Numbers, generator: np.random.Generator
 ) -> tuple[Mesh, ...]:
-    """The ground, and what stands along the part of the road that the ego gets to see.
-
-    Args:
-        middle: The middle of the median.
-        span_m: First and last place on it that matter.
-        everybody_m: (..., 3) places that the ground must reach.
-        generator: Draws everything.
-    """
+    """The ground, and what stands along the part of the road that the ego gets to see."""
     corners = everybody_m.reshape(-1, 3)[:, :2]
     ends = np.concatenate([corners, beside(middle, np.array(span_m), 0.0)[:, :2]])
     structures, bridges = _structures(middle, span_m, generator)

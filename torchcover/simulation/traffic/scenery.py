@@ -1,7 +1,6 @@
 """What stands beside a road, as closed convex pieces that are merged into few meshes."""
 
 from collections.abc import Sequence
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -9,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.simulation.bodies import merge
-from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.shapes import Mesh, band, circle, prism_faces
 from torchcover.simulation.traffic.roads import Polyline
 
 Numbers = NDArray[np.float64]
@@ -45,25 +44,7 @@ def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
     rings = np.empty((levels, corners, 3))
     rings[..., :2] = outlines
     rings[..., 2] = np.reshape(heights_m, (-1, 1))
-    return Mesh(rings.reshape(-1, 3), _prism_faces(levels, corners))
-
-
-@cache
-def _prism_faces(levels: int, corners: int) -> NDArray[np.int64]:
-    """Sides, bottom and top of a prism through so many outlines, which share them: nobody may write into them."""
-    here = np.arange(corners)
-    following = (here + 1) % corners
-    side = np.concatenate(
-        [
-            np.stack([here, following, following + corners], axis=1),
-            np.stack([here, following + corners, here + corners], axis=1),
-        ]
-    )
-    fan = np.stack([np.zeros(corners - 2, dtype=np.int64), here[1:-1], here[2:]], axis=1)
-    sides = [side + level * corners for level in range(levels - 1)]
-    faces = np.concatenate([*sides, fan[:, ::-1], fan + (levels - 1) * corners])
-    faces.flags.writeable = False
-    return faces
+    return Mesh(rings.reshape(-1, 3), prism_faces(levels, corners))
 
 
 def rectangle(x_m: tuple[float, float], y_m: tuple[float, float]) -> Numbers:
@@ -92,15 +73,9 @@ def slab(corners_m: Numbers, z_m: tuple[float, float]) -> Mesh:
         [np.stack(three, axis=-1).reshape(-1, 3) for three in ((here, ahead, across), (here, across, aside))]
     )
     around = np.concatenate([number[:-1, 0], number[-1, :-1], number[:0:-1, -1], number[0, :0:-1]])
-    following, up = np.roll(around, -1), rows * columns
-    sides = [
-        np.stack([around, following, following + up], axis=1),
-        np.stack([around, following + up, around + up], axis=1),
-    ]
+    sides, up = band(around, np.roll(around, -1), rows * columns), rows * columns
     places_m = np.tile(corners_m.reshape(-1, 2), (2, 1))
-    return Mesh(
-        np.column_stack([places_m, np.repeat(z_m, rows * columns)]), np.concatenate([over[:, ::-1], over + up, *sides])
-    )
+    return Mesh(np.column_stack([places_m, np.repeat(z_m, up)]), np.concatenate([over[:, ::-1], over + up, sides]))
 
 
 def box(centre_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: float = 0.0) -> Mesh:
@@ -112,21 +87,13 @@ def box(centre_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: 
 
 def post(centre_m: ArrayLike, radius_m: float, bottom_m: float, height_m: float) -> Mesh:
     """An upright post."""
-    outline = np.asarray(centre_m) + radius_m * _circle(POST_SIDES)
+    outline = np.asarray(centre_m) + radius_m * circle(POST_SIDES)
     return prism([outline, outline], [bottom_m, bottom_m + height_m]).made_of("metal")
 
 
 def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, crown_radius_m: float) -> list[Mesh]:
-    """A trunk, and on it a crown as wide as given.
-
-    Args:
-        centre_m: (2,) position.
-        bottom_m: Height of the soil.
-        clear_m: Height of the crown's lower end above the soil.
-        height_m: Height of the whole tree.
-        crown_radius_m: Largest radius of the crown.
-    """
-    shape, centre = _circle(CROWN_SIDES), np.asarray(centre_m)
+    """A trunk, and on it a crown as wide as given."""
+    shape, centre = circle(CROWN_SIDES), np.asarray(centre_m)
     outlines = [centre + share * crown_radius_m * shape for share in (0.45, 1.0, 0.9, 0.3)]
     levels = bottom_m + clear_m + np.array([0.0, 0.3, 0.65, 1.0]) * (height_m - clear_m)
     crown = prism(outlines, levels.tolist()).made_of("vegetation")
@@ -134,15 +101,7 @@ def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, 
 
 
 def rail(line: Polyline, places_m: Numbers, left_m: float, width_m: float, z_m: tuple[float, float]) -> list[Mesh]:
-    """A rail or wall along a line: one straight piece between each two places.
-
-    Args:
-        line: What it follows.
-        places_m: (K,) ascending places on the line.
-        left_m: How far its middle lies to the left of the line.
-        width_m: Its thickness.
-        z_m: Its lower and upper edge.
-    """
+    """A rail or wall along a line: one straight piece between each two of (K,) ascending places."""
     sides = [beside(line, places_m, left_m + shift)[:, :2] for shift in (-width_m / 2, width_m / 2)]
     pieces = []
     for piece in range(len(places_m) - 1):
@@ -168,9 +127,3 @@ def placed(mesh: Mesh, pose: ArrayLike, height_m: float = 0.0) -> Mesh:
 def few(*kinds: Sequence[Mesh]) -> tuple[Mesh, ...]:
     """One mesh for each kind of thing that there is."""
     return tuple(merge(list(pieces)) for pieces in kinds if pieces)
-
-
-@cache
-def _circle(sides: int) -> Numbers:
-    angle = 2 * np.pi * np.arange(sides) / sides
-    return np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -218,17 +218,7 @@ def plan(
     generator: np.random.Generator,
     shapes: np.random.Generator,
 ) -> Streets:
-    """Draw the cross streets and their lights. The origin lies halfway between two junctions.
-
-    Args:
-        section: Of the main street.
-        bend_deg: How much the main street may bend between two junctions.
-        turn_share: Share of the junctions at which it turns.
-        span_m: From the first to the last cross street, about, along the main street; it holds the origin.
-        reach_m: How far from the origin lanes begin and end.
-        generator: Draws blocks and lights.
-        shapes: Draws the course of the main street.
-    """
+    """Draw the cross streets and their lights. The origin lies halfway between two junctions."""
     middle = generator.uniform(MIN_BLOCK_M, MAX_BLOCK_M) / 2
     east, west = [middle], [-middle]
     while east[-1] < span_m[1]:
