@@ -14,11 +14,23 @@ from matplotlib.image import imread
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region, forward_regions
 from torchcover.data import SimulatedFrames
-from torchcover.report import write_figures
+from torchcover.geometry import rigid, rotation_from_euler
+from torchcover.report import SensorView, write_figures
 from torchcover.simulation import PaperReference, Scenario
 
 ROOT = Path(__file__).parents[1]
-NAMES = ("__main__", "cameras", "comparison", "measuring", "pieces", "published", "score", "tables", "thinning")
+NAMES = (
+    "__main__",
+    "cameras",
+    "comparison",
+    "four_views",
+    "measuring",
+    "pieces",
+    "published",
+    "score",
+    "tables",
+    "thinning",
+)
 
 
 class Example:
@@ -263,6 +275,36 @@ def test_both_references_have_the_range_that_is_asked_for(paper):
     assert asked.frames.reference_sensor == PaperReference(10, 10, max_range_m=120.0, ego_points=True)
     assert asked.surface_frames.reference_sensor.max_range_m == 120.0
     assert asked.surface_frames.reference_sensor.areas == tuple((region.x, region.y) for region in forward_regions())
+
+
+# Figure 2
+
+
+def test_figure_2_is_four_panels_of_one_frame_with_a_colour_bar_for_each_row(paper):
+    grid = BevGrid(x=(-10.0, 10.0), y=(-10.0, 10.0), cell=0.5)
+    points = torch.ones(grid.shape[1:])
+    points[:, :8] = 0.0
+    views = [
+        SensorView(name, rigid(rotation_from_euler(yaw, 0.0, 0.0), (0.0, 0.0, 1.0)), 90.0, (-30.0, 10.0), range_m)
+        for name, yaw, range_m in (("front", 0.0, float("inf")), ("left", 90.0, 5.0))
+    ]
+    outline = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0]])
+    given = {"steps": 10, "title": "Four", "ego_outline_m": outline, "sensors": views}
+    *panels, of_points, of_radius = paper.four_views.draw_four_views(torch.ones(grid.shape), points, grid, **given).axes
+    assert [(axes.get_xlim(), axes.get_ylim()) for axes in panels] == [(grid.x, grid.y)] * 4
+    boxes = [axes.get_window_extent() for axes in (*panels, of_points, of_radius)]
+    assert len({tuple(box.size.round(6)) for box in boxes[:4]}) == 1
+    for panel, bar in ((1, 4), (3, 5)):
+        assert boxes[panel].intervaly == pytest.approx(boxes[bar].intervaly)
+    assert of_points.get_ylabel().startswith("points in a cell (mean of the steps)")
+    assert of_radius.get_ylabel().startswith("mean blind spot radius (m)")
+    # Sectors lie where the sensors look, and end at their range.
+    wedges = panels[0].patches[:2]
+    inside = [[wedge.get_path().contains_point(at, wedge.get_patch_transform()) for wedge in wedges]
+              for at in ((9.0, 3.0), (0.0, 4.5), (0.0, 6.5), (-8.0, 0.0))]  # fmt: skip
+    assert inside == [[True, False], [False, True], [False, False], [False, False]]
+    named = [text.get_text() for text in panels[2].get_legend().get_texts()]
+    assert named[:3] == ["field of view: front", "field of view: left", "no point of the rig in any step"]
 
 
 # The command

@@ -3,13 +3,13 @@
 import torch
 from rich.console import Console
 
+from examples.paper.four_views import draw_four_views
 from examples.paper.measuring import Measurement
 from torchcover import BevGrid, Region
 from torchcover.evaluation import sensor_views
 from torchcover.report import (
     CoverageTable,
     as_markdown,
-    draw_four_views,
     map_figures,
     parts_of,
     print_table,

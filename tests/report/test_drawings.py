@@ -4,15 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from torchcover import BevGrid
 from torchcover.geometry import rigid, rotation_from_euler
-from torchcover.report import ActorMark, SensorView, StandingFaces, draw_depths, draw_four_views, draw_rig, draw_scene
+from torchcover.report import ActorMark, SensorView, StandingFaces, draw_depths, draw_rig, draw_scene
 from torchcover.report.drawings.frame import PATH, REFERENCE, SENSOR, SKY
 from torchcover.report.maps.overlay import COLOURS
 
@@ -281,81 +279,3 @@ def test_images_without_a_range_of_depths_are_drawn_too(image):
 def test_what_is_no_image_is_refused(images, message):
     with pytest.raises(ValueError, match=message):
         draw_depths(images, title="t")
-
-
-GRID = BevGrid(x=(-10.0, 10.0), y=(-8.0, 8.0), cell=0.5)
-FORWARD = view(name="front", range_m=200.0)
-LEFT = view(yaw=90.0, name="left", at=(0.0, 1.0, 1.0), wide=60.0, range_m=5.0)
-
-
-def four_views(radius=None, points=None, **options) -> Picture:
-    given = {"steps": 10, "title": "Four", "ego_outline_m": box(0, 0), "sensors": [FORWARD, LEFT]}
-    radius = torch.full(GRID.shape, 1.0) if radius is None else radius
-    points = torch.ones(GRID.shape[1:]) if points is None else points
-    return Picture(draw_four_views(radius, points, GRID, **(given | options)))
-
-
-def test_four_panels_share_frame_extent_and_axes():
-    picture = four_views()
-    *panels, points_bar, radius_bar = picture.figure.axes
-    assert [(axes.get_xlim(), axes.get_ylim()) for axes in panels] == [(GRID.x, GRID.y)] * 4
-    sizes = {tuple(axes.get_window_extent().size.round(6)) for axes in panels}
-    assert len(sizes) == 1
-    (width, height) = sizes.pop()
-    assert width / 20 == pytest.approx(height / 16)
-    assert points_bar.get_ylabel().startswith("points in a cell (mean of the steps)")
-    assert radius_bar.get_ylabel().startswith("mean blind spot radius (m)")
-    assert picture.figure.axes[0].get_window_extent().height == pytest.approx(points_bar.get_window_extent().height)
-
-
-def test_sectors_lie_where_the_sensors_look_and_end_at_their_range():
-    picture = four_views()
-    assert picture.tinted(0, 9.0, 3.0)
-    assert not picture.tinted(0, 2.5, 3.0)
-    assert picture.tinted(0, 0.0, 5.0)
-    assert not picture.tinted(0, 0.0, 6.5)
-    assert not picture.tinted(0, -8.0, 0.0)
-    assert abs(picture.at(0, 9.0, 3.0) - picture.at(0, 0.0, 5.0)).max() > 0.05
-
-
-def test_the_histogram_says_no_point_where_the_maps_say_unknown():
-    radius, points = torch.full(GRID.shape, 1.0), torch.full(GRID.shape[1:], 10.0)
-    radius[0, :, :8] = float("nan")
-    points[:, :8] = 0.0
-    points[:, 30:] = 1000.0
-    picture = four_views(radius, points, sensors=[])
-    assert picture.at(1, -8.1, 4.1) == pytest.approx((1, 1, 1))
-    assert abs(picture.at(1, 0.1, 5.1) - picture.at(1, 8.1, 5.1)).max() > 0.3
-    hatched = np.array([picture.at(2, -8.0, y) for y in np.arange(2.0, 7.0, 0.02)])
-    assert hatched.max() < 0.9
-    assert picture.tinted(3, -8.1, 4.1)
-    entries = [text.get_text() for text in picture.figure.axes[2].get_legend().get_texts()]
-    assert entries == ["no point of the rig in any step", "unknown: never probed (10.0 % of the cells)", "ego"]
-
-
-def test_radii_over_little_surface_are_pale_and_named():
-    opacity = torch.ones(GRID.shape)
-    opacity[1] = 0.3
-    picture = four_views(opacity=opacity, unknown="no visible surface found", sensors=[])
-    ground, obstacle = (np.ptp(picture.at(axes, -8.1, 4.1)) for axes in (2, 3))
-    assert 0 < obstacle < 0.5 * ground
-    entries = [text.get_text() for text in picture.figure.axes[2].get_legend().get_texts()]
-    assert entries[0] == "unknown: no visible surface found (0 % of the cells)"
-    assert entries[1].startswith("paler: ")
-
-
-def test_a_rig_without_a_point_is_drawn_too():
-    assert len(four_views(torch.full(GRID.shape, float("nan")), torch.zeros(GRID.shape[1:])).figure.axes) >= 4
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ({"radius": torch.zeros(2, 3, 4)}, r"radius: shape \(2, 32, 40\)"),
-        ({"points": torch.zeros(3, 4)}, "points: shape"),
-        ({"opacity": torch.zeros(3, 4)}, "opacity: shape"),
-    ],
-)
-def test_arrays_of_another_grid_are_refused(arguments, message):
-    with pytest.raises(ValueError, match=message):
-        four_views(**arguments)

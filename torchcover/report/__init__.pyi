@@ -1,6 +1,5 @@
 from .drawings.film import check_film as check_film
 from .drawings.film import write_film as write_film
-from .drawings.four_views import draw_four_views as draw_four_views
 from .drawings.frame import ActorMark as ActorMark
 from .drawings.frame import StandingFaces as StandingFaces
 from .drawings.frame import draw_depths as draw_depths

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.patches import FancyArrowPatch, Patch, Polygon, Wedge
+from matplotlib.patches import FancyArrowPatch, Polygon, Wedge
 from matplotlib.patheffects import AbstractPathEffect, withStroke
 from numpy.typing import NDArray
 
@@ -163,26 +163,7 @@ def draw_places(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
     return [Line2D([], [], linestyle="none", marker="o", label="sensor", **DOT)] if sensors else []
 
 
-def draw_sectors(sheet: Sheet, sensors: Sequence[SensorView]) -> list[Artist]:
-    """Fill the horizontal field of view of each sensor, as if nothing were in its way: all that geometry alone says.
-
-    Returns:
-        Legend entries.
-    """
-    entries: list[Artist] = []
-    for at, sensor in enumerate(sensors):
-        colour = sensor_colour(at)
-        _draw_wedge(sheet, sensor, facecolor=(colour, 0.3), edgecolor=colour, linewidth=1.0)
-        entries.append(Patch(facecolor=(colour, 0.3), edgecolor=colour, label=f"field of view: {sensor.name}"))
-    return entries
-
-
 def _draw_view(sheet: Sheet, sensor: SensorView) -> None:
-    dashes = {"fill": False, "edgecolor": "black", "linewidth": 0.8, "linestyle": (0, (5, 3))}
-    _draw_wedge(sheet, sensor, zorder=2.5, path_effects=THIN_HALO, **dashes)
-
-
-def _draw_wedge(sheet: Sheet, sensor: SensorView, **style: Any) -> None:  # noqa: ANN401  (matplotlib's own)
     start, half = (sensor.x_m, sensor.y_m), sensor.horizontal_fov_deg / 2
     furthest = max(math.dist(start, corner) for corner in product(sheet.axes.get_xlim(), sheet.axes.get_ylim()))
     wedge = Wedge(
@@ -190,7 +171,12 @@ def _draw_wedge(sheet: Sheet, sensor: SensorView, **style: Any) -> None:  # noqa
         min(sensor.range_m, 2 * furthest),  # infinity cannot be drawn; beyond the map all ranges look the same
         sensor.yaw_deg - half,
         sensor.yaw_deg + half,
-        **style,
+        fill=False,
+        edgecolor="black",
+        linewidth=0.8,
+        linestyle=(0, (5, 3)),
+        zorder=2.5,
+        path_effects=THIN_HALO,
     )
     sheet.axes.add_patch(wedge)
 

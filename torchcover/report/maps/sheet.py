@@ -44,7 +44,7 @@ class Sheet:
     Args:
         figure: The whole paper.
         axes: The map: x to the right and y upwards, in equal metres.
-        bar: Place of the colour bar, which the maps on one paper share, or those of one row.
+        bar: Place of the colour bar, which the maps on one paper share.
         legend_columns: How many entries of a legend fit beside each other.
         metres_per_inch: Scale of the map.
     """
@@ -56,20 +56,18 @@ class Sheet:
     metres_per_inch: float
 
 
-def lay_out(grid: BevGrid, maps: int = 1, *, across: int | None = None) -> list[Sheet]:
+def lay_out(grid: BevGrid, maps: int = 1) -> list[Sheet]:
     """Empty maps of the grid on one paper: long ones below each other, others beside each other.
 
     Args:
         grid: Bounds and cells.
         maps: How many.
-        across: How many in a row; each row then has its own colour bar.
 
     Returns:
         The maps, row by row from the upper left.
     """
     _, rows, columns = grid.shape
-    bar_for_all = across is None
-    across, inches_per_cell = _arrange(grid, maps, across)
+    across, inches_per_cell = _arrange(grid, maps)
     dpi = min(math.ceil(DOTS_PER_INCH * inches_per_cell) / inches_per_cell, MAX_DOTS_PER_INCH)
     map_in = inches_per_cell * np.array([columns, rows])
     # Gaps of whole pixels, so that every cell of every map is whole pixels.
@@ -86,17 +84,15 @@ def lay_out(grid: BevGrid, maps: int = 1, *, across: int | None = None) -> list[
         left_in, top_in = (step_in * [at % across, at // across]).tolist()
         views.append(figure.add_axes(place(left_in, top_in, map_in), xlim=grid.x, ylim=grid.y))
         _label(views[-1], left=at % across == 0, lowest=at + across >= maps)
-    bar_in = np.array([COLOUR_BAR_IN, max(paper_in[1] if bar_for_all else map_in[1], MIN_COLOUR_BAR_IN)])
+    bar_in = np.array([COLOUR_BAR_IN, max(paper_in[1], MIN_COLOUR_BAR_IN)])
     gap_in = GAP_IN if maps == 1 else BESIDE_IN  # the axis of a map above the last row has labels beside the bar
-    tops_in = [0.0] if bar_for_all else [step_in[1] * row for row in range(math.ceil(maps / across))]
-    bars = [figure.add_axes(place(paper_in[0] + gap_in, top_in, bar_in)) for top_in in tops_in]
+    bar = figure.add_axes(place(paper_in[0] + gap_in, 0.0, bar_in))
     legend_columns = max(1, int(paper_in[0] / LEGEND_COLUMN_IN))
-    bar_of = [bars[0 if bar_for_all else at // across] for at in range(maps)]
     scale = grid.cell / inches_per_cell
-    return [Sheet(figure, axes, bar, legend_columns, scale) for axes, bar in zip(views, bar_of, strict=True)]
+    return [Sheet(figure, axes, bar, legend_columns, scale) for axes in views]
 
 
-def _arrange(grid: BevGrid, maps: int, across: int | None) -> tuple[int, float]:
+def _arrange(grid: BevGrid, maps: int) -> tuple[int, float]:
     """How many maps beside each other, and inches for each cell: the most that the paper allows."""
     _, rows, columns = grid.shape
     width_in, height_in = MAX_MAP_IN if maps == 1 else MAX_PAPER_IN
@@ -104,7 +100,7 @@ def _arrange(grid: BevGrid, maps: int, across: int | None) -> tuple[int, float]:
     def inches_per_cell(across: int) -> float:
         return min(width_in / (across * columns), height_in / (math.ceil(maps / across) * rows))
 
-    across = across or max(range(1, maps + 1), key=inches_per_cell)
+    across = max(range(1, maps + 1), key=inches_per_cell)
     return across, inches_per_cell(across)
 
 

@@ -1,15 +1,11 @@
-"""A rig seen in four ways, in one frame: its sectors, a histogram of its points, and its radius maps."""
+"""Figure 2: a rig seen in four ways, in one frame: its sectors, a histogram of its points, and its radius maps."""
 
-from collections.abc import Sequence
+import math
+from dataclasses import replace
 
 import numpy as np
-from matplotlib.artist import Artist
-from matplotlib.figure import Figure
-from matplotlib.patches import Patch
-from numpy.typing import NDArray
-from torch import Tensor
+from matplotlib.patches import Patch, Wedge
 
-from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS
 from torchcover.report.maps.colours import (
     NEVER_PROBED,
@@ -17,13 +13,11 @@ from torchcover.report.maps.colours import (
     cell_entries,
     draw_cells,
     draw_colour_bar,
-    paler_entry,
     scale_of,
 )
-from torchcover.report.maps.overlay import SensorView, draw_ego, draw_sectors, draw_sensors
+from torchcover.report.maps.overlay import draw_ego, draw_sensors, sensor_colour
 from torchcover.report.maps.sheet import (
     HEADING_POINTS,
-    Sheet,
     fit_paper,
     lay_out,
     lower_left,
@@ -38,56 +32,29 @@ ROBUST_PERCENTILES = (1, 99.5)
 NO_POINT = "white"
 
 
-def draw_four_views(
-    radius: Tensor,
-    points: Tensor,
-    grid: BevGrid,
-    *,
-    steps: int,
-    title: str,
-    ego_outline_m: NDArray[np.floating],
-    sensors: Sequence[SensorView],
-    unknown: str = NEVER_PROBED,
-    opacity: Tensor | None = None,
-) -> Figure:
+def draw_four_views(radius, points, grid, *, steps, title, ego_outline_m, sensors):
     """Draw what geometry alone says of a rig, what its points alone say, and what it sees of what there is to be seen.
 
     Args:
-        radius: (H, Y, X) mean blind spot radius in metres, NaN where unknown.
+        radius: (2, Y, X) mean blind spot radius in metres, NaN where unknown.
         points: (Y, X) how many points of the rig fell into each cell, at any height, in all steps.
-        grid: The cells.
+        grid: The cells: as wide as long, with two bands.
         steps: How many steps.
         title: First line.
         ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
         sensors: The rig.
-        unknown: Why a cell has no radius, for the legend.
-        opacity: (H, Y, X) that of the radius, as in `draw_map`.
-
-    Returns:
-        A figure of its own, outside pyplot: sectors and histogram, and below them the blind spot radius in every band;
-        four panels for two bands. All have the same frame, extent and axes.
-
-    Raises:
-        ValueError: `radius`, `points`, the opacity or the outline have another shape.
     """
-    expected = ("radius", radius, grid.shape), ("points", points, grid.shape[1:]), ("opacity", opacity, grid.shape)
-    for name, array, shape in expected:
-        if array is not None and tuple(array.shape) != shape:
-            raise ValueError(f"{name}: shape {shape} is needed, as of the grid; got {tuple(array.shape)}")
-    sectors, histogram, *maps = lay_out(grid, 2 + len(grid.heights), across=2)
-    entries = draw_sectors(sectors, sensors)
+    sectors, histogram, *maps = _with_a_bar_for_each_row(lay_out(grid, 2 + len(grid.heights)))
+    entries = _draw_sectors(sectors, sensors)
     write_heading(sectors.axes, "fields of view, as if nothing were in the way")
     entries += _draw_histogram(histogram, points.double().cpu().numpy() / steps)
     write_heading(histogram.axes, "points of the rig in each cell")
     scale = scale_of(RADIUS, radius)
     together = radius.cpu().double().numpy()
-    opaque = [None] * len(maps) if opacity is None else list(opacity.cpu().double().numpy())
-    for sheet, values, shown, name in zip(maps, together, opaque, grid.heights, strict=True):
-        draw_colour_bar(sheet, draw_cells(sheet.axes, values, scale, opacity=shown), together, scale)
+    for sheet, values, name in zip(maps, together, grid.heights, strict=True):
+        draw_colour_bar(sheet, draw_cells(sheet.axes, values, scale), together, scale)
         write_heading(sheet.axes, f"blind spot radius, {name}: {span(grid, name)}")
-    entries += cell_entries(together, unknown)
-    if opacity is not None:
-        entries.append(paler_entry())
+    entries += cell_entries(together, NEVER_PROBED)
     for sheet in (histogram, *maps):
         entries += draw_sensors(sheet, sensors, named=False)
     for sheet in (sectors, histogram, *maps):
@@ -98,7 +65,29 @@ def draw_four_views(
     return sectors.figure
 
 
-def _draw_histogram(sheet: Sheet, per_step: NDArray[np.float64]) -> list[Artist]:
+def _with_a_bar_for_each_row(sheets):
+    """The upper maps show points, the lower ones radii: a colour bar as high as its row, instead of one for all."""
+    figure, whole = sheets[0].figure, sheets[0].bar.get_position()
+    rows = [sheet.axes.get_position() for sheet in sheets[::2]]
+    sheets[0].bar.remove()
+    bars = [figure.add_axes((whole.x0, row.y0, whole.width, row.height)) for row in rows]
+    return [replace(sheet, bar=bars[at // 2]) for at, sheet in enumerate(sheets)]
+
+
+def _draw_sectors(sheet, sensors):
+    """Fill the horizontal field of view of each sensor: all that geometry alone says."""
+    entries = []
+    for at, sensor in enumerate(sensors):
+        style = {"facecolor": (sensor_colour(at), 0.3), "edgecolor": sensor_colour(at)}
+        # Infinity cannot be drawn; so far beyond the map all ranges look the same.
+        reach_m = min(sensor.range_m, 4 * math.hypot(*sheet.axes.get_xlim(), *sheet.axes.get_ylim()))
+        ends_deg = (sensor.yaw_deg + side * sensor.horizontal_fov_deg / 2 for side in (-1, 1))
+        sheet.axes.add_patch(Wedge((sensor.x_m, sensor.y_m), reach_m, *ends_deg, linewidth=1.0, **style))
+        entries.append(Patch(**style, label=f"field of view: {sensor.name}"))
+    return entries
+
+
+def _draw_histogram(sheet, per_step):
     empty = per_step == 0
     low, high = np.percentile(per_step[~empty], ROBUST_PERCENTILES) if not empty.all() else (1.0, 10.0)
     high = max(float(high), 1.01 * float(low))
