@@ -87,9 +87,9 @@ def record(
 
 
 def _with_a_bar(steps: range) -> Iterator[int]:
-    from torchcover.evaluation.progress import progress_of
+    from torchcover.evaluation.progress import Progress
 
-    with progress_of(steps.stop, "record", done=steps.start, shown=True) as bar:
+    with Progress(steps.stop, "record", done=steps.start, shown=True) as bar:
         for step in steps:
             yield step
             bar.advance(steps.stop)

@@ -15,7 +15,7 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from torchcover.evaluation.checkpoint import Journal
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.progress import ENDS, held_back, progress_of
+from torchcover.evaluation.progress import ENDS, Progress, held_back
 from torchcover.evaluation.ranks import Ranks
 from torchcover.files import end_with_parent
 from torchcover.frames import BadFrameError, Frame, FrameSource, worlds_of
@@ -148,7 +148,7 @@ def observe(
     run.reached = until is not None and run.steps > 0 and until.is_reached(run.steps)
     share = most if ranks is None else -(-most // ranks.size)
     try:
-        with _threads_beside(workers), progress_of(share, title, done=run.steps, shown=progress) as bar:
+        with _threads_beside(workers), Progress(share, title, done=run.steps, shown=progress) as bar:
             tasks = made_together(() if run.reached else todo, world_of if workers > 1 else int)
             for frame in _each(frames, tasks, workers, run, skip_bad_frames=skip_bad_frames):
                 if ranks:

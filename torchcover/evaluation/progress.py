@@ -4,9 +4,9 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from types import FrameType
-from typing import Protocol
+from typing import Self
 
 # Ctrl-C, a scheduler, and a terminal that is gone.
 ENDS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
@@ -16,8 +16,46 @@ TOGETHER_S = 1.0
 HELD_BACK = [*ENDS, *([signal.SIGCHLD] if hasattr(signal, "SIGCHLD") else [])]
 
 
-class Progress(Protocol):
-    """Is told of every step of a run; a context manager around it."""
+class Progress:
+    """Is told of every step of a run: a bar with steps a second, the worst error and the time that is left, or nothing.
+
+    A context manager around the run. The bar is on stderr, in a notebook below the cell.
+
+    Args:
+        steps: Steps that the run is thought to have.
+        title: What stands before it.
+        done: Steps that are done before.
+        shown: Whether anybody sees it.
+    """
+
+    def __init__(self, steps: int, title: str, *, done: int = 0, shown: bool) -> None:
+        self._rich = None
+        if not shown:
+            return
+        # rich takes 0.1 s to import, which nobody should wait for who wants no bar.
+        from rich import progress
+        from rich.console import Console
+
+        self._rich = progress.Progress(
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TextColumn("{task.fields[rate]}"),
+            progress.TextColumn("{task.fields[words]}", markup=False),
+            progress.TimeRemainingColumn(),
+            progress.TextColumn("left"),
+            console=Console(stderr=True),
+        )
+        self._task = self._rich.add_task(title, total=steps, completed=done, rate="", words="")
+
+    def __enter__(self) -> Self:
+        if self._rich:
+            self._rich.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._rich:
+            self._rich.stop()
 
     def advance(self, expected_steps: int, words: str = "") -> None:
         """A step is done.
@@ -26,66 +64,11 @@ class Progress(Protocol):
             expected_steps: Steps that the run is thought to have in all.
             words: How good its numbers are, if anybody looks.
         """
-        ...
-
-
-class Silence:
-    """Tells nobody."""
-
-    def advance(self, expected_steps: int, words: str = "") -> None:
-        """Nothing."""
-
-
-class Bar:
-    """A bar with the steps done, steps a second, the worst error, and the time that is left; on stderr.
-
-    Args:
-        steps: Steps that the run is thought to have.
-        title: What stands before it.
-        done: Steps that are done before.
-    """
-
-    def __init__(self, steps: int, title: str, done: int) -> None:
-        # rich takes 0.1 s to import, which nobody should wait for who wants no bar.
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-        from rich.progress import Progress as RichProgress
-
-        self.rich = RichProgress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[rate]}"),
-            TextColumn("{task.fields[words]}", markup=False),
-            TimeRemainingColumn(),
-            TextColumn("left"),
-            console=Console(stderr=True),
-        )
-        self._task = self.rich.add_task(title, total=steps, completed=done, rate="", words="")
-
-    def advance(self, expected_steps: int, words: str = "") -> None:
-        """Move on by a step."""
-        self.rich.advance(self._task)
-        speed = self.rich.tasks[0].speed
-        rate = f"{speed:.2f} steps/s" if speed else ""
-        self.rich.update(self._task, total=expected_steps, rate=rate, words=words)
-
-
-def progress_of(steps: int, title: str, *, done: int = 0, shown: bool) -> AbstractContextManager[Progress]:
-    """A bar on stderr (in a notebook: below the cell), or nothing."""
-    return _bar(steps, title, done) if shown else _silence()
-
-
-@contextmanager
-def _silence() -> Iterator[Progress]:
-    yield Silence()
-
-
-@contextmanager
-def _bar(steps: int, title: str, done: int) -> Iterator[Progress]:
-    bar = Bar(steps, title, done)
-    with bar.rich:
-        yield bar
+        if self._rich:
+            self._rich.advance(self._task)
+            speed = self._rich.tasks[0].speed
+            rate = f"{speed:.2f} steps/s" if speed else ""
+            self._rich.update(self._task, total=expected_steps, rate=rate, words=words)
 
 
 @contextmanager

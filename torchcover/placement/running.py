@@ -14,7 +14,7 @@ import torch
 from torchcover.evaluation import Checkpoint
 from torchcover.evaluation.checkpoint import Journal
 from torchcover.evaluation.pipeline import Run
-from torchcover.evaluation.progress import held_back, progress_of
+from torchcover.evaluation.progress import Progress, held_back
 from torchcover.files import BadFileError, claimed
 from torchcover.placement.evaluation import OPTIMISER, RANDOM
 from torchcover.placement.fresh import amount, fresh_test
@@ -73,7 +73,7 @@ def _run(search: PlacementSearch, out: Path | None, resume: bool, progress: bool
         search.evaluate(start)
     budget = _Budget(search, clock, began - earlier_s, build_s)
     budget.check()
-    with progress_of(budget.expected, search.space.name, done=len(search.evaluations), shown=progress) as bar:
+    with Progress(budget.expected, search.space.name, done=len(search.evaluations), shown=progress) as bar:
         _spend(search, budget, journal, bar.advance)
     picks, untested = _tested(search, _picks(search))
     return SearchResult(search, picks, untested, clock() - began + earlier_s)
