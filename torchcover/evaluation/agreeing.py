@@ -1,14 +1,12 @@
 """Whether metrics rank published sensor placements as the detectors that were trained on them do."""
 
-import csv
-import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from torchcover.evaluation.placement_scores import PlacementScores, score_placements
-from torchcover.files import Publication
+from torchcover.files import Publication, csv_text
 from torchcover.published import Agreement, Judged, Ranked, Relation, agreement_of, read_results
 from torchcover.published.agreement import kind_of
 from torchcover.simulation import Scenario, builtin_folder, builtin_names
@@ -91,8 +89,8 @@ class AgreementStudy:
         """
         scores = [(one.name, kind_of(one), *map(_known, one.gains.tolist())) for one in self.scores.rankings]
         with Publication(Path(folder)) as files:
-            files.add_text("agreement.csv", _csv([COLUMNS, *self.rows]))
-            files.add_text("scores.csv", _csv([("metric", "kind", *self.scores.rigs), *scores]))
+            files.add_text("agreement.csv", csv_text([COLUMNS, *self.rows]))
+            files.add_text("scores.csv", csv_text([("metric", "kind", *self.scores.rigs), *scores]))
             files.publish(self.record)
         return files.paths
 
@@ -188,9 +186,3 @@ def _over(row: Ranked) -> str:
 
 def _known(value: float) -> float | None:
     return None if math.isnan(value) else value
-
-
-def _csv(rows: Sequence[Sequence[object]]) -> str:
-    text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
-    return text.getvalue()

@@ -1,7 +1,7 @@
 """What the system gives: the door of all readers, its error, files that are whole, NumPy's, tables, processes."""
 
 from torchcover.files.bad_file import BadFileError, TooLargeError, check_memory, decode, naming, read_short_text, reads
-from torchcover.files.csv_tables import read_csv
+from torchcover.files.csv_tables import csv_text, read_csv
 from torchcover.files.feather import read_feather
 from torchcover.files.json_tables import read_json_table
 from torchcover.files.numpy_files import DEFLATE_MAX_RATIO, NpyHeader, npz_headers, read_npy, read_npz, write_npz
@@ -30,6 +30,7 @@ __all__ = [
     "as_yaml",
     "check_memory",
     "claimed",
+    "csv_text",
     "decode",
     "end_with_parent",
     "feed_xml",

@@ -1,7 +1,8 @@
 """Tables in CSV: poses of frames, boxes of objects."""
 
 import csv
-from collections.abc import Iterator, Sequence
+import io
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -53,6 +54,13 @@ def read_csv(
         {name: _finite(name, columns[name], lines) for name in (*numbers, *(optional or ())) if name in columns},
         {name: [word.strip() for word in columns[name]] for name in words},
     )
+
+
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Rows as CSV; an empty field for None and NaN, infinity is `inf`."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(["" if value != value else value for value in row] for row in rows)
+    return text.getvalue()
 
 
 def _rows(text: str) -> Iterator[tuple[int, list[str]]]:

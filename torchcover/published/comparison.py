@@ -1,10 +1,8 @@
 """Metrics side by side: which rig each thinks best, how alike their orders are, and both in tables and files."""
 
-import csv
-import io
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any, NamedTuple
@@ -13,6 +11,7 @@ import numpy as np
 from rich.table import Table
 
 from torchcover.estimation import Number
+from torchcover.files import csv_text
 from torchcover.published.ranks import LEAST, Ranking, kendall_tau_b
 from torchcover.published.s_mig import unequal_rays
 from torchcover.report import PageTable, Words, json_record, number_words, shown_unit, text_table
@@ -138,12 +137,13 @@ def record(comparison: MetricComparison) -> dict[str, Any]:
 def numbers_csv(comparison: MetricComparison) -> str:
     """A line for each rig and number; an unknown one is an empty field, parameters are JSON."""
     rows = _number_records(comparison)
-    return _csv(COLUMNS, ({**row, "parameters": json.dumps(row["parameters"], sort_keys=True)} for row in rows))
+    records = ({**row, "parameters": json.dumps(row["parameters"], sort_keys=True)} for row in rows)
+    return csv_text([COLUMNS, *([record[name] for name in COLUMNS] for record in records)])
 
 
 def tau_csv(comparison: MetricComparison) -> str:
     """A line for each pair of numbers."""
-    return _csv(Tau._fields, _tau_records(comparison))
+    return csv_text([Tau._fields, *(record.values() for record in _tau_records(comparison))])
 
 
 def _number_records(comparison: MetricComparison) -> list[dict[str, Any]]:
@@ -189,11 +189,3 @@ def _tau_words(tau: Tau) -> str:
         return "–"
     interval = "" if math.isnan(tau.low) else f" [{tau.low:+.2f}, {tau.high:+.2f}]"
     return f"{tau.tau:+.2f}{interval}"
-
-
-def _csv(columns: Sequence[str], rows: Iterable[Mapping[str, object]]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({name: "" if value is None else value for name, value in row.items()} for row in rows)
-    return text.getvalue()
