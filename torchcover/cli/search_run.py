@@ -86,6 +86,7 @@ def _chosen(path: Path, out: Path, *, resume: bool, **settings: Any) -> SensorCh
         seed=plan.seed,
         rays=plan.rays,
         estimate=plan.estimate,
+        sensor_model=plan.sensor_model,
         workers=plan.workers,
     ) as instants:
         return choose(space, instants, test_seed=plan.seed_of_test, fresh_worlds=plan.fresh_worlds)

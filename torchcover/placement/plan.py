@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from torchcover import __version__
 from torchcover.coverage import Measure
@@ -30,6 +30,7 @@ def common_instants(space: SearchSpace, plan: "SearchPlan", seed: int, worlds: i
         seed=seed,
         rays=plan.rays,
         estimate=plan.estimate,
+        sensor_model=plan.sensor_model,
         workers=plan.workers,
     )
 
@@ -45,6 +46,7 @@ class SearchPlan:
         seed: Of the worlds that candidates are scored in, and of all that is drawn.
         test_seed: Of the fresh worlds; not given, the next.
         estimate: What a score is: "area", the share of the visible surface, or "known", the mean of the known cells.
+        sensor_model: What sensors make of their hits, "ideal" or "real"; not given: real where that is known of them.
         worlds: Worlds of each scenario to search in.
         fresh_worlds: Worlds of each to test in.
         per_world: Instants of each world.
@@ -63,6 +65,7 @@ class SearchPlan:
     seed: int = 0
     test_seed: int | None = None
     estimate: Measure = "area"
+    sensor_model: Literal["ideal", "real"] | None = None
     worlds: int = WORLDS
     fresh_worlds: int = FRESH_WORLDS
     per_world: int = PER_WORLD
@@ -109,7 +112,11 @@ class SearchPlan:
         return name, OPTIMISERS[name]
 
     def settings(self, space: SearchSpace) -> dict[str, Any]:
-        """All that decides which candidates are asked for, for JSON."""
+        """All that decides which candidates are asked for, for JSON.
+
+        Raises:
+            ValueError: The sensor model is to be real, and of no sensor of the start that is known.
+        """
         content = {"space": space.content(), "scenarios": [scenario.content() for scenario in space.scenarios]}
         text = json.dumps(content, sort_keys=True, default=str)
         return {
@@ -118,6 +125,7 @@ class SearchPlan:
             "space_sha256": hashlib.sha256(text.encode()).hexdigest(),
             "optimiser": self.optimiser_in(space)[0],
             "estimate": self.estimate,
+            "sensor_model": space.start.sensing(self.sensor_model).sensor_model,
             "seed": self.seed,
             "worlds": self.worlds,
             "per_world": self.per_world,
