@@ -13,6 +13,7 @@ from torchcover.placement.common_instants import EVERY_S, MEASURES, PER_WORLD, R
 from torchcover.placement.optimisers import AUTO, OPTIMISERS, MakesOptimiser, optimiser_for
 from torchcover.placement.space import SearchSpace
 from torchcover.placement.variables import FreeChoice
+from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
 
 FRESH_WORLDS = 16
 
@@ -119,6 +120,7 @@ class SearchPlan:
             "space_sha256": hashlib.sha256(text.encode()).hexdigest(),
             "optimiser": self.optimiser_in(space)[0],
             "estimate": self.estimate,
+            "band_frame": DEFAULT_BAND_FRAME,
             "seed": self.seed,
             "worlds": self.worlds,
             "per_world": self.per_world,
