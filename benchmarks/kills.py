@@ -58,7 +58,7 @@ RESULTS = {
     "targets": ("targets", "rig.yaml", "--raster", "3,5,-1,1,1"),
     "search": ("search", "space.yaml", "--evaluations", "2"),
     "search, a choice": ("search", "choice.yaml", "--rays", "256", "--per-world", "1"),
-    "study": ("study", "rig.yaml", *WORLD, "--rays", "64", "--steps", "2", "--long-run-steps", "8"),
+    "study": ("study", "rig.yaml", *WORLD, "--rays", "64", "--rays", "32", "--steps", "8"),
     "agree": ("agree", "place3d2024", "--scenario", "courtyard", "--metrics", "point_density", "--steps", "1"),
 }
 RECORDINGS = {

@@ -45,5 +45,5 @@ def test_quoted_tables_are_those_of_their_pages():
 
 def test_every_picture_is_made_by_a_page():
     pages = [page.read_text(encoding="utf-8") for page in (DOCS / "measured").glob("*.md")]
-    made = {name for text in pages for name in re.findall(r"docs/images/(\S+\.png)$", text, re.MULTILINE)}
+    made = {name for text in pages for name in re.findall(r"docs/images/(\S+\.png)", text)}
     assert made == {path.name for path in (DOCS / "images").glob("*.png")}

@@ -7,7 +7,7 @@ import pytest
 from benchmarks.good_files import kinds
 from benchmarks.mutated_files import attempt, mutated
 
-PARTS, FILES = 8, 270
+PARTS, FILES = 4, 270
 
 
 @pytest.fixture(scope="module")

@@ -7,15 +7,24 @@ import pytest
 from torchcover.evaluation import compare, evaluate
 
 
+@pytest.fixture(scope="module")
+def measured():
+    """What was measured by a test before, by its settings."""
+    return {}
+
+
 @pytest.fixture
-def saved(worlds):
+def saved(worlds, measured):
     """Evaluate a rig of the yard, and give its coverage file."""
 
     def run(rig, **changes):
         settings = {"steps": 16, "cell_m": 4.0, "thresholds_m": (2.0,), "rays": 1024, **changes}
+        key = rig, *settings.items()
+        if key not in measured:
+            measured[key] = evaluate(worlds / f"{rig}.yaml", worlds / "yard.yaml", **settings).coverage
         file = worlds / rig / "coverage.npz"
         file.parent.mkdir()
-        evaluate(worlds / f"{rig}.yaml", worlds / "yard.yaml", **settings).coverage.save(file)
+        measured[key].save(file)
         return file
 
     return run

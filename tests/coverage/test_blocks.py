@@ -329,7 +329,7 @@ def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
 
 
 @pytest.mark.parametrize(
-    ("index", "message"), [(-1, "a number from 0 to .*; got -1"), ([0, 1], "2 places in time for 1 reference clouds")]
+    ("index", "message"), [(-1, "a number from 0 to .*; got -1"), ([0, 1], "2 places in time and 1 errors for 1 reference clouds")]
 )
 def test_numbers_of_steps_that_make_no_sense_are_refused(index, message):
     with pytest.raises(ValueError, match=message):
@@ -406,7 +406,7 @@ def test_bad_weights_are_refused_and_nothing_is_counted(weights, message):
     metric = CoverageMetric(GRID)
     with pytest.raises(ValueError, match=rf"weights\[0\]: .*{message}"):
         metric.update(*clouds_of({0: [0.5, 0.5]}), weights=torch.tensor(weights))
-    with pytest.raises(ValueError, match="2 weights, 1 heights and 1 places in time for 1 reference clouds"):
+    with pytest.raises(ValueError, match="2 weights, 1 heights, 1 places in time and 1 errors for 1 reference clouds"):
         metric.update(*clouds_of({0: [0.5]}), weights=[torch.ones(1), torch.ones(1)])
     assert int(metric.steps) == 0
 

@@ -244,14 +244,7 @@ def test_an_error_of_another_text_has_no_frame():
 
 @pytest.mark.parametrize("workers", [0, 1])
 def test_a_caller_skips_bad_frames_with_and_without_workers(tmp_path, workers):
-    # spawn: everything travels by pickle, and no threads are forked.
-    loader = DataLoader(
-        spoiled(tmp_path),
-        batch_size=1,
-        collate_fn=collate_frames,
-        num_workers=workers,
-        multiprocessing_context="spawn" if workers else None,
-    )
+    loader = DataLoader(spoiled(tmp_path), batch_size=1, collate_fn=collate_frames, num_workers=workers)
     batches, seen, skipped = iter(loader), [], []
     while True:
         try:

@@ -196,10 +196,10 @@ def test_an_ego_below_the_ground_is_an_error():
 @pytest.mark.parametrize("name", ["urban", "highway", "parking"])
 def test_traffic_plays_the_same_in_any_order_and_starts_anew_at_its_end(name):
     short = Scenario.model_validate({"name": name, "traffic": {"type": name, "duration_s": 1.0, "time_step_s": 0.5}})
-    made = SimulatedFrames(short, lidar(), steps=7, seed=1, reference_sensor=SMALL)
-    in_order = [made[index] for index in range(7)]
-    again = SimulatedFrames(short, lidar(), steps=7, seed=1, reference_sensor=SMALL)
-    assert all(same(in_order[index], again[index]) for index in (6, 2, 5, 0))
+    made = SimulatedFrames(short, lidar(), steps=5, seed=1, reference_sensor=SMALL)
+    in_order = [made[index] for index in range(5)]
+    again = SimulatedFrames(short, lidar(), steps=5, seed=1, reference_sensor=SMALL)
+    assert all(same(in_order[index], again[index]) for index in (4, 2, 3, 0))
     assert not torch.equal(in_order[0].sensor, in_order[3].sensor)
     other = SimulatedFrames(short, lidar(), steps=1, seed=2, reference_sensor=SMALL)[0]
     assert not torch.equal(in_order[0].sensor, other.sensor)

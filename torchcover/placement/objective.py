@@ -4,6 +4,7 @@ import re
 import warnings
 from collections.abc import Mapping
 from difflib import get_close_matches
+from functools import cache
 from typing import Annotated, Self
 
 from pydantic import Field, NonNegativeFloat, model_validator
@@ -21,12 +22,13 @@ THRESHOLD_M = 0.4
 CHOSEN = re.compile(r"(radius_m|(detection|sensors|seen_by_two)_[\d.]+m)(_without_|$)")
 
 
-def published_numbers() -> list[str]:
+@cache
+def published_numbers() -> tuple[str, ...]:
     """Those of published metrics that may be objectives, of any rig."""
     setup = Setup(sensors=Rig.load("front_roof_32").sensors)
     with warnings.catch_warnings(action="ignore"):  # that they were fed with nothing
         numbers = {name: each.make(setup).estimate().quantities for name, each in PUBLISHED.items()}
-    return [one.key for name, each in numbers.items() for one in each if one.key.startswith(name)]
+    return tuple(one.key for name, each in numbers.items() for one in each if one.key.startswith(name))
 
 
 class Objective(Document):

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 TOUCHING_M = 1e-3
 BENT = ("urban", "narrow", "winding")
-CASES = [(kind, seed) for kind in ("urban", "highway", "parking") for seed in (0, 1, 2)] + [
+CASES = [(kind, seed) for kind in ("urban", "highway", "parking") for seed in (0, 1)] + [
     ("narrow", 0),
     ("winding", 0),
     ("winding", 1),
@@ -140,7 +140,7 @@ def test_who_moves_does_not_interpenetrate(kind, seed, world):
     w = world(kind, seed)
     static = at_rest(w, kind in BENT)
     everybody = (w.ego, *w.actors)
-    times_s = w.ego.trajectory.times_s[::3]
+    times_s = w.ego.trajectory.times_s[::5]
     movers = Movers(everybody, times_s)
     for number, time_s in enumerate(times_s):
         moving, who = movers.at(number)
