@@ -8,6 +8,7 @@ from typing import Any, cast
 
 from torchcover import __version__
 from torchcover.coverage import Measure
+from torchcover.placement.choice_space import ChoiceSpace
 from torchcover.placement.common_instants import EVERY_S, MEASURES, PER_WORLD, RAYS, WORLDS, CommonInstants
 from torchcover.placement.optimisers import AUTO, OPTIMISERS, MakesOptimiser, optimiser_for
 from torchcover.placement.space import SearchSpace
@@ -19,7 +20,7 @@ FRESH_WORLDS = 16
 MakesInstants = Callable[[SearchSpace, "SearchPlan", int, int], CommonInstants]
 
 
-def common_instants(space: SearchSpace, plan: "SearchPlan", seed: int, worlds: int) -> CommonInstants:
+def common_instants(space: SearchSpace | ChoiceSpace, plan: "SearchPlan", seed: int, worlds: int) -> CommonInstants:
     """Instants of the worlds of a seed."""
     return CommonInstants(
         space.scenarios,
