@@ -19,9 +19,9 @@ from torchcover.simulation import Rig
 
 def with_boards(study):
     """The study with the share of cells hit of boards at several distances, which is the same in all worlds."""
-    boards = []
+    boards, rigs = [], [Rig.load(rig) for rig in study.scores.rigs]
     for distance_m in DISTANCES_M:
-        shares = [float(cells_hit(Rig.load(rig).sensors, distance_m).mean()) for rig in study.scores.rigs]
+        shares = [float(cells_hit(rig.sensors, distance_m).mean()) for rig in rigs]
         name = f"lob_{distance_m:g}m"
         boards.append(Ranking.of_values(Quantity(name, name, "share", lower_is_better=False), shares, "lob"))
     scores = replace(study.scores, rankings=(*study.scores.rankings, *boards))

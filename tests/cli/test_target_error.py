@@ -68,7 +68,7 @@ def test_compare_stops_when_rigs_and_differences_are_good_enough(torchcover, wor
     rigs = [worlds / "low.yaml", worlds / "both.yaml"]
     code, printed, _ = torchcover("compare", *rigs, *options, "--target-error", "50m")
     assert code == 0
-    assert "Target error reached after 71 steps." in printed
+    assert "Target error reached after 67 steps." in printed
     assert "Difference to low: mean blind spot radius (m)" in printed
     target = json.loads((worlds / "out" / "summary.json").read_text())["target_error"]
     assert {number["rig"] for number in target["numbers"]} == {"low", "both", "both minus low"}

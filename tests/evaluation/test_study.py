@@ -33,7 +33,7 @@ def trial(a, seconds=64.0, bias=0.0, options="", least=64):
     error = ErrorModel(a, bias)
     other = Studied("3m", "ground", False, DETECTION, 0.5, ErrorModel(9.0), None, False)
     own = Studied("20m", "ground", True, DETECTION, 0.5, error, None, False)
-    return Trial(options, 64, least, seconds, 1.0, seconds, [own, other])
+    return Trial(options, 64, least, seconds, 1.0, seconds, "ground", [own, other])
 
 
 @pytest.mark.parametrize("a", [0.01, 0.36, 25.0])
@@ -93,7 +93,9 @@ def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
     biased = Study(plan, [trial(0.04), trial(0.04, 1.0, bias=0.02, options="--rays=64")], 1.0)
     assert biased.recommended(0.01)[0].options == ""
     assert Study(plan, [trial(math.nan)], 1.0).recommended(0.01) is None
-    assert "not reached, or not known" in Study(plan, [trial(math.nan)], 1.0).advice(0.01)
+    assert Study(plan, [trial(math.nan)], 1.0).advice(0.01) == (
+        "For 1 percentage point of every detection: not known, for 64 steps say no error of 20m ground."
+    )
     assert Study(plan, [trial(0.04)], 1.0).advice(0.01) == (
         "For 1 percentage point of every detection: front_roof_32 --scenario=courtyard --cell-m=4.0 --rays=256 "
         "--steps=400 (401 s)."
@@ -112,6 +114,7 @@ def test_records_are_json_without_nan_and_the_files_are_written(study, tmp_path)
     assert [path.name for path in paths] == ["work_precision.png", "summary.json"]
     record = json.loads(json.dumps(study.record, allow_nan=False))
     assert [one["options"] for one in record["trials"]] == ["", "--rays=64", "--reference=paper --rays=1024"]
+    assert [one["band_frame"] for one in record["trials"]] == ["ground", "ground", "vehicle"]
     assert [one["error"] for one in record["recommended"]] == [0.02, 0.01, 0.005]
 
 

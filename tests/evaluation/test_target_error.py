@@ -164,6 +164,14 @@ def test_what_was_not_reached_is_told_for_each_region_with_the_steps_it_would_ta
     json.dumps(record, allow_nan=False)
 
 
+def test_what_all_steps_say_alike_is_not_waited_for_and_named():
+    _, lines = outcome(TargetError(detection=0.5), {"a": filled(64).compute()}, REGIONS, confirmed=True)
+    assert [line for line in lines if "say the same" in line] == [
+        "Not waited for, as all steps say the same, which proves nothing: far all, detection_0.4m of a; "
+        "far all, detection_0.8m of a."
+    ]
+
+
 def test_without_an_error_no_number_of_steps_is_made_up():
     record, lines = outcome(TargetError(radius_m=0.01), {"a": filled(5).compute()}, REGIONS, confirmed=False)
     assert record["steps_needed"] is None

@@ -71,6 +71,15 @@ def test_files_have_both_measures_each_under_its_name():
     assert (nothing["radius_m"], nothing["known_radius_m"]) == (None, None)
 
 
+@pytest.mark.parametrize("band_frame", ["ground", "vehicle"])
+def test_every_row_of_a_file_names_what_its_band_is_over(band_frame):
+    grid = BevGrid(x=(0.0, 4.0), y=(0.0, 2.0), cell=1.0, band_frame=band_frame)
+    metric, point = CoverageMetric(grid), torch.tensor([[0.5, 0.5, 0.0]])
+    metric.update(point, point, height=torch.zeros(1) if band_frame == "ground" else None)
+    table = CoverageTable.of({"rig": metric.compute()}, [Region("all", grid.x, grid.y)])
+    assert {row["band_frame"] for row in csv.DictReader(io.StringIO(RENDERERS["csv"](table)))} == {band_frame}
+
+
 def test_records_are_those_of_the_summary(table, surface_pair, regions):
     rows = [row for coverage in surface_pair.values() for row in coverage.summary(regions)]
     for record, row in zip(records(table), rows, strict=True):

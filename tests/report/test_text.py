@@ -129,6 +129,17 @@ def test_every_number_has_its_interval_with_the_digits_of_its_error():
     assert "In brackets: 95 % intervals, from 16 blocks of up to 4 steps in a row." in text_of(coverage, NEAR)
 
 
+@pytest.mark.parametrize("differ", [False, True])
+def test_brackets_are_explained_where_there_are_any(differ):
+    coverage, place = metric(blocks=16), torch.tensor([[0.5, 0.5, 0.0]])
+    for index in range(16):
+        radius_m = torch.tensor([0.0, 0.0, 0.1 + 0.05 * index * differ])
+        coverage.update(place - radius_m, place, place_in_time=index)
+    text = text_of(coverage.compute(), NEAR)
+    assert ("[" in text, "In brackets: 95 % intervals, from 16 blocks of a step." in text) == (differ, differ)
+    assert ("In brackets" in text) == differ
+
+
 def test_a_region_that_one_block_alone_has_probed_has_a_number_without_error():
     coverage = metric(blocks=16)
     for index in range(16):

@@ -11,7 +11,6 @@ from torchcover.cli.printing import in_words, print_files, print_whole
 from torchcover.files import SUMMARY, claimed
 from torchcover.placement import (
     ChoiceSpace,
-    CommonInstants,
     PlacementSearch,
     SearchPlan,
     SearchResult,
@@ -20,7 +19,7 @@ from torchcover.placement import (
     choose,
     run_search,
 )
-from torchcover.placement.choosing import OBJECTIVE
+from torchcover.placement.plan import common_instants
 from torchcover.placement.running import CHECKPOINT
 from torchcover.simulation.documents import read_mapping
 
@@ -77,16 +76,5 @@ def _chosen(path: Path, out: Path, *, resume: bool, **settings: Any) -> SensorCh
     if useless := [option for option, given in asked.items() if given]:
         raise ValueError(f"{', '.join(useless)}: the {CHOICE_KEY} of this file are all looked at; leave it out")
     space, plan = ChoiceSpace.load(path), SearchPlan(**settings | {"budget_s": math.inf})
-    with CommonInstants(
-        space.scenarios,
-        {OBJECTIVE: space.objective},
-        worlds=plan.worlds,
-        per_world=plan.per_world,
-        every_s=plan.every_s,
-        seed=plan.seed,
-        rays=plan.rays,
-        estimate=plan.estimate,
-        sensor_model=plan.sensor_model,
-        workers=plan.workers,
-    ) as instants:
+    with common_instants(space, plan, plan.seed, plan.worlds) as instants:
         return choose(space, instants, test_seed=plan.seed_of_test, fresh_worlds=plan.fresh_worlds)

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
+from torchcover.coverage.grid import BandFrame
 from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, ErrorModel, Estimate, Quantity
 from torchcover.evaluation.measuring import measured
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, OPTIONS, Settings
@@ -132,6 +133,7 @@ class Trial:
         seconds: What they took.
         measuring_s: That part of it that went into the search and the sums.
         processor_s: What it took of all processors, those of workers too.
+        band_frame: What the bands are over.
         numbers: Of all regions and bands.
     """
 
@@ -141,6 +143,7 @@ class Trial:
     seconds: float
     measuring_s: float
     processor_s: float
+    band_frame: BandFrame
     numbers: Sequence[Studied]
 
     def of(self, unit: str) -> list[Studied]:
@@ -233,8 +236,10 @@ class Study:
         """The options of `evaluate` that reach an error."""
         found = self.recommended(error)
         if found is None:
-            after = f"{self.trials[0].steps:,} steps"
-            return f"For {_points(error)} of every detection: not reached, or not known from {after}."
+            first = self.trials[0]
+            unknown = [f"{one.region} {one.height}" for one in first.of("share") if math.isnan(one.error.a)]
+            why = f"not known, for {first.steps:,} steps say no error of {', '.join(unknown) or 'any'}"
+            return f"For {_points(error)} of every detection: {why}."
         trial, steps = found
         options = " ".join([*self.plan.command[1:], *([trial.options] if trial.options else []), f"--steps={steps}"])
         return f"For {_points(error)} of every detection: {options} ({trial.seconds_for(steps, self.start_s):.0f} s)."
@@ -308,7 +313,7 @@ def _record(trial: Trial) -> dict[str, Any]:
         told = {name: difference.get(name, math.nan) for name in ("value", "error", "p")}
         own = {"region": one.region, "height": one.height, "quantity": one.quantity.key, "value": one.value}
         numbers.append(json_record({**own, "a": one.error.a, "bias": one.error.bias, "difference": json_record(told)}))
-    names = ("options", "steps", "least_steps", "seconds", "measuring_s", "processor_s")
+    names = ("options", "steps", "least_steps", "seconds", "measuring_s", "processor_s", "band_frame")
     return {**{name: getattr(trial, name) for name in names}, "numbers": numbers}
 
 
@@ -370,7 +375,7 @@ def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Tr
             numbers.append(Studied(*place, quantity, value, ErrorModel(own, bias), difference, is_biased))
     least = max(MIN_STEPS, math.ceil(MIN_BLOCKS * steps / worlds) if worlds > 0 else steps)
     times = result.run.seconds, result.run.measuring_s, processor_s
-    return Trial(options, steps, least, *times, numbers), coverage
+    return Trial(options, steps, least, *times, coverage.band_frame, numbers), coverage
 
 
 def _known(errors: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ from itertools import groupby
 from typing import Any
 
 from torchcover.coverage import Coverage, Region
-from torchcover.estimation import ErrorModel
+from torchcover.estimation import ROUND_OFF, ErrorModel
 from torchcover.evaluation.observers import Observer
 from torchcover.report import json_record
 
@@ -238,6 +238,8 @@ def outcome(
     lines = _lines(found, first.counts["steps"], confirmed=confirmed)
     if blank:
         lines.append(f"Not waited for, as no cell of it is known: {', '.join(blank)}.")
+    if alike := [f"{one.region} {one.height}, {one.quantity} of {one.rig}" for one in found if one.error <= ROUND_OFF]:
+        lines.append(f"Not waited for, as all steps say the same, which proves nothing: {'; '.join(alike)}.")
     return {**_record(target, found), "reached": confirmed, "unknown": blank}, lines
 
 

@@ -203,7 +203,7 @@ class ChoiceSpace(VehicleSpace):
             raise ValueError(f"now: {', '.join(unknown)}: no candidate; they are {', '.join(candidates[:20])}")
         if twice := [name for name, count in now.items() if count > 1]:
             raise ValueError(f"now: {twice[0]} is there once at most; it is named twice")
-        questions = Questions.around(self.carrier.outline_m, {"objective": self.objective})
+        questions = Questions.around(self.carrier.outline_m, self.objectives)
         if not self.objective.key.startswith("detection_") or "_without_" in self.objective.key:
             wanted = f"a detection, as in detection: 0.4; got {self.objective.key!r}"
             raise ValueError(f"objective: candidates are chosen by {wanted}")
@@ -228,6 +228,11 @@ class ChoiceSpace(VehicleSpace):
     def first_rig(self) -> Rig | None:
         """Sensors that are there in any case."""
         return self.always
+
+    @property
+    def objectives(self) -> dict[str, Objective]:
+        """The only one, by the name that it has where a search has several."""
+        return {"objective": self.objective}
 
     @cached_property
     def sensors(self) -> tuple[Sensor, ...]:

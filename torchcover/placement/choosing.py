@@ -34,6 +34,7 @@ from torchcover.placement.subsets import (
 )
 from torchcover.report import ChoiceSize, PageTable, Words, draw_choice
 from torchcover.simulation import Rig, Sensor
+from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
 
 OBJECTIVE = "objective"
 # Random choices that keep to the limits, as a control.
@@ -145,6 +146,7 @@ class SensorChoice:
             "choice": self.space.name,
             "estimate": self.estimate,
             "sensor_model": self.sensor_model,
+            "band_frame": DEFAULT_BAND_FRAME,
             "best": {
                 "sensors": self.names(self.best.chosen),
                 "value": self.number.value,

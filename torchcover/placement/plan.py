@@ -8,10 +8,12 @@ from typing import Any, Literal, cast
 
 from torchcover import __version__
 from torchcover.coverage import Measure
+from torchcover.placement.choice_space import ChoiceSpace
 from torchcover.placement.common_instants import EVERY_S, MEASURES, PER_WORLD, RAYS, WORLDS, CommonInstants
 from torchcover.placement.optimisers import AUTO, OPTIMISERS, MakesOptimiser, optimiser_for
 from torchcover.placement.space import SearchSpace
 from torchcover.placement.variables import FreeChoice
+from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
 
 FRESH_WORLDS = 16
 
@@ -19,7 +21,7 @@ FRESH_WORLDS = 16
 MakesInstants = Callable[[SearchSpace, "SearchPlan", int, int], CommonInstants]
 
 
-def common_instants(space: SearchSpace, plan: "SearchPlan", seed: int, worlds: int) -> CommonInstants:
+def common_instants(space: SearchSpace | ChoiceSpace, plan: "SearchPlan", seed: int, worlds: int) -> CommonInstants:
     """Instants of the worlds of a seed."""
     return CommonInstants(
         space.scenarios,
@@ -126,6 +128,7 @@ class SearchPlan:
             "optimiser": self.optimiser_in(space)[0],
             "estimate": self.estimate,
             "sensor_model": space.start.sensing(self.sensor_model).sensor_model,
+            "band_frame": DEFAULT_BAND_FRAME,
             "seed": self.seed,
             "worlds": self.worlds,
             "per_world": self.per_world,

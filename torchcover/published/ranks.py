@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from itertools import permutations
 from typing import NamedTuple, TypeAlias
 
@@ -178,12 +179,16 @@ def spearman(first: ArrayLike, second: ArrayLike) -> Array:
     return _ratio((one * other).sum(axis=-1), spread, _known_in_both(first, second)[0])
 
 
+@lru_cache(maxsize=8)  # each metric asks for the same ones
 def orders(count: int, seed: int = 0) -> NDArray[np.int64]:
-    """(P, n) orders of n things: all of them up to n = 8, else as many as 8 have, drawn."""
+    """(P, n) orders of n things, to be read only: all of them up to n = 8, else as many as 8 have, drawn."""
     if math.factorial(count) <= MOST_TRIED:
-        return np.array(list(permutations(range(count))), dtype=np.int64)
-    generator = np.random.default_rng(seed)
-    return generator.permuted(np.tile(np.arange(count), (MOST_TRIED, 1)), axis=1)
+        found = np.array(list(permutations(range(count))), dtype=np.int64)
+    else:
+        drawn = np.tile(np.arange(count), (MOST_TRIED, 1))
+        found = np.random.default_rng(seed).permuted(drawn, axis=1)
+    found.setflags(write=False)
+    return found
 
 
 def permutation_p(first: ArrayLike, second: ArrayLike, statistic: Statistic = spearman, seed: int = 0) -> float:

@@ -78,7 +78,8 @@ def _on_errors(table: CoverageTable, rig: str) -> list[Remark]:
     means = [quantity.key for quantity in table.means]  # of a largest radius no error is ever known
     numbers = [[row.summary.numbers[key] for key in means] for row in table.rows[rig]]
     without = sum(any(math.isfinite(number.value) and math.isnan(number.low) for number in row) for row in numbers)
-    return [Remark("intervals", blocks, blocks), Remark("no_intervals", without, len(numbers))]
+    some = any(math.isfinite(number.low) for row in numbers for number in row)
+    return [Remark("intervals", blocks * some, blocks), Remark("no_intervals", without, len(numbers))]
 
 
 def notes_on(table: CoverageTable) -> list[str]:
@@ -115,8 +116,9 @@ def _too_few_blocks(remark: Remark, _: CoverageTable, __: str) -> str:
 
 
 def _intervals(remark: Remark, table: CoverageTable, rig: str) -> str:
-    steps = table.conditions[rig].steps_per_block
-    return f"In brackets: 95 % intervals, from {remark.count} blocks of up to {steps:,} steps in a row."
+    steps = table.conditions[rig].steps_per_block or 0
+    length = f"up to {steps:,} steps in a row" if steps > 1 else "a step"
+    return f"In brackets: 95 % intervals, from {remark.count} blocks of {length}."
 
 
 def _saturated(remark: Remark, table: CoverageTable, _: str) -> str:
@@ -151,7 +153,7 @@ SENTENCES: Mapping[RemarkName, Callable[[Remark, CoverageTable, str], str]] = Ma
         "saturated_points": _saturated,
         "outside_points": _outside,
         "no_ground_points": lambda remark, *_: (
-            f"{_some(remark)} reference points have no ground at or below them: in no band."
+            f"{_some(remark)} reference points have no known ground at or below them: in no band."
         ),
     }
 )

@@ -73,20 +73,17 @@ def draw_map(
             raise ValueError(
                 f"{name}: shape {grid.shape[1:]} is needed, as of a band of the grid; got {tuple(given.shape)}"
             )
-    array = as_array(values)
-    (sheet,) = lay_out(grid)
-    cells = draw_cells(sheet.axes, array, scale, opacity=None if opacity is None else as_array(opacity))
-    draw_colour_bar(sheet, cells, array, scale)
-    entries = cell_entries(array, unknown)
-    if opacity is not None:
-        entries.append(paler_entry())
-    if ego_outline_m is not None:
-        entries += draw_ego(sheet.axes, ego_outline_m)
-    entries += draw_sensors(sheet, sensors)
-    write_title(sheet.axes, title, subtitle)
-    write_legend(sheet.axes, entries, sheet.legend_columns)
-    fit_paper(sheet.figure)
-    return sheet.figure
+    return draw_side_by_side(
+        {"": values},
+        grid,
+        scale,
+        title=title,
+        subtitle=subtitle,
+        ego_outline_m=ego_outline_m,
+        sensors={"": sensors},
+        unknown=unknown,
+        opacity=None if opacity is None else {"": opacity},
+    )
 
 
 def draw_side_by_side(
@@ -105,7 +102,7 @@ def draw_side_by_side(
     """Draw several arrays over one grid, with one colour bar.
 
     Args:
-        values: (Y, X) numbers in the unit of `scale`, by their headings; as in `draw_map`.
+        values: (Y, X) numbers in the unit of `scale`, by their headings; as in `draw_map`, which has one of no words.
         grid: The cells.
         scale: What the colours of all of them mean.
         title: First line.
@@ -135,12 +132,13 @@ def draw_side_by_side(
     if opacity:
         entries.append(paler_entry())
     for sheet, name in zip(sheets, values, strict=True):
-        write_heading(sheet.axes, name)
+        if name:
+            write_heading(sheet.axes, name)
         if ego_outline_m is not None:
             entries += draw_ego(sheet.axes, ego_outline_m)
         own = (sensors or {}).get(name, ())
-        entries += draw_sensors(sheet, own, named=False) if directions else draw_places(sheet, own)
-    write_title(sheets[0].axes, title, subtitle, lift_points=HEADING_POINTS)
+        entries += draw_sensors(sheet, own, named=not name) if directions else draw_places(sheet, own)
+    write_title(sheets[0].axes, title, subtitle, lift_points=HEADING_POINTS if any(arrays) else 0.0)
     write_legend(lower_left(sheets), entries, sheets[0].legend_columns)
     fit_paper(sheets[0].figure)
     return sheets[0].figure

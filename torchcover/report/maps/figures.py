@@ -161,17 +161,16 @@ def _figures(coverages: Mapping[str, Coverage], setting: _Setting, *, errors: bo
     first, ego = next(iter(coverages.values())), setting.ego_outline_m
     bands, shown = _bands(first.grid), asked_and_known(first, ego)
     near = None if ego is None else near_field(first.grid, ego)
-    draw_rigs = _draw_one if len(coverages) == 1 else _draw_several
     for whole in map(setting.told, subjects_of(coverages)):
         subject = _within(whole, shown)
-        yield from draw_rigs(subject, shown.grid, bands, setting)
+        yield from _draw_rigs(subject, shown.grid, bands, setting)
         yield from _draw_differences(subject, shown.grid, bands, setting)
         if near is not None:
             around = _within(whole, near)
             own = scale_of(around.quantity, torch.stack(list(around.values.values())))
             yield _draw_near(replace(around, scale=own), near.grid, bands, setting)
     for whole in map(setting.told, error_subjects_of(coverages) if errors else ()):
-        yield from draw_rigs(_within(whole, shown), shown.grid, bands, setting)
+        yield from _draw_rigs(_within(whole, shown), shown.grid, bands, setting)
 
 
 def _within(subject: Subject, shown: Window) -> Subject:
@@ -184,35 +183,21 @@ def _bands(grid: BevGrid) -> list[_Band]:
     return [_Band(at, name, stem, span(grid, name)) for at, (name, stem) in enumerate(named)]
 
 
-def _draw_one(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[Named]:
-    ((rig, values),) = subject.values.items()
+def _draw_rigs(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[Named]:
+    """Rigs side by side; one alone has no heading."""
+    headings = {rig: rig if len(subject.values) > 1 else "" for rig in subject.values}
     for band in bands:
-        figure = draw_map(
-            values[band.number],
-            grid,
-            subject.scale,
-            title=f"{capitalised(subject.quantity.title)}, {band.name}",
-            subtitle=band.subtitle(subject),
-            ego_outline_m=setting.ego_outline_m,
-            sensors=setting.sensors.get(rig, ()),
-            unknown=subject.unknown,
-            opacity=band.opacity(subject),
-        )
-        yield f"{subject.quantity.key}_{band.stem}", figure
-
-
-def _draw_several(subject: Subject, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[Named]:
-    for band in bands:
+        opacity = band.opacity(subject)
         figure = draw_side_by_side(
-            {rig: values[band.number] for rig, values in subject.values.items()},
+            {headings[rig]: values[band.number] for rig, values in subject.values.items()},
             grid,
             subject.scale,
             title=f"{capitalised(subject.quantity.title)}, {band.name}",
             subtitle=band.subtitle(subject),
             ego_outline_m=setting.ego_outline_m,
-            sensors=setting.sensors,
+            sensors={heading: setting.sensors.get(rig, ()) for rig, heading in headings.items()},
             unknown=subject.unknown,
-            opacity=None if subject.opacity is None else dict.fromkeys(subject.values, subject.opacity[band.number]),
+            opacity=None if opacity is None else dict.fromkeys(headings.values(), opacity),
         )
         yield f"{subject.quantity.key}_{band.stem}", figure
 

@@ -64,6 +64,7 @@ COLUMNS = (
     Column("x_max_m", "where it ends", lambda _, row: row.region.x[1]),
     Column("y_min_m", "its right border", lambda _, row: row.region.y[0]),
     Column("y_max_m", "its left border", lambda _, row: row.region.y[1]),
+    Column("band_frame", "what the band is over: `ground` or `vehicle`", lambda table, _: table.grid.band_frame),
     Column("z_min_m", "where the band begins", lambda table, row: table.grid.heights[row.summary.height][0]),
     Column("z_max_m", "where it ends", lambda table, row: table.grid.heights[row.summary.height][1]),
 )
