@@ -65,6 +65,7 @@ def run(commands, root):
         "OMP_WAIT_POLICY": "passive",
         "COLUMNS": "120",
     }
+    (root / "out").mkdir(exist_ok=True)  # where the commands write
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(
         ["bash", "-euc", script], cwd=root, env=environment, stdout=subprocess.PIPE, text=True, check=True

@@ -12,6 +12,7 @@ def test_a_small_run_prints_ranks_and_what_they_are_worth(torchcover, tmp_path):
         assert words in text
     assert "No metric is validated by this" in text
     assert "cannot separate metrics" in text
+    assert "Sensor model: " in text
     assert "…" not in text
     assert {path.name for path in out.iterdir()} >= {"agreement.csv", "scores.csv", "summary.json"}
 

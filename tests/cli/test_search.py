@@ -36,7 +36,7 @@ def test_a_search_ends_with_what_was_gained_and_what_random_search_got(torchcove
     last = printed.splitlines()[-1]
     assert last.startswith("near: ")
     assert "Random search with the same budget" in last
-    assert last.endswith("of the instants.")
+    assert last.endswith("of the instants. Sensor model: ideal, every hit is a point.")
     assert "optimiser" in printed
     assert (out / "best.yaml").exists()
     code, again, _ = torchcover("search", space, "--evaluations", 12, "--out", out, "--seed", 3, "--resume")
@@ -53,6 +53,7 @@ def test_a_search_ends_with_what_was_gained_and_what_random_search_got(torchcove
         (("--budget", "1h", "--evaluations", "3"), "one of them; both are given"),
         (("--optimiser", "luck"), "one of auto, gp, cmaes, random, enumerate is needed; got 'luck'"),
         (("--test-seed", "0"), "the worlds would not be fresh"),
+        (("--evaluations", "3", "--sensor-model", "real"), "no LiDAR of the rig 'front_roof_32' has a range_at_10"),
         (("--budget", "0s"), "more than 0 s is needed; got 0"),
         (("--budget", "0.00001s"), "are less than one evaluation"),
     ],

@@ -329,7 +329,8 @@ def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
 
 
 @pytest.mark.parametrize(
-    ("index", "message"), [(-1, "a number from 0 to .*; got -1"), ([0, 1], "2 places in time and 1 errors for 1 reference clouds")]
+    ("index", "message"),
+    [(-1, "a number from 0 to .*; got -1"), ([0, 1], "2 places in time and 1 errors for 1 reference clouds")],
 )
 def test_numbers_of_steps_that_make_no_sense_are_refused(index, message):
     with pytest.raises(ValueError, match=message):

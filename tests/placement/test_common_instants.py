@@ -43,6 +43,15 @@ def test_another_rig_sees_what_it_would_see_in_frames_of_its_own(scenario):
     np.testing.assert_array_equal(other.step(3).clouds["first"], alone[3].sensor.numpy())
 
 
+def test_ideal_sensors_have_a_point_for_every_hit():
+    short = rig(lidar(range_at_10_percent_m=5.0))
+    ideal, real = held(worlds=1, sensor_model="ideal"), held(worlds=1)
+    points = [[len(frame.sensor) for frame in of.frames(short)] for of in (ideal, real)]
+    assert points[0] == [len(frame.sensor) for frame in real.frames(rig(name=short.name))]
+    assert points[1][0] < points[0][0]
+    assert ideal.anew(1, 1).sensor_model == "ideal"
+
+
 def test_numbers_are_those_of_evaluate_on_the_same_instants_to_the_last_bit():
     """By area and over known cells, in regions of several objectives, from frames that nobody has cut."""
     found = held(objectives=OBJECTIVES, worlds=4, per_world=2)

@@ -68,6 +68,7 @@ def test_there_is_a_row_for_every_evaluation_and_its_gain_is_the_difference_of_m
 def test_the_record_has_seeds_gains_and_what_was_saved(one):
     result, folder, _ = one
     record = json.loads((folder / "search.json").read_text())
+    assert record["band_frame"] == "ground"
     assert (record["seed"], record["test_seed"], record["optimiser"]) == (0, 1, "gp")
     assert record["share_of_instants_saved"] == result.search.share_saved
     gain = record["found"][0]["gains"]["near"]["area"]

@@ -179,6 +179,20 @@ def test_what_reflects_returns_from_farther():
     )
 
 
+def test_a_material_may_be_a_file_beside_the_scenario(tmp_path):
+    """It counts as what stands there: black returns nothing, and what else it is called makes no difference."""
+    of = []
+    for reflectivity in (0.0, "retroreflective", 0.0):
+        (tmp_path / "own.yaml").write_text(yaml.safe_dump({"name": "own", "reflectivity": reflectivity}))
+        ground = PLAIN["bodies"][0] | {"material": "own.yaml"}
+        (tmp_path / "scenario.yaml").write_text(yaml.safe_dump(PLAIN | {"bodies": [ground]}))
+        scenario = Scenario.load(tmp_path / "scenario.yaml")
+        of.append((len(seen(bodies=scenario.bodies).points), scenario.content()))
+    assert of[0] == of[2]
+    assert of[0][0] == 0 < of[1][0]
+    assert of[0][1] != of[1][1]
+
+
 def test_a_body_is_as_dark_all_over_and_always():
     """Of black cars, hardly one ray returns; and a step later it is the same cars."""
     bodies = [

@@ -55,6 +55,15 @@ def split_matrix(matrix: ArrayLike, name: str) -> tuple[float, float, float, flo
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])
 
 
+def split_projection(numbers: Matrix, name: str) -> tuple[tuple[float, float, float, float], Matrix]:
+    """fx, fy, cx, cy and `camera_T_rectified` of the 12 numbers of KITTI's P = K [I | t]: all cameras are parallel."""
+    P = numbers.reshape(3, 4)
+    intrinsics = split_matrix(P[:, :3], name)
+    if 0.0 in intrinsics[:2]:
+        raise ValueError(f"{name} has no focal length; got {P.tolist()}")
+    return intrinsics, rigid(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3]))
+
+
 def focal_from_fov(width: int, fov_deg: float) -> float:
     """Focal length in pixels of a pinhole with this horizontal field of view: W / (2 tan(fov / 2))."""
     if not 0.0 < fov_deg < 180.0:
@@ -170,12 +179,7 @@ def read_kitti(
     """
     lines = (line.split(":", 1) for line in read_short_text(path).splitlines() if ":" in line)
     table = {key.strip(): value.split() for key, value in lines}
-    P = numbers_of(table, f"P{camera}", 12).reshape(3, 4)
-    intrinsics = split_matrix(P[:, :3], f"P{camera}")
-    if 0.0 in intrinsics[:2]:
-        raise ValueError(f"P{camera} has no focal length; got {table[f'P{camera}']}")
-    # P = K [I | t]: the rectified cameras differ from each other by a translation only.
-    camera_T_rectified = rigid(np.eye(3), np.linalg.solve(P[:, :3], P[:, 3]))
+    intrinsics, camera_T_rectified = split_projection(numbers_of(table, f"P{camera}", 12), f"P{camera}")
     rotation = numbers_of(table, "R0_rect", 9).reshape(3, 3) if "R0_rect" in table else np.eye(3)
     lidar = numbers_of(table, "Tr_velo_to_cam" if "Tr_velo_to_cam" in table else "Tr", 12)
     reference_T_lidar = np.vstack([lidar.reshape(3, 4), [0.0, 0.0, 0.0, 1.0]])

@@ -223,6 +223,7 @@ def targets(
     raise typer.Exit(code)
 
 
+@with_options(of_evaluate("sensor_model"))
 def search(
     space: Annotated[Path, typer.Argument(help="YAML file of what is free, and of what a good rig is.")],
     budget: Annotated[
@@ -257,6 +258,7 @@ def search(
     ] = False,
     out: options.Out = Path("out/search"),
     files: options.Files = options.ALL_FILES,
+    **settings: Any,  # noqa: ANN401
 ) -> None:
     """Look for better places for sensors, compared with a random search, and test what was found in fresh worlds."""
     from torchcover.cli.search_run import run
@@ -264,7 +266,7 @@ def search(
     if budget is not None and evaluations is not None:
         raise ValueError("--budget, --evaluations: one of them; both are given")
     given = {"worlds": worlds, "fresh_worlds": fresh_worlds, "per_world": per_world, "every_s": every_s,
-             "rays": rays}  # fmt: skip
+             "rays": rays, **settings}  # fmt: skip
     run(
         space,
         out,
@@ -297,7 +299,7 @@ def parsed_budget(text: str) -> float:
     return float(match[1]) * UNITS_S[match[2]]
 
 
-@with_options(of_evaluate("seed", "every_s", "workers"))
+@with_options(of_evaluate("sensor_model", "seed", "every_s", "workers"))
 def agree(
     paper: Annotated[str, typer.Argument(help="Published placements: place3d2024.")],
     scenario: Annotated[str, typer.Option(help="Scenario: a built-in name or a YAML file.")] = "urban",

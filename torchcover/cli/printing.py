@@ -9,6 +9,7 @@ from rich.table import Table
 
 from torchcover.evaluation import AgreementStudy, Result, Study, relation, verdict
 from torchcover.evaluation.agreeing import NOTES
+from torchcover.evaluation.result import sensor_model_words
 from torchcover.evaluation.result_page import left_out_table
 from torchcover.evaluation.study import WANTED
 from torchcover.published.comparison import text_tables
@@ -88,6 +89,6 @@ def print_agreement(study: AgreementStudy, files: Sequence[Path], out: Path) -> 
     print_whole(tables)
     for truth in truths:
         console.print(verdict(truth, {one: study.found[truth, one] for one in readings}), markup=False, soft_wrap=True)
-    for note in NOTES:
+    for note in (*sensor_model_words(study.scores.sensor_models), *NOTES):
         console.print(note, markup=False, soft_wrap=True)
     print_files(files, out, console)

@@ -246,8 +246,8 @@ class Boxes:
     def _each(self, change: Callable[[Tensor], Tensor], **names: tuple[str, ...]) -> "Boxes":
         """With all tensors changed, and other names where their number changes."""
         tensors = ("centre_m", "size_m", "yaw_rad", "velocity_mps", "drawn_points", "bottom_heights_m")
-        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in tensors}
-        return replace(self, **changed, hits={rig: change(count) for rig, count in self.hits.items()}, **names)
+        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in tensors} | names
+        return replace(self, **changed, hits={rig: change(count) for rig, count in self.hits.items()})
 
 
 def check_boxes(boxes: object) -> None:

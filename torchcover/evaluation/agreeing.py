@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from torchcover.evaluation.placement_scores import PlacementScores, score_placements
 from torchcover.files import Publication, csv_text
@@ -53,6 +54,7 @@ class AgreementStudy:
             "scenario": self.scenario,
             "steps": self.scores.steps,
             "seed": self.seed,
+            "sensor_model": dict(self.scores.sensor_models),
             "notes": list(NOTES),
             "truths": [
                 {
@@ -103,6 +105,7 @@ def agree(
     steps: int = 64,
     seed: int = 0,
     every_s: float | None = None,
+    sensor_model: Literal["ideal", "real"] | None = None,
     workers: int = 0,
     progress: bool = False,
 ) -> AgreementStudy:
@@ -115,6 +118,7 @@ def agree(
         steps: Steps.
         seed: Seed of the traffic.
         every_s: Time between two steps in seconds; as in `evaluate` if not given.
+        sensor_model: What sensors make of their hits; as for `evaluate`.
         workers: Processes that make frames.
         progress: Whether to show a bar.
 
@@ -126,7 +130,15 @@ def agree(
         raise ValueError(f"{paper}: no published placements of this name; there is {PAPER}")
     rigs = {name: name for name in builtin_names("rigs") if name.startswith(f"{PAPER}_")}
     scores = score_placements(
-        rigs, scenario, metrics=metrics, steps=steps, seed=seed, every_s=every_s, workers=workers, progress=progress
+        rigs,
+        scenario,
+        metrics=metrics,
+        steps=steps,
+        seed=seed,
+        every_s=every_s,
+        sensor_model=sensor_model,
+        workers=workers,
+        progress=progress,
     )
     return AgreementStudy(agreements(scores), scores, str(getattr(scenario, "name", scenario)), seed)
 

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -41,11 +42,13 @@ class PlacementScores:
         rigs: Names of the placements.
         rankings: A row for each metric, with numbers in the order of `rigs`.
         steps: Steps that they were measured in.
+        sensor_models: Name of each placement -> what its sensors made of their hits, `ideal` or `real`.
     """
 
     rigs: tuple[str, ...]
     rankings: tuple[Ranking, ...]
     steps: int
+    sensor_models: Mapping[str, str]
 
     def of(self, rigs: Sequence[str]) -> tuple[Ranking, ...]:
         """The rows of some of the placements, in another order."""
@@ -62,6 +65,7 @@ def score_placements(
     steps: int = 64,
     seed: int = 0,
     every_s: float | None = None,
+    sensor_model: Literal["ideal", "real"] | None = None,
     workers: int = 0,
     progress: bool = False,
 ) -> PlacementScores:
@@ -79,6 +83,7 @@ def score_placements(
         steps: Steps.
         seed: Seed of the traffic.
         every_s: Time between two steps in seconds; as in `evaluate` if not given.
+        sensor_model: What sensors make of their hits; as for `evaluate`.
         workers: Processes that make frames.
         progress: Whether to show a bar.
 
@@ -94,7 +99,7 @@ def score_placements(
     """
     if len(rigs) < LEAST:
         raise ValueError(f"rigs: three or more are needed to speak of ranks; got {', '.join(rigs) or 'none'}")
-    carried = {name: loaded(rig).model_copy(update={"name": name}) for name, rig in rigs.items()}
+    carried = {name: loaded(rig).sensing(sensor_model).model_copy(update={"name": name}) for name, rig in rigs.items()}
     region = circle() if region is None else region
     result = evaluate(
         list(carried.values()),
@@ -120,6 +125,7 @@ def score_placements(
             _of_rigs("rays", "rays", map(_rays, carried.values())),
         ),
         steps=steps,
+        sensor_models={name: rig.sensor_model for name, rig in carried.items()},
     )
 
 

@@ -14,6 +14,7 @@ from torchcover import __version__
 from torchcover.coverage import Measure
 from torchcover.coverage.regions import Places
 from torchcover.estimation import Number
+from torchcover.evaluation.result import sensor_model_words
 from torchcover.evaluation.settings import FILES
 from torchcover.neighbors import nearest
 from torchcover.placement.choice_space import ChoiceSpace
@@ -33,6 +34,7 @@ from torchcover.placement.subsets import (
 )
 from torchcover.report import ChoiceSize, PageTable, Words, draw_choice
 from torchcover.simulation import Rig, Sensor
+from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
 
 OBJECTIVE = "objective"
 # Random choices that keep to the limits, as a control.
@@ -49,6 +51,7 @@ class SensorChoice:
     Args:
         space: What there was to choose from.
         estimate: What the choice is by.
+        sensor_model: What its sensors make of their hits, `ideal` or `real`.
         sensors: The candidates that can be mounted.
         refused: Name of each of the others, and why it cannot be.
         candidates: What each of `sensors` sees.
@@ -64,6 +67,7 @@ class SensorChoice:
 
     space: ChoiceSpace
     estimate: Measure
+    sensor_model: str
     sensors: tuple[Sensor, ...]
     refused: dict[str, str]
     candidates: Candidates
@@ -105,9 +109,10 @@ class SensorChoice:
         gap = self.best.upper_bound - self.best.value
         kind = "the best there is" if self.best.proven else f"at most {100 * gap:.2f} points below the best"
         found = f"{', '.join(self.names(self.best.chosen))}: {100 * self.number.value:.2f} %, {kind}"
+        (model,) = sensor_model_words({self.rig.name: self.sensor_model})
         if self.gain is None:
-            return f"{found}; not tested in fresh worlds: {self.untested}."
-        return f"{found}. Against {', '.join(self.names(self.now))}: {told(self.gain, optimism=True)}."
+            return f"{found}; not tested in fresh worlds: {self.untested}. {model}"
+        return f"{found}. Against {', '.join(self.names(self.now))}: {told(self.gain, optimism=True)}. {model}"
 
     @property
     def report(self) -> PlacementReport:
@@ -140,6 +145,8 @@ class SensorChoice:
             "torchcover": __version__,
             "choice": self.space.name,
             "estimate": self.estimate,
+            "sensor_model": self.sensor_model,
+            "band_frame": DEFAULT_BAND_FRAME,
             "best": {
                 "sensors": self.names(self.best.chosen),
                 "value": self.number.value,
@@ -219,7 +226,8 @@ def choose(
         fresh_worlds: How many.
 
     Raises:
-        ValueError: No candidate can be mounted, or sees anything that counts; one of `now` cannot be mounted.
+        ValueError: No candidate can be mounted, or sees anything that counts; one of `now` cannot be mounted; the
+            sensor model is to be real, and of none of the chosen sensors that is known.
     """
     sensors, bits, refused = _mounted(space, instants)
     always = seen_by(space.always, instants) if space.always else np.zeros_like(bits[0])
@@ -242,7 +250,8 @@ def choose(
     rig = space.rig(tuple(sensors[one] for one in best.chosen), f"{space.name}_best")
     number = instants.estimates(rig)[instants.estimate].numbers()[OBJECTIVE]
     control = greedy(candidates, limits), best, number, tuple(drawn), now
-    found = SensorChoice(space, instants.estimate, sensors, refused, candidates, limits, *control, None, "")
+    model = rig.sensing(instants.sensor_model).sensor_model
+    found = SensorChoice(space, instants.estimate, model, sensors, refused, candidates, limits, *control, None, "")
     return _tested(found, instants, test_seed, fresh_worlds)
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 from torch.utils.data import DataLoader, Dataset
 
@@ -112,6 +112,7 @@ class CommonInstants:
         seed: Seed of the traffic, of the reference, and of the order of the instants.
         rays: About how many rays the reference casts at each instant.
         estimate: What numbers of the coverage are means over: "area", the visible surface, or "known", the known cells.
+        sensor_model: What sensors make of their hits, as of `evaluate`: "ideal", or else each rig as it is.
         budget_bytes: What all worlds may take, about 35 MB for one of `urban`. All are held: to build one again takes
             five times as long as to score a rig on three instants of it.
         workers: Processes that hold the worlds; 0 holds them in this one.
@@ -146,6 +147,7 @@ class CommonInstants:
         seed: int = 0,
         rays: int = RAYS,
         estimate: Measure = "area",
+        sensor_model: Literal["ideal", "real"] | None = None,
         budget_bytes: float = BUDGET_BYTES,
         workers: int = 0,
     ) -> None:
@@ -161,7 +163,13 @@ class CommonInstants:
         self.scenarios = tuple(one if isinstance(one, Scenario) else Scenario.load(one) for one in given)
         self.seed, self.estimate, self.objectives = seed, estimate, dict(objectives)
         self._settings: dict[str, Any] = {"vehicle": vehicle, "per_world": per_world, "every_s": every_s, "rays": rays}
-        self._settings |= {"estimate": estimate, "budget_bytes": budget_bytes, "workers": workers}
+        self.sensor_model = sensor_model
+        self._settings |= {
+            "estimate": estimate,
+            "sensor_model": sensor_model,
+            "budget_bytes": budget_bytes,
+            "workers": workers,
+        }
         self._vehicles: set[str | None] = {None}  # that were found to be that of these worlds
         self._worlds = [with_ego(one, {}, vehicle) for one in self.scenarios]
         self.questions = Questions.around(Carrier.of(self._worlds).outline_m, objectives)
@@ -268,6 +276,7 @@ class CommonInstants:
         """
         if rig is not None:
             self._check_vehicle(rig)
+            rig = rig.sensing("ideal") if self.sensor_model == "ideal" else rig
         wanted = range(len(self)) if numbers is None else numbers
         for start in range(0, len(wanted), TOGETHER):
             yield from self._made(rig, wanted[start : start + TOGETHER])

@@ -4,7 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 from torchcover import __version__
 from torchcover.coverage import Measure
@@ -13,6 +13,7 @@ from torchcover.placement.common_instants import EVERY_S, MEASURES, PER_WORLD, R
 from torchcover.placement.optimisers import AUTO, OPTIMISERS, MakesOptimiser, optimiser_for
 from torchcover.placement.space import SearchSpace
 from torchcover.placement.variables import FreeChoice
+from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME
 
 FRESH_WORLDS = 16
 
@@ -31,6 +32,7 @@ def common_instants(space: SearchSpace | ChoiceSpace, plan: "SearchPlan", seed: 
         seed=seed,
         rays=plan.rays,
         estimate=plan.estimate,
+        sensor_model=plan.sensor_model,
         workers=plan.workers,
     )
 
@@ -46,6 +48,7 @@ class SearchPlan:
         seed: Of the worlds that candidates are scored in, and of all that is drawn.
         test_seed: Of the fresh worlds; not given, the next.
         estimate: What a score is: "area", the share of the visible surface, or "known", the mean of the known cells.
+        sensor_model: What sensors make of their hits, "ideal" or "real"; not given: real where that is known of them.
         worlds: Worlds of each scenario to search in.
         fresh_worlds: Worlds of each to test in.
         per_world: Instants of each world.
@@ -64,6 +67,7 @@ class SearchPlan:
     seed: int = 0
     test_seed: int | None = None
     estimate: Measure = "area"
+    sensor_model: Literal["ideal", "real"] | None = None
     worlds: int = WORLDS
     fresh_worlds: int = FRESH_WORLDS
     per_world: int = PER_WORLD
@@ -110,7 +114,11 @@ class SearchPlan:
         return name, OPTIMISERS[name]
 
     def settings(self, space: SearchSpace) -> dict[str, Any]:
-        """All that decides which candidates are asked for, for JSON."""
+        """All that decides which candidates are asked for, for JSON.
+
+        Raises:
+            ValueError: The sensor model is to be real, and of no sensor of the start that is known.
+        """
         content = {"space": space.content(), "scenarios": [scenario.content() for scenario in space.scenarios]}
         text = json.dumps(content, sort_keys=True, default=str)
         return {
@@ -119,6 +127,8 @@ class SearchPlan:
             "space_sha256": hashlib.sha256(text.encode()).hexdigest(),
             "optimiser": self.optimiser_in(space)[0],
             "estimate": self.estimate,
+            "sensor_model": space.start.sensing(self.sensor_model).sensor_model,
+            "band_frame": DEFAULT_BAND_FRAME,
             "seed": self.seed,
             "worlds": self.worlds,
             "per_world": self.per_world,

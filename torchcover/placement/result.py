@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from torchcover.evaluation.result import sensor_model_words
 from torchcover.evaluation.settings import FILES
 from torchcover.placement.arm import Arm
 from torchcover.placement.evaluation import OPTIMISER, RANDOM, START, Evaluation
@@ -113,6 +114,9 @@ class SearchResult:
             yield f"{self._told(best, optimism=True)}."
         yield self._control()
         yield f"Racing saved {search.share_saved:.0%} of the instants."
+        asked = {"start": search.space.start, **{pick.name: pick.rig for pick in self.picks}}
+        ideal = search.plan.sensor_model == "ideal"
+        yield from sensor_model_words({name: "ideal" if ideal else rig.sensor_model for name, rig in asked.items()})
 
     def _control(self) -> str:
         """What random search got."""

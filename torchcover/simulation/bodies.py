@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from torchcover.geometry import BoundingBox, rigid
 from torchcover.simulation import shapes
 from torchcover.simulation.documents import BuiltIn, Document, NameOrFile, Pose, is_file_name
-from torchcover.simulation.material import material_number
+from torchcover.simulation.material import Material, material_number
 from torchcover.simulation.mount_regions import MountRegion
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sound import told
@@ -104,8 +104,8 @@ class Body(Document):
         name: What messages call it.
         shape: Its form, in its own frame.
         poses: Where its frame lies in that of the document; one copy for each.
-        material: What it is made of, a built-in material. Not given: ground is `road`, other scenery `brick`, and what
-            moves or is a vehicle `car_paint`, or `clothing` if it walks.
+        material: What it is made of, a built-in material or the path of a YAML file. Not given: ground is `road`, other
+            scenery `brick`, and what moves or is a vehicle `car_paint`, or `clothing` if it walks.
         ground: In a scenario: whether one drives or walks on it, so that heights are measured from its level faces. If
             no body of a scenario is, the ground is what is level under the ego and connected with that by steps of at
             most 0.3 m.
@@ -114,7 +114,7 @@ class Body(Document):
     name: str
     shape: Shape
     poses: tuple[Pose, ...] = Field(default=(Pose(),), min_length=1)
-    material: str | None = None
+    material: NameOrFile | None = None
     ground: bool = False
 
     @model_validator(mode="after")
@@ -125,6 +125,11 @@ class Body(Document):
             except FileNotFoundError as error:
                 raise ValueError(f"material: {error}") from error
         return self
+
+    def content(self) -> dict[str, Any]:
+        """Its keys; of a material from a file what stands there."""
+        own = self.material is not None and is_file_name(self.material)
+        return super().content() | ({"material": Material.load(str(self.material)).content()} if own else {})
 
     def meshes(self) -> list[Mesh]:
         """One mesh for each pose."""

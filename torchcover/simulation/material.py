@@ -1,6 +1,7 @@
 """What surfaces are made of, as far as a LiDAR can tell."""
 
 from functools import cache
+from threading import Lock
 from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -12,6 +13,10 @@ from torchcover.simulation.documents import BuiltIn
 
 # What nobody said the material of is scenery: walls for the most part.
 UNSAID = "brick"
+# Materials from files that were met so far, in this process, and how many there may be for numbers of one byte.
+_FROM_FILES: list["Material"] = []
+_LOCK = Lock()
+MOST = 255
 # A body has its own tone, the same at every time and for every rig: that of its number among so many.
 TONES = np.append(np.random.default_rng(905).standard_normal(4095), 0.0).astype(np.float32)
 
@@ -58,19 +63,38 @@ class Materials(NamedTuple):
     spread_of_bodies: NDArray[np.float32]
 
 
-@cache
 def material_number(name: str) -> int:
-    """The number of a built-in material, which meshes have; 0 is where none was said."""
-    known = builtin_names("materials")
-    if name not in known:
-        Material.load(name)
-    return 1 + known.index(name)
+    """The number of a material, which meshes have in this process; 0 is where none was said.
+
+    Args:
+        name: Of a built-in material, or the path of a YAML file.
+
+    Raises:
+        FileNotFoundError: There is none; the message lists those that there are.
+        ValueError: A file that is not valid, or more materials than there are numbers.
+    """
+    known = _builtin_numbers()
+    if name in known:
+        return known[name]
+    own = Material.load(name)
+    with _LOCK:
+        if own not in _FROM_FILES:
+            if len(known) + len(_FROM_FILES) == MOST:
+                raise ValueError(f"{name}: {MOST} materials are too many already")
+            _FROM_FILES.append(own)
+            materials.cache_clear()
+        return 1 + len(known) + _FROM_FILES.index(own)
+
+
+@cache
+def _builtin_numbers() -> dict[str, int]:
+    return {name: number for number, name in enumerate(builtin_names("materials"), 1)}
 
 
 @cache
 def materials() -> Materials:
-    """All built-in materials, that for number 0 ahead."""
-    each = [Material.load(name) for name in (UNSAID, *builtin_names("materials"))]
+    """All materials by their numbers."""
+    each = [Material.load(name) for name in (UNSAID, *builtin_names("materials"))] + _FROM_FILES
     of_body = [one.spread if one.varies_by == "body" else 0.0 for one in each]
     of_place = [one.spread - spread for one, spread in zip(each, of_body, strict=True)]
     columns = ([one.share for one in each], [one.incidence_exponent for one in each], of_place, of_body)

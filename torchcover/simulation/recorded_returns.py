@@ -116,13 +116,8 @@ def ground_rays(sweeps: Sequence[NDArray[np.floating]], lidar: Lidar) -> GroundR
 
 def _of_sweep(points_m: Float64, lidar: Lidar, number: int) -> GroundRays:
     vehicle_T_sensor, rows_deg = lidar.mount.matrix(), np.sort(lidar.rows_deg())
-    road = road_profile(points_m)
-    in_sensor_m = transform(invert(vehicle_T_sensor), points_m)
-    range_m = np.linalg.norm(in_sensor_m, axis=1)
-    elevation_deg = np.rad2deg(np.arctan2(in_sensor_m[:, 2], np.hypot(in_sensor_m[:, 0], in_sensor_m[:, 1])))
-    row = np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, elevation_deg)
-    sectors = round(360.0 / SECTOR_DEG)
-    azimuth_deg = np.rad2deg(np.arctan2(in_sensor_m[:, 1], in_sensor_m[:, 0]))
+    road, sectors = road_profile(points_m), round(360.0 / SECTOR_DEG)
+    row, azimuth_deg, range_m = _in_rows(points_m, lidar)
     sector = np.floor((azimuth_deg + 180.0) / SECTOR_DEG).astype(np.int64) % sectors
     above_m = points_m[:, 2] - road.height_m(points_m)
     middle_deg: Float64 = (np.arange(sectors, dtype=np.float64) + 0.5) * SECTOR_DEG - 180.0
@@ -154,6 +149,15 @@ def _of_sweep(points_m: Float64, lidar: Lidar, number: int) -> GroundRays:
         azimuths_deg[free],
         np.full(np.count_nonzero(free), number, dtype=np.int64),
     )
+
+
+def _in_rows(points_m: Float64, lidar: Lidar) -> tuple[NDArray[np.intp], Float64, Float64]:
+    """(N,) row of a LiDAR that each point is nearest to, its azimuth in degrees and its range."""
+    in_sensor_m = transform(invert(lidar.mount.matrix()), points_m)
+    x, y, z = in_sensor_m.T
+    rows_deg, elevation_deg = np.sort(lidar.rows_deg()), np.rad2deg(np.arctan2(z, np.hypot(x, y)))
+    row = np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, elevation_deg)
+    return row, np.rad2deg(np.arctan2(y, x)), np.linalg.norm(in_sensor_m, axis=1)
 
 
 def _second(range_m: Float64) -> float:
@@ -351,15 +355,11 @@ def _calibration(lidar: Lidar, sweeps: Sequence[NDArray[np.float32]], road: Mate
 
 def _noise_m(sweeps: Sequence[NDArray[np.float32]], lidar: Lidar) -> float:
     """Noise of ranges to near road: second differences of three neighbours in a row are sqrt(6) of it."""
-    off_m, sensor_T_vehicle, rows_deg = [np.empty(0)], invert(lidar.mount.matrix()), np.sort(lidar.rows_deg())
-    step_deg = lidar.horizontal_fov_deg / lidar.columns
+    off_m, step_deg = [np.empty(0)], lidar.horizontal_fov_deg / lidar.columns
     for sweep in sweeps:
         points_m = sweep.astype(np.float64)
         on_road = np.abs(points_m[:, 2] - road_profile(points_m).height_m(points_m)) < OFF_GROUND_M
-        in_sensor_m = transform(sensor_T_vehicle, points_m[on_road & (np.abs(points_m[:, 1]) < HALF_ROAD_M)])
-        range_m, flat_m = np.linalg.norm(in_sensor_m, axis=1), np.hypot(in_sensor_m[:, 0], in_sensor_m[:, 1])
-        row = np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, np.rad2deg(np.arctan2(in_sensor_m[:, 2], flat_m)))
-        azimuth_deg = np.rad2deg(np.arctan2(in_sensor_m[:, 1], in_sensor_m[:, 0]))
+        row, azimuth_deg, range_m = _in_rows(points_m[on_road & (np.abs(points_m[:, 1]) < HALF_ROAD_M)], lidar)
         order = np.lexsort((azimuth_deg, row))
         row, azimuth_deg, range_m = row[order], azimuth_deg[order], range_m[order]
         together = (row[2:] == row[:-2]) & (azimuth_deg[2:] - azimuth_deg[:-2] < 2.5 * step_deg)

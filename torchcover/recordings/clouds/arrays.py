@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.files import NpyHeader, check_memory, npz_headers, read_npy, read_npz
+from torchcover.files import NpyHeader, check_memory, npz_headers, read_npy, read_npz, reads
 from torchcover.recordings.clouds.binary import check_records
 
 Points = NDArray[np.floating]
@@ -35,8 +35,19 @@ def read_archive(path: Path) -> Points:
     return _coordinates(points)
 
 
-def read_weighted_archive(path: Path) -> tuple[Points, NDArray[np.float64]]:
-    """Read the arrays `points` and `weights` of a `.npz` file: (N, 3) and (N,), what each point counts for."""
+@reads("a point cloud with weights")
+def read_weighted_cloud(path: Path) -> tuple[Points, NDArray[np.float64]]:
+    """Read a cloud and what each of its points counts for: the arrays `points` and `weights` of a `.npz`.
+
+    Returns:
+        (N, 3) points, and (N,) float64 weights.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        BadFileError: Not such a file; a weight that is not positive and finite, or another number of them.
+    """
+    if path.suffix.lower() != ".npz":
+        raise ValueError("weights are read from a .npz with the arrays points and weights only")
     (points,) = read_npz(path, _check, _only("points")).values()
     (weights,) = read_npz(path, partial(_check_values, "weights"), _only("weights")).values()
     if len(points) != len(weights):
@@ -47,9 +58,17 @@ def read_weighted_archive(path: Path) -> tuple[Points, NDArray[np.float64]]:
     return _coordinates(points), weights.astype(np.float64)
 
 
-def read_heights_of_archive(path: Path, count: int) -> NDArray[np.float32] | None:
-    """Read the array `heights_m` of a `.npz` file, one for each of its points; None if there is none."""
-    if "heights_m" not in npz_headers(path):
+@reads("a point cloud with heights")
+def read_heights(path: Path, count: int) -> NDArray[np.float32] | None:
+    """Read how high above the local ground the points of a cloud are: the array `heights_m` of a `.npz`.
+
+    Returns:
+        (N,) metres, NaN where there is no ground at or below; None if the file does not say.
+
+    Raises:
+        BadFileError: Another number of them, or infinite ones.
+    """
+    if path.suffix.lower() != ".npz" or "heights_m" not in npz_headers(path):
         return None
     (heights_m,) = read_npz(path, partial(_check_values, "heights_m"), _only("heights_m")).values()
     if len(heights_m) != count:

@@ -5,17 +5,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.files import reads
-from torchcover.recordings.clouds.arrays import (
-    Points,
-    read_archive,
-    read_array,
-    read_heights_of_archive,
-    read_records,
-    read_weighted_archive,
-)
+from torchcover.recordings.clouds.arrays import Points, read_archive, read_array, read_records
 from torchcover.recordings.clouds.las import read_las
 from torchcover.recordings.clouds.pcd import read_pcd
 from torchcover.recordings.clouds.ply import read_ply
@@ -98,32 +90,3 @@ def read_cloud(path: Path) -> Points:
     if len(own) and not finite.all() and not finite.all(axis=1).any():
         raise ValueError(f"none of the {len(own)} points is finite; at least one has to be")
     return own
-
-
-@reads("a point cloud with heights")
-def read_heights(path: Path, count: int) -> NDArray[np.float32] | None:
-    """Read how high above the local ground the points of a cloud are: the array `heights_m` of a `.npz`.
-
-    Returns:
-        (N,) metres, NaN where there is no ground at or below; None if the file does not say.
-
-    Raises:
-        BadFileError: Another number of them, or infinite ones.
-    """
-    return read_heights_of_archive(path, count) if path.suffix.lower() == ".npz" else None
-
-
-@reads("a point cloud with weights")
-def read_weighted_cloud(path: Path) -> tuple[Points, NDArray[np.float64]]:
-    """Read a cloud and what each of its points counts for: the arrays `points` and `weights` of a `.npz`.
-
-    Returns:
-        (N, 3) points as `read_cloud` gives them, and (N,) float64 weights.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        BadFileError: Not such a file; a weight that is not positive and finite, or another number of them.
-    """
-    if path.suffix.lower() != ".npz":
-        raise ValueError("weights are read from a .npz with the arrays points and weights only")
-    return read_weighted_archive(path)

@@ -6,7 +6,8 @@ from typing import ClassVar
 
 from torchcover.detection.boxes import Boxes
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.clouds.readers import read_cloud, read_heights, read_weighted_cloud
+from torchcover.recordings.clouds.arrays import read_heights, read_weighted_cloud
+from torchcover.recordings.clouds.readers import read_cloud
 from torchcover.recordings.formats.file_names import check_same_names, frame_files, natural
 from torchcover.recordings.formats.folder_settings import FolderSettings, PlaceSettings, read_folder_settings
 from torchcover.recordings.formats.folder_tables import PoseTable, read_boxes

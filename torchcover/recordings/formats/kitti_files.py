@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.cameras.calibration import Calibration, split_matrix
+from torchcover.cameras.calibration import Calibration, split_projection
 from torchcover.files import BadFileError, check_memory, decode, naming, read_short_text, reads
 from torchcover.geometry import BoundingBox, check_rigid, invert, rigid, rotation_from_euler
 from torchcover.geometry.rigid import Matrix
@@ -79,14 +79,9 @@ def read_rectified(path: Path, vehicle_T_camera0: Matrix) -> tuple[Calibration, 
         if matrix.size != 12 or size.size != 2:
             arrived = f"{matrix.size} and {size.size}"
             raise BadFileError(f"{path}: 12 numbers of P_rect_{name} and 2 of S_rect_{name} are needed; got {arrived}")
-        matrix = matrix.reshape(3, 4)
         with naming(path, "a KITTI calibration"):
-            intrinsics = split_matrix(matrix[:, :3], f"P_rect_{name}")
-            if 0.0 in intrinsics[:2]:
-                raise ValueError(f"P_rect_{name} has no focal length")
-            # P = K [I | t]: the rectified cameras differ from each other by a translation only.
-            rectified_T_camera = invert(rigid(np.eye(3), np.linalg.solve(matrix[:, :3], matrix[:, 3])))
-        pose = vehicle_T_rectified @ rectified_T_camera
+            intrinsics, camera_T_rectified = split_projection(matrix, f"P_rect_{name}")
+        pose = vehicle_T_rectified @ invert(camera_T_rectified)
         found.append(Calibration(int(size[0]), int(size[1]), *intrinsics, vehicle_T_camera=pose, name=f"image_{name}"))
     return tuple(found)
 

@@ -2,6 +2,7 @@
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache, lru_cache
 
 import numpy as np
@@ -73,7 +74,8 @@ class Fleet:
 
     def draw_driver(self, typical: Driver, spread: float) -> Driver:
         """A driver whose desired speed differs from the typical one by up to `spread`, a share of it."""
-        return _with_speed(typical, float(typical.desired_speed_mps * self._generator.uniform(1 - spread, 1 + spread)))
+        desired_mps = float(typical.desired_speed_mps * self._generator.uniform(1 - spread, 1 + spread))
+        return replace(typical, desired_speed_mps=desired_mps)
 
     def agent(self, kind: str, lane: int, place_m: float, driver: Driver) -> Agent:
         """Somebody of a kind on a lane."""
@@ -137,16 +139,6 @@ def _shares_up_to(weights: tuple[float, ...]) -> list[float]:
     up_to = (np.array(weights) / np.sum(weights)).cumsum()
     shares: list[float] = (up_to / up_to[-1]).tolist()
     return shares
-
-
-def _with_speed(driver: Driver, desired_speed_mps: float) -> Driver:
-    return Driver(
-        desired_speed_mps,
-        driver.headway_s,
-        driver.standstill_gap_m,
-        driver.acceleration_mps2,
-        driver.deceleration_mps2,
-    )
 
 
 def _smallest_gap_m(driver: Driver) -> float:

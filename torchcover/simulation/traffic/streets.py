@@ -18,7 +18,7 @@ GUTTER_M = 0.5
 MIN_BLOCK_M, MAX_BLOCK_M = 80.0, 130.0
 
 # Along the way of whoever drives: stop line, crossing, carriageway of the other street, crossing.
-CROSSING_STARTS_M, CROSSING_ENDS_M = 1.0, 4.0
+CROSSING_ENDS_M = 4.0
 STOP_LINE_M = 5.0
 # People walk at these distances from the kerb, each way on its own, between the posts and the facades.
 TRACKS_M = (1.35, 2.25)
