@@ -5,8 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize, minimize_scalar
-from scipy.special import log_ndtr
 
 from torchcover.geometry import invert, transform
 from torchcover.recordings.in_vehicle import in_vehicle
@@ -214,6 +212,12 @@ class ReturnFit(NamedTuple):
 
 def fit_returns(rays: GroundRays, road: Material) -> ReturnFit:
     """The likeliest range at 10 % and spread. The rays of a cell meet one spot, and count as one."""
+    try:
+        from scipy.optimize import minimize, minimize_scalar
+        from scipy.special import log_ndtr
+    except ModuleNotFoundError as error:
+        raise ImportError("calibrate: scipy is needed: pip install 'torchcover[calibrate]'") from error
+
     at_one_metre = log_excess(rays.range_m, rays.cos_incidence, road.share, road.incidence_exponent, 1.0)
     returned = rays.returned / rays.rays
 

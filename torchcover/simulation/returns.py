@@ -6,8 +6,8 @@ What is enough differs from pulse to pulse: P(return) = p0 Phi(ln q / (2 s)), wh
 """
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 Floats = NDArray[np.floating]
 
@@ -66,7 +66,8 @@ def return_probability(
         >>> float(return_probability(0.0, 0.3)) == SURE / 2
         True
     """
-    probability: Floats = SURE * ndtr(log_excess / np.hypot(2.0 * np.asarray(spread), reflectivity_spread))
+    sigmas = np.asarray(log_excess / np.hypot(2.0 * np.asarray(spread), reflectivity_spread))
+    probability: Floats = SURE * torch.special.ndtr(torch.from_numpy(sigmas)).numpy()
     return probability
 
 
