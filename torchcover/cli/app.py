@@ -81,7 +81,8 @@ def _on_signals() -> Callable[[Sequence[int]], None]:
 def _mistake(error: Exception) -> str | None:
     """What a user did wrong, or lacks; None if it is a mistake of ours."""
     if isinstance(error, USAGE_ERROR):
-        return str(error.format_message())  # type: ignore[attr-defined]  # the typed name is private
+        # The typed name is private; of a choice it tells the kind of the exception, too.
+        return str(error.format_message()).replace("Value error, ", "")  # type: ignore[attr-defined]
     if isinstance(error, ValueError | TypeError | OSError):
         return str(error)
     if isinstance(error, ImportError) and "pip install" in str(error):
