@@ -13,6 +13,7 @@ import typer
 
 from torchcover.cli import commands
 from torchcover.cli.evaluate import compare, evaluate
+from torchcover.evaluation.cores import set_threads
 from torchcover.evaluation.progress import terminable
 
 app = typer.Typer(
@@ -39,6 +40,7 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # where there is no –, a result with ? is better than none
+    set_threads()
     try:
         with warnings.catch_warnings(), terminable(_on_signals()) as signals:
             warnings.showwarning = _warn
