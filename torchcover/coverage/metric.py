@@ -13,6 +13,7 @@ from torchcover.coverage.blocks import AreaSums, Blocks, BlockSumsT
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.measures import Measure
 from torchcover.coverage.plotting import draw_coverage
+from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.coverage.redundancy import Redundancy, SensorFailures
 from torchcover.coverage.region_sums import IN_REGIONS, RegionSums
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within
@@ -157,7 +158,7 @@ class CoverageMetric(SumsInBlocks):
         weights: Clouds | None = None,
         height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
-        error: SensorClouds | None = None,
+        error: Clouds | None = None,
     ) -> None:
         """Add one step, or one step for each entry of two lists.
 
@@ -176,8 +177,9 @@ class CoverageMetric(SumsInBlocks):
             place_in_time: Number of the step, 10^15 at most, or a list of them (`frame.place_in_time`); it decides
                 about the block, so that steps of one number, as of an instant that is seen again, share one. Not
                 given: counted on from the steps so far.
-            error: (N,) by how many metres each point of the rig was measured off its place, along its ray, or as
-                `sensor` in a dict or a list. One that is off by more than `within_m` is no point. Not given: none is.
+            error: (N,) by how many metres each point of the rig was measured off its place, along its ray, those of
+                several sensors one after the other, or a list of them. A point covers nothing at thresholds below that,
+                and counts for radii up to `MEASURED_WITHIN_M`, 0.4. Not given: none is off.
 
         Raises:
             ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates; weights,
@@ -186,7 +188,7 @@ class CoverageMetric(SumsInBlocks):
         """
         given = (sensor, reference, weights, height, place_in_time, error)
         how: dict[str, Any] = {"grid": self.grid, "square_metres": self.square_metres, "names": self.sensors}
-        for step in checked_steps(*given, within_m=self.within_m, first=int(self.steps), **how):
+        for step in checked_steps(*given, first=int(self.steps), **how):
             self._add_step(step)
 
     def forward(
@@ -197,7 +199,7 @@ class CoverageMetric(SumsInBlocks):
         weights: Clouds | None = None,
         height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
-        error: SensorClouds | None = None,
+        error: Clouds | None = None,
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
         if place_in_time is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
@@ -205,22 +207,15 @@ class CoverageMetric(SumsInBlocks):
         given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
         return super().forward(sensor, reference, **given)  # type: ignore[no-any-return]
 
-    @property
-    def within_m(self) -> float:
-        """How far off a point may be measured: the largest threshold; any distance if there is none."""
-        return max(self.thresholds, default=math.inf)
-
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
     def _add_step(self, step: CheckedStep) -> None:
-        sensors, reference, weights, height, place_in_time = step
+        _, _, reference, weights, height, place_in_time = step
         inside, of, cell = self.grid.bins(reference, height)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
-        how: dict[str, Any] = {"backend": self.backend, "memory_mb": self.memory_mb, "max_distance": self.max_radius}
-        each = [nearest(reference[inside], one.to(reference.device), **how).distance for one in sensors.values()]
-        of_sensors = torch.stack(each)
-        distance, device = of_sensors.amin(dim=0), self.points.device
+        of_sensors = self._distances(reference[inside], step)
+        distance, device = of_sensors[0].amin(dim=0), self.points.device
         weights = None if weights is None else weights.to(reference.device)[inside[of]].to(device)
-        binned = self._binned(place_in_time, cell.to(device), of_sensors[:, of].to(device), weights)
+        binned = self._binned(place_in_time, cell.to(device), [one[:, of].to(device) for one in of_sensors], weights)
         for aggregation in self.aggregations:
             aggregation.update(self._sums_of(aggregation.name), binned)
         fine = self._fine_block_of(place_in_time)
@@ -228,18 +223,38 @@ class CoverageMetric(SumsInBlocks):
         self.probed_steps[binned.block, binned.means.cell] += 1
         self.points[binned.means.cell] += binned.means.points
         self.steps += 1
-        self.empty_sensor_steps += not any(map(len, sensors.values()))
+        self.empty_sensor_steps += step.is_blind
         self.empty_reference_steps += len(reference) == 0
         self.inside_points += len(distance)
         self.outside_points += len(reference) - len(distance)
         self.no_ground_points += 0 if height is None else height.isnan().sum().to(device)
         self.saturated_points += (distance >= self.max_radius).sum().to(device)
 
-    def _binned(self, place_in_time: int, cell: Tensor, of_sensors: Tensor, weights: Tensor | None) -> BinnedStep:
-        """The values of points in cells, from their distances to each sensor, or to all of them as one."""
-        distance = of_sensors.amin(dim=0)
+    def _distances(self, reference: Tensor, step: CheckedStep) -> list[Tensor]:
+        """(S, M) metres to the nearest point of each sensor that counts for the radius, then those for each threshold.
+
+        Each point is searched in once, beside those that the same thresholds take: most are off by less than any.
+        """
+        found: dict[float, Tensor] = {}
+        beyond_m, distance = -math.inf, None
+        for within_m in sorted({MEASURED_WITHIN_M, *self.thresholds}):
+            reach_m = self.max_radius if within_m <= MEASURED_WITHIN_M else max(self.thresholds)
+            some = step.measured(beyond_m, within_m)
+            if distance is None or any(map(len, some)):
+                how: dict[str, Any] = {"backend": self.backend, "memory_mb": self.memory_mb, "max_distance": reach_m}
+                each = torch.stack([nearest(reference, one.to(reference.device), **how).distance for one in some])
+                distance = each if distance is None else torch.minimum(distance, each)
+            found[within_m], beyond_m = distance, within_m
+        return [found[within_m] for within_m in (MEASURED_WITHIN_M, *self.thresholds)]
+
+    def _binned(
+        self, place_in_time: int, cell: Tensor, of_sensors: Sequence[Tensor], weights: Tensor | None
+    ) -> BinnedStep:
+        """The values of points in cells, from what `_distances` found."""
+        distance, *of_thresholds = (one.amin(dim=0) for one in of_sensors)
         # Before saturation: a point with nothing within `max_radius` is not detected at a threshold of `max_radius`.
-        detected = [(distance <= threshold).double() for threshold in self.thresholds]
+        pairs = zip(of_thresholds, self.thresholds, strict=True)
+        detected = [(near <= threshold).double() for near, threshold in pairs]
         radius = distance.clamp(max=distance.new_tensor(self.max_radius)).double()
         values = torch.stack([radius, *detected])
         if self._failures:
