@@ -224,7 +224,10 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             ["evaluate", "front_roof_128", "--reference", "best"],
             f"reference best: {' or '.join(f'`{name}`' for name in REFERENCE_SENSORS)} is needed",
         ),
-        (["evaluate", "front_roof_128", "--estimate", "best"], "'best' is not one of 'area', 'known'"),
+        (
+            ["evaluate", "front_roof_128", "--estimate", "best"],
+            "Invalid value for '--estimate': 'best' is not one of 'area', 'known'",
+        ),
         (
             ["evaluate", "front_roof_128", "--reference", "paper", "--estimate", "area"],
             "estimate area: it needs the",

@@ -113,8 +113,9 @@ def test_near_road_cannot_tell_how_far_a_lidar_sees(sweeps, tmp_path):
     [
         (lambda made: [points_m[:0] for points_m in made], 5.0, "0 rays to an open road"),
         (lambda made: made, 0.1, "the vehicle stands, 3 sweeps within 0.20 m"),
+        (lambda made: [*made[:2], made[0]], False, "roof: sweeps 0 and 2 are the same cloud"),
     ],
-    ids=["empty", "standing"],
+    ids=["empty", "standing", "one sweep again"],
 )
 def test_recordings_that_say_nothing_are_refused(sweeps, tmp_path, sweeps_made, poses, told):
     with pytest.raises(ValueError, match=told):

@@ -58,6 +58,8 @@ def test_each_column_is_that_of_a_scan_at_its_own_time(ego_mps, cars_mps, turn_d
     """The slow twin: the whole scene is placed anew for each column."""
     made = world(ego_mps, cars_mps, turn_deg)
     mounted, seen = swept(made)
+    _, raw = swept(made, lidar=LIDAR.model_copy(update={"scan": ScanTimes(period_s=PERIOD_S, deskewed=False)}))
+    np.testing.assert_array_equal(raw.points, seen.points)
     fine = Scene(world(ego_mps, cars_mps, turn_deg, step_s=STEP_S))
     now, at_once = round(0.5 / STEP_S), LIDAR.model_copy(update={"scan": None})
     world_T_now = made.ego.trajectory.at(0.5)
@@ -69,6 +71,7 @@ def test_each_column_is_that_of_a_scan_at_its_own_time(ego_mps, cars_mps, turn_d
         own, mine = (mounted.pixel_of_ray[scan.ray] % COLUMNS == column for scan in (there, seen))
         np.testing.assert_array_equal(there.ray[own], seen.ray[mine])
         np.testing.assert_allclose(seen.range_m[mine], there.range_m[own], rtol=1e-4, atol=2e-3)
+        np.testing.assert_allclose(raw.landed[mine], there.points[own], atol=5e-3)
         struck = then.scan(at_once.mount.matrix(), mounted.tiles, max_range_m=60).struck()
         now_T_then = invert(world_T_now) @ made.ego.trajectory.at(time_s)
         true = transform(now_T_then, there.points[own])
@@ -155,7 +158,10 @@ def test_where_points_of_a_sensor_that_errs_land():
 
 
 def test_a_scan_that_is_longer_than_a_time_step_is_refused():
-    with pytest.raises(ValueError, match=r"'roof': a scan of 0\.0975 s is longer than the time step .* 0\.05 s"):
-        swept(world(ego_mps=1.0, step_s=0.05))
+    for ego_mps in (0.0, 1.0):
+        with pytest.raises(
+            ValueError, match=r"'roof': a scan of period_s 0\.1 is longer than the time step .* 0\.05 s"
+        ):
+            swept(world(ego_mps=ego_mps, step_s=0.05))
     with pytest.raises(ValueError, match=r"scan\.period_s\n.*greater than 0"):
         Lidar.model_validate({**LIDAR.model_dump(), "scan": {"period_s": 0.0}})

@@ -13,6 +13,7 @@ from torchcover.coverage.columns import Columns, Sums
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.measures import Measure
 from torchcover.coverage.plotting import draw_coverage
+from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.coverage.redundancy import Redundancy, SensorFailures
 from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums, numbers_of_places
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within
@@ -145,7 +146,7 @@ class CoverageMetric(SumsInBlocks):
         weights: Clouds | None = None,
         height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
-        error: SensorClouds | None = None,
+        error: Clouds | None = None,
     ) -> None:
         """Add one step, or one step for each entry of two lists.
 
@@ -164,8 +165,9 @@ class CoverageMetric(SumsInBlocks):
             place_in_time: Number of the step, 10^15 at most, or a list of them (`frame.place_in_time`); it decides
                 about the block, so that steps of one number, as of an instant that is seen again, share one. Not
                 given: counted on from the steps so far.
-            error: (N,) by how many metres each point of the rig was measured off its place, along its ray, or as
-                `sensor` in a dict or a list. One that is off by more than `within_m` is no point. Not given: none is.
+            error: (N,) by how many metres each point of the rig was measured off its place, along its ray, those of
+                several sensors one after the other, or a list of them. A point covers nothing at thresholds below that,
+                and counts for radii up to `MEASURED_WITHIN_M`, 0.4. Not given: none is off.
 
         Raises:
             ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates; weights,
@@ -174,7 +176,7 @@ class CoverageMetric(SumsInBlocks):
         """
         given = (sensor, reference, weights, height, place_in_time, error)
         how: dict[str, Any] = {"grid": self.grid, "square_metres": self.square_metres, "names": self.sensors}
-        for step in checked_steps(*given, within_m=self.within_m, first=int(self.steps), **how):
+        for step in checked_steps(*given, first=int(self.steps), **how):
             self.add(self.sums_of(step))
 
     def forward(
@@ -185,7 +187,7 @@ class CoverageMetric(SumsInBlocks):
         weights: Clouds | None = None,
         height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
-        error: SensorClouds | None = None,
+        error: Clouds | None = None,
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
         if place_in_time is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
@@ -193,27 +195,20 @@ class CoverageMetric(SumsInBlocks):
         given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
         return super().forward(sensor, reference, **given)  # type: ignore[no-any-return]
 
-    @property
-    def within_m(self) -> float:
-        """How far off a point may be measured: the largest threshold; any distance if there is none."""
-        return max(self.thresholds, default=math.inf)
-
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
     def sums_of(self, step: CheckedStep) -> StepSums:
         """What a step is to `add`, wherever it is measured: it depends on the parameters of the metric alone."""
-        sensors, reference, weights, height, place_in_time = step
+        _, _, reference, weights, height, place_in_time = step
         inside, of, cell = self.grid.bins(reference, height)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
-        how: dict[str, Any] = {"backend": self.backend, "memory_mb": self.memory_mb, "max_distance": self.max_radius}
-        each = [nearest(reference[inside], one.to(reference.device), **how).distance for one in sensors.values()]
-        of_sensors = torch.stack(each)
-        distance = of_sensors.amin(dim=0)
-        values, points = self._values(of_sensors[:, of]), reference[inside[of]]
+        of_sensors = self._distances(reference[inside], step)
+        distance = of_sensors[0].amin(dim=0)
+        values, points = self._values([one[:, of] for one in of_sensors]), reference[inside[of]]
         weights = None if weights is None else weights.to(reference.device)[inside[of]]
         place, point = self._places.of_points(points, cell)
         counts = {
             "steps": 1,
-            "empty_sensor_steps": int(not any(map(len, sensors.values()))),
+            "empty_sensor_steps": int(step.is_blind),
             "empty_reference_steps": int(len(reference) == 0),
             "saturated_points": int((distance >= self.max_radius).sum()),
             "inside_points": len(distance),
@@ -235,11 +230,29 @@ class CoverageMetric(SumsInBlocks):
         for name, count in sums.counts.items():
             getattr(self, name).add_(count)
 
-    def _values(self, of_sensors: Tensor) -> Tensor:
-        """(V, N) float64 values of points, from (S, N) their distances to each sensor, or to all of them as one."""
-        distance = of_sensors.amin(dim=0)
+    def _distances(self, reference: Tensor, step: CheckedStep) -> list[Tensor]:
+        """(S, M) metres to the nearest point of each sensor that counts for the radius, then those for each threshold.
+
+        Each point is searched in once, beside those that the same thresholds take: most are off by less than any.
+        """
+        found: dict[float, Tensor] = {}
+        beyond_m, distance = -math.inf, None
+        for within_m in sorted({MEASURED_WITHIN_M, *self.thresholds}):
+            reach_m = self.max_radius if within_m <= MEASURED_WITHIN_M else max(self.thresholds)
+            some = step.measured(beyond_m, within_m)
+            if distance is None or any(map(len, some)):
+                how: dict[str, Any] = {"backend": self.backend, "memory_mb": self.memory_mb, "max_distance": reach_m}
+                each = torch.stack([nearest(reference, one.to(reference.device), **how).distance for one in some])
+                distance = each if distance is None else torch.minimum(distance, each)
+            found[within_m], beyond_m = distance, within_m
+        return [found[within_m] for within_m in (MEASURED_WITHIN_M, *self.thresholds)]
+
+    def _values(self, of_sensors: Sequence[Tensor]) -> Tensor:
+        """(V, N) float64 values of points, from what `_distances` found."""
+        distance, *of_thresholds = (one.amin(dim=0) for one in of_sensors)
         # Before saturation: a point with nothing within `max_radius` is not detected at a threshold of `max_radius`.
-        detected = [(distance <= threshold).double() for threshold in self.thresholds]
+        pairs = zip(of_thresholds, self.thresholds, strict=True)
+        detected = [(near <= threshold).double() for near, threshold in pairs]
         radius = distance.clamp(max=distance.new_tensor(self.max_radius)).double()
         values = torch.stack([radius, *detected])
         if self._failures:
@@ -283,7 +296,7 @@ class CoverageMetric(SumsInBlocks):
         """The sums of (..., B, P) places in blocks, the fine ones or the others."""
         together = 1 if fine else min(int(self.block_length), FINER)  # so many fine blocks are one
         blocks, count = self.fine_blocks if fine else self.blocks, self._places.count
-        key, columns = self.places.split([1, self._columns.count], dim=1)
+        key, columns = self.places.split_with_sizes([1, self._columns.count], dim=1)
         key = key.div(together * count, rounding_mode="floor") * count + key % count
         rows = added_up(torch.cat([key, columns], dim=1), self._columns.maxima)
         sums = columns.new_zeros(self._columns.count, blocks * count)

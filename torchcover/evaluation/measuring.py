@@ -11,6 +11,7 @@ import torch
 
 from torchcover.coverage import CoverageMetric
 from torchcover.evaluation.checkpoint import Checkpoint, Journal
+from torchcover.evaluation.cores import usual_workers
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.other_metrics import compared, metrics_of
 from torchcover.evaluation.pipeline import Run, observe
@@ -22,7 +23,7 @@ from torchcover.evaluation.target_error import TargetWatch
 from torchcover.evaluation.task import CALLER, Task, run_identity
 from torchcover.files import claimed
 from torchcover.frames import BadFrameError, FrameSource
-from torchcover.simulation import Asked
+from torchcover.simulation import Asked, SimulatedFrames
 from torchcover.simulation.memory import check_fits
 
 Observers = Mapping[str, AnyObserver]
@@ -30,6 +31,8 @@ Observers = Mapping[str, AnyObserver]
 BLOCKS = 16
 # The sums are over what was touched, but maps are made of all cells, several of which are there at a time.
 BYTES_A_CELL = 64
+# To see of how many worlds they are.
+ENOUGH_FRAMES = 256
 
 
 def measured(task: Task[FrameSource], settings: Settings) -> Result:
@@ -42,6 +45,7 @@ def measured(task: Task[FrameSource], settings: Settings) -> Result:
     frames = task.frames
     sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
     check_drawable(sensors)
+    settings = replace(settings, workers=_workers(task, settings))
     metrics = metrics_of(task, settings) if settings.metrics else None
     others = {**settings.observers, **(metrics.observers if metrics else {})}
     with ranks.aborting() if ranks else nullcontext():
@@ -68,12 +72,23 @@ def measured(task: Task[FrameSource], settings: Settings) -> Result:
             list(coverages.values()),
             settings.aggregations,
             sensors,
-            workers=settings.workers,
+            workers=settings.workers or 0,
         ),
     )
     if result.cut_short:
         warnings.warn(result.cut_short, RuntimeWarning, stacklevel=CALLER)
     return result
+
+
+def _workers(task: Task[FrameSource], settings: Settings) -> int:
+    """Processes that make the frames: recordings may share open files, and ranks share the cores."""
+    if settings.workers is not None:
+        return settings.workers
+    frames = task.frames
+    if settings.ranks or not isinstance(frames, SimulatedFrames):
+        return 0
+    most = min(len(frames), task.steps or len(frames), ENOUGH_FRAMES)
+    return usual_workers(most, len({frames.world_of(index) for index in range(most)}))
 
 
 def _observed(task: Task[FrameSource], settings: Settings, others: Observers) -> tuple[Observers, Observers, Run]:
@@ -107,7 +122,7 @@ def _observed(task: Task[FrameSource], settings: Settings, others: Observers) ->
             task.frames,
             observers,
             steps=task.steps,
-            workers=settings.workers,
+            workers=settings.workers or 0,
             device=settings.device,
             skip_bad_frames=settings.skip_bad_frames,
             until=watch,

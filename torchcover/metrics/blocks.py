@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torchmetrics.utilities.distributed import gather_all_tensors
 
 from torchcover.estimation import MIN_BLOCKS
+from torchcover.metrics.lean import gather_all_tensors
 from torchcover.metrics.mergeable import FILLER, MergeableMetric
 
 # What takes little room is kept in so many times as many blocks.

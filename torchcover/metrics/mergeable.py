@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from torch import Tensor
-from torchmetrics import Metric
-from torchmetrics.utilities.distributed import gather_all_tensors
+
+from torchcover.metrics.lean import Metric, gather_all_tensors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -289,7 +289,8 @@ def calibrate(recording: Recording, rig: Rig) -> tuple[Rig, list[LidarCalibratio
         The rig with what was found, and what that is for each LiDAR; where the road never fades, its keys stay.
 
     Raises:
-        ValueError: No LiDAR of the rig is in the recording, no ray points at a road, or the recording stands still.
+        ValueError: No LiDAR of the rig is in the recording, no ray points at a road, the recording stands still, or a
+            sweep is in it twice.
         OSError: A file is missing.
     """
     names = _paired(recording, rig)
@@ -302,6 +303,7 @@ def calibrate(recording: Recording, rig: Rig) -> tuple[Rig, list[LidarCalibratio
         sweeps = [
             in_vehicle(recording.scan(names[sensor.name], index), recording.body).points_m for index in recording.frames
         ]
+        _check_different(sweeps, f"{recording.path}: {sensor.name}")
         told = _calibration(sensor, sweeps, road, str(recording.path))
         keys = sensor.model_dump(exclude_unset=True)
         if told.fit.fades:
@@ -342,6 +344,18 @@ def _check_drive(recording: Recording) -> None:
             raise ValueError(
                 f"{recording.path}: the vehicle stands, {len(poses)} sweeps within {way_m:.2f} m, which see the same "
                 f"road: give one sweep, or a drive of {LEAST_WAY_M:g} m at least"
+            )
+
+
+def _check_different(sweeps: Sequence[NDArray[np.float32]], source: str) -> None:
+    """Refuse a sweep that is there again, as it may be where no poses tell that the vehicle stands."""
+    first: dict[bytes, int] = {}
+    for number, sweep in enumerate(sweeps):
+        same = first.setdefault(sweep.tobytes(), number)
+        if same != number and len(sweep):
+            raise ValueError(
+                f"{source}: sweeps {same} and {number} are the same cloud, so that both know what one does; give each "
+                "sweep once"
             )
 
 
