@@ -40,6 +40,7 @@ BENCHMARKS = (
     "published",
     "voxels",
     "cities",
+    "streets",
 )
 
 

@@ -31,6 +31,9 @@ STEEP_DEG = (-12.0, -4.0)
 PARTS = {"paint": (-0.3, 0.05, "car_paint"), "windows": (0.1, 0.45, "car_windows")}
 OFF_BOX_M = 1.5
 VEHICLES = ("vehicle", "car", "truck", "bus", "van")
+# Points from whose rows is told what a turn was moved by, and less than what is none.
+MOVED_M = (8.0, 30.0)
+LEAST_WAY_M = 0.4
 PLAIN = {
     "name": "plain",
     "ego": {"pose": {}},
@@ -75,6 +78,36 @@ def misfit(rows, column):
     return np.abs(enough[:, 2] - enough[:, column]).max(), np.sqrt(
         np.mean(np.log(enough[:, 2] / enough[:, column]) ** 2)
     )
+
+
+def as_cast(points_m, lidar):
+    """The points where they were when they were hit: data sets move those of a turn to where the vehicle is at one time.
+
+    Moved along x by what the vehicle drove, in proportion to the azimuth and with a jump where the turn begins, rows are
+    no more cones about the axis: that tells how far.
+    """
+    cast_m, way_m = transform(invert(lidar.mount.matrix()), points_m), 0.0
+    rows_deg = np.sort(lidar.rows_deg())
+    for _ in range(4):  # with every pass fewer points are in a row that is not theirs
+        x, y, z = cast_m.T
+        flat_m, azimuth_deg = np.hypot(x, y), np.rad2deg(np.arctan2(y, x))
+        elevation_deg = np.rad2deg(np.arctan2(z, flat_m))
+        row_deg = rows_deg[np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, elevation_deg)]
+        used = (np.abs(elevation_deg) > 2.0) & (flat_m > MOVED_M[0]) & (flat_m < MOVED_M[1])
+        off_m = z[used] / np.tan(np.deg2rad(row_deg[used])) - flat_m[used]
+        along, best = np.cos(np.deg2rad(azimuth_deg[used])), (np.inf, np.zeros(2), np.zeros(len(z)))
+        for begin_deg in np.arange(-180.0, 180.0, 5.0):
+            turn = (azimuth_deg - begin_deg) % 360.0 / 360.0
+            terms, misfit_m = np.column_stack([along, along * turn[used]]), np.abs(off_m)
+            for within_m in (0.5, 0.3, 0.1):
+                kept = misfit_m < within_m
+                moved_m = np.linalg.lstsq(terms[kept], off_m[kept], rcond=None)[0]
+                misfit_m = np.abs(off_m - terms @ moved_m)
+            best = min(best, (np.minimum(misfit_m, 0.1).mean(), moved_m, turn), key=lambda one: one[0])
+        _, moved_m, turn = best
+        cast_m[:, 0] += moved_m[0] + moved_m[1] * turn
+        way_m += moved_m[1]
+    return points_m if abs(way_m) < LEAST_WAY_M else transform(lidar.mount.matrix(), cast_m)
 
 
 def nearest_road(points_m, place_m):
@@ -193,10 +226,8 @@ def main():
             if not isinstance(lidar, Lidar):
                 continue
             recorded = lidar.name if lidar.name in recording.sensors else recording.sensors[0]
-            sweeps = [
-                in_vehicle(recording.scan(recorded, index), recording.body).points_m.astype(float)
-                for index in recording.frames
-            ]
+            clouds = (in_vehicle(recording.scan(recorded, index), recording.body).points_m for index in recording.frames)
+            sweeps = [as_cast(points_m.astype(float), lidar) for points_m in clouds]
             label = f"{Path(folder).name} {lidar.name}"
             rows = curves[label] = by_range(ground_rays(sweeps, lidar), lidar, road)
             returns += [

@@ -1,4 +1,7 @@
-"""Packets beside pykdtree, scipy, Open3D and nanoflann, Warp beside CuPy on a GPU: trees built every time."""
+"""Packets beside pykdtree, scipy, Open3D and nanoflann, Warp beside CuPy on a GPU: trees built every time.
+
+What `auto` takes is held against the better of packets and KD-tree.
+"""
 
 import json
 import os
@@ -15,6 +18,7 @@ from scipy.spatial import cKDTree
 from benchmarks.timing import compare, table
 from torchcover import nearest
 from torchcover.data import SimulatedFrames
+from torchcover.neighbors.choice import choose_search
 from torchcover.simulation import PaperReference
 
 RIGS = (
@@ -24,6 +28,8 @@ RIGS = (
 SIZES = (10**3, 10**4, 10**5, 10**6, 10**7)
 MOST_QUERIES = 100_000
 SLOW = 500_000  # queries and points together: only pykdtree is compared, and fewer times
+# What a call pays of loading numba, if there are a hundred: `auto` counts it, and so does its ratio.
+SHARE_OF_LOADING_S = 5e-3
 RESULT = Path("out/benchmarks/search.json")
 
 
@@ -36,9 +42,9 @@ def main():
 def measure():
     """Ratios of processor time; where there is a GPU, of wall time on it."""
     torch.set_num_threads(1)
-    searches = {"packets": packets, "pykdtree": pykdtree, "scipy": scipy} | optional()
+    searches = {"packets": packets, "KD-tree": kdtree, "pykdtree": pykdtree, "scipy": scipy} | optional()
     result = {"torch": torch.__version__, "threads": 1}
-    result["figures"] = compared(searches, ("packets", "pykdtree"), time.process_time)
+    result["figures"] = compared(searches, ("packets", "KD-tree", "pykdtree"), time.process_time)
     if torch.cuda.is_available():
         print(f"\nOn {torch.cuda.get_device_name()}, seconds of wall time:\n")
         searches = on_cuda()
@@ -62,10 +68,27 @@ def compared(searches, of_large, clock):
             times, ratio = (dict(zip(names, numbers, strict=True)) for numbers in (seconds, ratios))
             figures.append({"case": name, "queries": len(query), "points": len(points), "seconds": times})
             counts = f"{len(query):,}", f"{len(points):,}"
-            yield name, *counts, times[ours], *(ratio.get(other, "") for other in others)
+            yield (
+                name,
+                *counts,
+                times[ours],
+                *(ratio.get(other, "") for other in others),
+                *of_auto(query, points, times),
+            )
 
-    table(("clouds", "queries", "points", f"{ours} (s)", *(f"{other} / {ours}" for other in others)), rows())
+    header = "clouds", "queries", "points", f"{ours} (s)", *(f"{other} / {ours}" for other in others)
+    table((*header, "`auto` takes", "better / auto"), rows())
     return figures
+
+
+def of_auto(query, points, seconds):
+    """What `auto` takes, and the better of packets and KD-tree over it; the time of packets with their share."""
+    search = choose_search(torch.from_numpy(query), torch.from_numpy(points), "auto")
+    taken = {"packets": "packets", "kdtree": "KD-tree"}.get(search.__module__.rpartition(".")[2])
+    if taken not in seconds:
+        return "", ""
+    cost = {"packets": seconds["packets"] + SHARE_OF_LOADING_S, "KD-tree": seconds["KD-tree"]}
+    return taken, min(cost.values()) / cost[taken]
 
 
 def cases():
@@ -95,6 +118,10 @@ def cases():
 
 def packets(query, points):
     return nearest(torch.from_numpy(query), torch.from_numpy(points), backend="packets")
+
+
+def kdtree(query, points):
+    return nearest(torch.from_numpy(query), torch.from_numpy(points), backend="kdtree")
 
 
 def pykdtree(query, points):

@@ -313,13 +313,14 @@ def test_auto_chooses_by_size_and_is_as_exact(counts, chosen, monkeypatch):
 @pytest.mark.parametrize(
     ("counts", "dtype", "chosen"),
     [
-        ((100, 19_900), torch.float32, "packets"),
-        ((100, 19_900), torch.float64, "kdtree"),
-        ((100, 19_899), torch.float32, "kdtree"),
-        ((16, 30_000), torch.float32, "cdist"),
+        ((17_000, 100), torch.float32, "packets"),
+        ((100, 700_000), torch.float32, "packets"),
+        ((17_000, 100), torch.float64, "kdtree"),
+        ((6_000, 300_000), torch.float32, "kdtree"),
+        ((16, 700_000), torch.float32, "cdist"),
     ],
 )
-def test_auto_takes_packets_for_large_clouds_in_float32(counts, dtype, chosen, monkeypatch):
+def test_auto_takes_packets_in_float32_where_a_call_gains_its_share_of_loading_them(counts, dtype, chosen, monkeypatch):
     """Stood in for by what any machine has: which is chosen, not what it finds."""
     monkeypatch.setattr(choice, "_works", lambda *_: True)
     for name in BACKENDS.keys() - {chosen}:
@@ -337,7 +338,7 @@ def untried():
     choice._works.cache_clear()
 
 
-LARGE = (random_cloud(200, 50), random_cloud(20_000, 51))
+LARGE = (random_cloud(17_000, 50), random_cloud(200, 51))
 
 
 def test_without_numba_the_tree_searches_and_the_log_says_how_to_get_it(monkeypatch, caplog, untried):

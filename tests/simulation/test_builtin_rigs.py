@@ -185,7 +185,7 @@ def test_tilted_placements_look_down_on_their_own_side():
 @pytest.mark.parametrize(
     ("rig", "sensor", "azimuth", "elevation"),
     [
-        ("nuscenes", "top", 0.1, 0.0),
+        ("nuscenes", "top", 0.1, -1.39),
         ("waymo", "side_left", 88.8, 0.0),
         ("waymo", "side_right", -92.2, 0.0),
         ("waymo", "rear", 178.4, 0.0),

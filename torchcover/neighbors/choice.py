@@ -23,8 +23,12 @@ DEVICES = {"kdtree": ("cpu",), "packets": ("cpu",), "warp": ("cpu", "cuda")}
 # (docs/measured/performance.md, crossover).
 MAX_QUERIES_COMPARED = 16
 MANY_POINTS = 10_000
-# Packets are faster than the KD-tree from fewer points and queries, but take a second to load.
-PACKETS_PAY = 20_000
+# Once loaded, packets are faster than the KD-tree for any clouds, by at least so much (docs/measured/performance.md,
+# search). Loading numba takes each process half a second, which a hundred calls should earn. By sizes alone: a choice
+# that depended on what was searched before would change the last bits of a run with its workers.
+GAINED_PER_QUERY_S = 3e-7
+GAINED_PER_POINT_S = 8e-9
+LEAST_GAIN_S = 5e-3
 # So many pairs take longer to compare on a GPU than to search on the CPU, by the bandwidth of its memory: 4 bytes a
 # pair, written and read, at 1 TB/s. Never run on a GPU.
 MAX_PAIRS_ON_THE_DEVICE = 10**9
@@ -67,13 +71,12 @@ def choose_search(query: Tensor, points: Tensor, backend: str) -> Search:
 
 def backend_of_several(query: Tensor, clouds: Sequence[Tensor]) -> str:
     """The backend for the same queries in several clouds, one after the other: what pays for all together."""
-    together = len(query) * len(clouds) + sum(map(len, clouds))
-    return "packets" if query.device.type == "cpu" and _packets_pay(query, together) else "auto"
+    return "packets" if query.device.type == "cpu" and _packets_pay(query, clouds) else "auto"
 
 
-def _packets_pay(query: Tensor, together: int) -> bool:
-    # Packets are for float32, and where there are few queries, most of the time goes into sorting the points.
-    if query.dtype == torch.float64 or together < PACKETS_PAY:
+def _packets_pay(query: Tensor, clouds: Sequence[Tensor]) -> bool:
+    gain_s = GAINED_PER_QUERY_S * len(query) * len(clouds) + GAINED_PER_POINT_S * sum(map(len, clouds))
+    if query.dtype == torch.float64 or gain_s < LEAST_GAIN_S:  # packets are for float32
         return False
     return _works("packets", query.device, "the KD-tree searches")
 
@@ -86,7 +89,7 @@ def _search_of(backend: str) -> Search:
 def _on_the_cpu(query: Tensor, points: Tensor) -> Search:
     if len(query) <= MAX_QUERIES_COMPARED and len(points) >= MANY_POINTS:
         return _search_of("cdist")
-    return _search_of("packets" if _packets_pay(query, len(query) + len(points)) else "kdtree")
+    return _search_of("packets" if _packets_pay(query, [points]) else "kdtree")
 
 
 def _on_a_device(query: Tensor, points: Tensor) -> Search:

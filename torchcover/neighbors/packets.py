@@ -32,6 +32,10 @@ X, Y, Z, LEAST, TO_BOX, MOST = range(0, 6 * PACKET, PACKET)
 AXIS_CELLS = 1 << 11
 INDEX_BITS = np.uint64(31)
 INDEX_MASK = np.uint64((1 << 31) - 1)
+# A pass of the sort takes so many bits: few enough for the places that it writes to to stay in the cache.
+DIGIT_BITS = 9
+DIGITS = 1 << DIGIT_BITS
+PASSES = 4  # for 33 bits
 # More points than this in one cell of the curve are sorted again, in finer cells.
 CROWD = 1024
 
@@ -55,11 +59,11 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
 
 def along_the_curve(cloud: NDArray[np.float32]) -> NDArray[np.int64]:
     """Indices of the points in the order of their Morton keys; equal keys in the order of the indices."""
-    keys = _morton_keys(cloud)
-    keys.sort()
-    order: NDArray[np.int64] = (keys & INDEX_MASK).view(np.int64)
+    keys = _sorted(_morton_keys(cloud))
+    crowds = _crowds(keys)
+    order: NDArray[np.int64] = np.bitwise_and(keys, INDEX_MASK, out=keys).view(np.int64)
     # A point far away makes the cells large, and all others may lie in one. Equal points stay together for ever.
-    for start, end in _crowds(keys):
+    for start, end in crowds:
         if end - start < len(cloud):
             crowd = order[start:end]
             crowd[:] = crowd[along_the_curve(cloud[crowd])]
@@ -97,6 +101,28 @@ def _morton_keys(cloud: NDArray[np.float32]) -> Array:
             | (_spread(cloud[i, 2], z0, scale) << np.uint64(2))
         )
         keys[i] = (key << INDEX_BITS) | np.uint64(i)
+    return keys
+
+
+@compiled("uint64[::1](uint64[::1])")
+def _sorted(keys: NDArray[np.uint64]) -> Array:
+    """The keys in the order of their cells, equal cells in the order they came in: by digits, the last one first."""
+    starts = np.zeros((PASSES, DIGITS), np.int64)
+    for i in range(len(keys)):
+        for k in range(PASSES):
+            starts[k, (keys[i] >> np.uint64(INDEX_BITS + k * DIGIT_BITS)) & np.uint64(DIGITS - 1)] += 1
+    other = np.empty_like(keys)
+    for k in range(PASSES):
+        start, shift, before = starts[k], np.uint64(INDEX_BITS + k * DIGIT_BITS), 0
+        for digit in range(DIGITS):
+            count = start[digit]
+            start[digit] = before
+            before += count
+        for i in range(len(keys)):
+            digit = (keys[i] >> shift) & np.uint64(DIGITS - 1)
+            other[start[digit]] = keys[i]
+            start[digit] += 1
+        keys, other = other, keys
     return keys
 
 
