@@ -10,7 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Mesh, band, circle, prism_faces
-from torchcover.simulation.traffic.roads import Polyline
 
 Numbers = NDArray[np.float64]
 
@@ -124,24 +123,6 @@ def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, 
     levels = bottom_m + clear_m + np.array([0.0, 0.3, 0.65, 1.0]) * (height_m - clear_m)
     crown = prism(outlines, levels.tolist()).made_of("vegetation")
     return [post(centre, 0.15, bottom_m, clear_m).made_of("wood"), crown]
-
-
-def rail(line: Polyline, places_m: Numbers, left_m: float, width_m: float, z_m: tuple[float, float]) -> list[Mesh]:
-    """A rail or wall along a line: one straight piece between each two of (K,) ascending places."""
-    sides = [beside(line, places_m, left_m + shift)[:, :2] for shift in (-width_m / 2, width_m / 2)]
-    pieces = []
-    for piece in range(len(places_m) - 1):
-        outline = np.stack([sides[0][piece], sides[0][piece + 1], sides[1][piece + 1], sides[1][piece]])
-        pieces.append(prism([outline, outline], z_m).made_of("metal"))
-    return pieces
-
-
-def beside(line: Polyline, places_m: ArrayLike, left_m: float) -> Numbers:
-    """(..., 3) poses x, y, yaw to the left of a line."""
-    poses = line.poses(places_m)
-    yaw = np.deg2rad(poses[..., 2])
-    poses[..., :2] += left_m * np.stack([-np.sin(yaw), np.cos(yaw)], axis=-1)
-    return poses
 
 
 def placed(mesh: Mesh, pose: ArrayLike, height_m: float = 0.0) -> Mesh:

@@ -148,7 +148,7 @@ class Urban(Procedural):
         check_crowd(sum(per_km * end / 1000 for (per_km, _), end in zip(per_lane, ends_m, strict=True)), self.steps)
         agents = self._ego_and_leader(streets, fleet, generator)
         for index, ((per_km, drivers), end) in enumerate(zip(per_lane, ends_m, strict=True)):
-            agents += fleet.fill(lanes, index, (0.0, end), per_km, drivers, keep_free=agents[:2])
+            agents += fleet.fill(index, (0.0, end), per_km, drivers, gates=lanes[index].gates, keep_free=agents[:2])
         return lanes, _who_matter(lanes, agents, self.duration_s + self.time_step_s + WARM_UP_S)
 
     def _ego_and_leader(self, streets: Streets, fleet: Fleet, generator: np.random.Generator) -> list[Agent]:
