@@ -1,5 +1,6 @@
 """Bodies on the ground: heights and tilts along their tracks, and cars in bays, lanes that nobody may use."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
@@ -89,7 +90,7 @@ def _smooth(heights_m: Numbers, times_s: Numbers) -> Numbers:
 
 def park(vicinity: Vicinity, ground: Ground, fleet: Fleet, share: float, generator: np.random.Generator) -> None:
     """Put cars into the bays of the streets that are near."""
-    poses: dict[str, list[np.ndarray]] = {kind: [] for kind in PARKED}
+    poses: dict[str, list[np.ndarray]] = defaultdict(list)
     for lane in vicinity.lanes:
         if lane.use != "bay":
             continue
