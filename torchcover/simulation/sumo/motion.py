@@ -14,9 +14,9 @@ Numbers = NDArray[np.float64]
 
 # Bodies have a pose this often, and places are means over so much time before and after.
 FINE_S = 0.1
-SMOOTH_S = 0.8
+SMOOTH_S = 1.0
 # Corners of ways are rounded over so much before and after them; ways are looked at this often.
-CORNER_M, ALONG_M = 2.0, 0.5
+CORNER_M, ALONG_M = 3.0, 0.5
 STANDS_M = 1e-6
 # The axles of vehicles lie so far from their middle, as a share of the length; people turn about a point behind them.
 AXLE_SHARE = 0.3
