@@ -5,8 +5,8 @@ import pytest
 import shapely
 
 from torchcover.simulation.sumo.floating import SumoTrack
-from torchcover.simulation.sumo.ground import Pavement, corners_m, ground_of
-from torchcover.simulation.sumo.motion import CATCH_UP_MPS, RoadUser, motions, possible, tractrix
+from torchcover.simulation.sumo.ground import Pavement, ground_of
+from torchcover.simulation.sumo.motion import CATCH_UP_MPS, RoadUser, corners_m, motions, possible, tractrix
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.vicinity import Vicinity
 
@@ -132,16 +132,16 @@ def corner(tmp_path_factory):
     ]
     net = write_net(tmp_path_factory.mktemp("corner") / "a.net.xml", *ways)
     near = Vicinity(read_network(net), np.array([[0.0, 0.0], [10.0, 0.0]]), ORIGIN)
-    return Pavement(near, ground_of(near))
+    return Pavement(near, ground_of(near)).parts
 
 
 def test_long_vehicles_swing_out_and_none_comes_over_a_kerb(corner):
     bus = user(turn(5.0, 3.0, (3.5, 4.5)), size_m=(9.0, 2.4))
-    (cuts,), (swings,) = (motions([bus], 22.0, ORIGIN, pavement) for pavement in (None, corner))
+    (cuts,), (swings,) = (motions([bus], 22.0, ORIGIN, kerbs) for kerbs in (None, corner))
     over = [
         shapely.intersection(
             shapely.polygons(corners_m(m.poses, np.tile(bus.size_m, (len(m.poses), 1)))),
-            shapely.union_all(corner.parts),
+            shapely.union_all(corner),
         )
         for m in (cuts, swings)
     ]

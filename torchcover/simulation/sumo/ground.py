@@ -90,42 +90,6 @@ class Pavement:
         held[self._tree.query(shapely.points(places_m), predicate="intersects")[0]] = True
         return held
 
-    def push_m(self, poses: Numbers, size_m: Numbers) -> Numbers:
-        """(K,) how far K rectangles have to go to their left to be off it, or to their right if that is negative.
-
-        Args:
-            poses: (K, 3) x and y of their middles, and their headings in radians.
-            size_m: (K, 2) their lengths and widths.
-        """
-        outlines = shapely.polygons(corners_m(poses, size_m))
-        part, body = shapely.STRtree(outlines).query(self.parts, predicate="intersects")
-        common = shapely.intersection(outlines[body], self.parts[part])
-        places_m, of_pair = shapely.get_coordinates(common, return_index=True)
-        away_m, yaw = places_m - poses[body[of_pair], :2], poses[body[of_pair], 2]
-        left_m = away_m[:, 1] * np.cos(yaw) - away_m[:, 0] * np.sin(yaw)
-        low_m, high_m = np.full((2, len(body)), [[np.inf], [-np.inf]])
-        np.minimum.at(low_m, of_pair, left_m)
-        np.maximum.at(high_m, of_pair, left_m)
-        # A piece lies on the side where its middle is.
-        half_m = size_m[body, 1] / 2
-        need_m = np.where(low_m + high_m > 0, low_m - half_m, high_m + half_m)
-        pushed = np.zeros(len(poses))
-        for worst in (np.minimum, np.maximum):
-            of_side = np.zeros(len(poses))
-            worst.at(of_side, body, need_m)
-            pushed += of_side
-        return pushed
-
-
-def corners_m(poses: Numbers, size_m: Numbers) -> Numbers:
-    """(K, 4, 2) corners of K rectangles with poses x, y and a heading in radians, and a length and width."""
-    forward = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
-    left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
-    half = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) / 2
-    along_m, aside_m = (half[:, k] * size_m[:, k, None] for k in (0, 1))
-    found: Numbers = poses[:, None, :2] + along_m[..., None] * forward[:, None] + aside_m[..., None] * left[:, None]
-    return found
-
 
 def decks(vicinity: Vicinity) -> list[Mesh]:
     """The decks of bridges: a slab under each lane, a little farther than where another street is below."""

@@ -8,7 +8,6 @@ import shapely
 from numpy.typing import NDArray
 
 from torchcover.simulation.sumo.floating import TIME_SLACK_S, SumoTrack
-from torchcover.simulation.sumo.ground import Pavement
 
 Numbers = NDArray[np.float64]
 
@@ -79,7 +78,10 @@ class Motion(NamedTuple):
 
 
 def motions(
-    users: Sequence[RoadUser], duration_s: float, origin_m: Numbers, pavement: Pavement | None = None
+    users: Sequence[RoadUser],
+    duration_s: float,
+    origin_m: Numbers,
+    obstacles: NDArray[np.object_] | None = None,
 ) -> list[Motion]:
     """Move bodies along their tracks, without those who are there for no time.
 
@@ -87,7 +89,7 @@ def motions(
         users: Who.
         duration_s: Of the run, from 0 on.
         origin_m: (2,) what is subtracted of all places.
-        pavement: Vehicles swing out for it where they can.
+        obstacles: Polygons in plan, of pavements and what is parked: vehicles swing out for them where they can.
     """
     times_s = np.linspace(0.0, duration_s, int(np.ceil(duration_s / FINE_S - TIME_SLACK_S)) + 1)
     by_time = sorted(range(len(users)), key=lambda number: users[number].track.times_s[0])
@@ -95,8 +97,8 @@ def motions(
     for start in range(0, len(users), BODIES_AT_ONCE):
         some = by_time[start : start + BODIES_AT_ONCE]
         group = _Group([users[number] for number in some], times_s, origin_m)
-        if pavement is not None:
-            group.keep_off(pavement)
+        if obstacles is not None:
+            group.keep_off(obstacles)
         found |= {some[at]: motion for at, motion in group.motions()}
     return [found[number] for number in sorted(found)]
 
@@ -171,7 +173,7 @@ class _Group:
         ahead_m = self._ahead_m[number]
         return np.stack([x_m - ahead_m * np.cos(yaw), y_m - ahead_m * np.sin(yaw), yaw], axis=-1)
 
-    def keep_off(self, pavement: Pavement) -> None:
+    def keep_off(self, obstacles: NDArray[np.object_]) -> None:
         """Swing out where the inner side of a turn would come over a kerb, as long vehicles do."""
         lead_m, start = self._lead_m.copy(), self.yaw[0].copy()
         along_m, way = _along_m(lead_m), _held(np.gradient(lead_m, axis=0))
@@ -183,7 +185,7 @@ class _Group:
         aside_m, look = np.zeros(lead_m.shape[:2]), there & (astray_m > ASTRAY_M)
         for swing in range(SWINGS + 1):
             at, number = np.nonzero(look)
-            push_m = pavement.push_m(self.poses((at, number)), self._size_m[number])
+            push_m = _push_m(obstacles, self.poses((at, number)), self._size_m[number])
             self.over_kerb_m[look.any(axis=0)] = 0.0
             np.maximum.at(self.over_kerb_m, number, np.abs(push_m))
             met = np.flatnonzero(self.over_kerb_m)
@@ -281,6 +283,44 @@ def tractrix(lead_m: Numbers, length_m: Numbers, yaw: Numbers) -> Numbers:
     for k, (toward, fall) in enumerate(zip(towards, falls, strict=True)):
         half = np.tan((toward - found[k]) / 2)
         found[k + 1] = found[k] + 2 * (np.arctan(half) - np.arctan(half * fall))
+    return found
+
+
+def _push_m(obstacles: NDArray[np.object_], poses: Numbers, size_m: Numbers) -> Numbers:
+    """(K,) how far K rectangles have to go to their left to be off obstacles, or to their right if that is negative.
+
+    Args:
+        obstacles: Polygons in plan.
+        poses: (K, 3) x and y of their middles, and their headings in radians.
+        size_m: (K, 2) their lengths and widths.
+    """
+    outlines = shapely.polygons(corners_m(poses, size_m))
+    part, body = shapely.STRtree(outlines).query(obstacles, predicate="intersects")
+    common = shapely.intersection(outlines[body], obstacles[part])
+    places_m, of_pair = shapely.get_coordinates(common, return_index=True)
+    away_m, yaw = places_m - poses[body[of_pair], :2], poses[body[of_pair], 2]
+    left_m = away_m[:, 1] * np.cos(yaw) - away_m[:, 0] * np.sin(yaw)
+    low_m, high_m = np.full((2, len(body)), [[np.inf], [-np.inf]])
+    np.minimum.at(low_m, of_pair, left_m)
+    np.maximum.at(high_m, of_pair, left_m)
+    # A piece lies on the side where its middle is.
+    half_m = size_m[body, 1] / 2
+    need_m = np.where(low_m + high_m > 0, low_m - half_m, high_m + half_m)
+    pushed = np.zeros(len(poses))
+    for worst in (np.minimum, np.maximum):
+        of_side = np.zeros(len(poses))
+        worst.at(of_side, body, need_m)
+        pushed += of_side
+    return pushed
+
+
+def corners_m(poses: Numbers, size_m: Numbers) -> Numbers:
+    """(K, 4, 2) corners of K rectangles with poses x, y and a heading in radians, and a length and width."""
+    forward = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
+    left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
+    half = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) / 2
+    along_m, aside_m = (half[:, k] * size_m[:, k, None] for k in (0, 1))
+    found: Numbers = poses[:, None, :2] + along_m[..., None] * forward[:, None] + aside_m[..., None] * left[:, None]
     return found
 
 

@@ -3,13 +3,14 @@
 from collections.abc import Sequence
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.height_field import Ground, Plain
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.ground import Pavement, tilts_deg
-from torchcover.simulation.sumo.motion import Motion
+from torchcover.simulation.sumo.motion import Motion, corners_m
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.assemble import attitude
 from torchcover.simulation.traffic.city import FREE_AT_CORNERS_M, PARKED, PARKED_GAP_M
@@ -85,8 +86,11 @@ def _smooth(heights_m: Numbers, times_s: Numbers) -> Numbers:
     return smooth
 
 
-def park(vicinity: Vicinity, ground: Ground, fleet: Fleet, share: float, generator: np.random.Generator) -> None:
-    """Put cars into the bays of the streets that are near."""
+def park(
+    vicinity: Vicinity, ground: Ground, fleet: Fleet, share: float, generator: np.random.Generator
+) -> NDArray[np.object_]:
+    """Put cars into the bays of the streets that are near; their outlines in plan."""
+    outlines_m = [np.empty((0, 4, 2))]
     poses: dict[str, list[np.ndarray]] = {kind: [] for kind in PARKED}
     for lane in vicinity.lanes:
         if lane.use != "bay":
@@ -103,8 +107,13 @@ def park(vicinity: Vicinity, ground: Ground, fleet: Fleet, share: float, generat
     for kind, drawn in poses.items():
         places = np.array(drawn).reshape(-1, 3)
         heights_m = ground.heights_m(places[:, :2])
-        tilts = tilts_deg(ground, places[:, :2], places[:, 2], (fleet.length_m(kind), fleet.width_m(kind)))
+        size_m = fleet.length_m(kind), fleet.width_m(kind)
+        tilts = tilts_deg(ground, places[:, :2], places[:, 2], size_m)
+        turned = np.column_stack([places[:, :2], np.deg2rad(places[:, 2])])
+        outlines_m.append(corners_m(turned, np.tile(size_m, (len(places), 1))))
         for (x_m, y_m, yaw_deg), height_m, (pitch, roll) in zip(
             places.tolist(), heights_m.tolist(), tilts.tolist(), strict=True
         ):
             fleet.park(kind, (x_m, y_m, yaw_deg), height_m, (pitch, roll))
+    parked: NDArray[np.object_] = shapely.polygons(np.concatenate(outlines_m))
+    return parked

@@ -102,8 +102,8 @@ class Sumo(Procedural):
         frontage = StreetScenery(vicinity, ground, self.built_share, generator)
         raised = few(pavement.meshes(), decks(vicinity))
         static = (ground.mesh(), *raised, *frontage.meshes())
-        park(vicinity, ground, fleet, self.parked_share, generator)
-        moved = motions([ego, *others], duration_s, origin_m, pavement)
+        parked = park(vicinity, ground, fleet, self.parked_share, generator)
+        moved = motions([ego, *others], duration_s, origin_m, np.concatenate([pavement.parts, parked]))
         shown = possible(moved)
         fleet.left_out = len(moved) - len(shown)
         if fleet.left_out and self.random is None:
