@@ -15,7 +15,7 @@ from torchcover.evaluation.settings import OPTIONS, Settings
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from torchcover.evaluation import Checkpoint, MixedResult, Ranks, Result
+    from torchcover.evaluation import Checkpoint, Ranks, Result
     from torchcover.evaluation.rerun_log import RerunLog
     from torchcover.frames import FrameSource
 
@@ -250,7 +250,7 @@ def logged(path: Path | None, ranks: "Ranks | None") -> "RerunLog | None":
 
 
 def finish(
-    result: "Result | MixedResult",
+    result: "Result",
     out: Path,
     ranks: "Ranks | None",
     log: "RerunLog | None" = None,

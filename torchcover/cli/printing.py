@@ -32,7 +32,7 @@ def in_words(table: PageTable) -> Table:
     return text_table(table.headings, [rows], title=table.title, caption="\n".join(table.notes))
 
 
-def print_result(result: Result | MixedResult, files: Sequence[Path], out: Path, *, explain: bool) -> None:
+def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:
     """The tables, of several kinds of world one after the other, and where the files are."""
     console = Console()
     if isinstance(result, MixedResult):

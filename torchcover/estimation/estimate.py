@@ -223,7 +223,7 @@ class Estimate:
                 other is content with 3 worlds.
         """
         if self.strata:
-            return torch.stack([weight * one.errors(least) for weight, one in self.strata]).norm(dim=0)
+            return torch.stack([(weight * one.errors(least)) ** 2 for weight, one in self.strata]).sum(dim=0).sqrt()
         return jackknife_error(self.left_out, self.value, self.steps, least)
 
     @property
@@ -234,7 +234,7 @@ class Estimate:
         variances = torch.stack([(weight * one.error) ** 2 for weight, one in self.strata])
         most = torch.tensor([one.freedom for _, one in self.strata]).to(variances)
         found = variances.sum(dim=0) ** 2 / (variances**2 / most).sum(dim=0)
-        return [int(each) for each in found.where(found.isfinite(), most.amin(dim=0)).tolist()]
+        return [int(each + 1e-9) for each in found.where(found.isfinite(), most.amin(dim=0)).tolist()]
 
     @property
     def _varies(self) -> Tensor:

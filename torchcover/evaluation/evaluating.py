@@ -15,11 +15,9 @@ SAVED = ".npz"
 # What `evaluate` calls its file in any folder, so that the folder tells more.
 USUAL_STEM = "coverage"
 
-Measured = Result | MixedResult | str | Path
-
 
 @taking(Settings)
-def evaluate(settings: Settings) -> Result | MixedResult:
+def evaluate(settings: Settings) -> Result:
     """Measure the coverage of a rig, or of several in the same frames, as `torchcover evaluate` does.
 
     Returns:
@@ -47,7 +45,7 @@ def _measured(settings: Settings) -> Result:
     return measured(task_of(settings), settings)
 
 
-def compare(results: Measured | Sequence[Measured]) -> Result | MixedResult:
+def compare(results: Result | str | Path | Sequence[Result | str | Path]) -> Result:
     """Compare what is measured already: the others with the first, as `torchcover compare` does with saved coverages.
 
     Args:
@@ -69,15 +67,15 @@ def compare(results: Measured | Sequence[Measured]) -> Result | MixedResult:
         >>> list(compare([low, high]).coverages)
         ['front_grille_128', 'front_roof_128']
     """
-    each = [results] if isinstance(results, Result | MixedResult | str | Path) else list(results)
+    each = [results] if isinstance(results, Result | str | Path) else list(results)
     if mixed := [one for one in each if isinstance(one, MixedResult)]:
         weights = mixed[0].weights
         if len(mixed) < len(each) or any(one.weights != weights for one in mixed):
             raise ValueError(
                 "compare: results of the same scenarios with the same weights are needed, or none of several"
             )
-        return MixedResult({name: _compared([one.worlds[name] for one in mixed]) for name in weights}, weights)
-    return _compared([one for one in each if not isinstance(one, MixedResult)])
+        return MixedResult.of({name: _compared([one.worlds[name] for one in mixed]) for name in weights}, weights)
+    return _compared(each)
 
 
 def _compared(each: Sequence[Result | str | Path]) -> Result:

@@ -1,13 +1,15 @@
 """Rigs in several kinds of world, and in a mixture of them."""
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
-from torchcover.coverage import Mixture
+from matplotlib.figure import Figure
+
+from torchcover.coverage import Coverage, Mixture
 from torchcover.evaluation.checkpoint import Checkpoint
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.settings import FILES, Settings, wanted_files
@@ -20,52 +22,75 @@ MIXTURE = "mixture"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class MixedResult:
-    """What `evaluate` and `compare` return of several scenarios.
+class MixedResult(Result):
+    """What `evaluate` and `compare` return of several scenarios: the numbers of their mixture.
+
+    Coverages, maps and pages are of one kind of world each: those of `worlds`.
 
     Args:
         worlds: By the name of the scenario, what was measured there: the same rigs in all of them.
         weights: By the same names, how much each counts in the mixture; they sum to 1.
-
-    Raises:
-        ValueError: The worlds were not asked about the same.
     """
 
-    worlds: Mapping[str, Result]
-    weights: Mapping[str, float]
+    worlds: Mapping[str, Result] = field(default_factory=dict)
+    weights: Mapping[str, float] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        _ = self.table  # what cannot be mixed is refused now
+    @classmethod
+    def of(cls, worlds: Mapping[str, Result], weights: Mapping[str, float]) -> "MixedResult":
+        """Mix results.
+
+        Raises:
+            ValueError: They were not asked about the same.
+        """
+        first = next(iter(worlds.values()))
+        source = {**dict.fromkeys(first.source), "scenario": dict(weights)}
+        mixed = cls(
+            coverages={},
+            regions=first.regions,
+            run=None,
+            rigs=first.rigs,
+            source=source,
+            reference_record=None,
+            device=first.device,
+            worlds=worlds,
+            weights=weights,
+        )
+        _ = mixed.table  # what cannot be mixed is refused now
+        return mixed
+
+    @property
+    def coverage(self) -> Coverage:
+        """None.
+
+        Raises:
+            ValueError: Always: a mixture has numbers only.
+        """
+        raise ValueError(f"a mixture has no maps: use worlds[name].coverage, of {', '.join(self.worlds)}")
 
     @cached_property
     def table(self) -> CoverageTable:
-        """The numbers of the mixture, as `Result.table`; those of each kind of world are in its own."""
+        """The numbers of the mixture, with errors, differences and marks."""
         counted = [(weight, self.worlds[name]) for name, weight in self.weights.items() if weight > 0.0]
-        first = counted[0][1]
-        mixed = {rig: Mixture([(weight, world.coverages[rig]) for weight, world in counted]) for rig in first.coverages}
+        rigs = counted[0][1].coverages
+        mixed = {rig: Mixture([(weight, world.coverages[rig]) for weight, world in counted]) for rig in rigs}
         shares = ", ".join(f"{name} {weight:.3g}" for name, weight in self.weights.items())
         note = (
             f"Weighted means over kinds of world: {shares}. These are given, not drawn: intervals are about chance "
             "within each of them, and say nothing of other kinds or other weights."
         )
-        return CoverageTable.of(mixed, first.regions, [note])
-
-    @property
-    def summary(self) -> list[dict[str, Any]]:
-        """A row for each rig, region and height band of the mixture, as in `summary.json`."""
-        rows: list[dict[str, Any]] = table_dict(self.table)["rows"]
-        return rows
+        return CoverageTable.of(mixed, self.regions, [note])
 
     @property
     def record(self) -> dict[str, Any]:
         """What stands in `summary.json`: the numbers of the mixture, and under `worlds` the record of each."""
+        complete = all(world.run is None or world.run.complete for world in self.worlds.values())
         worlds = {name: {"weight": self.weights[name], **world.record} for name, world in self.worlds.items()}
-        return {
-            "complete": all(world.run is None or world.run.complete for world in self.worlds.values()),
-            "worlds": worlds,
-            "measure": self.table.measure,
-            **table_dict(self.table),
-        }
+        return {"complete": complete, "worlds": worlds, "measure": self.table.measure, **table_dict(self.table)}
+
+    def maps(self, *, errors: bool = False) -> Iterator[tuple[str, Figure]]:
+        """Those of each kind of world; its name is the first part of the stems."""
+        for name, world in self.worlds.items():
+            yield from ((f"{name}/{stem}", figure) for stem, figure in world.maps(errors=errors))
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES, error_maps: bool = False) -> list[Path]:
         """Write the files of each kind of world to a folder of its own, as `Result.save`, and those of the mixture.
@@ -126,4 +151,4 @@ def measured_in_each(settings: Settings, measure: Callable[[Settings], Result]) 
         worlds[name] = measure(replace(settings, scenario=scenario, checkpoint=checkpoint))
         if (run := worlds[name].run) is not None:
             run.raise_failure()
-    return MixedResult(worlds, {name: weight for name, (_, weight) in settings.mixture.items()})
+    return MixedResult.of(worlds, {name: weight for name, (_, weight) in settings.mixture.items()})

@@ -72,7 +72,7 @@ class CoverageTable:
     @classmethod
     def of(
         cls,
-        coverages: Mapping[str, Coverage] | Mapping[str, Mixture],
+        coverages: Mapping[str, Coverage | Mixture],
         regions: Sequence[Region],
         notes: Sequence[str] = (),
     ) -> "CoverageTable":
