@@ -226,7 +226,9 @@ def main():
             if not isinstance(lidar, Lidar):
                 continue
             recorded = lidar.name if lidar.name in recording.sensors else recording.sensors[0]
-            clouds = (in_vehicle(recording.scan(recorded, index), recording.body).points_m for index in recording.frames)
+            clouds = (
+                in_vehicle(recording.scan(recorded, index), recording.body).points_m for index in recording.frames
+            )
             sweeps = [as_cast(points_m.astype(float), lidar) for points_m in clouds]
             label = f"{Path(folder).name} {lidar.name}"
             rows = curves[label] = by_range(ground_rays(sweeps, lidar), lidar, road)
