@@ -62,17 +62,15 @@ class SensorFailures(Aggregation):
 
     def states(self, cells: int) -> dict[str, State]:
         """`sums` (V, C): means of each step, or with square metres those times them, and `m2` (C)."""
-        zero = torch.zeros((), dtype=torch.float64)
-        m2 = {"m2": State(zero.expand(cells))} if self.square_metres else {}
-        return {"sums": State(zero.expand(len(self.quantities), cells)), **m2}
+        m2 = {"m2": State(torch.zeros(cells, dtype=torch.float64))} if self.square_metres else {}
+        return {"sums": State(torch.zeros(len(self.quantities), cells, dtype=torch.float64)), **m2}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the points of a step, whose last values are those of `values`."""
-        cell, _, weight, mean = step.means
-        own = mean[-len(self.quantities) :]
-        sums["sums"][:, cell] += own * weight if self.square_metres else own
+        own, weight = step.means.mean[-len(self.quantities) :], step.means.weight
+        sums["sums"].add_(own * weight if self.square_metres else own)
         if self.square_metres:
-            sums["m2"][cell] += weight
+            sums["m2"].add_(weight)
 
     def values(self, of_sensors: Sequence[Tensor], max_radius: float) -> Tensor:
         """(V, N) float64 what there is to say of each point.

@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any, NamedTuple, TypeAlias
 
+import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.quantity import MEASURED_WITHIN_M, detection
 from torchcover.coverage.redundancy import SensorFailures
-from torchcover.coverage.region_sums import IN_REGIONS
 from torchcover.neighbors import check_cloud, check_tensor
 
-# The aggregations that a metric has by itself, and the names that its own states begin with.
-BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, SensorFailures.name, IN_REGIONS, "block", "probed"})
+# The aggregations that a metric has by itself.
+BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, SensorFailures.name})
 
 # Steps are numbered in int64, and blocks double until one holds the last.
 MAX_NUMBER = 10**15
@@ -54,6 +54,22 @@ class CheckedStep(NamedTuple):
         if self.errors is None:
             return not any(map(len, self.sensors.values()))
         return not any(bool((error <= MEASURED_WITHIN_M).any()) for error in self.errors.values())
+
+
+class StepSums(NamedTuple):
+    """What one step adds to the sums of a `CoverageMetric`; it is small, and travels between processes.
+
+    Args:
+        place_in_time: Which decides about its block.
+        counts: Name of a count -> how much it grows.
+        cells: (1 + C, K) float64 cells of the grid that it touches, and what it adds to their columns.
+        places: (1 + C, K) the same of regions in bands; nothing is touched where none are asked about.
+    """
+
+    place_in_time: int
+    counts: Mapping[str, int]
+    cells: Tensor
+    places: Tensor
 
 
 def check_parameters(thresholds: Sequence[float], max_radius: float, aggregations: Sequence[Aggregation]) -> None:
@@ -153,7 +169,7 @@ def _by_sensor(
             f"{name}: metres of each of {sum(sizes)} points of the rig are needed; got {tuple(error.shape)} with "
             f"{int(error.isnan().sum())} NaN"
         )
-    return dict(zip(names, error.abs().split(sizes), strict=True))
+    return dict(zip(names, torch.split(error.abs(), sizes), strict=True))
 
 
 def as_list(clouds: Any, name: str) -> list[Any]:  # noqa: ANN401
