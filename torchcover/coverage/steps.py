@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any, NamedTuple, TypeAlias
 
+import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
@@ -168,7 +169,7 @@ def _by_sensor(
             f"{name}: metres of each of {sum(sizes)} points of the rig are needed; got {tuple(error.shape)} with "
             f"{int(error.isnan().sum())} NaN"
         )
-    return dict(zip(names, error.abs().split(sizes), strict=True))
+    return dict(zip(names, torch.split(error.abs(), sizes), strict=True))
 
 
 def as_list(clouds: Any, name: str) -> list[Any]:  # noqa: ANN401
