@@ -112,6 +112,26 @@ def test_a_car_that_drives_beside_the_ego_is_where_it_is():
     np.testing.assert_allclose(seen.points[on_car[0]], at_once.points[on_car[1]], atol=1e-3)
 
 
+@pytest.mark.parametrize("car_mps", [0.0, 12.0])
+def test_a_sweep_moves_a_point_by_speed_times_time(car_mps):
+    """The rear of a car ahead, 8 m before an ego at 20 m/s, at the frame's time: three clouds in closed form."""
+    made = world(ego_mps=20.0)
+    car = Actor("car", "car", box(4, 6, 1.5), driving((20.0 - car_mps / 2, 0, 0), (5 * car_mps, 0, 0)))
+    mounted, seen = swept(replace(made, static=made.static[:1], actors=(car,)))
+    pixel = mounted.pixel_of_ray[seen.ray]
+    time_s = LIDAR.times_s().reshape(-1)[pixel]
+    directions = LIDAR.mount.matrix()[:3, :3] @ LIDAR.directions().reshape(3, -1)[:, pixel]
+    as_cast_m = LIDAR.mount.matrix()[:3, 3] + (directions * seen.range_m).T
+    rear = (seen.points[:, 2] > 0.3) & (seen.points[:, 2] < 1.4) & (np.abs(seen.points[:, 0] - 8.0) < 0.01)
+    landed = seen.points if seen.landed is None else seen.landed
+    assert rear.sum() > 5
+    # As it came from the sensor: by the speed relative to the ego.
+    np.testing.assert_allclose(as_cast_m[rear, 0], 8.0 + (car_mps - 20.0) * time_s[rear], atol=2e-3)
+    # With the ego's motion undone: by the car's own, and what stands is where it is.
+    np.testing.assert_allclose(landed[rear, 0], 8.0 + car_mps * time_s[rear], atol=2e-3)
+    assert np.ptp(landed[rear, 0]) == pytest.approx(car_mps * np.ptp(time_s[rear]), abs=2e-3)
+
+
 def test_the_first_frame_of_a_world_is_as_its_second():
     """Before a world begins it is told from how it goes on."""
     made = world(ego_mps=20.0)

@@ -18,7 +18,8 @@ KINDS = {
     "winding": Urban(lanes=4, bend_deg=35.0, turn_share=0.6, built_share=1.0, **PLAIN),
     "straight": Urban(built_share=1.0, **STRAIGHT),
     "hilly": Urban(hills_m=2.0),
-    "highway": Highway(),
+    "highway": Highway(**PLAIN),
+    "motorway": Highway(hills_m=10.0),
     "parking": Parking(),
 }
 

@@ -151,6 +151,15 @@ def test_hills_are_what_their_slopes_say_and_their_mesh_is_near():
     assert SQUARE_M == 10.0
 
 
+def test_hills_of_a_motorway_are_high_and_nowhere_too_steep():
+    hills = Hills(100.0, np.random.default_rng(1), (1000.0, 2500.0), 0.04)
+    places = np.random.default_rng(2).uniform(-5000, 5000, (20_000, 2))
+    _, pitch, _ = hills.stances(places, np.linspace(0, 360, 20_000)).T
+    assert np.deg2rad(np.abs(pitch).max()) == pytest.approx(0.04, rel=0.2)
+    assert np.deg2rad(np.abs(pitch).max()) <= 0.04
+    assert np.ptp(hills.heights_m(places)) > 10.0
+
+
 def test_a_slab_over_a_bent_net_is_closed_and_looks_outwards():
     x, y = np.meshgrid(np.linspace(0, 30, 7), np.linspace(0, 8, 3), indexing="ij")
     net = Alignment([0.0, 5.0, 25.0, 30.0], [0.0, 0.04, 0.04, 0.0]).poses(x, y)[..., :2]
@@ -160,8 +169,9 @@ def test_a_slab_over_a_bent_net_is_closed_and_looks_outwards():
     assert solid.volume == pytest.approx(0.15 * (30 * 8 - 0.04 * 25 * 8**2 / 2), rel=0.01)
 
 
-def test_what_is_built_in_the_hills_is_closed_and_stands_on_the_ground(world):
-    w = world("hilly", 0)
+@pytest.mark.parametrize("kind", ["hilly", "motorway"])
+def test_what_is_built_in_the_hills_is_closed_and_stands_on_the_ground(kind, world):
+    w = world(kind, 0)
     for mesh in w.static[1:]:
         assert trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False).is_volume
     ground = RayCaster(w.static[:1])
@@ -205,8 +215,9 @@ def test_open_country_has_no_houses():
     assert max(mesh.vertices_m[:, 2].max() for mesh in w.static) < 12.0
 
 
-def test_rays_always_hit_the_hills(world):
-    w = world("hilly", 0)
+@pytest.mark.parametrize("kind", ["hilly", "motorway"])
+def test_rays_always_hit_the_hills(kind, world):
+    w = world(kind, 0)
     generator = np.random.default_rng(0)
     for time_s in (0.0, w.duration_s):
         pose = w.ego.trajectory.at(time_s)

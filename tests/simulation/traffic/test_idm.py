@@ -102,3 +102,9 @@ def test_many_drivers_are_that_many_single_drivers():
     for index, single in enumerate([Driver(20.0, 1.0, 1.0, 1.0), Driver(30.0, 2.0, 3.0, 2.0)]):
         alone = acceleration(single, speed[[index]], gap[[index]], closing[[index]])
         assert together[index] == pytest.approx(alone[0])
+
+
+@pytest.mark.parametrize("speed", [0.0, -1.0, np.nan, np.array([3.0, 0.0])])
+def test_who_wants_to_stand_is_no_driver(speed):
+    with pytest.raises(ValueError, match="desired speed above 0"):
+        Driver(speed)

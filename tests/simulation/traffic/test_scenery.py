@@ -4,17 +4,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchcover.simulation.traffic.roads import Polyline
-from torchcover.simulation.traffic.scenery import beside, block, box, few, ground, post, prism, rail, rectangle, tree
+from torchcover.simulation.traffic.scenery import block, box, few, ground, post, prism, rectangle, tree
 
 TREE = tree((1.0, 2.0), 0.15, 2.5, 7.0, 1.5)
-RAIL = rail(Polyline.straight((0.0, 0.0), 30.0, 100.0), np.array([0.0, 12.0, 24.0]), -5.0, 0.1, (0.4, 0.7))
 PIECES = {
     "block": (block((1.0, 3.0), (-2.0, 2.0), (0.0, 5.0)), 2 * 4 * 5),
     "box": (box((5.0, 5.0), (2.0, 3.0, 4.0), 1.0, 35.0), 2 * 3 * 4),
     "post": (post((1.0, 1.0), 0.1, 0.0, 3.0), 6 / 2 * np.sin(np.pi / 3) * 0.01 * 3),
     "trunk": (TREE[0], 6 / 2 * np.sin(np.pi / 3) * 0.15**2 * 2.5),
-    "rail": (RAIL[0], 12 * 0.1 * 0.3),
     "pyramid": (prism([rectangle((-1, 1), (-1, 1)), rectangle((-0.5, 0.5), (-0.5, 0.5))], [0.0, 3.0]), 7.0),
 }
 
@@ -33,14 +30,6 @@ def test_a_crown_is_closed_and_begins_where_the_trunk_ends():
     assert TREE[1].vertices_m[:, 2].min() == pytest.approx(TREE[0].vertices_m[:, 2].max())
     assert TREE[1].vertices_m[:, 2].max() == pytest.approx(7.15)
     assert np.linalg.norm(TREE[1].vertices_m[:, :2] - [1, 2], axis=1).max() == pytest.approx(1.5)
-
-
-def test_pieces_of_a_rail_join():
-    np.testing.assert_allclose(RAIL[0].vertices_m[[1, 2]], RAIL[1].vertices_m[[0, 3]])
-
-
-def test_beside_is_to_the_left():
-    np.testing.assert_allclose(beside(Polyline.straight((0, 0), 90.0, 10.0), 4.0, 3.0), [-3.0, 4.0, 90.0], atol=1e-12)
 
 
 def test_the_ground_covers_its_corners_and_few_merges_by_kind():

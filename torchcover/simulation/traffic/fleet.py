@@ -11,8 +11,9 @@ from torchcover.geometry import BoundingBox
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.flow import Agent, Lane
+from torchcover.simulation.traffic.flow import Agent
 from torchcover.simulation.traffic.idm import Driver
+from torchcover.simulation.traffic.signals import Gate
 from torchcover.simulation.world import Actor
 
 # What each built-in body counts as.
@@ -29,6 +30,7 @@ CATEGORIES = {
     "child": "pedestrian",
 }
 EGO = "ego"
+HEAVY = ("truck", "bus")
 
 WALKING = Driver(
     desired_speed_mps=1.4, headway_s=0.4, standstill_gap_m=0.5, acceleration_mps2=1.0, deceleration_mps2=1.5
@@ -95,25 +97,27 @@ class Fleet:
 
     def fill(
         self,
-        lanes: Sequence[Lane],
         lane: int,
         span_m: tuple[float, float],
         per_km: float,
         drivers: Mapping[str, tuple[float, Driver]],
         *,
+        gates: Sequence[Gate] = (),
         keep_free: Sequence[Agent] = (),
         spread: float = 0.12,
+        heavy_spread: float = 0.12,
     ) -> list[Agent]:
         """Fill a lane with agents at random gaps, nobody on a junction.
 
         Args:
-            lanes: All lanes.
-            lane: Index of the one to fill.
+            lane: Index of the lane.
             span_m: Where on it the fronts and rears of all lie.
             per_km: How many to a kilometre, about, as far as they fit at full speed.
             drivers: Weight and typical driver of each kind that uses the lane.
+            gates: The junctions on it.
             keep_free: Agents that are there already.
             spread: Of the desired speeds.
+            heavy_spread: Of those of lorries and buses.
         """
         mix = {kind: weight for kind, (weight, _) in drivers.items()}
         agents: list[Agent] = []
@@ -121,13 +125,13 @@ class Fleet:
         rear = span_m[0]
         while per_km > 0:
             kind = self.draw_kind(mix)
-            driver = self.draw_driver(drivers[kind][1], spread)
+            driver = self.draw_driver(drivers[kind][1], heavy_spread if kind in HEAVY else spread)
             length, gap = self.length_m(kind), _smallest_gap_m(driver)
             rear += gap + self._generator.exponential(max(1000.0 / per_km - gap - length, 0.1))
             if rear + length > span_m[1]:
                 break
             agent = self.agent(kind, lane, rear + length / 2, driver)
-            if not _in_the_way(agent, lanes[lane], gap, others):
+            if not _in_the_way(agent, gates, gap, others):
                 agents.append(agent)
             rear += length
         return agents
@@ -146,10 +150,10 @@ def _smallest_gap_m(driver: Driver) -> float:
     return float(driver.standstill_gap_m + driver.headway_s * driver.desired_speed_mps)
 
 
-def _in_the_way(agent: Agent, lane: Lane, gap_m: float, others: Sequence[Agent]) -> bool:
+def _in_the_way(agent: Agent, gates: Sequence[Gate], gap_m: float, others: Sequence[Agent]) -> bool:
     rear, front = agent.place_m - agent.length_m / 2, agent.place_m + agent.length_m / 2
     # Gates follow each other: of those that are not behind, the first is the nearest.
-    gate = bisect_right(lane.gates, rear, key=lambda gate: gate.exit_m)
-    if gate < len(lane.gates) and front > lane.gates[gate].enter_m - gap_m:
+    gate = bisect_right(gates, rear, key=lambda gate: gate.exit_m)
+    if gate < len(gates) and front > gates[gate].enter_m - gap_m:
         return True
     return any(abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m for other in others)

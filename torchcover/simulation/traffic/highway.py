@@ -1,4 +1,4 @@
-"""A motorway: three lanes each way in gentle curves, with guard rails, bridges and sign gantries."""
+"""A motorway: lanes on which one overtakes, ramps, gentle curves and grades, guard rails, bridges and sign gantries."""
 
 from typing import Literal
 
@@ -6,15 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from torchcover.simulation.traffic.assemble import actors, ego_actor, paths
-from torchcover.simulation.traffic.fleet import EGO, Fleet
-from torchcover.simulation.traffic.flow import Agent, Lane, Simulation, check_crowd
+from torchcover.simulation.traffic.alignment import Alignment
+from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, ego_actor
+from torchcover.simulation.traffic.fleet import EGO, HEAVY, Fleet
+from torchcover.simulation.traffic.flow import Agent, Flow, check_crowd
+from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.idm import Driver
+from torchcover.simulation.traffic.overtaking import LANES, RAMP_MPS, SIDE_LANE, Overtaking
 from torchcover.simulation.traffic.procedural import MostVehicles, Procedural
-from torchcover.simulation.traffic.roads import Polyline
-from torchcover.simulation.traffic.roadside import LANE_CENTRES_M, roadside
+from torchcover.simulation.traffic.roadside import LANE_CENTRES_M, SideLane, roadside
 from torchcover.simulation.traffic.scenery import Scenery
-from torchcover.simulation.traffic.signals import Signals
 from torchcover.simulation.world import Actor
 
 Numbers = NDArray[np.float64]
@@ -22,23 +23,34 @@ Numbers = NDArray[np.float64]
 # Platoons form behind the slower ones.
 WARM_UP_S = 30.0
 BEHIND_M, AHEAD_M = 150.0, 300.0
-# Nobody is faster; a lane is filled as far as its vehicles can come near the ego.
-FASTEST_MPS = 36.0
-CORNER_EVERY_M = 10.0
+# On the level; those on the inside of a curve are a little nearer than the stations say.
+SLACK_M = 15.0
+# About: a lane is filled as far as its vehicles can come near the ego.
+SLOWEST_MPS, EGO_AT_MOST_MPS, FASTEST_MPS = 22.0, 36.0, 40.0
 # Snaking by a few degrees over such a length makes curves of 1.5 to 4 km radius.
 CURVE_DEG = (4.0, 8.0)
 WAVELENGTH_M = (1400.0, 2200.0)
+CURVATURE_EVERY_M, POSE_EVERY_M = 50.0, 2.0
+# Hills are long, and no road goes up or down them by more than this.
+HILLS_M, STEEPEST = (1000.0, 2500.0), 0.04
+SIDE_LANE_M = (450.0, 700.0)
 LEADER_AHEAD_M = 45.0
-EGO_MPS, LEADER_MPS = 35.0, 28.5
+EGO_MPS, LEADER_MPS = 34.0, 29.0
 
-# Weight and driver by kind, from the lane at the median to the one at the shoulder.
+# Weight, driver and spread of the speeds by kind, from the lane at the median to the one at the shoulder. Lorries have
+# limiters at 90 km/h, and drive between that and the 80 km/h that they are allowed: no two of them differ by enough to
+# overtake.
+LORRY = Driver(23.6, 1.6, 3.0, 0.6)
 LANE_USERS = (
-    {"sedan": (4.0, Driver(34.0)), "suv": (3.0, Driver(34.0)), "motorcycle": (0.4, Driver(34.0))},
-    {"sedan": (4.0, Driver(30.0)), "hatchback": (4.0, Driver(29.5)), "suv": (3.0, Driver(30.0)),
-     "van": (2.0, Driver(29.0)), "bus": (0.4, Driver(28.5))},
-    {"truck": (4.0, Driver(27.5, 1.5, 3.0, 0.7)), "hatchback": (2.0, Driver(29.0)), "van": (1.5, Driver(28.5))},
+    {"sedan": (4.0, Driver(35.0)), "suv": (3.0, Driver(34.5)), "motorcycle": (0.4, Driver(35.0))},
+    {"sedan": (4.0, Driver(32.0)), "hatchback": (4.0, Driver(31.0)), "suv": (3.0, Driver(32.0)),
+     "van": (2.0, Driver(29.5)), "bus": (0.4, Driver(27.0, 1.5, 3.0, 0.8))},
+    {"truck": (4.0, LORRY), "hatchback": (2.0, Driver(30.0)), "van": (1.5, Driver(29.0))},
+    {"truck": (1.0, LORRY), "sedan": (2.0, Driver(31.0)), "hatchback": (2.0, Driver(30.0)), "van": (1.0, Driver(29.0))},
 )  # fmt: skip
-SPEED_SPREAD = 0.025
+SPEED_SPREAD, HEAVY_SPREAD = 0.09, 0.02
+# Of those who drive beside the side lane, who leave; and on ramps there are fewer.
+EXIT_SHARE, RAMP_SHARE = 0.15, 0.6
 
 
 class Highway(Procedural):
@@ -46,68 +58,134 @@ class Highway(Procedural):
 
     Args:
         traffic_per_km: Vehicles to a kilometre of lane.
-        ego_lane: 1 is the lane at the shoulder, 3 the one at the median.
+        ego_lane: In which the ego starts: 1 is the lane at the shoulder, 3 the one at the median.
+        hills_m: Height of the hills, as a standard deviation; 0 is a plain, and no grade is above 4 %.
     """
 
     type: Literal["highway"] = "highway"
     traffic_per_km: MostVehicles = 12.0
     ego_lane: int = Field(default=2, ge=1, le=3)
+    hills_m: float = Field(default=3.0, ge=0.0, le=10.0)
 
     def _build(
         self, fleet: Fleet, times_s: Numbers, generator: np.random.Generator
     ) -> tuple[Scenery, Actor, tuple[Actor, ...]]:
-        middle = self._middle_line(generator)
-        lanes = _lanes(middle)
-        agents = self._traffic(lanes, fleet)
-        flow = Simulation(lanes, agents, Signals.none()).run(times_s, WARM_UP_S)
-        moving = paths(lanes, agents, flow.place_m)
-        driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator)
-        first, last = (_nearest(middle, position) for position in driver.trajectory.positions_m[[0, -1], :2])
-        static = roadside(middle, (first - BEHIND_M, last + AHEAD_M), moving.positions_m, generator)
-        return Scenery(static, (0,)), driver, actors(times_s, [moving], driver, fleet)
+        (shapes,) = generator.spawn(1)
+        hills = Hills(self.hills_m, shapes, HILLS_M, STEEPEST)
+        middle, sides = self._middle_line(shapes), [self._side_lane(shapes) for _ in range(2)]
+        # Places of the other direction are stations with the sign turned.
+        side_m = np.array([sides[0], (-sides[1].end_m, -sides[1].begin_m)])
+        agents = self._traffic(side_m, fleet)
+        heavy = np.array([agent.kind in HEAVY for agent in agents])
+        exits = (generator.random(len(agents)) < EXIT_SHARE) & np.array(
+            [a.lane % LANES == SIDE_LANE - 1 for a in agents]
+        )
+        exits[0] = False
+        driving = Overtaking(agents, heavy, exits, side_m, generator)
+        flow = driving.run(times_s, WARM_UP_S)
+        moving = _near(middle, sides, agents, driving, flow)
+        driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator, hills)
+        seen_m = (float(flow.place_m[0, 0]) - BEHIND_M, float(flow.place_m[-1, 0]) + AHEAD_M)
+        scenery = roadside(middle, {-1: sides[0], 1: sides[1]}, hills, seen_m, shapes)
+        return scenery, driver, actors(times_s, [moving], driver, fleet, hills)
 
     @property
-    def _ego_starts_m(self) -> float:
-        """Way on the middle line: the faster ones from behind still start on the line."""
-        return 0.4 * FASTEST_MPS * (self.duration_s + WARM_UP_S) + 2 * AHEAD_M
+    def _lasts_s(self) -> float:
+        return self.duration_s + self.time_step_s + WARM_UP_S
 
-    def _middle_line(self, generator: np.random.Generator) -> Polyline:
-        length = self._ego_starts_m + 2 * FASTEST_MPS * (self.duration_s + WARM_UP_S) + 2 * AHEAD_M
-        along = np.arange(0.0, length, CORNER_EVERY_M)
+    def _middle_line(self, generator: np.random.Generator) -> Alignment:
+        """The ego begins near station 0."""
+        first, last = -FASTEST_MPS * WARM_UP_S, EGO_AT_MOST_MPS * self._lasts_s + 4 * AHEAD_M
+        stations = np.arange(first, last, CURVATURE_EVERY_M)
         amplitude, wavelength = np.deg2rad(generator.uniform(*CURVE_DEG)), generator.uniform(*WAVELENGTH_M)
-        heading = amplitude * np.sin(2 * np.pi * (along / wavelength + generator.random()))
-        steps = CORNER_EVERY_M * np.stack([np.cos(heading), np.sin(heading)], axis=1)
-        points = np.cumsum(steps, axis=0)
-        # World coordinates begin where the ego does.
-        return Polyline(points - Polyline(points).poses(self._ego_starts_m)[:2])
+        waves = 2 * np.pi * (stations / wavelength + generator.random())
+        curvatures = amplitude * 2 * np.pi / wavelength * np.cos(waves)
+        curvatures[[0, -1]] = 0.0
+        return Alignment(stations, curvatures, (first, 0.0, float(amplitude * np.sin(waves[0]))))
 
-    def _traffic(self, lanes: list[Lane], fleet: Fleet) -> list[Agent]:
+    def _side_lane(self, generator: np.random.Generator) -> SideLane:
+        """Somewhere on the ego's way."""
+        begin_m = LEADER_MPS * (WARM_UP_S + generator.uniform(0.0, 0.8) * self.duration_s)
+        return SideLane(begin_m, begin_m + float(generator.uniform(*SIDE_LANE_M)))
+
+    def _traffic(self, side_m: Numbers, fleet: Fleet) -> list[Agent]:
         """Everybody; the ego is the first, behind a leader in its lane."""
-        own = 3 - self.ego_lane
-        start = self._ego_starts_m
+        own, lasts_s = 3 - self.ego_lane, self._lasts_s
         kind = fleet.draw_kind({kind: weight for kind, (weight, _) in LANE_USERS[own].items()})
-        leader = LANE_USERS[own][kind][1] if kind == "truck" else Driver(LEADER_MPS)
+        leader = LANE_USERS[own][kind][1] if kind in HEAVY else Driver(LEADER_MPS)
         agents = [
-            fleet.agent(EGO, own, start - LEADER_AHEAD_M / 2, Driver(EGO_MPS, headway_s=0.9)),
-            fleet.agent(kind, own, start + LEADER_AHEAD_M / 2, leader),
+            fleet.agent(EGO, own, -LEADER_AHEAD_M / 2, Driver(EGO_MPS, headway_s=1.0)),
+            fleet.agent(kind, own, LEADER_AHEAD_M / 2, leader),
         ]
-        # Nobody of one's own direction who is that far ahead is ever caught up with.
-        ends_m = [2 * start] * 3 + [lane.line.length_m for lane in lanes[3:]]
-        check_crowd(self.traffic_per_km * sum(ends_m) / 1000, self.steps)
-        for index, end in enumerate(ends_m):
-            users = LANE_USERS[index % 3]
+        # Who may be seen, and who those may meet.
+        within_m = (EGO_AT_MOST_MPS - SLOWEST_MPS) * lasts_s + AHEAD_M
+        meets_m = (2 * SLOWEST_MPS * WARM_UP_S - AHEAD_M, (EGO_AT_MOST_MPS + FASTEST_MPS) * lasts_s + AHEAD_M)
+        spans_m = [(-within_m, within_m)] * SIDE_LANE + [(0.0, 0.0)]
+        spans_m += [(-meets_m[1], -meets_m[0])] * SIDE_LANE + [(0.0, 0.0)]
+        for direction, (begin_m, _) in enumerate(side_m.tolist()):
+            spans_m[direction * LANES + SIDE_LANE] = (begin_m - RAMP_MPS * lasts_s, begin_m)
+        shares = [1.0, 1.0, 1.0, RAMP_SHARE] * 2
+        check_crowd(
+            self.traffic_per_km * sum(share * np.ptp(span) for share, span in zip(shares, spans_m, strict=True)) / 1000,
+            self.steps,
+        )
+        for lane, (share, span) in enumerate(zip(shares, spans_m, strict=True)):
+            users = LANE_USERS[lane % LANES]
             agents += fleet.fill(
-                lanes, index, (0.0, end), self.traffic_per_km, users, keep_free=agents[:2], spread=SPEED_SPREAD
+                lane,
+                span,
+                share * self.traffic_per_km,
+                users,
+                keep_free=agents[:2],
+                spread=SPEED_SPREAD,
+                heavy_spread=HEAVY_SPREAD,
             )
         return agents
 
 
-def _lanes(middle: Polyline) -> list[Lane]:
-    """Three lanes of the ego's direction from the median outwards, then three of the other; all keep to the right."""
-    own = [Lane(middle.shifted(-offset)) for offset in LANE_CENTRES_M]
-    return own + [Lane(middle.shifted(offset).reversed()) for offset in LANE_CENTRES_M]
+def _near(middle: Alignment, sides: list[SideLane], agents: list[Agent], driving: Overtaking, flow: Flow) -> Paths:
+    """Where those are at all times who come near the ego, which is the first of them."""
+    way = np.array([1.0 if agent.lane < LANES else -1.0 for agent in agents])
+    stations = flow.place_m * way
+    near = np.flatnonzero((np.abs(stations - stations[:, :1]) < HORIZON_M + SLACK_M).any(axis=0))
+    stations, way = stations[:, near], way[near]
+    # How far to the right of the middle they are in their own direction, and how much more after each metre.
+    right_m, slope = np.empty((2, *stations.shape))
+    for column, agent in enumerate(near.tolist()):
+        own, lane = stations[:, column], agents[agent].lane
+        right_m[:, column], slope[:, column] = _lane_at(own, lane, sides)
+        for change in driving.changes:
+            if change.agent == agent:
+                done, per_m = change.share(flow.place_m[:, agent])
+                (old_m, old_slope), (new_m, new_slope) = (
+                    _lane_at(own, lane, sides) for lane in (change.old, change.new)
+                )
+                right_m[:, column] += done * (new_m - old_m)
+                slope[:, column] += done * (new_slope - old_slope) + per_m * (new_m - old_m)
+    poses = _poses(middle, stations)
+    yaw = np.deg2rad(poses[..., 2])
+    positions_m = np.zeros(poses.shape)
+    positions_m[..., 0] = poses[..., 0] + way * right_m * np.sin(yaw)
+    positions_m[..., 1] = poses[..., 1] - way * right_m * np.cos(yaw)
+    yaw_deg = poses[..., 2] + np.where(way > 0, 0.0, 180.0) - np.rad2deg(np.arctan(slope))
+    return Paths(positions_m, yaw_deg, tuple(agents[agent].kind for agent in near))
 
 
-def _nearest(line: Polyline, position_m: Numbers) -> float:
-    """Way of the corner of a line that is nearest to a position."""
-    return float(line.arc_m[np.linalg.norm(line.points_m - position_m, axis=1).argmin()])
+def _lane_at(stations: Numbers, lane: int, sides: list[SideLane]) -> tuple[Numbers | float, Numbers | float]:
+    """(T,) how far from the middle of the road a lane is at stations, and how much more after each metre driven."""
+    centre_m = float(LANE_CENTRES_M[lane % LANES])
+    if lane % LANES != SIDE_LANE:
+        return centre_m, 0.0
+    away_m, slope = sides[lane // LANES].away_m(stations)
+    return centre_m + away_m, slope if lane < LANES else -slope
+
+
+def _poses(middle: Alignment, stations: Numbers) -> Numbers:
+    """(..., 3) poses of the middle at stations, of which there are very many, to a third of a millimetre."""
+    first = float(stations.min())
+    table = middle.poses(np.arange(first, float(stations.max()) + 2 * POSE_EVERY_M, POSE_EVERY_M), 0.0)
+    place = (stations - first) / POSE_EVERY_M
+    entry = place.astype(np.int64)
+    poses = table.take(entry, axis=0)
+    poses += (place - entry)[..., None] * np.diff(table, axis=0, append=0.0).take(entry, axis=0)
+    return poses

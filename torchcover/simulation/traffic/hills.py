@@ -12,19 +12,26 @@ Numbers = NDArray[np.float64]
 
 WAVELENGTHS_M = (250.0, 700.0)
 WAVES = 3
-# Between the corners of its squares the ground is nowhere farther from the hills than a centimetre or two.
+# Between the corners of its squares the ground is nowhere farther from the hills than a centimetre or two; longer hills
+# have larger ones.
 SQUARE_M = 10.0
 
 
 class Hills:
-    """A few long waves with heights of a standard deviation; a plain if that is 0."""
+    """A few long waves with heights of a standard deviation, but nowhere steeper than a share; a plain if that is 0."""
 
-    def __init__(self, height_m: float, generator: np.random.Generator) -> None:
+    def __init__(
+        self,
+        height_m: float,
+        generator: np.random.Generator,
+        wavelengths_m: tuple[float, float] = WAVELENGTHS_M,
+        steepest: float = np.inf,
+    ) -> None:
         towards, phase = generator.uniform(0.0, 2 * np.pi, (2, WAVES))
-        waves = 2 * np.pi / generator.uniform(*WAVELENGTHS_M, WAVES)
+        waves = 2 * np.pi / generator.uniform(*wavelengths_m, WAVES)
         self._waves_per_m = waves * np.array([np.cos(towards), np.sin(towards)])
         self._phase = phase
-        self._wave_m = height_m * np.sqrt(2 / WAVES)
+        self._wave_m = min(height_m * np.sqrt(2 / WAVES), steepest / waves.sum())
 
     @property
     def are_flat(self) -> bool:
@@ -65,12 +72,12 @@ class Hills:
         for x_per_m, y_per_m, phase in zip(*self._waves_per_m, self._phase, strict=True):
             yield (x_per_m * x_m + y_per_m * y_m + phase).astype(np.float32)
 
-    def mesh(self, way_m: Numbers, within_m: float) -> Mesh:
+    def mesh(self, way_m: Numbers, within_m: float, square_m: float = SQUARE_M) -> Mesh:
         """The ground near a way, (N, 2) places, as one sheet of squares."""
-        lower = np.floor((way_m.min(axis=0) - within_m) / SQUARE_M)
-        columns, rows = (np.ceil((way_m.max(axis=0) + within_m) / SQUARE_M) - lower).astype(np.int64).tolist()
+        lower = np.floor((way_m.min(axis=0) - within_m) / square_m)
+        columns, rows = (np.ceil((way_m.max(axis=0) + within_m) / square_m) - lower).astype(np.int64).tolist()
         row, column = np.indices((rows, columns)).reshape(2, -1)
-        middles_m = SQUARE_M * (lower + 0.5 + np.stack([column, row], axis=1))
+        middles_m = square_m * (lower + 0.5 + np.stack([column, row], axis=1))
         near = squared_distances(middles_m, way_m).min(axis=1) < within_m**2
         here = (row * (columns + 1) + column)[near]
         right, above = here + 1, here + columns + 1
@@ -79,5 +86,5 @@ class Hills:
         wanted = np.zeros((rows + 1) * (columns + 1), dtype=bool)
         wanted[faces] = True
         used, number = np.flatnonzero(wanted), np.cumsum(wanted) - 1
-        places_m = SQUARE_M * (lower + np.stack([used % (columns + 1), used // (columns + 1)], axis=1))
+        places_m = square_m * (lower + np.stack([used % (columns + 1), used // (columns + 1)], axis=1))
         return Mesh(np.column_stack([places_m, self.heights_m(places_m)]), number[faces]).made_of("road")

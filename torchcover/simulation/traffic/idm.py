@@ -30,6 +30,9 @@ class Driver:
         standstill_gap_m: Gap to the vehicle ahead in a queue, bumper to bumper.
         acceleration_mps2: When starting on an empty road.
         deceleration_mps2: Comfortable braking.
+
+    Raises:
+        ValueError: A desired speed that is not above 0.
     """
 
     desired_speed_mps: Quantity
@@ -37,6 +40,10 @@ class Driver:
     standstill_gap_m: Quantity = 2.0
     acceleration_mps2: Quantity = 1.5
     deceleration_mps2: Quantity = 2.0
+
+    def __post_init__(self) -> None:
+        if not np.all(np.asarray(self.desired_speed_mps) > 0.0):
+            raise ValueError(f"a driver needs a desired speed above 0 m/s; got {self.desired_speed_mps}")
 
     @cached_property
     def _braking_mps2(self) -> Quantity:

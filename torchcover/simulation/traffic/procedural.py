@@ -43,8 +43,8 @@ class Procedural(Traffic):
             bodies: A mesh for each kind of body (`fleet.CATEGORIES`); the built-in ones if not given.
 
         Returns:
-            The world: the ground is z = 0, nobody ever overlaps anybody, and the ego is followed closely enough for
-            sensors of up to 250 m range.
+            The world: without hills the ground is z = 0; nobody ever overlaps anybody, and the ego is followed closely
+            enough for sensors of up to 250 m range.
         """
         generator = np.random.default_rng(seed)
         fleet = Fleet(load_bodies() if bodies is None else bodies, ego, generator)

@@ -1,19 +1,22 @@
 """What stands beside a road, as closed convex pieces that are merged into few meshes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from torchcover.geometry import rigid, rotation_from_euler
 from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Mesh, band, circle, prism_faces
-from torchcover.simulation.traffic.roads import Polyline
 
 Numbers = NDArray[np.float64]
 
 PAVEMENT_M = 0.15
+# Kerbs go on below the ground, as far as it may rise between two of their corners.
+SUNK_M = 0.3
+PLACES_ALIKE_M = 1e-6
 POST_SIDES = 6
 CROWN_SIDES = 6
 
@@ -78,6 +81,28 @@ def slab(corners_m: Numbers, z_m: tuple[float, float]) -> Mesh:
     return Mesh(np.column_stack([places_m, np.repeat(z_m, up)]), np.concatenate([over[:, ::-1], over + up, sides]))
 
 
+def plateau(piece: shapely.Geometry, heights_m: Callable[[Numbers], Numbers]) -> Mesh:
+    """Pavement of any outline: a closed body from above the ground, whose heights are given, to below it."""
+    triangles = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(piece)))
+    corners_m = np.round(triangles.reshape(-1, 4, 2)[:, :3].reshape(-1, 2) / PLACES_ALIKE_M) * PLACES_ALIKE_M
+    places_m, faces = np.unique(corners_m, axis=0, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    first, second, third = places_m[faces].swapaxes(0, 1)
+    turns_left = np.cross(np.pad(second - first, ((0, 0), (0, 1))), np.pad(third - first, ((0, 0), (0, 1))))[:, 2] > 0
+    faces[~turns_left] = faces[~turns_left][:, ::-1]
+    above_m, count = heights_m(places_m), len(places_m)
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    # Around the outline an edge has a triangle on one side only.
+    key, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
+    here, following = edges[~np.isin(key, back)].T
+    return Mesh(
+        np.concatenate([
+            np.column_stack([places_m, above_m + PAVEMENT_M]), np.column_stack([places_m, above_m - SUNK_M])
+        ]),
+        np.concatenate([faces, faces[:, ::-1] + count, band(here + count, following + count, -count)]),
+    ).made_of("pavement")  # fmt: skip
+
+
 def box(centre_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: float = 0.0) -> Mesh:
     """A box about a point (x, y), turned."""
     length, width, height = np.asarray(size_m, dtype=np.float64)
@@ -98,24 +123,6 @@ def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, 
     levels = bottom_m + clear_m + np.array([0.0, 0.3, 0.65, 1.0]) * (height_m - clear_m)
     crown = prism(outlines, levels.tolist()).made_of("vegetation")
     return [post(centre, 0.15, bottom_m, clear_m).made_of("wood"), crown]
-
-
-def rail(line: Polyline, places_m: Numbers, left_m: float, width_m: float, z_m: tuple[float, float]) -> list[Mesh]:
-    """A rail or wall along a line: one straight piece between each two of (K,) ascending places."""
-    sides = [beside(line, places_m, left_m + shift)[:, :2] for shift in (-width_m / 2, width_m / 2)]
-    pieces = []
-    for piece in range(len(places_m) - 1):
-        outline = np.stack([sides[0][piece], sides[0][piece + 1], sides[1][piece + 1], sides[1][piece]])
-        pieces.append(prism([outline, outline], z_m).made_of("metal"))
-    return pieces
-
-
-def beside(line: Polyline, places_m: ArrayLike, left_m: float) -> Numbers:
-    """(..., 3) poses x, y, yaw to the left of a line."""
-    poses = line.poses(places_m)
-    yaw = np.deg2rad(poses[..., 2])
-    poses[..., :2] += left_m * np.stack([-np.sin(yaw), np.cos(yaw)], axis=-1)
-    return poses
 
 
 def placed(mesh: Mesh, pose: ArrayLike, height_m: float = 0.0) -> Mesh:
