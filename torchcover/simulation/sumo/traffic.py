@@ -13,7 +13,7 @@ from torchcover.simulation.documents import PathBeside
 from torchcover.simulation.sumo.crowd import crowd, types_of
 from torchcover.simulation.sumo.demand import EGO_TYPE, write_routes
 from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
-from torchcover.simulation.sumo.frontage import StreetScenery
+from torchcover.simulation.sumo.frontage import sides_of
 from torchcover.simulation.sumo.ground import Pavement, decks, ground_of
 from torchcover.simulation.sumo.motion import motions, possible
 from torchcover.simulation.sumo.network import SAME_PLACE_M, Network, read_network
@@ -22,6 +22,7 @@ from torchcover.simulation.sumo.simulating import from_opendrive, simulate
 from torchcover.simulation.sumo.streets import DrawnStreets
 from torchcover.simulation.sumo.vicinity import OFF_STREET_M, Vicinity
 from torchcover.simulation.traffic.fleet import EGO, Fleet
+from torchcover.simulation.traffic.frontage import Times, stand
 from torchcover.simulation.traffic.procedural import Procedural
 from torchcover.simulation.traffic.scenery import Scenery, few
 from torchcover.simulation.world import Actor
@@ -46,6 +47,8 @@ class Sumo(Procedural):
         begin_s: Time of the simulation at which the run begins, at the earliest: the ego has to be there. After a
             minute if not given, or with the floating car data.
         built_share: Share of the streets' sides that have houses.
+        roadside: How many times as much of what stands beside streets, but houses, there is than usually; or of some
+            kinds of it, such as `{hedge: 2, lamp: 0}`.
         parked_share: Share of the parking bays that are taken: lanes that nobody may use.
     """
 
@@ -58,6 +61,7 @@ class Sumo(Procedural):
     ego_type: str | None = None
     begin_s: Annotated[float, Field(ge=0.0)] | None = None
     built_share: float = Field(default=0.8, ge=0.0, le=1.0)
+    roadside: Times = 1.0
     parked_share: float = Field(default=0.5, ge=0.0, le=1.0)
 
     @model_validator(mode="after")
@@ -99,9 +103,10 @@ class Sumo(Procedural):
             )
         ground = ground_of(vicinity)
         pavement = Pavement(vicinity, ground)
-        frontage = StreetScenery(vicinity, ground, self.built_share, generator)
+        sides, taken = sides_of(vicinity, self.built_share, generator)
+        stood = stand(sides, taken, (), (), ground.heights_m, self.roadside, generator)
         raised = few(pavement.meshes(), decks(vicinity))
-        static = (ground.mesh(), *raised, *frontage.meshes())
+        static = (ground.mesh(), *raised, *few(*stood))
         parked = park(vicinity, ground, fleet, self.parked_share, generator)
         moved = motions([ego, *others], duration_s, origin_m, np.concatenate([pavement.parts, parked]))
         shown = possible(moved)
