@@ -36,7 +36,7 @@ types: $(VENV)/.ready
 	$(BIN)/mypy tests/typing
 
 doctest: $(VENV)/.ready  ## the examples in the docstrings; tests/test_documentation.py runs those of the documentation
-	$(BIN)/python -m pytest --doctest-modules torchcover
+	OMP_WAIT_POLICY=passive $(BIN)/python -m pytest --doctest-modules torchcover
 
 docs: $(VENV)/.ready  ## the pages, with those made from the code, in out/site
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'

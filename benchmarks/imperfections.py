@@ -27,8 +27,9 @@ def main():
     metrics = {(rig, landed): CoverageMetric(GRID, square_metres=True) for rig in rigs for landed in (False, True)}
     for frame in frames:
         for (rig, landed), metric in metrics.items():
-            points = frame.landed(rig) if landed else frame.cloud_of(rig, within_m=metric.within_m)
-            metric.update(points, frame.reference, weights=frame.reference_weights, height=frame.reference_heights_m)
+            points, error = (frame.landed(rig), None) if landed else (frame.cloud_of(rig), frame.error_of(rig))
+            surface = {"weights": frame.reference_weights, "height": frame.reference_heights_m}
+            metric.update(points, frame.reference, error=error, **surface)
     percent = {key: [f"{100 * value:.1f}" for value in detection(metric)] for key, metric in metrics.items()}
     rows = [(*rig.split(": ", 1), *percent[rig, False], *percent[rig, True]) for rig in rigs]
     table(

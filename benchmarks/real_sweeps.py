@@ -15,12 +15,14 @@ from torchcover.data import open_recording
 from torchcover.geometry import invert, transform
 from torchcover.recordings.in_vehicle import in_vehicle
 from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator
-from torchcover.simulation.recorded_returns import HALF_ROAD_M, fit_returns, ground_rays, road_profile
+from torchcover.simulation.recorded_returns import HALF_LANES_M, fit_returns, ground_rays, road_profile
 from torchcover.simulation.returns import log_excess, return_probability
 
-BINS_M = np.arange(10.0, 100.0, 10.0)
+BINS_M = (10.0, 20.0, 30.0, 40.0, 50.0, 70.0, 100.0)
 VEHICLE_BINS_M = (5.0, 10.0, 20.0, 40.0, 60.0, 100.0)
 ENOUGH_RAYS = 200
+# About so many rays have a row in one sector, and meet one spot.
+RAYS_OF_A_CELL = 2.5
 # Every other stripe of azimuths is fitted, the others are judged; then the other way round.
 STRIPE_DEG = 2.0
 DIRECTIONS = {"ahead": 0.0, "left": 90.0, "behind": 180.0, "right": -90.0}
@@ -32,7 +34,7 @@ PARTS = {"paint": (-0.3, 0.05, "car_paint"), "windows": (0.1, 0.45, "car_windows
 OFF_BOX_M = 1.5
 VEHICLES = ("vehicle", "car", "truck", "bus", "van")
 # Points from whose rows is told what a turn was moved by, and less than what is none.
-MOVED_M = (8.0, 30.0)
+MOVED_M, MOVED_BY_M = (3.0, 30.0), 0.5
 LEAST_WAY_M = 0.4
 PLAIN = {
     "name": "plain",
@@ -63,51 +65,55 @@ def by_range(rays, lidar, road):
     fitted = predicted(rays, road)
     own = probabilities(rays, road, lidar.range_at_10_percent_m or np.inf, lidar.spread)
     rows = []
-    for low_m in BINS_M:
-        there = (rays.range_m >= low_m) & (rays.range_m < low_m + 10.0)
+    for low_m, high_m in pairwise(BINS_M):
+        there = (rays.range_m >= low_m) & (rays.range_m < high_m)
         count = rays.rays[there].sum()
         if count >= 10:
             shares = (rays.returned, fitted * rays.rays, own * rays.rays)
-            rows.append((low_m, count, *(one[there].sum() / count for one in shares)))
+            rows.append((low_m, high_m, count, *(one[there].sum() / count for one in shares)))
     return np.array(rows)
 
 
 def misfit(rows, column):
     """Largest difference of P(return), and rms ln(real / modelled) of the density, in bins with enough rays."""
-    enough = rows[rows[:, 1] >= ENOUGH_RAYS]
-    return np.abs(enough[:, 2] - enough[:, column]).max(), np.sqrt(
-        np.mean(np.log(enough[:, 2] / enough[:, column]) ** 2)
-    )
+    enough = rows[rows[:, 2] >= ENOUGH_RAYS]
+    real, modelled = enough[:, 3], enough[:, column]
+    return np.abs(real - modelled).max(), np.sqrt(np.mean(np.log(real / modelled) ** 2))
 
 
 def as_cast(points_m, lidar):
-    """The points where they were when they were hit: data sets move those of a turn to where the vehicle is at one time.
+    """The points where they were when they were hit: data sets move those of a turn to one time.
 
-    Moved along x by what the vehicle drove, in proportion to the azimuth and with a jump where the turn begins, rows are
-    no more cones about the axis: that tells how far.
+    Moved along x by what the vehicle drove, in proportion to the azimuth and with a jump where the turn begins, rows
+    are no more cones about the axis: that tells how far.
     """
-    cast_m, way_m = transform(invert(lidar.mount.matrix()), points_m), 0.0
-    rows_deg = np.sort(lidar.rows_deg())
+    in_sensor_m, rows_deg = transform(invert(lidar.mount.matrix()), points_m), np.sort(lidar.rows_deg())
+    x, y, z = in_sensor_m.T
+    flat_m, azimuth_deg = np.hypot(x, y), np.rad2deg(np.arctan2(y, x))
+    gap_rad = np.deg2rad(np.interp(np.rad2deg(np.arctan2(z, flat_m)), rows_deg, np.gradient(rows_deg)))
+    # Of points that are moved by metres only those are told apart that stay in their row, by more than they err.
+    used = (np.abs(z) > 0.04 * flat_m) & (flat_m > MOVED_M[0]) & (flat_m < MOVED_M[1])
+    used &= MOVED_BY_M * np.abs(z) < flat_m**2 * gap_rad / 2
+    weight = np.abs(z / flat_m)[used]
+    along, shift_m = np.cos(np.deg2rad(azimuth_deg[used])), np.zeros(len(z))
     for _ in range(4):  # with every pass fewer points are in a row that is not theirs
-        x, y, z = cast_m.T
-        flat_m, azimuth_deg = np.hypot(x, y), np.rad2deg(np.arctan2(y, x))
-        elevation_deg = np.rad2deg(np.arctan2(z, flat_m))
+        elevation_deg = np.rad2deg(np.arctan2(z, np.hypot(x + shift_m, y)))[used]
         row_deg = rows_deg[np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, elevation_deg)]
-        used = (np.abs(elevation_deg) > 2.0) & (flat_m > MOVED_M[0]) & (flat_m < MOVED_M[1])
-        off_m = z[used] / np.tan(np.deg2rad(row_deg[used])) - flat_m[used]
-        along, best = np.cos(np.deg2rad(azimuth_deg[used])), (np.inf, np.zeros(2), np.zeros(len(z)))
+        off_m = z[used] / np.tan(np.deg2rad(row_deg)) - flat_m[used]
+        best = np.inf, np.zeros(2), shift_m
         for begin_deg in np.arange(-180.0, 180.0, 5.0):
-            turn = (azimuth_deg - begin_deg) % 360.0 / 360.0
-            terms, misfit_m = np.column_stack([along, along * turn[used]]), np.abs(off_m)
+            turn = (np.rad2deg(np.arctan2(y, x + shift_m)) - begin_deg) % 360.0 / 360.0
+            terms, misfit_m = np.column_stack([along, along * turn[used]]), np.abs(off_m - along * shift_m[used])
             for within_m in (0.5, 0.3, 0.1):
                 kept = misfit_m < within_m
-                moved_m = np.linalg.lstsq(terms[kept], off_m[kept], rcond=None)[0]
+                moved_m = np.linalg.lstsq(terms[kept] * weight[kept, None], (off_m * weight)[kept], rcond=None)[0]
                 misfit_m = np.abs(off_m - terms @ moved_m)
-            best = min(best, (np.minimum(misfit_m, 0.1).mean(), moved_m, turn), key=lambda one: one[0])
+            best = min(best, ((np.minimum(misfit_m, 0.1) * weight).mean(), moved_m, turn), key=lambda one: one[0])
         _, moved_m, turn = best
-        cast_m[:, 0] += moved_m[0] + moved_m[1] * turn
-        way_m += moved_m[1]
-    return points_m if abs(way_m) < LEAST_WAY_M else transform(lidar.mount.matrix(), cast_m)
+        shift_m = moved_m[0] + moved_m[1] * turn
+    if abs(moved_m[1]) < LEAST_WAY_M:
+        return points_m
+    return transform(lidar.mount.matrix(), in_sensor_m + np.outer(shift_m, [1.0, 0.0, 0.0]))
 
 
 def nearest_road(points_m, place_m):
@@ -226,19 +232,19 @@ def main():
             if not isinstance(lidar, Lidar):
                 continue
             recorded = lidar.name if lidar.name in recording.sensors else recording.sensors[0]
-            clouds = (in_vehicle(recording.scan(recorded, index), recording.body).points_m for index in recording.frames)
-            sweeps = [as_cast(points_m.astype(float), lidar) for points_m in clouds]
+            scans = (recording.scan(recorded, index) for index in recording.frames)
+            sweeps = [as_cast(in_vehicle(one, recording.body).points_m.astype(float), lidar) for one in scans]
             label = f"{Path(folder).name} {lidar.name}"
             rows = curves[label] = by_range(ground_rays(sweeps, lidar), lidar, road)
             returns += [
-                (label, f"{low_m:.0f}-{low_m + 10:.0f}", f"{n:.0f}", *(f"{p:.2f}" for p in rest))
-                for low_m, n, *rest in rows
+                (label, f"{low_m:.0f}-{high_m:.0f}", f"{n:.0f}", *(f"{p:.2f}" for p in rest))
+                for low_m, high_m, n, *rest in rows
             ]
-            misfits.append((label, *(f"{value:.3f}" for column in (3, 4) for value in misfit(rows, column))))
+            misfits.append((label, *(f"{value:.3f}" for column in (4, 5) for value in misfit(rows, column))))
             place_m, on_road = lidar.mount.matrix()[:3, 3], []
             for points_m in sweeps:
                 above_m = points_m[:, 2] - road_profile(points_m).height_m(points_m)
-                on_road.append(points_m[(np.abs(above_m) < 0.15) & (np.abs(points_m[:, 1]) < 3 * HALF_ROAD_M)])
+                on_road.append(points_m[(np.abs(above_m) < 0.15) & (np.abs(points_m[:, 1]) < 3 * HALF_LANES_M)])
             real = [nearest_road(one, place_m) for one in on_road]
             model = nearest_road(simulated[lidar.name].points, place_m)
             cones += [(label, f"{np.median([one[at] for one in real]):.1f} / {model[at]:.1f}", at) for at in DIRECTIONS]
@@ -269,11 +275,12 @@ def draw(curves, path):
 
     figure, axes = plt.subplots(1, len(curves), figsize=(3.2 * len(curves), 2.8), sharey=True, layout="constrained")
     for axis, (label, rows) in zip(np.atleast_1d(axes), curves.items(), strict=True):
-        middle_m = rows[:, 0] + 5.0
-        error = np.sqrt(rows[:, 2].clip(0.02, 0.98) * (1 - rows[:, 2].clip(0.02, 0.98)) / (rows[:, 1] / 5.0))
-        axis.errorbar(middle_m, rows[:, 2], error, fmt="ko", markersize=4, label="real")
-        axis.plot(middle_m, rows[:, 3], "C0-", label="modelled, from the other half")
-        axis.plot(middle_m, rows[:, 4], "C1--", label="modelled, as built in")
+        middle_m = rows[:, :2].mean(axis=1)
+        share = rows[:, 3].clip(0.02, 0.98)
+        error = np.sqrt(share * (1 - share) / (rows[:, 2] / RAYS_OF_A_CELL))
+        axis.errorbar(middle_m, rows[:, 3], error, fmt="ko", markersize=4, label="real")
+        axis.plot(middle_m, rows[:, 4], "C0-", label="modelled, from the other half")
+        axis.plot(middle_m, rows[:, 5], "C1--", label="modelled, as built in")
         axis.axhline(1.0, color="0.6", linestyle=":", label="ideal")
         axis.set(title=label.split()[-1] if len(label) > 20 else label, xlabel="range (m)", ylim=(0, 1.08))
     np.atleast_1d(axes)[0].set_ylabel("P(return) from road")

@@ -1,6 +1,9 @@
 """What the tests of several rooms share."""
 
+import os
 import signal
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # before torch is loaded: threads that wait are to leave the cores
 
 import pytest
 from matplotlib.figure import Figure

@@ -104,6 +104,18 @@ def test_a_run_imports_what_it_needs_only(loaded):
     assert not loaded["run"] & optional
 
 
+def test_a_run_loads_of_scipy_next_to_nothing_which_stays_there_for_others():
+    code = (
+        "import sys; from torchcover.evaluation import evaluate\n"
+        "print('scipy.signal' in sys.modules, 'torchmetrics' in sys.modules)\n"
+        # As another package may ask that torchmetrics loads in the meantime.
+        "from torchcover.metrics.lean import _StandIn; sys.modules['scipy.signal'] = _StandIn('scipy.signal')\n"
+        "from scipy.signal import convolve; import scipy.signal.windows\n"
+        "print(len(convolve([1, 2], [1, 2])), type(sys.modules['scipy.signal']).__name__)"
+    )
+    assert python(code).split() == ["False", "True", "3", "module"]
+
+
 def test_every_public_name_is_there():
     assert {name for name in torchcover.__all__ if getattr(torchcover, name) is None} == set()
     assert set(torchcover.__all__) <= set(dir(torchcover))

@@ -53,6 +53,21 @@ def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
     np.testing.assert_array_equal(Coverage.load(alone / "coverage.npz").radius, coverages["both"].radius)
 
 
+def test_fog_never_makes_a_rig_better(torchcover, worlds):
+    path = worlds / "both.yaml"
+    path.write_text(path.read_text().replace("max_range_m: 60", "max_range_m: 60, range_at_10_percent_m: 30"))
+    *_, out = compare(torchcover, worlds, "both", options=["--weather", "clear", "--weather", "fog_50m"])
+    rows = json.loads((out / "summary.json").read_text())["rows"]
+    in_fog = {(row["region"], row["height"]): row for row in rows if row["rig"] == "both, fog_50m"}
+    pairs = [(row, in_fog[row["region"], row["height"]]) for row in rows if row["rig"] == "both, clear"]
+    known = [(clear, fog) for clear, fog in pairs if clear["known_cells"]]
+    assert known
+    assert all(fog["radius_m"] >= clear["radius_m"] for clear, fog in known)
+    lost = [clear["detection_2m"] - fog["detection_2m"] for clear, fog in known]
+    assert min(lost) >= 0
+    assert max(lost) > 0.05
+
+
 def test_one_more_sensor_never_makes_it_worse(torchcover, worlds):
     *_, out = compare(torchcover, worlds, "low", "both")
     rows = [row for row in json.loads((out / "summary.json").read_text())["rows"] if row["rig"] == "both"]

@@ -9,7 +9,7 @@ import torch
 
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.coverage import Coverage, Layer, Maximum, MeanOfMeans, PooledMean, Quantiles
-from torchcover.coverage.blocks import Blocks
+from torchcover.coverage.blocks import Blocks, KnownCells
 from torchcover.estimation import jackknife_error, ratio_errors
 
 # Cells so large that the sensor point below a reference point is always the nearest.
@@ -274,9 +274,10 @@ def test_steps_without_a_number_are_counted_on(forward):
 def test_doubling_the_blocks_keeps_every_sum(count):
     steps = random_steps(count, dyadic=True)
     blocked, plain = metric_over(steps), metric_over(steps, blocks=1)
-    for name in ("probed_steps", "mean_sums", "block_steps"):
-        assert torch.equal(blocked.metric_state[name].sum(dim=0), plain.metric_state[name][0]), name
-    assert torch.equal(blocked.points, plain.points)
+    sums = torch.zeros(CELLS, plain.cells.shape[1] - 1, dtype=torch.float64)
+    sums.index_add_(0, (blocked.cells[:, 0] % CELLS).long(), blocked.cells[:, 1:])
+    assert torch.equal(sums, plain.cells[:, 1:])
+    assert blocked.block_steps.sum() == plain.block_steps.sum() == count
     assert int(blocked.block_length) == 2 ** math.ceil(math.log2(count / 16))
     used = blocked.block_steps[blocked.block_steps > 0]
     assert 8 <= len(used) <= 16
@@ -439,15 +440,14 @@ def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
     values = torch.stack([radii, (radii <= THRESHOLD).double()]) * probed
     frames, sums = probed.sum(dim=1).long(), values.sum(dim=2)
     means = sums.sum(dim=1) / frames.sum(dim=0)
-    steps = torch.full((16,), radii.shape[1])
+    steps, at = torch.full((16,), radii.shape[1]), frames.sum(dim=0).flatten().nonzero().squeeze(1)
     counts = dict.fromkeys(Coverage.COUNTS, 0)
     return Coverage(
         grid=GRID,
         thresholds=(THRESHOLD,),
         max_radius=math.inf,
-        probed_steps=frames.sum(dim=0),
-        points=frames.sum(dim=0),
-        layers=map(Layer, MeanOfMeans((THRESHOLD,)).quantities, means),
+        known=KnownCells(GRID.shape, at, *[frames.sum(dim=0).flatten()[at]] * 2),
+        layers=map(Layer, MeanOfMeans((THRESHOLD,)).quantities, means.flatten(1)[:, at]),
         counts=counts,
         blocks=Blocks.of(steps, frames, sums.movedim(0, 1)),
     )

@@ -14,6 +14,7 @@ from torchcover.coverage import Maximum, MeanOfMeans, PooledMean, Quantiles, Ste
 GRID = BevGrid(x=(-2.0, 3.0), y=(-1.5, 1.0), cell=0.5, heights={"high": (1.0, 2.0), "low": (-1.0, 0.5)})
 ONE_CELL = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
 NOTHING = torch.zeros(0, 3)
+SETS_OF_THRESHOLDS = ((0.1,), (0.25,), (0.5,), (0.1, 0.25, 0.5), (0.25, 0.4, 3.0))
 EVERY_AGGREGATION = (Maximum(), PooledMean(), Quantiles((0.25, 0.9)), StepQuantiles((0.5,)))
 OPTIONS = {"aggregations": EVERY_AGGREGATION}
 
@@ -269,23 +270,36 @@ def test_more_sensor_points_never_make_it_worse(seed):
     assert (map_of(before, "radius_maximum_m") >= before.radius - 1e-12)[known].all()
 
 
-def test_points_that_were_measured_farther_off_than_the_largest_threshold_are_none():
+def test_a_point_covers_from_a_threshold_as_large_as_its_error_on_whatever_else_is_asked():
     points, reference = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(2)).unbind()
-    error = torch.linspace(-0.6, 0.6, 40)
-    off, near = torch.full((40,), math.inf), error.abs() <= 0.4
-    for each, kept in ((error, points[near]), ([error], points[near]), (off, NOTHING), (torch.zeros(40), points)):
-        metric, plain = (CoverageMetric(ONE_CELL, (0.1, 0.4), max_radius=9.0) for _ in range(2))
-        many = isinstance(each, list)
-        metric.update([points] if many else points, [reference] if many else reference, error=each)
-        plain.update(kept, reference)
-        assert torch.equal(metric.compute().radius, plain.compute().radius)
-        assert int(metric.empty_sensor_steps) == (len(kept) == 0)
-    by_name = CoverageMetric(ONE_CELL, (0.4,), max_radius=9.0, sensors=("a", "b"))
-    by_name.update({"a": points, "b": points[:5]}, reference, error={"a": error, "b": off[:5]})
-    assert torch.equal(by_name.compute().radius, coverage([(points[near], reference)], max_radius=9.0).radius)
-    everything = CoverageMetric(ONE_CELL, (), max_radius=9.0)
-    everything.update(points, reference, error=1e9 * error)
-    assert torch.equal(everything.compute().radius, coverage([(points, reference)], max_radius=9.0).radius)
+    error = torch.linspace(-0.6, 0.6, 40)[torch.randperm(40, generator=torch.Generator().manual_seed(3))]
+    asked = {thresholds: CoverageMetric(ONE_CELL, thresholds, max_radius=9.0) for thresholds in SETS_OF_THRESHOLDS}
+    for metric in asked.values():
+        metric.update([points], [reference], error=[error])
+    found = {thresholds: metric.compute() for thresholds, metric in asked.items()}
+    (radius,) = {float(one.radius) for one in found.values()}
+    assert radius == float(coverage([(points[error.abs() <= 0.4], reference)], max_radius=9.0).radius)
+    for threshold in (0.1, 0.25, 0.5):
+        (known,) = {float(one.detection[given.index(threshold)]) for given, one in found.items() if threshold in given}
+        near = torch.cdist(reference, points[error.abs() <= threshold]).amin(dim=1) <= threshold
+        assert known == pytest.approx(float(near.double().mean()))
+    assert len({float(one) for one in found[0.1, 0.25, 0.5].detection}) == 3
+
+
+def test_errors_are_those_of_all_sensors_one_after_the_other():
+    points, reference = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(2)).unbind()
+    error, far = torch.linspace(-0.6, 0.6, 40), torch.full((5,), math.inf)
+    by_name, plain = (CoverageMetric(ONE_CELL, (0.3,), max_radius=9.0, sensors=("a", "b")) for _ in range(2))
+    by_name.update({"b": points[:5], "a": points}, reference, error=torch.cat([far, error]))
+    plain.update({"a": points[error.abs() <= 0.3], "b": NOTHING}, reference)
+    layers, expected = (metric.compute().redundancy.layers for metric in (by_name, plain))
+    assert [key for key in layers if "radius" not in key and torch.equal(layers[key].values, expected[key].values)] == [
+        key for key in layers if "radius" not in key
+    ]
+    blind = CoverageMetric(ONE_CELL, (3.0,), max_radius=9.0)
+    blind.update(points, reference, error=torch.full((40,), 0.5))
+    assert int(blind.empty_sensor_steps) == 1
+    assert (float(blind.compute().radius), float(blind.compute().detection)) == (9.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -299,7 +313,7 @@ def test_points_that_were_measured_farther_off_than_the_largest_threshold_are_no
         (torch.tensor([0.0, math.nan]), ValueError, r"error\[0\]: .*got \(2,\) with 1 NaN"),
         ([torch.zeros(2)] * 2, ValueError, r"2 errors for 1 reference clouds; one a step each"),
         (0.1, TypeError, r"error .*tensor"),
-        ({"a": torch.zeros(2)}, TypeError, r"got clouds by name"),
+        ({"a": torch.zeros(2)}, TypeError, r"error .*tensor"),
     ],
 )
 def test_errors_that_are_none_of_its_points_are_refused(given, error, message):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from torchcover import BevGrid, CoverageMetric
+from torchcover.coverage import Maximum, PooledMean
 
 ONE_CELL = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)})
 STEP = (torch.tensor([[1.0, 0.0, 0.0]]), torch.zeros(1, 3))
@@ -18,14 +19,47 @@ def test_sums_over_very_many_steps_do_not_drift():
     many = {name: value if name == "fingerprint" else value * 2**25 for name, value in metric.state_dict().items()}
     metric.load_state_dict(many)
     metric.update([STEP[0]] * 3, [STEP[1]] * 3)
-    for name in ("probed_steps", "points", "steps", "mean_sums"):
-        assert metric.metric_state[name].amax().item() == 2**25 + 3, name
+    assert metric.cells.tolist() == [[0.0, 2**25 + 3, 2**25 + 3, 2**25 + 3, 2**25 + 3]]
 
 
-@pytest.mark.parametrize("cells", [10, 1000])
-def test_the_state_is_a_few_numbers_for_each_cell(cells):
-    metric = CoverageMetric(BevGrid(x=(0.0, cells), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)}))
-    assert sum(value.numel() for value in metric.metric_state.values()) < 4 * cells + 50
+def clouds(seed: int, points: int = 300) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(20, 3, generator=generator), torch.rand(points, 3, generator=generator)
+
+
+@pytest.mark.parametrize("cell", [0.1, 0.001])
+def test_the_state_is_a_few_numbers_for_each_cell_that_a_step_has_touched(cell):
+    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=cell, heights={"all": (-1.0, 1.0)})
+    metric = CoverageMetric(grid, blocks=8)
+    for at in range(16):
+        metric.update(*clouds(at), place_in_time=at)
+    assert len(metric.cells) <= min(8 * grid.cells, 16 * 300)
+    assert sum(value.numel() for value in metric.metric_state.values()) < 5 * len(metric.cells) + 250
+
+
+def test_when_rows_are_added_up_changes_no_bit_and_a_state_has_no_order():
+    """Reading the state adds up what waits: after every step, or once."""
+    grid = BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=0.1, heights={"all": (-1.0, 1.0)})
+    every = [CoverageMetric(grid, blocks=8, aggregations=[Maximum(), PooledMean()]) for _ in range(3)]
+    for at in range(40):
+        for number, metric in enumerate(every):
+            metric.update(*clouds(at, points=60), place_in_time=at)
+            if number == 1 or (number == 2 and at % 7 == 0):
+                assert (metric.cells[:, 0].diff() > 0).all()
+    for metric in every[1:]:
+        assert all(torch.equal(value, metric.metric_state[name]) for name, value in every[0].metric_state.items())
+
+
+@pytest.mark.parametrize(
+    "spoil", [lambda key: key + 0.5, lambda key: key.flip(0), lambda key: key - 1.0, lambda key: key * 1e6]
+)
+def test_a_table_whose_keys_are_none_is_refused(spoil):
+    metric = CoverageMetric(BevGrid(x=(0.0, 1.0), y=(0.0, 1.0), cell=0.1, heights={"all": (-1.0, 1.0)}))
+    metric.update(*clouds(0))
+    state = metric.state_dict()
+    state["cells"][:, 0] = spoil(state["cells"][:, 0])
+    with pytest.raises(ValueError, match="state 'cells': keys in ascending order, whole numbers below 100, are needed"):
+        metric.load_state_dict(state)
 
 
 def test_no_step_holds_on_to_its_graph():

@@ -28,11 +28,13 @@ RIG = Rig.model_validate(
 ROAD = Material.load("road")
 
 
-def sweep(generator, wall_m=np.inf):
-    """What returns from a plain, with a wall across the road ahead."""
+def sweep(generator, wall_m=np.inf, top_m=np.inf):
+    """What returns from a plain, with a wall across the road ahead, as high as said."""
     directions = RIG.sensors[0].directions().reshape(3, -1)
     range_m = HEIGHT_M / -directions[2]
-    cosine, on_wall = -directions[2], directions[0] * range_m > wall_m
+    with np.errstate(divide="ignore"):
+        at_wall_m = HEIGHT_M + directions[2] * wall_m / directions[0]
+    cosine, on_wall = -directions[2], (directions[0] * range_m > wall_m) & (at_wall_m < top_m)
     range_m = np.where(on_wall, wall_m / directions[0], range_m)
     excess = log_excess(range_m, cosine, ROAD.share, ROAD.incidence_exponent, RANGE_M)
     returned = on_wall | (generator.random(len(range_m)) < return_probability(excess, SPREAD, ROAD.spread))
@@ -88,6 +90,14 @@ def test_rays_behind_a_wall_are_in_nobodys_count():
     assert rays.range_m[ahead].max() < 31 < 60 < rays.range_m[~ahead].max()
 
 
+def test_rays_pass_over_what_is_low():
+    """Behind a beam of 0.5 m the road is hidden from 30 to 30 / (1 - 0.5 / 1.9) = 41 m only."""
+    beam = ground_rays([sweep(np.random.default_rng(1), wall_m=30.0, top_m=0.5)], RIG.sensors[0])
+    ahead = np.abs(beam.azimuth_deg) < 10
+    assert not ((beam.range_m[ahead] > 31) & (beam.range_m[ahead] < 40)).any()
+    assert ((beam.range_m[ahead] > 45) & (beam.range_m[ahead] < 80)).sum() > 100
+
+
 def test_the_road_is_found_where_it_tilts_and_bends():
     x, y = np.meshgrid(np.linspace(-60, 60, 121), np.linspace(-6, 6, 25))
     height_m = 0.02 * x - 0.01 * y + 0.2 * (x / 40) ** 2 * (x > 0)
@@ -113,8 +123,9 @@ def test_near_road_cannot_tell_how_far_a_lidar_sees(sweeps, tmp_path):
     [
         (lambda made: [points_m[:0] for points_m in made], 5.0, "0 rays to an open road"),
         (lambda made: made, 0.1, "the vehicle stands, 3 sweeps within 0.20 m"),
+        (lambda made: [*made[:2], made[0]], False, "roof: sweeps 0 and 2 are the same cloud"),
     ],
-    ids=["empty", "standing"],
+    ids=["empty", "standing", "one sweep again"],
 )
 def test_recordings_that_say_nothing_are_refused(sweeps, tmp_path, sweeps_made, poses, told):
     with pytest.raises(ValueError, match=told):

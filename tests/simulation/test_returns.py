@@ -6,6 +6,7 @@ import yaml
 from pydantic import ValidationError
 
 from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator, builtin_names
+from torchcover.simulation.documents import explain
 from torchcover.simulation.returns import SURE, extinction_per_m, log_excess, return_probability
 
 KEYS = {
@@ -72,10 +73,12 @@ def test_each_builtin_material_is_called_as_its_file():
 
 
 def test_bad_materials_are_told():
-    with pytest.raises(ValidationError, match="less than or equal to 1"):
-        Material(name="snow", reflectivity=1.2)
-    with pytest.raises(ValidationError, match="greater than or equal to 0"):
-        Material(name="hole", reflectivity=-0.1)
+    for reflectivity in (1.5, -0.1, True, "shiny", float("nan"), None):
+        with pytest.raises(ValidationError) as refused:
+            Material(name="snow", reflectivity=reflectivity)
+        assert explain(refused.value) == (
+            f"reflectivity: a share of light from 0 to 1, or `retroreflective`, is needed; got {reflectivity!r}"
+        )
     with pytest.raises(FileNotFoundError, match="is 'brick' meant"):
         Material.load("bricks")
 
@@ -191,6 +194,21 @@ def test_a_material_may_be_a_file_beside_the_scenario(tmp_path):
     assert of[0] == of[2]
     assert of[0][0] == 0 < of[1][0]
     assert of[0][1] != of[1][1]
+
+
+def test_a_rig_is_written_with_the_material_of_a_housing_wherever_it_goes(tmp_path, monkeypatch):
+    """And so it is with any file that a document names."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "there").mkdir()
+    (tmp_path / "own.yaml").write_text(yaml.safe_dump({"name": "own", "reflectivity": 0.4}))
+    body = {"name": "mast", "shape": {"type": "cylinder", "radius_m": 0.1, "height_m": 1.0}, "material": "own.yaml"}
+    (tmp_path / "rig.yaml").write_text(yaml.safe_dump({"name": "r", "sensors": [KEYS | {"housing": [body]}]}))
+    rig = Rig.load("rig.yaml")
+    rig.save("there/again.yaml")
+    monkeypatch.chdir(tmp_path / "there")
+    again = Rig.load("again.yaml")
+    assert again.sensors[0].housing[0].material == str(tmp_path / "own.yaml")
+    assert again.content() == Rig.load(tmp_path / "rig.yaml").content()
 
 
 def test_a_body_is_as_dark_all_over_and_always():

@@ -7,7 +7,9 @@ import pytest
 import trimesh
 
 from torchcover.geometry import rigid
-from torchcover.simulation import SurfaceReference
+from torchcover.simulation import SurfaceReference, shapes, sound
+from torchcover.simulation.local_ground import GroundSquares, level_faces
+from torchcover.simulation.patches import Bounds, Patches, outward_faces
 from torchcover.simulation.scene import Scene
 from torchcover.simulation.shapes import Box, Ellipsoid, Mesh, Plane
 from torchcover.simulation.sound import coincident_faces, told
@@ -47,7 +49,7 @@ def test_sound_meshes_are_told_nothing_about(mesh, inside_out):
     mesh = turned(mesh, slice(None)) if inside_out else mesh
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert told("it", mesh) is mesh
+        assert told("it", mesh).faces is mesh.faces
 
 
 def test_what_is_wrong_is_said_with_the_name_and_the_share():
@@ -77,6 +79,30 @@ def test_faces_coincide_with_what_looks_the_same_way():
     # A pavement whose top is in the plane of a sheet, whichever way the sheet looks.
     sunk = Mesh(cube.vertices_m - [0, 0, 2], cube.faces)
     assert counts(turned(plane, slice(None)), sunk)[1] == counts(plane, sunk)[1] == 2
+
+
+def test_how_many_faces_are_looked_at_together_changes_nothing(monkeypatch):
+    """A mesh of ten million is looked at in parts: of hills, a ball, and a patch of the hills once more."""
+    hills, ball = grid(), Ellipsoid(type="ellipsoid", size_m=(9, 9, 9)).mesh()
+    hills = hills._replace(vertices_m=hills.vertices_m + [0, 0, 1] * np.sin(hills.vertices_m[:, :1]))
+    meshes = [hills, ball, hills.with_faces(np.arange(30, 50))]
+    around = Bounds(np.array([[-20.0, -15.0, -9.0]]), np.array([[30.0, 5.0, 9.0]]))
+
+    def found():
+        cut = [Patches.cut(mesh, around) for mesh in meshes]
+        return [
+            *(mask for mesh in meshes for mask in (outward_faces(mesh), level_faces(mesh))),
+            *coincident_faces(meshes, [True] * 3),
+            *GroundSquares.of(meshes, np.zeros(3)).levels,
+            *(np.sort(patches.corner_m + patches.first_m, axis=1) for patches in cut),
+        ]
+
+    at_once = found()
+    assert [int(mask.sum()) for mask in at_once[6:9]] == [20, 0, 20]
+    monkeypatch.setattr(shapes, "PART", 7)
+    monkeypatch.setattr(sound, "PART", 7)
+    for one, other in zip(at_once, found(), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.filterwarnings("ignore:.*faces lie within 1 mm")

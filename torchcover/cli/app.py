@@ -13,6 +13,7 @@ import typer
 
 from torchcover.cli import commands
 from torchcover.cli.evaluate import compare, evaluate
+from torchcover.evaluation.cores import set_threads
 from torchcover.evaluation.progress import terminable
 
 app = typer.Typer(
@@ -39,6 +40,7 @@ def main() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # where there is no –, a result with ? is better than none
+    set_threads()
     try:
         with warnings.catch_warnings(), terminable(_on_signals()) as signals:
             warnings.showwarning = _warn
@@ -81,7 +83,8 @@ def _on_signals() -> Callable[[Sequence[int]], None]:
 def _mistake(error: Exception) -> str | None:
     """What a user did wrong, or lacks; None if it is a mistake of ours."""
     if isinstance(error, USAGE_ERROR):
-        return str(error.format_message())  # type: ignore[attr-defined]  # the typed name is private
+        # The typed name is private; of a choice it tells the kind of the exception, too.
+        return str(error.format_message()).replace("Value error, ", "")  # type: ignore[attr-defined]
     if isinstance(error, ValueError | TypeError | OSError):
         return str(error)
     if isinstance(error, ImportError) and "pip install" in str(error):

@@ -18,42 +18,41 @@ class CellMeans(NamedTuple):
 
     Args:
         cell: (K,) int64 numbers of the cells that have points, ascending.
+        of_point: (N,) int64 which of these each point lies in.
         points: (K,) int64 points in each of them.
         weight: (K,) float64 sum of their weights; the number of points where there are none.
         mean: (V, K) float64 mean of each of the V values.
     """
 
     cell: Tensor
+    of_point: Tensor
     points: Tensor
     weight: Tensor
     mean: Tensor
 
 
-def mean_per_cell(cell: Tensor, values: Tensor, cells: int, weights: Tensor | None = None) -> CellMeans:
+def mean_per_cell(cell: Tensor, values: Tensor, weights: Tensor | None = None) -> CellMeans:
     """Mean of each value over the points of each cell, summed in float64.
 
     Args:
-        cell: (N,) int64 cell numbers in [0, cells).
+        cell: (N,) int64 cell numbers.
         values: (V, N) one row a value, one column a point.
-        cells: Number of cells of the grid.
         weights: (N,) positive weight of each point; all the same if not given.
 
     Example:
-        >>> means = mean_per_cell(torch.tensor([4, 4, 7]), torch.tensor([[1.0, 3.0, 5.0]]), cells=9)
+        >>> means = mean_per_cell(torch.tensor([4, 4, 7]), torch.tensor([[1.0, 3.0, 5.0]]))
         >>> means.cell, means.points, means.mean
         (tensor([4, 7]), tensor([2, 1]), tensor([[2., 5.]], dtype=torch.float64))
     """
-    count = torch.bincount(cell, minlength=cells)
-    touched = count.nonzero().squeeze(1)
-    points = count[touched]
+    touched, of_point, points = torch.unique(cell, return_inverse=True, return_counts=True)
     if weights is None:
         weight, weighted = points.double(), values.double()
     else:
         weights = weights.double()
-        weight, weighted = _sum_per_cell(cell, weights, cells)[touched], values.double() * weights
-    sums = [_sum_per_cell(cell, row, cells)[touched] for row in weighted]
+        weight, weighted = _sum_per_cell(of_point, weights, len(touched)), values.double() * weights
+    sums = [_sum_per_cell(of_point, row, len(touched)) for row in weighted]
     mean = torch.stack(sums) / weight if sums else values.new_empty((0, len(touched)), dtype=torch.float64)
-    return CellMeans(touched, points, weight, mean)
+    return CellMeans(touched, of_point, points, weight, mean)
 
 
 def _sum_per_cell(cell: Tensor, values: Tensor, cells: int) -> Tensor:

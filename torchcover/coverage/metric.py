@@ -1,25 +1,35 @@
-"""The coverage metric: clouds in, fixed-size sums, coverage out."""
+"""The coverage metric: clouds in, sums over the cells that were touched, coverage out."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations import Aggregation, BinnedStep, Layer, MeanOfMeans, State, VisibleArea
-from torchcover.coverage.binning import mean_per_cell
-from torchcover.coverage.blocks import AreaSums, Blocks, BlockSumsT
+from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
+from torchcover.coverage.blocks import AreaSums, Blocks, KnownCells
+from torchcover.coverage.columns import Columns, Sums
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.measures import Measure
 from torchcover.coverage.plotting import draw_coverage
+from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.coverage.redundancy import Redundancy, SensorFailures
-from torchcover.coverage.region_sums import IN_REGIONS, RegionSums
+from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums, numbers_of_places
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.steps import CheckedStep, Clouds, SensorClouds, as_list, check_parameters, checked_steps
+from torchcover.coverage.steps import (
+    CheckedStep,
+    Clouds,
+    SensorClouds,
+    StepSums,
+    as_list,
+    check_parameters,
+    checked_steps,
+)
 from torchcover.estimation import Estimate
-from torchcover.metrics import SumsInBlocks, figure_of
+from torchcover.metrics import SumsInBlocks, TouchedSums, added_up, figure_of
+from torchcover.metrics.blocks import FINER
 from torchcover.neighbors import nearest
 
 if TYPE_CHECKING:
@@ -34,8 +44,9 @@ class CoverageMetric(SumsInBlocks):
         detection[h, y, x] = E_t[ E_q in cell [ 1(r(q) <= threshold) ] ]
 
     with r(q) from `torchcover.blind_spot_radius`; a step counts in a cell only if it had a reference point there
-    (Uecker & Zöllner 2024). The state is a few sums for each cell and region, whatever the number of steps: two metrics
-    over different steps merge exactly (`merge_state`), and ranks are added up when `compute` is called.
+    (Uecker & Zöllner 2024). The state is a few sums for each cell and region that a step has touched: two metrics over
+    different steps merge exactly (`merge_state`), and ranks are added up when `compute` is called. Steps are added up
+    in the order in which they come; in another one, or in parts, the last bits may differ, as of any sum of floats.
 
     With `blocks` the sums are kept in as many blocks of contiguous steps, and the result has standard errors: steps
     that follow each other are alike, blocks that are longer than the likeness lasts are independent.
@@ -47,7 +58,7 @@ class CoverageMetric(SumsInBlocks):
         max_radius: Saturation of r in metres. An empty sensor cloud gives r = `max_radius`: with the default,
             infinity, such a step makes the radius of its cells infinite.
         blocks: 1 for no errors, or an even number from 8 on, half of which at least are in use at the end of a long
-            run. The state grows with it: 24 bytes a cell and block.
+            run.
         aggregations: Others than the mean of means, from `torchcover.coverage`: `Maximum()`, `PooledMean()`,
             `Quantiles(levels)`, `StepQuantiles(levels)`, or a class of one's own; at most one of each. Each gives maps,
             and numbers of `regions`.
@@ -56,8 +67,7 @@ class CoverageMetric(SumsInBlocks):
         sensors: Names of the rig's sensors, for `Coverage.redundancy`: then `update` takes a cloud for each by its
             name, and what the rig is without each of them is known as well.
         square_metres: Whether there is to be an estimate by area too; then every step needs the square metres of its
-            reference points, as `SurfaceReference` gives them. The state grows by 8 (2 + thresholds) bytes a cell and
-            block.
+            reference points, as `SurfaceReference` gives them.
         backend: Nearest-neighbour search, as in `torchcover.nearest`.
         memory_mb: As in `torchcover.nearest`.
         kwargs: For `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
@@ -74,11 +84,8 @@ class CoverageMetric(SumsInBlocks):
         tensor([[[0.4000,    nan]]], dtype=torch.float64)
     """
 
-    probed_steps: Tensor
-    points: Tensor
-    mean_sums: Tensor
-    area_m2: Tensor
-    area_sums: Tensor
+    cells = TouchedSums()
+    places = TouchedSums()
     empty_sensor_steps: Tensor
     empty_reference_steps: Tensor
     saturated_points: Tensor
@@ -119,35 +126,17 @@ class CoverageMetric(SumsInBlocks):
         self.grid, self.thresholds, self.max_radius = grid, thresholds, max_radius
         self.regions, self.sensors, self.square_metres = regions, tuple(sensors), square_metres
         self.backend, self.memory_mb = backend, memory_mb
-        over_area = [VisibleArea(thresholds, blocks)] if square_metres else []
-        self._of_grid: tuple[Aggregation, ...] = (MeanOfMeans(thresholds, blocks), *over_area, *aggregations)
+        over_area = [VisibleArea(thresholds)] if square_metres else []
+        self._of_grid: tuple[Aggregation, ...] = (MeanOfMeans(thresholds), *over_area, *aggregations)
         self._failures = SensorFailures(self.sensors, thresholds, square_metres) if sensors else None
         self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *([self._failures] if self._failures else []))
-        values = 1 + len(thresholds) + (len(self._failures.quantities) if self._failures else 0)
-        by_area = (self.fine_blocks, values) if square_metres else None
-        self._in_regions = RegionSums(aggregations, Places(regions, grid), blocks, by_area)
-        self._add_states()
-
-    def _add_states(self) -> None:
-        self.add_block_sum("probed_steps", (self.grid.cells,), torch.int64)
-        self.add_sum("points", (self.grid.cells,), torch.int64)
+        self._aggregated, self._columns = tuple(aggregations), Columns(self.aggregations)
+        self._places = Places(regions if square_metres or aggregations else (), grid)
+        shape: dict[str, Any] = {"columns": self._columns.count, "maxima": self._columns.maxima}
+        self.add_touched_sums("cells", grid.cells, **shape)
+        self.add_touched_sums("places", self._places.count, **shape, fine=True)
         for name in Coverage.COUNTS[1:]:  # but for the steps
             self.add_sum(name, (), torch.int64)
-        self._state_names: dict[str, list[str]] = {}
-        for aggregation in self.aggregations:
-            self._add_states_of(aggregation.name, aggregation.states(self.grid.cells))
-        self._add_states_of(IN_REGIONS, self._in_regions.states())
-
-    def _add_states_of(self, owner: str, states: Mapping[str, State]) -> None:
-        self._state_names[owner] = list(states)
-        for name, state in states.items():
-            full_name = f"{owner}_{name}"
-            self.add_state(full_name, state.initial, dist_reduce_fx=state.reduction, persistent=True)
-            self._in_blocks = (*self._in_blocks, *[full_name] * (state.in_blocks and not state.fine))
-            self._in_fine_blocks = (*self._in_fine_blocks, *[full_name] * state.fine)
-
-    def _sums_of(self, owner: str) -> dict[str, Tensor]:
-        return {name: getattr(self, f"{owner}_{name}") for name in self._state_names[owner]}
 
     def update(
         self,
@@ -157,7 +146,7 @@ class CoverageMetric(SumsInBlocks):
         weights: Clouds | None = None,
         height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
-        error: SensorClouds | None = None,
+        error: Clouds | None = None,
     ) -> None:
         """Add one step, or one step for each entry of two lists.
 
@@ -176,8 +165,9 @@ class CoverageMetric(SumsInBlocks):
             place_in_time: Number of the step, 10^15 at most, or a list of them (`frame.place_in_time`); it decides
                 about the block, so that steps of one number, as of an instant that is seen again, share one. Not
                 given: counted on from the steps so far.
-            error: (N,) by how many metres each point of the rig was measured off its place, along its ray, or as
-                `sensor` in a dict or a list. One that is off by more than `within_m` is no point. Not given: none is.
+            error: (N,) by how many metres each point of the rig was measured off its place, along its ray, those of
+                several sensors one after the other, or a list of them. A point covers nothing at thresholds below that,
+                and counts for radii up to `MEASURED_WITHIN_M`, 0.4. Not given: none is off.
 
         Raises:
             ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates; weights,
@@ -186,8 +176,8 @@ class CoverageMetric(SumsInBlocks):
         """
         given = (sensor, reference, weights, height, place_in_time, error)
         how: dict[str, Any] = {"grid": self.grid, "square_metres": self.square_metres, "names": self.sensors}
-        for step in checked_steps(*given, within_m=self.within_m, first=int(self.steps), **how):
-            self._add_step(step)
+        for step in checked_steps(*given, first=int(self.steps), **how):
+            self.add(self.sums_of(step))
 
     def forward(
         self,
@@ -197,7 +187,7 @@ class CoverageMetric(SumsInBlocks):
         weights: Clouds | None = None,
         height: Clouds | None = None,
         place_in_time: int | Sequence[int] | None = None,
-        error: SensorClouds | None = None,
+        error: Clouds | None = None,
     ) -> Coverage:
         """Add steps as `update` does, and return the coverage of these steps alone."""
         if place_in_time is None:  # torchmetrics adds the steps to an empty state first: counting would start at 0
@@ -205,67 +195,121 @@ class CoverageMetric(SumsInBlocks):
         given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
         return super().forward(sensor, reference, **given)  # type: ignore[no-any-return]
 
-    @property
-    def within_m(self) -> float:
-        """How far off a point may be measured: the largest threshold; any distance if there is none."""
-        return max(self.thresholds, default=math.inf)
-
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
-    def _add_step(self, step: CheckedStep) -> None:
-        sensors, reference, weights, height, place_in_time = step
+    def sums_of(self, step: CheckedStep) -> StepSums:
+        """What a step is to `add`, wherever it is measured: it depends on the parameters of the metric alone."""
+        _, _, reference, weights, height, place_in_time = step
         inside, of, cell = self.grid.bins(reference, height)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
-        how: dict[str, Any] = {"backend": self.backend, "memory_mb": self.memory_mb, "max_distance": self.max_radius}
-        each = [nearest(reference[inside], one.to(reference.device), **how).distance for one in sensors.values()]
-        of_sensors = torch.stack(each)
-        distance, device = of_sensors.amin(dim=0), self.points.device
-        weights = None if weights is None else weights.to(reference.device)[inside[of]].to(device)
-        binned = self._binned(place_in_time, cell.to(device), of_sensors[:, of].to(device), weights)
-        for aggregation in self.aggregations:
-            aggregation.update(self._sums_of(aggregation.name), binned)
-        fine = self._fine_block_of(place_in_time)
-        self._in_regions.update(self._sums_of(IN_REGIONS), binned, fine, reference[inside[of]].to(device))
-        self.probed_steps[binned.block, binned.means.cell] += 1
-        self.points[binned.means.cell] += binned.means.points
-        self.steps += 1
-        self.empty_sensor_steps += not any(map(len, sensors.values()))
-        self.empty_reference_steps += len(reference) == 0
-        self.inside_points += len(distance)
-        self.outside_points += len(reference) - len(distance)
-        self.no_ground_points += 0 if height is None else height.isnan().sum().to(device)
-        self.saturated_points += (distance >= self.max_radius).sum().to(device)
+        of_sensors = self._distances(reference[inside], step)
+        distance = of_sensors[0].amin(dim=0)
+        values, points = self._values([one[:, of] for one in of_sensors]), reference[inside[of]]
+        weights = None if weights is None else weights.to(reference.device)[inside[of]]
+        place, point = self._places.of_points(points, cell)
+        counts = {
+            "steps": 1,
+            "empty_sensor_steps": int(step.is_blind),
+            "empty_reference_steps": int(len(reference) == 0),
+            "saturated_points": int((distance >= self.max_radius).sum()),
+            "inside_points": len(distance),
+            "outside_points": len(reference) - len(distance),
+            "no_ground_points": 0 if height is None else int(height.isnan().sum()),
+        }
+        return StepSums(
+            place_in_time,
+            counts,
+            self._columns.of_step(cell, values, weights),
+            self._columns.of_step(place, values[:, point], None if weights is None else weights[point]),
+        )
 
-    def _binned(self, place_in_time: int, cell: Tensor, of_sensors: Tensor, weights: Tensor | None) -> BinnedStep:
-        """The values of points in cells, from their distances to each sensor, or to all of them as one."""
-        distance = of_sensors.amin(dim=0)
+    def add(self, sums: StepSums) -> None:
+        """Add what `sums_of` a metric of the same parameters has made of a step."""
+        block, fine = self._block_of(sums.place_in_time), self._fine_block_of(sums.place_in_time)
+        self.add_touched("cells", block, sums.cells)
+        self.add_touched("places", fine, sums.places)
+        for name, count in sums.counts.items():
+            getattr(self, name).add_(count)
+
+    def _distances(self, reference: Tensor, step: CheckedStep) -> list[Tensor]:
+        """(S, M) metres to the nearest point of each sensor that counts for the radius, then those for each threshold.
+
+        Each point is searched in once, beside those that the same thresholds take: most are off by less than any.
+        """
+        found: dict[float, Tensor] = {}
+        beyond_m, distance = -math.inf, None
+        for within_m in sorted({MEASURED_WITHIN_M, *self.thresholds}):
+            reach_m = self.max_radius if within_m <= MEASURED_WITHIN_M else max(self.thresholds)
+            some = step.measured(beyond_m, within_m)
+            if distance is None or any(map(len, some)):
+                how: dict[str, Any] = {"backend": self.backend, "memory_mb": self.memory_mb, "max_distance": reach_m}
+                each = torch.stack([nearest(reference, one.to(reference.device), **how).distance for one in some])
+                distance = each if distance is None else torch.minimum(distance, each)
+            found[within_m], beyond_m = distance, within_m
+        return [found[within_m] for within_m in (MEASURED_WITHIN_M, *self.thresholds)]
+
+    def _values(self, of_sensors: Sequence[Tensor]) -> Tensor:
+        """(V, N) float64 values of points, from what `_distances` found."""
+        distance, *of_thresholds = (one.amin(dim=0) for one in of_sensors)
         # Before saturation: a point with nothing within `max_radius` is not detected at a threshold of `max_radius`.
-        detected = [(distance <= threshold).double() for threshold in self.thresholds]
+        pairs = zip(of_thresholds, self.thresholds, strict=True)
+        detected = [(near <= threshold).double() for near, threshold in pairs]
         radius = distance.clamp(max=distance.new_tensor(self.max_radius)).double()
         values = torch.stack([radius, *detected])
         if self._failures:
             values = torch.cat([values, self._failures.values(of_sensors, self.max_radius)])
-        means = mean_per_cell(cell, values, self.grid.cells, weights)
-        return BinnedStep(cell, values, weights, means, self._block_of(place_in_time), self.grid.cells)
+        return values
 
     def compute(self) -> Coverage:
         """The coverage so far. Cells that no reference point ever probed are NaN with count 0."""
-        probed_steps = self.probed_steps.sum(dim=0)
-        failures = [] if self._failures is None else self._layers(self._failures, probed_steps)
+        cells, table = self.grid.cells, self.cells
+        whole = added_up(torch.cat([table[:, :1] % cells, table[:, 1:]], dim=1), self._columns.maxima)
+        at, sums = whole[:, 0].long(), self._columns.read(whole[:, 1:].T)
+
+        known = KnownCells(self.grid.shape, at, sums.probed_steps.long(), sums.points.long())
+        failures = sums.layers(self._failures, self.max_radius) if self._failures else []
+        in_blocks = self._columns.read(table[:, 1:].T)
+        listed = self.block_steps.clone(), (self.blocks, *self.grid.shape), table[:, 0].long()
+        mean, area = (in_blocks.of.get(kind.name, {}) for kind in (MeanOfMeans, VisibleArea))
         return Coverage(
             grid=self.grid,
             thresholds=self.thresholds,
             max_radius=self.max_radius,
-            probed_steps=probed_steps.view(self.grid.shape),
-            points=self.points.view(self.grid.shape).clone(),
-            layers=[layer for one in self._of_grid for layer in self._layers(one, probed_steps)],
-            blocks=self._listed(Blocks, self.probed_steps, self.mean_sums) if self.blocks > 1 else None,
-            area=self._listed(AreaSums, self.area_m2, self.area_sums) if self.square_metres else None,
+            known=known,
+            layers=[layer for one in self._of_grid for layer in sums.layers(one, self.max_radius)],
+            blocks=Blocks(*listed, in_blocks.probed_steps.long(), mean["sums"]) if self.blocks > 1 else None,
+            area=AreaSums(*listed, area["m2"], area["sums"]) if area else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
             regions=self.regions,
-            places=self._in_regions.area(self._sums_of(IN_REGIONS), self.fine_steps),
-            aggregated=self._in_regions.numbers(self._sums_of(IN_REGIONS), self.max_radius),
-            redundancy=Redundancy(self.sensors, {one.quantity.key: one for one in failures}) if failures else None,
+            places=self._by_area(),
+            aggregated=self._numbers(),
+            redundancy=Redundancy(self.sensors, known, {one.quantity.key: one for one in failures})
+            if failures
+            else None,
         )
+
+    def _in_places(self, *, fine: bool) -> Sums:
+        """The sums of (..., B, P) places in blocks, the fine ones or the others."""
+        together = 1 if fine else min(int(self.block_length), FINER)  # so many fine blocks are one
+        blocks, count = self.fine_blocks if fine else self.blocks, self._places.count
+        key, columns = self.places.split_with_sizes([1, self._columns.count], dim=1)
+        key = key.div(together * count, rounding_mode="floor") * count + key % count
+        rows = added_up(torch.cat([key, columns], dim=1), self._columns.maxima)
+        sums = columns.new_zeros(self._columns.count, blocks * count)
+        sums[self._columns.count - self._columns.maxima :] = -math.inf
+        sums[:, rows[:, 0].long()] = rows[:, 1:].T
+        return self._columns.read(sums.view(-1, blocks, count))
+
+    def _by_area(self) -> PlaceSums | None:
+        if not (self.square_metres and self._places.count):
+            return None
+        sums = self._in_places(fine=True).of
+        own = [sums[kind.name]["sums"] for kind in (VisibleArea, SensorFailures) if kind.name in sums]
+        return PlaceSums(self.fine_steps.clone(), sums[VisibleArea.name]["m2"], torch.cat(own).movedim(0, 1))
+
+    def _numbers(self) -> PlaceNumbers | None:
+        if not (self._aggregated and self._places.count):
+            return None
+        return numbers_of_places(self._in_places(fine=False), self._aggregated, self.max_radius)
 
     def estimates(self, places: Sequence[tuple[Region, str]], measure: Measure) -> list[Estimate]:
         """The numbers of regions in bands so far: those of `compute().estimate`, but no maps are made for them.
@@ -277,17 +321,12 @@ class CoverageMetric(SumsInBlocks):
         Raises:
             ValueError: As there.
         """
-        sums = self._in_regions.area(self._sums_of(IN_REGIONS), self.fine_steps)
-        numbers = [self._in_regions.places.number_of(*place) for place in places]
+        sums, numbers = self._by_area(), [self._places.number_of(*place) for place in places]
         if measure == "area" and sums and None not in numbers:
             quantities = MeanOfMeans(self.thresholds).quantities
             return [sums.estimate(quantities, number) for number in numbers if number is not None]
         coverage = self.compute()
         return [coverage.estimate(region, height, measure) for region, height in places]
-
-    def _layers(self, aggregation: Aggregation, probed_steps: Tensor) -> list[Layer]:
-        found = aggregation.layers(self._sums_of(aggregation.name), probed_steps, self.max_radius)
-        return [Layer(layer.quantity, layer.values.view(self.grid.shape)) for layer in found]
 
     def plot(
         self,
@@ -308,7 +347,3 @@ class CoverageMetric(SumsInBlocks):
         fig, ax = figure_of(ax)
         draw_coverage(self.compute() if val is None else val, ax, layer, height)
         return fig, ax
-
-    def _listed(self, kind: type[BlockSumsT], base: Tensor, sums: Tensor) -> BlockSumsT:
-        shape = self.grid.shape
-        return kind.of(self.block_steps, base.view(-1, *shape), sums.view(self.blocks, -1, *shape))

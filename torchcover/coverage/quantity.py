@@ -2,6 +2,9 @@
 
 from torchcover.estimation import Quantity
 
+# What was measured farther off than this is no point where no threshold decides: the threshold of the paper.
+MEASURED_WITHIN_M = 0.4
+
 
 def radius(which: str = "", title: str = "mean") -> Quantity:
     """A blind spot radius in metres.

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, BinnedStep, Layer, State
+from torchcover.coverage.blocks import KnownCells, Maps
 from torchcover.coverage.quantity import RADIUS, detection, seen_by_two, sensors_seeing, without
 from torchcover.estimation import Quantity
 
@@ -18,14 +19,26 @@ class Redundancy:
 
     Args:
         sensors: Their names.
-        layers: Over the grid, by the key of their quantity: for each threshold by how many sensors the points of a
+        known: The cells that it is known of.
+        listed: In these, by the key of their quantity: for each threshold by how many sensors the points of a
             cell are seen ("sensors_0.4m") and the share that two or more see ("seen_by_two_0.4m"); for each sensor the
             radius and the detection without it ("radius_m_without_roof"). By area if the coverage is, else means of
             means.
     """
 
     sensors: tuple[str, ...]
-    layers: Mapping[str, Layer]
+    known: KnownCells
+    listed: Mapping[str, Layer]
+
+    @property
+    def layers(self) -> Mapping[str, Layer]:
+        """The same over the grid."""
+        return layers_of(self.listed, self.known)
+
+
+def layers_of(listed: Mapping[str, Layer], known: KnownCells) -> Mapping[str, Layer]:
+    """Layers over the grid from those over the known cells."""
+    return Maps(listed, lambda layer: Layer(layer.quantity, known.spread(layer.values)))
 
 
 def redundancy_quantities(sensors: Sequence[str], thresholds: Sequence[float]) -> tuple[Quantity, ...]:
@@ -62,39 +75,44 @@ class SensorFailures(Aggregation):
 
     def states(self, cells: int) -> dict[str, State]:
         """`sums` (V, C): means of each step, or with square metres those times them, and `m2` (C)."""
-        zero = torch.zeros((), dtype=torch.float64)
-        m2 = {"m2": State(zero.expand(cells))} if self.square_metres else {}
-        return {"sums": State(zero.expand(len(self.quantities), cells)), **m2}
+        m2 = {"m2": State(torch.zeros(cells, dtype=torch.float64))} if self.square_metres else {}
+        return {"sums": State(torch.zeros(len(self.quantities), cells, dtype=torch.float64)), **m2}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the points of a step, whose last values are those of `values`."""
-        cell, _, weight, mean = step.means
-        own = mean[-len(self.quantities) :]
-        sums["sums"][:, cell] += own * weight if self.square_metres else own
+        own, weight = step.means.mean[-len(self.quantities) :], step.means.weight
+        sums["sums"].add_(own * weight if self.square_metres else own)
         if self.square_metres:
-            sums["m2"][cell] += weight
+            sums["m2"].add_(weight)
 
-    def values(self, of_sensors: Tensor, max_radius: float) -> Tensor:
+    def values(self, of_sensors: Sequence[Tensor], max_radius: float) -> Tensor:
         """(V, N) float64 what there is to say of each point.
 
         Args:
-            of_sensors: (S, N) distances to the nearest point of each sensor, infinite where none is near.
+            of_sensors: (S, N) distances to the nearest point of each sensor, infinite where none is near: for the
+                radius, then for each threshold.
             max_radius: Saturation of the radius in metres.
         """
-        nearest, which = of_sensors.min(dim=0)
         rows = []
-        for threshold in self.thresholds:
-            seeing = (of_sensors <= threshold).sum(dim=0)
+        for distance, threshold in zip(of_sensors[1:], self.thresholds, strict=True):
+            seeing = (distance <= threshold).sum(dim=0)
             rows += [seeing.double(), (seeing >= 2).double()]
-        # Without any sensor but the nearest the radius stays as it is.
-        second = of_sensors.scatter(0, which[None], torch.inf).amin(dim=0)
-        for number in range(len(self.sensors)):
-            radius = torch.where(which == number, second, nearest)
+        for radius, *others in zip(*map(_without_each, of_sensors), strict=True):
             rows.append(radius.clamp(max=radius.new_tensor(max_radius)).double())
-            rows += [(radius <= threshold).double() for threshold in self.thresholds]
+            pairs = zip(others, self.thresholds, strict=True)
+            rows += [(distance <= threshold).double() for distance, threshold in pairs]
         return torch.stack(rows)
 
     def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
         """One for each quantity; 0 / 0, which is NaN, where nothing was seen."""
         values = sums["sums"] / (sums["m2"] if self.square_metres else probed_steps)
         return list(map(Layer, self.quantities, values))
+
+
+def _without_each(of_sensors: Tensor) -> Tensor:
+    """(S, N) the smallest distances without each of the sensors."""
+    nearest, which = of_sensors.min(dim=0)
+    # Without any sensor but the nearest the distance stays as it is.
+    second = of_sensors.scatter(0, which[None], torch.inf).amin(dim=0)
+    failed = torch.arange(len(of_sensors), device=which.device)[:, None]
+    return torch.where(which == failed, second, nearest)

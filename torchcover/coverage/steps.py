@@ -6,38 +6,70 @@ from collections.abc import Mapping, Sequence
 from numbers import Real
 from typing import Any, NamedTuple, TypeAlias
 
+import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
 from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.quantity import detection
+from torchcover.coverage.quantity import MEASURED_WITHIN_M, detection
 from torchcover.coverage.redundancy import SensorFailures
-from torchcover.coverage.region_sums import IN_REGIONS
 from torchcover.neighbors import check_cloud, check_tensor
 
-# The aggregations that a metric has by itself, and the names that its own states begin with.
-BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, SensorFailures.name, IN_REGIONS, "block", "probed"})
+# The aggregations that a metric has by itself.
+BUILT_IN = frozenset({MeanOfMeans.name, VisibleArea.name, SensorFailures.name})
 
 # Steps are numbered in int64, and blocks double until one holds the last.
 MAX_NUMBER = 10**15
 
 # One step, or a list with an entry for each.
 Clouds: TypeAlias = Tensor | Sequence[Tensor]
-# Of a rig whose sensors are told apart: by their names. Of clouds, or of a number for each of their points.
+# Of a rig whose sensors are told apart: by their names.
 SensorClouds: TypeAlias = Clouds | Mapping[str, Tensor] | Sequence[Mapping[str, Tensor]]
 
 
 class CheckedStep(NamedTuple):
     """One step: clouds in the vehicle frame, weights and heights of the reference points, and its number in time.
 
-    `sensors` has those of the rig by the names of the sensors; one without a name if they are not told apart.
+    `sensors` has those of the rig by the names of the sensors; one without a name if they are not told apart. `errors`
+    has by how many metres each of these points was measured off; None if none was.
     """
 
     sensors: Mapping[str, Tensor]
+    errors: Mapping[str, Tensor] | None
     reference: Tensor
     weights: Tensor | None
     height: Tensor | None
     number: int
+
+    def measured(self, beyond_m: float, within_m: float) -> list[Tensor]:
+        """The points of each sensor that were measured farther off than the one, and no farther than the other."""
+        if self.errors is None:
+            return [cloud if beyond_m < 0 else cloud[:0] for cloud in self.sensors.values()]
+        each = [(cloud, self.errors[name].to(cloud.device)) for name, cloud in self.sensors.items()]
+        return [cloud[(error > beyond_m) & (error <= within_m)] for cloud, error in each]
+
+    @property
+    def is_blind(self) -> bool:
+        """Whether the rig has no point that counts for the radius."""
+        if self.errors is None:
+            return not any(map(len, self.sensors.values()))
+        return not any(bool((error <= MEASURED_WITHIN_M).any()) for error in self.errors.values())
+
+
+class StepSums(NamedTuple):
+    """What one step adds to the sums of a `CoverageMetric`; it is small, and travels between processes.
+
+    Args:
+        place_in_time: Which decides about its block.
+        counts: Name of a count -> how much it grows.
+        cells: (1 + C, K) float64 cells of the grid that it touches, and what it adds to their columns.
+        places: (1 + C, K) the same of regions in bands; nothing is touched where none are asked about.
+    """
+
+    place_in_time: int
+    counts: Mapping[str, int]
+    cells: Tensor
+    places: Tensor
 
 
 def check_parameters(thresholds: Sequence[float], max_radius: float, aggregations: Sequence[Aggregation]) -> None:
@@ -75,9 +107,8 @@ def checked_steps(
     weights: Clouds | None,
     height: Clouds | None,
     place_in_time: int | Sequence[int] | None,
-    error: SensorClouds | None,
+    error: Clouds | None,
     *,
-    within_m: float,
     grid: BevGrid,
     square_metres: bool,
     names: Sequence[str] = (),
@@ -105,44 +136,40 @@ def checked_steps(
     numbers = list(range(first, first + count)) if place_in_time is None else _numbers(place_in_time)
     if len(sensors) != count:
         raise ValueError(f"{len(sensors)} sensor clouds for {count} reference clouds; one pair a step")
-    errors = [None] * count if error is None else [error] if isinstance(error, Mapping) else as_list(error, "error")
+    errors: Sequence[Tensor | None] = [None] * count if error is None else as_list(error, "error")
     if {len(every_weights), len(every_height), len(numbers), len(errors)} != {count}:
         raise ValueError(
             f"{len(every_weights)} weights, {len(every_height)} heights, {len(numbers)} places in time and "
             f"{len(errors)} errors for {count} reference clouds; one a step each"
         )
-    each = zip(sensors, references, every_weights, every_height, numbers, strict=True)
-    steps = [CheckedStep(*parts) for parts in each]
-    for at, step in enumerate(steps):
-        for name, cloud in step.sensors.items():
+    each = zip(sensors, errors, references, every_weights, every_height, numbers, strict=True)
+    steps = []
+    for at, (clouds, off, *parts) in enumerate(each):
+        for name, cloud in clouds.items():
             check_cloud(cloud, f"sensor[{at}]" + f"[{name!r}]" * bool(name))
+        step = CheckedStep(clouds, None if off is None else _by_sensor(off, rigs[at], clouds, f"error[{at}]"), *parts)
+        steps.append(step)
         check_cloud(step.reference, f"reference[{at}]")
         _check_weights(step.weights, len(step.reference), f"weights[{at}]")
         _check_height(step.height, step.reference, grid, f"height[{at}]")
         if not 0 <= step.number <= MAX_NUMBER:
             raise ValueError(f"place_in_time[{at}]: a number from 0 to {MAX_NUMBER:,} is needed; got {step.number}")
-    if error is None:
-        return steps
-    of_steps = [_by_name(one, names) for one in errors]
-    return [
-        step._replace(sensors=_measured(step.sensors, one, f"error[{at}]", within_m))
-        for at, (step, one) in enumerate(zip(steps, of_steps, strict=True))
-    ]
+    return steps
 
 
-def _measured(
-    clouds: Mapping[str, Tensor], errors: Mapping[str, Tensor], name: str, within_m: float
+def _by_sensor(
+    error: Tensor, rig: Tensor | Mapping[str, Tensor], clouds: Mapping[str, Tensor], name: str
 ) -> Mapping[str, Tensor]:
-    """The points that were not measured farther off."""
-    for sensor, error in errors.items():
-        what, points = name + f"[{sensor!r}]" * bool(sensor), len(clouds[sensor])
-        check_tensor(error, what)
-        if error.shape != (points,) or bool(error.isnan().any()):
-            raise ValueError(
-                f"{what}: metres of each of {points} points of the rig are needed; got {tuple(error.shape)} with "
-                f"{int(error.isnan().sum())} NaN"
-            )
-    return {sensor: cloud[errors[sensor].to(cloud.device).abs() <= within_m] for sensor, cloud in clouds.items()}
+    """How far off the points of each sensor are, whatever the sign: in the order in which these were given."""
+    check_tensor(error, name)
+    names = list(rig) if isinstance(rig, Mapping) else list(clouds)
+    sizes = [len(clouds[sensor]) for sensor in names]
+    if error.shape != (sum(sizes),) or bool(error.isnan().any()):
+        raise ValueError(
+            f"{name}: metres of each of {sum(sizes)} points of the rig are needed; got {tuple(error.shape)} with "
+            f"{int(error.isnan().sum())} NaN"
+        )
+    return dict(zip(names, torch.split(error.abs(), sizes), strict=True))
 
 
 def as_list(clouds: Any, name: str) -> list[Any]:  # noqa: ANN401

@@ -5,14 +5,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from torchcover.coverage import CoverageMetric
 from torchcover.evaluation.checkpoint import Checkpoint, Journal
+from torchcover.evaluation.cores import usual_workers
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.other_metrics import compared, metrics_of
 from torchcover.evaluation.pipeline import Run, observe
@@ -24,15 +23,16 @@ from torchcover.evaluation.target_error import TargetWatch
 from torchcover.evaluation.task import CALLER, Task, run_identity
 from torchcover.files import claimed
 from torchcover.frames import BadFrameError, FrameSource
-from torchcover.simulation import Asked
+from torchcover.simulation import Asked, SimulatedFrames
 from torchcover.simulation.memory import check_fits
 
 Observers = Mapping[str, AnyObserver]
 # For standard errors: at least half as many are in use at the end of a long run.
 BLOCKS = 16
-# Beside its sums a metric makes a result of them, at most as large.
-STATE_COPIES = 2
-TOO_MANY_CELLS = "use larger cells, or a smaller grid"
+# The sums are over what was touched, but maps are made of all cells, several of which are there at a time.
+BYTES_A_CELL = 64
+# To see of how many worlds they are.
+ENOUGH_FRAMES = 256
 
 
 def measured(task: Task[FrameSource], settings: Settings) -> Result:
@@ -45,6 +45,7 @@ def measured(task: Task[FrameSource], settings: Settings) -> Result:
     frames = task.frames
     sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
     check_drawable(sensors)
+    settings = replace(settings, workers=_workers(task, settings))
     metrics = metrics_of(task, settings) if settings.metrics else None
     others = {**settings.observers, **(metrics.observers if metrics else {})}
     with ranks.aborting() if ranks else nullcontext():
@@ -71,12 +72,23 @@ def measured(task: Task[FrameSource], settings: Settings) -> Result:
             list(coverages.values()),
             settings.aggregations,
             sensors,
-            workers=settings.workers,
+            workers=settings.workers or 0,
         ),
     )
     if result.cut_short:
         warnings.warn(result.cut_short, RuntimeWarning, stacklevel=CALLER)
     return result
+
+
+def _workers(task: Task[FrameSource], settings: Settings) -> int:
+    """Processes that make the frames: recordings may share open files, and ranks share the cores."""
+    if settings.workers is not None:
+        return settings.workers
+    frames = task.frames
+    if settings.ranks or not isinstance(frames, SimulatedFrames):
+        return 0
+    most = min(len(frames), task.steps or len(frames), ENOUGH_FRAMES)
+    return usual_workers(most, len({frames.world_of(index) for index in range(most)}))
 
 
 def _observed(task: Task[FrameSource], settings: Settings, others: Observers) -> tuple[Observers, Observers, Run]:
@@ -110,7 +122,7 @@ def _observed(task: Task[FrameSource], settings: Settings, others: Observers) ->
             task.frames,
             observers,
             steps=task.steps,
-            workers=settings.workers,
+            workers=settings.workers or 0,
             device=settings.device,
             skip_bad_frames=settings.skip_bad_frames,
             until=watch,
@@ -175,7 +187,7 @@ def metric_of(
 
     Raises:
         ValueError: An estimate by area is wanted, and there are no square metres; a device that cannot be used; a
-            threshold that makes no sense, or more cells than there is memory for.
+            threshold that makes no sense, or more cells than there is memory for maps of.
     """
     if settings.estimate == "area" and not square_metres:
         raise ValueError(
@@ -183,8 +195,7 @@ def metric_of(
             "simulation gives; leave it out for means over the known cells"
         )
     device, grid = usable_device(settings.device), asked.grid
-    build = partial(
-        CoverageMetric,
+    metric = CoverageMetric(
         grid,
         settings.thresholds_m,
         max_radius=grid.diagonal_m,
@@ -195,18 +206,8 @@ def metric_of(
         square_metres=square_metres and settings.estimate != "known",
         sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
     )
-    try:
-        with torch.device("meta"):  # where tensors have a size and take no memory
-            need = STATE_COPIES * sum(
-                state.nbytes for state in build().metric_state.values() if isinstance(state, Tensor)
-            )
-        check_fits(f"the sums of {grid.cells:,} cells in {blocks} blocks", need, TOO_MANY_CELLS)
-        return build().to(device)
-    except RuntimeError as error:  # what torch raises when there is no memory left on the device
-        raise ValueError(
-            f"a cell of {grid.cell:g} m: there is not enough memory for the sums of {grid.cells:,} cells in {blocks} "
-            f"blocks; {TOO_MANY_CELLS}"
-        ) from error
+    check_fits(f"maps of {grid.cells:,} cells", BYTES_A_CELL * grid.cells, "use larger cells, or a smaller grid")
+    return metric.to(device)
 
 
 def usable_device(name: str) -> torch.device:

@@ -87,8 +87,9 @@ class CoverageObserver:
         """
         clouds = frame.clouds_by_sensor if self.metric.sensors else frame.cloud_of
         self.metric.update(
-            clouds(self.rig, within_m=self.metric.within_m),
+            clouds(self.rig),
             frame.reference,
+            error=frame.error_of(self.rig),
             weights=frame.reference_weights,
             height=frame.heights_in(self.metric.grid.band_frame),
             place_in_time=frame.place_in_time,

@@ -1,6 +1,5 @@
 """The one loop: frames in order, and every observer is fed with each of them."""
 
-import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -14,6 +13,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from torchcover.evaluation.checkpoint import Journal
+from torchcover.evaluation.cores import cores, warn_of_spinning
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.progress import ENDS, Progress, held_back
 from torchcover.evaluation.ranks import Ranks
@@ -185,10 +185,11 @@ def observe(
 
 @contextmanager
 def _threads_beside(workers: int) -> Iterator[None]:
-    """Leave each worker a core: threads that wait here would spin on it."""
+    """Leave each worker a core."""
     before = torch.get_num_threads()
     if workers:
-        torch.set_num_threads(max(1, min(before, (os.cpu_count() or 1) - workers)))
+        torch.set_num_threads(max(1, min(before, cores() - workers)))
+    warn_of_spinning(torch.get_num_threads())
     try:
         yield
     finally:

@@ -318,8 +318,13 @@ class Settings:
         Option("Where the search and the sums run: cpu, cuda, cuda:1, ...", str, in_study="tried"),
     ] = Read(_device, "cpu")
     workers: Annotated[
-        int, Option("Processes that make frames; 0 makes them in this one.", minimum=0, in_study="tried")
-    ] = 0
+        int | None,
+        Option(
+            "Processes that make frames; 0 makes them in this one. Not given: of a simulation, as many as help.",
+            minimum=0,
+            in_study="tried",
+        ),
+    ] = None
     skip_bad_frames: Annotated[bool, Option("Skip and count frames that cannot be read, instead of stopping.")] = False
     observers: Annotated[
         "Mapping[str, AnyObserver]",
@@ -340,7 +345,7 @@ class Settings:
     def __post_init__(self) -> None:
         if self.steps is not None and self.steps < 1:
             raise ValueError(f"steps: at least 1 is needed; got {self.steps}")
-        check_fits(f"{self.workers:,} workers", BYTES_PER_WORKER * self.workers, "use fewer")
+        check_fits(f"{self.workers or 0:,} workers", BYTES_PER_WORKER * (self.workers or 0), "use fewer")
         if self.estimate not in (None, "area", "known"):
             raise ValueError(f"estimate {self.estimate}: `area` or `known` is needed")
         if self.band_frame not in (None, "ground", "vehicle"):

@@ -11,9 +11,6 @@ from torch import Tensor
 from torchcover.coverage.grid import BandFrame
 from torchcover.detection.boxes import Boxes
 
-# What was measured farther off than this is no point on an object: the threshold of the paper.
-ON_OBJECT_WITHIN_M = 0.4
-
 
 class Measured(NamedTuple):
     """What sensors that err made of the points of a rig.
@@ -98,6 +95,18 @@ class Frame:
         rig = self._named(rig)
         cloud = self.clouds[rig]
         return cloud[self._is_within(rig, within_m)] if rig in self.measured and within_m < math.inf else cloud
+
+    def error_of(self, rig: str | None = None) -> Tensor | None:
+        """(N,) how far off the points of one rig were measured, along their rays; None if where they are.
+
+        Args:
+            rig: As in `cloud_of`.
+
+        Raises:
+            ValueError: As there.
+        """
+        rig = self._named(rig)
+        return self.measured[rig].error_m if rig in self.measured else None
 
     def landed(self, rig: str | None = None) -> Tensor:
         """(N, 3) points of one rig as they were measured: what a network is fed with, or a file holds.
@@ -202,7 +211,7 @@ class Frame:
 class FrameBatch:
     """Frames side by side, as `CoverageMetric.update` takes them.
 
-    `metric.update(batch.clouds_of(within_m=metric.within_m), batch.reference, weights=batch.weights,
+    `metric.update(batch.sensor, batch.reference, error=batch.errors_of(), weights=batch.weights,
     height=batch.heights_in(grid.band_frame), place_in_time=batch.place_in_time)`.
 
     Args:
@@ -216,13 +225,24 @@ class FrameBatch:
         """One (N, 3) cloud a frame, of the only rig, where its points truly are; N differs."""
         return [frame.sensor for frame in self.frames]
 
-    def clouds_of(self, rig: str | None = None, *, within_m: float = math.inf) -> list[Tensor]:
+    def clouds_of(self, rig: str | None = None) -> list[Tensor]:
         """One (N, 3) cloud a frame, as `Frame.cloud_of`.
 
         Raises:
             ValueError: A frame has no such rig.
         """
-        return [frame.cloud_of(rig, within_m=within_m) for frame in self.frames]
+        return [frame.cloud_of(rig) for frame in self.frames]
+
+    def errors_of(self, rig: str | None = None) -> list[Tensor] | None:
+        """One (N,) tensor a frame, as `Frame.error_of`, zeros of points that are where they were; None if all are.
+
+        Raises:
+            ValueError: A frame has no such rig.
+        """
+        pairs = [(frame.cloud_of(rig), frame.error_of(rig)) for frame in self.frames]
+        if all(error is None for _, error in pairs):
+            return None
+        return [cloud.new_zeros(len(cloud)) if error is None else error for cloud, error in pairs]
 
     def landed(self, rig: str | None = None) -> list[Tensor]:
         """One (N, 3) cloud a frame, as `Frame.landed`.

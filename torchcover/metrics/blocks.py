@@ -1,26 +1,98 @@
 """Metrics whose sums are kept in blocks of contiguous steps: what standard errors are estimated from."""
 
-from collections.abc import Callable
-from typing import Any
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torchmetrics.utilities.distributed import gather_all_tensors
 
 from torchcover.estimation import MIN_BLOCKS
-from torchcover.metrics.mergeable import MergeableMetric
+from torchcover.metrics.lean import gather_all_tensors
+from torchcover.metrics.mergeable import FILLER, MergeableMetric
 
 # What takes little room is kept in so many times as many blocks.
 FINER = 16
+# Rows that wait at least before they are added up.
+MIN_WAITING = 4096
+
+
+class Rows(NamedTuple):
+    """What the rows of a `TouchedSums` are.
+
+    Args:
+        cells: How many cells there are; a row is of the cell `key % cells` in the block `key // cells`.
+        maxima: How many of the last columns are not added up, but keep the largest.
+        fine: Whether its blocks are the fine ones.
+    """
+
+    cells: int
+    maxima: int
+    fine: bool
+
+
+class TouchedSums:
+    """A state of `SumsInBlocks`: a table of sums over those cells of those blocks that a step has touched.
+
+    It is an attribute of the class, and `add_touched_sums` makes the state. Rows that come wait until it is read or as
+    many wait as it has, so that a step costs what it touches. They are added up in the order in which they came: when
+    that is done changes no bit.
+    """
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name, self._table, self._waiting = name, f"_{name}_table", f"_{name}_waiting"
+
+    def __get__(self, metric: "SumsInBlocks | None", owner: type) -> Tensor:
+        if metric is None:
+            raise AttributeError(f"{owner.__name__} has the state {self.name} once it is made")
+        own = metric.__dict__
+        if own[self._waiting]:
+            rows = torch.cat([own[self._table], *own[self._waiting]])
+            own[self._table], own[self._waiting] = added_up(rows, metric.rows_of[self.name].maxima), []
+        table: Tensor = own[self._table]
+        return table
+
+    def __set__(self, metric: "SumsInBlocks", table: Tensor) -> None:
+        metric.__dict__.update({self._table: table, self._waiting: []})
+
+
+def added_up(rows: Tensor, maxima: int = 0) -> Tensor:
+    """One row for each key, in their order.
+
+    Args:
+        rows: (N, 1 + C) float64 keys, then what is added up in the order of the rows.
+        maxima: How many of the last columns keep the largest instead.
+
+    Example:
+        >>> added_up(torch.tensor([[7.0, 1.0, 3.0], [2.0, 5.0, 4.0], [7.0, 2.0, 9.0]]).double(), maxima=1).tolist()
+        [[2.0, 5.0, 4.0], [7.0, 3.0, 9.0]]
+    """
+    keys, of_row = torch.unique(rows[:, 0], return_inverse=True)
+    if len(keys) == len(rows):
+        return torch.empty_like(rows).index_copy_(0, of_row, rows)
+    columns = rows[:, 1:].T.contiguous()
+    first = len(columns) - maxima
+    sums = [torch.bincount(of_row, weights=column, minlength=len(keys)) for column in columns[:first]]
+    lowest = columns.new_full((maxima, len(keys)), -math.inf)
+    largest = lowest.scatter_reduce_(1, of_row.expand(maxima, -1), columns[first:], "amax")
+    return torch.stack([keys, *sums, *largest], dim=1)
+
+
+def _of_parts(tables: Tensor, maxima: int) -> Tensor:
+    """The sums of several parts, (parts, N, 1 + C), that were filled up to the same length."""
+    rows = tables.flatten(0, 1)
+    return added_up(rows[rows[:, 0] != FILLER], maxima)
 
 
 class SumsInBlocks(MergeableMetric):
     """Sums in as many blocks of contiguous steps, or worlds.
 
     Blocks start with one step each; whenever a step comes that is past the last one, neighbours are added up in pairs
-    and blocks become twice as long. The state has a fixed size, and parts merge exactly, whatever the lengths of their
-    blocks. A metric adds its sums with `add_block_sum`, and asks `_block_of` where those of a step belong. What is
-    `fine` is in 16 times as many blocks, so that up to 256 worlds are known one by one: `_fine_block_of`.
+    and blocks become twice as long. The state does not grow with the steps, and parts merge exactly, whatever the
+    lengths of their blocks. A metric adds its sums with `add_block_sum` and `add_touched_sums`, and asks `_block_of`
+    where those of a step belong. What is `fine` is in 16 times as many blocks, so that up to 256 worlds are known one
+    by one: `_fine_block_of`.
 
     Args:
         blocks: 1 for no errors, or an even number from 8 on: at least half as many are in use at the end of a long run.
@@ -43,6 +115,7 @@ class SumsInBlocks(MergeableMetric):
         self.fine_blocks = blocks * FINER if blocks > 1 else 1
         self._in_blocks: tuple[str, ...] = ()
         self._in_fine_blocks: tuple[str, ...] = ()
+        self.rows_of: dict[str, Rows] = {}
         self.add_block_sum("block_steps", (), torch.int64)
         self.add_block_sum("fine_steps", (), torch.int64, fine=True)
         self.add_state("block_length", torch.tensor(1), dist_reduce_fx="max", persistent=True)
@@ -57,11 +130,24 @@ class SumsInBlocks(MergeableMetric):
         else:
             self._in_blocks = (*self._in_blocks, name)
 
+    def add_touched_sums(self, name: str, cells: int, columns: int, *, maxima: int = 0, fine: bool = False) -> None:
+        """Make the state of a `TouchedSums` of this name: a table, empty at first; see `Rows`."""
+        self.rows_of[name] = Rows(cells, maxima, fine)
+        self.add_table(name, 1 + columns, partial(_of_parts, maxima=maxima))
+
+    def add_touched(self, name: str, block: int, touched: Tensor) -> None:
+        """Add to a `TouchedSums` the (1 + C, K) columns of a block: cells, each once, then what they grow by."""
+        table, waiting = self.__dict__[f"_{name}_table"], self.__dict__[f"_{name}_waiting"]
+        key = touched[:1] + block * self.rows_of[name].cells
+        waiting.append(torch.cat([key, touched[1:]]).T.to(table.device))
+        if sum(map(len, waiting)) > max(MIN_WAITING, len(table)):
+            getattr(self, name)
+
     def _block_of(self, place: int) -> int:
         """The block of a step at a place in time, which is counted there; makes room for it."""
         if self.blocks > 1:
             while place >= self.blocks * int(self.block_length):
-                self._pair_up(self.metric_state)
+                self._pair_up_own()
         block = place // int(self.block_length) if self.blocks > 1 else 0
         self.block_steps[block] += 1
         self.fine_steps[self._fine_block_of(place)] += 1
@@ -79,17 +165,35 @@ class SumsInBlocks(MergeableMetric):
             half = len(sums) // 2
             sums[:half] = sums[0::2] + sums[1::2]
             sums[half:] = 0
+        for name, (cells, maxima, fine) in self.rows_of.items():
+            if fine_too or not fine:
+                key, sums = state[name].split([1, state[name].shape[1] - 1], dim=1)
+                pair = key.div(2 * cells, rounding_mode="floor") * cells + key % cells
+                state[name] = added_up(torch.cat([pair, sums], dim=1), maxima)
         state["block_length"] *= 2
+
+    def _pair_up_own(self) -> None:
+        state = self.metric_state
+        self._pair_up(state)
+        for name in self.rows_of:
+            setattr(self, name, state[name])
 
     def _align_with(self, incoming: dict[str, Any]) -> None:
         # Blocks of the same length only can be added up.
-        longest = max(int(self.block_length), int(incoming["block_length"]))
-        states: tuple[dict[str, Any], ...] = (self.metric_state, incoming)
-        for state in states:
-            while int(state["block_length"]) < longest:
-                self._pair_up(state)
+        while int(incoming["block_length"]) < int(self.block_length):
+            self._pair_up(incoming)
+        while int(self.block_length) < int(incoming["block_length"]):
+            self._pair_up_own()
 
     def _align_ranks(self, dist_sync_fn: Callable[..., Any] = gather_all_tensors, process_group: Any = None) -> None:  # noqa: ANN401
         lengths = dist_sync_fn(self.block_length, group=process_group or self.process_group)
         while int(self.block_length) < max(map(int, lengths)):
-            self._pair_up(self.metric_state)
+            self._pair_up_own()
+
+    def _copied(self, states: Mapping[str, Tensor]) -> dict[str, Any]:
+        copies = super()._copied(states)
+        for name, (cells, _, fine) in self.rows_of.items():
+            key, end = copies[name][:, 0], cells * (self.fine_blocks if fine else self.blocks)
+            if not bool(((key >= 0) & (key < end) & (key == key.floor())).all() and (key.diff() > 0).all()):
+                raise ValueError(f"state {name!r}: keys in ascending order, whole numbers below {end}, are needed")
+        return copies

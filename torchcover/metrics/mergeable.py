@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from torch import Tensor
-from torchmetrics import Metric
-from torchmetrics.utilities.distributed import gather_all_tensors
+
+from torchcover.metrics.lean import Metric, gather_all_tensors
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -100,11 +100,18 @@ class MergeableMetric(Metric):
         lowest = torch.tensor(-math.inf, dtype=torch.float64).expand(shape)
         self.add_state(name, lowest, dist_reduce_fx="max", persistent=True)
 
-    def add_table(self, name: str, columns: int) -> None:
-        """Add a float64 state of finite rows, none at first; to be added to with `torchcover.metrics.with_rows`."""
+    def add_table(self, name: str, columns: int, reduction: Callable[[Tensor], Tensor] | None = None) -> None:
+        """Add a float64 state of rows that begin with a finite number, none at first.
+
+        Args:
+            name: Of the state.
+            columns: Numbers in a row.
+            reduction: How (parts, N, columns) become one table again. Not given: all rows are kept, in the order of
+                `torchcover.metrics.with_rows`.
+        """
         self._tables = (*self._tables, name)
         none = torch.empty((0, columns), dtype=torch.float64)
-        self.add_state(name, none, dist_reduce_fx=joined, persistent=True)
+        self.add_state(name, none, dist_reduce_fx=reduction or joined, persistent=True)
 
     @torch.inference_mode(False)  # here and below: a tensor made under it could not be added to outside of it
     def reset(self) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.frames import Frame
-from torchcover.frames.frame import ON_OBJECT_WITHIN_M
 from torchcover.published.frame_metric import WorldRatios, said
 from torchcover.published.object_strata import CATEGORIES, RANGE_BORDERS_M, ObjectStrata
 from torchcover.published.sights import Sights, count_in_boxes, rig_of
@@ -119,7 +119,7 @@ class PerceptionEntropy(WorldRatios):
         if not self.cameras:
             return standard_deviation(self.sights.hits(frame, rig), "lidar")
         boxes, measurements = self.sights.boxes(frame), dict[str, Tensor]()
-        for name, cloud in frame.clouds_by_sensor(rig, within_m=ON_OBJECT_WITHIN_M).items():
+        for name, cloud in frame.clouds_by_sensor(rig, within_m=MEASURED_WITHIN_M).items():
             kind = "camera" if name in self.cameras else "lidar"
             of_sensor = self.cameras.get(name, 1) * count_in_boxes(cloud, boxes)
             measurements[kind] = measurements.get(kind, torch.zeros_like(of_sensor)) + of_sensor

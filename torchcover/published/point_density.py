@@ -19,7 +19,8 @@ class PointDensity(WorldRatios):
 
     The density is over the ground as drawn, be it visible or not. The uniformity is (sum n)^2 / (C sum n^2) over the
     points n in C square cells: 1 if all cells have as many, 1 / C if one has all. Density and uniformity are what Cai
-    et al. (2023) look at; their own formula of uniformity could not be read.
+    et al. (2023) look at; their own formula of uniformity could not be read. It does not ask how many points there are:
+    those that are missed may raise it, by 0.0004 within 3 m ahead of `kitti` in fog of 100 m.
 
     Args:
         grid: Where points count: its extent, its height bands, and the cells of the uniformity. The ground below a

@@ -8,10 +8,10 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid
 from torchcover.coverage.grid import Bins
+from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.detection import Boxes, points_in_boxes
 from torchcover.detection.inside import Inside
 from torchcover.frames import Frame
-from torchcover.frames.frame import ON_OBJECT_WITHIN_M
 from torchcover.neighbors import check_cloud, nearest
 from torchcover.neighbors.choice import backend_of_several
 from torchcover.published.object_strata import ObjectStrata
@@ -97,7 +97,7 @@ class Sights:
         boxes = self.boxes(frame)
         if rig in boxes.hits:
             return boxes.hits[rig]
-        points = frame.cloud_of(rig, within_m=ON_OBJECT_WITHIN_M)
+        points = frame.cloud_of(rig, within_m=MEASURED_WITHIN_M)
         return self.once(frame, ("hits", rig), lambda: count_in_boxes(points, boxes))
 
     def bins(self, frame: Frame, grid: BevGrid) -> Bins:

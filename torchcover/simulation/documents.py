@@ -10,7 +10,16 @@ from typing import Annotated, Any, ClassVar, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, ValidationInfo, model_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    PlainSerializer,
+    ValidationError,
+    ValidationInfo,
+    model_validator,
+)
 from pydantic_core import ErrorDetails
 
 from torchcover.files import BadFileError, parse_yaml, read_short_text, reads
@@ -194,7 +203,14 @@ def beside(path: Path, info: ValidationInfo) -> Path:
     return folder / path if folder and not path.is_absolute() else path
 
 
-PathBeside = Annotated[Path, BeforeValidator(_beside)]
+def _from_anywhere(path_or_name: str | Path) -> str:
+    is_path = isinstance(path_or_name, Path) or is_file_name(path_or_name)
+    return str(Path(path_or_name).resolve() if is_path else path_or_name)
+
+
+_WRITTEN = PlainSerializer(_from_anywhere, when_used="json")
+
+PathBeside = Annotated[Path, BeforeValidator(_beside), _WRITTEN]
 """A path in a document; a relative one is meant from the document's folder."""
 
 
@@ -202,7 +218,7 @@ def _named(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever 
     return str(beside(Path(given), info)) if isinstance(given, str) and is_file_name(given) else given
 
 
-NameOrFile = Annotated[str, BeforeValidator(_named)]
+NameOrFile = Annotated[str, BeforeValidator(_named), _WRITTEN]
 """The name of a built-in document, or the path of a YAML file, which is meant from the folder of the document."""
 
 

@@ -1,7 +1,7 @@
 """The ground of a world: what one drives or walks on, and how high above it something is."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -67,10 +67,11 @@ def looks_down(mesh: Mesh) -> Bools:
 
 
 def _looks(mesh: Mesh, way: float) -> Bools:
-    first, second, third = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
-    normals = np.cross(second - first, third - first)
-    least = np.cos(np.deg2rad(STEEPEST_DEG)) * np.linalg.norm(normals, axis=1)
-    looks: Bools = (way * normals[:, 2] >= least) & (least > 0)
+    looks = np.empty(len(mesh.faces), dtype=bool)
+    for part, (first, second, third) in mesh.parts():
+        normals = np.cross(second - first, third - first, axis=0)
+        least = np.cos(np.deg2rad(STEEPEST_DEG)) * np.linalg.norm(normals, axis=0)
+        looks[part] = (way * normals[2] >= least) & (least > 0)
     return looks
 
 
@@ -234,33 +235,33 @@ class GroundSquares(NamedTuple):
     @classmethod
     def of(cls, meshes: Sequence[Mesh], origin_m: Float64) -> "GroundSquares":
         """Those of triangles, of whose bounding boxes all squares are taken, lest one be overlooked."""
-        parts = [mesh.vertices_m[mesh.faces] for mesh in meshes]
-        # NumPy is quick along the last axis.
-        corners_m = np.ascontiguousarray(np.concatenate([np.empty((0, 3, 3)), *parts]).transpose(1, 2, 0))
-        if corners_m.shape[2] == 0:
+        parts = [(corners_m.min(axis=(0, 2)), corners_m.max(axis=(0, 2))) for corners_m in _corners(meshes)]
+        if not parts:
             return cls(np.zeros(2), math.inf, [np.array([[[np.inf]], [[-np.inf]]], dtype=np.float32)])
-        lower_m, upper_m = corners_m.min(axis=0), corners_m.max(axis=0)
-        lowest_m, highest_m = float(lower_m[2].min()), float(upper_m[2].max())
+        least_m, most_m = np.min([low for low, _ in parts], axis=0), np.max([high for _, high in parts], axis=0)
+        lowest_m, highest_m = float(least_m[2]), float(most_m[2])
         if highest_m - lowest_m <= LEVEL_M:
             everywhere = np.array([lowest_m - SLACK_M, highest_m + SLACK_M], dtype=np.float32)
             return cls(np.zeros(2), math.inf, [everywhere.reshape(2, 1, 1)])
-        size_m = np.ptp(np.hstack([lower_m[:2], upper_m[:2]]), axis=1)
+        size_m = (most_m - least_m)[:2]
         square_m = max(SQUARE_M, float(np.sqrt(size_m.prod() / MOST_SQUARES)), float(size_m.max()) / MOST_SQUARES)
-        first_m = np.floor((lower_m[:2].min(axis=1) + origin_m[:2]) / square_m) * square_m - origin_m[:2]
-        from_square = np.floor((lower_m[:2] - first_m[:, None]) / square_m + ROUNDING).astype(np.int64)
-        to_square = np.ceil((upper_m[:2] - first_m[:, None]) / square_m - ROUNDING).astype(np.int64) - 1
-        to_square = np.maximum(to_square, from_square)
-        columns, rows = (to_square.max(axis=1) + 1).tolist()
+        first_m = np.floor((least_m[:2] + origin_m[:2]) / square_m) * square_m - origin_m[:2]
+        columns, rows = (np.floor((most_m[:2] - first_m) / square_m + ROUNDING).astype(np.int64) + 1).tolist()
         lowest, highest = np.full(columns * rows, np.inf), np.full(columns * rows, -np.inf)
-        slopes, at_zero_m = _planes(corners_m - np.append(first_m, 0.0)[None, :, None])
-        # The plane of a triangle in a square, but nowhere beyond the triangle.
-        reach_m = square_m / 2 * np.abs(slopes).sum(axis=0)
-        for triangle, column, row in _squares_of(from_square, to_square - from_square + 1):
-            x_slope, y_slope = slopes.take(triangle, axis=1) * square_m
-            at_middle_m = at_zero_m[triangle] + x_slope * (column + 0.5) + y_slope * (row + 0.5)
-            square, reach = column * rows + row, reach_m[triangle]
-            np.minimum.at(lowest, square, np.maximum(at_middle_m - reach, lower_m[2].take(triangle)))
-            np.maximum.at(highest, square, np.minimum(at_middle_m + reach, upper_m[2].take(triangle)))
+        for corners_m in _corners(meshes):
+            lower_m, upper_m = corners_m.min(axis=0), corners_m.max(axis=0)
+            from_square = np.floor((lower_m[:2] - first_m[:, None]) / square_m + ROUNDING).astype(np.int64)
+            to_square = np.ceil((upper_m[:2] - first_m[:, None]) / square_m - ROUNDING).astype(np.int64) - 1
+            to_square = np.maximum(to_square, from_square)
+            slopes, at_zero_m = _planes(corners_m - np.append(first_m, 0.0)[None, :, None])
+            # The plane of a triangle in a square, but nowhere beyond the triangle.
+            reach_m = square_m / 2 * np.abs(slopes).sum(axis=0)
+            for triangle, column, row in _squares_of(from_square, to_square - from_square + 1):
+                x_slope, y_slope = slopes.take(triangle, axis=1) * square_m
+                at_middle_m = at_zero_m[triangle] + x_slope * (column + 0.5) + y_slope * (row + 0.5)
+                square, reach = column * rows + row, reach_m[triangle]
+                np.minimum.at(lowest, square, np.maximum(at_middle_m - reach, lower_m[2].take(triangle)))
+                np.maximum.at(highest, square, np.minimum(at_middle_m + reach, upper_m[2].take(triangle)))
         raster = np.stack([lowest - SLACK_M, highest + SLACK_M]).astype(np.float32)
         levels = [raster.reshape(2, columns, rows)]
         while max(levels[-1].shape) > 2:
@@ -307,6 +308,11 @@ class GroundSquares(NamedTuple):
         lower_m, upper_m = triangles_m.min(axis=0), triangles_m.max(axis=0)
         lowest_m, highest_m = self.between_m(lower_m[:2], upper_m[:2])
         return height_bounds(lower_m[2] - highest_m, upper_m[2] - lowest_m)
+
+
+def _corners(meshes: Sequence[Mesh]) -> Iterator[Float64]:
+    """(3, 3, N) corners, coordinates, faces, part by part of all meshes."""
+    return (corners_m for mesh in meshes for _, corners_m in mesh.parts())
 
 
 def height_bounds(low_m: Float64, high_m: Float64) -> Float32:

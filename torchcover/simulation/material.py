@@ -2,11 +2,11 @@
 
 from functools import cache
 from threading import Lock
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, NonNegativeFloat
+from pydantic import BeforeValidator, NonNegativeFloat
 
 from torchcover.simulation.builtin import builtin_names
 from torchcover.simulation.documents import BuiltIn
@@ -19,6 +19,12 @@ _LOCK = Lock()
 MOST = 255
 # A body has its own tone, the same at every time and for every rig: that of its number among so many.
 TONES = np.append(np.random.default_rng(905).standard_normal(4095), 0.0).astype(np.float32)
+
+
+def _reflecting(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
+    if given != "retroreflective" and not (type(given) in (int, float) and 0.0 <= given <= 1.0):
+        raise ValueError(f"a share of light from 0 to 1, or `retroreflective`, is needed; got {given!r:.60}")
+    return given
 
 
 class Material(BuiltIn):
@@ -43,7 +49,7 @@ class Material(BuiltIn):
 
     name: str
     description: str = ""
-    reflectivity: Annotated[float, Field(ge=0.0, le=1.0)] | Literal["retroreflective"]
+    reflectivity: Annotated[float | Literal["retroreflective"], BeforeValidator(_reflecting)]
     incidence_exponent: NonNegativeFloat = 1.0
     spread: NonNegativeFloat = 0.0
     varies_by: Literal["place", "body"] = "place"

@@ -12,6 +12,7 @@ from torchcover.simulation.shapes import Mesh
 Float32 = NDArray[np.float32]
 Float64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Int8 = NDArray[np.int8]
 Int32 = NDArray[np.int32]
 Int64 = NDArray[np.int64]
 
@@ -41,29 +42,49 @@ def outward_faces(mesh: Mesh) -> NDArray[np.bool_]:
         >>> outward_faces(Plane(type="plane", size_m=(1, 1)).mesh()).tolist()
         [False, False]
     """
+    if mesh.outward is not None:
+        return mesh.outward
     edge, way = edges_of(mesh)
-    face = np.repeat(np.arange(len(mesh.faces)), 3)
-    surface = connected(edge, face, len(mesh.faces))
+    return outward_by(mesh, edge, way, surfaces_of(edge))
+
+
+def surfaces_of(edge: Int64) -> Int64:
+    """(F,) number of the surface of each face by (3 F,) numbers of edges; see `connected`."""
+    return connected(edge, np.arange(len(edge)) // 3, len(edge) // 3)
+
+
+def outward_by(mesh: Mesh, edge: Int64, way: Int8, surface: Int64) -> Bools:
+    """`outward_faces` of a mesh of which `edges_of` and `surfaces_of` are known."""
+    face = np.arange(len(edge)) // 3
     turns = np.bincount(edge, weights=way)
     open_edges = np.bincount(surface[face], weights=turns[edge] != 0, minlength=len(mesh.faces))
-    first, second, third = (mesh.vertices_m - mesh.vertices_m.mean(axis=0))[mesh.faces].transpose(1, 0, 2)
-    volumes = np.einsum("fc,fc->f", first, np.cross(second, third))
+    centred = mesh._replace(vertices_m=mesh.vertices_m - mesh.vertices_m.mean(axis=0))
+    volumes = np.empty(len(mesh.faces))
+    for part, (first, second, third) in centred.parts():
+        volumes[part] = (first * np.cross(second, third, axis=0)).sum(axis=0)
     volume = np.bincount(surface, weights=volumes, minlength=len(mesh.faces))
     rounding = VOLUME_ROUNDING * np.bincount(surface, weights=np.abs(volumes), minlength=len(mesh.faces))
     outward: NDArray[np.bool_] = ((open_edges == 0) & (volume >= -rounding))[surface]
     return outward
 
 
-def edges_of(mesh: Mesh) -> tuple[Int64, Int64]:
+def edges_of(mesh: Mesh) -> tuple[Int64, Int8]:
     """(3 F,) the number of each edge of each face, shared by the faces that it borders, and (3 F,) which way it runs.
 
     The ways are 1 and -1, and 0 from a corner to itself. Vertices at the same place are one.
     """
     corners = _welded(mesh.vertices_m)[mesh.faces]
     start, end = corners.ravel(), corners[:, [1, 2, 0]].ravel()
-    lower, upper = np.minimum(start, end), np.maximum(start, end)
-    _, edge = np.unique(lower * len(mesh.vertices_m) + upper, return_inverse=True)
-    return edge.reshape(-1), np.sign(end - start)
+    way = (end > start).astype(np.int8) - (end < start).astype(np.int8)
+    key = np.minimum(start, end)
+    key *= len(mesh.vertices_m)
+    key += np.maximum(start, end, out=start)
+    del start, end, corners
+    order = key.argsort()
+    key = key[order]
+    edge = np.empty_like(order)
+    edge[order] = np.cumsum(np.concatenate([[False], key[1:] != key[:-1]]))
+    return edge, way
 
 
 def _welded(vertices_m: NDArray[np.float64]) -> Int64:
@@ -77,8 +98,9 @@ def _welded(vertices_m: NDArray[np.float64]) -> Int64:
 
 def connected(edge: Int64, face: Int64, faces: int) -> Int64:
     """(faces,) number of the surface of each face, of those that share edges: the smallest number of a face of it."""
-    order = np.argsort(edge, kind="stable")
-    shared = np.flatnonzero(np.diff(edge[order]) == 0)
+    order = np.argsort(edge)
+    ordered = edge[order]
+    shared = np.flatnonzero(ordered[1:] == ordered[:-1])
     one, other = face[order[shared]], face[order[shared + 1]]
     surface = np.arange(faces)
     while (surface[one] != surface[other]).any():
@@ -151,9 +173,12 @@ class Patches(NamedTuple):
             outward: (F,) what `outward_faces` says of it, if that is known.
         """
         extent_m = 0.0 if bounds is not None else float(np.ptp(mesh.vertices_m, axis=0).max())
-        corners_m = np.ascontiguousarray(mesh.vertices_m[mesh.faces].transpose(1, 2, 0))
         longest_m = max(LONGEST_M, LONGEST_SHARE * extent_m)
-        (corner, second, third), face, heights_m = _cut(corners_m, bounds, longest_m, heights)
+        none = np.empty((3, 3, 0)), np.empty(0, dtype=np.int64), np.empty((0 if heights is None else 2, 0), np.float32)
+        parts = [_cut(corners, part.start, bounds, longest_m, heights) for part, corners in mesh.parts()]
+        triangles, faces, all_heights_m = zip(none, *parts, strict=True)
+        (corner, second, third), face = np.concatenate(triangles, axis=2), np.concatenate(faces)
+        heights_m = np.concatenate(all_heights_m, axis=1)
         first_m, second_m = (second - corner).astype(np.float32), (third - corner).astype(np.float32)
         nobodys = np.full(len(face), -1, dtype=np.int32)
         of_face = np.empty((0, len(face)), dtype=np.int32) if coincident is None else coincident[None, face]
@@ -216,15 +241,17 @@ class Patches(NamedTuple):
 
 def _cut(
     triangles: Float64,
+    first: int,
     bounds: Bounds | None,
     longest_m: float,
     heights: Callable[[Float64, Int64], tuple[Float32, Bools]] | None,
 ) -> tuple[Float64, Int64, Float32]:
     """(3, 3, N) triangles with short edges, (N,) of which one of those given, (3, 3, M), each is a part, and heights.
 
-    Axes are the corner, the coordinate, the triangle: NumPy is quick along the last one.
+    The first of those given has the number `first`. Axes are the corner, the coordinate, the triangle: NumPy is quick
+    along the last one.
     """
-    face, area_m2 = np.arange(triangles.shape[2]), _areas(triangles)
+    face, area_m2 = np.arange(first, first + triangles.shape[2]), _areas(triangles)
     done, done_face = [np.empty((3, 3, 0))], [np.empty(0, dtype=np.int64)]
     done_heights_m = [np.empty((0 if heights is None else 2, 0), dtype=np.float32)]
     while len(face):

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import transform
 from torchcover.simulation.patches import outward_faces
 from torchcover.simulation.rays import rotate
-from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.shapes import Mesh, corners_of, normals_of
 
 Float32 = NDArray[np.float32]
 Matrix = NDArray[np.float64]
@@ -36,26 +36,26 @@ class Faces:
     """The faces of all bodies, one after the other, and how far from each a place counts as on it.
 
     `contact_m` (F,) bounds the distance from its plane at which float32 may find a place that lies on it, unless it is
-    a sliver; `normals` (3, F) are of length one, or 0 where a face has no area.
+    a sliver; `normals` (3, F) are of length one, or 0 where a face has no area. Both are float32, for there may be ten
+    million; what a question needs in float64 is computed again for the few faces that it is about.
     """
 
     def __init__(self, bodies: Sequence[Mesh], reach_m: float) -> None:
-        first, second, third = np.concatenate([body.vertices_m[body.faces] for body in bodies]).transpose(1, 2, 0)
-        (ax, ay, az), (bx, by, bz) = np.abs(second - first), np.abs(third - first)
-        across = np.cross(second - first, third - first, axis=0)
-        length = np.linalg.norm(across, axis=0)
-        length[length == 0] = np.inf  # Embree does not hit a face without an area
-        # To first order, the roundings of n . x, where n = a x b, are the sum of all its products.
-        products = np.stack([ay * bz + az * by, az * bx + ax * bz, ax * by + ay * bx])
-        largest = np.abs([first, second, third]).max(axis=0)
-        rounding_m = (products * largest).sum(axis=0) / length
-        # The plane of a sliver is anybody's guess, but the sliver is not far from where it is.
-        rounding_m = np.minimum(rounding_m, largest.max(axis=0)) * np.finfo(np.float32).eps
-        self.contact_m = np.maximum(CONTACT_ROUNDINGS * rounding_m, MIN_CONTACT * reach_m)
-        self.normals = across / length
-        self._corner_m = first
-        self._lower_m = np.min([first, second, third], axis=0) - 2 * self.contact_m
-        self._upper_m = np.max([first, second, third], axis=0) + 2 * self.contact_m
+        self._bodies = bodies
+        starts = np.cumsum([0] + [len(body.faces) for body in bodies]).tolist()
+        count = starts[-1]
+        self.contact_m, self.normals = np.empty(count, dtype=np.float32), np.empty((3, count), dtype=np.float32)
+        self._lower_m, self._upper_m = (np.empty((3, count), dtype=np.float32) for _ in range(2))
+        for start, body in zip(starts, bodies, strict=False):
+            for part, corners_m in body.parts():
+                faces = slice(start + part.start, start + part.stop)
+                self.normals[:, faces] = normals_of(corners_m)
+                contact_m = np.maximum(_contact_m(corners_m), MIN_CONTACT * reach_m)
+                self.contact_m[faces] = contact_m
+                # Rounded outwards.
+                lower_m, upper_m = corners_m.min(axis=0) - 2 * contact_m, corners_m.max(axis=0) + 2 * contact_m
+                self._lower_m[:, faces] = np.nextafter(lower_m.astype(np.float32), np.float32(-np.inf))
+                self._upper_m[:, faces] = np.nextafter(upper_m.astype(np.float32), np.float32(np.inf))
         self._least_m, self._most_m = (
             self._lower_m.min(axis=1, initial=np.inf),
             self._upper_m.max(axis=1, initial=-np.inf),
@@ -75,9 +75,23 @@ class Faces:
 
     def from_plane_m(self, place_m: NDArray[np.floating], faces: NDArray[np.int64]) -> NDArray[np.float64]:
         """Distance of a (3,) place from the planes of some of them."""
-        along_normal = (place_m[:, None] - self._corner_m[:, faces]) * self.normals[:, faces]
-        distance_m: NDArray[np.float64] = np.abs(along_normal.sum(axis=0))
+        corners_m = corners_of(self._bodies, faces)
+        distance_m: Matrix = np.abs(((place_m[:, None] - corners_m[0]) * normals_of(corners_m)).sum(axis=0))
         return distance_m
+
+
+def _contact_m(corners_m: Matrix) -> Matrix:
+    """(N,) how far from its plane float32 may find a place that lies on a face, of (3, 3, N) corners."""
+    first, second, third = corners_m
+    (ax, ay, az), (bx, by, bz) = np.abs(second - first), np.abs(third - first)
+    length = np.linalg.norm(np.cross(second - first, third - first, axis=0), axis=0)
+    # To first order, the roundings of n . x, where n = a x b, are the sum of all its products.
+    products = np.stack([ay * bz + az * by, az * bx + ax * bz, ax * by + ay * bx])
+    largest = np.abs(corners_m).max(axis=0)
+    rounding_m = (products * largest).sum(axis=0) / np.where(length == 0, np.inf, length)
+    # The plane of a sliver is anybody's guess, but the sliver is not far from where it is.
+    contact_m: Matrix = np.minimum(rounding_m, largest.max(axis=0)) * (CONTACT_ROUNDINGS * np.finfo(np.float32).eps)
+    return contact_m
 
 
 class Hits(NamedTuple):
@@ -144,12 +158,6 @@ class RayCaster:
         return Faces(self._bodies, self._reach_m)
 
     @cached_property
-    def _normals(self) -> Float32:
-        """(3, F) normals of all faces."""
-        normals: Float32 = self._faces.normals.astype(np.float32)
-        return normals
-
-    @cached_property
     def _materials(self) -> NDArray[np.uint8]:
         """(F,) what each of all faces is made of."""
         return np.concatenate([body.materials for body in self._bodies])
@@ -200,7 +208,7 @@ class RayCaster:
             directions: (3, N) unit directions of these rays.
         """
         face = self._first_face.take(body) + triangle
-        (nx, ny, nz), (x, y, z) = self._normals.take(face, axis=1), directions
+        (nx, ny, nz), (x, y, z) = self._faces.normals.take(face, axis=1), directions
         cosine = np.abs(nx * x + ny * y + nz * z)
         return Struck(body, triangle, np.minimum(cosine, 1.0, out=cosine), self._materials.take(face))
 

@@ -16,11 +16,11 @@ from torchcover.simulation.rig import Rig
 
 Float64 = NDArray[np.float64]
 
-# Of a road that is straight ahead; beside it there are kerbs and grass.
-HALF_ROAD_M = 7.0
+# Of a road that is straight ahead; beside it there are kerbs and grass. Its height is fitted to the inner part.
+HALF_ROAD_M, HALF_LANES_M = 10.0, 7.0
 # Rays to nearer ground always return, or the vehicle hides them.
 NEAREST_M, FARTHEST_M = 10.0, 125.0
-SECTOR_DEG = 1.0
+SECTOR_DEG = 0.5
 # Higher than this above the road, or lower than what no road hides, is in nobody's way.
 OVERHEAD_M = 2.5
 # How far a return from the ground may lie off it, and how much of that is an error of the ground.
@@ -84,7 +84,7 @@ def _terms(points_m: Float64) -> Float64:
 def road_profile(points_m: Float64) -> RoadProfile:
     """Fit the road under a sweep, (N, 3) points in the vehicle frame, from near to far."""
     range_m = np.hypot(points_m[:, 0], points_m[:, 1])
-    chosen = (np.abs(points_m[:, 1]) < HALF_ROAD_M) & (range_m < 90.0) & (range_m > 3.5)
+    chosen = (np.abs(points_m[:, 1]) < HALF_LANES_M) & (range_m < 90.0) & (range_m > 3.5)
     points_m, range_m = points_m[chosen], range_m[chosen]
     low = (range_m < 15.0) & (np.abs(points_m[:, 2]) < 0.6)
     terms, coefficients = _terms(points_m), np.zeros(5)
@@ -120,10 +120,14 @@ def _of_sweep(points_m: Float64, lidar: Lidar, number: int) -> GroundRays:
     above_m = points_m[:, 2] - road.height_m(points_m)
     middle_deg: Float64 = (np.arange(sectors, dtype=np.float64) + 0.5) * SECTOR_DEG - 180.0
     expected_m, place_m = _expected(vehicle_T_sensor, rows_deg, middle_deg, road)
-    # What stands in the way: the second nearest of a sector and its neighbours, for one may be rain or dust.
+    height_m = vehicle_T_sensor[2, 3] - road.height_m(vehicle_T_sensor[None, :3, 3])[0]
     stands = (above_m > OFF_GROUND_M + OFF_GROUND_SHARE * range_m) & (above_m < OVERHEAD_M) & (range_m > 2.0)
-    blocked_m = np.array([_second(range_m[stands & (sector == k)]) for k in range(sectors)])
-    blocked_m = np.minimum(blocked_m, np.minimum(np.roll(blocked_m, 1), np.roll(blocked_m, -1)))
+    order = np.flatnonzero(stands)[np.argsort(sector[stands], kind="stable")]
+    of_sector = np.split(order, np.searchsorted(sector[order], np.arange(1, sectors)))
+    blocked = np.empty(expected_m.shape, dtype=np.bool_)
+    for k in range(sectors):
+        there = np.concatenate([of_sector[beside % sectors] for beside in (k - 1, k, k + 1)])
+        blocked[:, k] = _blocked(expected_m[:, k], height_m, range_m[there], above_m[there])
     cell = row * sectors + sector
     share = range_m / expected_m.reshape(-1)[cell]
 
@@ -132,12 +136,11 @@ def _of_sweep(points_m: Float64, lidar: Lidar, number: int) -> GroundRays:
 
     returned, beyond = counted((share > ABOUT[0]) & (share < ABOUT[1])), counted(share >= ABOUT[1])
     rays = np.maximum(lidar.columns * SECTOR_DEG / lidar.horizontal_fov_deg - beyond, 0.0)
-    free = (expected_m < CLEAR * blocked_m) & (np.abs(place_m[..., 1]) < HALF_ROAD_M) & (rays > 0)
+    free = ~blocked & (np.abs(place_m[..., 1]) < HALF_ROAD_M) & (rays > 0)
     free &= (expected_m > NEAREST_M) & (expected_m < FARTHEST_M)
     near = free & (expected_m < 2 * NEAREST_M)
     opened = (returned * near).sum(axis=0) >= OPEN_SHARE * (rays * near).sum(axis=0)
     free &= opened & near.any(axis=0)
-    height_m = vehicle_T_sensor[2, 3] - road.height_m(vehicle_T_sensor[None, :3, 3])[0]
     azimuths_deg = np.broadcast_to(middle_deg, expected_m.shape)
     return GroundRays(
         expected_m[free],
@@ -158,8 +161,14 @@ def _in_rows(points_m: Float64, lidar: Lidar) -> tuple[NDArray[np.intp], Float64
     return row, np.rad2deg(np.arctan2(y, x)), np.linalg.norm(in_sensor_m, axis=1)
 
 
-def _second(range_m: Float64) -> float:
-    return float(np.partition(range_m, 1)[1]) if len(range_m) > 1 else np.inf
+def _blocked(expected_m: Float64, height_m: float, range_m: Float64, above_m: Float64) -> NDArray[np.bool_]:
+    """(rows,) whether what stands in a sector, (K,) points of it, is in the way of rays to the road.
+
+    A ray passes over what is lower than the ray is there. Two points are needed, for one may be rain or dust.
+    """
+    ray_m = height_m * (1.0 - range_m[None] / expected_m[:, None])
+    in_the_way = (range_m[None] * CLEAR < expected_m[:, None]) & (above_m[None] > ray_m - OFF_GROUND_M)
+    return np.asarray(np.count_nonzero(in_the_way, axis=1) > 1)
 
 
 def _expected(
@@ -289,7 +298,8 @@ def calibrate(recording: Recording, rig: Rig) -> tuple[Rig, list[LidarCalibratio
         The rig with what was found, and what that is for each LiDAR; where the road never fades, its keys stay.
 
     Raises:
-        ValueError: No LiDAR of the rig is in the recording, no ray points at a road, or the recording stands still.
+        ValueError: No LiDAR of the rig is in the recording, no ray points at a road, the recording stands still, or a
+            sweep is in it twice.
         OSError: A file is missing.
     """
     names = _paired(recording, rig)
@@ -302,6 +312,7 @@ def calibrate(recording: Recording, rig: Rig) -> tuple[Rig, list[LidarCalibratio
         sweeps = [
             in_vehicle(recording.scan(names[sensor.name], index), recording.body).points_m for index in recording.frames
         ]
+        _check_different(sweeps, f"{recording.path}: {sensor.name}")
         told = _calibration(sensor, sweeps, road, str(recording.path))
         keys = sensor.model_dump(exclude_unset=True)
         if told.fit.fades:
@@ -345,6 +356,18 @@ def _check_drive(recording: Recording) -> None:
             )
 
 
+def _check_different(sweeps: Sequence[NDArray[np.float32]], source: str) -> None:
+    """Refuse a sweep that is there again, as it may be where no poses tell that the vehicle stands."""
+    first: dict[bytes, int] = {}
+    for number, sweep in enumerate(sweeps):
+        same = first.setdefault(sweep.tobytes(), number)
+        if same != number and len(sweep):
+            raise ValueError(
+                f"{source}: sweeps {same} and {number} are the same cloud, so that both know what one does; give each "
+                "sweep once"
+            )
+
+
 def _calibration(lidar: Lidar, sweeps: Sequence[NDArray[np.float32]], road: Material, source: str) -> LidarCalibration:
     rays = ground_rays(sweeps, lidar)
     if rays.rays.sum() < FEWEST_RAYS:
@@ -363,7 +386,7 @@ def _noise_m(sweeps: Sequence[NDArray[np.float32]], lidar: Lidar) -> float:
     for sweep in sweeps:
         points_m = sweep.astype(np.float64)
         on_road = np.abs(points_m[:, 2] - road_profile(points_m).height_m(points_m)) < OFF_GROUND_M
-        row, azimuth_deg, range_m = _in_rows(points_m[on_road & (np.abs(points_m[:, 1]) < HALF_ROAD_M)], lidar)
+        row, azimuth_deg, range_m = _in_rows(points_m[on_road & (np.abs(points_m[:, 1]) < HALF_LANES_M)], lidar)
         order = np.lexsort((azimuth_deg, row))
         row, azimuth_deg, range_m = row[order], azimuth_deg[order], range_m[order]
         together = (row[2:] == row[:-2]) & (azimuth_deg[2:] - azimuth_deg[:-2] < 2.5 * step_deg)

@@ -59,7 +59,7 @@ class Rig(BuiltIn):
     def save(self, path: str | Path) -> None:
         """Write it to a YAML file from which `load` makes the same rig, wherever that is put.
 
-        A LiDAR model from a file is written out, and so is the place of a vehicle's file.
+        A LiDAR model from a file is written out, and so is the place of any other file.
 
         Raises:
             OSError: The file cannot be written.
@@ -72,8 +72,6 @@ class Rig(BuiltIn):
             True
         """
         keys = self.model_dump(mode="json", exclude_unset=True, exclude={"sensors"})
-        if self.vehicle is not None and is_file_name(self.vehicle):
-            keys["vehicle"] = str(Path(self.vehicle).resolve())
         keys["sensors"] = [_written(sensor) for sensor in self.sensors]
         write_durably(Path(path), lambda aside: aside.write_text(as_yaml(keys), encoding="utf-8"))
 

@@ -199,10 +199,13 @@ class ScanTimes(Document):
     Args:
         period_s: From the first to the last.
         start_s: When the first is cast, after the time of the frame; `-period_s` if not given, so that it ends then.
+        deskewed: Whether points land where they are at the time of the frame. Else each lands as its ray was cast, in
+            the vehicle frame of that time, as in the raw cloud of a driver; no number depends on it.
     """
 
     period_s: PositiveFloat
     start_s: float | None = None
+    deskewed: bool = True
 
     def times_s(self, count: int) -> Float64:
         """(count,) when each is cast, after the time of the frame."""

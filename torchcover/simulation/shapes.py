@@ -1,5 +1,7 @@
 """Shapes: primitives, and meshes from files."""
 
+import gc
+from collections.abc import Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal, NamedTuple
@@ -17,8 +19,10 @@ CYLINDER_SIDES = 24
 MAX_SIDES = 10_000
 ELLIPSOID_SIDES = 12  # around the z axis; half as many bands from pole to pole
 
+# So many faces are looked at together: what is computed for each takes far more memory than the face.
+PART = 1 << 16
 # What trimesh takes for each byte of a mesh's file at most: text becomes lists of words.
-_BYTES_PER_FILE_BYTE = 16
+_BYTES_PER_TEXT_BYTE, _BYTES_PER_BINARY_BYTE = 16, 10
 
 Length = PositiveFloat
 
@@ -27,11 +31,13 @@ class Mesh(NamedTuple):
     """A triangle mesh: `vertices_m` (V, 3) float64 in metres and `faces` (F, 3) int64 indices into them.
 
     `material` (F,) uint8 is what each face is made of, by `material_number`; None, as 0, where that is not said.
+    `outward` (F,) is what `outward_faces` says, where that is known.
     """
 
     vertices_m: NDArray[np.float64]
     faces: NDArray[np.int64]
     material: NDArray[np.uint8] | None = None
+    outward: NDArray[np.bool_] | None = None
 
     def moved(self, destination_T_source: NDArray[np.float64]) -> "Mesh":
         """The mesh in another frame."""
@@ -39,7 +45,14 @@ class Mesh(NamedTuple):
 
     def with_faces(self, which: NDArray[np.bool_] | NDArray[np.int64]) -> "Mesh":
         """Some of its faces, of what they were made of."""
-        return self._replace(faces=self.faces[which], material=None if self.material is None else self.material[which])
+        material = None if self.material is None else self.material[which]
+        return Mesh(self.vertices_m, self.faces[which], material)
+
+    def parts(self) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+        """Which faces, and their (3, 3, N) corners, coordinates, faces: as many at a time as there is memory for."""
+        for first in range(0, len(self.faces), PART):
+            part = slice(first, min(first + PART, len(self.faces)))
+            yield part, np.ascontiguousarray(self.vertices_m[self.faces[part]].transpose(1, 2, 0))
 
     def made_of(self, material: str) -> "Mesh":
         """The mesh with all its faces of a built-in material."""
@@ -49,6 +62,25 @@ class Mesh(NamedTuple):
     def materials(self) -> NDArray[np.uint8]:
         """(F,) the number of what each face is made of."""
         return np.zeros(len(self.faces), dtype=np.uint8) if self.material is None else self.material
+
+
+def corners_of(meshes: Sequence[Mesh], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(3, 3, N) corners, coordinates, faces, of some that are counted through all meshes."""
+    starts = np.cumsum([0] + [len(mesh.faces) for mesh in meshes])
+    corners_m, of_mesh = np.empty((3, 3, len(faces))), np.searchsorted(starts, faces, side="right") - 1
+    for number in np.unique(of_mesh).tolist():
+        some, mesh = np.flatnonzero(of_mesh == number), meshes[number]
+        corners_m[..., some] = mesh.vertices_m[mesh.faces[faces[some] - starts[number]]].transpose(1, 2, 0)
+    return corners_m
+
+
+def normals_of(corners_m: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, N) normals of (3, 3, N) corners, coordinates, faces; 0 without an area, for Embree does not hit that."""
+    first, second, third = corners_m
+    across = np.cross(second - first, third - first, axis=0)
+    length = np.linalg.norm(across, axis=0)
+    normals: NDArray[np.float64] = across / np.where(length == 0, np.inf, length)
+    return normals
 
 
 class Plane(Document):
@@ -170,13 +202,19 @@ def _read_mesh(path: Path) -> Mesh:
     """All geometry of a file, in its own unit."""
     import trimesh
 
-    check_memory(_BYTES_PER_FILE_BYTE * path.stat().st_size)
+    with path.open("rb") as file:
+        is_binary = b"\0" in file.read(PART)
+    size = path.stat().st_size
+    check_memory((_BYTES_PER_BINARY_BYTE if is_binary else _BYTES_PER_TEXT_BYTE) * size)
     try:
         loaded = trimesh.load_mesh(path, process=False)
     except Exception as error:  # trimesh raises whatever the reader of the format raises
         raise ValueError(f"trimesh cannot read it as a mesh ({error})") from error
     vertices = np.asarray(getattr(loaded, "vertices", ()), dtype=np.float64)
     faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64)
+    del loaded
+    if size > PART:
+        gc.collect()  # it stood in a circle with what it was read from, four times as large as the mesh
     if len(faces) == 0:
         raise ValueError(f"a mesh with faces is needed; it has {len(vertices)} vertices and no face")
     if not np.isfinite(vertices).all():

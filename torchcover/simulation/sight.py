@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torchcover.geometry import rigid
 from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.rays import BLOCK, Tile, into_tiles, pixels_in_tiles
+from torchcover.simulation.rays import BLOCK, Tile, into_tiles, pixels_in_tiles, rotate
 from torchcover.simulation.scene import Scene, ends_at
-from torchcover.simulation.sensor import Draws, RayHits, Sensor
+from torchcover.simulation.sensor import Draws, RayHits, ScanTimes, Sensor
 from torchcover.simulation.sweep import RayTimes
 from torchcover.simulation.weather import CLEAR, Weather
 
@@ -53,13 +53,14 @@ class MountedSensor:
         directions = sensor.directions()
         self.tiles = into_tiles(directions)
         self.pixel_of_ray = pixels_in_tiles(directions)
-        self._times = ray_times(sensor, self.tiles, self.pixel_of_ray) if scene.moves else None
-        taken_s = max((float(np.ptp(each.at_s)) for each in self._times or () if len(each.at_s)), default=0.0)
-        if taken_s > scene.world.time_step_s:
+        timing: ScanTimes | None = getattr(sensor, "scan", None)
+        if timing and timing.period_s > scene.world.time_step_s:
             raise ValueError(
-                f"sensor {sensor.name!r}: a scan of {taken_s:g} s is longer than the time step of the scenario, "
-                f"{scene.world.time_step_s:g} s; shorten its period, or make the time steps longer"
+                f"sensor {sensor.name!r}: a scan of period_s {timing.period_s:g} is longer than the time step of the "
+                f"scenario, {scene.world.time_step_s:g} s; shorten its period, or make the time steps longer"
             )
+        self._times = ray_times(sensor, self.tiles, self.pixel_of_ray) if scene.moves else None
+        self._is_raw = bool(self._times and timing and not timing.deskewed)
         self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
         housings = [
             mesh.moved(other.mount.matrix()) for other in others for body in other.housing for mesh in body.meshes()
@@ -75,6 +76,8 @@ class MountedSensor:
     def scan(self, instant: Instant, draws: Draws, *, threads: int = 1) -> SensorScan:
         """What it makes of what its rays hit at one time of the scene."""
         scan, hits = self._cast(instant, threads)
+        if self._is_raw:
+            scan = self._as_cast(scan)
         hit, error_m = self.sensor.measure(hits, draws)
         ways = scan.ways() if error_m is not None and scan.ways else None
         scan = scan._replace(struck=None, ways=None)
@@ -85,6 +88,13 @@ class MountedSensor:
         landed, ways = scan.points if scan.landed is None else scan.landed, ways if hit is None else ways[hit]
         landed = (landed + error_m[:, None] * ways).astype(np.float32)
         return scan._replace(error_m=error_m.astype(np.float32), landed=landed)
+
+    def _as_cast(self, scan: SensorScan) -> SensorScan:
+        """The scan with points that land in the vehicle frame of the time at which their ray was cast."""
+        towards = np.concatenate([tile.directions for tile in self.tiles], axis=1).take(scan.ray, axis=1)
+        ways = rotate(self.vehicle_T_sensor[:3, :3], towards).T
+        landed = self.vehicle_T_sensor[:3, 3] + scan.range_m[:, None] * ways
+        return scan._replace(landed=landed.astype(np.float32), ways=lambda: ways)
 
     def _cast(self, instant: Instant, threads: int) -> tuple[SensorScan, RayHits]:
         if self._resting is not None:

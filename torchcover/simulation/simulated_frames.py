@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from torchcover.coverage.quantity import MEASURED_WITHIN_M
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import with_hits
-from torchcover.frames.frame import ON_OBJECT_WITHIN_M, Frame, Measured
+from torchcover.frames.frame import Frame, Measured
 from torchcover.frames.source import FrameDataset
 from torchcover.simulation.instant import SensorScan
 from torchcover.simulation.kinds import REFERENCE_SENSORS
@@ -267,11 +268,11 @@ def of_rigs(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) 
 
 def with_boxes(frame: Frame, boxes: Boxes, rigs: Mapping[str, Rig]) -> Frame:
     """The frame with its objects, and how many points each of its rigs has on them."""
-    clouds = {name: frame.cloud_of(name, within_m=ON_OBJECT_WITHIN_M) for name in frame.clouds}
+    clouds = {name: frame.cloud_of(name, within_m=MEASURED_WITHIN_M) for name in frame.clouds}
     counts_as = {}
     for name, rig in rigs.items():
         if any(sensor.counts_as > 1 for sensor in rig.sensors):
-            of_sensors = frame.clouds_by_sensor(name, within_m=ON_OBJECT_WITHIN_M).values()
+            of_sensors = frame.clouds_by_sensor(name, within_m=MEASURED_WITHIN_M).values()
             each = torch.tensor([sensor.counts_as for sensor in rig.sensors])
             counts_as[name] = each.repeat_interleave(torch.tensor([len(cloud) for cloud in of_sensors]))
     return replace(frame, boxes=with_hits(boxes, clouds, counts_as))

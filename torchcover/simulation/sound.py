@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.simulation.patches import connected, edges_of, outward_faces
+from torchcover.simulation.patches import edges_of, outward_by, outward_faces, surfaces_of
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.shapes import PART, Mesh, corners_of, normals_of
 
 Bools = NDArray[np.bool_]
 Float64 = NDArray[np.float64]
@@ -22,6 +22,8 @@ ALIKE = 0.9
 SIDE_POINTS, LONG_SIDE_POINTS, LONG_M = 2, 10, 4.0
 # Of a sheet all normals add up to its area, of what is nearly closed to nothing: what is below is meant to be closed.
 BODY_SHARE = 0.5
+# Odd numbers without a pattern: sums of products with them are alike by chance once in 2^64.
+MIXING = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 
 
 def told(owner: str, mesh: Mesh) -> Mesh:
@@ -37,6 +39,7 @@ def told(owner: str, mesh: Mesh) -> Mesh:
         _warn(owner, f"{_share(doubled, len(mesh.faces))} of its faces are there more than once, and count once")
         mesh = mesh.with_faces(once)
         edge, way = edges_of(mesh)
+    surface = surfaces_of(edge)
     faces = np.bincount(edge, weights=way != 0)
     turns = np.bincount(edge, weights=way)
     shared = faces == 2
@@ -49,7 +52,6 @@ def told(owner: str, mesh: Mesh) -> Mesh:
             "modelling tool",
         )
     elif (faces % 2 == 1).any():
-        surface = connected(edge, np.arange(len(edge)) // 3, len(mesh.faces))
         is_open = np.bincount(surface[np.flatnonzero((faces % 2 == 1)[edge]) // 3], minlength=len(mesh.faces)) > 0
         missing = is_open[surface] & _encloses(mesh, surface)[surface]
         if missing.any():
@@ -59,7 +61,7 @@ def told(owner: str, mesh: Mesh) -> Mesh:
                 "only, though it looks like a body: rays pass through the holes, and nothing lies inside of it; close "
                 "it in a modelling tool",
             )
-    return mesh
+    return mesh._replace(outward=outward_by(mesh, edge, way, surface))
 
 
 def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Bools]:
@@ -75,32 +77,32 @@ def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Boo
     Returns:
         One (F,) mask for each mesh.
     """
-    corners_m = np.concatenate([mesh.vertices_m[mesh.faces] for mesh in meshes])
     outward = np.concatenate([outward_faces(mesh) for mesh in meshes])
-    across = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
-    length = np.linalg.norm(across, axis=1, keepdims=True)
-    normals = across / np.where(length == 0, 1.0, length)
     number = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
-    longest_m = np.linalg.norm(corners_m - np.roll(corners_m, 1, axis=1), axis=2).max(axis=1)
-    caster, found = RayCaster(meshes), np.zeros(len(corners_m), dtype=bool)
-    for is_long, points in ((False, SIDE_POINTS), (True, LONG_SIDE_POINTS)):
-        faces = np.flatnonzero(((longest_m > LONG_M) == is_long) & (length[:, 0] > 0))
-        for shares in _inner_points(points):
-            places_m = np.einsum("c,fcd->fd", shares, corners_m[faces])
-            # From above, to what lies on it or is the same; from within, to what lies below.
-            for start_m in (COINCIDE_M, -APART_M):
-                met = caster.faces_met(
-                    places_m + start_m * normals[faces], -normals[faces], COINCIDE_M + max(start_m, -COINCIDE_M / 2)
-                )
-                other = (met >= 0) & (met != faces)
-                other &= (number[met] != number[faces]) | np.array(within, dtype=bool)[number[faces]]
-                one, two = faces[other], met[other]
-                cosine = (normals[one] * normals[two]).sum(axis=1)
-                # Back to back they are seen from different sides: by nobody, that of a body that stands on a sheet.
-                apart = (outward[one] & outward[two]) | (outward[one] & (normals[one, 2] < -ALIKE))
-                apart |= outward[two] & (normals[two, 2] < -ALIKE)
-                same = (cosine > ALIKE) | ((cosine < -ALIKE) & ~apart)
-                found[one[same]] = found[two[same]] = True
+    caster, found = RayCaster(meshes), np.zeros(len(number), dtype=bool)
+    for start in range(0, len(number), PART):
+        corners_m = corners_of(meshes, np.arange(start, min(start + PART, len(number))))
+        has_area = normals_of(corners_m).any(axis=0)
+        is_long = np.linalg.norm(corners_m - corners_m[[2, 0, 1]], axis=1).max(axis=0) > LONG_M
+        for some, points in ((has_area & ~is_long, SIDE_POINTS), (has_area & is_long, LONG_SIDE_POINTS)):
+            faces, corners = start + np.flatnonzero(some), corners_m[..., some]
+            normals = normals_of(corners).T
+            for shares in _inner_points(points) if len(faces) else ():
+                places_m = np.tensordot(shares, corners, 1).T
+                # From above, to what lies on it or is the same; from within, to what lies below.
+                for start_m in (COINCIDE_M, -APART_M):
+                    limit_m = COINCIDE_M + max(start_m, -COINCIDE_M / 2)
+                    met = caster.faces_met(places_m + start_m * normals, -normals, limit_m)
+                    other = (met >= 0) & (met != faces)
+                    other &= (number[met] != number[faces]) | np.array(within, dtype=bool)[number[faces]]
+                    one, two = faces[other], met[other]
+                    upon = normals[other], normals_of(corners_of(meshes, two)).T
+                    cosine = (upon[0] * upon[1]).sum(axis=1)
+                    # Back to back they are seen from different sides: by nobody, that of a body that stands on a sheet.
+                    apart = outward[one] & outward[two]
+                    apart |= (outward[one] & (upon[0][:, 2] < -ALIKE)) | (outward[two] & (upon[1][:, 2] < -ALIKE))
+                    same = (cosine > ALIKE) | ((cosine < -ALIKE) & ~apart)
+                    found[one[same]] = found[two[same]] = True
     return np.split(found, np.cumsum([len(mesh.faces) for mesh in meshes])[:-1])
 
 
@@ -119,19 +121,24 @@ def warn_of_coincidence(names: Sequence[str], coincident: Sequence[Bools]) -> No
         )
 
 
-def _first_of_each(edge: NDArray[np.int64], way: NDArray[np.int64]) -> NDArray[np.int64]:
+def _first_of_each(edge: NDArray[np.int64], way: NDArray[np.int8]) -> NDArray[np.int64]:
     """Numbers of the faces but those that have the same edges as one before, run through the same way."""
-    triples = edge.reshape(-1, 3) * 3 + 1 + way.reshape(-1, 3)
-    _, first = np.unique(np.sort(triples, axis=1), axis=0, return_index=True)
+    triples = np.sort(edge.reshape(-1, 3) * 3 + 1 + way.reshape(-1, 3), axis=1)
+    # Hardly ever are any alike; then no two have the same number, and the slow comparison is not needed.
+    numbers = np.sort((triples.view(np.uint64) * MIXING).sum(axis=1, dtype=np.uint64))
+    if (numbers[1:] != numbers[:-1]).all():
+        return np.arange(len(triples))
+    _, first = np.unique(triples, axis=0, return_index=True)
     return np.sort(first)
 
 
 def _encloses(mesh: Mesh, surface: NDArray[np.int64]) -> Bools:
     """(F,) whether the surface of that number looks like a body: its normals point to all sides."""
-    first, second, third = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
-    normals = np.cross(second - first, third - first)
-    sums = np.stack([np.bincount(surface, axis, minlength=len(mesh.faces)) for axis in normals.T])
-    area = np.bincount(surface, np.linalg.norm(normals, axis=1), minlength=len(mesh.faces))
+    normals = np.empty((3, len(mesh.faces)))
+    for part, (first, second, third) in mesh.parts():
+        normals[:, part] = np.cross(second - first, third - first, axis=0)
+    sums = np.stack([np.bincount(surface, axis, minlength=len(mesh.faces)) for axis in normals])
+    area = np.bincount(surface, np.linalg.norm(normals, axis=0), minlength=len(mesh.faces))
     encloses: Bools = np.linalg.norm(sums, axis=0) < BODY_SHARE * area
     return encloses
 

@@ -45,7 +45,8 @@ def survey(
     Rays are those of `Simulator`, and points what a sensor makes of their hits. Of a LiDAR or a camera, each ray that
     meets the target before anything else, the vehicle's own body included, gives one, within the sensor's ranges, less
     those that drop out. Of a radar, a cell gives one if the hit in the middle of its hits is on the target. All places
-    see the same rays drop out.
+    see the same rays drop out. All rays are cast at the time of the step, whatever the `scan` of a sensor: exact where
+    vehicle and target rest or drive alike, but for what hides the target and drives otherwise.
 
     Args:
         rig: The sensors.

@@ -133,8 +133,9 @@ class CoverageCallback(Callback):
         self._added = True
         indices = [frame.index for frame in new.frames]
         self.metric.update(
-            new.clouds_of(self.rig, within_m=self.metric.within_m),
+            new.clouds_of(self.rig),
             new.reference,
+            error=new.errors_of(self.rig),
             weights=new.weights,
             height=new.heights_in(self.metric.grid.band_frame),
             place_in_time=None if UNKNOWN_INDEX in indices else new.place_in_time,
@@ -170,7 +171,7 @@ class CoverageCallback(Callback):
         self.metric.update([], [], weights=[])  # a process that was dealt nothing but padding has not updated yet
         coverage: Coverage = self.metric.compute()
         self.coverage = coverage
-        if not bool((coverage.probed_steps > 0).any()):
+        if not len(coverage.known.at):
             self._warn_once("no reference point lies in the grid: the coverage of these frames is unknown (NaN)")
         return coverage
 

@@ -78,8 +78,9 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         for frame in self._once.new(frames, Shard(rank, processes, size)):
             index = None if frame.index == UNKNOWN_INDEX else frame.place_in_time
             self.metric.update(
-                frame.cloud_of(within_m=self.metric.within_m),
+                frame.sensor,
                 frame.reference,
+                error=frame.error_of(),
                 weights=frame.reference_weights,
                 height=frame.heights_in(self.metric.grid.band_frame),
                 place_in_time=index,

@@ -58,7 +58,7 @@ def test_a_world_is_complete(kind, world):
         np.testing.assert_allclose(np.diff(actor.trajectory.times_s), w.time_step_s)
         # Nobody jumps, either.
         assert speeds(actor).max() < 40.0
-    assert sum(len(mesh.faces) for mesh in w.static) < 50_000
+    assert sum(len(mesh.faces) for mesh in w.static) < 90_000
     assert {actor.category for actor in w.actors} >= {"car"}
 
 

@@ -31,37 +31,29 @@ class State(NamedTuple):
     """A sum of an aggregation.
 
     Args:
-        initial: What it is before the first step; float64 or int64. One number that is expanded takes no memory.
+        initial: (..., C) what it is before the first step; float64 or int64.
         reduction: How two of them become one: added up, or the larger of each entry.
-        in_blocks: Whether its first dimension is the blocks of contiguous steps.
-        fine: Whether these are the fine ones.
     """
 
     initial: Tensor
     reduction: Literal["sum", "max"] = "sum"
-    in_blocks: bool = False
-    fine: bool = False
 
 
 class BinnedStep(NamedTuple):
-    """The reference points of one step that lie in the grid.
+    """The reference points of one step, in those C cells that they lie in.
 
     Args:
-        cell: (N,) int64 cell of each point.
+        cell: (N,) int64 which of the C cells each point lies in.
         values: (V, N) float64 of each point: its `radius`, then 1 for each threshold that it is within, or 0; then what
             there is to say of the sensors, if the metric knows them.
         weight: (N,) weight of each point; None if all weigh the same.
         means: Of each value over the points of each cell.
-        block: Number of the block that the step belongs to.
-        cells: Number of cells of the grid.
     """
 
     cell: Tensor
     values: Tensor
     weight: Tensor | None
     means: CellMeans
-    block: int
-    cells: int
 
     @property
     def radius(self) -> Tensor:
@@ -113,11 +105,11 @@ class Aggregation(ABC):
 
     @abstractmethod
     def states(self, cells: int) -> dict[str, State]:
-        """The empty sums, by name."""
+        """The empty sums over so many cells, by name."""
 
     @abstractmethod
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
-        """Add a step to the sums, in place."""
+        """Add a step to the empty sums over its cells, in place."""
 
     @abstractmethod
     def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:

@@ -24,14 +24,12 @@ class MeanOfMeans(Aggregation):
 
     Args:
         thresholds: Detection thresholds in metres.
-        blocks: Blocks of contiguous steps that the sums are kept in.
     """
 
     name: ClassVar[str] = "mean"
     words: ClassVar[str] = "means of means"
 
     thresholds: tuple[float, ...]
-    blocks: int = 1
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
@@ -39,19 +37,17 @@ class MeanOfMeans(Aggregation):
         return (RADIUS, *map(detection, self.thresholds))
 
     def states(self, cells: int) -> dict[str, State]:
-        """`sums` (B, Q, C): sums over the steps of a block of the cell's mean of each quantity."""
-        shape = (self.blocks, len(self.quantities), cells)
-        return {"sums": State(torch.zeros((), dtype=torch.float64).expand(shape), in_blocks=True)}
+        """`sums` (Q, C): sums over the steps of the cell's mean of each quantity."""
+        return {"sums": State(torch.zeros(len(self.quantities), cells, dtype=torch.float64))}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the means of a step."""
-        sums["sums"][step.block][:, step.means.cell] += step.means.mean[: len(self.quantities)]
+        sums["sums"].add_(step.means.mean[: len(self.quantities)])
 
     def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
         """The radius, then the detection at each threshold."""
         steps = probed_steps.double().where(probed_steps > 0, math.nan)
-        means = sums["sums"].sum(dim=0) / steps
-        return list(map(Layer, self.quantities, means))
+        return list(map(Layer, self.quantities, sums["sums"] / steps))
 
 
 @dataclass(frozen=True)
@@ -66,14 +62,12 @@ class VisibleArea(Aggregation):
 
     Args:
         thresholds: Detection thresholds in metres.
-        blocks: Blocks of contiguous steps that the sums are kept in.
     """
 
     name: ClassVar[str] = "area"
     words: ClassVar[str] = "means over the visible surface"
 
     thresholds: tuple[float, ...]
-    blocks: int = 1
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
@@ -81,21 +75,20 @@ class VisibleArea(Aggregation):
         return tuple(map(by_area, (RADIUS, *map(detection, self.thresholds))))
 
     def states(self, cells: int) -> dict[str, State]:
-        """`m2` (B, C): square metres in the steps of a block; `sums` (B, Q, C): each quantity times them."""
-        shape = (self.blocks, len(self.thresholds) + 1, cells)
+        """`m2` (C,): square metres; `sums` (Q, C): each quantity times them."""
         return {
-            "m2": State(torch.zeros((), dtype=torch.float64).expand(self.blocks, cells), in_blocks=True),
-            "sums": State(torch.zeros((), dtype=torch.float64).expand(shape), in_blocks=True),
+            "m2": State(torch.zeros(cells, dtype=torch.float64)),
+            "sums": State(torch.zeros(len(self.thresholds) + 1, cells, dtype=torch.float64)),
         }
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the points of a step."""
-        sums["m2"][step.block, step.means.cell] += step.means.weight
-        sums["sums"][step.block][:, step.means.cell] += step.means.mean[: len(self.quantities)] * step.means.weight
+        sums["m2"].add_(step.means.weight)
+        sums["sums"].add_(step.means.mean[: len(self.quantities)] * step.means.weight)
 
     def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
         """The radius, then the detection at each threshold; 0 / 0, which is NaN, where nothing was seen."""
-        return list(map(Layer, self.quantities, sums["sums"].sum(dim=0) / sums["m2"].sum(dim=0)))
+        return list(map(Layer, self.quantities, sums["sums"] / sums["m2"]))
 
 
 @dataclass(frozen=True)
@@ -112,12 +105,12 @@ class PooledMean(Aggregation):
 
     def states(self, cells: int) -> dict[str, State]:
         """`sum` (C,) of weighted radii and `weight` (C,) of the points."""
-        return {name: State(torch.zeros((), dtype=torch.float64).expand(cells)) for name in ("sum", "weight")}
+        return {name: State(torch.zeros(cells, dtype=torch.float64)) for name in ("sum", "weight")}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the points of a step."""
-        sums["sum"][step.means.cell] += step.means.mean[0] * step.means.weight
-        sums["weight"][step.means.cell] += step.means.weight
+        sums["sum"].add_(step.means.mean[0] * step.means.weight)
+        sums["weight"].add_(step.means.weight)
 
     def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
         """The pooled mean radius."""

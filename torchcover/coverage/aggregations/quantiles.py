@@ -110,7 +110,7 @@ class AtLevels(Aggregation):
 
     def layers(self, sums: Mapping[str, Tensor], probed_steps: Tensor, max_radius: float) -> list[Layer]:
         """A map for each level."""
-        values = histogram_quantiles(sums["histogram"].double(), RADIUS_EDGES_M, self.levels).clamp(max=max_radius)
+        values = histogram_quantiles(sums["histogram"], RADIUS_EDGES_M, self.levels).clamp(max=max_radius)
         return list(map(Layer, self.quantities, values))
 
 
@@ -139,13 +139,13 @@ class Quantiles(AtLevels):
 
     def states(self, cells: int) -> dict[str, State]:
         """`histogram` (bins, C): for each step that has probed the cell, shares that add up to 1."""
-        return {"histogram": State(torch.zeros((), dtype=torch.float64).expand(len(RADIUS_EDGES_M) - 1, cells))}
+        return {"histogram": State(torch.zeros(len(RADIUS_EDGES_M) - 1, cells, dtype=torch.float64))}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
         """Add the points of a step, each with its share of its cell."""
         share = torch.ones_like(step.radius) if step.weight is None else step.weight.double()
-        share = share / torch.bincount(step.cell, weights=share, minlength=step.cells)[step.cell]
-        bin_and_cell = bin_of(step.radius.clamp(max=1e300), RADIUS_EDGES_M) * step.cells + step.cell
+        share = share / step.means.weight[step.cell]
+        bin_and_cell = bin_of(step.radius.clamp(max=1e300), RADIUS_EDGES_M) * len(step.means.cell) + step.cell
         sums["histogram"].view(-1).index_add_(0, bin_and_cell, share)
 
 
@@ -170,9 +170,9 @@ class StepQuantiles(AtLevels):
 
     def states(self, cells: int) -> dict[str, State]:
         """`histogram` (bins, C): in how many steps the mean radius of the cell fell into each bin."""
-        return {"histogram": State(torch.zeros((), dtype=torch.int64).expand(len(RADIUS_EDGES_M) - 1, cells))}
+        return {"histogram": State(torch.zeros(len(RADIUS_EDGES_M) - 1, cells, dtype=torch.int64))}
 
     def update(self, sums: Mapping[str, Tensor], step: BinnedStep) -> None:
-        """Count the step in every cell that it has probed; a cell comes once."""
+        """Count the step in every cell that it has probed."""
         bins = bin_of(step.means.mean[0].clamp(max=1e300), RADIUS_EDGES_M)
-        sums["histogram"][bins, step.means.cell] += 1
+        sums["histogram"].scatter_(0, bins[None], 1)

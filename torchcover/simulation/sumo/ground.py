@@ -8,20 +8,17 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import spread
 from torchcover.simulation.height_field import CELL_M, MARGIN_M, Ground, Plain, Slopes, corners_of, middles_m
-from torchcover.simulation.shapes import Mesh, band
+from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.vicinity import Vicinity
-from torchcover.simulation.traffic.scenery import PAVEMENT_M
+from torchcover.simulation.traffic.scenery import plateau
 
 Numbers = NDArray[np.float64]
 
 # Rounds of smoothing between the streets, at each scale; the streets' own heights stay.
 SMOOTHINGS = 4
-# Kerbs go on below the ground, as far as it may rise between two of their corners.
-SUNK_M = 0.3
 DECK_M = 0.8
 # Slivers that are left where outlines nearly meet.
 SMALLEST_M2 = 0.05
-PLACES_ALIKE_M = 1e-6
 
 
 def ground_of(vicinity: Vicinity) -> Plain | Slopes:
@@ -85,7 +82,7 @@ class Pavement:
     def meshes(self) -> list[Mesh]:
         """One for each piece that is not connected to another."""
         pieces = self.parts if isinstance(self._ground, Plain) else shapely.segmentize(self.parts, CELL_M)
-        return [_slab(piece, self._ground) for piece in pieces]
+        return [plateau(piece, self._ground.heights_m) for piece in pieces]
 
     def holds(self, places_m: Numbers) -> NDArray[np.bool_]:
         """(N,) whether (N, 2) places are on it."""
@@ -107,28 +104,6 @@ def decks(vicinity: Vicinity) -> list[Mesh]:
             line_m = vicinity.samples_m[own[max(first - 2, 0) : end + 2]]
             found.append(_strip(line_m, vicinity.lanes[number].width_m))
     return found
-
-
-def _slab(piece: shapely.Geometry, ground: Ground) -> Mesh:
-    """A closed body between an outline, lifted above the ground, and the same below it."""
-    triangles = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(piece)))
-    corners_m = np.round(triangles.reshape(-1, 4, 2)[:, :3].reshape(-1, 2) / PLACES_ALIKE_M) * PLACES_ALIKE_M
-    places_m, faces = np.unique(corners_m, axis=0, return_inverse=True)
-    faces = faces.reshape(-1, 3)
-    first, second, third = places_m[faces].swapaxes(0, 1)
-    turns_left = np.cross(np.pad(second - first, ((0, 0), (0, 1))), np.pad(third - first, ((0, 0), (0, 1))))[:, 2] > 0
-    faces[~turns_left] = faces[~turns_left][:, ::-1]
-    heights_m, count = ground.heights_m(places_m), len(places_m)
-    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-    # Around the outline an edge has a triangle on one side only.
-    key, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
-    here, following = edges[~np.isin(key, back)].T
-    return Mesh(
-        np.concatenate([
-            np.column_stack([places_m, heights_m + PAVEMENT_M]), np.column_stack([places_m, heights_m - SUNK_M])
-        ]),
-        np.concatenate([faces, faces[:, ::-1] + count, band(here + count, following + count, -count)]),
-    ).made_of("pavement")  # fmt: skip
 
 
 def _strip(line_m: Numbers, width_m: float) -> Mesh:

@@ -56,17 +56,17 @@ class Polyline:
         if len(self.points_m) == 2:
             poses = np.empty((*place.shape, 3))
             poses[..., :2] = self.points_m[0] + place[..., None] * self._directions[0]
-            poses[..., 2] = np.rad2deg(self._headings[0])
+            poses[..., 2] = np.rad2deg(self.headings[0])
             return poses
         segment = np.clip(np.searchsorted(self.arc_m, place, side="right") - 1, 0, len(self.arc_m) - 2)
         along = (place - self.arc_m[segment])[..., None]
         position = self.points_m[segment] + along * self._directions[segment]
-        yaw = np.rad2deg(np.interp(place, self.arc_m, self._headings))
+        yaw = np.rad2deg(np.interp(place, self.arc_m, self.headings))
         return np.concatenate([position, yaw[..., None]], axis=-1)
 
     def shifted(self, left_m: float) -> "Polyline":
         """The line beside this one, with a way of its own."""
-        normals = np.stack([-np.sin(self._headings), np.cos(self._headings)], axis=1)
+        normals = np.stack([-np.sin(self.headings), np.cos(self.headings)], axis=1)
         return Polyline(self.points_m + left_m * normals, self.closed)
 
     def reversed(self) -> "Polyline":
@@ -79,7 +79,7 @@ class Polyline:
         return np.asarray(steps / np.linalg.norm(steps, axis=1, keepdims=True))
 
     @cached_property
-    def _headings(self) -> Numbers:
+    def headings(self) -> Numbers:
         """(K,) heading at each corner in radians, halfway between the pieces that meet there, without jumps."""
         pieces = np.unwrap(np.arctan2(self._directions[:, 1], self._directions[:, 0]))
         return np.concatenate([pieces[:1], (pieces[:-1] + pieces[1:]) / 2, pieces[-1:]])

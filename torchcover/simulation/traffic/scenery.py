@@ -1,9 +1,10 @@
 """What stands beside a road, as closed convex pieces that are merged into few meshes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from torchcover.geometry import rigid, rotation_from_euler
@@ -13,6 +14,9 @@ from torchcover.simulation.shapes import Mesh, band, circle, prism_faces
 Numbers = NDArray[np.float64]
 
 PAVEMENT_M = 0.15
+# Kerbs go on below the ground, as far as it may rise between two of their corners.
+SUNK_M = 0.3
+PLACES_ALIKE_M = 1e-6
 POST_SIDES = 6
 CROWN_SIDES = 6
 
@@ -75,6 +79,28 @@ def slab(corners_m: Numbers, z_m: tuple[float, float]) -> Mesh:
     sides, up = band(around, np.roll(around, -1), rows * columns), rows * columns
     places_m = np.tile(corners_m.reshape(-1, 2), (2, 1))
     return Mesh(np.column_stack([places_m, np.repeat(z_m, up)]), np.concatenate([over[:, ::-1], over + up, sides]))
+
+
+def plateau(piece: shapely.Geometry, heights_m: Callable[[Numbers], Numbers]) -> Mesh:
+    """Pavement of any outline: a closed body from above the ground, whose heights are given, to below it."""
+    triangles = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(piece)))
+    corners_m = np.round(triangles.reshape(-1, 4, 2)[:, :3].reshape(-1, 2) / PLACES_ALIKE_M) * PLACES_ALIKE_M
+    places_m, faces = np.unique(corners_m, axis=0, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    first, second, third = places_m[faces].swapaxes(0, 1)
+    turns_left = np.cross(np.pad(second - first, ((0, 0), (0, 1))), np.pad(third - first, ((0, 0), (0, 1))))[:, 2] > 0
+    faces[~turns_left] = faces[~turns_left][:, ::-1]
+    above_m, count = heights_m(places_m), len(places_m)
+    edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    # Around the outline an edge has a triangle on one side only.
+    key, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
+    here, following = edges[~np.isin(key, back)].T
+    return Mesh(
+        np.concatenate([
+            np.column_stack([places_m, above_m + PAVEMENT_M]), np.column_stack([places_m, above_m - SUNK_M])
+        ]),
+        np.concatenate([faces, faces[:, ::-1] + count, band(here + count, following + count, -count)]),
+    ).made_of("pavement")  # fmt: skip
 
 
 def box(centre_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: float = 0.0) -> Mesh:

@@ -13,6 +13,7 @@ from torchcover.simulation.traffic.city import City
 from torchcover.simulation.traffic.crossing import Footpath, step_height, walk
 from torchcover.simulation.traffic.fleet import CYCLING, EGO, WALKING, Fleet
 from torchcover.simulation.traffic.flow import Agent, Flow, Lane, Simulation, check_crowd
+from torchcover.simulation.traffic.frontage import Times
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.procedural import MostPeople, MostVehicles, Procedural
@@ -67,6 +68,8 @@ class Urban(Procedural):
         people_per_km: On foot, to a kilometre of sidewalk in each direction.
         parked_share: Share of the parking bays that are taken.
         built_share: Share of the blocks' sides that have houses; 0 is open country.
+        roadside: How many times as much of what stands beside streets, but houses, there is than usually; or of some
+            kinds of it, such as `{hedge: 2, lamp: 0}`.
         bend_deg: How much the ego's street may bend between two junctions; 0 is straight.
         turn_share: Share of the junctions at which the ego's street turns.
         hills_m: Height of the hills, as a standard deviation; 0 is a plain.
@@ -80,6 +83,7 @@ class Urban(Procedural):
     people_per_km: MostPeople = 25.0
     parked_share: float = Field(default=0.45, ge=0.0, le=1.0)
     built_share: float = Field(default=0.8, ge=0.0, le=1.0)
+    roadside: Times = 1.0
     bend_deg: float = Field(default=25.0, ge=0.0, le=35.0)
     turn_share: float = Field(default=0.25, ge=0.0, le=1.0)
     hills_m: float = Field(default=1.0, ge=0.0, le=2.0)
@@ -108,7 +112,9 @@ class Urban(Procedural):
         moving = _in_place(paths(lanes, agents, place_m), lanes, agents, place_m, streets, fleet)
         driver = ego_actor(times_s, moving, flow, 0, fleet.meshes[EGO], generator, hills)
         crossing = _crossers(streets, flow, times_s, seen, fleet, generator)
-        city = City(streets, territory, hills, fleet, self.parked_share, self.built_share, generator, shapes)
+        city = City(
+            streets, territory, hills, fleet, self.parked_share, self.built_share, self.roadside, generator, shapes
+        )
         static = city.static(seen)
         return static, driver, actors(times_s, [moving, crossing], driver, fleet, hills)
 

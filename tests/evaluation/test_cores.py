@@ -1,0 +1,119 @@
+"""Threads that wait leave their cores to others, and a run has as many processes as help."""
+
+import multiprocessing
+import os
+import subprocess
+import sys
+import warnings
+
+import pytest
+
+from torchcover.evaluation import cores as module
+from torchcover.evaluation.cores import cores, set_threads, usual_workers, warn_of_spinning
+
+SAID = (*module.WAITING, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+
+
+@pytest.fixture
+def nothing_said(monkeypatch):
+    for name in SAID:
+        monkeypatch.setenv(name, "")  # what was there comes back
+        monkeypatch.delenv(name)
+    module._warn_once.cache_clear()
+    yield monkeypatch
+    module._warn_once.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        ({}, 8),
+        ({"max": "max 100000"}, 8),
+        ({"max": "250000 100000"}, 2),
+        ({"max": "50000 100000"}, 1),
+        ({"max": "9900000 100000"}, 8),
+        ({"quota": "-1", "period": "100000"}, 8),
+        ({"quota": "300000\n", "period": "100000\n"}, 3),
+        ({"quota": "300000"}, 8),
+        ({"max": "nonsense"}, 8),
+        ({"max": ""}, 8),
+    ],
+)
+def test_a_container_has_the_cores_that_it_is_given(tmp_path, monkeypatch, files, expected):
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    monkeypatch.setattr(module, "CPU_QUOTAS", ((tmp_path / "max",), (tmp_path / "quota", tmp_path / "period")))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    assert cores() == expected
+
+
+@pytest.mark.parametrize("said", [{}, {"OMP_NUM_THREADS": "7"}, *({name: "active"} for name in module.WAITING)])
+def test_the_command_line_says_what_the_environment_does_not(nothing_said, said):
+    for name, value in said.items():
+        nothing_said.setenv(name, value)
+    set_threads()
+    assert {name: os.environ[name] for name in said} == said
+    assert ("OMP_WAIT_POLICY" in os.environ) == ("GOMP_SPINCOUNT" not in said and "KMP_BLOCKTIME" not in said)
+    assert os.environ["OPENBLAS_NUM_THREADS"] == "1"
+    assert os.environ["OMP_NUM_THREADS"] == said.get("OMP_NUM_THREADS", str(cores()))
+
+
+def test_torch_is_loaded_after_it_is_said():
+    """With two threads, which one core would not have."""
+    code = (
+        "import os, sys; from torchcover.cli import app\n"
+        "from torchcover.evaluation import cores; cores.cores = lambda: 2\n"
+        "assert not {'torch', 'numpy'} & sys.modules.keys(); sys.argv = ['torchcover', '--version']\n"
+        "try: app.main()\nexcept SystemExit: pass\n"
+        "import torch; print(torch.get_num_threads(), os.environ['OMP_WAIT_POLICY'])"
+    )
+    environment = {name: value for name, value in os.environ.items() if name not in SAID}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "2 passive"
+
+
+def test_who_lets_threads_spin_is_told_once(nothing_said):
+    with pytest.warns(UserWarning, match="OMP_WAIT_POLICY"):
+        warn_of_spinning(2)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_spinning(2)
+
+
+@pytest.mark.parametrize("said", [None, *module.WAITING])
+def test_who_does_not_is_told_nothing(nothing_said, said):
+    if said:
+        nothing_said.setenv(said, "0")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_spinning(2 if said else 1)
+
+
+@pytest.mark.parametrize(
+    ("count", "frames", "worlds", "expected"),
+    [
+        (1, 64, 11, 0),
+        (2, 64, 11, 2),
+        (16, 64, 11, module.MOST_WORKERS),
+        (16, 24, 4, 3),
+        (16, 64, 2, 2),
+        (16, 64, 1, 0),
+        (16, 8, 8, 0),
+    ],
+)
+def test_workers_are_as_many_as_have_something_to_do(monkeypatch, count, frames, worlds, expected):
+    monkeypatch.setattr(module, "cores", lambda: count)
+    monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
+    monkeypatch.setattr(module, "SHARED_MEMORY", "/nowhere")
+    assert usual_workers(frames, worlds) == expected
+    monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "spawn")
+    assert usual_workers(frames, worlds) == 0
+
+
+def test_workers_need_room_for_what_they_hand_over(monkeypatch, tmp_path):
+    monkeypatch.setattr(module, "cores", lambda: 16)
+    monkeypatch.setattr(module, "SHARED_MEMORY", str(tmp_path))
+    monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
+    for room, expected in ((64e6, 0), (512e6, 2), (1e12, module.MOST_WORKERS)):
+        monkeypatch.setattr(os, "statvfs", lambda _, room=room: os.statvfs_result([1] * 4 + [int(room)] + [1] * 5))
+        assert usual_workers(64, 64) == expected

@@ -1,0 +1,99 @@
+"""The cores of a run: how many there are, how their threads wait, and how many processes are to make frames."""
+
+import multiprocessing
+import os
+import warnings
+from functools import cache
+from pathlib import Path
+
+# What a container may take, where the system tells: microseconds of processor time, and of the time that they are for.
+# Of cgroups of version 2 in one file, of version 1 in two.
+CPU_QUOTAS = (
+    (Path("/sys/fs/cgroup/cpu.max"),),
+    (Path("/sys/fs/cgroup/cpu/cpu.cfs_quota_us"), Path("/sys/fs/cgroup/cpu/cpu.cfs_period_us")),
+)
+# Each of these says how threads of OpenMP wait: of the standard, of GNU, of Intel and LLVM.
+WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME")
+# More processes wait for the one that measures what they make.
+MOST_WORKERS = 6
+LEAST_FRAMES = 8
+# What finished frames wait in, where the system tells; a container often has 64 MB of it.
+SHARED_MEMORY = "/dev/shm"
+SHARED_BYTES = 256e6
+
+
+def cores() -> int:
+    """Cores that this process may use: those that it is bound to, at most as many as its container is given.
+
+    Example:
+        >>> 1 <= cores() <= os.cpu_count()
+        True
+    """
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    for files in CPU_QUOTAS:
+        try:
+            quota, period = map(float, " ".join(file.read_text() for file in files).split())
+        except (OSError, ValueError):  # there is none; or "max"
+            continue
+        if quota > 0 and period > 0:  # -1 is none
+            count = min(count, max(1, int(quota / period)))
+    return count
+
+
+def set_threads() -> None:
+    """Before torch and NumPy are loaded: as many threads as cores, none that spins; what the environment says, stays.
+
+    NumPy's OpenBLAS has spinning threads of its own. They turn a matrix of three columns no sooner than one does.
+    """
+    if not _is_said():
+        os.environ["OMP_WAIT_POLICY"] = "passive"
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("OMP_NUM_THREADS", str(cores()))
+
+
+def usual_workers(frames: int, worlds: int) -> int:
+    """Processes that make the frames of a simulation, if nobody says how many.
+
+    None where a process can only be started anew: a program that is not made for that would start itself.
+
+    Args:
+        frames: How many.
+        worlds: How many they are of; a world is built by one process.
+
+    Example:
+        >>> usual_workers(frames=64, worlds=1)
+        0
+    """
+    forks = (multiprocessing.get_start_method(allow_none=True) or multiprocessing.get_all_start_methods()[0]) == "fork"
+    if not forks or multiprocessing.current_process().daemon:  # which may start none
+        return 0
+    room = os.statvfs(SHARED_MEMORY) if os.path.isdir(SHARED_MEMORY) else None
+    most = MOST_WORKERS if room is None else min(MOST_WORKERS, int(room.f_bavail * room.f_frsize / SHARED_BYTES))
+    workers = min(most, cores(), worlds, frames // LEAST_FRAMES)
+    return workers if workers > 1 else 0
+
+
+def warn_of_spinning(threads: int) -> None:
+    """Tell, once a process, that several threads are about to spin.
+
+    Args:
+        threads: Of torch.
+
+    Warns:
+        UserWarning: There are several, and the environment does not say how they wait.
+    """
+    if threads > 1 and not _is_said():
+        _warn_once()
+
+
+def _is_said() -> bool:
+    return any(name in os.environ for name in WAITING)
+
+
+@cache
+def _warn_once() -> None:
+    warnings.warn(
+        "threads of torch keep their cores busy while they wait, for up to half of a run's processor time: set "
+        'os.environ["OMP_WAIT_POLICY"] = "passive" before torch is imported, or call torch.set_num_threads(1)',
+        stacklevel=2,
+    )

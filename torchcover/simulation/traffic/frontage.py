@@ -1,0 +1,323 @@
+"""What stands beside streets: one list of kinds with their places, sizes and densities, for all worlds.
+
+A side of a street is a line that has the street on its left. Along all sides runs of every kind are drawn; what would
+stand on a street, across the edge of a pavement, or in what comes before it in the list is left out.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from pydantic import AfterValidator, Field
+
+from torchcover.simulation.bodies import merge
+from torchcover.simulation.shapes import Mesh, circle
+from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, prism
+
+Numbers = NDArray[np.float64]
+Bounds = tuple[float, float]
+Zone = Literal["kerb", "built", "open"]
+
+# What stands on a slope goes on below it.
+SUNK_M = 1.0
+# Walls and hedges are straight for so long at most.
+WALL_M = 6.0
+# Corners of a line may coincide.
+TINY_M = 1e-9
+# In the middle of a tree's width, which hangs over the street otherwise.
+TRUNK = 0.1
+
+
+class Kind(NamedTuple):
+    """What stands beside streets; lengths are along the street, depths away from it.
+
+    Args:
+        form: Key of `FORMS`.
+        zones: Where: `kerb`, before the sidewalk, or behind it, along a side that is `built` or `open`.
+        share: Of the sides that have it.
+        at_m: From the line to a run of it; what is negative hangs over.
+        run_m: Length of a run.
+        gap_m: From one run to the next, at the usual density.
+        deep_m: Depth of a piece.
+        high_m: Its height.
+        piece_m: Its length; None: as long as the run. Walls and hedges consist of pieces without gaps.
+        air_m: Between the pieces of a run.
+        foot: How much of it must keep off streets, as a share of its size.
+    """
+
+    form: str
+    zones: tuple[Zone, ...]
+    share: float
+    at_m: Bounds
+    run_m: Bounds
+    gap_m: Bounds
+    deep_m: Bounds
+    high_m: Bounds
+    piece_m: float | None = None
+    air_m: float = 0.0
+    foot: float = 1.0
+
+
+BEHIND: tuple[Zone, ...] = ("built", "open")
+# Sizes of the small are those of usual products; densities agree with real sweeps in what closes the view
+# (docs/measured/streets.md).
+KINDS: Mapping[str, Kind] = {
+    "house": Kind("house", ("built",), 1.0, (0.0, 5.0), (9.0, 24.0), (0.1, 4.0), (9.0, 15.0), (5.0, 24.0)),
+    "back_house": Kind("house", ("built",), 1.0, (24.0, 44.0), (9.0, 22.0), (4.0, 22.0), (9.0, 14.0), (5.0, 22.0)),
+    "hedge": Kind("hedge", ("built",), 0.85, (0.2, 0.8), (6.0, 24.0), (1.5, 7.0), (0.5, 1.1), (0.9, 2.2), WALL_M),
+    "hedgerow": Kind("hedge", ("open",), 1.0, (0.3, 2.0), (20.0, 70.0), (3.0, 10.0), (0.8, 1.6), (1.2, 2.6), WALL_M),
+    "fence": Kind("fence", BEHIND, 0.6, (0.2, 1.2), (6.0, 24.0), (2.0, 14.0), (0.08, 0.08), (0.9, 1.8), WALL_M),
+    "lamp": Kind("lamp", ("kerb",), 0.9, (0.35, 0.45), (0.2, 0.2), (22.0, 34.0), (0.2, 0.2), (6.0, 8.0)),
+    "tree": Kind("tree", ("kerb",), 0.6, (-0.9, -0.6), (2.0, 3.0), (5.0, 14.0), (2.0, 3.0), (6.5, 9.0), foot=TRUNK),
+    "sign": Kind("sign", ("kerb",), 0.9, (0.25, 0.35), (0.06, 0.06), (14.0, 45.0), (0.5, 0.6), (2.4, 3.0)),
+    "bin": Kind("bin", ("kerb",), 0.7, (0.3, 0.4), (0.5, 0.8), (20.0, 60.0), (0.4, 0.5), (0.8, 1.3)),
+    "bicycle": Kind("bicycle", ("kerb",), 0.4, (0.3, 0.4), (1.8, 9.0), (15.0, 60.0), (0.5, 0.5), (1.0, 1.1), 1.75, 0.3),
+    "bollard": Kind(
+        "bollard", ("kerb",), 0.35, (0.3, 0.4), (4.0, 16.0), (8.0, 40.0), (0.12, 0.12), (0.8, 1.0), 0.12, 1.5
+    ),
+    "garden_tree": Kind("tree", BEHIND, 0.8, (1.5, 20.0), (2.0, 4.0), (4.0, 22.0), (2.0, 4.0), (5.0, 11.0)),
+    "bush": Kind("bush", BEHIND, 0.8, (0.5, 12.0), (1.0, 2.5), (3.0, 16.0), (1.0, 2.5), (0.7, 2.5)),
+}
+HOUSES = ("house", "back_house")
+MOST_TIMES = 4.0
+
+
+def _known(times: Mapping[str, float]) -> Mapping[str, float]:
+    unknown = sorted(times.keys() - (KINDS.keys() - set(HOUSES)))
+    if unknown:
+        raise ValueError(f"{', '.join(unknown)}: there are {', '.join(kind for kind in KINDS if kind not in HOUSES)}")
+    return times
+
+
+Factor = Annotated[float, Field(ge=0.0, le=MOST_TIMES)]
+# How many times as much there is as usually of all kinds but houses, or of some of them.
+Times = Factor | Annotated[dict[str, Factor], AfterValidator(_known)]
+
+
+class Side(NamedTuple):
+    """A side of a street in a zone: a line of (K, 2) places that has the street on its left."""
+
+    zone: Zone
+    line_m: Numbers
+
+
+class _Pieces(NamedTuple):
+    """(N, 4, 2) outlines in plan, counter-clockwise from the far side on; (N,) heights, and which pieces are one."""
+
+    outlines_m: Numbers
+    high_m: Numbers
+    run: NDArray[np.int64]
+
+
+def stand(
+    sides: Sequence[Side],
+    driven: Sequence[shapely.Geometry],
+    walked: Sequence[shapely.Geometry],
+    pavements: Sequence[shapely.Geometry],
+    heights_m: Callable[[Numbers], Numbers],
+    times: float | Mapping[str, float],
+    generator: np.random.Generator,
+) -> tuple[list[Mesh], list[Mesh]]:
+    """Draw what stands along the sides of streets.
+
+    Args:
+        sides: The sides.
+        driven: In plan: where nothing may stand.
+        walked: In plan: where only what stands at kerbs may.
+        pavements: In plan: what is a kerb higher than the ground.
+        heights_m: Of the ground, at (N, 2) places.
+        times: See `Times`.
+        generator: Draws it.
+
+    Returns:
+        Houses and all else, each kind in one mesh.
+    """
+    if not sides:
+        return [], []
+    lines = _Lines(sides)
+    drawn = []
+    for name, kind in KINDS.items():
+        factor = times.get(name, 1.0) if isinstance(times, Mapping) else 1.0 if name in HOUSES else times
+        drawn.append(_drawn(kind, lines, factor, generator))
+    kinds = np.repeat(np.arange(len(KINDS)), [len(one.run) for one in drawn])
+    outlines_m, high_m, run = (np.concatenate(column) for column in zip(*drawn, strict=True))
+    kept, raised_m = _free(outlines_m, kinds, run, driven, walked, pavements)
+    outlines_m, high_m, kinds, raised_m = outlines_m[kept], high_m[kept], kinds[kept], raised_m[kept]
+    corners_m = heights_m(outlines_m.reshape(-1, 2)).reshape(-1, 4)
+    low_m, base_m = corners_m.min(axis=1) + raised_m, corners_m.max(axis=1) + raised_m
+    bottom_m = np.where(base_m > low_m, low_m - SUNK_M, low_m)
+    houses: list[Mesh] = []
+    others: list[Mesh] = []
+    for number, (name, kind) in enumerate(KINDS.items()):
+        own = kinds == number
+        if own.any():
+            into = houses if name in HOUSES else others
+            into.append(_copies(_form(kind.form), outlines_m[own], bottom_m[own], base_m[own], high_m[own]))
+    return houses, others
+
+
+class _Lines:
+    """The lines of sides on one axis: each begins where the last one ended."""
+
+    def __init__(self, sides: Sequence[Side]) -> None:
+        self.zones = [side.zone for side in sides]
+        count = np.array([len(side.line_m) for side in sides])
+        self._first = np.cumsum(count) - count
+        self._last = self._first + count - 1
+        self._places_m = np.concatenate([np.empty((0, 2)), *(side.line_m for side in sides)])
+        steps_m = np.diff(self._places_m, axis=0, append=0.0)
+        steps_m[self._last] = steps_m[self._last - 1]
+        ways_m = np.linalg.norm(steps_m, axis=1)
+        steps_m /= np.maximum(ways_m, TINY_M)[:, None]
+        ways_m[self._last] = 0.0
+        self._arc_m = np.cumsum(ways_m) - ways_m
+        # Halfway between the pieces that meet in a corner.
+        ahead = steps_m + np.where(
+            np.isin(np.arange(len(steps_m)), self._first)[:, None], steps_m, np.roll(steps_m, 1, 0)
+        )
+        ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), TINY_M)
+        self._right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
+        self.length_m = self._arc_m[self._last] - self._arc_m[self._first]
+
+    def along(self, number: NDArray[np.int64], ways_m: Numbers) -> tuple[Numbers, Numbers]:
+        """(N, 2, 2) places, and the way to the right there, after (N, 2) ways along lines of some numbers."""
+        way_m = self._arc_m[self._first[number]][:, None] + ways_m
+        piece = np.searchsorted(self._arc_m, way_m, side="right") - 1
+        piece = np.clip(piece, self._first[number][:, None], self._last[number][:, None] - 1)
+        long_m = np.maximum(self._arc_m[piece + 1] - self._arc_m[piece], TINY_M)
+        share = ((way_m - self._arc_m[piece]) / long_m)[..., None]
+        places_m, right = (
+            (1 - share) * each[piece] + share * each[piece + 1] for each in (self._places_m, self._right)
+        )
+        return places_m, right
+
+
+def _drawn(kind: Kind, lines: _Lines, times: float, generator: np.random.Generator) -> _Pieces:
+    """Runs of a kind along the sides that have it."""
+    has = np.array([zone in kind.zones for zone in lines.zones], dtype=bool)
+    has[has] = generator.random(np.count_nonzero(has)) < kind.share
+    numbers = np.flatnonzero(has)
+    if not len(numbers) or times == 0:
+        return _Pieces(np.empty((0, 4, 2)), np.empty(0), np.empty(0, dtype=np.int64))
+    length_m, gap_m = lines.length_m[numbers], np.array(kind.gap_m) / times
+    shape = len(numbers), int(length_m.max() / (kind.run_m[0] + gap_m[0])) + 1
+    run_m, between_m = generator.uniform(*kind.run_m, shape), generator.uniform(*gap_m, shape)
+    # The first begins anywhere in a gap.
+    between_m[:, 0] *= generator.random(len(numbers))
+    start_m = np.cumsum(run_m + between_m, axis=1) - run_m
+    fits = start_m + kind.run_m[0] <= length_m[:, None]
+    on = np.nonzero(fits)[0]
+    run_m = np.minimum(run_m[fits], length_m[on] - start_m[fits])
+    at_m, deep_m, high_m = (generator.uniform(*bounds, len(on)) for bounds in (kind.at_m, kind.deep_m, kind.high_m))
+    first_m, piece_m, run = start_m[fits], run_m, np.arange(len(on))
+    if kind.piece_m is not None:
+        is_wall = kind.piece_m == WALL_M
+        count = np.maximum((run_m / (kind.piece_m + kind.air_m)).astype(np.int64) + is_wall, 1)
+        every_m = run_m / count if is_wall else np.full(len(run), kind.piece_m + kind.air_m)
+        run = np.repeat(run, count)
+        number = np.arange(len(run)) - np.repeat(np.cumsum(count) - count, count)
+        first_m, piece_m = first_m[run] + number * every_m[run], (every_m if is_wall else every_m - kind.air_m)[run]
+    places_m, right = lines.along(numbers[on[run]], np.stack([first_m, first_m + piece_m], axis=1))
+    near_m, far_m = (places_m + right * out_m[run, None, None] for out_m in (at_m, at_m + deep_m))
+    return _Pieces(np.concatenate([far_m, near_m[:, ::-1]], axis=1), high_m[run], run)
+
+
+def _free(
+    outlines_m: Numbers,
+    kinds: NDArray[np.int64],
+    run: NDArray[np.int64],
+    driven: Sequence[shapely.Geometry],
+    walked: Sequence[shapely.Geometry],
+    pavements: Sequence[shapely.Geometry],
+) -> tuple[NDArray[np.bool_], Numbers]:
+    """(N,) which pieces are in nobody's way, and how much higher than the ground they stand."""
+    foot = np.array([kind.foot for kind in KINDS.values()])[kinds][:, None, None]
+    middles_m = outlines_m.mean(axis=1, keepdims=True)
+    feet = shapely.STRtree(shapely.linearrings(middles_m + foot * (outlines_m - middles_m)))
+    # Of the two geometries it is the query's that is prepared: it had better be the large one.
+    met, on = (np.zeros((2, len(kinds)), dtype=bool) for _ in range(2))
+    for which, large in enumerate((driven, walked)):
+        met[which, feet.query(np.array(large, dtype=object), predicate="intersects")[1]] = True
+    for which, predicate in enumerate(("intersects", "contains")):
+        on[which, feet.query(np.array(pavements, dtype=object), predicate=predicate)[1]] = True
+    at_kerb = np.array(["kerb" in kind.zones for kind in KINDS.values()])[kinds]
+    free = ~met[0] & (at_kerb | ~met[1]) & (on[0] == on[1])
+    number = np.flatnonzero(free)
+    later, earlier = number[_meeting(outlines_m[number])]
+    apart = (kinds[earlier] != kinds[later]) | (run[earlier] != run[later])
+    order = np.lexsort((earlier[apart], later[apart]))
+    for one, other in zip(later[apart][order].tolist(), earlier[apart][order].tolist(), strict=True):
+        if free[other]:
+            free[one] = False
+    return free, PAVEMENT_M * on[1]
+
+
+def _meeting(outlines_m: Numbers) -> NDArray[np.int64]:
+    """(2, P) pairs of (N, 4, 2) convex outlines that no side of the one or the other separates."""
+    boxes = shapely.box(*outlines_m.min(axis=1).T, *outlines_m.max(axis=1).T)
+    pairs = shapely.STRtree(boxes).query(boxes)
+    pairs = pairs[:, pairs[0] > pairs[1]]
+    for way in (1, -1):
+        one, other = pairs[::way]
+        normals = (np.roll(outlines_m, -1, axis=1) - outlines_m)[one][..., ::-1] * np.array([1.0, -1.0])
+        beyond = np.einsum("pkc,plkc->plk", normals, outlines_m[other][:, :, None] - outlines_m[one][:, None])
+        meet = ~(beyond.min(axis=1) > 0).any(axis=1)
+        pairs = pairs[:, meet]
+    return pairs
+
+
+def _copies(form: Mesh, outlines_m: Numbers, bottom_m: Numbers, base_m: Numbers, high_m: Numbers) -> Mesh:
+    """A form, once over each of (N, 4, 2) outlines: it stands on a base, and its lowest corners go on to a bottom."""
+    x, y, z = form.vertices_m.T
+    weights = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
+    count, corners = len(outlines_m), len(x)
+    places_m = np.einsum("vc,ncd->nvd", weights, outlines_m)
+    heights_m = np.where(z == 0.0, bottom_m[:, None], base_m[:, None] + high_m[:, None] * z)
+    faces = form.faces + corners * np.arange(count)[:, None, None]
+    return Mesh(
+        np.concatenate([places_m, heights_m[..., None]], axis=2).reshape(-1, 3),
+        faces.reshape(-1, 3),
+        np.tile(form.materials, count),
+    )
+
+
+@cache
+def _form(name: str) -> Mesh:
+    """A form over the unit square with the street beyond y = 1, from z = 0 to 1."""
+    whole = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
+    ring = 0.5 * circle(6)
+    middle = np.array([0.5, 0.5])
+
+    def turned(levels: Sequence[float], sizes: Sequence[float]) -> Mesh:
+        return prism([middle + size * ring for size in sizes], levels)
+
+    def wheel(x: float) -> Mesh:
+        around = np.array([x, 0.0]) + np.array([0.4, 0.65]) * (ring / np.array([1.0, np.sqrt(0.75)]) + 0.5)
+        disc = prism([around, around], [0.46, 0.54])
+        return Mesh(disc.vertices_m[:, [0, 2, 1]], disc.faces[:, ::-1])
+
+    parts = {
+        "house": [block(*whole)],
+        "hedge": [block(*whole).made_of("vegetation")],
+        "fence": [block(*whole).made_of("wood")],
+        "bin": [block(*whole).made_of("metal")],
+        "bollard": [turned([0.0, 1.0], [1.0, 1.0]).made_of("metal")],
+        "lamp": [turned([0.0, 0.97], [1.0, 0.7]).made_of("metal"), block((0.2, 0.8), (0.0, 11.0), (0.975, 1.0))],
+        "tree": [
+            turned([0.0, 0.42], [TRUNK, TRUNK]).made_of("wood"),
+            turned([0.42, 0.6, 0.8, 1.0], [0.45, 1.0, 0.9, 0.3]).made_of("vegetation"),
+        ],
+        "bush": [turned([0.0, 0.4, 0.8, 1.0], [0.7, 1.0, 0.9, 0.4]).made_of("vegetation")],
+        "sign": [
+            block((0.0, 1.0), (0.45, 0.55), (0.0, 0.75)).made_of("metal"),
+            block((0.2, 0.8), (0.0, 1.0), (0.755, 1.0)).made_of("sign"),
+        ],
+        "bicycle": [
+            wheel(0.0), wheel(0.6), block((0.42, 0.58), (0.44, 0.56), (0.25, 0.88)),
+            block((0.66, 0.7), (0.0, 1.0), (0.94, 1.0)),
+        ],
+    }  # fmt: skip
+    return merge(parts[name])
