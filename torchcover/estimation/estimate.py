@@ -255,9 +255,10 @@ class Estimate:
             count: How many they are over.
             count_of: What these are.
         """
-        found, errors = {}, self.error.where(self._varies, math.nan)
-        numbers = self.quantities, self.value.tolist(), errors.tolist(), self.has_intervals, self.freedom
-        for quantity, value, error, has_interval, freedom in zip(*numbers, strict=True):
+        found, varies = {}, self._varies.tolist()
+        numbers = self.quantities, self.value.tolist(), self.error.tolist(), self.has_intervals, self.freedom
+        for (quantity, value, error, has_interval, freedom), known in zip(zip(*numbers, strict=True), varies, strict=True):
+            error = error if known else math.nan
             ends = interval95(value, error if has_interval else math.nan, freedom, quantity)
             found[quantity.key] = Number(quantity, value, error, *ends, count, count_of)
         return found
