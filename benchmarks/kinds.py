@@ -44,7 +44,7 @@ def main(steps=STEPS):
 def _span(numbers):
     """Of numbers of kinds of world, how far the largest is from the smallest, and the standard error of that."""
     known = [number for number in numbers if number.known] or numbers
-    low, high = (choose(known, key=lambda number: number.value) for choose in (min, max))
+    low, high = min(known, key=lambda number: number.value), max(known, key=lambda number: number.value)
     return high.value - low.value, math.hypot(low.error, high.error)
 
 

@@ -256,9 +256,9 @@ class Estimate:
             count_of: What these are.
         """
         found, varies = {}, self._varies.tolist()
-        numbers = self.quantities, self.value.tolist(), self.error.tolist(), self.has_intervals, self.freedom
-        for (quantity, value, error, has_interval, freedom), known in zip(zip(*numbers, strict=True), varies, strict=True):
-            error = error if known else math.nan
+        errors = [error if known else math.nan for error, known in zip(self.error.tolist(), varies, strict=True)]
+        numbers = self.quantities, self.value.tolist(), errors, self.has_intervals, self.freedom
+        for quantity, value, error, has_interval, freedom in zip(*numbers, strict=True):
             ends = interval95(value, error if has_interval else math.nan, freedom, quantity)
             found[quantity.key] = Number(quantity, value, error, *ends, count, count_of)
         return found
