@@ -25,6 +25,8 @@ Zone = Literal["kerb", "built", "open"]
 SUNK_M = 1.0
 # Walls and hedges are straight for so long at most.
 WALL_M = 6.0
+# Corners of a line may coincide.
+TINY_M = 1e-9
 # In the middle of a tree's width, which hangs over the street otherwise.
 TRUNK = 0.1
 
@@ -65,7 +67,7 @@ BEHIND: tuple[Zone, ...] = ("built", "open")
 KINDS: Mapping[str, Kind] = {
     "house": Kind("house", ("built",), 1.0, (0.0, 5.0), (9.0, 24.0), (0.1, 4.0), (9.0, 15.0), (5.0, 24.0)),
     "back_house": Kind("house", ("built",), 1.0, (24.0, 44.0), (9.0, 22.0), (4.0, 22.0), (9.0, 14.0), (5.0, 22.0)),
-    "hedge": Kind("hedge", ("built",), 0.7, (0.2, 0.8), (6.0, 24.0), (2.0, 10.0), (0.5, 1.1), (0.9, 2.2), WALL_M),
+    "hedge": Kind("hedge", ("built",), 0.85, (0.2, 0.8), (6.0, 24.0), (1.5, 7.0), (0.5, 1.1), (0.9, 2.2), WALL_M),
     "hedgerow": Kind("hedge", ("open",), 1.0, (0.3, 2.0), (20.0, 70.0), (3.0, 10.0), (0.8, 1.6), (1.2, 2.6), WALL_M),
     "fence": Kind("fence", BEHIND, 0.6, (0.2, 1.2), (6.0, 24.0), (2.0, 14.0), (0.08, 0.08), (0.9, 1.8), WALL_M),
     "lamp": Kind("lamp", ("kerb",), 0.9, (0.35, 0.45), (0.2, 0.2), (22.0, 34.0), (0.2, 0.2), (6.0, 8.0)),
@@ -133,6 +135,8 @@ def stand(
     Returns:
         Houses and all else, each kind in one mesh.
     """
+    if not sides:
+        return [], []
     lines = _Lines(sides)
     drawn = []
     for name, kind in KINDS.items():
@@ -167,14 +171,14 @@ class _Lines:
         steps_m = np.diff(self._places_m, axis=0, append=0.0)
         steps_m[self._last] = steps_m[self._last - 1]
         ways_m = np.linalg.norm(steps_m, axis=1)
-        steps_m /= ways_m[:, None]
+        steps_m /= np.maximum(ways_m, TINY_M)[:, None]
         ways_m[self._last] = 0.0
         self._arc_m = np.cumsum(ways_m) - ways_m
         # Halfway between the pieces that meet in a corner.
         ahead = steps_m + np.where(
             np.isin(np.arange(len(steps_m)), self._first)[:, None], steps_m, np.roll(steps_m, 1, 0)
         )
-        ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+        ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), TINY_M)
         self._right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
         self.length_m = self._arc_m[self._last] - self._arc_m[self._first]
 
@@ -183,7 +187,8 @@ class _Lines:
         way_m = self._arc_m[self._first[number]][:, None] + ways_m
         piece = np.searchsorted(self._arc_m, way_m, side="right") - 1
         piece = np.clip(piece, self._first[number][:, None], self._last[number][:, None] - 1)
-        share = ((way_m - self._arc_m[piece]) / (self._arc_m[piece + 1] - self._arc_m[piece]))[..., None]
+        long_m = np.maximum(self._arc_m[piece + 1] - self._arc_m[piece], TINY_M)
+        share = ((way_m - self._arc_m[piece]) / long_m)[..., None]
         places_m, right = (
             (1 - share) * each[piece] + share * each[piece + 1] for each in (self._places_m, self._right)
         )
@@ -235,9 +240,9 @@ def _free(
     # Of the two geometries it is the query's that is prepared: it had better be the large one.
     met, on = (np.zeros((2, len(kinds)), dtype=bool) for _ in range(2))
     for which, large in enumerate((driven, walked)):
-        met[which, feet.query(large, predicate="intersects")[1]] = True
+        met[which, feet.query(np.array(large, dtype=object), predicate="intersects")[1]] = True
     for which, predicate in enumerate(("intersects", "contains")):
-        on[which, feet.query(pavements, predicate=predicate)[1]] = True
+        on[which, feet.query(np.array(pavements, dtype=object), predicate=predicate)[1]] = True
     at_kerb = np.array(["kerb" in kind.zones for kind in KINDS.values()])[kinds]
     free = ~met[0] & (at_kerb | ~met[1]) & (on[0] == on[1])
     number = np.flatnonzero(free)
