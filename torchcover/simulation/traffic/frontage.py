@@ -27,6 +27,7 @@ SUNK_M = 1.0
 WALL_M = 10.0
 # Corners of a line may coincide.
 TINY_M = 1e-9
+TAPERED = 0.6
 # In the middle of a tree's width, which hangs over the street otherwise.
 TRUNK = 0.1
 
@@ -247,10 +248,12 @@ def _free(
     for found, predicate in ((on, "intersects"), (within, "contains")):
         found[floors.query(np.array(pavements, dtype=object), predicate=predicate)[1]] = True
     free &= on == within
-    # On the inside of a tight curve, where the ways to the right meet, outlines fold.
+    # On the inside of a tight curve, where the ways to the right meet, outlines fold or taper.
     sides = np.roll(outlines_m, -1, axis=1) - outlines_m
     following = np.roll(sides, -1, axis=1)
     free &= (sides[..., 0] * following[..., 1] > sides[..., 1] * following[..., 0]).all(axis=1)
+    far_m, near_m = np.linalg.norm(sides[:, ::2], axis=2).T
+    free &= (far_m > TAPERED * near_m) & (near_m > TAPERED * far_m)
     number = np.flatnonzero(free)
     later, earlier = number[_meeting(outlines_m[number])]
     apart = (kinds[earlier] != kinds[later]) | (run[earlier] != run[later])
