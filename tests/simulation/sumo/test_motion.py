@@ -156,3 +156,5 @@ def test_who_cannot_get_round_is_not_there(corner):
     assert lorry.over_kerb_m > 0.05
     assert not lorry.can_be
     assert possible([lorry]) == [lorry]  # the first is the ego
+    (walker,) = motions([user(turn(5.0, 1.4), on_foot=True)], 40.0, ORIGIN, corner)
+    assert walker.can_be

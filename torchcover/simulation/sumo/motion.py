@@ -89,89 +89,75 @@ def motions(
         obstacles: Polygons in plan, of pavements and what is parked: vehicles swing out for them where they can.
     """
     times_s = np.linspace(0.0, duration_s, int(np.ceil(duration_s / FINE_S - TIME_SLACK_S)) + 1)
-    ways: list[_Way] = []
+    there: list[tuple[RoadUser, Numbers]] = []
     for user in users:
         first, end = np.searchsorted(times_s, user.track.times_s[[0, -1]] + [-TIME_SLACK_S, TIME_SLACK_S]).tolist()
         if end - first > 1:
-            ways.append(_Way.of(user, times_s if end - first == len(times_s) else times_s[first:end], origin_m))
+            there.append((user, times_s if end - first == len(times_s) else times_s[first:end]))
     found: list[Motion] = []
-    for start in range(0, len(ways), BODIES_AT_ONCE):
-        some = ways[start : start + BODIES_AT_ONCE]
-        poses = _poses(some)
-        over_m = np.zeros(len(some)) if obstacles is None else _keep_off(some, poses, obstacles)
-        found += map(Motion, (way.user for way in some), (way.times_s for way in some), poses, over_m.tolist())
+    for start in range(0, len(there), BODIES_AT_ONCE):
+        some, own_s = zip(*there[start : start + BODIES_AT_ONCE], strict=True)
+        ways_m = [_lead_m(user, at_s, origin_m) for user, at_s in zip(some, own_s, strict=True)]
+        poses = _poses(some, ways_m)
+        over_m = np.zeros(len(some)) if obstacles is None else _keep_off(some, ways_m, poses, obstacles)
+        found += map(Motion, some, own_s, poses, over_m.tolist())
     return found
 
 
-class _Way(NamedTuple):
-    """(K, 2) where the point of a body goes that leads, at (K,) times."""
-
-    user: RoadUser
-    times_s: Numbers
-    lead_m: Numbers
-
-    @classmethod
-    def of(cls, user: RoadUser, times_s: Numbers, origin_m: Numbers) -> "_Way":
-        """Along its track."""
-        track = user.track
-        told_m = (_without_jumps(track) if track.on_foot else track.places_m[:, :2]) - origin_m
-        even_m = np.stack([np.interp(times_s, track.times_s, axis) for axis in told_m.T], axis=1)
-        half_s = max(SMOOTH_S, float(np.median(np.diff(track.times_s))))
-        smooth_m = _rounded(even_m, int(np.ceil(half_s / (times_s[1] - times_s[0]))))
-        behind_m = 0.0 if track.on_foot else max(user.length_m / 2 - user.ahead_m, 0.0)
-        return cls(user, times_s, _behind(smooth_m, behind_m, np.deg2rad(track.yaw_deg[0])))
+def _lead_m(user: RoadUser, times_s: Numbers, origin_m: Numbers) -> Numbers:
+    """(K, 2) where the point goes that leads, at (K,) times."""
+    track = user.track
+    told_m = (_without_jumps(track) if track.on_foot else track.places_m[:, :2]) - origin_m
+    even_m = np.stack([np.interp(times_s, track.times_s, axis) for axis in told_m.T], axis=1)
+    half_s = max(SMOOTH_S, float(np.median(np.diff(track.times_s))))
+    smooth_m = rounded(even_m, int(np.ceil(half_s / (times_s[1] - times_s[0]))))
+    behind_m = 0.0 if track.on_foot else max(user.length_m / 2 - user.ahead_m, 0.0)
+    return _behind(smooth_m, behind_m, np.deg2rad(track.yaw_deg[0]))
 
 
-def _poses(ways: Sequence[_Way]) -> list[Numbers]:
-    """(K, 3) of each way."""
-    longest = max(len(way.lead_m) for way in ways)
-    lead_m = np.stack([np.pad(way.lead_m, ((0, longest - len(way.lead_m)), (0, 0)), "edge") for way in ways], axis=1)
-    start = np.deg2rad([way.user.track.yaw_deg[0] for way in ways])
-    yaw = tractrix(lead_m, np.array([way.user.drawn_m for way in ways]), start)
-    ahead_m = np.array([way.user.ahead_m for way in ways])[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=2)
+def _poses(users: Sequence[RoadUser], ways_m: Sequence[Numbers]) -> list[Numbers]:
+    """(K, 3) of each, along the (K, 2) way of its point that leads."""
+    longest = max(map(len, ways_m))
+    lead_m = np.stack([np.pad(way_m, ((0, longest - len(way_m)), (0, 0)), "edge") for way_m in ways_m], axis=1)
+    start = np.deg2rad([user.track.yaw_deg[0] for user in users])
+    yaw = tractrix(lead_m, np.array([user.drawn_m for user in users]), start)
+    ahead_m = np.array([user.ahead_m for user in users])[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=2)
     poses = np.concatenate([lead_m - ahead_m, yaw[..., None]], axis=2)
-    return [poses[: len(way.lead_m), number].copy() for number, way in enumerate(ways)]
+    return [poses[: len(way_m), number].copy() for number, way_m in enumerate(ways_m)]
 
 
-def _keep_off(ways: Sequence[_Way], poses: list[Numbers], obstacles: NDArray[np.object_]) -> Numbers:
-    """Let vehicles swing out where the inner side of a turn would come over a kerb; (N,) how far they still do.
-
-    Args:
-        ways: N of them.
-        poses: Those along the ways; they are changed.
-        obstacles: Kerbs, as polygons.
-    """
-    over_m, moved = np.zeros(len(ways)), list(ways)
-    aside_m = [np.zeros(len(way.lead_m)) for way in ways]
-    along_m = [_along_m(way.lead_m) for way in ways]
+def _keep_off(
+    users: Sequence[RoadUser], ways_m: Sequence[Numbers], poses: list[Numbers], obstacles: NDArray[np.object_]
+) -> Numbers:
+    """Let vehicles swing out where the inner side of a turn would come over a kerb; (N,) how far they still do."""
+    over_m, moved_m, aside_m = np.zeros(len(users)), list(ways_m), [np.zeros(len(way_m)) for way_m in ways_m]
     left = [np.stack([-np.sin(own[:, 2]), np.cos(own[:, 2])], axis=1) for own in poses]
     look: dict[int, NDArray[np.int64]] = {}
-    for number, (way, own) in enumerate(zip(ways, poses, strict=True)):
-        rear_m = 2 * own[:, :2] - way.lead_m
-        if not way.user.track.on_foot:
-            astray_m = _lengths(rear_m - _behind(way.lead_m, way.user.drawn_m, own[0, 2]))
+    for number, (user, way_m, own) in enumerate(zip(users, ways_m, poses, strict=True)):
+        if not user.track.on_foot:
+            astray_m = _lengths(2 * own[:, :2] - way_m - _behind(way_m, user.drawn_m, own[0, 2]))
             look[number] = np.flatnonzero(astray_m > ASTRAY_M)[::LOOKS_EVERY]
     for swing in range(SWINGS + 1):
-        of = np.repeat(list(look), [len(at) for at in look.values()])
-        size_m = np.array([ways[number].user.size_m for number in of.tolist()]).reshape(-1, 2)
-        push_m = _push_m(
-            obstacles, np.concatenate([poses[n][at] for n, at in look.items()] + [np.empty((0, 3))]), size_m
-        )
+        of = np.repeat(np.array(list(look), dtype=np.int64), [len(at) for at in look.values()])
+        size_m = np.array([user.size_m for user in users])[of]
+        looked_at = [poses[number][at] for number, at in look.items()]
+        push_m = _push_m(obstacles, np.concatenate([np.empty((0, 3)), *looked_at]), size_m)
         over_m[list(look)] = 0.0
         np.maximum.at(over_m, of, np.abs(push_m))
-        met = {number: at[push_m[of == number] != 0.0] for number, at in look.items() if over_m[number] > 0.0}
+        met = [number for number in look if over_m[number] > 0.0]
         if not met or swing == SWINGS:
             break
-        for number, at in met.items():
-            wanted_m = push_m[(of == number) & (push_m != 0.0)]
+        for number in met:
+            pushed_m = push_m[of == number]
+            at, wanted_m = look[number][pushed_m != 0.0], pushed_m[pushed_m != 0.0]
             wanted_m += np.copysign(ROOM_M, wanted_m)
-            away = np.abs(along_m[number][:, None] - along_m[number][at])
-            away /= SWING_M + SWING_LENGTHS * ways[number].user.size_m[0]
+            along_m = _along_m(ways_m[number])
+            away = np.abs(along_m[:, None] - along_m[at]) / (SWING_M + SWING_LENGTHS * users[number].size_m[0])
             bumps_m = wanted_m * np.where(away < 1, (1 + np.cos(np.pi * away)) / 2, 0.0)
             aside_m[number] += bumps_m.max(axis=1).clip(min=0.0) + bumps_m.min(axis=1).clip(max=0.0)
-            lead_m = ways[number].lead_m + aside_m[number][:, None] * left[number]
-            moved[number] = ways[number]._replace(lead_m=lead_m)
-        for number, own in zip(met, _poses([moved[number] for number in met]), strict=True):
+            moved_m[number] = ways_m[number] + aside_m[number][:, None] * left[number]
+        again = _poses([users[number] for number in met], [moved_m[number] for number in met])
+        for number, own in zip(met, again, strict=True):
             poses[number] = own
         look = {number: np.flatnonzero(aside_m[number])[::LOOKS_EVERY] for number in met}
     return over_m
@@ -249,13 +235,7 @@ def tractrix(lead_m: Numbers, length_m: Numbers, yaw: Numbers) -> Numbers:
 
 
 def _push_m(obstacles: NDArray[np.object_], poses: Numbers, size_m: Numbers) -> Numbers:
-    """(K,) how far K rectangles have to go to their left to be off obstacles, or to their right if that is negative.
-
-    Args:
-        obstacles: Polygons in plan.
-        poses: (K, 3) x and y of their middles, and their headings in radians.
-        size_m: (K, 2) their lengths and widths.
-    """
+    """(K,) how far K rectangles have to go to their left to be off obstacles, or to their right if that is negative."""
     outlines = shapely.polygons(corners_m(poses, size_m))
     part, body = shapely.STRtree(outlines).query(obstacles, predicate="intersects")
     common = shapely.intersection(outlines[body], obstacles[part])
@@ -297,7 +277,7 @@ def _along_m(way_m: Numbers) -> Numbers:
     return np.concatenate([[0.0], _lengths(np.diff(way_m, axis=0)).cumsum()])
 
 
-def _rounded(places_m: Numbers, half: int) -> Numbers:
+def rounded(places_m: Numbers, half: int) -> Numbers:
     """(K, 2) means over so many places before and after; beyond the ends it goes on as it came."""
     weights = np.hanning(2 * half + 3)[1:-1] / np.hanning(2 * half + 3).sum()
     padded_m = np.pad(places_m, ((half, half), (0, 0)), "reflect", reflect_type="odd")
@@ -311,7 +291,7 @@ def _behind(way_m: Numbers, behind_m: float, yaw: float) -> Numbers:
     way_m = np.concatenate([way_m[:1] - behind_m * np.array([np.cos(yaw), np.sin(yaw)]), way_m])
     at_m = np.linspace(-behind_m, along_m[-1], 2 + int((along_m[-1] + behind_m) / ALONG_M))
     even_m = np.stack([np.interp(at_m, told_m, axis) for axis in way_m.T], axis=1)
-    round_m = _rounded(even_m, round(CORNER_M / ALONG_M))
+    round_m = rounded(even_m, round(CORNER_M / ALONG_M))
     return np.stack([np.interp(along_m - behind_m, at_m, axis) for axis in round_m.T], axis=1)
 
 
