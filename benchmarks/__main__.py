@@ -34,6 +34,7 @@ BENCHMARKS = (
     "scaling",
     "mutated_files",
     "targets",
+    "kinds",
     "towns",
     "pairing",
     "placement",
