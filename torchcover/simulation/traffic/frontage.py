@@ -245,6 +245,10 @@ def _free(
         on[which, feet.query(np.array(pavements, dtype=object), predicate=predicate)[1]] = True
     at_kerb = np.array(["kerb" in kind.zones for kind in KINDS.values()])[kinds]
     free = ~met[0] & (at_kerb | ~met[1]) & (on[0] == on[1])
+    # On the inside of a tight curve, where the ways to the right meet, outlines fold.
+    sides = np.roll(outlines_m, -1, axis=1) - outlines_m
+    following = np.roll(sides, -1, axis=1)
+    free &= (sides[..., 0] * following[..., 1] > sides[..., 1] * following[..., 0]).all(axis=1)
     number = np.flatnonzero(free)
     later, earlier = number[_meeting(outlines_m[number])]
     apart = (kinds[earlier] != kinds[later]) | (run[earlier] != run[later])
