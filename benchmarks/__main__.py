@@ -25,6 +25,7 @@ BENCHMARKS = (
     "scaling",
     "mutated_files",
     "targets",
+    "kinds",
     "towns",
     "pairing",
     "placement",
