@@ -113,10 +113,10 @@ class Sumo(Procedural):
         fleet.left_out = len(moved) - len(shown)
         if fleet.left_out and self.random is None:
             there = {motion.user.track.name for motion in shown}
-            gone = sorted({motion.user.track.name for motion in moved} - there)
+            missing = sorted({motion.user.track.name for motion in moved} - there)
             warnings.warn(
                 f"the simulation has {fleet.left_out} of {len(others)} road users where another one is, over a kerb or "
-                f"faster than people are ({', '.join(map(repr, gone[:3]))}); they are left out",
+                f"faster than people are ({', '.join(map(repr, missing[:3]))}); they are left out",
                 stacklevel=2,
             )
         placing = Placing(ground, pavement)
