@@ -107,7 +107,7 @@ def test_coverage_is_that_of_the_metric_with_weights_and_places_in_time(frames):
                 frame.clouds[rig], frame.reference, weights=frame.reference_weights, place_in_time=frame.index
             )
         assert torch.equal(observer.compute().radius, metric.compute().radius)
-        assert torch.equal(observer.compute().blocks.sums, metric.compute().blocks.sums)
+        assert torch.equal(observer.compute().blocks.listed, metric.compute().blocks.listed)
     assert (run.steps, dict(run.counts), run.complete) == (6, {"seen": 15}, True)
 
 

@@ -95,7 +95,7 @@ def measured(source, ranks=None, **settings):
     counts, sums = {}, {}
     for name, coverage in result.coverages.items():
         counts[name] = (coverage.counts, coverage.points, coverage.probed_steps, coverage.blocks.steps)
-        sums[name] = (coverage.blocks.sums, coverage.radius)
+        sums[name] = (coverage.blocks.listed, coverage.radius)
     run = (result.run.steps, dict(result.run.counts), result.run.skipped, str(result.run.failure))
     return {"counts": (counts, run, result.observed), "sums": sums}
 

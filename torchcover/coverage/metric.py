@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
-from torchcover.coverage.blocks import AreaSums, Blocks, KnownCells
+from torchcover.coverage.blocks import BlockSums, KnownCells
 from torchcover.coverage.columns import Columns, Sums
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.measures import Measure
@@ -276,8 +276,8 @@ class CoverageMetric(SumsInBlocks):
             max_radius=self.max_radius,
             known=known,
             layers=[layer for one in self._of_grid for layer in sums.layers(one, self.max_radius)],
-            blocks=Blocks(*listed, in_blocks.probed_steps.long(), mean["sums"]) if self.blocks > 1 else None,
-            area=AreaSums(*listed, area["m2"], area["sums"]) if area else None,
+            blocks=BlockSums(*listed, in_blocks.probed_steps.long(), mean["sums"]) if self.blocks > 1 else None,
+            area=BlockSums(*listed, area["m2"], area["sums"]) if area else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
             regions=self.regions,
             places=self._by_area(),
