@@ -5,6 +5,7 @@ from .agreeing import verdict as verdict
 from .checkpoint import Checkpoint as Checkpoint
 from .evaluating import compare as compare
 from .evaluating import evaluate as evaluate
+from .mixed import MixedResult as MixedResult
 from .observers import CoverageObserver as CoverageObserver
 from .observers import Observer as Observer
 from .observers import Stateful as Stateful

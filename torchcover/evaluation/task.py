@@ -11,7 +11,7 @@ from typing import Generic, NamedTuple, TypeVar
 from torchcover import __version__
 from torchcover.coverage.grid import BandFrame
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, OPTIONS, Settings
+from torchcover.evaluation.settings import DEFAULT_STEPS, OPTIONS, Settings
 from torchcover.frames import ChosenRigs, FrameSource
 from torchcover.recordings import RecordedFrames
 from torchcover.simulation import (
@@ -123,7 +123,7 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
     Raises:
         ValueError, FileNotFoundError: As `task_of`.
     """
-    rigs, scenario = settings.rigs, DEFAULT_SCENARIO if settings.scenario is None else settings.scenario
+    rigs, scenario = settings.rigs, settings.one_scenario
     if not rigs:
         raise ValueError("which rig? Give a built-in name (see `torchcover list`) or a YAML file, or a recording")
     names = distinct_names(rigs)

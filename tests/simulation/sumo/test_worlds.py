@@ -29,7 +29,7 @@ def test_the_ego_drives_as_it_did_there(tmp_path):
     np.testing.assert_allclose(np.diff(positions_m[:, 0]), 1.0, atol=1e-9)
     np.testing.assert_array_equal(positions_m[:, 1:], 0.0)
     # The ground is that of the first place's whole metres: 50 m on the street, less half of a car of 5 m.
-    assert positions_m[0, 0] == 0.5
+    assert positions_m[0, 0] == pytest.approx(0.5)
 
 
 def test_coordinates_of_utm_size_change_nothing(tmp_path):
@@ -67,13 +67,13 @@ def test_types_have_bodies_by_class_and_length(tmp_path):
     }  # fmt: skip
 
 
-def test_whoever_is_where_the_ego_is_is_left_out_with_a_warning_unless_another_ego_is_free(tmp_path):
-    steps = together(drive(), drive("ghost", start=52.0), drive("free", start=90.0))
-    with pytest.warns(UserWarning, match=r"has 1 of 2 road users where the ego is at some time \('ghost'\)"):
+def test_whoever_is_where_another_one_is_is_left_out_with_a_count(tmp_path):
+    pair = drive("one", start=90.0), drive("other", start=92.0)
+    steps = together(drive(), drive("ghost", start=52.0), *pair, drive("free", start=120.0))
+    with pytest.warns(UserWarning, match=r"has 2 of 4 road users where another one is.* \('ghost', 'other'\)"):
         world = made(tmp_path, steps=steps, ego_id="ego").world(0)
-    assert [actor.name.split()[1] for actor in world.actors] == ["free"]
-    for seed in range(3):
-        assert len(made(tmp_path, steps=steps).world(seed).actors) == 2
+    assert [actor.name.split()[1] for actor in world.actors] == ["one", "free"]
+    assert world.left_out == 2
 
 
 def test_people_walk_on_the_pavement_and_step_down(tmp_path):

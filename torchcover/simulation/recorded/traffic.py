@@ -90,9 +90,11 @@ class RecordedTraffic(Traffic):
         drive = self._shown(run.drive)
         mesh = bodies["suv"] if ego is None else ego
         driver = Actor(EGO, "car", mesh, Trajectory(drive.times_s, drive.positions_m, drive.angles_deg))
-        others = self._apart(driver, list(self._actors(driver.trajectory, Bodies(bodies))))
+        others = list(self._actors(driver.trajectory, Bodies(bodies)))
+        shown = self._apart(driver, others)
         ground = self._fitted(driver) if self.ground is None else self._read(self.ground)
-        return World((ground,), driver, tuple(others), self.time_step_s, run.duration_s, ground=(0,))
+        left_out = len(others) - len(shown)
+        return World((ground,), driver, tuple(shown), self.time_step_s, run.duration_s, ground=(0,), left_out=left_out)
 
     @cached_property
     def _objects(self) -> RecordedObjects:

@@ -61,6 +61,7 @@ class Fleet:
         self._sizes = {kind: BoundingBox.around(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
         self._generator = generator
         self.parked: list[Actor] = []
+        self.left_out = 0
 
     def length_m(self, kind: str) -> float:
         """Extent along x."""
