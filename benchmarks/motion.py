@@ -253,6 +253,6 @@ def wheels_m(world, looks=12):
         low_m = low_m[low_m[:, 2] < 0.02]
         own_s = actor.trajectory.times_s
         for time_s in np.linspace(own_s[0], own_s[-1], looks) if len(low_m) else ():
-            above_m = ground.heights_m(transform(actor.trajectory.at(time_s), low_m) + UP_M - 1.0
+            above_m = ground.heights_m(transform(actor.trajectory.at(time_s), low_m) + UP_M) - UP_M[2]
             worst_m = max(worst_m, float(np.abs(above_m[np.isfinite(above_m)]).max(initial=0.0)))
     return worst_m

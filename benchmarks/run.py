@@ -31,7 +31,7 @@ WATCHED = {
     "torchcover.simulation.surface_reference:SurfaceReference.scan": REFERENCE,
     "torchcover.simulation.scene:Scene.at": MOVING,
     "torchcover.neighbors.query:_nearest": SEARCH,
-    "torchcover.coverage.metric:CoverageMetric._add_step": SUMS,
+    "torchcover.coverage.metric:CoverageMetric.update": SUMS,
     "torchcover.report.maps.figures:draw_side_by_side": MAPS,
     "torchcover.files.publishing:Publication.add_figure": MAPS,
     "torchcover.evaluation.result:Result.save": FILES,

@@ -142,7 +142,7 @@ def test_each_world_has_a_checkpoint_of_its_own(mixed, yards, tmp_path):
     ],
 )
 def test_what_is_no_mixture_is_refused_before_anything_is_measured(scenario, says, monkeypatch):
-    monkeypatch.setattr("torchcover.evaluation.evaluating.measured", None)
+    monkeypatch.setattr("torchcover.evaluation.mixed.measured", None)
     with pytest.raises((ValueError, FileNotFoundError), match=says):
         evaluate(RIGS[0], scenario, **SMALL)
 

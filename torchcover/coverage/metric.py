@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
 from torchcover.coverage.blocks import BlockSums, KnownCells
-from torchcover.coverage.columns import Columns, Sums
+from torchcover.coverage.columns import CellSums, Columns
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.measures import Measure
 from torchcover.coverage.plotting import draw_coverage
@@ -301,7 +301,7 @@ class CoverageMetric(SumsInBlocks):
             else None,
         )
 
-    def _in_places(self, *, fine: bool) -> Sums:
+    def _in_places(self, *, fine: bool) -> CellSums:
         """The sums of (..., B, P) places in blocks, the fine ones or the others."""
         together = 1 if fine else min(int(self.block_length), FINER)  # so many fine blocks are one
         blocks, count = self.fine_blocks if fine else self.blocks, self._places.count

@@ -255,8 +255,9 @@ class Estimate:
             count: How many they are over.
             count_of: What these are.
         """
-        found, errors = {}, self.error.where(self._varies, math.nan)
-        numbers = self.quantities, self.value.tolist(), errors.tolist(), self.has_intervals, self.freedom
+        found, varies = {}, self._varies.tolist()
+        errors = [error if known else math.nan for error, known in zip(self.error.tolist(), varies, strict=True)]
+        numbers = self.quantities, self.value.tolist(), errors, self.has_intervals, self.freedom
         for quantity, value, error, has_interval, freedom in zip(*numbers, strict=True):
             ends = interval95(value, error if has_interval else math.nan, freedom, quantity)
             found[quantity.key] = Number(quantity, value, error, *ends, count, count_of)

@@ -37,11 +37,7 @@ def evaluate(settings: Settings) -> Result:
         (2, ['20m', '80m', '160m', 'front_3m', 'rear_3m', 'left_3m', 'right_3m'])
     """
     if settings.mixture is not None:
-        return measured_in_each(settings, _measured)
-    return _measured(settings)
-
-
-def _measured(settings: Settings) -> Result:
+        return measured_in_each(settings)
     return measured(task_of(settings), settings)
 
 

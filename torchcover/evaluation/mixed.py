@@ -1,6 +1,6 @@
 """Rigs in several kinds of world, and in a mixture of them."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import chain
@@ -11,8 +11,10 @@ from matplotlib.figure import Figure
 
 from torchcover.coverage import Coverage, Mixture
 from torchcover.evaluation.checkpoint import Checkpoint
+from torchcover.evaluation.measuring import measured
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.settings import FILES, Settings, wanted_files
+from torchcover.evaluation.task import task_of
 from torchcover.files import Publication, csv_text
 from torchcover.report import RENDERERS, CoverageTable, file_stems, table_dict
 from torchcover.report.renderers.records import records_of
@@ -68,17 +70,21 @@ class MixedResult(Result):
         raise ValueError(f"a mixture has no maps: use worlds[name].coverage, of {', '.join(self.worlds)}")
 
     @cached_property
-    def table(self) -> CoverageTable:
-        """The numbers of the mixture, with errors, differences and marks."""
+    def mixtures(self) -> Mapping[str, Mixture]:
+        """Name of each rig -> its numbers, for any region, with what they become without one block after the other."""
         counted = [(weight, self.worlds[name]) for name, weight in self.weights.items() if weight > 0.0]
         rigs = counted[0][1].coverages
-        mixed = {rig: Mixture([(weight, world.coverages[rig]) for weight, world in counted]) for rig in rigs}
+        return {rig: Mixture([(weight, world.coverages[rig]) for weight, world in counted]) for rig in rigs}
+
+    @cached_property
+    def table(self) -> CoverageTable:
+        """The numbers of the mixture, with errors, differences and marks."""
         shares = ", ".join(f"{name} {weight:.3g}" for name, weight in self.weights.items())
         note = (
             f"Weighted means over kinds of world: {shares}. These are given, not drawn: intervals are about chance "
             "within each of them, and say nothing of other kinds or other weights."
         )
-        return CoverageTable.of(mixed, self.regions, [note])
+        return CoverageTable.of(self.mixtures, self.regions, [note])
 
     @property
     def record(self) -> dict[str, Any]:
@@ -124,12 +130,11 @@ class MixedResult(Result):
         return "\n".join(f"{name}\n{RENDERERS['text'](table)}" for name, table in tables.items())
 
 
-def measured_in_each(settings: Settings, measure: Callable[[Settings], Result]) -> MixedResult:
+def measured_in_each(settings: Settings) -> MixedResult:
     """Measure in one kind of world after the other.
 
     Args:
         settings: Of `evaluate`, with several scenarios.
-        measure: Measures in one of them.
 
     Raises:
         ValueError: A recording among them, processes that share the run, or observers; as `evaluate`.
@@ -148,7 +153,8 @@ def measured_in_each(settings: Settings, measure: Callable[[Settings], Result]) 
         if checkpoint is not None:
             checkpoint = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
             checkpoint = checkpoint.within(stem)
-        worlds[name] = measure(replace(settings, scenario=scenario, checkpoint=checkpoint))
+        of_one = replace(settings, scenario=scenario, checkpoint=checkpoint)
+        worlds[name] = measured(task_of(of_one), of_one)
         if (run := worlds[name].run) is not None:
             run.raise_failure()
     return MixedResult.of(worlds, {name: weight for name, (_, weight) in settings.mixture.items()})

@@ -145,6 +145,7 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
         every_s=spread_s(world, settings.every_s),
         reference_sensor=reference_called(settings.reference, settings.rays, asked),
         boxes=boxes or settings.needs_boxes,
+        kept_bytes=0.0,  # steps come in order: no world is needed again
     )
     frames.simulator.check_run(frames.steps)
     # A path says more than the name within the file.

@@ -1,5 +1,6 @@
 """Bodies on the ground: heights and tilts along their tracks, and cars in bays, lanes that nobody may use."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
@@ -91,7 +92,7 @@ def park(
 ) -> NDArray[np.object_]:
     """Put cars into the bays of the streets that are near; their outlines in plan."""
     outlines_m = [np.empty((0, 4, 2))]
-    poses: dict[str, list[np.ndarray]] = {kind: [] for kind in PARKED}
+    poses: dict[str, list[np.ndarray]] = defaultdict(list)
     for lane in vicinity.lanes:
         if lane.use != "bay":
             continue
