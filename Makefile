@@ -45,8 +45,8 @@ docs: $(VENV)/.ready  ## the pages, with those made from the code, in out/site
 smoke: $(VENV)/.ready  ## the built wheel, in an empty environment outside the repository
 	PYTHON="$(PYTHON)" bash .ci/smoke $(BIN)/python
 
-bench: $(VENV)/.ready  ## the speed and memory figures of docs/measured/performance.md
-	$(BIN)/python -m benchmarks
+bench: $(VENV)/.ready  ## docs/measured/performance.md: speed and memory
+	$(BIN)/python -m benchmarks.measured performance
 
 measured: $(VENV)/.ready  ## the tables and pictures that README and the pages quote, with their pages, within 20 minutes
 	$(BIN)/python -m benchmarks.measured

@@ -1,29 +1,20 @@
-"""Run every benchmark and print its table: `python -m benchmarks [name ...]`."""
+"""Run benchmarks and print their tables: `python -m benchmarks [name ...]`; without names, those of speed."""
 
 import importlib
 import sys
 
+# Of speed and memory, which docs/measured/performance.md is made of; the others have pages of their own.
+PERFORMANCE = ("run", "nearest", "crossover", "raycasting", "moving_actors", "reading", "omissions")
 BENCHMARKS = (
-    "nearest",
+    *PERFORMANCE,
     "search",
-    "crossover",
-    "raycasting",
-    "paper_step",
-    "memory",
-    "imports",
     "stability",
     "trade_offs",
-    "moving_actors",
-    "urban_throughput",
     "heights",
     "settings",
     "imperfections",
-    "five_rigs",
-    "omissions",
-    "metric_omissions",
     "ray_budget",
     "recorded_measure",
-    "reading",
     "accumulated_reference",
     "calibration",
     "training_overhead",
@@ -48,7 +39,7 @@ def main(names):
     unknown = set(names) - set(BENCHMARKS)
     if unknown:
         sys.exit(f"no benchmark {', '.join(sorted(unknown))}; there are {', '.join(BENCHMARKS)}")
-    for name in names or BENCHMARKS:
+    for name in names or PERFORMANCE:
         module = importlib.import_module(f"benchmarks.{name}")
         print(f"## {name}: {module.__doc__.splitlines()[0]}\n", flush=True)
         module.main()

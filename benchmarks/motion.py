@@ -4,8 +4,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchcover.geometry import BoundingBox
+from torchcover.geometry import BoundingBox, transform
 from torchcover.geometry.trajectory import Trajectory
+from torchcover.simulation.material import material_number
+from torchcover.simulation.scene import Scene as Scenery
+from torchcover.simulation.world import World
 
 # Recorded categories and those of bodies, as kinds that can be compared.
 KINDS = {
@@ -17,6 +20,9 @@ KINDS = {
 }  # fmt: skip
 OTHER = "other"
 STANDS_MPS = 0.3
+HARD_MPS2 = 6.0
+# From there the ground below is looked for, kerbs included.
+UP_M = np.array([0.0, 0.0, 1.0])
 
 
 class Body(NamedTuple):
@@ -40,17 +46,18 @@ class Body(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """A drive: the ego, all others, and the times that are looked at."""
+    """A drive: the ego, all others, and the times that are looked at; the world, if it is simulated."""
 
     ego: Body
     others: list
     times_s: np.ndarray
+    world: World | None = None
 
     @classmethod
     def of_world(cls, world, every_s=1.0):
         """What a scenario builds."""
         ego, *others = (_body(actor) for actor in (world.ego, *world.objects))
-        return cls(ego, others, np.arange(0.0, max(world.duration_s, 1e-6), every_s))
+        return cls(ego, others, np.arange(0.0, max(world.duration_s, 1e-6), every_s), world)
 
     @classmethod
     def of_recording(cls, objects, every_s=1.0):
@@ -147,17 +154,19 @@ def motion(scene, every_s=0.2):
             fastest_mps = max(fastest_mps, float(speed.max()))
         elif body.kind in hard:
             count[body.kind] += 1
-            hard[body.kind] += np.hypot(ahead, left).max() > 10.0
+            hard[body.kind] += np.hypot(ahead, left).max() > HARD_MPS2
     pairs = met(scene)
     _, _, ahead, left = accelerations(scene.ego.trajectory, every_s)
     return {
         "pairs that overlap": len(pairs),
         "deepest (m)": max(pairs.values(), default=0.0),
-        **{f"{kind}: above 10 m/s2": f"{hard[kind]} of {count[kind]}" for kind in ("car", "lorry or bus")},
+        **{f"{kind}: above {HARD_MPS2:g} m/s2": f"{hard[kind]} of {count[kind]}" for kind in ("car", "lorry or bus")},
         "people above 4 m/s": f"{runners} of {people}",
         "fastest of them (m/s)": fastest_mps,
         "ego to the side (m/s2)": float(np.abs(left).max(initial=0.0)),
         "ego brakes (m/s2)": float(-ahead.min(initial=0.0)),
+        "wheels off the ground, or in a kerb (m)": np.nan if scene.world is None else wheels_m(scene.world),
+        "left out": 0 if scene.world is None else scene.world.left_out,
     }
 
 
@@ -234,3 +243,16 @@ def kerbs(scene, beside_m=(2.0, 12.0), beyond_m=40.0, shortest_m=30.0):
         if beside_m[0] < abs(left_m) < beside_m[1] and abs(np.sin(turned - heading[nearest])) < np.sin(np.deg2rad(15)):
             taken[int(left_m > 0)] |= np.abs(fine_m - fine_m[nearest]) < body.size_m[0] / 2
     return float(taken.mean())
+
+
+def wheels_m(world, looks=12):
+    """How far the lowest points of the wheels of what moves are from the ground, kerbs included, at the worst."""
+    ground, tyre, worst_m = Scenery(world).ground, material_number("tyre"), 0.0
+    for actor in (world.ego, *world.actors):
+        low_m = actor.mesh.vertices_m[np.unique(actor.mesh.faces[actor.mesh.materials == tyre])]
+        low_m = low_m[low_m[:, 2] < 0.02]
+        own_s = actor.trajectory.times_s
+        for time_s in np.linspace(own_s[0], own_s[-1], looks) if len(low_m) else ():
+            above_m = ground.heights_m(transform(actor.trajectory.at(time_s), low_m) + UP_M) - UP_M[2]
+            worst_m = max(worst_m, float(np.abs(above_m[np.isfinite(above_m)]).max(initial=0.0)))
+    return worst_m

@@ -29,16 +29,21 @@ def test_lists_say_what_the_arrays_said(share):
     assert len(listed.at) == (base > 0).sum()
     np.testing.assert_array_equal(listed.m2, base)
     np.testing.assert_array_equal(listed.sums, sums)
-    np.testing.assert_array_equal(listed.known_in(), (base > 0).sum(axis=0))
+    for blocks in (1, 3):
+        enough = (base > 0).sum(axis=0) >= blocks
+        cells, *spread = listed.spread_where(blocks)
+        np.testing.assert_array_equal(cells, np.flatnonzero(enough))
+        np.testing.assert_array_equal(spread[0], base[:, enough])
+        np.testing.assert_array_equal(spread[1], sums[:, :, enough].swapaxes(0, 1))
     both = np.concatenate([base[:, None], sums], axis=1)
     np.testing.assert_allclose(listed.totals(), both.sum(axis=0), rtol=1e-14, atol=1e-14)
-    cells = np.random.default_rng(1).random(SHAPE[1:]) < 0.5
-    np.testing.assert_allclose(
-        listed.over(torch.from_numpy(cells)), both[:, :, cells].sum(axis=2), rtol=1e-14, atol=1e-14
-    )
-    spread = listed.spread_over(torch.from_numpy(cells))
-    np.testing.assert_array_equal(spread[0], base[:, cells])
-    np.testing.assert_array_equal(spread[1], sums[:, :, cells].swapaxes(0, 1))
+    some, band = np.random.default_rng(1).random(SHAPE[2:]) < 0.5, 1
+    own = torch.from_numpy(some), band
+    np.testing.assert_allclose(listed.over(*own), both[:, :, band, some].sum(axis=2), rtol=1e-14, atol=1e-14)
+    known = some & (base[:, band] > 0).any(axis=0)
+    spread = listed.spread_over(*own)
+    np.testing.assert_array_equal(spread[0], base[:, band, known])
+    np.testing.assert_array_equal(spread[1], sums[:, :, band, known].swapaxes(0, 1))
 
 
 def test_nothing_in_the_lists_belongs_to_the_arrays():

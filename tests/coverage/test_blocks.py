@@ -9,7 +9,7 @@ import torch
 
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.coverage import Coverage, Layer, Maximum, MeanOfMeans, PooledMean, Quantiles
-from torchcover.coverage.blocks import Blocks
+from torchcover.coverage.blocks import Blocks, KnownCells
 from torchcover.estimation import jackknife_error, ratio_errors
 
 # Cells so large that the sensor point below a reference point is always the nearest.
@@ -440,15 +440,14 @@ def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
     values = torch.stack([radii, (radii <= THRESHOLD).double()]) * probed
     frames, sums = probed.sum(dim=1).long(), values.sum(dim=2)
     means = sums.sum(dim=1) / frames.sum(dim=0)
-    steps = torch.full((16,), radii.shape[1])
+    steps, at = torch.full((16,), radii.shape[1]), frames.sum(dim=0).flatten().nonzero().squeeze(1)
     counts = dict.fromkeys(Coverage.COUNTS, 0)
     return Coverage(
         grid=GRID,
         thresholds=(THRESHOLD,),
         max_radius=math.inf,
-        probed_steps=frames.sum(dim=0),
-        points=frames.sum(dim=0),
-        layers=map(Layer, MeanOfMeans((THRESHOLD,)).quantities, means),
+        known=KnownCells(GRID.shape, at, *[frames.sum(dim=0).flatten()[at]] * 2),
+        layers=map(Layer, MeanOfMeans((THRESHOLD,)).quantities, means.flatten(1)[:, at]),
         counts=counts,
         blocks=Blocks.of(steps, frames, sums.movedim(0, 1)),
     )

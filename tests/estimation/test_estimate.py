@@ -1,6 +1,7 @@
 """Estimates: what numbers and differences say of sums in blocks, by hand and by SciPy."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from scipy import stats
 
 from torchcover.coverage.quantity import RADIUS, detection
 from torchcover.estimation import Estimate
-from torchcover.estimation.student import BLIND_SIDE
+from torchcover.estimation.student import BLIND_SIDE, interval95
 
 BOTH = (RADIUS, detection(0.4))
 
@@ -113,3 +114,56 @@ def test_after_some_blocks_it_is_what_these_alone_say():
     for one, other in ((some.value, alone.value), (some.left_out, alone.left_out), (some.error, alone.error)):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=0)
     assert some.steps.tolist() == alone.steps.tolist()
+
+
+def drawn(blocks, mean, spread, seed, size=2.0):
+    """Ratios of blocks of a world, with an error that is known from what was drawn."""
+    ratios = mean + spread * torch.randn(blocks, 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    m2 = torch.full((blocks,), size, dtype=torch.float64)
+    return Estimate.of_ratios((RADIUS,), m2, m2[:, None] * ratios, torch.ones(blocks, dtype=torch.int64))
+
+
+def test_a_mixture_has_the_variance_of_its_strata_and_the_freedom_of_welch_and_satterthwaite():
+    strata = [(0.6, drawn(10, 2.0, 0.5, 1)), (0.3, drawn(25, 4.0, 0.1, 2)), (0.1, drawn(9, 1.0, 2.0, 3))]
+    mixed = Estimate.mixed(strata)
+    variances = [(weight * float(one.error)) ** 2 for weight, one in strata]
+    number = mixed.numbers()["radius_m"]
+    assert number.value == pytest.approx(sum(weight * float(one.value) for weight, one in strata))
+    assert number.error == pytest.approx(math.sqrt(sum(variances)))
+    freedom = sum(variances) ** 2 / (variances[0] ** 2 / 9 + variances[1] ** 2 / 24 + variances[2] ** 2 / 8)
+    assert mixed.freedom == [int(freedom)]
+    assert (number.low, number.high) == interval95(number.value, number.error, int(freedom), RADIUS)
+    # Each stratum counts as it is, however many blocks it has.
+    alone = Estimate.mixed([(1.0, strata[0][1])]).numbers()["radius_m"]
+    assert alone == strata[0][1].numbers()["radius_m"]
+
+
+def test_differences_of_mixtures_are_paired_in_each_stratum():
+    shared = [drawn(12, 2.0, 1.0, 1), drawn(16, 5.0, 1.0, 2)]
+    other = [replace(one, value=one.value - 0.3, left_out=one.left_out - 0.3) for one in shared]
+    other[1] = replace(other[1], left_out=other[1].left_out + 1e-4 * torch.randn(16, 1, dtype=torch.float64))
+    one, another = (Estimate.mixed(list(zip((0.5, 0.5), each, strict=True))) for each in (shared, other))
+    difference = another.differences(one)["radius_m"]
+    assert difference.value == pytest.approx(-0.3)
+    assert difference.error < 0.01 < float(one.error)
+    assert difference.significant
+    assert (difference.blocks, difference.better) == (28, 28)
+
+
+@pytest.mark.parametrize("blocks", [7, 1])
+def test_no_stratum_makes_up_for_blocks_that_another_lacks(blocks):
+    number = Estimate.mixed([(0.99, drawn(1000, 2.0, 1.0, 1)), (0.01, drawn(blocks, 2.0, 1.0, 2))]).numbers()[
+        "radius_m"
+    ]
+    assert math.isfinite(number.value)
+    assert math.isnan(number.error)
+    assert math.isnan(number.low)
+
+
+def test_a_stratum_of_which_nothing_is_known_or_that_never_varies_leaves_the_mixture_unknown():
+    known = drawn(16, 2.0, 1.0, 1)
+    nothing = Estimate.of((RADIUS,), torch.tensor([math.nan], dtype=torch.float64))
+    assert math.isnan(Estimate.mixed([(0.5, known), (0.5, nothing)]).numbers()["radius_m"].value)
+    same = Estimate.mixed([(0.5, known), (0.5, drawn(16, 2.0, 0.0, 1))]).numbers()["radius_m"]
+    assert same.value == pytest.approx(0.5 * float(known.value) + 1.0)
+    assert math.isnan(same.error)

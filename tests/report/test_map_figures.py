@@ -70,8 +70,8 @@ def test_there_is_a_figure_for_each_quantity_and_band(tmp_path):
     assert sorted(paths) == sorted((tmp_path / "new" / "maps").iterdir())
     for path in paths:
         height, width, _ = imread(path).shape
-        assert 600 < height < 1500
-        assert 1350 < width < 2600
+        assert 500 < height < 1200
+        assert 1000 < width < 2000
 
 
 def test_maps_show_what_was_asked_for_and_is_known_and_the_ego():

@@ -17,7 +17,9 @@ SIZES_M = {
     "dog_57cm": (0.98, 0.22, 0.69),
     "ford_fusion": (4.869, 1.852, 1.476),
     "hatchback": (4.28, 1.79, 1.46),
+    "lorry": (8.60, 2.50, 3.45),
     "motorcycle": (2.10, 0.80, 1.50),
+    "pickup": (5.37, 1.92, 1.88),
     "pole_100cm": (0.075, 0.075, 1.00),
     "renault_zoe": (4.084, 1.730, 1.562),
     "sedan": (4.77, 1.83, 1.46),
@@ -35,7 +37,7 @@ AXLES_M = {
     "volkswagen_multivan": (1.592, 3.124),
     "volkswagen_passat_estate": (1.337, 2.709),
 }
-CARS = ("hatchback", "sedan", "suv", "van", *AXLES_M)
+CARS = ("hatchback", "pickup", "sedan", "suv", "van", *AXLES_M)
 WITH_WHEELS = tuple(sorted(set(SIZES_M) - {"adult", "child", "child_110cm", "dog_57cm", "pole_100cm"}))
 
 
@@ -147,7 +149,7 @@ def test_a_cars_cabin_is_narrower_than_its_body(name):
     assert np.ptp(roof[:, 1]) < 0.8 * SIZES_M[name][1]
 
 
-@pytest.mark.parametrize("name", [*CARS, "truck", "bus"])
+@pytest.mark.parametrize("name", [*CARS, "truck", "lorry", "bus"])
 def test_mirrors_end_within_the_width(name):
     (mirrors,) = [part for part in load(name).parts if part.name == "mirrors"]
     outermost = max(mesh.vertices_m[:, 1].max() for mesh in mirrors.meshes())

@@ -10,7 +10,7 @@ import typer
 
 from torchcover.cli import options
 from torchcover.cli.options import of_evaluate, parameters_of, with_options
-from torchcover.evaluation.settings import OPTIONS
+from torchcover.evaluation.settings import OPTIONS, Settings
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -92,7 +92,8 @@ def _measure(
     if (asked := options.asked(settings.get("ask"), region, height, grid)) is not None:
         settings["ask"] = asked
     with sharing(out) as ranks:
-        log, checkpoint = logged(rerun, ranks), checkpoint_in(out, resume=resume)
+        log = logged(rerun, ranks)
+        checkpoint = checkpoint_in(out, Settings(scenario=settings.get("scenario")), resume=resume)
         result = evaluate_(
             rigs,
             frames=recording,
@@ -196,16 +197,20 @@ def opened(
     )
 
 
-def checkpoint_in(out: Path, *, resume: bool) -> "Checkpoint":
+def checkpoint_in(out: Path, settings: Settings, *, resume: bool) -> "Checkpoint":
     """The checkpoint in the folder of the results; one line if it is not what the user may think."""
     from torchcover.evaluation import Checkpoint
+    from torchcover.report import file_stems
 
-    path = out / "checkpoint.npz"
-    if resume and not path.exists():
-        typer.echo(f"torchcover: {path} is not there: the run starts with its first step", err=True)
-    elif path.exists() and not resume and not _complete(out):
-        typer.echo(f"torchcover: {path} will be replaced; to go on from it, stop now and add --resume", err=True)
-    return Checkpoint(path, resume, keep=resume)
+    checkpoint = Checkpoint(out / "checkpoint.npz", resume, keep=resume)
+    for each in map(checkpoint.within, file_stems(list(settings.mixture))) if settings.mixture else [checkpoint]:
+        if resume and not each.path.exists():
+            typer.echo(f"torchcover: {each.path} is not there: the run starts with its first step", err=True)
+        elif each.path.exists() and not resume and not _complete(each.path.parent):
+            typer.echo(
+                f"torchcover: {each.path} will be replaced; to go on from it, stop now and add --resume", err=True
+            )
+    return checkpoint
 
 
 def _complete(out: Path) -> bool:
@@ -257,12 +262,20 @@ def finish(
 ) -> None:
     """Results are safe before anything is printed; then the command ends as the run did."""
     from torchcover.cli.printing import print_result
+    from torchcover.evaluation import MixedResult
+    from torchcover.report import file_stems
 
     if ranks is None or ranks.rank == 0:
         written = result.save(out, files=files, error_maps=error_maps)
         print_result(result, written, out, explain=explain)
-        if log is not None:
+        if log is not None and not isinstance(result, MixedResult):
             log.finish(result)
+    if isinstance(result, MixedResult):  # complete, for else there was none
+        for each in (
+            map(checkpoint.within, file_stems(list(result.worlds))) if checkpoint and not checkpoint.keep else ()
+        ):
+            each.path.unlink(missing_ok=True)
+        return
     if result.run is None:
         return
     if checkpoint and result.run.complete and not checkpoint.keep:

@@ -5,10 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
-from torchcover.evaluation import AgreementStudy, Result, Study, relation, verdict
+from torchcover.evaluation import AgreementStudy, MixedResult, Result, Study, relation, verdict
 from torchcover.evaluation.agreeing import NOTES
+from torchcover.evaluation.mixed import MIXTURE
 from torchcover.evaluation.result import sensor_model_words
 from torchcover.evaluation.result_page import left_out_table
 from torchcover.evaluation.study import WANTED
@@ -31,8 +33,21 @@ def in_words(table: PageTable) -> Table:
 
 
 def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: bool) -> None:
-    """The tables, what the run left out if that is asked for, and where the files are."""
+    """The tables, of several kinds of world one after the other, and where the files are."""
     console = Console()
+    if isinstance(result, MixedResult):
+        for name, world in result.worlds.items():
+            console.rule(escape(name))
+            _print_world(world, console, explain=explain)
+        console.rule(MIXTURE)
+        print_table(result.table, console)
+    else:
+        _print_world(result, console, explain=explain)
+    print_files(files, out, console)
+
+
+def _print_world(result: Result, console: Console, *, explain: bool) -> None:
+    """The tables, and what the run left out if that is asked for."""
     print_table(result.table, console)
     if result.metrics:
         print_whole(text_tables(result.metrics))
@@ -47,7 +62,6 @@ def print_result(result: Result, files: Sequence[Path], out: Path, *, explain: b
         console.print(f"skipped: {line}", style="yellow", markup=False)
     for line in result.target_lines:
         console.print(line, markup=False, soft_wrap=True)
-    print_files(files, out, console)
 
 
 def print_files(files: Sequence[Path], out: Path, console: Console) -> None:

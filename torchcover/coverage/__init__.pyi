@@ -12,6 +12,7 @@ from .aggregations import aggregation_named as aggregation_named
 from .grid import BevGrid as BevGrid
 from .measures import Measure as Measure
 from .metric import CoverageMetric as CoverageMetric
+from .mixture import Mixture as Mixture
 from .number_metric import CoverageNumber as CoverageNumber
 from .paired import check_paired as check_paired
 from .paired import differences as differences

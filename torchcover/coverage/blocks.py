@@ -1,12 +1,62 @@
-"""Blocks of contiguous steps: what standard errors are estimated from."""
+"""Lists of what is known: the cells that were probed, and those of each block of contiguous steps, for errors."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Self, TypeVar
+from typing import Generic, Self, TypeVar
 
 import torch
 from torch import Tensor
+
+ListedT = TypeVar("ListedT")
+MapT = TypeVar("MapT")
+
+
+@dataclass(frozen=True)
+class KnownCells:
+    """The cells that a reference point has probed, as lists: of small cells they are few.
+
+    Args:
+        shape: (H, Y, X) all cells.
+        at: (K,) int64 which of them, as an index into all, ascending.
+        probed_steps: (K,) int64 steps that had a reference point in each.
+        points: (K,) int64 reference points in each.
+    """
+
+    shape: tuple[int, ...]
+    at: Tensor
+    probed_steps: Tensor
+    points: Tensor
+
+    def spread(self, values: Tensor, nothing: float = math.nan) -> Tensor:
+        """(H, Y, X) with (K,) values in these cells."""
+        spread = values.new_full((math.prod(self.shape),), nothing)
+        return spread.index_copy_(0, self.at, values).view(self.shape)
+
+    def within(self, cells: Tensor, band: int) -> Tensor:
+        """(K,) bool: which of them are some cells, (Y, X) bool, in a band."""
+        return _is_in(self.at, cells, band)
+
+
+def _is_in(at: Tensor, cells: Tensor, band: int) -> Tensor:
+    return (at // cells.numel() == band) & cells.flatten()[at % cells.numel()]
+
+
+class Maps(Mapping[str, MapT], Generic[ListedT, MapT]):
+    """Maps by key, each made of its list when it is asked for: those of all cells are large."""
+
+    def __init__(self, listed: Mapping[str, ListedT], make: Callable[[ListedT], MapT]) -> None:
+        self.listed = listed
+        self._make = make
+
+    def __getitem__(self, key: str) -> MapT:
+        return self._make(self.listed[key])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.listed)
+
+    def __len__(self) -> int:
+        return len(self.listed)
 
 
 @dataclass(frozen=True)
@@ -60,25 +110,27 @@ class BlockSums:
             totals[:, cell] += each  # a cell is in a block once
         return totals.view(-1, *self.shape[1:])
 
-    def over(self, cells: Tensor) -> Tensor:
-        """(B, 1 + Q) float64 over some cells, (H, Y, X) bool, in each block: what is divided by, then the sums."""
-        chosen = cells.flatten()
-        return torch.stack([each[:, chosen[cell]].sum(dim=1) for cell, each in self._each_block()])
+    def over(self, cells: Tensor, band: int) -> Tensor:
+        """(B, 1 + Q) float64 what is divided by, then the sums, of each block over some cells of a band, (Y, X)."""
+        return torch.stack([each[:, _is_in(cell, cells, band)].sum(dim=1) for cell, each in self._each_block()])
 
-    def known_in(self) -> Tensor:
-        """(H, Y, X) int64 how many blocks list each cell."""
-        return torch.bincount(self.at % self._cells, minlength=self._cells).view(self.shape[1:])
+    def spread_over(self, cells: Tensor, band: int) -> tuple[Tensor, Tensor]:
+        """Arrays over the K known ones of such cells: (B, K) what is divided by, and (Q, B, K) the sums."""
+        return self._spread_of(_is_in(self.at % self._cells, cells, band))[1:]
 
-    def spread_over(self, cells: Tensor) -> tuple[Tensor, Tensor]:
-        """Arrays over the K of some cells, (H, Y, X) bool: (B, K) what is divided by, and (Q, B, K) the sums."""
-        chosen, cell, block = cells.flatten(), self.at % self._cells, self.at // self._cells
-        kept = chosen[cell]
-        place = block[kept], (chosen.cumsum(dim=0) - 1)[cell[kept]]
-        base = self.base.new_zeros((self.shape[0], int(chosen.sum())))
+    def spread_where(self, blocks: int) -> tuple[Tensor, Tensor, Tensor]:
+        """(K,) the cells that so many blocks list at least; then as `spread_over`."""
+        _, place, count = torch.unique(self.at % self._cells, return_inverse=True, return_counts=True)
+        return self._spread_of(count[place] >= blocks)
+
+    def _spread_of(self, kept: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        cells, cell = torch.unique(self.at[kept] % self._cells, return_inverse=True)
+        place = self.at[kept] // self._cells, cell
+        base = self.base.new_zeros((self.shape[0], len(cells)))
         sums = self.listed.new_zeros((len(self.listed), *base.shape))
         base[place] = self.base[kept]
         sums[(slice(None), *place)] = self.listed[:, kept]
-        return base, sums
+        return cells, base, sums
 
     @property
     def _cells(self) -> int:

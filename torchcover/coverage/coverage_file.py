@@ -1,7 +1,7 @@
 """Results as files: everything that a `Coverage` has, in one `.npz`.
 
-Maps are arrays over the whole grid under the key of their quantity, for NumPy users; the blocks, most of whose cells
-no step of theirs has probed, are lists of what was probed.
+All are lists over the cells that were probed. `cell` has their indices into the `shape` (H, Y, X) of the header; a map
+is `layer = np.full(shape, nan)` and `layer.flat[file["cell"]] = file["radius_m"]`, by the key of its quantity.
 """
 
 import json
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Layer
-from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums, BlockSumsT
+from torchcover.coverage.blocks import AreaSums, Blocks, BlockSums, BlockSumsT, KnownCells
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
 from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
@@ -26,7 +26,7 @@ from torchcover.estimation import Quantity
 from torchcover.files import NpyHeader, TooLargeError, check_memory, read_npz, reads, write_npz
 from torchcover.metrics.blocks import FINER
 
-FORMAT_VERSION = 8
+FORMAT_VERSION = 9
 Arrays = dict[str, NDArray[Any]]
 # Steps, cells, what is divided by, sums.
 IN_BLOCKS = ("block_steps", "block_cell", "block_probed_steps", "block_sums")
@@ -42,8 +42,7 @@ class CoverageParts(TypedDict):
     grid: BevGrid
     thresholds: Sequence[float]
     max_radius: float
-    probed_steps: Tensor
-    points: Tensor
+    known: KnownCells
     layers: Sequence[Layer]
     counts: Mapping[str, int]
     blocks: Blocks | None
@@ -55,8 +54,14 @@ class CoverageParts(TypedDict):
 
 
 def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Path) -> None:
-    """Write a coverage to one compressed file, with maps of standard errors by key, for NumPy users."""
-    grid, blocks, area, redundancy = parts["grid"], parts["blocks"], parts["area"], parts["redundancy"]
+    """Write a coverage to one compressed file, with standard errors by key, for NumPy users."""
+    grid, known, blocks, area, redundancy = (
+        parts["grid"],
+        parts["known"],
+        parts["blocks"],
+        parts["area"],
+        parts["redundancy"],
+    )
     places, aggregated = parts["places"], parts["aggregated"]
     header = {
         "format": FORMAT_VERSION,
@@ -67,6 +72,7 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
             "heights": dict(grid.heights),
             "band_frame": grid.band_frame,
         },
+        "shape": grid.shape,
         "thresholds": parts["thresholds"],
         "max_radius": parts["max_radius"],
         "layers": [layer.quantity._asdict() for layer in parts["layers"]],
@@ -77,18 +83,19 @@ def write_coverage(parts: CoverageParts, errors: Mapping[str, Tensor], path: Pat
         "by_area": places is not None,
         "aggregated": [] if aggregated is None else [quantity._asdict() for quantity in aggregated.quantities],
         "sensors": None if redundancy is None else redundancy.sensors,
-        "redundancy": [] if redundancy is None else [layer.quantity._asdict() for layer in redundancy.layers.values()],
+        "redundancy": [] if redundancy is None else [layer.quantity._asdict() for layer in redundancy.listed.values()],
     }
-    tensors = {"probed_steps": parts["probed_steps"], "points": parts["points"]}
+    tensors = {"cell": known.at, "probed_steps": known.probed_steps, "points": known.points}
     tensors |= {layer.quantity.key: layer.values for layer in parts["layers"]}
     tensors |= {f"{key}_error": error for key, error in errors.items()}
     if aggregated is not None:
         tensors |= dict(zip(AGGREGATED, aggregated[1:], strict=True))
     if redundancy is not None:
-        tensors |= {key: layer.values for key, layer in redundancy.layers.items()}
+        tensors |= {key: layer.values for key, layer in redundancy.listed.items()}
     if places is not None:
         tensors |= dict(zip(OVER_PLACES, places, strict=True))
     arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
+    arrays["cell"] = _short(arrays["cell"], grid.cells)
     arrays |= {} if blocks is None else _listed(blocks, IN_BLOCKS)
     arrays |= {} if area is None else _listed(area, OVER_AREA)
     write_npz(path, {"header": np.array(json.dumps(header)), **arrays})
@@ -130,16 +137,16 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
         heights=heights,
         band_frame=stored["band_frame"],
     )
-    layers = _layers(header["layers"], grid, arrays)
-    for name in ("probed_steps", "points"):
-        _check_shape(name, grid, arrays)
-    _check_spread(grid, arrays)
+    known = _known(grid, arrays)
+    layers = _layers(header["layers"], arrays)
+    blocks = max((len(arrays[names[0]]) for names in (IN_BLOCKS, OVER_AREA) if names[0] in arrays), default=0)
+    # Of all cells maps are made one at a time, and of the known ones in all blocks errors.
+    check_memory(8 * (grid.cells + 3 * blocks * len(known.at)) + sum(array.nbytes for array in arrays.values()))
     return {
         "grid": grid,
         "thresholds": tuple(header["thresholds"]),
         "max_radius": header["max_radius"],
-        "probed_steps": torch.from_numpy(arrays["probed_steps"]),
-        "points": torch.from_numpy(arrays["points"]),
+        "known": known,
         "layers": layers,
         "counts": header["counts"],
         "blocks": None if header["blocks"] == 1 else _read_listed(Blocks, IN_BLOCKS, header, grid, arrays),
@@ -147,7 +154,7 @@ def _parts(header: dict[str, Any], arrays: Arrays) -> CoverageParts:
         "regions": [_region(stored) for stored in header["regions"]],
         "places": _places(header, grid, arrays) if header["by_area"] else None,
         "aggregated": _aggregated(header, grid, arrays) if header["aggregated"] else None,
-        "redundancy": None if header["sensors"] is None else _redundancy(header, grid, arrays),
+        "redundancy": None if header["sensors"] is None else _redundancy(header, known, arrays),
     }
 
 
@@ -162,12 +169,12 @@ def _aggregated(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> PlaceN
     return PlaceNumbers(quantities, value, left_out)
 
 
-def _redundancy(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> Redundancy:
-    layers = _layers(header["redundancy"], grid, arrays)
+def _redundancy(header: dict[str, Any], known: KnownCells, arrays: Arrays) -> Redundancy:
+    layers = _layers(header["redundancy"], arrays)
     sensors = tuple(header["sensors"])
     if [layer.quantity for layer in layers] != list(redundancy_quantities(sensors, header["thresholds"])):
         raise ValueError(f"other layers of redundancy than those of the sensors {', '.join(sensors)}")
-    return Redundancy(sensors, {layer.quantity.key: layer for layer in layers})
+    return Redundancy(sensors, known, {layer.quantity.key: layer for layer in layers})
 
 
 def _places(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> PlaceSums:
@@ -180,16 +187,31 @@ def _places(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> PlaceSums:
     return places
 
 
-def _layers(stored: Sequence[dict[str, Any]], grid: BevGrid, arrays: Arrays) -> list[Layer]:
+def _known(grid: BevGrid, arrays: Arrays) -> KnownCells:
+    at = _ascending("cell", arrays, grid.cells)
+    return KnownCells(grid.shape, at, *(_of_cells(name, arrays) for name in ("probed_steps", "points")))
+
+
+def _layers(stored: Sequence[dict[str, Any]], arrays: Arrays) -> list[Layer]:
     quantities = [Quantity(**quantity) for quantity in stored]
-    for quantity in quantities:
-        _check_shape(quantity.key, grid, arrays)
-    return [Layer(quantity, torch.from_numpy(arrays[quantity.key])) for quantity in quantities]
+    return [Layer(quantity, _of_cells(quantity.key, arrays)) for quantity in quantities]
 
 
-def _check_shape(name: str, grid: BevGrid, arrays: Arrays) -> None:
-    if arrays[name].shape != grid.shape:
-        raise ValueError(f"{name} has shape {arrays[name].shape}, the grid {grid.shape}")
+def _of_cells(name: str, arrays: Arrays) -> Tensor:
+    if arrays[name].shape != arrays["cell"].shape:
+        raise ValueError(f"{name} has shape {arrays[name].shape}, the cells {arrays['cell'].shape}")
+    return torch.from_numpy(arrays[name])
+
+
+def _ascending(name: str, arrays: Arrays, end: int) -> Tensor:
+    at = arrays[name].astype(np.int64)
+    if not (at.ndim == 1 and (np.diff(at) > 0).all() and 0 <= at.min(initial=0) <= at.max(initial=0) < max(end, 1)):
+        raise ValueError(f"{name}: numbers of cells in ascending order, below {end}, are needed")
+    return torch.from_numpy(at)
+
+
+def _short(at: NDArray[Any], end: int) -> NDArray[Any]:
+    return at.astype(np.uint32 if end < 2**32 else np.int64)
 
 
 def _region(stored: Mapping[str, Any]) -> Region:
@@ -198,29 +220,19 @@ def _region(stored: Mapping[str, Any]) -> Region:
 
 
 def _listed(blocks: BlockSums, names: Sequence[str]) -> Arrays:
-    kind = np.uint32 if math.prod(blocks.shape) < 2**32 else np.int64
     arrays = [each.cpu().numpy() for each in (blocks.steps, blocks.at, blocks.base, blocks.listed)]
-    arrays[1] = arrays[1].astype(kind)
+    arrays[1] = _short(arrays[1], math.prod(blocks.shape))
     return dict(zip(names, arrays, strict=True))
 
 
 def _read_listed(
     of: type[BlockSumsT], names: Sequence[str], header: dict[str, Any], grid: BevGrid, arrays: Arrays
 ) -> BlockSumsT:
-    steps, at, base, sums = (arrays[name] for name in names)
+    steps, _, base, sums = (arrays[name] for name in names)
     if steps.shape != (header["blocks"],):
         raise ValueError(f"the steps of {header['blocks']} blocks have shape {steps.shape}")
     shape = (len(steps), *grid.shape)
-    at = at.astype(np.int64)
-    fits = at.ndim == 1 and base.shape == at.shape and sums.shape[1:] == at.shape and (np.diff(at) > 0).all()
-    if not (fits and 0 <= at.min(initial=0) <= at.max(initial=0) < math.prod(shape)):
-        raise ValueError(f"sums of shape {sums.shape} at {at.shape} cells do not fit into {shape}")
-    return of(torch.from_numpy(steps), shape, *map(torch.from_numpy, (at, base, sums)))
-
-
-def _check_spread(grid: BevGrid, arrays: Arrays) -> None:
-    """Maps of errors spread the lists of the blocks over all cells of all blocks."""
-    blocks = max((len(arrays[names[0]]) for names in (IN_BLOCKS, OVER_AREA) if names[0] in arrays), default=0)
-    listed = [arrays[name] for names in (IN_BLOCKS, OVER_AREA) for name in names[2:] if name in arrays]
-    spread_bytes = blocks * grid.cells * sum(math.prod(one.shape[:-1]) * one.itemsize for one in listed)
-    check_memory(spread_bytes + sum(array.nbytes for array in arrays.values()))
+    at = _ascending(names[1], arrays, math.prod(shape))
+    if not (base.shape == at.shape == sums.shape[1:] and np.isin(at % grid.cells, arrays["cell"]).all()):
+        raise ValueError(f"sums of shape {sums.shape} at {tuple(at.shape)} cells do not fit into {shape}")
+    return of(torch.from_numpy(steps), shape, at, *map(torch.from_numpy, (base, sums)))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from torchcover.coverage.blocks import Blocks, BlockSums
+from torchcover.coverage.blocks import Blocks, BlockSums, KnownCells
 from torchcover.coverage.regions import Region
 from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Estimate, Quantity, ratio_errors
 
@@ -25,14 +25,15 @@ def estimate_known(coverage: "Coverage", region: Region, height: str) -> Estimat
     Returns:
         NaN where no cell is known.
     """
-    band, cells, blocks = coverage.band_of(height), coverage.known_cells(region, height), coverage.blocks
-    probed = coverage.probed_steps[band][cells]
-    sums = probed * torch.stack([coverage.layers[one.key].values[band][cells] for one in coverage.quantities])
+    cells, band, blocks = coverage.cells_of(region), coverage.band_of(height), coverage.blocks
+    known = coverage.known.within(cells, band)
+    probed = coverage.known.probed_steps[known]
+    sums = probed * torch.stack([coverage.listed[one.key].values[known] for one in coverage.quantities])
     whole = known_mean(probed, sums)
     if blocks is None:
         return Estimate.of(coverage.quantities, whole)
     used = blocks.steps.nonzero().flatten().tolist()
-    own_probed, own_sums = blocks.spread_over(_in_band(blocks, band, cells))
+    own_probed, own_sums = blocks.spread_over(cells, band)
     left_out = [known_mean(probed - own_probed[block], sums - own_sums[:, block]) for block in used]
     without = torch.stack(left_out) if left_out else whole[None][:0]
     return Estimate(coverage.quantities, whole, without, blocks.steps[used], partial(_known_again, blocks, band, cells))
@@ -76,8 +77,7 @@ def area_in_blocks(coverage: "Coverage", region: Region, height: str) -> tuple[T
             f"region {region.name!r}: no points were summed up over it, and cells of {coverage.grid.cell:g} m cannot "
             "tell, for its edges are not theirs; ask for it when measuring, or move its edges"
         )
-    cells = region.mask(coverage.grid).to(coverage.area.at.device)
-    return coverage.area.steps, coverage.area.over(_in_band(coverage.area, coverage.band_of(height), cells))
+    return coverage.area.steps, coverage.area.over(coverage.cells_of(region), coverage.band_of(height))
 
 
 def estimate_redundancy(coverage: "Coverage", region: Region, height: str) -> Estimate:
@@ -86,34 +86,26 @@ def estimate_redundancy(coverage: "Coverage", region: Region, height: str) -> Es
     By area they are unknown where the metric was not told of the region. Over known cells they have no errors.
     """
     assert coverage.redundancy is not None
-    layers = coverage.redundancy.layers.values()
+    layers = coverage.redundancy.listed.values()
     quantities = (*coverage.quantities, *(layer.quantity for layer in layers))
     place = coverage.place_of(region, height)
     if coverage.places is not None and place is not None:
         return coverage.places.estimate(quantities, place)
     if coverage.measure == "area":
-        return Estimate.of(quantities, coverage.radius.new_full((len(quantities),), math.nan))
-    band, known = coverage.band_of(height), coverage.known_cells(region, height)
-    own = torch.stack([layer.values[band][known].mean() for layer in layers])
+        return Estimate.of(quantities, torch.full((len(quantities),), math.nan, dtype=torch.float64))
+    known = coverage.known_in(region, height)
+    own = torch.stack([layer.values[known].mean() for layer in layers])
     return Estimate.of(quantities, torch.cat([coverage.estimate(region, height).value, own]))
 
 
-def errors_of_cells(quantities: Sequence[Quantity], blocks: BlockSums) -> dict[str, Tensor]:
-    """Key of each quantity -> (H, Y, X) standard errors of its map; NaN where too few blocks probed."""
-    where = blocks.known_in() >= MIN_BLOCKS_OF_A_CELL
-    base, sums = blocks.spread_over(where)
-    errors = {}
+def errors_of_cells(quantities: Sequence[Quantity], known: KnownCells, blocks: BlockSums) -> dict[str, Tensor]:
+    """Key of each quantity -> (K,) standard errors in the known cells; NaN where too few blocks probed."""
+    cells, base, sums = blocks.spread_where(MIN_BLOCKS_OF_A_CELL)
+    where, errors = torch.searchsorted(known.at, cells), {}
     for quantity, own in zip(quantities, sums, strict=True):
-        errors[quantity.key] = sums.new_full(blocks.shape[1:], math.nan)
+        errors[quantity.key] = sums.new_full((len(known.at),), math.nan)
         errors[quantity.key][where] = ratio_errors(base, own, quantity.unit)
     return errors
-
-
-def _in_band(blocks: BlockSums, band: int, cells: Tensor) -> Tensor:
-    """(H, Y, X) bool: these cells in this band."""
-    chosen = torch.zeros(blocks.shape[1:], dtype=torch.bool, device=cells.device)
-    chosen[band] = cells
-    return chosen
 
 
 def known_mean(probed: Tensor, sums: Tensor) -> Tensor:
@@ -131,7 +123,7 @@ def _known_again(blocks: Blocks, band: int, cells: Tensor, weights: Tensor) -> T
     """(R, Q) the same if the blocks in use come as often as (R, g) they are weighted."""
     used = blocks.steps > 0
     # Not kept with the estimate: for all regions it is as large as the sums of the run.
-    probed, sums = blocks.spread_over(_in_band(blocks, band, cells))
+    probed, sums = blocks.spread_over(cells, band)
     steps = weights @ probed[used].double()
     known = steps > 0
     means = (weights @ sums[:, used]) / steps.where(known, 1.0)

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from torchcover.coverage.aggregations import Aggregation, Layer, MeanOfMeans, VisibleArea
-from torchcover.coverage.blocks import AreaSums, Blocks
-from torchcover.coverage.columns import Columns, Sums
+from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
+from torchcover.coverage.blocks import AreaSums, Blocks, KnownCells
+from torchcover.coverage.columns import CellSums, Columns
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.measures import Measure
 from torchcover.coverage.plotting import draw_coverage
@@ -265,14 +265,8 @@ class CoverageMetric(SumsInBlocks):
         whole = added_up(torch.cat([table[:, :1] % cells, table[:, 1:]], dim=1), self._columns.maxima)
         at, sums = whole[:, 0].long(), self._columns.read(whole[:, 1:].T)
 
-        def spread(values: Tensor, nothing: float = math.nan) -> Tensor:
-            return values.new_full((cells,), nothing).index_copy_(0, at, values).view(self.grid.shape)
-
-        def layers(of: Sequence[Aggregation]) -> list[Layer]:
-            found = [layer for one in of for layer in sums.layers(one, self.max_radius)]
-            return [Layer(layer.quantity, spread(layer.values)) for layer in found]
-
-        failures = layers([self._failures] if self._failures else [])
+        known = KnownCells(self.grid.shape, at, sums.probed_steps.long(), sums.points.long())
+        failures = sums.layers(self._failures, self.max_radius) if self._failures else []
         in_blocks = self._columns.read(table[:, 1:].T)
         listed = self.block_steps.clone(), (self.blocks, *self.grid.shape), table[:, 0].long()
         mean, area = (in_blocks.of.get(kind.name, {}) for kind in (MeanOfMeans, VisibleArea))
@@ -280,19 +274,20 @@ class CoverageMetric(SumsInBlocks):
             grid=self.grid,
             thresholds=self.thresholds,
             max_radius=self.max_radius,
-            probed_steps=spread(sums.probed_steps.long(), 0),
-            points=spread(sums.points.long(), 0),
-            layers=layers(self._of_grid),
+            known=known,
+            layers=[layer for one in self._of_grid for layer in sums.layers(one, self.max_radius)],
             blocks=Blocks(*listed, in_blocks.probed_steps.long(), mean["sums"]) if self.blocks > 1 else None,
             area=AreaSums(*listed, area["m2"], area["sums"]) if area else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
             regions=self.regions,
             places=self._by_area(),
             aggregated=self._numbers(),
-            redundancy=Redundancy(self.sensors, {one.quantity.key: one for one in failures}) if failures else None,
+            redundancy=Redundancy(self.sensors, known, {one.quantity.key: one for one in failures})
+            if failures
+            else None,
         )
 
-    def _in_places(self, *, fine: bool) -> Sums:
+    def _in_places(self, *, fine: bool) -> CellSums:
         """The sums of (..., B, P) places in blocks, the fine ones or the others."""
         together = 1 if fine else min(int(self.block_length), FINER)  # so many fine blocks are one
         blocks, count = self.fine_blocks if fine else self.blocks, self._places.count

@@ -2,12 +2,17 @@
 
 import math
 from collections.abc import Mapping
+from operator import attrgetter
 
 import torch
 
+from torchcover.coverage.mixture import Mixture
 from torchcover.coverage.regions import Region
 from torchcover.coverage.result import Coverage
 from torchcover.estimation import Difference
+
+# What there is an estimate of, in each region and band.
+PARTS = attrgetter("estimate"), attrgetter("estimate_aggregated")
 
 
 def check_paired(coverages: Mapping[str, Coverage]) -> None:
@@ -37,13 +42,16 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
 
 
 def _same_steps(a: Coverage, b: Coverage) -> bool:
-    same = torch.equal(a.points, b.points) and a.counts["steps"] == b.counts["steps"]
+    same = torch.equal(a.known.at, b.known.at) and torch.equal(a.known.points, b.known.points)
+    same = same and a.counts["steps"] == b.counts["steps"]
     if a.blocks is None or b.blocks is None:
         return same and a.blocks is b.blocks
     return same and torch.equal(a.blocks.steps, b.blocks.steps)
 
 
-def differences(coverages: Mapping[str, Coverage], region: Region, height: str) -> dict[str, dict[str, Difference]]:
+def differences(
+    coverages: Mapping[str, Coverage | Mixture], region: Region, height: str
+) -> dict[str, dict[str, Difference]]:
     """The differences of every rig, the first one too, to the first.
 
     Args:
@@ -56,18 +64,18 @@ def differences(coverages: Mapping[str, Coverage], region: Region, height: str) 
     """
     first = next(iter(coverages.values()))
     found: dict[str, dict[str, Difference]] = {name: {} for name in coverages}
-    for part in (Coverage.estimate, Coverage.estimate_aggregated):
-        expected = part(first, region, height)
+    for part in PARTS:
+        expected = part(first)(region, height)
         for name, coverage in coverages.items():
-            found[name] |= part(coverage, region, height).differences(expected)
+            found[name] |= part(coverage)(region, height).differences(expected)
     return found
 
 
-def leaders(coverages: Mapping[str, Coverage], region: Region, height: str) -> dict[str, str]:
+def leaders(coverages: Mapping[str, Coverage | Mixture], region: Region, height: str) -> dict[str, str]:
     """Key of a quantity -> the rig that is best in it, where its lead over the next is more than chance."""
     found = {}
-    for part in (Coverage.estimate, Coverage.estimate_aggregated):
-        each = {rig: part(coverage, region, height) for rig, coverage in coverages.items()}
+    for part in PARTS:
+        each = {rig: part(coverage)(region, height) for rig, coverage in coverages.items()}
         for at, quantity in enumerate(next(iter(each.values())).quantities):
             gains = {rig: quantity.gain(float(estimate.value[at])) for rig, estimate in each.items()}
             ranked = sorted((rig for rig in gains if not math.isnan(gains[rig])), key=gains.__getitem__)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, BinnedStep, Layer, State
+from torchcover.coverage.blocks import KnownCells, Maps
 from torchcover.coverage.quantity import RADIUS, detection, seen_by_two, sensors_seeing, without
 from torchcover.estimation import Quantity
 
@@ -18,14 +19,26 @@ class Redundancy:
 
     Args:
         sensors: Their names.
-        layers: Over the grid, by the key of their quantity: for each threshold by how many sensors the points of a
+        known: The cells that it is known of.
+        listed: In these, by the key of their quantity: for each threshold by how many sensors the points of a
             cell are seen ("sensors_0.4m") and the share that two or more see ("seen_by_two_0.4m"); for each sensor the
             radius and the detection without it ("radius_m_without_roof"). By area if the coverage is, else means of
             means.
     """
 
     sensors: tuple[str, ...]
-    layers: Mapping[str, Layer]
+    known: KnownCells
+    listed: Mapping[str, Layer]
+
+    @property
+    def layers(self) -> Mapping[str, Layer]:
+        """The same over the grid."""
+        return layers_of(self.listed, self.known)
+
+
+def layers_of(listed: Mapping[str, Layer], known: KnownCells) -> Mapping[str, Layer]:
+    """Layers over the grid from those over the known cells."""
+    return Maps(listed, lambda layer: Layer(layer.quantity, known.spread(layer.values)))
 
 
 def redundancy_quantities(sensors: Sequence[str], thresholds: Sequence[float]) -> tuple[Quantity, ...]:

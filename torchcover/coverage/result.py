@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Layer, MeanOfMeans
-from torchcover.coverage.blocks import AreaSums, Blocks
+from torchcover.coverage.blocks import AreaSums, Blocks, KnownCells, Maps
 from torchcover.coverage.coverage_file import CoverageParts, read_coverage, write_coverage
 from torchcover.coverage.grid import BandFrame, BevGrid
 from torchcover.coverage.measures import Measure, errors_of_cells, estimate_area, estimate_known, estimate_redundancy
 from torchcover.coverage.quantity import RADIUS, by_area, over_known
-from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
+from torchcover.coverage.redundancy import Redundancy, layers_of, redundancy_quantities
 from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
 from torchcover.coverage.regions import Places, Region, check_regions, regions_within
 from torchcover.coverage.summary import RegionSummary, summarise
@@ -28,15 +28,16 @@ from torchcover.files import write_durably
 class Coverage:
     """Coverage maps of a run: what `CoverageMetric.compute` returns.
 
-    Arrays have the grid's shape (H, Y, X). An unknown cell, which no reference point ever probed, is NaN with count 0.
+    It is kept of the K known cells, which a reference point has probed; arrays over all cells have the grid's shape
+    (H, Y, X), are made when they are asked for, and are NaN with count 0 where nothing is known.
 
     Args:
         grid: Cells and height bands.
         thresholds: Detection thresholds in metres.
         max_radius: Saturation of the radius in metres.
-        probed_steps: (H, Y, X) int64 steps that had a reference point in the cell.
-        points: (H, Y, X) int64 reference points in the cell.
-        layers: What was measured: the mean radius, the detection at each threshold, then those of other aggregations.
+        known: The known cells, with their steps and points.
+        layers: What was measured of them, (K,) each: the mean radius, the detection at each threshold, then those of
+            other aggregations.
         counts: What happened on the way, one number for each name in `COUNTS`.
         blocks: The sums in blocks of contiguous steps, if errors were asked for.
         area: The sums over the visible surface, if the reference points had square metres.
@@ -47,7 +48,7 @@ class Coverage:
         redundancy: What each sensor of the rig adds, if the metric was told of the sensors.
 
     Attributes:
-        layers: By the key of their quantity: `coverage.layers["radius_m"].values`.
+        listed: The layers over the known cells, by the key of their quantity.
     """
 
     COUNTS: ClassVar[tuple[str, ...]] = (
@@ -66,8 +67,7 @@ class Coverage:
         grid: BevGrid,
         thresholds: Sequence[float],
         max_radius: float,
-        probed_steps: Tensor,
-        points: Tensor,
+        known: KnownCells,
         layers: Iterable[Layer],
         counts: Mapping[str, int],
         blocks: Blocks | None = None,
@@ -80,9 +80,8 @@ class Coverage:
         self.grid = grid
         self.thresholds = tuple(thresholds)
         self.max_radius = max_radius
-        self.probed_steps = probed_steps
-        self.points = points
-        self.layers: Mapping[str, Layer] = {layer.quantity.key: layer for layer in layers}
+        self.known = known
+        self.listed: Mapping[str, Layer] = {layer.quantity.key: layer for layer in layers}
         self.counts = dict(counts)
         self.blocks = blocks
         self.area = area
@@ -93,8 +92,23 @@ class Coverage:
         self._estimates: dict[tuple[Region, str, Measure], Estimate] = {}
 
     def __repr__(self) -> str:
-        known = float((self.probed_steps > 0).double().mean())
-        return f"Coverage({self.grid.shape} cells, {self.counts['steps']} steps, {known:.1%} of the cells known)"
+        known = f"{len(self.known.at) / self.grid.cells:.1%} of the cells known"
+        return f"Coverage({self.grid.shape} cells, {self.counts['steps']} steps, {known})"
+
+    @property
+    def layers(self) -> Mapping[str, Layer]:
+        """(H, Y, X) each, by the key of their quantity: `coverage.layers["radius_m"].values`."""
+        return layers_of(self.listed, self.known)
+
+    @property
+    def probed_steps(self) -> Tensor:
+        """(H, Y, X) int64 steps that had a reference point in the cell."""
+        return self.known.spread(self.known.probed_steps, 0)
+
+    @property
+    def points(self) -> Tensor:
+        """(H, Y, X) int64 reference points in the cell."""
+        return self.known.spread(self.known.points, 0)
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
@@ -114,16 +128,21 @@ class Coverage:
     @property
     def detection(self) -> Tensor:
         """(T, H, Y, X) float64 detection probability at each threshold."""
-        return self._stacked({key: layer.values for key, layer in self.layers.items()})
+        return self._stacked([self.listed[quantity.key].values for quantity in self.quantities[1:]])
 
-    @cached_property
+    @property
     def errors(self) -> Mapping[str, Tensor]:
         """Key of a quantity -> (H, Y, X) standard errors; NaN where too few blocks probed, empty without blocks."""
+        return Maps(self.listed_errors, self.known.spread)
+
+    @cached_property
+    def listed_errors(self) -> Mapping[str, Tensor]:
+        """Key of a quantity -> (K,) standard errors in the known cells."""
         if self.blocks is None:
             return {}
-        errors = errors_of_cells(self.quantities, self.blocks)
+        errors = errors_of_cells(self.quantities, self.known, self.blocks)
         if self.area is not None:
-            each = errors_of_cells(self.quantities, self.area)
+            each = errors_of_cells(self.quantities, self.known, self.area)
             errors |= {by_area(one).key: each[one.key] for one in self.quantities}
         return errors
 
@@ -135,12 +154,12 @@ class Coverage:
     @property
     def detection_error(self) -> Tensor | None:
         """(T, H, Y, X) standard error of `detection`, likewise."""
-        return self._stacked(self.errors) if self.errors else None
+        errors = self.listed_errors
+        return self._stacked([errors[quantity.key] for quantity in self.quantities[1:]]) if errors else None
 
-    def _stacked(self, by_key: Mapping[str, Tensor]) -> Tensor:
+    def _stacked(self, each: Sequence[Tensor]) -> Tensor:
         """(T, H, Y, X) one entry for each threshold."""
-        each = [by_key[quantity.key] for quantity in self.quantities[1:]]
-        return torch.stack(each) if each else self.radius.new_empty((0, *self.grid.shape))
+        return torch.stack(list(map(self.known.spread, each))) if each else self.radius.new_empty((0, *self.grid.shape))
 
     def summary(self, regions: Sequence[Region] | None = None) -> list[RegionSummary]:
         """One row for each region and height band.
@@ -247,13 +266,13 @@ class Coverage:
         return {key: value for row in rows for key, value in row.scalars(errors=self.blocks is not None).items()}
 
     def save(self, path: str | Path) -> None:
-        """Write everything to one `.npz` file, which NumPy reads too: maps and their errors by key, and the blocks.
+        """Write everything to one `.npz` file, which NumPy reads too: lists over the known cells, and the blocks.
 
         What `load` gives back has the same numbers, errors and differences to the last bit.
         """
-        given = {name: getattr(self, name) for name in CoverageParts.__annotations__}
-        parts = cast("CoverageParts", given | {"layers": list(self.layers.values())})
-        write_durably(Path(path), partial(write_coverage, parts, self.errors))
+        given = {name: getattr(self, name) for name in CoverageParts.__annotations__ if name != "layers"}
+        parts = cast("CoverageParts", given | {"layers": list(self.listed.values())})
+        write_durably(Path(path), partial(write_coverage, parts, self.listed_errors))
 
     @classmethod
     def load(cls, path: str | Path) -> "Coverage":
@@ -271,9 +290,13 @@ class Coverage:
         self.band_of(height)
         return Places(self.regions, self.grid).number_of(region, height)
 
-    def known_cells(self, region: Region, height: str) -> Tensor:
-        """(Y, X) bool: the known cells of a region in a band."""
-        return region.mask(self.grid).to(self.radius.device) & (self.probed_steps[self.band_of(height)] > 0)
+    def cells_of(self, region: Region) -> Tensor:
+        """(Y, X) bool: the cells of a region."""
+        return region.mask(self.grid).to(self.known.at.device)
+
+    def known_in(self, region: Region, height: str) -> Tensor:
+        """(K,) bool: which of the known cells lie in a region in a band."""
+        return self.known.within(self.cells_of(region), self.band_of(height))
 
     def band_of(self, height: str) -> int:
         """The number of a band; ValueError if there is none of this name."""

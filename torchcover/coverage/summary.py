@@ -85,9 +85,7 @@ class RegionSummary:
 
 def summarise(coverage: "Coverage", region: Region, height: str) -> RegionSummary:
     """The numbers of one region in one band."""
-    cells, known_cells = (
-        int(each.sum()) for each in (region.mask(coverage.grid), coverage.known_cells(region, height))
-    )
+    cells, known_cells = (int(each.sum()) for each in (coverage.cells_of(region), coverage.known_in(region, height)))
     numbers = partial(Estimate.numbers, count=known_cells, count_of="known cells")
     by_area, steps = coverage.measure == "area", coverage.counts["steps"]
     redundancy = coverage.redundancy

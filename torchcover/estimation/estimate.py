@@ -95,6 +95,7 @@ class Estimate:
         again: From (R, g) how often each block comes to (R, Q) what the numbers were then; None if that is unknown.
         effective: (Q,) how many blocks of equal weight would say as much: Kish's (sum of w)^2 / sum of w^2 over what is
             divided by in each. With fewer than 8 there is no interval. The number of blocks if not given.
+        strata: Of a mixture, the weights, which sum to 1, and what is mixed; empty of all else.
 
     Example:
         >>> detection = Quantity("detection_0.4m", "detection within 0.4 m", "share", lower_is_better=False)
@@ -118,6 +119,7 @@ class Estimate:
     steps: Tensor
     again: Callable[[Tensor], Tensor] | None = None
     effective: Tensor = None  # type: ignore[assignment]  # until the next line
+    strata: tuple[tuple[float, "Estimate"], ...] = ()
 
     def __post_init__(self) -> None:
         if self.effective is None:
@@ -158,8 +160,34 @@ class Estimate:
         values = again(torch.cat([once, 1.0 - torch.diag(once[0])]))
         return cls(tuple(quantities), values[0], values[1:], steps, again)
 
+    @classmethod
+    def mixed(cls, strata: Sequence[tuple[float, "Estimate"]]) -> "Estimate":
+        """The weighted mean of the same numbers of several strata, which are given and not drawn.
+
+        Its variance is the sum of theirs, times the squares of the weights; that has as many degrees of freedom as
+        Welch and Satterthwaite say. No stratum makes up for the blocks that another one lacks.
+
+        Args:
+            strata: Weights above 0 that sum to 1, and the numbers.
+
+        Example:
+            >>> radius = Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True)
+            >>> m2, metres = torch.ones(16, dtype=torch.float64), torch.arange(16.0, dtype=torch.float64)[:, None]
+            >>> low, high = (Estimate.of_ratios((radius,), m2, metres + more, m2) for more in (0.0, 10.0))
+            >>> mean, = Estimate.mixed([(0.5, low), (0.5, high)]).numbers().values()
+            >>> bool(mean.value == 12.5), round(mean.error / low.error.item(), 3)
+            (True, 0.707)
+        """
+        each = [one for _, one in strata]
+        value = torch.stack([weight * one.value for weight, one in strata]).sum(dim=0)
+        effective = torch.stack([one.effective for one in each]).amin(dim=0)
+        steps, left_out = torch.cat([one.steps for one in each]), torch.cat([one.left_out for one in each])
+        return cls(each[0].quantities, value, left_out, steps, None, effective, tuple(strata))
+
     def __getitem__(self, which: slice) -> "Estimate":
         """Some of the numbers."""
+        if self.strata:
+            return Estimate.mixed([(weight, one[which]) for weight, one in self.strata])
         again = None if self.again is None else partial(_some_again, self.again, which)
         some = self.value[which], self.left_out[:, which], self.steps, again, self.effective[which]
         return Estimate(self.quantities[which], *some)
@@ -194,7 +222,25 @@ class Estimate:
             least: Fewer blocks than these give none. Errors that are shown need 8; who only races rigs against each
                 other is content with 3 worlds.
         """
+        if self.strata:
+            return torch.stack([(weight * one.errors(least)) ** 2 for weight, one in self.strata]).sum(dim=0).sqrt()
         return jackknife_error(self.left_out, self.value, self.steps, least)
+
+    @property
+    def freedom(self) -> list[int]:
+        """(Q,) degrees of freedom of the errors: the blocks less one, or in a mixture what they come to."""
+        if not self.strata:
+            return [len(self.steps) - 1] * len(self.value)
+        variances = torch.stack([(weight * one.error) ** 2 for weight, one in self.strata])
+        most = torch.tensor([one.freedom for _, one in self.strata]).to(variances)
+        found = variances.sum(dim=0) ** 2 / (variances**2 / most).sum(dim=0)
+        return [int(each + 1e-9) for each in found.where(found.isfinite(), most.amin(dim=0)).tolist()]
+
+    @property
+    def _varies(self) -> Tensor:
+        """(Q,) whether blocks, in a mixture those of each stratum, say different things: else they prove nothing."""
+        each = [one.error > ROUND_OFF for _, one in self.strata] or [self.error > ROUND_OFF]
+        return torch.stack(each).all(dim=0)
 
     @property
     def has_intervals(self) -> list[bool]:
@@ -209,16 +255,19 @@ class Estimate:
             count: How many they are over.
             count_of: What these are.
         """
-        found, freedom = {}, len(self.steps) - 1
-        each = zip(self.quantities, self.value.tolist(), self.error.tolist(), self.has_intervals, strict=True)
-        for quantity, value, error, has_interval in each:
-            known = error if error > ROUND_OFF else math.nan  # blocks that all say the same prove nothing
-            ends = interval95(value, known if has_interval else math.nan, freedom, quantity)
-            found[quantity.key] = Number(quantity, value, known, *ends, count, count_of)
+        found, varies = {}, self._varies.tolist()
+        errors = [error if known else math.nan for error, known in zip(self.error.tolist(), varies, strict=True)]
+        numbers = self.quantities, self.value.tolist(), errors, self.has_intervals, self.freedom
+        for quantity, value, error, has_interval, freedom in zip(*numbers, strict=True):
+            ends = interval95(value, error if has_interval else math.nan, freedom, quantity)
+            found[quantity.key] = Number(quantity, value, error, *ends, count, count_of)
         return found
 
     def minus(self, other: "Estimate") -> "Estimate":
         """The difference to another rig over the same steps: what both share cancels out, block by block."""
+        if self.strata:
+            pairs = zip(self.strata, other.strata, strict=True)
+            return Estimate.mixed([(weight, one.minus(against)) for (weight, one), (_, against) in pairs])
         both = self.value - other.value, self.left_out - other.left_out, self.steps, None
         return Estimate(self.quantities, *both, torch.minimum(self.effective, other.effective))
 
@@ -233,21 +282,21 @@ class Estimate:
         # Two infinite numbers are equal; their difference would be NaN, which means unknown.
         values = (self.value - other.value).where(self.value != other.value, 0.0)
         between, blocks = self.minus(other), len(self.steps)
-        each = pseudo_values(between.left_out, between.value, self.steps)
+        parts = [one for _, one in between.strata] or [between]
+        each = torch.cat([pseudo_values(one.left_out, one.value, one.steps) for one in parts])
         found = {}
-        for at, (quantity, value, error) in enumerate(
-            zip(self.quantities, values.tolist(), between.error.tolist(), strict=True)
-        ):
+        numbers = self.quantities, values.tolist(), between.error.tolist(), between.freedom
+        for at, (quantity, value, error, freedom) in enumerate(zip(*numbers, strict=True)):
             judged = error if between.has_intervals[at] else math.nan
-            low, high = interval95(value, judged, blocks - 1, quantity, is_difference=True)
+            low, high = interval95(value, judged, freedom, quantity, is_difference=True)
             found[quantity.key] = Difference(
                 quantity=quantity,
                 value=value,
                 error=error,
                 low=low,
                 high=high,
-                significant=is_significant(value, judged, blocks - 1),
-                p=student_p(value / judged, blocks - 1) if judged > ROUND_OFF else math.nan,
+                significant=is_significant(value, judged, freedom),
+                p=student_p(value / judged, freedom) if judged > ROUND_OFF else math.nan,
                 blocks=blocks,
                 better=int((-each[:, at] if quantity.lower_is_better else each[:, at]).gt(ROUND_OFF).sum()),
             )

@@ -8,6 +8,7 @@ from .encountering import encounter_picture as encounter_picture
 from .encountering import save_encounters as save_encounters
 from .evaluating import compare as compare
 from .evaluating import evaluate as evaluate
+from .mixed import MixedResult as MixedResult
 from .observers import CoverageObserver as CoverageObserver
 from .observers import Observer as Observer
 from .observers import Stateful as Stateful

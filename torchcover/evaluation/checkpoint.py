@@ -67,6 +67,10 @@ class Checkpoint:
         """That of one of several processes that share a run: each has a file of its own."""
         return replace(self, path=self.path.with_stem(f"{self.path.stem}_rank{rank}")) if rank else self
 
+    def within(self, folder: str) -> Self:
+        """That of one of several runs whose results go to folders beside each other; kept until all are complete."""
+        return replace(self, path=self.path.parent / folder / self.path.name, keep=True)
+
 
 class Journal:
     """Keeps the checkpoint of one run.

@@ -41,9 +41,13 @@ def cores() -> int:
 
 
 def set_threads() -> None:
-    """Before torch is loaded: as many threads as cores, and none that spins; what the environment says, stays."""
+    """Before torch and NumPy are loaded: as many threads as cores, none that spins; what the environment says, stays.
+
+    NumPy's OpenBLAS has spinning threads of its own. They turn a matrix of three columns no sooner than one does.
+    """
     if not _is_said():
         os.environ["OMP_WAIT_POLICY"] = "passive"
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("OMP_NUM_THREADS", str(cores()))
 
 

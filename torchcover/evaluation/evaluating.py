@@ -6,6 +6,7 @@ from pathlib import Path
 from torchcover.coverage import Coverage
 from torchcover.evaluation.arguments import taking
 from torchcover.evaluation.measuring import measured
+from torchcover.evaluation.mixed import MixedResult, measured_in_each
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import distinct, task_of
@@ -22,7 +23,8 @@ def evaluate(settings: Settings) -> Result:
     Returns:
         Numbers, maps, and how the run went; of several rigs also the differences to the first, and whether they are
         more than chance. Whatever ends it after the first step, a bad frame, Ctrl-C or an error, is noted in
-        `result.run.failure`, with a RuntimeWarning, and what was measured until then is there.
+        `result.run.failure`, with a RuntimeWarning, and what was measured until then is there. Of several scenarios a
+        `MixedResult`: that of each, and the numbers of their mixture.
 
     Raises:
         ValueError: Settings that make no sense, not a single good frame, or a checkpoint of another run.
@@ -34,6 +36,8 @@ def evaluate(settings: Settings) -> Result:
         >>> result.coverage.counts["steps"], [row["region"] for row in result.summary][::2]
         (2, ['20m', '80m', '160m', 'front_3m', 'rear_3m', 'left_3m', 'right_3m'])
     """
+    if settings.mixture is not None:
+        return measured_in_each(settings)
     return measured(task_of(settings), settings)
 
 
@@ -43,7 +47,7 @@ def compare(results: Result | str | Path | Sequence[Result | str | Path]) -> Res
     Args:
         results: Results of `evaluate`, or `.npz` files of `Coverage.save`: two or more rigs that were measured in the
             same frames, by one call or by several of the same scenario, steps, seed and reference sensor. One result
-            of several rigs is enough.
+            of several rigs is enough. Of several scenarios, all of the same and with the same weights.
 
     Returns:
         As of `evaluate`, but how the runs went is unknown: `Result.run` is None.
@@ -59,7 +63,18 @@ def compare(results: Result | str | Path | Sequence[Result | str | Path]) -> Res
         >>> list(compare([low, high]).coverages)
         ['front_grille_128', 'front_roof_128']
     """
-    each = [results] if isinstance(results, Result | str | Path) else results
+    each = [results] if isinstance(results, Result | str | Path) else list(results)
+    if mixed := [one for one in each if isinstance(one, MixedResult)]:
+        weights = mixed[0].weights
+        if len(mixed) < len(each) or any(one.weights != weights for one in mixed):
+            raise ValueError(
+                "compare: results of the same scenarios with the same weights are needed, or none of several"
+            )
+        return MixedResult.of({name: _compared([one.worlds[name] for one in mixed]) for name in weights}, weights)
+    return _compared(each)
+
+
+def _compared(each: Sequence[Result | str | Path]) -> Result:
     measured_already = [one for given in each for one in _coverages(given)]
     names = distinct([name for name, *_ in measured_already])
     if len(names) < 2:

@@ -24,6 +24,7 @@ ELSEWHERE = ("rows", "metrics", "counts", "frame_counts", "left_out", "rig", "ri
 # What it is, how often it was left out, and of how many; the counts are those of the frames, added up.
 COUNTED = (
     ("moving bodies out of every sensor's range: not placed", "moving_bodies_out_of_range", "moving_bodies"),
+    ("road users of SUMO or a recording where bodies cannot be: not there", "road_users_left_out", "moving_bodies"),
     ("pairs of a ray and a moving body that cannot meet: not cast", "ray_body_pairs_left_out", "ray_body_pairs"),
     ("rays of sensors where nothing moves: cast once, for all steps", "sensor_rays_reused", "sensor_rays"),
     ("rays that end on the ego itself: known from the first scan", "sensor_self_hits_reused", "sensor_self_hits"),

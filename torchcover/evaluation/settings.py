@@ -3,11 +3,13 @@
 Nothing heavy is imported here: the command line takes its options from it, and `--help` answers at once.
 """
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
+from functools import cached_property
 from numbers import Real
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from torchcover.evaluation.arguments import Option, Read, options_of
 from torchcover.simulation.memory import check_fits
@@ -24,6 +26,7 @@ if TYPE_CHECKING:
     from torchcover.simulation import RegionsOfInterest, Rig, Scenario, Weather
 
     AnyRig = Rig | str | Path
+    AnyScenario = Scenario | str | Path
 
 DEFAULT_SCENARIO = "courtyard"
 DEFAULT_STEPS = 64
@@ -58,6 +61,49 @@ def _rigs(given: "AnyRig | Sequence[AnyRig] | None") -> "tuple[AnyRig, ...]":
     if given is None:
         return ()
     return (given,) if isinstance(given, str) or not isinstance(given, Sequence) else tuple(given)
+
+
+def _mixture(given: object) -> "dict[str, tuple[AnyScenario, float]] | None":
+    """Several scenarios and their shares.
+
+    Raises:
+        ValueError: One that is given twice, a recording, or weights that are no numbers, negative, or all 0.
+    """
+    if isinstance(given, str) and any(sign in given for sign in ",=") and not Path(given).exists():
+        parts = [part.strip().partition("=") for part in given.split(",")]
+        if len({sign for _, sign, _ in parts}) > 1:
+            raise ValueError(f"scenario {given}: every one needs a weight, or none")
+        given = {name: weight or 1.0 for name, _, weight in parts} if parts[0][1] else [name for name, *_ in parts]
+        if len(given) < len(parts):
+            raise ValueError(f"scenario: one of {', '.join(name for name, *_ in parts)} is given twice")
+    if isinstance(given, str) or not isinstance(given, Mapping | Sequence):
+        return None
+    weights = dict(given) if isinstance(given, Mapping) else {}
+    names = [_named(one) for one in given]
+    if len({name.lower() for name in names}) < len(names):
+        raise ValueError(f"scenario: one of {', '.join(names)} is given twice, or two are called alike")
+    try:
+        numbers = [float(weights.get(one, 1.0)) for one in given] if weights else [1.0] * len(names)
+    except (TypeError, ValueError):
+        numbers = []
+    if not (all(math.isfinite(number) and number >= 0.0 for number in numbers) and 0.0 < sum(numbers) < math.inf):
+        said = ", ".join(f"{name}={weight}" for name, weight in zip(names, weights.values(), strict=False))
+        raise ValueError(f"scenario: weights of 0 or more are needed, not all 0; got {said or 'no scenario'}")
+    return {name: (one, number / sum(numbers)) for name, one, number in zip(names, given, numbers, strict=True)}
+
+
+def _named(scenario: object) -> str:
+    """What a kind of world is called."""
+    if not isinstance(scenario, str | Path):
+        name: object = getattr(scenario, "name", None)
+        if not isinstance(name, str):
+            raise TypeError(f"scenario: names, paths or Scenario objects are needed; got {type(scenario).__name__}")
+        return name
+    if not str(scenario):
+        raise ValueError("scenario: one of several has no name")
+    if Path(scenario).is_dir():
+        raise ValueError(f"scenario {scenario}: a folder; a recording is no scenario: measure it apart, by `frames`")
+    return Path(scenario).stem if Path(scenario).suffix in (".yaml", ".yml") else str(scenario)
 
 
 def _thresholds(given: "float | Iterable[float]") -> tuple[float, ...]:
@@ -138,8 +184,14 @@ class Settings:
         "of its rigs, all if not given; or what its only one is, so that the maps show its sensors.",
     ] = Read(_rigs, None)
     scenario: Annotated[
-        "Scenario | str | Path | None",
-        Option("Scenario: a built-in name or a YAML file (courtyard).", str, in_study="once"),
+        "AnyScenario | Sequence[AnyScenario] | Mapping[str, float] | None",
+        Option(
+            "Scenario: a built-in name or a YAML file (courtyard). Or several kinds of world, each measured apart and "
+            "then mixed: `urban,highway`, with weights `urban=0.7,highway=0.3` (equal if not given); in Python also a "
+            "sequence, or a mapping to weights.",
+            str,
+            in_study="once",
+        ),
     ] = None
     _: KW_ONLY
     frames: Annotated[
@@ -302,6 +354,22 @@ class Settings:
             raise ValueError(f"sensor_model {self.sensor_model}: `ideal` or `real` is needed")
         if self.reference == "paper" and self.band_frame == "ground":
             raise ValueError("band_frame ground: the paper's reference has bands over z of the vehicle; leave it out")
+
+    @cached_property
+    def mixture(self) -> "Mapping[str, tuple[AnyScenario, float]] | None":
+        """Name of each scenario -> what was given, and its share; None of a single one."""
+        return _mixture(self.scenario)
+
+    @property
+    def one_scenario(self) -> "AnyScenario":
+        """The scenario, for what is done in one world.
+
+        Raises:
+            ValueError: There are several.
+        """
+        if self.mixture is not None:
+            raise ValueError(f"scenario: one at a time here; got {', '.join(self.mixture)} (`evaluate` takes several)")
+        return cast("AnyScenario", DEFAULT_SCENARIO if self.scenario is None else self.scenario)
 
     @property
     def simulated_steps(self) -> int:

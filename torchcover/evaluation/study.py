@@ -21,7 +21,7 @@ from torchcover.coverage import Coverage, Region
 from torchcover.coverage.grid import BandFrame
 from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, ErrorModel, Estimate, Quantity
 from torchcover.evaluation.measuring import measured
-from torchcover.evaluation.settings import DEFAULT_SCENARIO, OPTIONS, Settings
+from torchcover.evaluation.settings import OPTIONS, Settings
 from torchcover.evaluation.target_error import MIN_STEPS, rounded_up
 from torchcover.evaluation.task import simulation
 from torchcover.files import Publication, end_with_parent
@@ -74,7 +74,7 @@ class StudyPlan:
     @property
     def named(self) -> tuple[Any, ...]:
         """What the rig and the scenario were called."""
-        return (*self.settings.rigs, self.settings.scenario or DEFAULT_SCENARIO)
+        return (*self.settings.rigs, self.settings.one_scenario)
 
     @property
     def each(self) -> dict[str, Settings]:

@@ -11,7 +11,7 @@ from typing import Generic, NamedTuple, TypeVar
 from torchcover import __version__
 from torchcover.coverage.grid import BandFrame
 from torchcover.evaluation.observers import AnyObserver
-from torchcover.evaluation.settings import DEFAULT_SCENARIO, DEFAULT_STEPS, OPTIONS, Settings
+from torchcover.evaluation.settings import DEFAULT_STEPS, OPTIONS, Settings
 from torchcover.frames import ChosenRigs, FrameSource
 from torchcover.recordings import RecordedFrames
 from torchcover.simulation import (
@@ -123,7 +123,7 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
     Raises:
         ValueError, FileNotFoundError: As `task_of`.
     """
-    rigs, scenario = settings.rigs, DEFAULT_SCENARIO if settings.scenario is None else settings.scenario
+    rigs, scenario = settings.rigs, settings.one_scenario
     if not rigs:
         raise ValueError("which rig? Give a built-in name (see `torchcover list`) or a YAML file, or a recording")
     names = distinct_names(rigs)
@@ -145,6 +145,7 @@ def simulation(settings: Settings, *, boxes: bool = False) -> Task[SimulatedFram
         every_s=spread_s(world, settings.every_s),
         reference_sensor=reference_called(settings.reference, settings.rays, asked),
         boxes=boxes or settings.needs_boxes,
+        kept_bytes=0.0,  # steps come in order: no world is needed again
     )
     frames.simulator.check_run(frames.steps)
     # A path says more than the name within the file.

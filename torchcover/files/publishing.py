@@ -32,6 +32,8 @@ BEFORE = ".before.json"
 # What is aside of a publication that may be gone on with, and how far it is.
 PART = ".partial_to_go_on_with"
 NOTES = ".notes.jsonl"
+# Of pictures: with the usual 6, compressing one takes as long as drawing it, for a fifth less.
+PNG_LEVEL = 3
 
 # Folders that this process has claimed.
 _claims: list[Path] = []
@@ -195,7 +197,7 @@ class Publication:
 
     def add_figure(self, name: str, figure: "Figure") -> None:
         """Draw a figure aside."""
-        self.add(name, lambda path: figure.savefig(path, dpi=figure.dpi))
+        self.add(name, lambda path: figure.savefig(path, dpi=figure.dpi, pil_kwargs={"compress_level": PNG_LEVEL}))
 
     def note(self, record: Mapping[str, Any]) -> None:
         """Note that what was added until now is kept, and what else is to be known when this is gone on with."""

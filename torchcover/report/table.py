@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from torchcover.coverage import BevGrid, Coverage, Region, RegionSummary, check_paired, differences
+from torchcover.coverage import BevGrid, Coverage, Mixture, Region, RegionSummary, check_paired, differences
 from torchcover.coverage.measures import Measure
 from torchcover.coverage.paired import leaders
-from torchcover.estimation import Difference, Quantity
+from torchcover.estimation import MIN_BLOCKS, Difference, Quantity
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,15 @@ class CoverageTable:
 
     @classmethod
     def of(
-        cls, coverages: Mapping[str, Coverage], regions: Sequence[Region], notes: Sequence[str] = ()
+        cls,
+        coverages: Mapping[str, Coverage | Mixture],
+        regions: Sequence[Region],
+        notes: Sequence[str] = (),
     ) -> "CoverageTable":
         """Make the table of one rig, or of several that were measured together.
 
         Args:
-            coverages: What `CoverageMetric.compute` returned, by the name of the rig.
+            coverages: What `CoverageMetric.compute` returned, or mixtures of that, by the name of the rig.
             regions: Regions within the grid.
             notes: What else the numbers hold under.
 
@@ -86,8 +89,9 @@ class CoverageTable:
         """
         if not coverages:
             raise ValueError("a table needs at least one rig; got none")
-        if len(coverages) > 1:
-            check_paired(coverages)
+        for of_one_world in zip(*(_parts(coverage) for coverage in coverages.values()), strict=True):
+            if len(coverages) > 1:
+                check_paired(dict(zip(coverages, of_one_world, strict=True)))
         first = next(iter(coverages.values()))
         summaries = {rig: coverage.summary(regions) for rig, coverage in coverages.items()}
         rows = _rows(coverages, regions, summaries)
@@ -124,7 +128,9 @@ class CoverageTable:
 
 
 def _rows(
-    coverages: Mapping[str, Coverage], regions: Sequence[Region], summaries: Mapping[str, Sequence[RegionSummary]]
+    coverages: Mapping[str, Coverage | Mixture],
+    regions: Sequence[Region],
+    summaries: Mapping[str, Sequence[RegionSummary]],
 ) -> list[dict[str, Row]]:
     """For each region and band, the row of each rig."""
     first = next(iter(coverages.values()))
@@ -142,8 +148,15 @@ def _rows(
     return rows
 
 
-def _conditions(coverage: Coverage) -> Conditions:
-    blocks = coverage.blocks and (coverage.places or coverage.blocks)  # by area they are the fine ones
-    used = None if blocks is None else int((blocks.steps > 0).sum())
-    longest = None if blocks is None else int(blocks.steps.max())
-    return Conditions(dict(coverage.counts), used, longest, coverage.counts["inside_points"])
+def _parts(coverage: Coverage | Mixture) -> list[Coverage]:
+    """What was measured in each kind of world."""
+    return [coverage] if isinstance(coverage, Coverage) else [part for _, part in coverage.parts]
+
+
+def _conditions(coverage: Coverage | Mixture) -> Conditions:
+    """Of a mixture those of all kinds of world, but too few blocks of any of them are too few."""
+    each = [part.blocks and (part.places or part.blocks) for part in _parts(coverage)]  # by area they are the fine ones
+    used = [int((blocks.steps > 0).sum()) for blocks in each if blocks]
+    longest = [int(blocks.steps.max()) for blocks in each if blocks]
+    together = sum(used) if min(used, default=0) >= MIN_BLOCKS else min(used, default=None)
+    return Conditions(dict(coverage.counts), together, max(longest, default=None), coverage.counts["inside_points"])

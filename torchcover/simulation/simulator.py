@@ -326,6 +326,7 @@ def _counts_of(scene: Scene, instant: Instant, scans: Sequence[SensorScan], refe
         "reference_poses_redrawn": reference.redrawn,
         "moving_bodies": len(instant.moving) + instant.out_of_range,
         "moving_bodies_out_of_range": instant.out_of_range,
+        "road_users_left_out": scene.world.left_out,
         "ray_body_pairs": pairs,
         "ray_body_pairs_left_out": pairs - reference.body_casts - sum(scan.body_casts for scan in scans),
         "sensor_rays_reused": 0 if scene.moves else rays,

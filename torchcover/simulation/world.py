@@ -49,6 +49,7 @@ class World:
             that is not known: then `Scene.ground` finds it.
         coincident: For each static mesh (F,) which of its faces lie within 1 mm of others, of which one counts; empty
             if none do.
+        left_out: How many more road users the source of the traffic had near the ego, where bodies cannot be.
     """
 
     static: tuple[Mesh, ...]
@@ -59,6 +60,7 @@ class World:
     parked: tuple[Actor, ...] = ()
     ground: tuple[int, ...] | None = None
     coincident: tuple[NDArray[np.bool_], ...] = ()
+    left_out: int = 0
 
     @property
     def objects(self) -> tuple[Actor, ...]:

@@ -171,7 +171,7 @@ class CoverageCallback(Callback):
         self.metric.update([], [], weights=[])  # a process that was dealt nothing but padding has not updated yet
         coverage: Coverage = self.metric.compute()
         self.coverage = coverage
-        if not bool((coverage.probed_steps > 0).any()):
+        if not len(coverage.known.at):
             self._warn_once("no reference point lies in the grid: the coverage of these frames is unknown (NaN)")
         return coverage
 

@@ -157,6 +157,23 @@ def test_the_ground_is_below_the_tracks_within_centimetres(written):
     assert np.median(off_m) < 0.01
 
 
+@pytest.mark.parametrize("kind", ["table", "argoverse2"])
+def test_wheels_stand_on_slopes_whether_or_not_tilts_were_recorded(written, kind):
+    world = opened(written, kind)[0].world()
+    for actor in world.actors:
+        if actor.category not in ("car", "truck", "bus"):
+            continue
+        trajectory, length_m = actor.trajectory, np.ptp(actor.mesh.vertices_m[:, 0])
+        for time_s in trajectory.times_s[::4]:
+            pose = trajectory.at(time_s)
+            wheels_m = np.array([[along * length_m, across, 0.0] for along in (-0.3, 0.3) for across in (-0.8, 0.8)])
+            wheels_m = wheels_m @ pose[:3, :3].T + pose[:3, 3]
+            assert np.abs(wheels_m[:, 2] - hill_m(wheels_m[:, :2])).max() < 0.07
+    people = [actor for actor in world.actors if actor.category == "pedestrian"]
+    assert people
+    assert kind != "table" or not any(person.trajectory.angles_deg[:, 1:].any() for person in people)
+
+
 def test_the_ground_goes_on_beyond_the_tracks(written):
     world = opened(written, "argoverse2")[0].world()
     vertices_m = world.static[0].vertices_m

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from torchcover.files import BadFileError
-from torchcover.simulation.sumo.crowd import Walker
 from torchcover.simulation.sumo.floating import TimeWindow, read_floating, record
+from torchcover.simulation.sumo.motion import RoadUser, motions
 
 from .towns import drive, fcd, together, vehicle
 
@@ -20,16 +20,12 @@ def recorded(steps, window=ALL):
     ("angle", "yaw", "ahead"), [(90, 0, (1, 0)), (0, 90, (0, 1)), (270, 180, (-1, 0)), (180, -90, (0, -1))]
 )
 def test_places_are_those_of_the_front_and_angles_run_clockwise_from_north(angle, yaw, ahead):
-    track = recorded({0.0: [vehicle("a", 10.0, 20.0, angle, z=3.0)]}).tracks[0]
+    row = vehicle("a", 10.0, 20.0, angle, z=3.0)
+    track = recorded({0.0: [row], 1.0: [row]}).tracks[0]
     assert (track.yaw_deg[0] - yaw) % 360 == 0
-    body = Walker.of(track, "van", 6.0, (5.0, 2.0))
-    np.testing.assert_allclose(body.middle_m[0], np.array([10.0, 20.0]) - 3.0 * np.array(ahead), atol=1e-12)
+    (body,) = motions([RoadUser(track, "van", 6.0, (5.0, 2.0))], 1.0, np.zeros(2))
+    np.testing.assert_allclose(body.poses[0, :2], np.array([10.0, 20.0]) - 3.0 * np.array(ahead), atol=1e-12)
     assert track.places_m[0, 2] == 3.0
-
-
-def test_people_stand_where_they_are():
-    track = recorded({0.0: [vehicle("p", 1.0, 2.0, tag="person")]}).tracks[0]
-    np.testing.assert_array_equal(Walker.of(track, "adult", 0.2, (0.5, 0.5)).middle_m[0], [1.0, 2.0])
 
 
 def test_who_is_gone_in_between_or_jumps_has_several_tracks():
@@ -60,6 +56,22 @@ def test_a_window_begins_when_it_is_due_or_the_ego_is_there_and_reads_no_further
         raise AssertionError("asked for more than the window needs")
 
     assert record(pieces(), TimeWindow(0.0, 1.0)).last_s == 1.0
+
+
+def test_a_window_waits_for_a_vehicle_and_not_for_a_type_of_that_name():
+    rows = {t: row.replace('type="car"', 'type="ego"') for t, row in drive("a").items()}
+    steps = together(rows, {t: row for t, row in drive("ego").items() if t >= 1.0})
+    assert recorded(steps, TimeWindow(-np.inf, 1.0, "ego")).begin_s == 1.0
+
+
+def test_who_rides_is_inside():
+    walk = {t: vehicle("p", 40.0, -3.0, tag="person") for t in (0.0, 0.2, 0.4)}
+    ride = {t: vehicle("p", 50.0 + 10.0 * t, 0.0, tag="person") for t in drive() if 0.4 < t < 2.0}
+    on = {t: vehicle("p", 70.0, -3.0, tag="person") for t in drive() if t >= 2.0}
+    only = {t: vehicle("q", 50.0 + 10.0 * t, 0.0, tag="person") for t in drive()}
+    found = [track for track in recorded(together(drive(), walk | ride | on, only)).tracks if track.on_foot]
+    spans = [(track.name, round(track.times_s[0], 6), round(track.times_s[-1], 6)) for track in found]
+    assert spans == [("p", 0.0, 0.4), ("p", 2.0, 4.0)]
 
 
 def test_rows_may_have_different_attributes():

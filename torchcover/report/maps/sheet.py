@@ -25,6 +25,8 @@ BELOW_IN = 0.4
 # For a heading and the numbers of an axis.
 LABELS_IN = 0.55
 DOTS_PER_INCH = 150
+# Of maps, at least, so that a cell is whole pixels, and not more of them than are read: each is drawn and compressed.
+MIN_DOTS_PER_INCH = 110
 # Beyond this, cells are smaller than pixels and are averaged.
 MAX_DOTS_PER_INCH = 300
 COLOUR_BAR_IN = 0.16
@@ -68,7 +70,7 @@ def lay_out(grid: BevGrid, maps: int = 1) -> list[Sheet]:
     """
     _, rows, columns = grid.shape
     across, inches_per_cell = _arrange(grid, maps)
-    dpi = min(math.ceil(DOTS_PER_INCH * inches_per_cell) / inches_per_cell, MAX_DOTS_PER_INCH)
+    dpi = min(math.ceil(MIN_DOTS_PER_INCH * inches_per_cell) / inches_per_cell, MAX_DOTS_PER_INCH)
     map_in = inches_per_cell * np.array([columns, rows])
     # Gaps of whole pixels, so that every cell of every map is whole pixels.
     step_in = map_in + np.round(np.array([BESIDE_IN, BELOW_IN]) * dpi) / dpi

@@ -39,7 +39,7 @@ def asked_and_known(coverage: Coverage, ego_outline_m: Outline | None = None) ->
         ego_outline_m: (K, 2) corners x, y of the ego in metres.
     """
     grid = coverage.grid
-    known = (coverage.probed_steps > 0).any(dim=0)
+    known = coverage.known.spread(coverage.known.points > 0, False).any(dim=0)
     x, y = _held(known.any(dim=0), grid.x_edges_m, grid.x), _held(known.any(dim=1), grid.y_edges_m, grid.y)
     if coverage.regions:
         in_x = _both(x, (min(one.x[0] for one in coverage.regions), max(one.x[1] for one in coverage.regions)))

@@ -1,6 +1,7 @@
 """Ground below recorded tracks: a height field through the places on which road users stood."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import shapely
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import fitted
 from torchcover.simulation.height_field import CELL_M, MARGIN_M, Plain, Slopes, corners_of, middles_m
 from torchcover.simulation.traffic.assemble import HORIZON_M
+from torchcover.simulation.world import Actor
 
 Numbers = NDArray[np.float64]
 
@@ -16,6 +18,9 @@ Numbers = NDArray[np.float64]
 BEYOND_M = 25.0
 # Somebody who stays where it is counts once in so many metres, however long it was watched.
 STAYS_M = 1.0
+# Wheels are so far apart, as shares of the body; and what lies to the left of a direction.
+WHEELS = 0.6
+LEFT_OF = np.array([[0.0, 1.0], [-1.0, 0.0]])
 SCALES_M = tuple(CELL_M * factor for factor in (16.0, 8.0, 4.0, 2.0, 1.0))
 
 
@@ -61,3 +66,16 @@ def thinned(places_m: Numbers) -> Numbers:
 def stood_on(tracks: Sequence[Numbers]) -> Numbers:
     """(N, 3) all the places of some tracks, (K, 3) each, that say something new."""
     return np.concatenate([np.empty((0, 3)), *map(thinned, tracks)])
+
+
+def tilted(body: Actor, ground: Plain | Slopes) -> Actor:
+    """The body with the slope of the ground below its wheels, if its own was not recorded; people stand upright."""
+    own = body.trajectory
+    if isinstance(ground, Plain) or body.category == "pedestrian" or own.angles_deg[:, 1:].any():
+        return body
+    angles_deg, yaw = own.angles_deg.copy(), np.deg2rad(own.angles_deg[:, 0])
+    ahead, (length, width, _) = np.stack([np.cos(yaw), np.sin(yaw)], axis=1), np.ptp(body.mesh.vertices_m, axis=0)
+    for axis, way, apart_m, sign in ((1, ahead, WHEELS * length, -1), (2, ahead @ LEFT_OF, WHEELS * width, 1)):
+        over_m, under_m = (ground.heights_m(own.positions_m[:, :2] + end * apart_m / 2 * way) for end in (1, -1))
+        angles_deg[:, axis] = sign * np.rad2deg(np.arctan((over_m - under_m) / apart_m))
+    return replace(body, trajectory=replace(own, angles_deg=angles_deg))

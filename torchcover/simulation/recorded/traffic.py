@@ -17,8 +17,9 @@ from torchcover.recordings.formats.track_tables import read_trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects
 from torchcover.simulation.bodies import sound_mesh
 from torchcover.simulation.documents import PathBeside, Pose, builtin_hashes
+from torchcover.simulation.height_field import Plain, Slopes
 from torchcover.simulation.recorded.bodies import Bodies
-from torchcover.simulation.recorded.ground import ground_below, stood_on
+from torchcover.simulation.recorded.ground import ground_below, stood_on, tilted
 from torchcover.simulation.recorded.run import Excerpt, cast_of, excerpt_of, pieces, poses_at_all
 from torchcover.simulation.shapes import Mesh, MeshFile
 from torchcover.simulation.traffic.assemble import HORIZON_M
@@ -90,9 +91,15 @@ class RecordedTraffic(Traffic):
         drive = self._shown(run.drive)
         mesh = bodies["suv"] if ego is None else ego
         driver = Actor(EGO, "car", mesh, Trajectory(drive.times_s, drive.positions_m, drive.angles_deg))
-        others = self._apart(driver, list(self._actors(driver.trajectory, Bodies(bodies))))
-        ground = self._fitted(driver) if self.ground is None else self._read(self.ground)
-        return World((ground,), driver, tuple(others), self.time_step_s, run.duration_s, ground=(0,))
+        others = list(self._actors(driver.trajectory, Bodies(bodies)))
+        shown = self._apart(driver, others)
+        left_out = len(others) - len(shown)
+        if self.ground is None:
+            below = self._fitted(driver)
+            ground, driver, shown = below.mesh(), tilted(driver, below), [tilted(other, below) for other in shown]
+        else:
+            ground = self._read(self.ground)
+        return World((ground,), driver, tuple(shown), self.time_step_s, run.duration_s, ground=(0,), left_out=left_out)
 
     @cached_property
     def _objects(self) -> RecordedObjects:
@@ -166,7 +173,7 @@ class RecordedTraffic(Traffic):
         """The ground from a file."""
         return sound_mesh(MeshFile(type="mesh", path=ground), str(ground))
 
-    def _fitted(self, ego: Actor) -> Mesh:
+    def _fitted(self, ego: Actor) -> Plain | Slopes:
         """The ground below all road users of the recording."""
         standing = [track.trajectory.positions_m for track in self._run.others if track.vehicle_class is not None]
-        return ground_below(stood_on(standing), stood_on([ego.trajectory.positions_at(self._times_s)])).mesh()
+        return ground_below(stood_on(standing), stood_on([ego.trajectory.positions_at(self._times_s)]))

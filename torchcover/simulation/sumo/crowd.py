@@ -1,6 +1,5 @@
 """From tracks to bodies: which of ours stands for a type of SUMO, who is the ego, and who comes near it."""
 
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -10,16 +9,13 @@ from numpy.typing import NDArray
 
 from torchcover.files import feed_xml, reads
 from torchcover.simulation.sumo.floating import Recorded, SumoTrack
+from torchcover.simulation.sumo.motion import RoadUser
 from torchcover.simulation.traffic.assemble import HORIZON_M
-from torchcover.simulation.traffic.fleet import CATEGORIES, Fleet
+from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet
 from torchcover.simulation.traffic.vehicle_class import VehicleType
 
 Numbers = NDArray[np.float64]
 
-# Bodies are kept apart in plan; that much more lets them tilt.
-APART_M = 0.15
-# Egos that are tried, until one meets nobody.
-TRIES = 8
 PIECE_BYTES = 1 << 18
 
 # What SUMO takes for the length of a type that has none.
@@ -76,42 +72,11 @@ def types_of(paths: Sequence[Path]) -> dict[str, VehicleType]:
     return {name: found for path in paths for name, found in read_types(path).items()}
 
 
-class Walker(NamedTuple):
-    """Somebody as a body in plan.
-
-    Args:
-        track: Where it is.
-        kind: Of its body.
-        middle_m: (K, 2) its middle, at the times of the track.
-        size_m: Length and width.
-    """
-
-    track: SumoTrack
-    kind: str
-    middle_m: Numbers
-    size_m: tuple[float, float]
-
-    @classmethod
-    def of(cls, track: SumoTrack, kind: str, length_m: float, size_m: tuple[float, float]) -> "Walker":
-        """Its middle lies half of the simulation's length behind its front; people's places are their middles."""
-        yaw = np.deg2rad(track.yaw_deg)
-        back_m = 0.0 if track.on_foot else length_m / 2
-        middle_m = track.places_m[:, :2] - back_m * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-        return cls(track, kind, middle_m, size_m)
-
-    def at(self, times_s: Numbers) -> tuple[Numbers, Numbers]:
-        """(T, 2) places and (T,) headings; NaN where it is not there."""
-        own_s = self.track.times_s
-        yaw = np.unwrap(np.deg2rad(self.track.yaw_deg))
-        columns = [np.interp(times_s, own_s, axis, np.nan, np.nan) for axis in (*self.middle_m.T, yaw)]
-        return np.stack(columns[:2], axis=1), columns[2]
-
-
 class Crowd(NamedTuple):
     """The ego, and who comes near to it."""
 
-    ego: Walker
-    others: list[Walker]
+    ego: RoadUser
+    others: list[RoadUser]
 
 
 def crowd(
@@ -120,10 +85,10 @@ def crowd(
     fleet: Fleet,
     ego_name: str | None,
     ego_type: str | None,
-    times_s: Numbers,
+    duration_s: float,
     generator: np.random.Generator,
 ) -> Crowd:
-    """Choose the ego, and leave out whoever never comes near or is where the ego is.
+    """Choose the ego, and leave out whoever never comes near.
 
     Args:
         recorded: What the simulation had.
@@ -131,57 +96,40 @@ def crowd(
         fleet: Our bodies.
         ego_name: Which one the ego is; drawn if not given.
         ego_type: Of which type it is, if it is drawn; any car if not given.
-        times_s: (T,) the instants of the run.
+        duration_s: Of the run.
         generator: Draws the ego, in proportion to the ways that vehicles drive.
 
     Raises:
         ValueError: Nobody who may be the ego is there for the whole run.
     """
     lengths_m = {kind: fleet.length_m(kind) for kind in CATEGORIES}
-    walkers: list[Walker] = []
+    users: list[RoadUser] = []
     for track in recorded.tracks:
         found = type_of(track.kind, track.on_foot, known)
         kind = found.body(lengths_m)
         if kind is not None:
-            walkers.append(Walker.of(track, kind, found.length_m, (fleet.length_m(kind), fleet.width_m(kind))))
-    candidates = _candidates(walkers, recorded, ego_name, ego_type, float(times_s[-1]), generator)
-    best: tuple[Walker, list[Walker], list[Walker]] | None = None
-    for candidate in candidates[:TRIES]:
-        ego = candidate._replace(size_m=(fleet.length_m("ego"), fleet.width_m("ego")))
-        near = [other for other in walkers if other is not candidate and _comes_near(other, ego)]
-        met = [other for other in near if _overlap(ego, other, times_s)]
-        if best is None or len(met) < len(best[2]):
-            best = ego, near, met
-        if not met:
-            break
-    assert best is not None  # there is a candidate
-    ego, near, met = best
-    if met:
-        warnings.warn(
-            f"the simulation has {len(met)} of {len(near)} road users where the ego is at some time "
-            f"({', '.join(repr(other.track.name) for other in met[:3])}); they are left out",
-            stacklevel=2,
-        )
-    names = {other.track.name for other in met}
-    return Crowd(ego, [other for other in near if other.track.name not in names])
+            users.append(RoadUser(track, kind, found.length_m, (fleet.length_m(kind), fleet.width_m(kind))))
+    ego = _ego(users, recorded, ego_name, ego_type, duration_s, generator)
+    others = [other for other in users if other is not ego and _comes_near(other.track, ego.track)]
+    return Crowd(ego._replace(size_m=(fleet.length_m(EGO), fleet.width_m(EGO))), others)
 
 
-def _candidates(
-    walkers: Sequence[Walker],
+def _ego(
+    users: Sequence[RoadUser],
     recorded: Recorded,
     name: str | None,
     kind: str | None,
     duration_s: float,
     generator: np.random.Generator,
-) -> list[Walker]:
-    """Who may be the ego, in the order in which they are tried."""
+) -> RoadUser:
+    """Who is the ego: by name, or drawn."""
     begin_s, end_s = recorded.begin_s, recorded.begin_s + duration_s
     when = f"from t = {begin_s:g} to {end_s:g} s"
     if name is not None:
-        own = [walker for walker in walkers if walker.track.name == name and not walker.track.on_foot]
-        there = [walker for walker in own if walker.track.covers(duration_s)]
+        own = [user for user in users if user.track.name == name and not user.track.on_foot]
+        there = [user for user in own if user.track.covers(duration_s)]
         if there:
-            return there[:1]
+            return there[0]
         if not own:
             raise ValueError(f"ego_id: no vehicle {name!r} up to t = {recorded.last_s:g} s, where the data end")
         gone_s = begin_s + float(own[0].track.times_s[-1])
@@ -190,51 +138,24 @@ def _candidates(
             f"t = {gone_s:g} s; shorten duration_s to {max(gone_s - begin_s, 0.0):g}, or take another ego"
         )
     drivers = [
-        walker
-        for walker in walkers
-        if (walker.track.kind == kind if kind is not None else CATEGORIES[walker.kind] == "car")
+        user for user in users if (user.track.kind == kind if kind is not None else CATEGORIES[user.kind] == "car")
     ]
-    there = [walker for walker in drivers if walker.track.covers(duration_s) and not walker.track.on_foot]
+    there = [user for user in drivers if user.track.covers(duration_s) and not user.track.on_foot]
     if not there:
-        longest = max((float(np.ptp(walker.track.times_s)) for walker in drivers), default=0.0)
+        longest = max((float(np.ptp(user.track.times_s)) for user in drivers), default=0.0)
         who = f"vehicle of type {kind!r}" if kind is not None else "car"
         raise ValueError(
             f"no {who} that could be the ego is there all the time {when}: of {len(drivers)}, the longest drives "
             f"for {longest:g} s (data end at t = {recorded.last_s:g} s); change duration_s or begin_s"
         )
-    ways_m = np.array([np.linalg.norm(np.diff(walker.middle_m, axis=0), axis=1).sum() for walker in there]) + 1e-3
-    order = generator.choice(len(there), size=len(there), replace=False, p=ways_m / ways_m.sum())
-    return [there[number] for number in order.tolist()]
+    ways_m = [np.linalg.norm(np.diff(user.track.places_m[:, :2], axis=0), axis=1).sum() for user in there]
+    shares = np.array(ways_m) + 1e-3
+    return there[int(generator.choice(len(there), p=shares / shares.sum()))]
 
 
-def _comes_near(other: Walker, ego: Walker) -> bool:
+def _comes_near(other: SumoTrack, ego: SumoTrack) -> bool:
     """Whether the two are ever within the range of sensors, at the times of the other."""
-    if other.track.times_s is ego.track.times_s:
-        ego_m = ego.middle_m
-    else:
-        ego_m, _ = ego.at(other.track.times_s)
-    distance_m = np.linalg.norm(other.middle_m - ego_m, axis=1)
-    return bool((distance_m < HORIZON_M).any())
-
-
-def _overlap(ego: Walker, other: Walker, times_s: Numbers) -> bool:
-    """Whether two rectangles in plan do at any of some times, as no axis of either separates them."""
-    (ego_m, ego_yaw), (other_m, other_yaw) = ego.at(times_s), other.at(times_s)
-    between_m = other_m - ego_m
-    reach_m = (np.hypot(*ego.size_m) + np.hypot(*other.size_m)) / 2 + APART_M
-    close = np.flatnonzero(np.linalg.norm(between_m, axis=1) < reach_m)
-    if len(close) == 0:
-        return False
-    between_m, turn = between_m[close], (other_yaw - ego_yaw)[close]
-    cos, sin = np.abs(np.cos(turn)), np.abs(np.sin(turn))
-    apart = np.zeros(len(close), dtype=bool)
-    for yaw, own, its in ((ego_yaw[close], ego.size_m, other.size_m), (other_yaw[close], other.size_m, ego.size_m)):
-        forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
-        left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
-        length_m, width_m = its
-        for axis, half_m, reach in (
-            (forward, own[0] / 2, (length_m * cos + width_m * sin) / 2),
-            (left, own[1] / 2, (length_m * sin + width_m * cos) / 2),
-        ):
-            apart |= np.abs((between_m * axis).sum(axis=1)) > half_m + reach + APART_M
-    return bool(not apart.all())
+    ego_m = ego.places_m[:, :2]
+    if other.times_s is not ego.times_s:
+        ego_m = np.stack([np.interp(other.times_s, ego.times_s, axis, np.nan, np.nan) for axis in ego_m.T], axis=1)
+    return bool((np.linalg.norm(other.places_m[:, :2] - ego_m, axis=1) < HORIZON_M).any())

@@ -11,9 +11,11 @@ from torchcover.simulation.sumo.network import Network
 from torchcover.simulation.sumo.streets import DrawnStreets
 
 # Nobody is so much faster than what is allowed, nor walks faster.
-FASTER = 1.3
+FASTER = 1.1
 WALKING_MPS = 2.2
 SLOWEST_MPS = 1.0
+# They brake as drivers do who are not in an emergency.
+DRIVERS = f'decel="3.5" speedFactor="normc(1,0.1,0.8,{FASTER})"'
 # The ego is one of those who have its length; which one, is found out when they have driven.
 EGO_TYPE, EGOS = "ego", 8
 MAX_AGENTS = 20_000
@@ -49,7 +51,7 @@ def write_routes(
     kinds = {**TRAFFIC, EGO_TYPE: 0.0, "bus": 0.0, "cyclist": 0.0}
     rows = [
         f'<vType id="{kind}" vClass="{CLASSES.get(kind, "passenger")}" length="{sizes_m[kind][0]:.2f}" '
-        f'width="{sizes_m[kind][1]:.2f}"/>'
+        f'width="{sizes_m[kind][1]:.2f}" {DRIVERS}/>'
         for kind in kinds
     ]
     rows += [f'<vType id="{kind}" vClass="pedestrian"/>' for kind in PEOPLE]

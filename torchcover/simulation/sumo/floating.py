@@ -99,15 +99,26 @@ class _Collector:
         self._now = {"vehicle": [], "person": []}
         if np.isnan(self.begin_s):
             waits = self._window.from_name is not None and not any(
-                self._window.from_name in row for row in now.get("vehicle", ())
+                ("id", self._window.from_name) in zip(row[::2], row[1::2], strict=True)
+                for row in now.get("vehicle", ())
             )
             if waits or self.last_s < self._window.begin_s - TIME_SLACK_S or not np.isfinite(self.last_s):
                 return
             self.begin_s, self._end_s = self.last_s, self.last_s + self._window.duration_s
         self.times_s.append(self.last_s)
-        self.counts.append(sum(map(len, now.values())))
+        self.counts.append(0)
+        driven: set[tuple[str, str]] = set()
         for name, rows in now.items():
             columns = self._columns(rows)
+            places = list(zip(columns["x"], columns["y"], strict=True))
+            if name == "vehicle":
+                driven = set(places)
+            elif not driven.isdisjoint(places):  # who rides is told of where the vehicle is
+                rows = [row for row, place in zip(rows, places, strict=True) if place not in driven]  # noqa: PLW2901
+                if not rows:
+                    continue
+                columns = self._columns(rows)
+            self.counts[-1] += len(rows)
             for who, kind in zip(columns["id"], columns.get("type", ("",) * len(rows)), strict=True):
                 number = self.number.setdefault((name == "person", who), len(self.kinds))
                 if number == len(self.kinds):

@@ -1,15 +1,17 @@
 """Bodies on the ground: heights and tilts along their tracks, and cars in bays, lanes that nobody may use."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.height_field import Ground, Plain
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sumo.crowd import Walker
 from torchcover.simulation.sumo.ground import Pavement, tilts_deg
+from torchcover.simulation.sumo.motion import Motion, corners_m
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.assemble import attitude
 from torchcover.simulation.traffic.city import FREE_AT_CORNERS_M, PARKED, PARKED_GAP_M
@@ -27,52 +29,50 @@ STEP_S = 0.4
 
 
 class Placing:
-    """Puts bodies onto the ground, the pavement, or the deck of a bridge; `origin_m` is subtracted of all places."""
+    """Puts bodies onto the ground, the pavement, or the deck of a bridge."""
 
-    def __init__(self, ground: Ground, pavement: Pavement, origin_m: Numbers) -> None:
+    def __init__(self, ground: Ground, pavement: Pavement) -> None:
         self._ground = ground
         self._pavement = pavement
-        self._origin_m = origin_m
 
-    def actors(self, others: Sequence[Walker], fleet: Fleet, duration_s: float) -> tuple[Actor, ...]:
+    def actors(self, others: Sequence[Motion], fleet: Fleet, duration_s: float) -> tuple[Actor, ...]:
         """The others as actors, there for as long as they were in the simulation."""
         return tuple(
             Actor(
-                f"{other.kind} {other.track.name} {number}",
-                CATEGORIES[other.kind],
-                fleet.meshes[other.kind],
-                Trajectory(other.track.times_s, *self._poses(other), transient=not other.track.covers(duration_s)),
+                f"{motion.user.kind} {motion.user.track.name} {number}",
+                CATEGORIES[motion.user.kind],
+                fleet.meshes[motion.user.kind],
+                Trajectory(motion.times_s, *self._poses(motion), not motion.user.track.covers(duration_s)),
             )
-            for number, other in enumerate(others)
+            for number, motion in enumerate(others)
         )
 
-    def ego(self, ego: Walker, times_s: Numbers, mesh: Mesh, generator: np.random.Generator) -> Actor:
+    def ego(self, ego: Motion, times_s: Numbers, mesh: Mesh, generator: np.random.Generator) -> Actor:
         """The ego, with a body that tilts with braking and curves, too, at evenly spaced times."""
-        own_s = ego.track.times_s
-        places_m, angles_deg = self._poses(ego)
-        yaw_deg = np.rad2deg(np.unwrap(np.deg2rad(angles_deg[:, 0])))
-        x_m, y_m, z_m, yaw, pitch, roll = (
-            np.interp(times_s, own_s, column) for column in (*places_m.T, yaw_deg, *angles_deg[:, 1:].T)
-        )
+        columns = np.concatenate(self._poses(ego), axis=1).T
+        x_m, y_m, z_m, yaw, pitch, roll = (np.interp(times_s, ego.times_s, column) for column in columns)
         way_m = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x_m), np.diff(y_m)))])
         angles = attitude(times_s, way_m, np.gradient(way_m, times_s), yaw, generator)
         angles[:, 1:] += np.stack([pitch, roll], axis=1)
         return Actor(EGO, "car", mesh, Trajectory(times_s, np.stack([x_m, y_m, z_m], axis=1), angles))
 
-    def _poses(self, walker: Walker) -> tuple[Numbers, Numbers]:
-        """(K, 3) places and (K, 3) angles of a body at the times of its track."""
-        middle_m, yaw_deg = walker.middle_m - self._origin_m, walker.track.yaw_deg
-        on_foot, slope_deg = walker.track.on_foot, walker.track.slope_deg
-        back_m = 0.0 if on_foot else walker.size_m[0] / 2
+    def _poses(self, motion: Motion) -> tuple[Numbers, Numbers]:
+        """(K, 3) places and (K, 3) angles of a body."""
+        middle_m, yaw_deg = motion.poses[:, :2], np.rad2deg(motion.poses[:, 2])
+        track, size_m = motion.user.track, motion.user.size_m
+        back_m = 0.0 if track.on_foot else size_m[0] / 2
         heights_m = self._ground.heights_m(middle_m)
-        on_deck_m = walker.track.places_m[:, 2] - back_m * np.sin(np.deg2rad(slope_deg))
+        told_m, slope_deg = (
+            np.interp(motion.times_s, track.times_s, told) for told in (track.places_m[:, 2], track.slope_deg)
+        )
+        on_deck_m = told_m - back_m * np.sin(np.deg2rad(slope_deg))
         up = on_deck_m > heights_m + BRIDGE_M
         angles_deg = np.column_stack([yaw_deg, np.zeros((len(yaw_deg), 2))])
-        if on_foot:
+        if track.on_foot:
             raised_m = np.where(self._pavement.holds(middle_m) & ~up, PAVEMENT_M, 0.0)
-            heights_m = heights_m + _smooth(raised_m, walker.track.times_s)
+            heights_m = heights_m + _smooth(raised_m, motion.times_s)
         elif not isinstance(self._ground, Plain):
-            angles_deg[:, 1:] = tilts_deg(self._ground, middle_m, yaw_deg, walker.size_m)
+            angles_deg[:, 1:] = tilts_deg(self._ground, middle_m, yaw_deg, size_m)
             angles_deg[up, 1], angles_deg[up, 2] = -slope_deg[up], 0.0
         return np.column_stack([middle_m, np.where(up, on_deck_m, heights_m)]), angles_deg
 
@@ -87,9 +87,12 @@ def _smooth(heights_m: Numbers, times_s: Numbers) -> Numbers:
     return smooth
 
 
-def park(vicinity: Vicinity, ground: Ground, fleet: Fleet, share: float, generator: np.random.Generator) -> None:
-    """Put cars into the bays of the streets that are near."""
-    poses: dict[str, list[np.ndarray]] = {kind: [] for kind in PARKED}
+def park(
+    vicinity: Vicinity, ground: Ground, fleet: Fleet, share: float, generator: np.random.Generator
+) -> NDArray[np.object_]:
+    """Put cars into the bays of the streets that are near; their outlines in plan."""
+    outlines_m = [np.empty((0, 4, 2))]
+    poses: dict[str, list[np.ndarray]] = defaultdict(list)
     for lane in vicinity.lanes:
         if lane.use != "bay":
             continue
@@ -105,8 +108,13 @@ def park(vicinity: Vicinity, ground: Ground, fleet: Fleet, share: float, generat
     for kind, drawn in poses.items():
         places = np.array(drawn).reshape(-1, 3)
         heights_m = ground.heights_m(places[:, :2])
-        tilts = tilts_deg(ground, places[:, :2], places[:, 2], (fleet.length_m(kind), fleet.width_m(kind)))
+        size_m = fleet.length_m(kind), fleet.width_m(kind)
+        tilts = tilts_deg(ground, places[:, :2], places[:, 2], size_m)
+        turned = np.column_stack([places[:, :2], np.deg2rad(places[:, 2])])
+        outlines_m.append(corners_m(turned, np.tile(size_m, (len(places), 1))))
         for (x_m, y_m, yaw_deg), height_m, (pitch, roll) in zip(
             places.tolist(), heights_m.tolist(), tilts.tolist(), strict=True
         ):
             fleet.park(kind, (x_m, y_m, yaw_deg), height_m, (pitch, roll))
+    parked: NDArray[np.object_] = shapely.polygons(np.concatenate(outlines_m))
+    return parked

@@ -27,6 +27,8 @@ WITH_BAYS, WITH_BICYCLE_LANES, WITH_MEDIAN = 0.7, 0.5, 0.3
 # Two streets that do not meet keep so far apart, middle to middle: the plan knows no widths.
 APART_M = 40.0
 BEND_PIECES = 10
+# Of kerbs at corners; nobody turns there with more than so much to the side, by much.
+CORNER_M, TURN_MPS2 = 6.0, 1.9
 HILL_WAVELENGTHS_M = (250.0, 700.0)
 HILL_WAVES = 4
 
@@ -78,6 +80,8 @@ class DrawnStreets(Document):
         run(
             "netconvert", "--node-files", node_file, "--edge-files", edge_file, "--output-file", network,
             "--precision", "3", "--tls.guess", "--walkingareas", "--crossings.guess", "--no-turnarounds.except-deadend",
+            "--junctions.limit-turn-speed", str(TURN_MPS2), "--default.junctions.radius", str(CORNER_M),
+            "--junctions.internal-link-detail", "12",
         )  # fmt: skip
         return network
 

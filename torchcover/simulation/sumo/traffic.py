@@ -1,5 +1,6 @@
 """Traffic of type `sumo`: road networks and road users of SUMO, the user's own or drawn."""
 
+import warnings
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Literal, Self
@@ -12,14 +13,16 @@ from torchcover.simulation.documents import PathBeside
 from torchcover.simulation.sumo.crowd import crowd, types_of
 from torchcover.simulation.sumo.demand import EGO_TYPE, write_routes
 from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
-from torchcover.simulation.sumo.frontage import StreetScenery
+from torchcover.simulation.sumo.frontage import sides_of
 from torchcover.simulation.sumo.ground import Pavement, decks, ground_of
-from torchcover.simulation.sumo.network import Network, read_network
+from torchcover.simulation.sumo.motion import motions, possible
+from torchcover.simulation.sumo.network import SAME_PLACE_M, Network, read_network
 from torchcover.simulation.sumo.placing import Placing, park
 from torchcover.simulation.sumo.simulating import from_opendrive, simulate
 from torchcover.simulation.sumo.streets import DrawnStreets
 from torchcover.simulation.sumo.vicinity import OFF_STREET_M, Vicinity
 from torchcover.simulation.traffic.fleet import EGO, Fleet
+from torchcover.simulation.traffic.frontage import Times, stand
 from torchcover.simulation.traffic.procedural import Procedural
 from torchcover.simulation.traffic.scenery import Scenery, few
 from torchcover.simulation.world import Actor
@@ -44,6 +47,8 @@ class Sumo(Procedural):
         begin_s: Time of the simulation at which the run begins, at the earliest: the ego has to be there. After a
             minute if not given, or with the floating car data.
         built_share: Share of the streets' sides that have houses.
+        roadside: How many times as much of what stands beside streets, but houses, there is than usually; or of some
+            kinds of it, such as `{hedge: 2, lamp: 0}`.
         parked_share: Share of the parking bays that are taken: lanes that nobody may use.
     """
 
@@ -56,6 +61,7 @@ class Sumo(Procedural):
     ego_type: str | None = None
     begin_s: Annotated[float, Field(ge=0.0)] | None = None
     built_share: float = Field(default=0.8, ge=0.0, le=1.0)
+    roadside: Times = 1.0
     parked_share: float = Field(default=0.5, ge=0.0, le=1.0)
 
     @model_validator(mode="after")
@@ -81,26 +87,42 @@ class Sumo(Procedural):
             known = types_of(routes)
             recorded = self._recorded(network_file, routes, float(times_s[-1]), generator)
         ego_type = EGO_TYPE if self.random is not None else self.ego_type
-        found = crowd(recorded, known, fleet, self.ego_id, ego_type, times_s, generator)
-        way_m, _ = found.ego.at(times_s)
-        origin_m = np.floor(way_m[0])
-        vicinity = Vicinity(network, way_m - origin_m, origin_m)
-        gone = np.flatnonzero(~vicinity.on_streets(way_m - origin_m))
+        duration_s = float(times_s[-1])
+        ego, others = crowd(recorded, known, fleet, self.ego_id, ego_type, duration_s, generator)
+        near_m = np.floor(ego.track.places_m[0, :2])
+        (alone,) = motions([ego], duration_s, near_m)
+        begin_m = np.floor(alone.poses[0, :2] + SAME_PLACE_M)
+        origin_m, way_m = near_m + begin_m, alone.poses[:, :2] - begin_m
+        vicinity = Vicinity(network, way_m, origin_m)
+        gone = np.flatnonzero(~vicinity.on_streets(way_m))
         if len(gone):
             raise ValueError(
                 f"the ego is farther than {OFF_STREET_M:g} m from all streets of the network at t = "
-                f"{recorded.begin_s + times_s[gone[0]]:g} s: it leaves them, or the data are those of another network"
+                f"{recorded.begin_s + alone.times_s[gone[0]]:g} s: it leaves them, or the data are those of another "
+                "network"
             )
         ground = ground_of(vicinity)
         pavement = Pavement(vicinity, ground)
-        frontage = StreetScenery(vicinity, ground, self.built_share, generator)
+        sides, taken = sides_of(vicinity, self.built_share, generator)
+        stood = stand(sides, taken, (), (), ground.heights_m, self.roadside, generator)
         raised = few(pavement.meshes(), decks(vicinity))
-        static = (ground.mesh(), *raised, *frontage.meshes())
-        park(vicinity, ground, fleet, self.parked_share, generator)
-        placing = Placing(ground, pavement, origin_m)
-        driver = placing.ego(found.ego, times_s, fleet.meshes[EGO], generator)
+        static = (ground.mesh(), *raised, *few(*stood))
+        parked = park(vicinity, ground, fleet, self.parked_share, generator)
+        moved = motions([ego, *others], duration_s, origin_m, np.concatenate([pavement.parts, parked]))
+        shown = possible(moved)
+        fleet.left_out = len(moved) - len(shown)
+        if fleet.left_out and self.random is None:
+            there = {motion.user.track.name for motion in shown}
+            missing = sorted({motion.user.track.name for motion in moved} - there)
+            warnings.warn(
+                f"the simulation has {fleet.left_out} of {len(others)} road users where another one is, over a kerb or "
+                f"faster than people are ({', '.join(map(repr, missing[:3]))}); they are left out",
+                stacklevel=2,
+            )
+        placing = Placing(ground, pavement)
+        driver = placing.ego(shown[0], times_s, fleet.meshes[EGO], generator)
         scenery = Scenery(static, tuple(range(1 + len(raised))))
-        return scenery, driver, placing.actors(found.others, fleet, float(times_s[-1]))
+        return scenery, driver, placing.actors(shown[1:], fleet, duration_s)
 
     def _network_file(self, folder: Path, generator: np.random.Generator) -> Path:
         """The network in SUMO's own format."""

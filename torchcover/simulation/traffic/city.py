@@ -24,7 +24,7 @@ BLOCK_DEPTH_M = 95.0
 FREE_AT_CORNERS_M, FREE_AT_ENDS_M = 9.0, 5.0
 PARKED_GAP_M = 0.9
 LANE_SIDE_M = 2.2
-PARKED = {"suv": 3.0, "sedan": 3.0, "hatchback": 3.0, "van": 1.0}
+PARKED = {"suv": 3.0, "sedan": 3.0, "hatchback": 3.0, "pickup": 0.8, "van": 1.0}
 # The block between two streets that meet the main street where it turns.
 CORNER_M, CORNER_DEPTH_M = 100.0, 40.0
 # Half of the width that a gap inside a block has at most.

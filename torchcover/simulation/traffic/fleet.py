@@ -17,11 +17,13 @@ from torchcover.simulation.traffic.signals import Gate
 from torchcover.simulation.world import Actor
 
 # What each built-in body counts as.
-CATEGORIES = {
+BODIES = {
     "suv": "car",
     "sedan": "car",
     "hatchback": "car",
+    "pickup": "car",
     "van": "car",
+    "lorry": "truck",
     "truck": "truck",
     "bus": "bus",
     "motorcycle": "motorcycle",
@@ -29,8 +31,24 @@ CATEGORIES = {
     "adult": "pedestrian",
     "child": "pedestrian",
 }
+# Lengths, widths and heights of others of a kind, as shares of its body's: within the spreads of boxes in recorded
+# logs (docs/measured/streets.md).
+SIZES: Mapping[str, tuple[tuple[float, float, float], ...]] = {
+    "suv": ((0.91, 0.95, 1.02), (1.03, 1.03, 1.10)),
+    "sedan": ((0.94, 0.98, 0.99), (1.04, 1.02, 1.03)),
+    "hatchback": ((0.90, 0.96, 1.00), (1.02, 1.01, 1.08)),
+    "pickup": ((1.07, 1.05, 1.04),),
+    "van": ((0.80, 0.94, 0.72), (0.90, 0.98, 0.82)),
+    "lorry": ((0.84, 0.94, 0.90), (1.13, 1.02, 1.07)),
+    "adult": ((0.95, 0.92, 0.94), (1.05, 1.06, 1.05)),
+    "child": ((0.90, 0.90, 0.88), (1.10, 1.08, 1.15)),
+}
+# Those of other sizes have a number behind their kind.
+KIND_OF = {f"{kind}_{number}": kind for kind, sizes in SIZES.items() for number in range(2, 2 + len(sizes))}
+KIND_OF |= {kind: kind for kind in BODIES}
+CATEGORIES = {name: BODIES[kind] for name, kind in sorted(KIND_OF.items())}
 EGO = "ego"
-HEAVY = ("truck", "bus")
+HEAVY = ("truck", "lorry", "bus")
 
 WALKING = Driver(
     desired_speed_mps=1.4, headway_s=0.4, standstill_gap_m=0.5, acceleration_mps2=1.0, deceleration_mps2=1.5
@@ -42,8 +60,12 @@ CYCLING = Driver(
 
 @cache
 def load_bodies() -> Mapping[str, Mesh]:
-    """The built-in bodies, by kind."""
-    return {kind: Vehicle.load(kind).mesh() for kind in CATEGORIES}
+    """The built-in bodies, in all their sizes."""
+    meshes = {kind: Vehicle.load(kind).mesh() for kind in BODIES}
+    for kind, sizes in SIZES.items():
+        for number, shares in enumerate(sizes, 2):
+            meshes[f"{kind}_{number}"] = meshes[kind]._replace(vertices_m=meshes[kind].vertices_m * np.array(shares))
+    return meshes
 
 
 class Fleet:
@@ -61,6 +83,7 @@ class Fleet:
         self._sizes = {kind: BoundingBox.around(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
         self._generator = generator
         self.parked: list[Actor] = []
+        self.left_out = 0
 
     def length_m(self, kind: str) -> float:
         """Extent along x."""
@@ -71,8 +94,10 @@ class Fleet:
         return self._sizes[kind][1]
 
     def draw_kind(self, mix: Mapping[str, float]) -> str:
-        """One kind, each with a probability in proportion to its weight."""
-        return list(mix)[bisect_right(_shares_up_to(tuple(mix.values())), self._generator.random())]
+        """One kind, each with a probability in proportion to its weight, in one of its sizes."""
+        kind = list(mix)[bisect_right(_shares_up_to(tuple(mix.values())), self._generator.random())]
+        size = int(self._generator.random() * (1 + len(SIZES.get(kind, ()))))
+        return f"{kind}_{size + 1}" if size else kind
 
     def draw_driver(self, typical: Driver, spread: float) -> Driver:
         """A driver whose desired speed differs from the typical one by up to `spread`, a share of it."""
@@ -125,7 +150,7 @@ class Fleet:
         rear = span_m[0]
         while per_km > 0:
             kind = self.draw_kind(mix)
-            driver = self.draw_driver(drivers[kind][1], heavy_spread if kind in HEAVY else spread)
+            driver = self.draw_driver(drivers[KIND_OF[kind]][1], heavy_spread if KIND_OF[kind] in HEAVY else spread)
             length, gap = self.length_m(kind), _smallest_gap_m(driver)
             rear += gap + self._generator.exponential(max(1000.0 / per_km - gap - length, 0.1))
             if rear + length > span_m[1]:

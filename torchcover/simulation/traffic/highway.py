@@ -8,7 +8,7 @@ from pydantic import Field
 
 from torchcover.simulation.traffic.alignment import Alignment
 from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, ego_actor
-from torchcover.simulation.traffic.fleet import EGO, HEAVY, Fleet
+from torchcover.simulation.traffic.fleet import EGO, HEAVY, KIND_OF, Fleet
 from torchcover.simulation.traffic.flow import Agent, Flow, check_crowd
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.idm import Driver
@@ -76,7 +76,7 @@ class Highway(Procedural):
         # Places of the other direction are stations with the sign turned.
         side_m = np.array([sides[0], (-sides[1].end_m, -sides[1].begin_m)])
         agents = self._traffic(side_m, fleet)
-        heavy = np.array([agent.kind in HEAVY for agent in agents])
+        heavy = np.array([KIND_OF.get(agent.kind) in HEAVY for agent in agents])
         exits = (generator.random(len(agents)) < EXIT_SHARE) & np.array(
             [a.lane % LANES == SIDE_LANE - 1 for a in agents]
         )
@@ -112,7 +112,7 @@ class Highway(Procedural):
         """Everybody; the ego is the first, behind a leader in its lane."""
         own, lasts_s = 3 - self.ego_lane, self._lasts_s
         kind = fleet.draw_kind({kind: weight for kind, (weight, _) in LANE_USERS[own].items()})
-        leader = LANE_USERS[own][kind][1] if kind in HEAVY else Driver(LEADER_MPS)
+        leader = LANE_USERS[own][KIND_OF[kind]][1] if KIND_OF[kind] in HEAVY else Driver(LEADER_MPS)
         agents = [
             fleet.agent(EGO, own, -LEADER_AHEAD_M / 2, Driver(EGO_MPS, headway_s=1.0)),
             fleet.agent(kind, own, LEADER_AHEAD_M / 2, leader),

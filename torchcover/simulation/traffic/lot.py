@@ -119,7 +119,7 @@ class Lot:
             pieces.append(box((x + 5.0, BUILDING_AT_Y_M - 7.0), (1.6, 0.6, 0.5)))
         for x in (-130.0, -95.0, 80.0, 115.0, 150.0):
             size = self._generator.uniform((14.0, 30.0, 5.0), (22.0, 60.0, 16.0))
-            pieces.append(box((x, self._generator.uniform(-30.0, 30.0)), size))
+            pieces.append(box((x, self._generator.uniform(0.0, 30.0)), size))
         for x in np.arange(-100.0, 100.0, 34.0):
             size = self._generator.uniform((15.0, 12.0, 5.0), (28.0, 20.0, 18.0))
             pieces.append(box((x, -EDGE_M - 30.0), size))

@@ -52,7 +52,14 @@ class Procedural(Traffic):
         times_s = self.time_step_s * np.arange(steps + 1, dtype=np.float64)
         scenery, driver, others = self._build(fleet, times_s, generator)
         return World(
-            scenery.static, driver, others, self.time_step_s, self.duration_s, tuple(fleet.parked), scenery.ground
+            static=scenery.static,
+            ego=driver,
+            actors=others,
+            time_step_s=self.time_step_s,
+            duration_s=self.duration_s,
+            parked=tuple(fleet.parked),
+            ground=scenery.ground,
+            left_out=fleet.left_out,
         )
 
     def content(self) -> dict[str, Any]:

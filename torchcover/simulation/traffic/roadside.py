@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from torchcover.simulation.shapes import Mesh, prism_faces
-from torchcover.simulation.traffic.alignment import Alignment, Territory
+from torchcover.simulation.traffic.alignment import Alignment
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.scenery import Scenery, block, few, ground, post, tree
-from torchcover.simulation.traffic.site import BuildingSite
+from torchcover.simulation.traffic.site import bent
 
 Numbers = NDArray[np.float64]
 Flags = NDArray[np.bool_]
@@ -80,7 +80,6 @@ def roadside(
         span_m: The stations of that part.
         generator: Draws what stands there.
     """
-    site = BuildingSite(middle, Territory(middle, span_m), hills, 0.0)
     way_m = middle.poses(np.arange(span_m[0], span_m[1] + 50.0, 50.0), 0.0)[:, :2]
     plain = (way_m.min(axis=0) - GROUND_M, way_m.max(axis=0) + GROUND_M)
     structures, bridges = _structures(sides, span_m, generator)
@@ -92,7 +91,7 @@ def roadside(
         _trees(sides, span_m, bridges, generator),
     )
     level = ground(*plain) if hills.are_flat else hills.mesh(way_m, GROUND_M, SQUARE_M)
-    return Scenery((level, *few(*(site.bent(pieces, 0.0) for pieces in stands))), (0,))
+    return Scenery((level, *few(*(bent(middle, hills, pieces) for pieces in stands))), (0,))
 
 
 def _prisms(outlines_m: Numbers, z_m: tuple[float, float]) -> Mesh:

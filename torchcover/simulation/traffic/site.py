@@ -1,9 +1,12 @@
 """The pavement of blocks along a street, which bends with it and keeps off other stretches."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from torchcover.simulation.bodies import merge
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import Alignment, Territory
 from torchcover.simulation.traffic.hills import Hills
@@ -18,8 +21,23 @@ SURVEY_EVERY_M = 8.0
 # There is so much room between blocks where two stretches of street are near.
 BETWEEN_BLOCKS_M = 4.0
 NARROWEST_M = 0.5
-# Pavement on a slope goes on below it.
+# What stands on a slope goes on below it.
 FOOT_M = 0.5
+
+
+def bent(street: Alignment, hills: Hills, pieces: Sequence[Mesh]) -> list[Mesh]:
+    """Bodies that were built as if a street were straight and level (x is a station), in the world, as one mesh.
+
+    What of them is not higher than 0 stands on the ground, and goes on below it on hills.
+    """
+    if (street.is_straight and hills.are_flat) or not pieces:
+        return list(pieces)
+    merged = merge(list(pieces))
+    x_m, y_m, height_m = merged.vertices_m.T
+    places_m = street.poses(x_m, y_m)[:, :2]
+    if not hills.are_flat:
+        height_m = height_m + hills.heights_m(places_m) - np.where(height_m <= 0.0, FOOT_M, 0.0)
+    return [merged._replace(vertices_m=np.column_stack([places_m, height_m]))]
 
 
 class BuildingSite:

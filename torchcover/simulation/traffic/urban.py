@@ -11,7 +11,7 @@ from torchcover.simulation.traffic.alignment import Beside, Territory
 from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, come_near, ego_actor, paths
 from torchcover.simulation.traffic.city import City
 from torchcover.simulation.traffic.crossing import Footpath, step_height, walk
-from torchcover.simulation.traffic.fleet import CYCLING, EGO, WALKING, Fleet
+from torchcover.simulation.traffic.fleet import CATEGORIES, CYCLING, EGO, WALKING, Fleet
 from torchcover.simulation.traffic.flow import Agent, Flow, Lane, Simulation, check_crowd
 from torchcover.simulation.traffic.frontage import Times
 from torchcover.simulation.traffic.hills import Hills
@@ -49,8 +49,10 @@ DRIVING = {
     "sedan": (4.0, 1.0, 1.2, 1.6),
     "hatchback": (4.0, 1.0, 1.2, 1.6),
     "suv": (3.0, 1.0, 1.2, 1.6),
+    "pickup": (1.0, 1.0, 1.2, 1.6),
     "van": (1.5, 0.95, 1.3, 1.4),
-    "truck": (0.5, 0.85, 1.6, 0.9),
+    "lorry": (0.5, 0.85, 1.5, 1.0),
+    "truck": (0.3, 0.85, 1.6, 0.9),
     "bus": (0.6, 0.85, 1.5, 1.0),
     "motorcycle": (0.6, 1.05, 1.2, 2.2),
 }
@@ -206,7 +208,7 @@ def _in_place(
             first_m, last_m = np.sort(line.places_at(ends_m[junction[id(line.street)]]))
             step, agent = np.nonzero((places_m < first_m) | (places_m > last_m))
             found.positions_m[step, on_lane[agent]] = np.nan
-        elif agents[on_lane[0]].kind in ("adult", "child"):
+        elif CATEGORIES.get(agents[on_lane[0]].kind) == "pedestrian":
             # On the inside of a turn the pavement goes on.
             stop = streets.course.turns != np.sign(line.left_m)
             middles_m, halves_m = streets.junctions_m[stop][:: line.way], streets.cross_kerbs_m[stop][:: line.way]

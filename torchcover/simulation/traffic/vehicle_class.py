@@ -13,7 +13,7 @@ BODIES: Mapping[str, tuple[str, ...]] = {
     "scooter": ("cyclist",),
     "moped": ("motorcycle",),
     "motorcycle": ("motorcycle",),
-    "truck": ("truck",),
+    "truck": ("lorry", "truck"),
     "trailer": ("truck",),
     "bus": ("bus",),
     "coach": ("bus",),
@@ -21,7 +21,7 @@ BODIES: Mapping[str, tuple[str, ...]] = {
     "delivery": ("van",),
     "emergency": ("van",),
 }
-CARS = ("hatchback", "sedan", "suv", "van")
+CARS = ("hatchback", "sedan", "suv", "pickup", "van")
 # They need no road, or one that is not built.
 LEFT_OUT = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship", "drone"})
 
@@ -33,8 +33,9 @@ class VehicleType(NamedTuple):
     length_m: float
 
     def body(self, lengths_m: Mapping[str, float]) -> str | None:
-        """The kind of body whose length is nearest among those of the class; None if there is none of this class."""
+        """The body whose length is nearest among those of the class; None if there is none of this class."""
         if self.vehicle_class in LEFT_OUT:
             return None
         kinds = BODIES.get(self.vehicle_class, CARS)
-        return min(kinds, key=lambda kind: abs(lengths_m[kind] - self.length_m))
+        bodies = [name for name in lengths_m if name.partition("_")[0] in kinds]
+        return min(bodies, key=lambda kind: abs(lengths_m[kind] - self.length_m))

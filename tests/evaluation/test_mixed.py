@@ -1,0 +1,169 @@
+"""Several kinds of world: each as if it were alone, and their mixture by the book."""
+
+import csv
+import json
+import math
+
+import pytest
+
+from torchcover import RegionsOfInterest, Rig, compare, evaluate
+from torchcover.evaluation import Checkpoint, MixedResult, Settings
+
+ASKED = RegionsOfInterest.model_validate(
+    {
+        "regions": {"ahead": {"x_m": [2, 22], "y_m": [-5, 5]}},
+        "heights": {"ground": [-0.5, 0.5]},
+        "grid": {"x_m": [0, 24], "y_m": [-8, 8]},
+    }
+)
+SMALL = {"steps": 16, "cell_m": 1.0, "rays": 256, "ask": ASKED}
+RIGS = [
+    Rig.model_validate({
+        "name": name,
+        "sensors": [{"name": "front", "mount": {"x_m": 2.5, "z_m": z_m}, "channels": 8, "vertical_fov_deg": [-30, 0],
+                     "horizontal_fov_deg": 90, "columns": 30, "max_range_m": 60}],
+    })
+    for name, z_m in (("high", 1.8), ("low", 0.5))
+]  # fmt: skip
+NUMBERS = ("radius_m", "detection_0.4m", "radius_m_difference", "detection_0.4m_difference")
+YARD = """name: {name}
+ego: {{shape: {{type: box, size_m: [4, 2, {height_m}]}}}}
+bodies:
+  - {{name: floor, shape: {{type: plane, size_m: [400, 400]}}}}
+  - {{name: wall, shape: {{type: box, size_m: [1, 8, 2]}}, poses: [{{x_m: {wall_m}}}]}}
+"""
+
+
+@pytest.fixture(scope="module")
+def yards(tmp_path_factory):
+    """Paths of two worlds that differ in where a wall is."""
+    folder = tmp_path_factory.mktemp("yards")
+    for name, wall_m in (("near", 8), ("far", 16)):
+        (folder / f"{name}.yaml").write_text(YARD.format(name=name, wall_m=wall_m, height_m=1.5))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def mixed(yards):
+    return evaluate(RIGS, {str(yards / "near.yaml"): 3, str(yards / "far.yaml"): 1.0}, **SMALL)
+
+
+def test_each_world_is_as_if_it_were_alone(mixed, yards):
+    alone = evaluate(RIGS, yards / "far.yaml", **SMALL)
+    assert mixed.worlds["far"].summary == alone.summary
+    assert list(mixed.worlds) == ["near", "far"]
+    assert mixed.weights == {"near": 0.75, "far": 0.25}
+
+
+def test_a_mixture_is_the_weighted_mean_and_its_variance_that_of_the_sum(mixed):
+    for at, row in enumerate(mixed.summary):
+        parts = [(mixed.weights[name], world.summary[at]) for name, world in mixed.worlds.items()]
+        assert all(part["rig"] == row["rig"] for _, part in parts)
+        for key in NUMBERS:
+            assert row[key] == pytest.approx(sum(weight * part[key] for weight, part in parts))
+            error = math.sqrt(sum((weight * part[f"{key}_error"]) ** 2 for weight, part in parts))
+            assert row[f"{key}_error"] == pytest.approx(error)
+        # From more blocks than one of the worlds has, an interval is shorter for the same error.
+        assert row["radius_m_low"] < row["radius_m"] < row["radius_m_high"]
+        assert row["blocks"] == sum(part["blocks"] for _, part in parts)
+        assert row["visible_m2"] == pytest.approx(sum(weight * part["visible_m2"] for weight, part in parts))
+
+
+def test_marks_are_beyond_chance_in_the_mixture(mixed, yards):
+    first, other = mixed.summary
+    assert other["detection_0.4m_difference_significant"]
+    assert first["detection_0.4m_best"] != other["detection_0.4m_best"]
+    few = evaluate(RIGS, [yards / "near.yaml", yards / "far.yaml"], **{**SMALL, "steps": 4})
+    assert not any(row["detection_0.4m_best"] for row in few.summary)
+    # Eight blocks in all are not eight in each.
+    assert all(row["detection_0.4m_low"] is None for row in few.summary)
+    assert "Not enough steps" in repr(few)
+
+
+def test_all_weight_on_one_is_that_one(yards):
+    paths = [str(yards / f"{name}.yaml") for name in ("near", "far")]
+    only = evaluate(RIGS, dict(zip(paths, (0.0, 2.0), strict=True)), **SMALL)
+    for row, same in zip(only.summary, only.worlds["far"].summary, strict=True):
+        for key in (*NUMBERS, "radius_m_low", "radius_m_difference_high", "known_radius_m_error"):
+            assert row[key] == pytest.approx(same[key])
+
+
+def test_results_of_one_rig_each_are_compared_as_if_measured_together(mixed, yards):
+    given = {str(yards / "near.yaml"): 0.75, str(yards / "far.yaml"): 0.25}
+    each = [evaluate(rig, given, **SMALL) for rig in RIGS]
+    assert compare(each).summary == mixed.summary
+    with pytest.raises(ValueError, match="same scenarios with the same weights"):
+        compare([each[0], MixedResult.of(each[1].worlds, {"near": 0.5, "far": 0.5})])
+    with pytest.raises(ValueError, match="same scenarios with the same weights"):
+        compare([each[0], each[1].worlds["far"]])
+
+
+def test_files_hold_every_world_and_the_mixture(mixed, tmp_path):
+    files = mixed.save(tmp_path, files="numbers")
+    assert all(file.is_file() for file in files)
+    record = json.loads((tmp_path / "summary.json").read_text())
+    assert record["rows"] == mixed.summary
+    assert {name: world["weight"] for name, world in record["worlds"].items()} == mixed.weights
+    for name, world in mixed.worlds.items():
+        assert json.loads((tmp_path / name / "summary.json").read_text())["rows"] == world.summary
+    with (tmp_path / "summary.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["world"] for row in rows] == ["near"] * 2 + ["far"] * 2 + ["mixture"] * 2
+    assert [float(row["radius_m"]) for row in rows[4:]] == [row["radius_m"] for row in mixed.summary]
+    assert [stem.split("/")[0] for stem, _ in mixed.maps()][:: len(list(mixed.maps())) - 1] == ["near", "far"]
+    with pytest.raises(ValueError, match=r"worlds\[name\]"):
+        _ = mixed.coverage
+
+
+def test_each_world_has_a_checkpoint_of_its_own(mixed, yards, tmp_path):
+    given = {str(yards / "near.yaml"): 0.75, str(yards / "far.yaml"): 0.25}
+    checkpoint = Checkpoint(tmp_path / "checkpoint.npz", keep=False)
+    evaluate(RIGS, given, checkpoint=checkpoint, **{**SMALL, "steps": 8})
+    assert sorted(path.parent.name for path in tmp_path.glob("*/checkpoint.npz")) == ["far", "near"]
+    longer = evaluate(RIGS, given, checkpoint=checkpoint, **SMALL)
+    assert longer.summary == mixed.summary
+
+
+@pytest.mark.parametrize(
+    ("scenario", "says"),
+    [
+        ("urban,highway,urban", "given twice"),
+        (["urban", "Urban"], "called alike"),
+        ("urban=-1,highway=2", "0 or more are needed, not all 0; got urban=-1, highway=2"),
+        ("urban=0,highway=0", "not all 0"),
+        ("urban=nan,highway=1", "not all 0"),
+        ("urban=much,highway=1", "got urban=much, highway=1"),
+        ({"urban": None, "highway": 1}, "weights"),
+        ("urban=1,highway", "every one needs a weight, or none"),
+        ("urban,", "no name"),
+        ([], "no scenario"),
+        (["urban", "nowhere"], "nowhere"),
+        (["urban", "."], "a folder; a recording is no scenario"),
+    ],
+)
+def test_what_is_no_mixture_is_refused_before_anything_is_measured(scenario, says, monkeypatch):
+    monkeypatch.setattr("torchcover.evaluation.mixed.measured", None)
+    with pytest.raises((ValueError, FileNotFoundError), match=says):
+        evaluate(RIGS[0], scenario, **SMALL)
+
+
+def test_who_cannot_be_mixed_is_refused(yards):
+    tall = yards / "tall.yaml"
+    tall.write_text(YARD.format(name="tall", wall_m=8, height_m=1.5).replace("[4, 2, 1.5]", "[6, 2, 1.5]"))
+    near = str(yards / "near.yaml")
+    with pytest.raises(ValueError, match="differ in their regions"):
+        evaluate(RIGS[0], [near, tall], steps=1, cell_m=1.0, rays=64)
+    with pytest.raises(TypeError, match="got int"):
+        evaluate(RIGS[0], [near, 3], **SMALL)
+    with pytest.raises(ValueError, match="observers"):
+        evaluate(RIGS[0], [near, "courtyard"], observers={"any": None}, **SMALL)
+    with pytest.raises(ValueError, match="exclude each other"):
+        evaluate(RIGS[0], [near, "courtyard"], frames="recording", **SMALL)
+    with pytest.raises(ValueError, match="one at a time here; got near, courtyard"):
+        _ = Settings(RIGS[0], [near, "courtyard"]).one_scenario
+
+
+def test_a_file_whose_name_has_a_comma_is_one_scenario(yards, monkeypatch):
+    monkeypatch.chdir(yards)
+    (yards / "a,b=c.yaml").write_text((yards / "near.yaml").read_text())
+    assert Settings(RIGS[0], "a,b=c.yaml").mixture is None

@@ -1,0 +1,158 @@
+"""How bodies follow their tracks."""
+
+import numpy as np
+import pytest
+import shapely
+
+from torchcover.simulation.sumo.floating import SumoTrack
+from torchcover.simulation.sumo.ground import Pavement, ground_of
+from torchcover.simulation.sumo.motion import CATCH_UP_MPS, RoadUser, corners_m, motions, possible, tractrix
+from torchcover.simulation.sumo.network import read_network
+from torchcover.simulation.sumo.vicinity import Vicinity
+
+from .towns import DRIVE, WALK, edge, write_net
+
+ORIGIN = np.zeros(2)
+
+
+def user(places_m, *, step_s=0.2, begin_s=0.0, kind="sedan", size_m=(5.0, 2.0), on_foot=False, yaw_deg=0.0):
+    places_m = np.asarray(places_m, dtype=np.float64)
+    times_s, zeros = begin_s + step_s * np.arange(len(places_m)), np.zeros(len(places_m))
+    track = SumoTrack(
+        kind, kind, on_foot, times_s, np.column_stack([places_m, zeros]), np.full(len(places_m), yaw_deg), zeros
+    )
+    return RoadUser(track, kind, size_m[0], size_m)
+
+
+def straight(speed_mps=10.0, seconds=10.0, x_m=0.0, y_m=0.0, step_s=0.2):
+    times_s = np.arange(0.0, seconds + 1e-9, step_s)
+    return np.column_stack([x_m + speed_mps * times_s, np.full(len(times_s), y_m)])
+
+
+def speeds(motion):
+    return np.linalg.norm(np.diff(motion.poses[:, :2], axis=0), axis=1) / np.diff(motion.times_s)
+
+
+def accelerations(motion):
+    return np.linalg.norm(np.diff(motion.poses[:, :2], 2, axis=0), axis=1) / np.diff(motion.times_s)[1:] ** 2
+
+
+def turn(radius_m, speed_mps=5.0, begin_m=(0.0, 0.0), lead_in_m=30.0):
+    """Places of a way to the east, then a quarter to the left, then north."""
+    s = np.arange(0.0, 2 * lead_in_m + radius_m * np.pi / 2, 0.2 * speed_mps)
+    bend = ((s - lead_in_m) / radius_m).clip(0.0, np.pi / 2)
+    more = s - lead_in_m - radius_m * bend
+    x = radius_m * np.sin(bend) + np.where(more < 0, more, 0.0)
+    y = radius_m * (1 - np.cos(bend)) + np.where(more > 0, more, 0.0)
+    return np.column_stack([x, y]) + begin_m
+
+
+def test_on_a_circle_the_rear_follows_a_smaller_one():
+    radius_m, length_m = 10.0, 3.0
+    angle = np.linspace(0.0, 4 * np.pi, 2000)
+    lead_m = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    (yaw,) = tractrix(lead_m[:, None], np.array([length_m]), np.array([np.pi / 2])).T
+    rear_m = lead_m - length_m * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
+    assert np.linalg.norm(rear_m[-1]) == pytest.approx(np.sqrt(radius_m**2 - length_m**2), abs=1e-4)
+    assert np.abs(np.diff(yaw)).max() < 0.02
+
+
+def test_along_a_line_the_angle_falls_as_in_the_closed_form_whatever_the_steps():
+    ways_m = np.array([0.0, 0.1, 3.0, 3.5, 9.0])
+    lead_m = np.stack([ways_m, np.zeros(5)], axis=1)[:, None]
+    (yaw,) = tractrix(lead_m, np.array([4.0]), np.array([2.5])).T
+    np.testing.assert_allclose(np.tan(yaw / 2), np.tan(1.25) * np.exp(-ways_m / 4.0), rtol=1e-12)
+
+
+def test_straight_on_nothing_changes_and_bodies_are_as_long_as_told():
+    (motion,) = motions([user(straight())], 10.0, ORIGIN)
+    np.testing.assert_allclose(motion.poses[:, 0], 10.0 * motion.times_s - 2.5, atol=1e-9)
+    np.testing.assert_allclose(motion.poses[:, 1:], 0.0, atol=1e-12)
+
+
+def test_a_corner_is_driven_round_and_lane_changes_are_smooth():
+    corner = np.concatenate([straight(4.0, 6.0), [[24.0, 0.8 * k] for k in range(1, 30)]])
+    (motion,) = motions([user(corner)], 11.8, ORIGIN)
+    assert accelerations(motion).max() < 6.0
+    assert speeds(motion).max() < 4.01
+    heading = np.arctan2(*np.diff(motion.poses[:, :2], axis=0).T[::-1])
+    # Drawn along, the middle slips aside as far as it lies before the rear axle.
+    assert np.abs(motion.poses[1:, 2] - heading).max() < 0.6
+    drift = straight(10.0, 8.0)
+    drift[:, 1] = (1.1 * (drift[:, 0] / 10.0 - 2.0)).clip(0.0, 3.3)
+    (motion,) = motions([user(drift)], 8.0, ORIGIN)
+    assert accelerations(motion).max() < 2.0
+
+
+def test_poses_of_one_do_not_depend_on_who_else_is_there():
+    bodies = [user(turn(8.0)), user(straight(3.0, 2.0), begin_s=4.0), user(straight(1.0, 9.0), on_foot=True)]
+    together = motions(bodies, 14.0, ORIGIN)
+    for body, motion in zip(bodies, together, strict=True):
+        (alone,) = motions([body], 14.0, ORIGIN)
+        np.testing.assert_array_equal(alone.times_s, motion.times_s)
+        np.testing.assert_allclose(alone.poses, motion.poses, atol=1e-9)
+    assert together[1].times_s[[0, -1]] == pytest.approx([4.0, 6.0])
+
+
+@pytest.mark.parametrize(("jump_m", "back"), [(1.5, 1.0), (1.5, -1.0), (8.0, 1.0)])
+def test_people_walk_what_they_jumped(jump_m, back):
+    places_m = straight(1.2, 30.0)
+    places_m[75:, 1] += 0.6 * jump_m
+    places_m[75:, 0] += 0.8 * jump_m * back
+    (motion,) = motions([user(places_m, on_foot=True, kind="adult", size_m=(0.3, 0.5))], 30.0, ORIGIN)
+    assert speeds(motion).max() < 1.2 + CATCH_UP_MPS + 1e-6
+    assert motion.can_be
+    np.testing.assert_allclose(motion.poses[[0, -1], :2], places_m[[0, -1]], atol=1e-6)
+
+
+def test_nobody_runs_faster_than_people_do():
+    (motion,) = motions([user(straight(9.0, 10.0), on_foot=True)], 10.0, ORIGIN)
+    assert not motion.can_be
+
+
+def test_who_is_where_another_one_is_goes_and_of_two_the_one_that_meets_more():
+    rows = [user(straight(y_m=20.0)), *(user(straight(x_m=4.0 * k)) for k in range(3)), user(straight(y_m=2.2))]
+    bodies = motions(rows, 10.0, ORIGIN)
+    assert [body.poses[0].round(1).tolist() for body in possible(bodies)] == [
+        bodies[k].poses[0].round(1).tolist() for k in (0, 1, 3, 4)
+    ]
+    (rest,) = motions([user(np.tile([[50.0, 20.5]], (51, 1)))], 10.0, ORIGIN)
+    assert possible([bodies[0], rest]) == [bodies[0]]
+    (later,) = motions([user(straight(0.1, 2.0, x_m=50.0, y_m=20.5), begin_s=7.0)], 10.0, ORIGIN)
+    assert possible([bodies[0], later]) == [bodies[0], later]
+
+
+@pytest.fixture(scope="module")
+def corner(tmp_path_factory):
+    """Two streets 7 m wide, and the pavement inside and outside of the turn from the one to the other."""
+    ways = [
+        edge("in", (WALK, 2.0, [(-90, -1, 0), (13, -1, 0)]), (DRIVE, 7.0, [(-90, 3.5, 0), (13, 3.5, 0)])),
+        edge("out", (WALK, 2.0, [(14, 0, 0), (14, 90, 0)]), (DRIVE, 7.0, [(9.5, 0, 0), (9.5, 90, 0)])),
+        edge("inner", (WALK, 6.0, [(3, 7, 0), (3, 90, 0)])),
+    ]
+    net = write_net(tmp_path_factory.mktemp("corner") / "a.net.xml", *ways)
+    near = Vicinity(read_network(net), np.array([[0.0, 0.0], [10.0, 0.0]]), ORIGIN)
+    return Pavement(near, ground_of(near)).parts
+
+
+def test_long_vehicles_swing_out_and_none_comes_over_a_kerb(corner):
+    bus = user(turn(5.0, 3.0, (3.5, 4.5)), size_m=(9.0, 2.4))
+    (cuts,), (swings,) = (motions([bus], 22.0, ORIGIN, kerbs) for kerbs in (None, corner))
+    over = [
+        shapely.intersection(
+            shapely.polygons(corners_m(m.poses, np.tile(bus.size_m, (len(m.poses), 1)))),
+            shapely.union_all(corner),
+        )
+        for m in (cuts, swings)
+    ]
+    assert shapely.area(over[0]).max() > 1.0
+    assert shapely.area(over[1]).max() == 0.0
+    assert swings.over_kerb_m == 0.0
+    assert accelerations(swings).max() < 3.5
+
+
+def test_who_cannot_get_round_is_not_there(corner):
+    (lorry,) = motions([user(turn(5.0, 5.0, (3.5, 4.5)), size_m=(16.5, 2.55))], 15.0, ORIGIN, corner)
+    assert lorry.over_kerb_m > 0.05
+    assert not lorry.can_be
+    assert possible([lorry]) == [lorry]  # the first is the ego

@@ -1,0 +1,97 @@
+"""What stands beside streets: off them, apart, on the ground, and as much of it as is asked for."""
+
+import numpy as np
+import pytest
+import shapely
+import trimesh
+from pydantic import TypeAdapter, ValidationError
+
+from torchcover.simulation.bodies import merge
+from torchcover.simulation.traffic import Urban
+from torchcover.simulation.traffic.frontage import HOUSES, KINDS, Side, Times, stand
+
+# A street along x to either side of a curve, 3 m wide, with a sidewalk of 2 m on its right.
+ARC_M = np.linspace(-1.2, 0.0, 30)
+LINE_M = np.concatenate([100.0 * np.column_stack([np.sin(ARC_M), 1 - np.cos(ARC_M)]), [[120.0, 0.0]]])
+STREET = shapely.LineString(LINE_M).buffer(3.0, quad_segs=32)
+OFF = {name: 0.0 for name in KINDS if name not in HOUSES}
+
+
+def shifted(right_m):
+    line = shapely.LineString(LINE_M).offset_curve(-right_m, quad_segs=64)
+    return np.array(line.coords)
+
+
+def slope(places_m):
+    return 0.05 * places_m[:, 0] + 0.02 * places_m[:, 1]
+
+
+def stood(times, zone="built", heights_m=slope, pavements=(), seed=0):
+    sides = [Side("kerb", shifted(3.3)), Side(zone, shifted(5.3))]
+    return stand(sides, [STREET], [STREET.buffer(1.9)], pavements, heights_m, times, np.random.default_rng(seed))
+
+
+@pytest.fixture(scope="module")
+def usual():
+    return stood(1.0)
+
+
+def solids(meshes):
+    return trimesh.Trimesh(*merge(list(meshes))[:2], process=False).split(only_watertight=False)
+
+
+def test_all_of_it_is_closed_and_stands_on_the_ground(usual):
+    for mesh in (*usual[0], *usual[1]):
+        assert trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False).is_volume
+    for solid in solids((*usual[0], *usual[1])):
+        foot_m = solid.vertices[:, 2].min() - slope(solid.vertices[:, :2])
+        # Some begin in the air: crowns, arms of lamps, plates of signs.
+        assert foot_m.max() < 0.0 or foot_m.min() > 0.5 or len(solid.vertices) == 12
+
+
+def test_nothing_stands_on_the_street_and_houses_stand_off_the_sidewalk(usual):
+    houses, others = usual
+    feet = [shapely.MultiPoint(s.vertices[:, :2]).convex_hull for s in solids(others) if np.ptp(s.vertices[:, 2]) > 0.3]
+    crowns = [foot for foot in feet if foot.area > 2.0]
+    assert not any(foot.intersects(STREET) for foot in feet if foot not in crowns)
+    assert min(shapely.MultiPoint(s.vertices[:, :2]).distance(STREET) for s in solids(houses)) > 1.8
+
+
+def test_densities_are_times_as_much_down_to_none():
+    few, usual, many = (sum(len(m.faces) for m in stood(times)[1]) for times in (0.25, 1.0, 3.0))
+    assert 0 < few < usual < many
+    assert stood(0.0)[1] == []
+    assert stood(0.0)[0]
+    hedges = stood({**OFF, "hedge": 1.0})[1]
+    assert len(hedges) == 1
+    assert np.ptp(hedges[0].material) == 0
+    assert stood({**OFF, "hedge": 1.0}, "open") == ([], [])
+
+
+def test_nothing_stands_where_there_are_no_sides():
+    assert stand([], [STREET], [], [], slope, 1.0, np.random.default_rng(0)) == ([], [])
+
+
+def test_lines_may_be_short_and_their_corners_coincide():
+    short = Side("kerb", np.array([[0.0, 0.0], [0.3, 0.0]]))
+    twice = Side("open", np.repeat(shifted(5.3), 2, axis=0))
+    _, others = stand([short, twice], [STREET], [], [], slope, 1.0, np.random.default_rng(0))
+    assert others
+    assert all(np.isfinite(mesh.vertices_m).all() for mesh in others)
+
+
+def test_what_stands_on_pavement_is_a_kerb_higher_and_nothing_stands_across_its_edge():
+    flat = stood(1.0, heights_m=lambda places_m: np.zeros(len(places_m)), pavements=[shapely.box(-50, -80, 60, 40)])
+    for solid in solids((*flat[0], *flat[1])):
+        x, foot_m = solid.vertices[:, 0], solid.vertices[:, 2].min()
+        if foot_m < 0.5:
+            inside = (x.min() > -50) and (x.max() < 60)
+            assert foot_m == pytest.approx(0.15 if inside else 0.0, abs=0.1)
+
+
+@pytest.mark.parametrize("times", [-0.1, 100.0, float("nan"), {"hedge": 100.0}, {"hedges": 1.0}, {"house": 0.0}])
+def test_other_densities_are_refused(times):
+    with pytest.raises(ValidationError):
+        TypeAdapter(Times).validate_python(times)
+    with pytest.raises(ValidationError, match="roadside"):
+        Urban(roadside=times)
