@@ -28,7 +28,6 @@ def study(
     steps: Annotated[
         int, typer.Option(min=8, help="Steps of the first setting; the others see the first quarter of these instants.")
     ] = 512,
-    explain: Annotated[bool, typer.Option("--explain", help="Say where the seconds go.")] = False,
     out: options.Out = Path("out"),
     **settings: Any,  # noqa: ANN401
 ) -> None:
@@ -52,7 +51,7 @@ def study(
     with claimed(out):
         found = error_against_time(plan, progress=True)
         files = found.save(out)
-    print_study(found, files, out, explain=explain)
+    print_study(found, files, out)
 
 
 @with_options(of_evaluate("scenario", "seed", "vehicle", "sensor_model", "weather", "reference", "rays", "every_s"))
@@ -195,9 +194,6 @@ def targets(
     require: Annotated[
         Path | None, typer.Option(help="YAML file of requirements: exit code 1 if one is not met.")
     ] = None,
-    rerun: Annotated[
-        Path | None, typer.Option(help="Write the map to this .rrd file, for the Rerun viewer (extra `rerun`).")
-    ] = None,
     out: options.Out = Path("out/targets"),
     files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
@@ -215,7 +211,6 @@ def targets(
         threshold_m=threshold_m,
         heading=heading,
         require=require,
-        rerun=rerun,
         out=out,
         files=files,
         **settings,

@@ -131,7 +131,6 @@ class Trial:
         steps: How many were measured.
         least_steps: The fewest that print an error of every number that is awaited.
         seconds: What they took.
-        measuring_s: That part of it that went into the search and the sums.
         processor_s: What it took of all processors, those of workers too.
         band_frame: What the bands are over.
         numbers: Of all regions and bands.
@@ -141,7 +140,6 @@ class Trial:
     steps: int
     least_steps: int
     seconds: float
-    measuring_s: float
     processor_s: float
     band_frame: BandFrame
     numbers: Sequence[Studied]
@@ -189,9 +187,10 @@ class Study:
         first = reached[0][0] is self.trials[0] and WORTH * times[0] <= min(times)
         return reached[0 if first else times.index(min(times))]
 
-    def tables(self, *, explain: bool) -> list[Table]:
-        """For people: the settings; the numbers of the first; where the time goes, if that is to be explained."""
-        return [self._settings(), self._numbers(), *([self._seconds()] if explain else [])]
+    @property
+    def tables(self) -> list[Table]:
+        """For people: the settings; the numbers of the first."""
+        return [self._settings(), self._numbers()]
 
     def _settings(self) -> Table:
         rows = []
@@ -220,17 +219,6 @@ class Study:
         return text_table(
             ("place", "number", f"error after {first.steps:,}", *wanted), [rows], title="Each number, as given"
         )
-
-    def _seconds(self) -> Table:
-        rows = [
-            [
-                trial.options or "as given",
-                *(f"{1000 * s / trial.steps:.0f}" for s in (trial.seconds - trial.measuring_s, trial.measuring_s)),
-            ]
-            for trial in self.trials
-        ]
-        headings = ("setting", "worlds and rays (ms a step)", "search and sums (ms a step)")
-        return text_table(headings, [rows], title="Where the time goes", caption=f"and {self.start_s:.1f} s once")
 
     def advice(self, error: float) -> str:
         """The options of `evaluate` that reach an error."""
@@ -313,7 +301,7 @@ def _record(trial: Trial) -> dict[str, Any]:
         told = {name: difference.get(name, math.nan) for name in ("value", "error", "p")}
         own = {"region": one.region, "height": one.height, "quantity": one.quantity.key, "value": one.value}
         numbers.append(json_record({**own, "a": one.error.a, "bias": one.error.bias, "difference": json_record(told)}))
-    names = ("options", "steps", "least_steps", "seconds", "measuring_s", "processor_s", "band_frame")
+    names = ("options", "steps", "least_steps", "seconds", "processor_s", "band_frame")
     return {**{name: getattr(trial, name) for name in names}, "numbers": numbers}
 
 
@@ -374,7 +362,7 @@ def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Tr
             place = region.name, height, region in awaited
             numbers.append(Studied(*place, quantity, value, ErrorModel(own, bias), difference, is_biased))
     least = max(MIN_STEPS, math.ceil(MIN_BLOCKS * steps / worlds) if worlds > 0 else steps)
-    times = result.run.seconds, result.run.measuring_s, processor_s
+    times = result.run.seconds, processor_s
     return Trial(options, steps, least, *times, coverage.band_frame, numbers), coverage
 
 
