@@ -239,10 +239,7 @@ def search(
     per_world: Annotated[int | None, typer.Option(min=1, help="Instants of each world (3).")] = None,
     every_s: Annotated[float | None, typer.Option("--every-s", help="Seconds between two of them (20).")] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Rays of the reference at each instant (16384).")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the search and of its worlds.")] = 0,
-    test_seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the fresh worlds, another one (the next).")
-    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the search and its worlds; fresh ones have the next.")] = 0,
     workers: Annotated[int, typer.Option(min=0, help="Processes that score; 0 scores in this one.")] = 0,
     resume: Annotated[
         bool,
@@ -272,7 +269,6 @@ def search(
         optimiser=optimiser,
         estimate=estimate,
         seed=seed,
-        test_seed=test_seed,
         workers=workers,
         **{name: value for name, value in given.items() if value is not None},
     )

@@ -26,7 +26,6 @@ from torchcover.evaluation.target_error import MIN_STEPS, rounded_up
 from torchcover.evaluation.task import simulation
 from torchcover.files import Publication, end_with_parent
 from torchcover.report import (
-    WorkPanel,
     difference_heading,
     difference_words,
     draw_work_precision,
@@ -252,7 +251,7 @@ class Study:
 
     def draw(self) -> Figure:
         """The diagram of error against run time: the largest error of each unit."""
-        panels = []
+        panels = {}
         for quantity in list(dict.fromkeys(one.quantity for one in self.trials[0].numbers))[:2]:
             lines = {}
             for trial in self.trials:
@@ -261,7 +260,7 @@ class Study:
                 errors = [factor * trial.error_after(each, quantity.unit) for each in steps]
                 times = [trial.seconds_for(each, self.start_s) for each in steps]
                 lines[trial.options or "as given"] = list(zip(times, errors, strict=True))
-            panels.append(WorkPanel(f"largest error of the {difference_heading(quantity)}", lines))
+            panels[f"largest error of the {difference_heading(quantity)}"] = lines
         return draw_work_precision(panels, title=" in ".join(map(str, self.plan.named)), legend_title="setting")
 
     def save(self, folder: str | Path) -> list[Path]:
