@@ -68,7 +68,7 @@ def write_routes(
         on_foot = mix is PEOPLE
         speed_mps = WALKING_MPS if on_foot else FASTER * max(ways.speed_mps, SLOWEST_MPS)
         for k in range(round(number) if ways.length_m.any() else 0):
-            kind = fleet.draw_kind(mix)
+            kind = EGO_TYPE if EGO_TYPE in mix else fleet.draw_kind(mix)
             way = ways.draw(speed_mps * duration_s, generator)
             if on_foot and generator.random() < 0.5:
                 way = way[::-1]
