@@ -47,7 +47,7 @@ def test_one_keeps_to_the_right_where_nothing_is_gained_on_the_left():
 def test_nobody_goes_to_the_right_to_pass_there():
     # The second looks first, while the one ahead of it is still in its lane; the shoulder's is free.
     drives = [
-        drive((1, 60.0, ahead), (1, 0.0, CAR), heavy=[1], times_s=TIMES_S[:8])[0] for ahead in (SLOW, Driver(40.0))
+        drive((1, 60.0, ahead), (1, 0.0, CAR), heavy=[1], times_s=TIMES_S[:15])[0] for ahead in (SLOW, Driver(40.0))
     ]
     assert [[change[:3] for change in traffic.changes] for traffic in drives] == [[], [(1, 1, 2)]]
 
@@ -62,7 +62,7 @@ def test_nobody_cuts_in_where_another_would_have_to_brake_hard():
 
 
 def test_lorries_keep_out_of_the_lane_at_the_median():
-    agents = [(1, 0.0, CAR), (1, 100.0, SLOW), (2, 100.0, SLOW)]
+    agents = [(1, 0.0, CAR), (1, 150.0, SLOW), (2, 150.0, SLOW)]
     assert any(change[:3] == (0, 1, 0) for change in drive(*agents)[0].changes)
     assert not any(change[:3] == (0, 1, 0) for change in drive(*agents, heavy=[0])[0].changes)
 
