@@ -34,9 +34,18 @@ def test_a_faster_one_overtakes_on_the_left_and_comes_back():
     assert flow.speed_mps[100:, 0].min() > 28.0
     passing = np.abs(flow.place_m[:, 0] - flow.place_m[:, 1]) < 5.0
     assert (lanes[passing, 0] == 1).all()
-    # However fast it gets away.
-    back = int(np.argmax(flow.place_m[:, 0] > traffic.changes[1].place_m))
-    assert flow.place_m[back, 0] - flow.place_m[back, 1] - 5.0 > 0.6 * flow.speed_mps[back, 1]
+
+
+def test_nobody_comes_back_right_in_front_of_another_however_fast_they_get_away():
+    pairs = [(2, 3000.0 * pair + 3.0 * pair * slow + 100.0 * slow, SLOW if slow else CAR)
+             for pair in range(16) for slow in (0, 1)]  # fmt: skip
+    traffic, flow, _ = drive(*pairs)
+    back = [change for change in traffic.changes if change.new == 2 and change.agent % 2 == 0]
+    assert len(back) > 8
+    for change in back:
+        at, slow = int(np.argmax(flow.place_m[:, change.agent] >= change.place_m)), change.agent + 1
+        gap_m = flow.place_m[at, change.agent] - flow.place_m[at, slow] - 5.0
+        assert gap_m > 0.6 * flow.speed_mps[at, slow] - 0.1
 
 
 def test_one_keeps_to_the_right_where_nothing_is_gained_on_the_left():
