@@ -27,6 +27,7 @@ BENCHMARKS = (
     "scaling",
     "mutated_files",
     "targets",
+    "kinds",
     "towns",
     "pairing",
     "placement",
