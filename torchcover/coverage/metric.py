@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, MeanOfMeans, VisibleArea
-from torchcover.coverage.blocks import AreaSums, Blocks, KnownCells
-from torchcover.coverage.columns import Columns, Sums
+from torchcover.coverage.blocks import BlockSums, KnownCells
+from torchcover.coverage.columns import CellSums, Columns
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.measures import Measure
 from torchcover.coverage.plotting import draw_coverage
@@ -180,10 +180,9 @@ class CoverageMetric(SumsInBlocks):
                 heights, places in time or errors as `torchcover.coverage.steps.checked_steps` refuses them.
             TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
         """
-        given = (sensor, reference, weights, height, place_in_time, error)
-        how: dict[str, Any] = {"grid": self.grid, "square_metres": self.square_metres, "names": self.sensors}
-        for step in checked_steps(*given, first=int(self.steps), **how):
-            self.add(self.sums_of(step))
+        given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
+        for sums in self.sums_of(sensor, reference, **given):
+            self.add(sums)
 
     def forward(
         self,
@@ -201,9 +200,23 @@ class CoverageMetric(SumsInBlocks):
         given = {"weights": weights, "height": height, "place_in_time": place_in_time, "error": error}
         return super().forward(sensor, reference, **given)  # type: ignore[no-any-return]
 
+    def sums_of(self, sensor: SensorClouds, reference: Clouds, **given: Any) -> list[StepSums]:  # noqa: ANN401
+        """What `update` adds for each step: the same in any process, where the metric has the same parameters.
+
+        Args:
+            sensor: As there.
+            reference: Likewise.
+            given: What else `update` takes.
+
+        Raises:
+            ValueError, TypeError: As there.
+        """
+        given = dict.fromkeys(("weights", "height", "place_in_time", "error")) | given
+        how: dict[str, Any] = {"grid": self.grid, "square_metres": self.square_metres, "names": self.sensors}
+        return list(map(self._sums_of, checked_steps(sensor, reference, **given, first=int(self.steps), **how)))
+
     @torch.no_grad()  # torchmetrics enables gradients in `forward`; the sums would hold on to every step's graph
-    def sums_of(self, step: CheckedStep) -> StepSums:
-        """What a step is to `add`, wherever it is measured: it depends on the parameters of the metric alone."""
+    def _sums_of(self, step: CheckedStep) -> StepSums:
         _, _, reference, weights, height, place_in_time = step
         inside, of, cell = self.grid.bins(reference, height)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
@@ -229,12 +242,13 @@ class CoverageMetric(SumsInBlocks):
         )
 
     def add(self, sums: StepSums) -> None:
-        """Add what `sums_of` a metric of the same parameters has made of a step."""
+        """Add a step that `sums_of` a metric of the same parameters has measured."""
         block, fine = self._block_of(sums.place_in_time), self._fine_block_of(sums.place_in_time)
         self.add_touched("cells", block, sums.cells)
         self.add_touched("places", fine, sums.places)
         for name, count in sums.counts.items():
             getattr(self, name).add_(count)
+        self._follow_steps()
 
     def _distances(self, reference: Tensor, step: CheckedStep) -> list[Tensor]:
         """(S, M) metres to the nearest point of each sensor that counts for the radius, then those for each threshold.
@@ -284,8 +298,8 @@ class CoverageMetric(SumsInBlocks):
             max_radius=self.max_radius,
             known=known,
             layers=[layer for one in self._of_grid for layer in sums.layers(one, self.max_radius)],
-            blocks=Blocks(*listed, in_blocks.probed_steps.long(), mean["sums"]) if self.blocks > 1 else None,
-            area=AreaSums(*listed, area["m2"], area["sums"]) if area else None,
+            blocks=BlockSums(*listed, in_blocks.probed_steps.long(), mean["sums"]) if self.blocks > 1 else None,
+            area=BlockSums(*listed, area["m2"], area["sums"]) if area else None,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
             regions=self.regions,
             places=self._by_area(),
@@ -295,7 +309,7 @@ class CoverageMetric(SumsInBlocks):
             else None,
         )
 
-    def _in_places(self, *, fine: bool) -> Sums:
+    def _in_places(self, *, fine: bool) -> CellSums:
         """The sums of (..., B, P) places in blocks, the fine ones or the others."""
         together = 1 if fine else min(int(self.block_length), FINER)  # so many fine blocks are one
         blocks, count = self.fine_blocks if fine else self.blocks, self._places.count

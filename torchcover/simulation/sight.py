@@ -63,15 +63,15 @@ class MountedSensor:
             )
         self._times = ray_times(sensor, self.tiles, self.pixel_of_ray) if scene.moves else None
         self._is_raw = bool(self._times and timing and not timing.deskewed)
-        self._own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
+        self.own_m = scene.own_m(self.vehicle_T_sensor, self.tiles, max_range_m=reach_m)
         housings = [
             mesh.moved(other.mount.matrix()) for other in others for body in other.housing for mesh in body.meshes()
         ]
         if housings:
             caster = RayCaster(housings)
             ends_m = [ends_at(caster, self.vehicle_T_sensor, tile, reach_m) for tile in self.tiles]
-            ego_m = self._own_m or ends_m
-            self._own_m = tuple(np.minimum(*both) for both in zip(ends_m, ego_m, strict=True))
+            ego_m = self.own_m or ends_m
+            self.own_m = tuple(np.minimum(*both) for both in zip(ends_m, ego_m, strict=True))
         self._at_rest = not scene.moves
         self._resting: tuple[SensorScan, RayHits] | None = None
 
@@ -108,7 +108,7 @@ class MountedSensor:
     def _cast(self, instant: Instant, threads: int, within: Balls | None) -> tuple[SensorScan, RayHits]:
         if self._resting is not None:
             return self._resting
-        tiles, own_m, cast = self.tiles, self._own_m, None
+        tiles, own_m, cast = self.tiles, self.own_m, None
         # A ray that is cast at another time than that of the frame starts elsewhere.
         may_spare = bool(own_m) and self._times is None and not self._at_rest
         if within is not None and len(within.centres_m) <= FEW and may_spare:
@@ -124,7 +124,7 @@ class MountedSensor:
             threads=threads,
         )
         if cast is not None:
-            ended = int((np.concatenate(self._own_m)[~cast] <= self.reach_m).sum())
+            ended = int((np.concatenate(self.own_m)[~cast] <= self.reach_m).sum())
             scan = scan._replace(
                 ray=np.flatnonzero(cast)[scan.ray],
                 rays=len(cast),
@@ -148,7 +148,7 @@ class MountedSensor:
 
     def ends(self, instant: Instant) -> Ends:
         """Where each of its rays ends: at what it hits first, the ego's body included, or at its reach."""
-        bodies, own = instant.outlines(self.vehicle_T_sensor[:3, 3]), self._own_m or [None] * len(self.tiles)
+        bodies, own = instant.outlines(self.vehicle_T_sensor[:3, 3]), self.own_m or [None] * len(self.tiles)
         range_m, is_hit = [], []
         for tile, own_m in zip(self.tiles, own, strict=True):
             limit_m = np.full(tile.directions.shape[1], self.reach_m, dtype=np.float32)
