@@ -59,7 +59,7 @@ def test_the_sight_opens_when_the_line_past_the_corner_of_a_wall_meets_the_walke
     one = sight_encounter(
         mounted(scanner), crossing(speed_kmh, walker, obstacles=walls), Criterion(points=1, looks=1), phases=1
     )
-    # Seconds before the ego's front is at the walker's way, which the line past the corner (-1.01, -1.6) meets at y = ..
+    # Seconds before the ego's front is at the walker's way, which the line past (-1.01, -1.6) meets at y = ..
     before_s = np.linspace(0.3, 1.39, 100_001)
     sensor_m = -0.5 - speed_kmh / 3.6 * before_s
     opens_s = before_s[-1.5 * before_s + 0.01 >= -1.6 * sensor_m / (sensor_m + 1.01)].max()
@@ -236,8 +236,10 @@ def test_rows_are_of_speeds_with_intervals_over_draws():
         assert row.worst == "ahead"
     slow = [one.ttc_s for one in found.sightings if one.encounter.ego.speed_kmh == 20]
     assert rows[0].in_time == np.mean(np.stack(slow) >= rows[0].needed_s)
-    bands = dict(found.bands())["f"]["small"]
-    assert [band[0] for band in bands] == [20, 40]
+    ((name, of_rigs, needed),) = found.bands()
+    bands = of_rigs["small"]
+    assert (name, [band[0] for band in bands]) == ("f", [20, 40])
+    assert [at for _, at in needed] == [row.needed_s for row in rows]
     assert bands[0][1:] == (rows[0].ttc_s_low, rows[0].ttc_s_high)
 
 

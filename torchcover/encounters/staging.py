@@ -111,7 +111,7 @@ class Staged:
             return overlapping(self.other.box, self.vehicle_T_other(times_s), self.ego.box.corners_m)
 
         end_s, words = self.encounter.before_s + AFTER_S, self.encounter.words
-        times_s = STEP_S * np.arange(math.ceil(end_s / STEP_S) + 1)
+        times_s = STEP_S * np.arange(math.ceil(end_s / STEP_S) + 1, dtype=np.float64)
         touches = touching(times_s)
         if not touches.any():
             raise ValueError(
