@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torchcover.geometry import rigid
 from torchcover.simulation.instant import Instant, SensorScan
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.rays import BLOCK, Tile, into_tiles, pixels_in_tiles, rotate
+from torchcover.simulation.rays import BLOCK, Balls, Tile, into_tiles, pixels_in_tiles, rotate
 from torchcover.simulation.scene import Scene, ends_at
 from torchcover.simulation.sensor import Draws, RayHits, ScanTimes, Sensor
 from torchcover.simulation.sweep import RayTimes
@@ -18,6 +18,8 @@ from torchcover.simulation.weather import CLEAR, Weather
 
 # Rays in a tile: of neighbours all, so that a tile is narrow. A constant, so that nothing depends on threads.
 TILE_RAYS = 8192
+# Of so many places or less it is found out which rays can hit something there; of more, nearly all can.
+FEW = 800
 # A ray ends before its target by this share of its length, which float32 leaves open.
 SHORTER = 1e-6
 
@@ -73,9 +75,16 @@ class MountedSensor:
         self._at_rest = not scene.moves
         self._resting: tuple[SensorScan, RayHits] | None = None
 
-    def scan(self, instant: Instant, draws: Draws, *, threads: int = 1) -> SensorScan:
-        """What it makes of what its rays hit at one time of the scene."""
-        scan, hits = self._cast(instant, threads)
+    def scan(self, instant: Instant, draws: Draws, *, threads: int = 1, within: Balls | None = None) -> SensorScan:
+        """What it makes of what its rays hit at one time of the scene.
+
+        Args:
+            instant: The scene then.
+            draws: Source of the random numbers, which each ray has of its own if some are not cast.
+            threads: Number of threads; the result does not depend on it.
+            within: What is asked about: rays that hit nothing there need not be cast. The points within are the same.
+        """
+        scan, hits = self._cast(instant, threads, within)
         if self._is_raw:
             scan = self._as_cast(scan)
         hit, error_m = self.sensor.measure(hits, draws)
@@ -96,21 +105,46 @@ class MountedSensor:
         landed = self.vehicle_T_sensor[:3, 3] + scan.range_m[:, None] * ways
         return scan._replace(landed=landed.astype(np.float32), ways=lambda: ways)
 
-    def _cast(self, instant: Instant, threads: int) -> tuple[SensorScan, RayHits]:
+    def _cast(self, instant: Instant, threads: int, within: Balls | None) -> tuple[SensorScan, RayHits]:
         if self._resting is not None:
             return self._resting
+        tiles, own_m, cast = self.tiles, self.own_m, None
+        # A ray that is cast at another time than that of the frame starts elsewhere.
+        may_spare = bool(own_m) and self._times is None and not self._at_rest
+        if within is not None and len(within.centres_m) <= FEW and may_spare:
+            met = self._met(within)
+            tiles = tuple(tile.some(some) for tile, some in zip(tiles, met, strict=True))
+            own_m, cast = tuple(ends_m[some] for ends_m, some in zip(own_m, met, strict=True)), np.concatenate(met)
         scan = instant.scan(
             self.vehicle_T_sensor,
-            self.tiles,
+            tiles,
             max_range_m=self.reach_m,
-            own_m=self.own_m,
+            own_m=own_m,
             times=self._times,
             threads=threads,
         )
+        if cast is not None:
+            ended = int((np.concatenate(self.own_m)[~cast] <= self.reach_m).sum())
+            scan = scan._replace(
+                ray=np.flatnonzero(cast)[scan.ray],
+                rays=len(cast),
+                rays_spared=len(cast) - scan.rays,
+                self_hits=scan.self_hits + ended,
+            )
         hits = RayHits(scan.ray, scan.range_m, self.pixel_of_ray, find=scan.struck, weather=self.weather)
         if self._at_rest:
             self._resting = scan, hits
         return scan, hits
+
+    def _met(self, within: Balls) -> list[NDArray[np.bool_]]:
+        """For each tile (n,) which of its rays have to be cast: all of a beam, or none."""
+        met = [within.met_by(tile, self.vehicle_T_sensor) for tile in self.tiles]
+        beams = self.sensor.beams()
+        if beams is None:
+            return met
+        beam = beams.ravel()[self.pixel_of_ray]
+        all_of_beams = np.isin(beam, beam[np.concatenate(met)])
+        return np.split(all_of_beams, np.cumsum([len(each) for each in met])[:-1])
 
     def ends(self, instant: Instant) -> Ends:
         """Where each of its rays ends: at what it hits first, the ego's body included, or at its reach."""

@@ -104,7 +104,7 @@ class Sumo(Procedural):
         ground = ground_of(vicinity)
         pavement = Pavement(vicinity, ground)
         sides, taken = sides_of(vicinity, self.built_share, generator)
-        stood = stand(sides, taken, (), (), ground.heights_m, self.roadside, generator)
+        stood = stand(sides, taken, taken, (), ground.heights_m, self.roadside, generator)
         raised = few(pavement.meshes(), decks(vicinity))
         static = (ground.mesh(), *raised, *few(*stood))
         parked = park(vicinity, ground, fleet, self.parked_share, generator)
