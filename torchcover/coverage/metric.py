@@ -66,6 +66,8 @@ class CoverageMetric(SumsInBlocks):
             area, a reference point belongs to a region by its own place, so that cells decide about maps only.
         sensors: Names of the rig's sensors, for `Coverage.redundancy`: then `update` takes a cloud for each by its
             name, and what the rig is without each of them is known as well.
+        radii: Whether radii are asked for. Without, they are NaN, and the search ends at the largest threshold: the
+            clouds may lack points that are farther from any reference point.
         square_metres: Whether there is to be an estimate by area too; then every step needs the square metres of its
             reference points, as `SurfaceReference` gives them.
         backend: Nearest-neighbour search, as in `torchcover.nearest`.
@@ -103,12 +105,15 @@ class CoverageMetric(SumsInBlocks):
         aggregations: Sequence[Aggregation] = (),
         regions: Sequence[Region] | None = None,
         sensors: Sequence[str] = (),
+        radii: bool = True,
         square_metres: bool = False,
         backend: str = "auto",
         memory_mb: float = 256.0,
         **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
     ) -> None:
         check_parameters(thresholds, max_radius, aggregations)
+        if not radii and (aggregations or sensors or not thresholds):
+            raise ValueError("radii: aggregations and sensors need them, and without there has to be a threshold")
         regions = regions_within(grid) if regions is None else tuple(regions)
         check_regions(regions, grid)
         thresholds, max_radius = tuple(float(threshold) for threshold in thresholds), float(max_radius)
@@ -120,12 +125,13 @@ class CoverageMetric(SumsInBlocks):
             "aggregations": tuple(aggregations),
             "square_metres": square_metres,
             **({"sensors": tuple(sensors)} if sensors else {}),
+            **({} if radii else {"radii": radii}),
             **({"regions": regions} if square_metres or aggregations else {}),
         }
         super().__init__(blocks, meaning, **kwargs)
         self.grid, self.thresholds, self.max_radius = grid, thresholds, max_radius
         self.regions, self.sensors, self.square_metres = regions, tuple(sensors), square_metres
-        self.backend, self.memory_mb = backend, memory_mb
+        self.radii, self.backend, self.memory_mb = radii, backend, memory_mb
         over_area = [VisibleArea(thresholds)] if square_metres else []
         self._of_grid: tuple[Aggregation, ...] = (MeanOfMeans(thresholds), *over_area, *aggregations)
         self._failures = SensorFailures(self.sensors, thresholds, square_metres) if sensors else None
@@ -223,7 +229,7 @@ class CoverageMetric(SumsInBlocks):
             "steps": 1,
             "empty_sensor_steps": int(step.is_blind),
             "empty_reference_steps": int(len(reference) == 0),
-            "saturated_points": int((distance >= self.max_radius).sum()),
+            "saturated_points": int((distance >= self.max_radius).sum()) if self.radii else 0,
             "inside_points": len(distance),
             "outside_points": len(reference) - len(distance),
             "no_ground_points": 0 if height is None else int(height.isnan().sum()),
@@ -252,7 +258,8 @@ class CoverageMetric(SumsInBlocks):
         found: dict[float, Tensor] = {}
         beyond_m, distance = -math.inf, None
         for within_m in sorted({MEASURED_WITHIN_M, *self.thresholds}):
-            reach_m = self.max_radius if within_m <= MEASURED_WITHIN_M else max(self.thresholds)
+            for_radii = self.radii and within_m <= MEASURED_WITHIN_M
+            reach_m = self.max_radius if for_radii else max(self.thresholds)
             some = step.measured(beyond_m, within_m)
             if distance is None or any(map(len, some)):
                 how: dict[str, Any] = {"backend": self.backend, "memory_mb": self.memory_mb, "max_distance": reach_m}
@@ -268,6 +275,7 @@ class CoverageMetric(SumsInBlocks):
         pairs = zip(of_thresholds, self.thresholds, strict=True)
         detected = [(near <= threshold).double() for near, threshold in pairs]
         radius = distance.clamp(max=distance.new_tensor(self.max_radius)).double()
+        radius = radius if self.radii else torch.full_like(radius, math.nan)
         values = torch.stack([radius, *detected])
         if self._failures:
             values = torch.cat([values, self._failures.values(of_sensors, self.max_radius)])

@@ -24,9 +24,10 @@ Zone = Literal["kerb", "built", "open"]
 # What stands on a slope goes on below it.
 SUNK_M = 1.0
 # Walls and hedges are straight for so long at most.
-WALL_M = 6.0
+WALL_M = 10.0
 # Corners of a line may coincide.
 TINY_M = 1e-9
+TAPERED = 0.6
 # In the middle of a tree's width, which hangs over the street otherwise.
 TRUNK = 0.1
 
@@ -127,8 +128,8 @@ def stand(
 
     Args:
         sides: The sides.
-        driven: In plan: where nothing may stand.
-        walked: In plan: where only what stands at kerbs may.
+        driven: In plan: where nothing at kerbs may stand.
+        walked: In plan: where nothing behind sidewalks may stand.
         pavements: In plan: what is a kerb higher than the ground.
         heights_m: Of the ground, at (N, 2) places.
         times: See `Times`.
@@ -238,19 +239,23 @@ def _free(
     """(N,) which pieces are in nobody's way, and how much higher than the ground they stand."""
     foot = np.array([kind.foot for kind in KINDS.values()])[kinds][:, None, None]
     middles_m = outlines_m.mean(axis=1, keepdims=True)
-    feet = shapely.STRtree(shapely.linearrings(middles_m + foot * (outlines_m - middles_m)))
+    feet = shapely.linearrings(middles_m + foot * (outlines_m - middles_m))
     # Of the two geometries it is the query's that is prepared: it had better be the large one.
-    met, on = (np.zeros((2, len(kinds)), dtype=bool) for _ in range(2))
-    for which, large in enumerate((driven, walked)):
-        met[which, feet.query(np.array(large, dtype=object), predicate="intersects")[1]] = True
-    for which, predicate in enumerate(("intersects", "contains")):
-        on[which, feet.query(np.array(pavements, dtype=object), predicate=predicate)[1]] = True
+    free, on, within = (np.zeros(len(kinds), dtype=bool) for _ in range(3))
     at_kerb = np.array(["kerb" in kind.zones for kind in KINDS.values()])[kinds]
-    free = ~met[0] & (at_kerb | ~met[1]) & (on[0] == on[1])
-    # On the inside of a tight curve, where the ways to the right meet, outlines fold.
+    for own, streets in ((at_kerb, driven), (~at_kerb, walked)):
+        met = shapely.STRtree(feet[own]).query(np.array(streets, dtype=object), predicate="intersects")[1]
+        free[own] = ~np.isin(np.arange(np.count_nonzero(own)), met)
+    floors = shapely.STRtree(feet)
+    for found, predicate in ((on, "intersects"), (within, "contains")):
+        found[floors.query(np.array(pavements, dtype=object), predicate=predicate)[1]] = True
+    free &= on == within
+    # On the inside of a tight curve, where the ways to the right meet, outlines fold or taper.
     sides = np.roll(outlines_m, -1, axis=1) - outlines_m
     following = np.roll(sides, -1, axis=1)
     free &= (sides[..., 0] * following[..., 1] > sides[..., 1] * following[..., 0]).all(axis=1)
+    far_m, near_m = np.linalg.norm(sides[:, ::2], axis=2).T
+    free &= (far_m > TAPERED * near_m) & (near_m > TAPERED * far_m)
     number = np.flatnonzero(free)
     later, earlier = number[_meeting(outlines_m[number])]
     apart = (kinds[earlier] != kinds[later]) | (run[earlier] != run[later])
@@ -258,7 +263,7 @@ def _free(
     for one, other in zip(later[apart][order].tolist(), earlier[apart][order].tolist(), strict=True):
         if free[other]:
             free[one] = False
-    return free, PAVEMENT_M * on[1]
+    return free, PAVEMENT_M * within
 
 
 def _meeting(outlines_m: Numbers) -> NDArray[np.int64]:
