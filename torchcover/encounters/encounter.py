@@ -2,11 +2,14 @@
 
 import math
 from collections.abc import Iterator
+from functools import lru_cache
 from itertools import product
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     BeforeValidator,
     Field,
     PositiveFloat,
@@ -16,8 +19,8 @@ from pydantic import (
     model_validator,
 )
 
-from torchcover.simulation.bodies import Shape
-from torchcover.simulation.documents import BuiltIn, Document, explain
+from torchcover.simulation.bodies import Shape, Vehicle, VehicleShape
+from torchcover.simulation.documents import BuiltIn, Document, beside, explain, is_file_name
 from torchcover.simulation.weather import CLEAR, Weather
 
 # Of a family: ten times what anybody would wait for.
@@ -35,11 +38,31 @@ def _body(content: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
     return {"type": "vehicle", "vehicle": content} if isinstance(content, str) else content
 
 
-def _weather(content: Any) -> Any:  # noqa: ANN401
-    return Weather.load(content) if isinstance(content, str) else content
+def _weather(content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401
+    if not isinstance(content, str):
+        return content
+    try:
+        return Weather.load(beside(Path(content), info) if is_file_name(content) else content)
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from error
 
 
-AnyBody = Annotated[Shape, BeforeValidator(_body)]
+def _known(shape: Shape) -> Shape:
+    """At the door, and once: a set has few bodies."""
+    if isinstance(shape, VehicleShape):
+        _check_vehicle(shape.vehicle)
+    return shape
+
+
+@lru_cache(maxsize=64)
+def _check_vehicle(name_or_path: str) -> None:
+    try:
+        Vehicle.load(name_or_path)
+    except FileNotFoundError as error:
+        raise ValueError(str(error)) from error
+
+
+AnyBody = Annotated[Shape, BeforeValidator(_body), AfterValidator(_known)]
 
 
 class Way(Document):
@@ -134,6 +157,19 @@ class Encounter(Document):
     def words(self) -> str:
         """Which one of its set."""
         return f"encounter {self.name!r} at {self.ego.speed_kmh:g} km/h"
+
+    @property
+    def closing_mps(self) -> float:
+        """What the brakes must take away: the ego's speed, less that of the other in the same direction.
+
+        Example:
+            >>> ways = {"ego": {"speed_kmh": 90}, "other": {"body": "hatchback", "speed_kmh": 54, "yaw_deg": 0}}
+            >>> round(Encounter.model_validate({"name": "ahead", **ways}).closing_mps, 9)
+            10.0
+        """
+        along_mps = self.other.speed_mps * math.cos(math.radians(self.other.yaw_deg))
+        speed_mps = self.ego.speed_mps
+        return max(abs(speed_mps) - max(math.copysign(along_mps, along_mps * speed_mps), 0.0), 0.0)
 
     @property
     def before_s(self) -> float:

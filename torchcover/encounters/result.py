@@ -82,7 +82,7 @@ class Sightings:
     def _row(self, draws: list[Sighting]) -> EncounterRow:
         first, criterion = draws[0], self.criterion
         ttc_s = np.stack([one.ttc_s for one in draws])
-        needed_s = np.array([criterion.needed_s(one.encounter.ego.speed_mps) for one in draws])
+        needed_s = np.array([criterion.needed_s(one.encounter.closing_mps) for one in draws])
         alone_s = np.mean([one.sensor_ttc_s for one in draws], axis=(0, 2))
         without_s = np.min([one.without_ttc_s for one in draws], axis=(0, 2))
         of_draws_s, sensors = ttc_s.mean(axis=1), self.sensors[first.rig]
@@ -132,7 +132,9 @@ class Sightings:
     def tables(self) -> list[PageTable]:
         """Up to which speed, when, and by which sensor."""
         rows, rigs = self.rows, list(self.sensors)
-        tables = [_speeds(self.up_to_kmh(), rigs), self._times(rows, rigs)]
+        tables = [self._times(rows, rigs)]
+        if any(one.encounter.speed_is_swept for one in self.sightings):
+            tables.insert(0, _speeds(self.up_to_kmh(), rigs))
         several = [row for row in rows if len(self.sensors[row.rig]) > 1]
         return [*tables, _sensors(several)] if several else tables
 
@@ -145,7 +147,7 @@ class Sightings:
         unsure = any(row.from_the_beginning for row in rows)
         notes = [
             "The least and the most over the phases of the looks and what was drawn, of that the mean with its 95 % "
-            "interval; ! is too late in some of them, !! in all, - is not before the collision.",
+            "interval; - is not before the collision.",
             *(["> was seen as soon as the encounter began, and may have been before."] if unsure else []),
             f"Detected: {self.criterion.points} points of LiDARs, {self.criterion.pixels} pixels of a camera, or a "
             f"point of a radar, in {self.criterion.looks} looks in a row. Needed: to stop with "
@@ -161,8 +163,8 @@ class Sightings:
             writer.writerow(EncounterRow._fields)
             writer.writerows(map(_cells, self.rows))
 
-    def bands(self) -> Iterator[tuple[str, dict[str, list[tuple[float, float, float]]]]]:
-        """For the picture: each encounter with, for each rig, speed in km/h, least and most time to collision."""
+    def bands(self) -> Iterator[tuple[str, dict[str, list[tuple[float, float, float]]], list[tuple[float, float]]]]:
+        """For the picture: each encounter; of each rig speed (km/h), least and most time to collision; the needed."""
         by_name = sorted(self.sightings, key=lambda one: one.encounter.name)
         of_names = {name: list(group) for name, group in groupby(by_name, key=lambda one: one.encounter.name)}
         for name in dict.fromkeys(one.encounter.name for one in self.sightings):
@@ -173,7 +175,8 @@ class Sightings:
                     if one.rig == rig:
                         times.setdefault(abs(one.encounter.ego.speed_kmh), []).extend(one.ttc_s.tolist())
                 bands[rig] = [(speed, min(each), max(each)) for speed, each in sorted(times.items())]
-            yield name, bands
+            cases = {abs(one.encounter.ego.speed_kmh): one.encounter.closing_mps for one in of_names[name]}
+            yield name, bands, [(speed, self.criterion.needed_s(mps)) for speed, mps in sorted(cases.items())]
 
 
 def _cells(row: EncounterRow) -> list[str]:
@@ -186,12 +189,12 @@ def _speed(row: EncounterRow) -> str:
 
 def _time(row: EncounterRow) -> str:
     if row.ttc_s_high == 0:
-        return "- !!"
+        return "-, too late"
     low, high = (f"{value:.2f}" if value else "-" for value in (row.ttc_s_low, row.ttc_s_high))
-    mark = "" if row.in_time == 1 else " !" if row.in_time else " !!"
+    late = "" if row.in_time == 1 else f", {100 * row.in_time:.0f} % in time" if row.in_time else ", too late"
     mean = f", mean {row.ttc_s:.2f}" if row.draws > 1 else ""
     interval = f" ({row.interval_low:.2f} to {row.interval_high:.2f})" if row.interval_high > row.interval_low else ""
-    return f"{'>' if row.from_the_beginning else ''}{low if low == high else f'{low} to {high}'}{mean}{interval}{mark}"
+    return f"{'>' if row.from_the_beginning else ''}{low if low == high else f'{low} to {high}'}{mean}{interval}{late}"
 
 
 def _speeds(up_to_kmh: dict[tuple[str, str], float], rigs: Sequence[str]) -> PageTable:

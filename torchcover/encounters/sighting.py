@@ -65,14 +65,14 @@ class Criterion:
         if not 0 <= self.latency_s < math.inf:
             raise ValueError(f"latency: seconds of 0 or more are needed; got {self.latency_s}")
 
-    def needed_s(self, speed_mps: float) -> float:
-        """The time to collision at which braking still stops the ego before the place: v / (2 a) + latency.
+    def needed_s(self, closing_mps: float) -> float:
+        """The time to collision at which braking still prevents it: v / (2 a) + latency.
 
         Example:
             >>> round(Criterion().needed_s(50 / 3.6), 2)
             1.27
         """
-        return abs(speed_mps) / (2 * self.deceleration_mps2) + self.latency_s
+        return closing_mps / (2 * self.deceleration_mps2) + self.latency_s
 
 
 class Sighting(NamedTuple):
@@ -141,7 +141,7 @@ class MountedRig:
 
 def _at_once(sensor: Sensor) -> Sensor:
     scan = getattr(sensor, "scan", None)
-    return sensor if scan is None else sensor.model_copy(update={"scan": None})  # type: ignore[attr-defined,no-any-return]
+    return sensor if scan is None else sensor.model_copy(update={"scan": None})  # type: ignore[attr-defined]
 
 
 def sight_encounter(
@@ -277,7 +277,8 @@ class Looks:
 
     def points(self, sensors: Sequence[int], steps: Numbers) -> Numbers:
         """(N,) points, or pixels, of some sensors together at (N,) steps."""
-        return np.sum([self._of_sensor(k, steps) for k in sensors], axis=0, dtype=np.int64)
+        points: Numbers = np.sum([self._of_sensor(k, steps) for k in sensors], axis=0, dtype=np.int64)
+        return points
 
     def _of_sensor(self, number: int, steps: Numbers) -> Numbers:
         known = self._points[number]
@@ -288,7 +289,7 @@ class Looks:
 
     def _look(self, number: int, steps: Numbers) -> Numbers:
         mounted, other = self._mounted[number], self._staged.other
-        poses = self._staged.vehicle_T_other(STEP_S * steps)
+        poses = self._staged.vehicle_T_other(STEP_S * steps.astype(np.float64))
         placed = Moving.placed([other] * len(steps), poses, np.full(len(steps), -1))
         reach_m = np.concatenate(mounted.own_m).clip(max=np.float32(mounted.reach_m))
         met = meetings(placed, mounted, reach_m)

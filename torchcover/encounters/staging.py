@@ -51,7 +51,7 @@ class Staged:
     def __init__(self, encounter: Encounter, ego: Solid) -> None:
         self.encounter, self.ego = encounter, ego
         self.other = solid_of(encounter.other.body)
-        self._obstacles = self._placed_obstacles()
+        self.obstacles = self._placed_obstacles()
         self.contact_s = self._contact_s()
         self._check_ways()
 
@@ -80,7 +80,7 @@ class Staged:
         # Transient: even an ego at rest is no part of what never moves, as it is in all other encounters.
         drive = Trajectory(along.times_s, along.positions_m, along.angles_deg, transient=True)
         ground = Plane(type="plane", size_m=(GROUND_M, GROUND_M)).mesh().made_of("road")
-        static = (ground, *(solid_of(one.body).mesh.moved(pose) for one, pose in self._obstacles))
+        static = (ground, *(solid_of(one.body).mesh.moved(pose) for one, pose in self.obstacles))
         ego = Actor("ego", "ego", self.ego.mesh, drive)
         return Scene(World(static, ego, time_step_s=STEP_S, duration_s=steps * STEP_S, ground=(0,)), solids)
 
@@ -111,7 +111,7 @@ class Staged:
             return overlapping(self.other.box, self.vehicle_T_other(times_s), self.ego.box.corners_m)
 
         end_s, words = self.encounter.before_s + AFTER_S, self.encounter.words
-        times_s = STEP_S * np.arange(math.ceil(end_s / STEP_S) + 1)
+        times_s = STEP_S * np.arange(math.ceil(end_s / STEP_S) + 1, dtype=np.float64)
         touches = touching(times_s)
         if not touches.any():
             raise ValueError(
@@ -131,7 +131,7 @@ class Staged:
         """Until they touch, nobody drives or walks through an obstacle."""
         times_s = np.append(np.arange(0.0, self.contact_s, BEND_S), self.contact_s)
         ways = (("the ego", self.ego, self.world_T_ego), ("the other", self.other, self.world_T_other))
-        for obstacle, pose in self._obstacles:
+        for obstacle, pose in self.obstacles:
             for who, solid, way in ways:
                 there = np.linalg.inv(way(times_s)) @ pose
                 on_way = overlapping(solid_of(obstacle.body).box, there, solid.box.corners_m)

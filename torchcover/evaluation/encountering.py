@@ -76,11 +76,7 @@ def encounter(
 
 def encounter_picture(found: Sightings) -> Figure:
     """Time to collision at detection against the speed, a band for each rig, and what is needed."""
-    return draw_encounters(
-        list(found.bands()),
-        lambda speed_kmh: found.criterion.needed_s(speed_kmh / 3.6),
-        title=f"{found.name}: time to collision at detection",
-    )
+    return draw_encounters(list(found.bands()), title=f"{found.name}: time to collision at detection")
 
 
 def save_encounters(found: Sightings, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:

@@ -1,6 +1,6 @@
 """Time to collision at detection against speed."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib import colormaps
@@ -14,13 +14,12 @@ Band = Sequence[tuple[float, float, float]]
 
 
 def draw_encounters(
-    panels: Sequence[tuple[str, Mapping[str, Band]]], needed_s: Callable[[float], float], *, title: str
+    panels: Sequence[tuple[str, Mapping[str, Band], Sequence[tuple[float, float]]]], *, title: str
 ) -> Figure:
     """Draw when rigs detected whom they met: a panel each encounter, a band each rig, a line for what is needed.
 
     Args:
-        panels: Name of each encounter, and the band of each rig.
-        needed_s: The time to collision that is needed at a speed in km/h.
+        panels: Name of each encounter, the band of each rig, and what is needed: speed in km/h, time to collision in s.
         title: Above all.
 
     Returns:
@@ -32,17 +31,14 @@ def draw_encounters(
     FigureCanvasAgg(figure)
     figure.suptitle(title, parse_math=False)
     views = figure.subplots(down, across, squeeze=False, sharey=True).ravel()
-    for axes, (name, bands) in zip(views, panels, strict=False):
+    for axes, (name, bands, needed) in zip(views, panels, strict=False):
         for number, (rig, band) in enumerate(bands.items()):
             speed_kmh, low_s, high_s = np.array(band).T
             colour = colormaps[COLOURS](number % 10)
             axes.fill_between(speed_kmh, low_s, high_s, color=colour, alpha=0.25, linewidth=0)
             # Of one speed alone there is no area.
             axes.vlines(speed_kmh, low_s, high_s, color=colour, linewidth=1.5, label=rig)
-        speeds_kmh = [one[0] for band in bands.values() for one in band]
-        ends_kmh = np.linspace(min(speeds_kmh) - 1.0, max(speeds_kmh) + 1.0, 50)
-        needed = [needed_s(speed_kmh) for speed_kmh in ends_kmh.tolist()]
-        axes.plot(ends_kmh, needed, color="black", linestyle="--", linewidth=1.2, label="needed")
+        axes.plot(*np.array(needed).T, color="black", linestyle="--", marker=".", linewidth=1.2, label="needed")
         axes.set_title(name, fontsize="small", parse_math=False)
         axes.set(xlabel="speed of the vehicle (km/h)")
         axes.set_ylim(bottom=0.0)
