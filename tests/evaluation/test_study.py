@@ -136,6 +136,6 @@ def test_a_run_that_was_cut_short_is_no_study(monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("torchcover.evaluation.observers.CoverageObserver.update", interrupted)
+    monkeypatch.setattr("torchcover.evaluation.observers.CoverageObserver.add", interrupted)
     with pytest.raises(KeyboardInterrupt):
         error_against_time(StudyPlan(SMALL))

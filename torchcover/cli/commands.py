@@ -218,6 +218,40 @@ def targets(
     raise typer.Exit(code)
 
 
+@with_options(of_evaluate("vehicle", "sensor_model", "seed"))
+def encounter(
+    rigs: Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files.")],
+    encounters: Annotated[
+        str, typer.Option("--set", help="Set of encounters: a built-in name or a YAML file.")
+    ] = "crossing_like",
+    phases: Annotated[int, typer.Option(min=1, help="At how many places of their period the looks begin.")] = 10,
+    points: Annotated[int, typer.Option(min=1, help="Points that are enough, of LiDARs with the same rate.")] = 5,
+    pixels: Annotated[int, typer.Option(min=1, help="Pixels of the full image that are enough, of a camera.")] = 200,
+    looks: Annotated[int, typer.Option(min=1, help="In so many looks in a row.")] = 3,
+    deceleration: Annotated[float, typer.Option(help="Of the brakes, in m/s2.")] = 9.0,
+    latency_s: Annotated[
+        float, typer.Option("--latency-s", help="Seconds from the last of these looks to the brakes.")
+    ] = 0.5,
+    out: options.Out = Path("out/encounters"),
+    files: options.Files = options.ALL_FILES,
+    **settings: Any,  # noqa: ANN401
+) -> None:
+    """Would it see the child in time? Of crossings and other encounters: the time to collision at detection."""
+    from rich.console import Console
+
+    from torchcover.cli.printing import in_words, print_files, print_whole
+    from torchcover.encounters import Criterion
+    from torchcover.evaluation import encounter, save_encounters
+    from torchcover.files import claimed
+
+    criterion = Criterion(points, pixels, looks, deceleration, latency_s)
+    with claimed(out):
+        found = encounter(rigs, encounters, criterion, phases=phases, progress=True, **settings)
+        written = save_encounters(found, out, files=files)
+    print_whole([in_words(table) for table in found.tables()])
+    print_files(written, out, Console())
+
+
 @with_options(of_evaluate("sensor_model"))
 def search(
     space: Annotated[Path, typer.Argument(help="YAML file of what is free, and of what a good rig is.")],
@@ -320,7 +354,7 @@ def list_builtin(
         str | None, typer.Argument(help="Only those with this word, with all that is said of them.")
     ] = None,
 ) -> None:
-    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials and weather."""
+    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials, weather and encounters."""
     from torchcover.cli.listing import run
 
     run(word)

@@ -10,7 +10,7 @@ from torchcover.coverage.aggregations import Aggregation, BinnedStep, Layer
 from torchcover.coverage.binning import mean_per_cell
 
 
-class Sums(NamedTuple):
+class CellSums(NamedTuple):
     """The columns by what they are.
 
     Args:
@@ -66,9 +66,9 @@ class Columns:
         counts = torch.stack([means.cell, torch.ones_like(means.cell), means.points])
         return torch.cat([counts.double(), *(columns[key].double() for key in self._shapes)])
 
-    def read(self, columns: Tensor) -> Sums:
+    def read(self, columns: Tensor) -> CellSums:
         """Tell (count, ...) columns apart."""
-        sums = Sums(columns[0], columns[1], {one.name: {} for one in self.aggregations})
+        sums = CellSums(columns[0], columns[1], {one.name: {} for one in self.aggregations})
         start = 2
         for (owner, name), shape in self._shapes.items():
             end = start + torch.Size(shape).numel()

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation
-from torchcover.coverage.columns import Sums
+from torchcover.coverage.columns import CellSums
 from torchcover.estimation import Estimate, Quantity
 
 
@@ -40,7 +40,7 @@ class PlaceSums(NamedTuple):
         return Estimate.of_ratios(quantities, self.m2[:, place], self.sums[:, : len(quantities), place], self.steps)
 
 
-def numbers_of_places(sums: Sums, aggregations: Sequence[Aggregation], max_radius: float) -> PlaceNumbers:
+def numbers_of_places(sums: CellSums, aggregations: Sequence[Aggregation], max_radius: float) -> PlaceNumbers:
     """What aggregations say of P places, as of maps, but for one cell a region and band.
 
     Of a largest value no error is known, for it is the same whichever block is left out but one.

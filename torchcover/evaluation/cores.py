@@ -93,7 +93,7 @@ def _is_said() -> bool:
 @cache
 def _warn_once() -> None:
     warnings.warn(
-        "threads of torch keep their cores busy while they wait, for up to half of a run's processor time: set "
-        'os.environ["OMP_WAIT_POLICY"] = "passive" before torch is imported, or call torch.set_num_threads(1)',
+        "threads of OpenMP keep their cores busy while they wait, for a third of a run's processor time: set "
+        'os.environ["OMP_WAIT_POLICY"] = "passive" before torch is imported',
         stacklevel=2,
     )

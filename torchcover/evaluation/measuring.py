@@ -203,6 +203,7 @@ def metric_of(
         aggregations=settings.aggregations,
         regions=asked.regions,
         sensors=sensors,
+        radii=not settings.only_detection,
         square_metres=square_metres and settings.estimate != "known",
         sync_on_compute=False,  # within a process group of the caller's, whose other processes know of no such metric
     )

@@ -38,7 +38,11 @@ from torchcover.report import (
 DEFAULT_STEPS = 512
 # Of the blocks of the first setting, which alone says how errors fall, the others see so many.
 SHARE_OF_OTHERS = 4
-FEWER_RAYS: tuple[Mapping[str, Any], ...] = ({"rays": 4096}, {"rays": 1024})
+FEWER_RAYS: tuple[Mapping[str, Any], ...] = (
+    {"rays": 4096},
+    {"only_detection": True, "rays": 1024},
+    {"only_detection": True, "rays": 256},
+)
 # Errors of the detection that settings are recommended for.
 WANTED = (0.02, 0.01, 0.005)
 # Another setting than the first is recommended only where it saves a fifth of the time.
@@ -94,7 +98,7 @@ class StudyPlan:
 def _options(settings: Mapping[str, Any]) -> Iterator[str]:
     for name, value in settings.items():
         for one in value if isinstance(value, tuple) else (value,):
-            yield f"--{name.replace('_', '-')}={one}"
+            yield f"--{name.replace('_', '-')}" + f"={one}" * (one is not True)
 
 
 class Studied(NamedTuple):

@@ -1,3 +1,4 @@
+from .drawings.encounters import draw_encounters as draw_encounters
 from .drawings.film import check_film as check_film
 from .drawings.film import write_film as write_film
 from .drawings.frame import ActorMark as ActorMark

@@ -234,7 +234,7 @@ def test_bodies_have_the_sizes_of_the_boxes(written):
 def test_a_body_without_a_recorded_height_has_its_own(written):
     world = opened(written, "commonroad")[0].world()
     size_m = BoundingBox.around(of(world, "3").mesh.vertices_m).size_m
-    np.testing.assert_allclose(size_m, (9.5, 2.5, 4.0))
+    np.testing.assert_allclose(size_m, (9.5, 2.5, 1.07 * 3.45))  # of the lorry whose length is nearest
 
 
 def test_another_track_may_be_the_ego_and_then_the_recordings_own_is_one_of_the_others(written):
@@ -372,3 +372,25 @@ def test_the_built_in_ones_are_those_that_are_written_here(written):
             drive = Scenario.load(name)
             drive.world()
             Simulator(drive, {"rig": RIG}, FEW).check_run(4)
+
+
+def test_what_was_not_recorded_is_drawn_if_asked_for_and_stands_where_nobody_was(written):
+    path = written / "argoverse2"
+    bare, drawn = scenario(path).world(0), scenario(path, built_share=1.0).world(0)
+    assert len(bare.static) == 1
+    assert len(drawn.static) == 3
+    assert len(scenario(path, built_share=0.0, roadside=0.0).world(0).static) == 1
+    np.testing.assert_array_equal(bare.static[0].vertices_m, drawn.static[0].vertices_m)
+    houses_m = drawn.static[1].vertices_m[:, :2]
+    assert len(houses_m) > 100
+    for actor in (drawn.ego, *drawn.actors):
+        for place_m in actor.trajectory.positions_m[:, :2]:
+            assert np.linalg.norm(houses_m - place_m, axis=1).min() > 2.0
+    # They begin on the ground: beside hills, below the highest of them.
+    assert drawn.static[1].vertices_m[:, 2].min() < bare.static[0].vertices_m[:, 2].max()
+
+
+@pytest.mark.parametrize("keys", [{"roadside": 2.0}, {"built_share": 1.0, "ground": "road.ply"}, {"built_share": 2.0}])
+def test_what_is_drawn_beside_tracks_is_said_as_a_whole(keys, written):
+    with pytest.raises(ValueError, match="built_share"):
+        scenario(written / "argoverse2", **keys)

@@ -4,10 +4,10 @@ import warnings
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from torchcover.geometry import BoundingBox, invert, overlap
 from torchcover.geometry.rigid import Matrix
@@ -21,10 +21,13 @@ from torchcover.simulation.height_field import Plain, Slopes
 from torchcover.simulation.recorded.bodies import Bodies
 from torchcover.simulation.recorded.ground import ground_below, stood_on, tilted
 from torchcover.simulation.recorded.run import Excerpt, cast_of, excerpt_of, pieces, poses_at_all
+from torchcover.simulation.recorded.sides import sides_of
 from torchcover.simulation.shapes import Mesh, MeshFile
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import EGO, load_bodies
+from torchcover.simulation.traffic.frontage import Times, stand
 from torchcover.simulation.traffic.kind import Traffic
+from torchcover.simulation.traffic.scenery import few
 from torchcover.simulation.world import Actor, World, steps_of
 
 # A time that is so near to an instant is that instant.
@@ -52,6 +55,9 @@ class RecordedTraffic(Traffic):
         duration_s: Length of the run; all of it if not given.
         max_gap_s: Who was not seen for longer was not there.
         ground: File of a mesh, in metres and in the recording's frame; a height field below the tracks if not given.
+        built_share: If it is given, what stands beside streets is drawn beside what was driven, with houses on such a
+            share of the sides: none of that was recorded.
+        roadside: How many times as much of it but houses there is than usually, or of some kinds of it.
         time_step_s: Time between two frames.
     """
 
@@ -67,6 +73,18 @@ class RecordedTraffic(Traffic):
     duration_s: Annotated[float | None, Field(ge=0.0)] = None
     max_gap_s: Annotated[float, Field(gt=0.0)] = 1.0
     ground: PathBeside | None = None
+    built_share: Annotated[float | None, Field(ge=0.0, le=1.0)] = None
+    roadside: Times = 1.0
+
+    @model_validator(mode="after")
+    def _check_drawn(self) -> Self:
+        if self.built_share is None and self.roadside != 1.0:
+            raise ValueError("roadside is for what is drawn beside tracks: give built_share, too, from 0 to 1")
+        if self.built_share is not None and self.ground is not None:
+            raise ValueError(
+                "built_share is for tracks without a ground of their own; leave out ground, or built_share"
+            )
+        return self
 
     @property
     def steps(self) -> int:
@@ -82,7 +100,7 @@ class RecordedTraffic(Traffic):
         }
 
     def world(self, seed: int, ego: Mesh | None = None) -> World:
-        """Build the world: nothing in it is drawn.
+        """Build the world: nothing in it is drawn but what stands beside streets, if it is asked for.
 
         Returns:
             The world, in the frame of the recording. Who is where the ego is at an instant is left out, with a warning.
@@ -94,12 +112,19 @@ class RecordedTraffic(Traffic):
         others = list(self._actors(driver.trajectory, Bodies(bodies)))
         shown = self._apart(driver, others)
         left_out = len(others) - len(shown)
+        stood: tuple[Mesh, ...] = ()
         if self.ground is None:
             below = self._fitted(driver)
+            if self.built_share is not None:
+                generator = np.random.default_rng(seed)
+                sides, driven, walked = sides_of(driver, shown, self.built_share, generator)
+                stood = few(*stand(sides, driven, walked, (), below.heights_m, self.roadside, generator))
             ground, driver, shown = below.mesh(), tilted(driver, below), [tilted(other, below) for other in shown]
         else:
             ground = self._read(self.ground)
-        return World((ground,), driver, tuple(shown), self.time_step_s, run.duration_s, ground=(0,), left_out=left_out)
+        return World(
+            (ground, *stood), driver, tuple(shown), self.time_step_s, run.duration_s, ground=(0,), left_out=left_out
+        )
 
     @cached_property
     def _objects(self) -> RecordedObjects:

@@ -104,7 +104,7 @@ class Sumo(Procedural):
         ground = ground_of(vicinity)
         pavement = Pavement(vicinity, ground)
         sides, taken = sides_of(vicinity, self.built_share, generator)
-        stood = stand(sides, taken, (), (), ground.heights_m, self.roadside, generator)
+        stood = stand(sides, taken, taken, (), ground.heights_m, self.roadside, generator)
         raised = few(pavement.meshes(), decks(vicinity))
         static = (ground.mesh(), *raised, *few(*stood))
         parked = park(vicinity, ground, fleet, self.parked_share, generator)
@@ -137,8 +137,7 @@ class Sumo(Procedural):
         if self.random is None:
             return self.routes
         drawn = folder / "drawn.rou.xml"
-        sizes_m = {kind: (fleet.length_m(kind), fleet.width_m(kind)) for kind in fleet.meshes}
-        write_routes(drawn, network, self.random, sizes_m, WARM_UP_S + duration_s, generator)
+        write_routes(drawn, network, self.random, fleet, WARM_UP_S + duration_s, generator)
         return (drawn,)
 
     def _recorded(

@@ -114,7 +114,7 @@ class City:
                 parts = shapely.get_parts(shapely.set_precision(rest, SNAPPED_M))
                 parts = parts[(shapely.get_type_id(parts) == 3) & (shapely.area(parts) > WEDGE_M)]
                 blocks += [plateau(shapely.segmentize(part, PIECE_M), self._hills.heights_m) for part in parts]
-        self._park([(site, car) for site, front in fronts for car in self._parked(front)])
+        self._park([(site, self._parked(front)) for site, front in fronts])
         driven, walked = self._in_plan()
         stood = stand(sides, driven, walked, floors, self._hills.heights_m, self._roadside, self._generator)
         pavements = few(blocks)
@@ -226,12 +226,16 @@ class City:
             x += length
         return cars
 
-    def _park(self, cars: list[tuple[BuildingSite, tuple[str, float, float, float]]]) -> None:
-        if not cars:
+    def _park(self, cars: list[tuple[BuildingSite, list[tuple[str, float, float, float]]]]) -> None:
+        kinds, poses = [], []
+        for site, of_front in cars:
+            if of_front:
+                kind, x_m, y_m, yaw_deg = zip(*of_front, strict=True)
+                kinds += kind
+                poses.append(site.street.poses(x_m, np.array(y_m)) + np.outer(yaw_deg, (0.0, 0.0, 1.0)))
+        if not kinds:
             return
-        kinds = [kind for _, (kind, *_) in cars]
-        poses = np.array([site.street.poses(x_m, y_m) for site, (_, x_m, y_m, _) in cars])
-        poses[:, 2] += [yaw_deg for _, (*_, yaw_deg) in cars]
+        poses = np.concatenate(poses)
         stances = self._hills.stances(poses[:, :2], poses[:, 2])
         for kind, (x, y, yaw), (height_m, *tilt_deg) in zip(kinds, poses.tolist(), stances.tolist(), strict=True):
             self._fleet.park(kind, (x, y, yaw), height_m, (tilt_deg[0], tilt_deg[1]))

@@ -95,9 +95,8 @@ class Fleet:
 
     def draw_kind(self, mix: Mapping[str, float]) -> str:
         """One kind, each with a probability in proportion to its weight, in one of its sizes."""
-        kind = list(mix)[bisect_right(_shares_up_to(tuple(mix.values())), self._generator.random())]
-        size = int(self._generator.random() * (1 + len(SIZES.get(kind, ()))))
-        return f"{kind}_{size + 1}" if size else kind
+        names, up_to = _bodies_of(tuple(mix), tuple(mix.values()))
+        return names[bisect_right(up_to, self._generator.random())]
 
     def draw_driver(self, typical: Driver, spread: float) -> Driver:
         """A driver whose desired speed differs from the typical one by up to `spread`, a share of it."""
@@ -163,11 +162,12 @@ class Fleet:
 
 
 @lru_cache(maxsize=64)
-def _shares_up_to(weights: tuple[float, ...]) -> list[float]:
-    """For each of some weights, the share that it and those before it have of the sum."""
-    up_to = (np.array(weights) / np.sum(weights)).cumsum()
-    shares: list[float] = (up_to / up_to[-1]).tolist()
-    return shares
+def _bodies_of(kinds: tuple[str, ...], weights: tuple[float, ...]) -> tuple[list[str], list[float]]:
+    """The bodies of some kinds, all sizes of a kind alike, and the share that each and those before it have."""
+    sizes = [[name for name, kind in KIND_OF.items() if kind == one] for one in kinds]
+    shares = np.repeat(np.array(weights) / np.sum(weights), [len(names) for names in sizes])
+    up_to = (shares / np.repeat([len(names) for names in sizes], [len(names) for names in sizes])).cumsum()
+    return [name for names in sizes for name in names], (up_to / up_to[-1]).tolist()
 
 
 def _smallest_gap_m(driver: Driver) -> float:

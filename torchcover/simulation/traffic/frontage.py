@@ -24,14 +24,15 @@ Zone = Literal["kerb", "built", "open"]
 # What stands on a slope goes on below it.
 SUNK_M = 1.0
 # Walls and hedges are straight for so long at most.
-WALL_M = 6.0
+WALL_M = 10.0
 # Corners of a line may coincide.
 TINY_M = 1e-9
+TAPERED = 0.6
 # In the middle of a tree's width, which hangs over the street otherwise.
 TRUNK = 0.1
 
 
-class Kind(NamedTuple):
+class _Kind(NamedTuple):
     """What stands beside streets; lengths are along the street, depths away from it.
 
     Args:
@@ -64,22 +65,24 @@ class Kind(NamedTuple):
 BEHIND: tuple[Zone, ...] = ("built", "open")
 # Sizes of the small are those of usual products; densities agree with real sweeps in what closes the view
 # (docs/measured/streets.md).
-KINDS: Mapping[str, Kind] = {
-    "house": Kind("house", ("built",), 1.0, (0.0, 5.0), (9.0, 24.0), (0.1, 4.0), (9.0, 15.0), (5.0, 24.0)),
-    "back_house": Kind("house", ("built",), 1.0, (24.0, 44.0), (9.0, 22.0), (4.0, 22.0), (9.0, 14.0), (5.0, 22.0)),
-    "hedge": Kind("hedge", ("built",), 0.85, (0.2, 0.8), (6.0, 24.0), (1.5, 7.0), (0.5, 1.1), (0.9, 2.2), WALL_M),
-    "hedgerow": Kind("hedge", ("open",), 1.0, (0.3, 2.0), (20.0, 70.0), (3.0, 10.0), (0.8, 1.6), (1.2, 2.6), WALL_M),
-    "fence": Kind("fence", BEHIND, 0.6, (0.2, 1.2), (6.0, 24.0), (2.0, 14.0), (0.08, 0.08), (0.9, 1.8), WALL_M),
-    "lamp": Kind("lamp", ("kerb",), 0.9, (0.35, 0.45), (0.2, 0.2), (22.0, 34.0), (0.2, 0.2), (6.0, 8.0)),
-    "tree": Kind("tree", ("kerb",), 0.6, (-0.9, -0.6), (2.0, 3.0), (5.0, 14.0), (2.0, 3.0), (6.5, 9.0), foot=TRUNK),
-    "sign": Kind("sign", ("kerb",), 0.9, (0.25, 0.35), (0.06, 0.06), (14.0, 45.0), (0.5, 0.6), (2.4, 3.0)),
-    "bin": Kind("bin", ("kerb",), 0.7, (0.3, 0.4), (0.5, 0.8), (20.0, 60.0), (0.4, 0.5), (0.8, 1.3)),
-    "bicycle": Kind("bicycle", ("kerb",), 0.4, (0.3, 0.4), (1.8, 9.0), (15.0, 60.0), (0.5, 0.5), (1.0, 1.1), 1.75, 0.3),
-    "bollard": Kind(
+KINDS: Mapping[str, _Kind] = {
+    "house": _Kind("house", ("built",), 1.0, (0.0, 5.0), (9.0, 24.0), (0.1, 4.0), (9.0, 15.0), (5.0, 24.0)),
+    "back_house": _Kind("house", ("built",), 1.0, (24.0, 44.0), (9.0, 22.0), (4.0, 22.0), (9.0, 14.0), (5.0, 22.0)),
+    "hedge": _Kind("hedge", ("built",), 0.85, (0.2, 0.8), (6.0, 24.0), (1.5, 7.0), (0.5, 1.1), (0.9, 2.2), WALL_M),
+    "hedgerow": _Kind("hedge", ("open",), 1.0, (0.3, 2.0), (20.0, 70.0), (3.0, 10.0), (0.8, 1.6), (1.2, 2.6), WALL_M),
+    "fence": _Kind("fence", BEHIND, 0.6, (0.2, 1.2), (6.0, 24.0), (2.0, 14.0), (0.08, 0.08), (0.9, 1.8), WALL_M),
+    "lamp": _Kind("lamp", ("kerb",), 0.9, (0.35, 0.45), (0.2, 0.2), (22.0, 34.0), (0.2, 0.2), (6.0, 8.0)),
+    "tree": _Kind("tree", ("kerb",), 0.6, (-0.9, -0.6), (2.0, 3.0), (5.0, 14.0), (2.0, 3.0), (6.5, 9.0), foot=TRUNK),
+    "sign": _Kind("sign", ("kerb",), 0.9, (0.25, 0.35), (0.06, 0.06), (14.0, 45.0), (0.5, 0.6), (2.4, 3.0)),
+    "bin": _Kind("bin", ("kerb",), 0.7, (0.3, 0.4), (0.5, 0.8), (20.0, 60.0), (0.4, 0.5), (0.8, 1.3)),
+    "bicycle": _Kind(
+        "bicycle", ("kerb",), 0.4, (0.3, 0.4), (1.8, 9.0), (15.0, 60.0), (0.5, 0.5), (1.0, 1.1), 1.75, 0.3
+    ),
+    "bollard": _Kind(
         "bollard", ("kerb",), 0.35, (0.3, 0.4), (4.0, 16.0), (8.0, 40.0), (0.12, 0.12), (0.8, 1.0), 0.12, 1.5
     ),
-    "garden_tree": Kind("tree", BEHIND, 0.8, (1.5, 20.0), (2.0, 4.0), (4.0, 22.0), (2.0, 4.0), (5.0, 11.0)),
-    "bush": Kind("bush", BEHIND, 0.8, (0.5, 12.0), (1.0, 2.5), (3.0, 16.0), (1.0, 2.5), (0.7, 2.5)),
+    "garden_tree": _Kind("tree", BEHIND, 0.8, (1.5, 20.0), (2.0, 4.0), (4.0, 22.0), (2.0, 4.0), (5.0, 11.0)),
+    "bush": _Kind("bush", BEHIND, 0.8, (0.5, 12.0), (1.0, 2.5), (3.0, 16.0), (1.0, 2.5), (0.7, 2.5)),
 }
 HOUSES = ("house", "back_house")
 MOST_TIMES = 4.0
@@ -125,8 +128,8 @@ def stand(
 
     Args:
         sides: The sides.
-        driven: In plan: where nothing may stand.
-        walked: In plan: where only what stands at kerbs may.
+        driven: In plan: where nothing at kerbs may stand.
+        walked: In plan: where nothing behind sidewalks may stand.
         pavements: In plan: what is a kerb higher than the ground.
         heights_m: Of the ground, at (N, 2) places.
         times: See `Times`.
@@ -195,7 +198,7 @@ class _Lines:
         return places_m, right
 
 
-def _drawn(kind: Kind, lines: _Lines, times: float, generator: np.random.Generator) -> _Pieces:
+def _drawn(kind: _Kind, lines: _Lines, times: float, generator: np.random.Generator) -> _Pieces:
     """Runs of a kind along the sides that have it."""
     has = np.array([zone in kind.zones for zone in lines.zones], dtype=bool)
     has[has] = generator.random(np.count_nonzero(has)) < kind.share
@@ -236,19 +239,23 @@ def _free(
     """(N,) which pieces are in nobody's way, and how much higher than the ground they stand."""
     foot = np.array([kind.foot for kind in KINDS.values()])[kinds][:, None, None]
     middles_m = outlines_m.mean(axis=1, keepdims=True)
-    feet = shapely.STRtree(shapely.linearrings(middles_m + foot * (outlines_m - middles_m)))
+    feet = shapely.linearrings(middles_m + foot * (outlines_m - middles_m))
     # Of the two geometries it is the query's that is prepared: it had better be the large one.
-    met, on = (np.zeros((2, len(kinds)), dtype=bool) for _ in range(2))
-    for which, large in enumerate((driven, walked)):
-        met[which, feet.query(np.array(large, dtype=object), predicate="intersects")[1]] = True
-    for which, predicate in enumerate(("intersects", "contains")):
-        on[which, feet.query(np.array(pavements, dtype=object), predicate=predicate)[1]] = True
+    free, on, within = (np.zeros(len(kinds), dtype=bool) for _ in range(3))
     at_kerb = np.array(["kerb" in kind.zones for kind in KINDS.values()])[kinds]
-    free = ~met[0] & (at_kerb | ~met[1]) & (on[0] == on[1])
-    # On the inside of a tight curve, where the ways to the right meet, outlines fold.
+    for own, streets in ((at_kerb, driven), (~at_kerb, walked)):
+        met = shapely.STRtree(feet[own]).query(np.array(streets, dtype=object), predicate="intersects")[1]
+        free[own] = ~np.isin(np.arange(np.count_nonzero(own)), met)
+    floors = shapely.STRtree(feet)
+    for found, predicate in ((on, "intersects"), (within, "contains")):
+        found[floors.query(np.array(pavements, dtype=object), predicate=predicate)[1]] = True
+    free &= on == within
+    # On the inside of a tight curve, where the ways to the right meet, outlines fold or taper.
     sides = np.roll(outlines_m, -1, axis=1) - outlines_m
     following = np.roll(sides, -1, axis=1)
     free &= (sides[..., 0] * following[..., 1] > sides[..., 1] * following[..., 0]).all(axis=1)
+    far_m, near_m = np.linalg.norm(sides[:, ::2], axis=2).T
+    free &= (far_m > TAPERED * near_m) & (near_m > TAPERED * far_m)
     number = np.flatnonzero(free)
     later, earlier = number[_meeting(outlines_m[number])]
     apart = (kinds[earlier] != kinds[later]) | (run[earlier] != run[later])
@@ -256,7 +263,7 @@ def _free(
     for one, other in zip(later[apart][order].tolist(), earlier[apart][order].tolist(), strict=True):
         if free[other]:
             free[one] = False
-    return free, PAVEMENT_M * on[1]
+    return free, PAVEMENT_M * within
 
 
 def _meeting(outlines_m: Numbers) -> NDArray[np.int64]:

@@ -1,0 +1,58 @@
+"""The sides of streets that were not recorded: a little beside what was driven, and not where anybody was."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from torchcover.simulation.traffic.assemble import HORIZON_M
+from torchcover.simulation.traffic.frontage import Side
+from torchcover.simulation.world import Actor
+
+Numbers = NDArray[np.float64]
+
+# From the middle of a track to the kerb; what lies between tracks that are nearer to each other is street, too.
+TO_KERB_M, BETWEEN_M, SIDEWALK_M = 5.0, 12.0, 3.0
+# Nothing stands nearer to where somebody was, and labels tremble by centimetres.
+CLEAR_M, TREMBLE_M = 0.5, 0.3
+# A side is built up or open for so long, and has corners so often.
+SIDE_M, CORNER_EVERY_M = 60.0, 4.0
+
+
+def sides_of(
+    ego: Actor, others: Sequence[Actor], built_share: float, generator: np.random.Generator
+) -> tuple[list[Side], list[shapely.Geometry], list[shapely.Geometry]]:
+    """The sides of what was driven, as far as the ego sees.
+
+    Args:
+        ego: The ego.
+        others: Everybody else.
+        built_share: Share of the sides that are built up.
+        generator: Draws which.
+
+    Returns:
+        The sides, and where nothing may stand: at kerbs, and behind sidewalks.
+    """
+    everybody = (ego, *others)
+    places_m = [actor.trajectory.positions_m[:, :2] for actor in everybody]
+    ways = [shapely.LineString(np.concatenate([way_m, way_m[-1:]])).simplify(TREMBLE_M) for way_m in places_m]
+    radius_m = [np.linalg.norm(np.ptp(actor.mesh.vertices_m[:, :2], axis=0)) / 2 + CLEAR_M for actor in everybody]
+    was_m = shapely.buffer(ways, radius_m, quad_segs=4)
+    driven = [
+        way
+        for actor, way in zip(everybody, ways, strict=True)
+        if actor is ego or (actor.category != "pedestrian" and way.length > CLEAR_M)
+    ]
+    street = shapely.union_all(shapely.buffer(driven, TO_KERB_M)).buffer(BETWEEN_M / 2).buffer(-BETWEEN_M / 2)
+    seen, sides = ways[0].buffer(HORIZON_M), list[Side]()
+    walked = street.buffer(SIDEWALK_M)
+    for area, is_kerb in ((street, True), (walked, False)):
+        for ring in shapely.get_parts(shapely.boundary(shapely.orient_polygons(area))):
+            line_m = shapely.get_coordinates(shapely.segmentize(ring.simplify(TREMBLE_M), CORNER_EVERY_M))
+            pieces = max(round(ring.length / SIDE_M), 1)
+            for side_m in np.array_split(line_m, pieces):
+                if len(side_m) > 1 and shapely.contains_xy(seen, *side_m.T).all():
+                    built = generator.random() < built_share
+                    sides.append(Side("kerb" if is_kerb else "built" if built else "open", side_m))
+    return sides, [street, *was_m], [walked, *was_m]
