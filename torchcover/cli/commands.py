@@ -28,7 +28,6 @@ def study(
     steps: Annotated[
         int, typer.Option(min=8, help="Steps of the first setting; the others see the first quarter of these instants.")
     ] = 512,
-    explain: Annotated[bool, typer.Option("--explain", help="Say where the seconds go.")] = False,
     out: options.Out = Path("out"),
     **settings: Any,  # noqa: ANN401
 ) -> None:
@@ -52,7 +51,7 @@ def study(
     with claimed(out):
         found = error_against_time(plan, progress=True)
         files = found.save(out)
-    print_study(found, files, out, explain=explain)
+    print_study(found, files, out)
 
 
 @with_options(of_evaluate("scenario", "seed", "vehicle", "sensor_model", "weather", "reference", "rays", "every_s"))
@@ -195,9 +194,6 @@ def targets(
     require: Annotated[
         Path | None, typer.Option(help="YAML file of requirements: exit code 1 if one is not met.")
     ] = None,
-    rerun: Annotated[
-        Path | None, typer.Option(help="Write the map to this .rrd file, for the Rerun viewer (extra `rerun`).")
-    ] = None,
     out: options.Out = Path("out/targets"),
     files: options.Files = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
@@ -215,7 +211,6 @@ def targets(
         threshold_m=threshold_m,
         heading=heading,
         require=require,
-        rerun=rerun,
         out=out,
         files=files,
         **settings,
@@ -278,10 +273,7 @@ def search(
     per_world: Annotated[int | None, typer.Option(min=1, help="Instants of each world (3).")] = None,
     every_s: Annotated[float | None, typer.Option("--every-s", help="Seconds between two of them (20).")] = None,
     rays: Annotated[int | None, typer.Option(min=1, help="Rays of the reference at each instant (16384).")] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the search and of its worlds.")] = 0,
-    test_seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed of the fresh worlds, another one (the next).")
-    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the search and its worlds; fresh ones have the next.")] = 0,
     workers: Annotated[int, typer.Option(min=0, help="Processes that score; 0 scores in this one.")] = 0,
     resume: Annotated[
         bool,
@@ -311,7 +303,6 @@ def search(
         optimiser=optimiser,
         estimate=estimate,
         seed=seed,
-        test_seed=test_seed,
         workers=workers,
         **{name: value for name, value in given.items() if value is not None},
     )

@@ -165,14 +165,10 @@ class CommonInstants:
             raise ValueError(f"workers: a number >= 0 is needed; got {workers}")
         self.scenarios = tuple(one if isinstance(one, Scenario) else Scenario.load(one) for one in given)
         self.seed, self.estimate, self.objectives = seed, estimate, dict(objectives)
-        self._settings: dict[str, Any] = {"vehicle": vehicle, "per_world": per_world, "every_s": every_s, "rays": rays}
         self.sensor_model = sensor_model
-        self._settings |= {
-            "estimate": estimate,
-            "sensor_model": sensor_model,
-            "budget_bytes": budget_bytes,
-            "workers": workers,
-        }
+        self._settings: dict[str, Any] = {"vehicle": vehicle, "per_world": per_world, "every_s": every_s, "rays": rays}
+        self._settings |= {"estimate": estimate, "sensor_model": sensor_model}
+        self._settings |= {"budget_bytes": budget_bytes, "workers": workers}
         self._vehicles: set[str | None] = {None}  # that were found to be that of these worlds
         self._worlds = [with_ego(one, {}, vehicle) for one in self.scenarios]
         self.questions = Questions.around(Carrier.of(self._worlds).outline_m, objectives)

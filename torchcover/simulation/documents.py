@@ -124,6 +124,20 @@ def read_document(model: type[DocumentT], path: Path) -> DocumentT:
         raise BadFileError(f"{path}: {explain(error)}") from error
 
 
+class Readable(Document):
+    """A document that fills a file of its own."""
+
+    @classmethod
+    def load(cls, path: str | Path) -> Self:
+        """Read it from a YAML file.
+
+        Raises:
+            FileNotFoundError: No such file.
+            BadFileError: Not YAML, or a wrong key or value; the message names the file and the key.
+        """
+        return read_document(cls, Path(path))
+
+
 class BuiltIn(Document):
     """A document that has a name if it comes with torchcover, in a folder of its kind."""
 

@@ -2,7 +2,6 @@
 
 import math
 import warnings
-from pathlib import Path
 from typing import Annotated, NamedTuple, Self
 
 import numpy as np
@@ -11,7 +10,7 @@ from pydantic import AfterValidator, Field, PositiveFloat, model_validator
 
 from torchcover.coverage import BevGrid, Region, check_regions, forward_regions, near_field_regions
 from torchcover.coverage.grid import PAPER_HEIGHTS, BandFrame
-from torchcover.simulation.documents import Coordinate, Document, read_document
+from torchcover.simulation.documents import Coordinate, Document, Readable
 from torchcover.simulation.reference_sensor import DEFAULT_BAND_FRAME, Areas, Bands
 
 # Holds the paper's regions, and the space beside and behind the vehicle.
@@ -72,7 +71,7 @@ class GridOfInterest(Document):
     cell_m: PositiveFloat | None = None
 
 
-class RegionsOfInterest(Document):
+class RegionsOfInterest(Readable):
     """What a run is asked about, for any vehicle; with nothing given, the usual table.
 
     Args:
@@ -96,16 +95,6 @@ class RegionsOfInterest(Document):
     regions: dict[Name, RegionOfInterest] = Field(default_factory=dict)
     heights: dict[Name, Bounds] = Field(default_factory=dict)
     grid: GridOfInterest = GridOfInterest()
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Read them from a YAML file.
-
-        Raises:
-            FileNotFoundError: No such file.
-            BadFileError: Not YAML, or a wrong key or value; the message names the file and the key.
-        """
-        return read_document(cls, Path(path))
 
     def around(
         self,
